@@ -1,0 +1,50 @@
+"""One clock: monotonic, integer nanoseconds, injected."""
+
+from __future__ import annotations
+
+import time
+from typing import Protocol
+
+NS_PER_S = 1_000_000_000
+NS_PER_MS = 1_000_000
+
+
+class Clock(Protocol):
+    """The only source of time in the runtime."""
+
+    def now_ns(self) -> int:
+        """Nanoseconds of one monotonic clock; its zero has no meaning."""
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Return at or after the deadline; at once where it has passed."""
+
+
+class MonotonicClock:
+    """The machine's monotonic clock."""
+
+    def now_ns(self) -> int:
+        return time.monotonic_ns()
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        remaining_ns = deadline_ns - time.monotonic_ns()
+        if remaining_ns > 0:
+            time.sleep(remaining_ns / NS_PER_S)
+
+
+class SimulatedClock:
+    """Time that passes only when it is told to: replay as fast as it can, and tests."""
+
+    def __init__(self, start_ns: int = 0) -> None:
+        self._now_ns = start_ns
+
+    def now_ns(self) -> int:
+        return self._now_ns
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        self._now_ns = max(self._now_ns, deadline_ns)
+
+    def advance_ns(self, duration_ns: int) -> None:
+        """Let simulated time pass; raises ValueError for a negative duration."""
+        if duration_ns < 0:
+            raise ValueError("a monotonic clock does not run backwards")
+        self._now_ns += duration_ns

@@ -1,0 +1,57 @@
+"""Errors are transient (hold, degrade, retry) or fatal (refuse to start, exit 2)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class PhasestackError(Exception):
+    """Everything that phasestack raises on purpose."""
+
+
+class FatalError(PhasestackError):
+    """Nothing sensible can be done: refuse to start. The CLI prints one line and exits with 2."""
+
+
+class InputError(FatalError):
+    """What a user gave us is wrong. Its text names the file (or option) and the field.
+
+    >>> str(InputError("panels.toml", "x_m", "must ascend"))
+    'panels.toml: x_m: must ascend'
+    """
+
+    def __init__(self, source: str | Path, field: str, problem: str) -> None:
+        self.source, self.field, self.problem = str(source), field, problem
+        super().__init__(": ".join(part for part in (self.source, field, problem) if part))
+
+
+class MissingPart(FatalError):
+    """Something optional is needed here and is not installed; the text names what to install."""
+
+
+class TransientError(PhasestackError):
+    """It may pass: hold the last good frame, degrade, retry. Never ends the daemon."""
+
+
+class SensorLost(TransientError):
+    """The sensor is gone, hangs or answers nonsense: close it and reopen it with back-off."""
+
+
+class SensorTimeout(TransientError):
+    """No new sample came in time; the sensor may still be well."""
+
+
+class EndOfRecording(TransientError):
+    """A replayed source has no more samples."""
+
+
+class ContentFailure(TransientError):
+    """The content source could not draw this frame: the last good picture stays."""
+
+
+class ModelFailure(TransientError):
+    """Inference failed or answered something that is not a picture: the last good layers stay."""
+
+
+class PanelLost(TransientError):
+    """A panel's window, monitor or GL context is gone: rebuild it; the loop goes on with none."""

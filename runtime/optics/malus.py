@@ -1,0 +1,44 @@
+"""Malus' law and Jones calculus of N rotators between crossed polarizers (seed 1-7)."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from runtime.records import F64
+
+HALF_PI = np.pi / 2
+Branch = Literal[1, 2]
+T = TypeVar("T", bound=np.floating[Any])
+
+
+def jones_rotator(angle_rad: float) -> F64:
+    """2x2 Jones matrix R(-phi) of a panel that turns the polarization counter-clockwise (seed 2, 3)."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[c, -s], [s, c]])
+
+
+def jones_intensity(angles_rad: ArrayLike) -> float:
+    """Transmitted intensity of panels between crossed polarizers by the Jones product (seed 5, 7), I_0 = 1."""
+    field = np.array([1.0, 0.0])
+    for angle in np.atleast_1d(np.asarray(angles_rad, dtype=np.float64)):
+        field = jones_rotator(float(angle)) @ field
+    return float(field[1] ** 2)
+
+
+def intensity_from_phase(phase: NDArray[T]) -> NDArray[T]:
+    """What an eye sees where the panel values along its ray add up to `phase` (units of pi/2): sin² (seed 7)."""
+    result: NDArray[T] = np.sin(phase * phase.dtype.type(HALF_PI)) ** 2
+    return result
+
+
+def phase_from_intensity(intensity: NDArray[T], branch: Branch = 2) -> NDArray[T]:
+    """The phase sum (units of pi/2) whose sin² is `intensity`, which is clipped to [0, 1].
+
+    Branch 1 lies in [0, 1], branch 2 in [1, 2]: with three panels it keeps every panel far from its limits.
+    """
+    root = np.arcsin(np.sqrt(np.clip(intensity, 0.0, 1.0))) / intensity.dtype.type(HALF_PI)
+    result: NDArray[T] = root if branch == 1 else 2 - root
+    return result

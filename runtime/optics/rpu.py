@@ -1,0 +1,64 @@
+"""Reverse perspective uniform: panel pixels from an eye's image pixels (seed 3.2, 40-47, errata applied)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from runtime.optics.stack import PlaneRaster
+from runtime.optics.views import image_from_raster
+from runtime.records import F64
+
+
+def panel_corners_px(raster: PlaneRaster) -> F64:
+    """(4, 2) outer corners Q_n in the seed's order 0-3: (0, 0), (W, 0), (W, H), (0, H)."""
+    width, height = float(raster.width_px), float(raster.height_px)
+    return np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
+
+
+def image_from_panel_four_points(corners_px: ArrayLike, *, width_px: float, height_px: float) -> F64:
+    """H of seed (40) from the images of a panel's four corners, in closed form (seed 42-46, corrected).
+
+    corners_px: (4, 2) image pixels of the corners in the order of `panel_corners_px`.
+    Returns 3x3 with h33 = 1. Raises ValueError where the quadrilateral is degenerate.
+    Use `image_from_raster` to build H; this is its independent check and the better only when all that is
+    known are four points.
+    """
+    (u0, v0), (u1, v1), (u2, v2), (u3, v3) = np.asarray(corners_px, dtype=np.float64)
+    du1, dv1 = u1 - u2, v1 - v2
+    du2, dv2 = u3 - u2, v3 - v2
+    du3, dv3 = u0 - u1 + u2 - u3, v0 - v1 + v2 - v3
+    determinant = du1 * dv2 - du2 * dv1
+    if not np.isfinite(determinant) or determinant == 0.0:
+        raise ValueError("the panel's corners are collinear in the image: its homography is singular")
+    g = (du3 * dv2 - du2 * dv3) / determinant
+    h = (du1 * dv3 - du3 * dv1) / determinant
+    return np.array(
+        [
+            [(u1 - u0 + g * u1) / width_px, (u3 - u0 + h * u3) / height_px, u0],
+            [(v1 - v0 + g * v1) / width_px, (v3 - v0 + h * v3) / height_px, v0],
+            [g / width_px, h / height_px, 1.0],
+        ]
+    )
+
+
+def corners_in_front(image_from_stack: F64, raster: PlaneRaster) -> bool:
+    """True where all four corners of a panel lie before the eye, so that its homography has one sign."""
+    corners = np.column_stack([panel_corners_px(raster), np.ones(4)])
+    depth_m = corners @ image_from_raster(image_from_stack, raster)[2]
+    return bool((depth_m > 0.0).all())
+
+
+def panel_from_image(image_from_stack: F64, raster: PlaneRaster) -> F64:
+    """M_RPU (seed 47): 3x3 panel pixels from an eye's image pixels; the inverse of the plane-induced homography.
+
+    Built without a numerical inverse: the ray of an image pixel is cut with the panel's plane, so that it
+    stays exact at grazing angles. Scaled so that its largest entry is 1.
+    Raises ValueError for an eye in the panel's plane.
+    """
+    h = image_from_raster(image_from_stack, raster)
+    adjugate = np.array([np.cross(h[:, 1], h[:, 2]), np.cross(h[:, 2], h[:, 0]), np.cross(h[:, 0], h[:, 1])])
+    scale = np.abs(adjugate).max()
+    if not np.isfinite(scale) or scale == 0.0 or (adjugate[0] @ h[:, 0]) == 0.0:
+        raise ValueError("the eye lies in the panel's plane: its view of the panel is singular")
+    return adjugate / scale

@@ -1,0 +1,88 @@
+"""Eye poses and projections (seed 2.1 and 3.1, with the errata of the design applied)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from runtime.optics.stack import PlaneRaster
+from runtime.records import F64
+
+
+def stack_from_eye(eye_m: ArrayLike) -> F64:
+    """4x4 pose of an eye that looks at the stack's origin (seed 10-14).
+
+    Axes: x right and parallel to the ground, y up, z from the scene towards the eye. On the vertical
+    axis, where the limits differ, the limit from +x is taken: r_x = +y.
+
+    Raises ValueError for an eye at the origin or that is not finite.
+    """
+    eye = np.asarray(eye_m, dtype=np.float64)
+    scale = float(np.abs(eye).max())
+    if not np.isfinite(scale) or scale == 0.0:
+        raise ValueError(f"an eye at {eye.tolist()} has no direction of gaze")
+    # Scaled first: squares of 1e-200 or 1e200 would leave float64.
+    back = eye / scale
+    back = back / math.hypot(*back)
+    ground = math.hypot(back[0], back[1])
+    right = np.array([-back[1] / ground, back[0] / ground, 0.0]) if ground > 0.0 else np.array([0.0, 1.0, 0.0])
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(back, right), back, eye
+    return pose
+
+
+def image_from_camera(*, width_px: int, height_px: int, fov_deg: float) -> F64:
+    """3x3 intrinsic matrix of square pixels and centred principal point (seed 36); fov is horizontal."""
+    focal_px = width_px / 2 / math.tan(math.radians(fov_deg) / 2)
+    return np.array([[focal_px, 0.0, width_px / 2], [0.0, focal_px, height_px / 2], [0.0, 0.0, 1.0]])
+
+
+def image_from_stack(eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float) -> F64:
+    """3x4 projection of `stack` points to an eye's image: K · diag(1, -1, -1) · R_e^T · [I | -e] (seed 31-39).
+
+    The third homogeneous coordinate is the distance along the gaze in metres, positive before the eye.
+    """
+    pose = stack_from_eye(eye_m)
+    rotation = np.diag([1.0, -1.0, -1.0]) @ pose[:3, :3].T
+    translation = -rotation @ pose[:3, 3]
+    camera = image_from_camera(width_px=width_px, height_px=height_px, fov_deg=fov_deg)
+    return camera @ np.column_stack([rotation, translation])
+
+
+def raster_from_stack(eye_m: ArrayLike, raster: PlaneRaster) -> F64:
+    """3x4 projection of `stack` points, seen from an eye, on to a plane's pixels.
+
+    A homography after a pinhole projection is another projection: this is M_RPU · `image_from_stack` for
+    whatever image the eye has. The third coordinate is the eye's distance from the point along x, in metres.
+    """
+    eye = np.asarray(eye_m, dtype=np.float64)
+    depth = raster.x_m - eye[0]
+    # A point p goes to e + (p - e)·(x_plane - e_x)/(p_x - e_x), written with e_x - p_x as the weight.
+    plane_from_stack = np.array(
+        [
+            [-eye[1], -depth, 0.0, eye[1] * eye[0] + eye[1] * depth],
+            [-eye[2], 0.0, -depth, eye[2] * eye[0] + eye[2] * depth],
+            [-1.0, 0.0, 0.0, eye[0]],
+        ]
+    )
+    return raster.raster_from_plane() @ plane_from_stack
+
+
+def image_from_raster(image_from_stack: F64, raster: PlaneRaster) -> F64:
+    """3x3 plane-induced homography: an eye's image pixels from a plane's pixels (H of seed 40-42)."""
+    return image_from_stack[:, :3] @ raster.stack_from_raster() + np.outer(image_from_stack[:, 3], [0.0, 0.0, 1.0])
+
+
+def relative_scale_shift(eye_m: ArrayLike, *, from_x_m: float, to_x_m: float) -> tuple[float, F64]:
+    """Where the ray from an eye through (y, z) on one plane crosses a parallel one: q = p·scale + shift.
+
+    Returns the scale and the (2,) shift in metres (y, z). Raises ValueError where the eye is in the first plane.
+    """
+    eye = np.asarray(eye_m, dtype=np.float64)
+    distance_m = eye[0] - from_x_m
+    if distance_m == 0.0:
+        raise ValueError("an eye in a panel's plane sees nothing through it")
+    scale = (eye[0] - to_x_m) / distance_m
+    return float(scale), eye[1:] * ((to_x_m - from_x_m) / distance_m)
