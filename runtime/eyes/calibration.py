@@ -1,0 +1,235 @@
+"""The calibration that takes eyes from the sensor's frame to the stack's: load, check, apply, and its error.
+
+Parameters of a calibration, about a pivot w0 (the pairs' centre, in `stack`) where they are nearly uncorrelated:
+rotation vector (3, rad, about the axes of `stack`), shift (3, m) and log scale (1). A small change d of them moves
+a point w by  d_rot × (w - w0) + d_shift + d_scale·(w - w0).
+"""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import ConfigDict, Field, field_validator
+
+from runtime.config import Section, read_table, validated
+from runtime.errors import InputError
+from runtime.records import F64, EyePoints
+
+DEMO_FILE = Path(__file__).parent / "data" / "demo-calibration.toml"
+SIMILARITY_TOLERANCE = 1e-3  # relative; printed matrices of four digits pass, sheared ones do not
+PLAUSIBLE_SCALE = (0.8, 1.25)  # both frames are in metres
+
+Number = Annotated[float, Field(strict=True)]  # "1.0" and true are not numbers
+Row4 = tuple[Number, Number, Number, Number]
+Vector3 = tuple[Number, Number, Number]
+Row7 = tuple[Number, Number, Number, Number, Number, Number, Number]
+
+
+class ResidualTable(Section):
+    """`[residuals]`: how well the pairs fit, metres."""
+
+    rms_m: Annotated[float, Field(ge=0)]
+    max_m: Annotated[float, Field(ge=0)]
+    axis_rms_m: Vector3
+    leave_one_out_rms_m: Annotated[float, Field(ge=0)] | None = None
+
+
+class CovarianceTable(Section):
+    """`[covariance]`: of the parameters in the module's text."""
+
+    pivot_m: Vector3
+    matrix: tuple[Row7, Row7, Row7, Row7, Row7, Row7, Row7]
+
+    @field_validator("matrix")
+    @classmethod
+    def _is_covariance(cls, rows: tuple[Row7, ...]) -> tuple[Row7, ...]:
+        matrix = np.array(rows)
+        size = float(np.abs(matrix).max())
+        if np.abs(matrix - matrix.T).max() > 1e-6 * size:
+            raise ValueError("must be symmetric")
+        if np.linalg.eigvalsh((matrix + matrix.T) / 2).min() < -1e-6 * size:
+            raise ValueError("must have no negative variances")
+        return rows
+
+
+class CalibrationFile(Section):
+    """A calibration file's tables; only `stack_from_sensor` is required, keys of others are left alone."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+
+    stack_from_sensor: tuple[Row4, Row4, Row4, Row4]
+    units: Literal["m"] = "m"
+    method: str = ""
+    date: str = ""
+    sensor_driver: str = ""
+    sensor_serial: str = ""
+    panel_ids: tuple[str, ...] = ()
+    pairs: Annotated[int, Field(ge=0)] = 0
+    condition: Annotated[float, Field(ge=0)] | None = None
+    residuals: ResidualTable | None = None
+    covariance: CovarianceTable | None = None
+
+    @field_validator("date", mode="before")
+    @classmethod
+    def _date_text(cls, value: Any) -> Any:
+        return value.isoformat() if isinstance(value, datetime.date) else value
+
+
+@dataclass(frozen=True, slots=True)
+class Residuals:
+    """How well the pairs fit the matrix, metres, in `stack`."""
+
+    rms_m: float
+    max_m: float
+    axis_rms_m: F64  # (3,)
+    leave_one_out_rms_m: float | None = None  # None: not known
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """A similarity from `sensor` to `stack`, where it comes from, and how good it is."""
+
+    stack_from_sensor: F64  # (4, 4) [sR t; 0 1]
+    source: str = "built-in demo"  # the file's name, for messages
+    method: str = ""
+    date: str = ""
+    sensor_driver: str = ""
+    sensor_serial: str = ""  # empty: of no particular device
+    panel_ids: tuple[str, ...] = ()
+    pairs: int = 0
+    condition: float | None = None
+    residuals: Residuals | None = None
+    pivot_m: F64 | None = None  # (3,) frame `stack`
+    covariance: F64 | None = None  # (7, 7) of rotation (rad), shift (m), log scale about the pivot; None: not known
+    warnings: tuple[str, ...] = field(default=())  # what a person should know before trusting it
+
+    @property
+    def scale(self) -> float:
+        """Metres of `stack` for each metre of `sensor`."""
+        return float(np.cbrt(np.linalg.det(self.stack_from_sensor[:3, :3])))
+
+    def points(self, sensor_m: ArrayLike) -> F64:
+        """(..., 3) points in `stack`, metres, from (..., 3) points in `sensor` (seed 28)."""
+        points = np.asarray(sensor_m, dtype=np.float64)
+        return points @ self.stack_from_sensor[:3, :3].T + self.stack_from_sensor[:3, 3]
+
+    def apply(self, eyes: EyePoints) -> EyePoints:
+        """The same eyes in `stack`; `eyes` are in `sensor`."""
+        return replace(eyes, eyes_m=self.points(eyes.eyes_m))
+
+    def position_covariance(self, stack_m: ArrayLike) -> F64 | None:
+        """(..., 3, 3) covariance, m², of points (..., 3) in `stack` due to the calibration alone; None: not known."""
+        if self.covariance is None or self.pivot_m is None:
+            return None
+        jacobian = position_jacobian(stack_m, pivot_m=self.pivot_m)
+        return jacobian @ self.covariance @ np.swapaxes(jacobian, -1, -2)
+
+    def position_error_m(self, stack_m: ArrayLike) -> F64 | None:
+        """(...) expected (RMS) distance, m, by which points (..., 3) in `stack` are off; None where not known."""
+        covariance = self.position_covariance(stack_m)
+        return None if covariance is None else np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
+
+    def serial_warning(self, serial: str) -> str:
+        """One line where a sensor is not the one that was calibrated, else an empty text."""
+        if not self.sensor_serial or serial == self.sensor_serial:
+            return ""
+        found = f"the sensor is {serial}" if serial else "the sensor tells no serial"
+        return f"{self.source}: calibrated for sensor {self.sensor_serial}, but {found}: calibrate again"
+
+
+def position_jacobian(stack_m: ArrayLike, *, pivot_m: ArrayLike) -> F64:
+    """(..., 3, 7) derivative of points (..., 3) in `stack` by a calibration's parameters about its pivot."""
+    arm = np.asarray(stack_m, dtype=np.float64) - np.asarray(pivot_m, dtype=np.float64)
+    jacobian = np.zeros((*arm.shape, 7))
+    jacobian[..., 0, 1], jacobian[..., 0, 2] = arm[..., 2], -arm[..., 1]
+    jacobian[..., 1, 0], jacobian[..., 1, 2] = -arm[..., 2], arm[..., 0]
+    jacobian[..., 2, 0], jacobian[..., 2, 1] = arm[..., 1], -arm[..., 0]
+    jacobian[..., :, 3:6] = np.eye(3)
+    jacobian[..., :, 6] = arm
+    return jacobian
+
+
+def similarity_defect(matrix: ArrayLike) -> float:
+    """How far the upper left 3x3 is from a scaled rotation: max of |A^T A / s² - I|, s² the mean square of columns.
+
+    0: exactly a similarity (or a reflection of one); infinite for a zero matrix.
+    """
+    linear = np.asarray(matrix, dtype=np.float64)[:3, :3]
+    largest = float(np.abs(linear).max())
+    if not np.isfinite(largest) or largest == 0.0:
+        return float("inf")
+    gram = (linear / largest).T @ (linear / largest)
+    return float(np.abs(gram / (np.trace(gram) / 3) - np.eye(3)).max())
+
+
+def check_similarity(matrix: F64, *, source: str | Path) -> None:
+    """Raise InputError, naming the field, where a finite 4x4 matrix is no similarity with positive determinant."""
+    name = "stack_from_sensor"
+    if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+        raise InputError(source, name, "its last row must be 0, 0, 0, 1")
+    defect = similarity_defect(matrix)
+    if not defect <= SIMILARITY_TOLERANCE:
+        raise InputError(
+            source, name, f"must be rotation times one scale (off by {defect:.2g}, allowed {SIMILARITY_TOLERANCE})"
+        )
+    sign = np.linalg.det(matrix[:3, :3] / np.abs(matrix[:3, :3]).max())
+    if sign <= 0.0:
+        raise InputError(source, name, "mirrors space (determinant not positive): check the axes' directions")
+
+
+def _warnings(matrix: F64, source: str) -> tuple[str, ...]:
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    if PLAUSIBLE_SCALE[0] <= scale <= PLAUSIBLE_SCALE[1]:
+        return ()
+    reason = "are both frames in metres?"
+    if 800 < scale < 1250 or 0.0008 < scale < 0.00125:
+        reason = "millimetres on one side, it seems"
+    return (f"{source}: stack_from_sensor: scale {scale:.6g} is far from 1: {reason}",)
+
+
+def _residuals(table: ResidualTable | None) -> Residuals | None:
+    if table is None:
+        return None
+    return Residuals(
+        rms_m=table.rms_m,
+        max_m=table.max_m,
+        axis_rms_m=np.array(table.axis_rms_m),
+        leave_one_out_rms_m=table.leave_one_out_rms_m,
+    )
+
+
+def load_calibration(path: Path | None) -> Calibration:
+    """A calibration file, checked; None: the built-in one of the demo recording.
+
+    Raises InputError, naming file and field: missing, malformed, wrong shape, not finite, not a similarity,
+    mirrored. A scale far from 1 only warns: `Calibration.warnings`.
+    """
+    file = DEMO_FILE if path is None else path
+    table = read_table(file)
+    if "stack_from_sensor" not in table:
+        raise InputError(file, "stack_from_sensor", "is missing (four rows of four numbers)")
+    parsed = validated(CalibrationFile, table, source=file)
+    matrix = np.array(parsed.stack_from_sensor, dtype=np.float64)
+    check_similarity(matrix, source=file)
+    source = "built-in demo" if path is None else str(path)
+    spread = parsed.covariance
+    return Calibration(
+        stack_from_sensor=matrix,
+        source=source,
+        method=parsed.method,
+        date=parsed.date,
+        sensor_driver=parsed.sensor_driver,
+        sensor_serial=parsed.sensor_serial,
+        panel_ids=parsed.panel_ids,
+        pairs=parsed.pairs,
+        condition=parsed.condition,
+        residuals=_residuals(parsed.residuals),
+        pivot_m=None if spread is None else np.array(spread.pivot_m),
+        covariance=None if spread is None else np.array(spread.matrix),
+        warnings=_warnings(matrix, source),
+    )

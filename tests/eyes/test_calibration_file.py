@@ -1,0 +1,150 @@
+"""A calibration file is a similarity with a positive determinant, in metres, or it is refused by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from runtime.errors import InputError
+from runtime.eyes.calibration import load_calibration, position_jacobian, similarity_defect
+from runtime.eyes.demo_geometry import demo_stack_from_sensor
+from runtime.records import EyePoints
+
+PUBLISHED = """stack_from_sensor = [
+    [0.699976, 2.09768, 7.81822, -1.90611], [8.09414, -0.276962, -0.650369, 0.166057],
+    [0.0985957, 7.8446, -2.11359, 3.31142], [0, 0, 0, 1]]
+"""
+
+
+def toml(matrix: np.ndarray) -> str:
+    return f"stack_from_sensor = {np.asarray(matrix).tolist()}\n"
+
+
+def refusal(folder: Path, text: str) -> str:
+    file = folder / "c.toml"
+    file.write_text(text)
+    with pytest.raises(InputError) as caught:
+        load_calibration(file)
+    message = str(caught.value)
+    assert str(file) in message
+    assert "\n" not in message
+    return message
+
+
+def test_the_demo_calibration_holds_the_demo_geometry_to_the_last_digit() -> None:
+    calibration = load_calibration(None)
+    np.testing.assert_array_equal(calibration.stack_from_sensor, demo_stack_from_sensor())
+    assert calibration.warnings == ()
+
+
+def test_the_demo_camera_looks_at_the_viewer_and_a_little_down() -> None:
+    viewer = load_calibration(None).points([[0.0, 0.0, 0.6]])[0]
+    assert viewer[0] > 0.6
+    assert viewer[2] < 0.22
+    image_right, image_down = load_calibration(None).points([[0.1, 0.0, 0.6], [0.0, 0.1, 0.6]])
+    assert image_right[1] < viewer[1], "the camera's right is the viewer's left"
+    assert image_down[2] < viewer[2]
+
+
+def test_eyes_keep_their_confidence_and_their_separation() -> None:
+    eyes = EyePoints(np.array([[0.03, -0.05, 0.6], [-0.03, -0.05, 0.6]]), np.array([0.9, 0.4]), completed="right")
+    moved = load_calibration(None).apply(eyes)
+    assert moved.completed == "right"
+    np.testing.assert_array_equal(moved.confidence, eyes.confidence)
+    assert np.linalg.norm(moved.eyes_m[0] - moved.eyes_m[1]) == pytest.approx(0.06)
+    assert moved.eyes_m[0][1] < moved.eyes_m[1][1], "the left eye is on the viewer's left"
+
+
+def test_the_published_prototype_matrix_is_a_similarity_to_its_printed_digits(tmp_path: Path) -> None:
+    file = tmp_path / "published.toml"
+    file.write_text(PUBLISHED)
+    calibration = load_calibration(file)
+    assert calibration.scale == pytest.approx(8.125, abs=5e-4)
+    assert similarity_defect(calibration.stack_from_sensor) < 2e-6
+    assert "8.12" in calibration.warnings[0], "its units are its own: a person is told"
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("", "stack_from_sensor: is missing"),
+        ("stack_from_sensor = [[1,", "malformed"),
+        ("stack_from_sensor = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]", "stack_from_sensor"),
+        ("stack_from_sensor = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0]]", "stack_from_sensor.0"),
+        ("stack_from_sensor = 3", "stack_from_sensor"),
+        (toml(np.eye(4)).replace("1.0", "nan", 1), "stack_from_sensor.0.0"),
+        (toml(np.eye(4)).replace("1.0", "inf", 1), "stack_from_sensor.0.0"),
+        (toml(np.eye(4)).replace("1.0", '"1.0"', 1), "stack_from_sensor.0.0"),
+        (toml(np.eye(4)).replace("1.0", "true", 1), "stack_from_sensor.0.0"),
+        (toml(np.diag([1.0, 1.0, 1.01, 1.0])), "rotation times one scale"),
+        (toml(np.diag([0.0, 0.0, 0.0, 1.0])), "rotation times one scale"),
+        (toml(np.diag([1.0, 1.0, -1.0, 1.0])), "mirrors space"),
+        (toml(np.eye(4) + np.eye(4)[[3, 0, 1, 2]] * [0.1, 0, 0, 0]), "rotation times one scale"),
+        (toml(np.eye(4) * 2), "last row"),
+        (toml(np.eye(4)) + 'units = "mm"', "units"),
+        (toml(np.eye(4)) + "[covariance]\npivot_m = [0, 0, 0]\nmatrix = [[1]]", "covariance.matrix.0"),
+        (toml(np.eye(4)) + "[residuals]\nrms_m = -1\nmax_m = 1\naxis_rms_m = [0, 0, 0]", "residuals.rms_m"),
+    ],
+)
+def test_a_wrong_file_is_refused_with_its_name_and_the_field(tmp_path: Path, text: str, wanted: str) -> None:
+    assert wanted in refusal(tmp_path, text)
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        load_calibration(tmp_path / "none.toml")
+
+
+def test_a_covariance_that_is_none_is_refused(tmp_path: Path) -> None:
+    for matrix in (-np.eye(7), np.eye(7) + np.eye(7)[[1, 2, 3, 4, 5, 6, 0]]):
+        table = f"[covariance]\npivot_m = [0, 0, 0]\nmatrix = {matrix.tolist()}\n"
+        assert "covariance.matrix" in refusal(tmp_path, toml(np.eye(4)) + table)
+
+
+def test_a_sensor_that_reports_millimetres_is_warned_of(tmp_path: Path) -> None:
+    file = tmp_path / "mm.toml"
+    file.write_text(toml(np.diag([0.001, 0.001, 0.001, 1.0])))
+    assert "millimetres" in load_calibration(file).warnings[0]
+
+
+def test_another_sensor_than_the_calibrated_one_is_warned_of(tmp_path: Path) -> None:
+    file = tmp_path / "c.toml"
+    file.write_text(toml(np.eye(4)) + 'sensor_serial = "A1"\n')
+    calibration = load_calibration(file)
+    assert calibration.serial_warning("A1") == ""
+    assert "A1" in calibration.serial_warning("B2")
+    assert "B2" in calibration.serial_warning("B2")
+    assert "no serial" in calibration.serial_warning("")
+    assert load_calibration(None).serial_warning("B2") == "", "a calibration of no particular device fits all"
+
+
+vectors = st.tuples(*[st.floats(-2, 2)] * 3).map(np.array)
+
+
+@given(vectors, vectors, vectors, st.tuples(*[st.floats(-1, 1)] * 7).map(np.array))
+def test_the_jacobian_is_the_derivative_of_the_similarity(rotation, point, pivot, direction) -> None:
+    """A central difference of the real thing, not of its formula."""
+
+    def moved(step: float) -> np.ndarray:
+        d = direction * step
+        turned = Rotation.from_rotvec(d[:3]).apply(point - pivot)
+        return np.exp(d[6]) * turned + pivot + d[3:6]
+
+    slope = (moved(1e-5) - moved(-1e-5)) / 2e-5
+    np.testing.assert_allclose(position_jacobian(point, pivot_m=pivot) @ direction, slope, atol=1e-8)
+
+
+def test_the_error_at_the_eye_grows_with_the_distance_from_the_pairs(tmp_path: Path) -> None:
+    file = tmp_path / "c.toml"
+    spread = np.diag([1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3]) ** 2
+    file.write_text(toml(np.eye(4)) + f"[covariance]\npivot_m = [0.5, 0, 0]\nmatrix = {spread.tolist()}\n")
+    calibration = load_calibration(file)
+    near, far = calibration.position_error_m([[0.5, 0.0, 0.0], [1.5, 0.0, 0.0]])
+    assert near == pytest.approx(np.sqrt(3) * 1e-3)
+    assert far == pytest.approx(np.sqrt(6) * 1e-3), "two axes of rotation and the scale act at a metre's arm"
+    assert load_calibration(None).position_error_m([[0.5, 0.0, 0.0]]) is None, "not known is not zero"
