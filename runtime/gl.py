@@ -1,0 +1,38 @@
+"""The OpenGL context without a screen: EGL, on whichever driver the machine has (Mesa's llvmpipe at the least)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import moderngl
+
+from runtime.errors import MissingPart
+
+DEBIAN_PACKAGES = "libegl1 libgl1-mesa-dri libgles2 libgl1"
+MINIMUM_VERSION = 330
+# Libraries by their sonames: the search that moderngl does otherwise starts a compiler and costs 60 ms.
+EGL: dict[str, Any] = {"backend": "egl", "libegl": "libEGL.so.1", "libgl": "libGL.so.1"}
+
+
+def offscreen_context() -> moderngl.Context:
+    """A context that needs no screen, current on the calling thread; content and offscreen panels share it.
+
+    Use it on one thread only. Raises MissingPart, naming Debian's packages, where EGL can't give OpenGL 3.3.
+    """
+    try:
+        return moderngl.create_context(require=MINIMUM_VERSION, standalone=True, **EGL)
+    except Exception as error:  # moderngl and glcontext raise plain Exception
+        raise MissingPart(
+            f"no OpenGL without a screen ({str(error).strip() or 'EGL failed'}): "
+            f"install Debian's packages {DEBIAN_PACKAGES}"
+        ) from None
+
+
+def describe(context: moderngl.Context) -> dict[str, str]:
+    """Vendor, renderer and version as the driver names them."""
+    info = context.info
+    return {
+        "vendor": str(info["GL_VENDOR"]),
+        "renderer": str(info["GL_RENDERER"]),
+        "version": str(info["GL_VERSION"]),
+    }

@@ -1,0 +1,83 @@
+"""From a monitor's pixels back to a layer's pixels: registration, mirroring, mounting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from runtime.records import F64
+
+IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def panel_size_px(*, screen_width_px: int, screen_height_px: int, rotation_deg: int) -> tuple[int, int]:
+    """Columns and rows of a panel as the viewer sees it, from those of its monitor."""
+    if rotation_deg in (90, 270):
+        return screen_height_px, screen_width_px
+    return screen_width_px, screen_height_px
+
+
+def panel_from_screen(*, screen_width_px: int, screen_height_px: int, rotation_deg: int, mirror: str) -> F64:
+    """3x3: the viewer's panel pixels from the monitor's own, both continuous, top left origin, v down.
+
+    A monitor that is turned by `rotation_deg` counter-clockwise, seen from the front, is shown its picture turned
+    clockwise. Mirroring is of the viewer's picture, before it is turned.
+    """
+    width, height = float(screen_width_px), float(screen_height_px)
+    turned = {
+        0: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        90: [[0.0, 1.0, 0.0], [-1.0, 0.0, width], [0.0, 0.0, 1.0]],
+        180: [[-1.0, 0.0, width], [0.0, -1.0, height], [0.0, 0.0, 1.0]],
+        270: [[0.0, -1.0, height], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
+    }[rotation_deg]
+    columns, rows = panel_size_px(
+        screen_width_px=screen_width_px, screen_height_px=screen_height_px, rotation_deg=rotation_deg
+    )
+    mirrored = {
+        "none": np.eye(3),
+        "horizontal": np.array([[-1.0, 0.0, columns], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+        "vertical": np.array([[1.0, 0.0, 0.0], [0.0, -1.0, rows], [0.0, 0.0, 1.0]]),
+    }[mirror]
+    return mirrored @ np.array(turned)
+
+
+def layer_from_screen(
+    *,
+    screen_width_px: int,
+    screen_height_px: int,
+    layer_width_px: int,
+    layer_height_px: int,
+    rotation_deg: int,
+    mirror: str,
+    homography: Sequence[Sequence[float]],
+) -> F64:
+    """3x3: layer pixels from the monitor's pixels, up to scale.
+
+    homography: true panel pixels from ideal ones, in the panel's own pixels, whatever the layers' resolution.
+    Raises ValueError for a singular homography.
+    """
+    columns, rows = panel_size_px(
+        screen_width_px=screen_width_px, screen_height_px=screen_height_px, rotation_deg=rotation_deg
+    )
+    true_from_ideal = np.asarray(homography, dtype=np.float64)
+    if not np.isfinite(true_from_ideal).all() or abs(np.linalg.det(true_from_ideal)) < 1e-12:
+        raise ValueError("a panel's homography must be invertible")
+    true_from_screen = panel_from_screen(
+        screen_width_px=screen_width_px, screen_height_px=screen_height_px, rotation_deg=rotation_deg, mirror=mirror
+    )
+    layer_from_ideal = np.diag([layer_width_px / columns, layer_height_px / rows, 1.0])
+    return layer_from_ideal @ np.linalg.solve(true_from_ideal, true_from_screen)
+
+
+def permutes_pixels(matrix: F64) -> bool:
+    """True where a 3x3 takes every pixel centre to a pixel centre, so that no interpolation is wanted."""
+    if matrix[2, 2] == 0.0:
+        return False
+    m = matrix / matrix[2, 2]
+    affine = np.abs(m[2, :2]).max() < 1e-15
+    turn = np.allclose(np.abs(m[:2, :2]).sum(axis=0), 1.0, atol=1e-12) and np.allclose(
+        m[:2, :2], np.rint(m[:2, :2]), atol=1e-12
+    )
+    centre = m @ np.array([0.5, 0.5, 1.0])
+    return bool(affine and turn and np.allclose((centre[:2] - 0.5) % 1.0 % 1.0, 0.0, atol=1e-9))

@@ -1,0 +1,66 @@
+"""Phase to grey: what a panel must be sent so that it turns the light by the angle that was asked for."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from runtime.errors import InputError
+from runtime.records import F32
+
+ENTRIES = 256
+COLUMNS = ("phase", "red", "green", "blue")
+
+
+def identity() -> F32:
+    """(256, 3) grey in [0, 1] for each 8-bit phase and channel: the grey is the phase."""
+    return gamma_curve(1.0)
+
+
+def gamma_curve(gamma: float) -> F32:
+    """(256, 3) grey = phase^(1/gamma), for a panel whose phase is grey^gamma."""
+    phase = np.linspace(0.0, 1.0, ENTRIES)
+    return np.repeat((phase ** (1.0 / gamma))[:, None], 3, axis=1).astype(np.float32)
+
+
+def measured_curve(path: Path) -> F32:
+    """(256, 3) grey from a CSV with columns phase, red, green, blue (or phase, grey), all in [0, 1].
+
+    Rows may be at any phases, ascending, at least two; between them it is linear, beyond them constant.
+    Raises InputError, naming the file and the row or column.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(path, "", f"cannot be read ({getattr(error, 'strerror', None) or error})") from None
+    header = tuple(name.strip().lower() for name in rows[0]) if rows else ()
+    if header not in (COLUMNS, ("phase", "grey")):
+        raise InputError(path, "columns", "must be phase, red, green, blue (or phase, grey)")
+    values = []
+    for number, row in enumerate(rows[1:], start=2):
+        try:
+            values.append([float(cell) for cell in row])
+        except ValueError:
+            raise InputError(path, f"row {number}", "is not a row of numbers") from None
+        if len(row) != len(header):
+            raise InputError(path, f"row {number}", f"has {len(row)} values, not {len(header)}")
+    table = np.array(values, dtype=np.float64)
+    if len(values) < 2:
+        raise InputError(path, "phase", "needs at least two rows")
+    if not np.isfinite(table).all() or table.min() < 0.0 or table.max() > 1.0:
+        raise InputError(path, "values", "must lie in [0, 1]")
+    if (np.diff(table[:, 0]) <= 0.0).any():
+        raise InputError(path, "phase", "must ascend")
+    wanted = np.linspace(0.0, 1.0, ENTRIES)
+    greys = table[:, 1:] if table.shape[1] == 4 else np.repeat(table[:, 1:2], 3, axis=1)
+    return np.stack([np.interp(wanted, table[:, 0], greys[:, channel]) for channel in range(3)], axis=1).astype(
+        np.float32
+    )
+
+
+def curve(*, lut: str, gamma: float) -> F32:
+    """(256, 3) grey of one panel: its measured curve, or else its gamma. Raises InputError."""
+    return measured_curve(Path(lut)) if lut else gamma_curve(gamma)
