@@ -1,0 +1,228 @@
+"""Recordings in MCAP: small chunks, so that a crash loses at most one; opened up to the break where there is one."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import IO, Any
+
+from runtime.clock import NS_PER_S
+from runtime.errors import InputError
+from runtime.records import Intrinsics, SensorFrame
+from runtime.sensor import recording_format as fmt
+from runtime.sensor.recording_format import RecordingHeader
+
+CHUNK_BYTES = 4096  # some 20 eye samples
+MESSAGE_OVERHEAD_BYTES = 64
+INDEX_BYTES_PER_CHUNK = 256
+RECORD_LIMIT_BYTES = 256 << 20
+MAGIC = b"\x89MCAP0\r\n"
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingLimits:
+    """A recording ends before it is longer or larger than this."""
+
+    max_s: float = 600.0
+    max_bytes: int = 2 << 30
+
+
+class RecordingWriter:
+    """Writes samples to an open binary file. `write` answers False once a limit is reached."""
+
+    def __init__(
+        self,
+        file: IO[bytes],
+        header: RecordingHeader,
+        *,
+        limits: RecordingLimits | None = None,
+        chunk_bytes: int = CHUNK_BYTES,
+    ) -> None:
+        from mcap.writer import CompressionType, IndexType, Writer
+
+        self._file, self._limits, self._chunk_bytes = file, limits or RecordingLimits(), chunk_bytes
+        self._images = header.colour or header.depth
+        # Eye points alone are so few that plain bytes, the same with every version of a library, are worth more.
+        compression = CompressionType.LZ4 if self._images else CompressionType.NONE
+        index = IndexType.CHUNK | IndexType.METADATA
+        self._writer: Any = Writer(file, chunk_size=chunk_bytes, compression=compression, index_types=index)
+        self._writer.start(profile="phasestack", library="phasestack")
+        self._writer.add_metadata(fmt.METADATA_NAME, header.metadata())
+        self._channels: dict[str, int] = {}
+        self._pending = self._chunks = self.count = 0
+        self._first_ns: int | None = None
+        self._intrinsics: Intrinsics | None = None
+
+    def _channel(self, topic: str) -> int:
+        if topic not in self._channels:
+            schema = fmt.SCHEMAS[topic]
+            number = self._writer.register_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
+            self._channels[topic] = self._writer.register_channel(topic, "json", number)
+        return self._channels[topic]
+
+    def write(self, frame: SensorFrame) -> bool:
+        """Append a sample, its images first; False, and nothing is written, where a limit forbids it."""
+        at = frame.capture_ns
+        messages: list[tuple[str, bytes]] = []
+        if self._images and frame.intrinsics is not None and frame.intrinsics != self._intrinsics:
+            messages.append((fmt.CALIBRATION_TOPIC, fmt.calibration_message(frame.intrinsics, capture_ns=at)))
+        if self._images and frame.colour is not None:
+            messages.append((fmt.COLOUR_TOPIC, fmt.colour_message(frame.colour, capture_ns=at)))
+        if self._images and frame.depth_mm is not None:
+            messages.append((fmt.DEPTH_TOPIC, fmt.depth_message(frame.depth_mm, capture_ns=at)))
+        messages.append((fmt.EYES_TOPIC, fmt.eyes_message(frame)))
+        first_ns = at if self._first_ns is None else self._first_ns
+        size = sum(len(data) + MESSAGE_OVERHEAD_BYTES for _, data in messages)
+        chunks = self._chunks + len(messages)
+        total = self._file.tell() + self._pending + size + 8192 + INDEX_BYTES_PER_CHUNK * chunks
+        if at - first_ns > self._limits.max_s * NS_PER_S or total > self._limits.max_bytes:
+            return False
+        for topic, data in messages:
+            before = self._file.tell()
+            self._writer.add_message(self._channel(topic), at, data, at, frame.sequence & 0xFFFFFFFF)
+            flushed = self._file.tell() > before
+            self._pending = 0 if flushed else self._pending + len(data) + MESSAGE_OVERHEAD_BYTES
+            self._chunks += flushed
+        self._file.flush()
+        self._first_ns, self._intrinsics = first_ns, frame.intrinsics or self._intrinsics
+        self.count += 1
+        return True
+
+    def finish(self) -> None:
+        """Write the last chunk and the summary; the file stays open."""
+        self._writer.finish()
+        self._file.flush()
+
+
+@contextmanager
+def recording_to(
+    path: Path, header: RecordingHeader, *, limits: RecordingLimits | None = None
+) -> Iterator[RecordingWriter]:
+    """A writer whose file appears under its name with the first sample, and is kept from then on.
+
+    Until then an older file of that name stays; what a crash leaves is readable up to its last whole chunk.
+    Raises InputError where the file can't be written.
+    """
+    part = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = part.open("wb")
+    except OSError as error:
+        raise InputError(path, "", f"cannot be written ({error.strerror})") from None
+    with file:
+        writer = _Appearing(file, header, limits=limits, part=part, path=path)
+        try:
+            yield writer
+        except OSError as error:
+            if error.filename is None and error.errno is not None:
+                raise InputError(path, "", f"cannot be written ({error.strerror})") from None
+            raise
+        finally:
+            if writer.count:
+                writer.finish()
+            else:
+                part.unlink(missing_ok=True)
+
+
+class _Appearing(RecordingWriter):
+    """Renames its file once there is something in it."""
+
+    def __init__(
+        self, file: IO[bytes], header: RecordingHeader, *, limits: RecordingLimits | None, part: Path, path: Path
+    ) -> None:
+        super().__init__(file, header, limits=limits)
+        self._part, self._path = part, path
+
+    def write(self, frame: SensorFrame) -> bool:
+        done = super().write(frame)
+        if done and self.count == 1:
+            self._part.replace(self._path)
+        return done
+
+
+class Recording:
+    """An opened recording. Samples are read as they are asked for: images do not pile up in memory."""
+
+    def __init__(self, path: Path) -> None:
+        """Reads the header and the first sample. Raises InputError, naming the file."""
+        self.path = path
+        self.is_whole = self._ends_well()
+        self.header = self._read_header()
+        first = next(self.samples(), None)
+        if first is None:
+            raise InputError(path, "", "holds no whole sample")
+        self.first = first
+
+    def _ends_well(self) -> bool:
+        try:
+            with self.path.open("rb") as file:
+                if file.read(len(MAGIC)) != MAGIC:
+                    raise InputError(self.path, "", "is not an MCAP recording")
+                file.seek(-len(MAGIC), 2)
+                is_whole = file.tell() > 0 and file.read() == MAGIC
+        except OSError as error:
+            raise InputError(self.path, "", f"cannot be read ({error.strerror})") from None
+        if not is_whole:
+            log.warning("%s: is cut off; it is read up to its last whole chunk", self.path)
+        return is_whole
+
+    def _read_header(self) -> RecordingHeader:
+        for kind, record in self._records():
+            if kind == "metadata" and record.name == fmt.METADATA_NAME:
+                try:
+                    return RecordingHeader.from_metadata(record.metadata)
+                except ValueError as error:
+                    raise InputError(self.path, fmt.METADATA_NAME, str(error)) from None
+            if kind == "message":
+                break
+        raise InputError(self.path, fmt.METADATA_NAME, "is missing: not a recording of phasestack")
+
+    def _records(self) -> Iterator[tuple[str, Any]]:
+        """Metadata and messages (with their topic as the kind `message`) until the end or the break."""
+        from mcap.records import Channel, Message, Metadata
+        from mcap.stream_reader import StreamReader
+
+        topics: dict[int, str] = {}
+        try:
+            with self.path.open("rb") as file:
+                reader = StreamReader(file, validate_crcs=True, record_size_limit=RECORD_LIMIT_BYTES)
+                for record in reader.records:
+                    if isinstance(record, Channel):
+                        topics[record.id] = record.topic
+                    elif isinstance(record, Metadata):
+                        yield "metadata", record
+                    elif isinstance(record, Message):
+                        yield "message", (topics.get(record.channel_id, ""), record)
+        except OSError as error:
+            raise InputError(self.path, "", f"cannot be read ({error.strerror})") from None
+        except Exception as error:  # mcap, lz4 and zstandard each raise their own for a broken file
+            if self.is_whole:
+                log.warning("%s: is damaged; it is read up to the damage (%s)", self.path, error)
+            self.is_whole = False
+
+    def samples(self) -> Iterator[SensorFrame]:
+        """All whole samples in the order of recording. Raises InputError for a sample that is not one of ours."""
+        parts: dict[str, Any] = {}
+        intrinsics: Intrinsics | None = None
+        for kind, value in self._records():
+            if kind != "message":
+                continue
+            topic, message = value
+            try:
+                if topic == fmt.COLOUR_TOPIC:
+                    parts["colour"] = fmt.colour_from_message(message.data)
+                elif topic == fmt.DEPTH_TOPIC:
+                    parts["depth_mm"] = fmt.depth_from_message(message.data)
+                elif topic == fmt.CALIBRATION_TOPIC:
+                    intrinsics = fmt.intrinsics_from_message(message.data)
+                elif topic == fmt.EYES_TOPIC:
+                    yield replace(fmt.frame_from_eyes_message(message.data), intrinsics=intrinsics, **parts)
+                    parts = {}
+            except (ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
+                raise InputError(self.path, topic, f"malformed message: {error}") from None
