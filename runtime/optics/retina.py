@@ -28,8 +28,9 @@ class Retina:
 def sample_bilinear(layer: NDArray[np.uint8] | F32, *, u: F32, v: F32) -> F32:
     """Exact bilinear samples of (H, W, C) at continuous pixel positions (h, w), edges clamped; float32 (h, w, C)."""
     height, width = layer.shape[:2]
-    x = np.clip(u - np.float32(0.5), 0, width - 1)
-    y = np.clip(v - np.float32(0.5), 0, height - 1)
+    # fmax and fmin, since a ray that never meets the panel has no position: NaN would make an index out of range.
+    x = np.fmin(np.fmax(u - np.float32(0.5), np.float32(0)), np.float32(width - 1))
+    y = np.fmin(np.fmax(v - np.float32(0.5), np.float32(0)), np.float32(height - 1))
     column = np.minimum(x.astype(np.int32), max(width - 2, 0))
     row = np.minimum(y.astype(np.int32), max(height - 2, 0))
     right, below = min(1, width - 1), min(1, height - 1) * width

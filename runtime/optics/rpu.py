@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -24,12 +26,12 @@ def image_from_panel_four_points(corners_px: ArrayLike, *, width_px: float, heig
     Use `image_from_raster` to build H; this is its independent check and the better only when all that is
     known are four points.
     """
-    (u0, v0), (u1, v1), (u2, v2), (u3, v3) = np.asarray(corners_px, dtype=np.float64)
+    (u0, v0), (u1, v1), (u2, v2), (u3, v3) = np.asarray(corners_px, dtype=np.float64).tolist()
     du1, dv1 = u1 - u2, v1 - v2
     du2, dv2 = u3 - u2, v3 - v2
     du3, dv3 = u0 - u1 + u2 - u3, v0 - v1 + v2 - v3
     determinant = du1 * dv2 - du2 * dv1
-    if not np.isfinite(determinant) or determinant == 0.0:
+    if not math.isfinite(determinant) or determinant == 0.0:
         raise ValueError("the panel's corners are collinear in the image: its homography is singular")
     g = (du3 * dv2 - du2 * dv3) / determinant
     h = (du1 * dv3 - du3 * dv1) / determinant
@@ -59,6 +61,9 @@ def panel_from_image(image_from_stack: F64, raster: PlaneRaster) -> F64:
     h = image_from_raster(image_from_stack, raster)
     adjugate = np.array([np.cross(h[:, 1], h[:, 2]), np.cross(h[:, 2], h[:, 0]), np.cross(h[:, 0], h[:, 1])])
     scale = np.abs(adjugate).max()
-    if not np.isfinite(scale) or scale == 0.0 or (adjugate[0] @ h[:, 0]) == 0.0:
+    # Below this the determinant is rounding error of the terms that h's last column was added up from.
+    terms = np.abs(image_from_stack) @ np.abs([raster.x_m, raster.left_m, raster.top_m, 1.0])
+    noise = 64 * np.finfo(np.float64).eps * float(terms @ np.abs(adjugate[2]))
+    if not np.isfinite(scale) or scale == 0.0 or abs(adjugate[2] @ h[:, 2]) <= noise:
         raise ValueError("the eye lies in the panel's plane: its view of the panel is singular")
     return adjugate / scale

@@ -26,8 +26,11 @@ def stack_from_eye(eye_m: ArrayLike) -> F64:
     # Scaled first: squares of 1e-200 or 1e200 would leave float64.
     back = eye / scale
     back = back / math.hypot(*back)
-    ground = math.hypot(back[0], back[1])
-    right = np.array([-back[1] / ground, back[0] / ground, 0.0]) if ground > 0.0 else np.array([0.0, 1.0, 0.0])
+    # From the unscaled eye: beside the vertical axis its x and y may be too small to survive the scaling.
+    off_axis = float(np.abs(eye[:2]).max())
+    along = eye[:2] / off_axis if off_axis > 0.0 else np.array([1.0, 0.0])
+    along = along / math.hypot(*along)
+    right = np.array([-along[1], along[0], 0.0])
     pose = np.eye(4)
     pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(back, right), back, eye
     return pose

@@ -1,0 +1,74 @@
+"""Malus' law against explicit products of Jones matrices (seed 1-7)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runtime.optics.malus import intensity_from_phase, jones_intensity, jones_rotator, phase_from_intensity
+from tests.optics import reference
+from tests.optics.strategies import floats
+
+panel_values = st.lists(floats(0.0, 1.0), min_size=1, max_size=8)
+
+
+@given(panel_values)
+def test_what_an_eye_sees_is_the_jones_product_between_crossed_polarizers(values: list[float]) -> None:
+    angles = [value * math.pi / 2 for value in values]
+    by_hand = reference.jones_intensity(angles, analyser=math.pi / 2)
+    assert jones_intensity(angles) == pytest.approx(by_hand, abs=1e-14)
+    assert float(intensity_from_phase(np.array(sum(values)))) == pytest.approx(by_hand, abs=1e-12)
+
+
+@given(panel_values, st.randoms(use_true_random=False))
+def test_the_order_of_the_panels_does_not_matter_to_a_single_ray(values: list[float], random) -> None:
+    shuffled = list(values)
+    random.shuffle(shuffled)
+    assert jones_intensity(values) == pytest.approx(jones_intensity(shuffled), abs=1e-14)
+
+
+def test_crossed_polarizers_are_dark_without_a_rotation_and_bright_with_a_quarter_turn() -> None:
+    assert jones_intensity([0.0]) == 0.0
+    assert jones_intensity([math.pi / 2]) == pytest.approx(1.0, abs=1e-15)
+    # The erratum to (1): with the angle from the transmission axis it would be cos², bright without a rotation.
+    assert reference.jones_intensity([0.0], analyser=0.0) == 1.0
+
+
+@given(floats(-10.0, 10.0))
+def test_a_rotator_turns_counter_clockwise_and_keeps_the_light(angle: float) -> None:
+    rotator = jones_rotator(angle)
+    np.testing.assert_allclose(rotator.T @ rotator, np.eye(2), atol=1e-15)
+    np.testing.assert_allclose(rotator @ [1.0, 0.0], [math.cos(angle), math.sin(angle)], atol=1e-15)
+
+
+@pytest.mark.parametrize("branch", [1, 2])
+@given(intensity=floats(0.0, 1.0))
+def test_each_branch_inverts_malus_law_within_its_own_range(branch, intensity: float) -> None:
+    phase = phase_from_intensity(np.array(intensity), branch)
+    assert branch - 1 <= phase <= branch
+    assert float(intensity_from_phase(phase)) == pytest.approx(intensity, abs=1e-15)
+
+
+@given(floats(0.0, 1.0))
+def test_the_branches_mirror_each_other(intensity: float) -> None:
+    value = np.array(intensity)
+    assert float(phase_from_intensity(value, 1) + phase_from_intensity(value, 2)) == pytest.approx(2.0, abs=1e-15)
+
+
+def test_intensities_outside_the_range_are_clipped_and_never_nan() -> None:
+    phase = phase_from_intensity(np.array([-0.5, 0.0, 1.0, 1.5]), 1)
+    np.testing.assert_allclose(phase, [0.0, 0.0, 1.0, 1.0], atol=1e-15)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_single_precision_stays_single(dtype: type) -> None:
+    value = np.linspace(0, 1, 1001, dtype=dtype)
+    phase = phase_from_intensity(value)
+    assert phase.dtype == dtype
+    assert intensity_from_phase(phase).dtype == dtype
+    # Where the slope of sin² is 1 at most, the error of the phase is that of the intensity.
+    assert np.abs(intensity_from_phase(phase) - value).max() < 4 * np.finfo(dtype).eps
