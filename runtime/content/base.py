@@ -28,20 +28,28 @@ class ContentInfo:
     grey: bool = False
     depth_range_m: tuple[float, float] | None = None  # nearest to farthest along +x of `stack`: (rear, front)
     background: tuple[float, float, float] | None = (1.0, 1.0, 1.0)  # uniform colour behind it, 0-1; None: none
+    flat_x_m: float | None = None  # all of it lies in this plane of `stack` and looks alike to both eyes
+    left_out: tuple[str, ...] = ()  # what its renderer does without here: lights, textures, harmonics, sorting
 
 
 class ContentSource(ABC):
-    """A scene, a picture or another program's pictures."""
+    """A scene, a picture or another program's pictures. One thread, the one with its GL context, uses it."""
 
     info: ContentInfo
 
     @abstractmethod
     def render(self, view: View, *, time_ns: int) -> U8:
-        """What the eye sees in the view's raster: (height_px, width_px, 4) RGBA, straight alpha.
+        """What the eye sees in the view's raster: (height_px, width_px, 4) RGBA, row 0 at the top.
 
-        Alpha is 255 where there is content and 0 where only the (already filled in) background shows.
-        `time_ns` is the run's clock, for content that moves. Raises ContentFailure: the last picture stays.
+        Colour is already composed over the background; alpha is the content's coverage: 0 only where nothing
+        but the background shows. The array is the source's own: it holds until the next `render` of the same
+        side, and the other side's call leaves it alone. `time_ns` is the run's clock, for content that moves.
+        Raises ContentFailure: the last picture stays.
         """
+
+    def revision(self, *, time_ns: int) -> int:
+        """A number that changes when what `render` draws for the same view may have changed; 0 for ever if static."""
+        return time_ns if self.info.moving else 0
 
     def close(self) -> None:  # noqa: B027 - most sources hold nothing
         """Release GL objects and files. May be called twice."""

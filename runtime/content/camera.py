@@ -1,0 +1,94 @@
+"""A view's 3x4 projection as a rasteriser's camera, and where boxes land in it: pure functions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from runtime.records import F64
+
+NEAREST_M = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class PixelBox:
+    """A rectangle of whole pixels, right and bottom exclusive; u right, v down."""
+
+    u0: int
+    v0: int
+    u1: int
+    v1: int
+
+    @property
+    def width_px(self) -> int:
+        return max(self.u1 - self.u0, 0)
+
+    @property
+    def height_px(self) -> int:
+        return max(self.v1 - self.v0, 0)
+
+
+def clip_from_stack(pixels_from_stack: F64, *, width_px: int, height_px: int, near_m: float, far_m: float) -> F64:
+    """4x4 OpenGL clip matrix of a 3x4 pixel projection; row 0 of the raster is row 0 of what GL reads back.
+
+    GL's first row in memory is its lowest, so the raster's v runs along GL's +y and nothing need be flipped.
+    Depths `near_m` and `far_m` are values of the projection's third coordinate. Raises
+    ValueError unless 0 < near < far.
+    """
+    if not 0.0 < near_m < far_m:
+        raise ValueError(f"near {near_m} and far {far_m} do not bound a view")
+    u, v, w = np.asarray(pixels_from_stack, dtype=np.float64)
+    span = far_m - near_m
+    depth = w * ((far_m + near_m) / span) + np.array([0.0, 0.0, 0.0, -2.0 * far_m * near_m / span])
+    return np.array([u * (2.0 / width_px) - w, v * (2.0 / height_px) - w, depth, w])
+
+
+def box_corners(low_m: ArrayLike, high_m: ArrayLike) -> F64:
+    """(8, 3) corners of an axis-aligned box."""
+    bounds = np.array([low_m, high_m], dtype=np.float64)
+    return np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+
+
+def project(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
+    """(n, 2) pixels and (n,) depths in metres of (n, 3) `stack` points. Pixels of points behind are meaningless."""
+    homogeneous = points_m @ pixels_from_stack[:, :3].T + pixels_from_stack[:, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return homogeneous[:, :2] / homogeneous[:, 2:], homogeneous[:, 2]
+
+
+def depth_bounds(pixels_from_stack: F64, corners_m: F64) -> tuple[float, float] | None:
+    """Near and far, with a margin, that hold all of `corners_m` before the eye; None: nothing is before it."""
+    depths = project(pixels_from_stack, corners_m)[1]
+    far = float(depths.max()) * 1.001 + NEAREST_M
+    if far <= 2 * NEAREST_M:
+        return None
+    return max(float(depths.min()) * 0.999 - NEAREST_M, min(NEAREST_M, far / 2)), far
+
+
+def covered_box(
+    pixels_from_stack: F64, corners_m: F64, *, width_px: int, height_px: int, align_px: int = 32
+) -> PixelBox:
+    """The part of the raster that a convex hull of corners may touch, grown to multiples of `align_px`."""
+    pixels, depths = project(pixels_from_stack, corners_m)
+    if (depths <= NEAREST_M).any():
+        return PixelBox(0, 0, width_px, height_px)
+    low = np.floor((pixels.min(0) - 1) / align_px) * align_px
+    high = np.ceil((pixels.max(0) + 1) / align_px) * align_px
+    u0, v0 = (int(value) for value in np.clip(low, 0, [width_px, height_px]))
+    u1, v1 = (int(value) for value in np.clip(high, 0, [width_px, height_px]))
+    return PixelBox(u0, v0, max(u1, u0), max(v1, v0))
+
+
+def union(boxes: list[PixelBox]) -> PixelBox:
+    """The smallest box around those that aren't empty; empty where all are."""
+    filled = [box for box in boxes if box.width_px and box.height_px]
+    if not filled:
+        return PixelBox(0, 0, 0, 0)
+    return PixelBox(
+        min(box.u0 for box in filled),
+        min(box.v0 for box in filled),
+        max(box.u1 for box in filled),
+        max(box.v1 for box in filled),
+    )

@@ -1,0 +1,110 @@
+"""Pictures with a projection of their own, warped into the raster that a view asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.optics.rpu import panel_from_image
+from runtime.optics.stack import PlaneRaster
+from runtime.optics.views import image_from_raster
+from runtime.records import F64, U8
+
+# Pixel centres are half-integers here and integers in OpenCV.
+_HALF = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+_MINUS_HALF = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])
+
+
+def rgba_from_rgb(rgb: U8) -> U8:
+    """(h, w, 4) opaque RGBA of an (h, w, 3) RGB picture; RGBA warps in half the time."""
+    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA))
+
+
+def plane_metres(x_m: float) -> PlaneRaster:
+    """A plane x = x_m whose `pixels` are metres: u is y, v is -z. For homographies that go by way of a plane."""
+    return PlaneRaster(x_m=x_m, left_m=0.0, top_m=0.0, pitch_u_m=1.0, pitch_v_m=1.0, width_px=1, height_px=1)
+
+
+def image_from_view(image_from_stack: F64, pixels_from_stack: F64, *, x_m: float) -> F64:
+    """3x3 picture pixels from a view's pixels by way of the plane x = x_m.
+
+    Where picture and view are of the same eye, every plane gives the same matrix; otherwise the plane is where
+    the picture hangs. Raises ValueError where the view's eye lies in that plane.
+    """
+    plane = plane_metres(x_m)
+    return image_from_raster(image_from_stack, plane) @ panel_from_image(pixels_from_stack, plane)
+
+
+def reduction(picture_from_view: F64, *, width_px: int, height_px: int) -> int:
+    """How often a picture is halved before it is warped, so that one sample stands for at most about 1.5 pixels."""
+    middle = np.array(
+        [[width_px / 2, height_px / 2], [width_px / 2 + 1, height_px / 2], [width_px / 2, height_px / 2 + 1]]
+    )
+    mapped = cv2.perspectiveTransform(middle[None], picture_from_view)[0]
+    steps = np.linalg.norm(mapped[1:] - mapped[0], axis=1)
+    return int(np.clip(np.floor(np.log2(max(float(steps.min()), 1e-9) / 1.5) + 1), 0, 8))
+
+
+class WarpedPicture:
+    """One RGBA picture, its smaller copies, and the warp into a view's raster."""
+
+    def __init__(self, rgba: U8, *, background: tuple[float, float, float]) -> None:
+        self._levels = [np.ascontiguousarray(rgba)]
+        self._border = (*(round(value * 255) for value in background), 0)
+        self._out: dict[tuple[int, int], U8] = {}
+
+    def warped(self, picture_from_view: F64, *, width_px: int, height_px: int) -> U8:
+        """(h, w, 4): the picture at each of the view's pixels; the background with alpha 0 beside it."""
+        level = reduction(picture_from_view, width_px=width_px, height_px=height_px)
+        picture, shrink = self._level(level)
+        out = self._out.setdefault((width_px, height_px), np.empty((height_px, width_px, 4), np.uint8))
+        matrix = _MINUS_HALF @ np.diag([*shrink, 1.0]) @ picture_from_view @ _HALF
+        cv2.warpPerspective(
+            picture,
+            matrix,
+            (width_px, height_px),
+            dst=out,
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=self._border,
+        )
+        return out
+
+    def _level(self, level: int) -> tuple[U8, tuple[float, float]]:
+        while len(self._levels) <= level and min(self._levels[-1].shape[:2]) > 1:
+            height, width = self._levels[-1].shape[:2]
+            size = ((width + 1) // 2, (height + 1) // 2)
+            self._levels.append(np.asarray(cv2.resize(self._levels[-1], size, interpolation=cv2.INTER_AREA)))
+        chosen = self._levels[min(level, len(self._levels) - 1)]
+        full = self._levels[0]
+        return chosen, (chosen.shape[1] / full.shape[1], chosen.shape[0] / full.shape[0])
+
+
+class StereoPair(ContentSource):
+    """Two pictures, each with its projection: the left one for left eyes, the right one for right eyes."""
+
+    def __init__(
+        self,
+        left_rgb: U8,
+        right_rgb: U8,
+        *,
+        image_from_stack: Sequence[F64],
+        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        plane_x_m: float = 0.0,
+        name: str = "pair",
+    ) -> None:
+        """left_rgb, right_rgb: (h, w, 3) RGB; image_from_stack: the (3, 4) projection of each.
+
+        plane_x_m: the plane on which pictures hang for eyes other than those they were taken with.
+        """
+        self._pictures = [WarpedPicture(rgba_from_rgb(rgb), background=background) for rgb in (left_rgb, right_rgb)]
+        self._image_from_stack = [np.asarray(matrix, dtype=np.float64) for matrix in image_from_stack]
+        self._plane_x_m = plane_x_m
+        self.info = ContentInfo(name=name, background=background)
+
+    def render(self, view: View, *, time_ns: int) -> U8:
+        matrix = image_from_view(self._image_from_stack[view.side], view.pixels_from_stack, x_m=self._plane_x_m)
+        return self._pictures[view.side].warped(matrix, width_px=view.width_px, height_px=view.height_px)

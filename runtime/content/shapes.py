@@ -1,0 +1,141 @@
+"""Shapes as triangle lists in their own coordinates: pure functions of numpy. Normals point outwards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from runtime.records import F32, F64
+
+I32 = NDArray[np.int32]
+
+# 5x7 letters, a row a string; only those that the built-in scene spells.
+GLYPHS = {
+    "3": ("####.", "....#", "....#", ".###.", "....#", "....#", "####."),
+    "D": ("####.", "#...#", "#...#", "#...#", "#...#", "#...#", "####."),
+    "P": ("####.", "#...#", "#...#", "####.", "#....", "#....", "#...."),
+    "H": ("#...#", "#...#", "#...#", "#####", "#...#", "#...#", "#...#"),
+    "A": (".###.", "#...#", "#...#", "#####", "#...#", "#...#", "#...#"),
+    "S": (".####", "#....", "#....", ".###.", "....#", "....#", "####."),
+    "E": ("#####", "#....", "#....", "####.", "#....", "#....", "#####"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """Triangles with normals and texture coordinates."""
+
+    positions_m: F32  # (v, 3)
+    normals: F32  # (v, 3), unit
+    uv: F32  # (v, 2)
+    triangles: I32  # (t, 3)
+
+    def moved(self, rotation: F64 | None = None, offset_m: ArrayLike = (0.0, 0.0, 0.0)) -> Shape:
+        """The same shape, rotated about its origin and then shifted."""
+        turn = np.eye(3) if rotation is None else rotation
+        positions = self.positions_m @ turn.T + np.asarray(offset_m)
+        return Shape(positions.astype(np.float32), (self.normals @ turn.T).astype(np.float32), self.uv, self.triangles)
+
+
+def join(shapes: Sequence[Shape]) -> Shape:
+    """Several shapes as one."""
+    starts = np.cumsum([0, *(len(shape.positions_m) for shape in shapes)])
+    return Shape(
+        np.concatenate([shape.positions_m for shape in shapes]),
+        np.concatenate([shape.normals for shape in shapes]),
+        np.concatenate([shape.uv for shape in shapes]),
+        np.concatenate([shape.triangles + start for shape, start in zip(shapes, starts, strict=False)]).astype(
+            np.int32
+        ),
+    )
+
+
+def rotation_about(axis: int, angle_rad: float) -> F64:
+    """3x3 right-handed rotation about x (0), y (1) or z (2)."""
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.eye(3)
+    matrix[i, i], matrix[i, j], matrix[j, i], matrix[j, j] = cosine, -sine, sine, cosine
+    return matrix
+
+
+def _grid(u: F64, v: F64) -> tuple[F64, F64, I32]:
+    """Parameters and triangles of a (len(v), len(u)) grid of vertices."""
+    columns, rows = len(u), len(v)
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
+    first = np.column_stack([corner, corner + 1, corner + columns])
+    second = np.column_stack([corner + 1, corner + columns + 1, corner + columns])
+    grid_u, grid_v = np.meshgrid(u, v)
+    return grid_u.reshape(-1), grid_v.reshape(-1), np.concatenate([first, second]).astype(np.int32)
+
+
+def _shape(positions: F64, normals: F64, uv: F64, triangles: I32) -> Shape:
+    return Shape(positions.astype(np.float32), normals.astype(np.float32), uv.astype(np.float32), triangles)
+
+
+def card(width_m: float, height_m: float, *, repeat: tuple[float, float] = (1.0, 1.0)) -> Shape:
+    """A rectangle in the plane x = 0 that faces +x, its picture upright and unmirrored for an eye at +x."""
+    s, t, triangles = _grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+    positions = np.column_stack([0 * s, (s - 0.5) * width_m, (0.5 - t) * height_m])
+    return _shape(
+        positions, np.tile([1.0, 0.0, 0.0], (4, 1)), np.column_stack([s * repeat[0], t * repeat[1]]), triangles
+    )
+
+
+def box(size_m: Sequence[float]) -> Shape:
+    """A box around the origin, each face with the whole texture."""
+    sx, sy, sz = size_m
+    turns = [
+        (np.eye(3), (sy, sz), sx),
+        (rotation_about(2, np.pi), (sy, sz), sx),
+        (rotation_about(2, np.pi / 2), (sx, sz), sy),
+        (rotation_about(2, -np.pi / 2), (sx, sz), sy),
+        (rotation_about(1, -np.pi / 2), (sy, sx), sz),
+        (rotation_about(1, np.pi / 2), (sy, sx), sz),
+    ]
+    return join([card(*face).moved(turn, turn @ [depth / 2, 0.0, 0.0]) for turn, face, depth in turns])
+
+
+def sphere(radius_m: float, *, columns: int = 48, rows: int = 24) -> Shape:
+    """A globe with its poles on the z axis."""
+    s, t, triangles = _grid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
+    longitude, polar = s * 2 * np.pi, t * np.pi
+    normal = np.column_stack([np.cos(longitude) * np.sin(polar), np.sin(longitude) * np.sin(polar), np.cos(polar)])
+    return _shape(normal * radius_m, normal, np.column_stack([2 * s, t]), triangles)
+
+
+def torus(radius_m: float, tube_m: float, *, columns: int = 64, rows: int = 24) -> Shape:
+    """A ring around the x axis."""
+    s, t, triangles = _grid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
+    around, across = s * 2 * np.pi, t * 2 * np.pi
+    normal = np.column_stack([np.sin(across), np.cos(around) * np.cos(across), np.sin(around) * np.cos(across)])
+    centre = np.column_stack([0 * around, np.cos(around), np.sin(around)]) * radius_m
+    return _shape(centre + normal * tube_m, normal, np.column_stack([6 * s, 2 * t]), triangles)
+
+
+def lettering(text: str, *, cell_m: float, depth_m: float) -> Shape:
+    """Letters of square bars, 5 x 7 cells each with a gap of one, centred on the origin, read from +x."""
+    left = -(len(text) * 6 - 1) / 2
+    cells = [
+        box((depth_m, cell_m * 0.92, cell_m * 0.92)).moved(
+            offset_m=(0.0, (left + index * 6 + column + 0.5) * cell_m, (3 - row) * cell_m)
+        )
+        for index, letter in enumerate(text)
+        for row, line in enumerate(GLYPHS[letter])
+        for column, mark in enumerate(line)
+        if mark == "#"
+    ]
+    return join(cells)
+
+
+def fence(width_m: float, height_m: float, *, bars: int, bar_m: float) -> Shape:
+    """Upright thin bars with two rails, in the plane x = 0."""
+    upright = [
+        box((bar_m, bar_m, height_m)).moved(offset_m=(0.0, y, 0.0))
+        for y in np.linspace(-width_m / 2, width_m / 2, bars)
+    ]
+    rails = [box((bar_m, width_m, bar_m)).moved(offset_m=(0.0, 0.0, z)) for z in (-0.3 * height_m, 0.3 * height_m)]
+    return join([*upright, *rails])

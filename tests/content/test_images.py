@@ -1,0 +1,75 @@
+"""Pictures with a projection of their own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runtime.content.images import StereoPair, image_from_view
+from runtime.content.procedural import ProceduralSource
+from runtime.optics.stack import PanelStack
+from runtime.optics.views import image_from_stack
+from tests.content.conftest import image_view, panel_view
+
+LEFT, RIGHT = (0.7, -0.03, 0.1), (0.7, 0.03, 0.1)
+
+
+def pair_of(context: Any, stack: PanelStack, width_px: int = 960, height_px: int = 540) -> StereoPair:
+    scene = ProceduralSource("demo", stack=stack, context=context)
+    views = [image_view(eye, width_px, height_px, side=side) for side, eye in enumerate((LEFT, RIGHT))]
+    pictures = [scene.render(view, time_ns=0)[..., :3].copy() for view in views]
+    return StereoPair(*pictures, image_from_stack=[view.pixels_from_stack for view in views])
+
+
+@pytest.mark.parametrize("panel", [0, 1, 2])
+def test_a_pair_warps_to_what_the_scene_would_have_drawn(context: Any, stack: PanelStack, panel: int) -> None:
+    scene = ProceduralSource("demo", stack=stack, context=context)
+    pair = pair_of(context, stack)
+    for side, eye in enumerate((LEFT, RIGHT)):
+        view = panel_view(eye, stack.panel(panel), side=side)
+        drawn, warped = scene.render(view, time_ns=0).astype(int), pair.render(view, time_ns=0).astype(int)
+        both = warped[..., 3] == 255
+        assert both.mean() > 0.6
+        error = np.sqrt(((drawn - warped)[both][:, :3] ** 2).mean())
+        shifted = np.sqrt(((np.roll(drawn, 2, axis=1) - warped)[both][:, :3] ** 2).mean())
+        assert error < 16
+        assert error < 0.6 * shifted
+
+
+def test_the_picture_s_own_view_gives_back_the_picture(context: Any) -> None:
+    random = np.random.default_rng(0)
+    pictures = random.integers(0, 256, (2, 90, 160, 3), np.uint8)
+    views = [image_view(eye, 160, 90, side=side) for side, eye in enumerate((LEFT, RIGHT))]
+    pair = StereoPair(*pictures, image_from_stack=[view.pixels_from_stack for view in views])
+    for side, view in enumerate(views):
+        assert (pair.render(view, time_ns=0)[1:-1, 1:-1, :3] == pictures[side][1:-1, 1:-1]).all()
+
+
+def test_beside_the_picture_is_the_background_with_alpha_zero(stack: PanelStack) -> None:
+    black = np.zeros((90, 160, 3), np.uint8)
+    projection = image_from_stack(LEFT, width_px=160, height_px=90, fov_deg=10)
+    pair = StereoPair(black, black, image_from_stack=[projection, projection], background=(0.0, 1.0, 0.0))
+    picture = pair.render(panel_view(LEFT, stack.panel(1)), time_ns=0)
+    assert picture[0, 0].tolist() == [0, 255, 0, 0]
+    assert picture[135, 240].tolist() == [0, 0, 0, 255]
+
+
+def test_a_picture_much_larger_than_the_raster_is_averaged_and_not_picked_from(stack: PanelStack) -> None:
+    lines = np.zeros((1080, 1920, 3), np.uint8)
+    lines[:, ::2] = 255
+    projection = image_from_stack(LEFT, width_px=1920, height_px=1080, fov_deg=60)
+    picture = StereoPair(lines, lines, image_from_stack=[projection] * 2).render(
+        panel_view(LEFT, stack.panel(1)), time_ns=0
+    )
+    inner = picture[60:-60, 60:-60, 0].astype(int)
+    assert np.abs(inner - 128).max() < 32
+
+
+def test_through_one_eye_every_plane_gives_the_same_homography(stack: PanelStack) -> None:
+    view = panel_view(LEFT, stack.panel(2))
+    projection = image_from_stack(LEFT, width_px=640, height_px=360, fov_deg=40)
+    matrices = [image_from_view(projection, view.pixels_from_stack, x_m=x) for x in (-0.2, 0.0, 0.1)]
+    for matrix in matrices[1:]:
+        assert matrix / matrix[2, 2] == pytest.approx(matrices[0] / matrices[0][2, 2], abs=1e-9)

@@ -1,0 +1,177 @@
+"""The built-in scenes: where points land, which surface is in front, and that nothing changes from run to run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from runtime.content import shapes
+from runtime.content.base import View
+from runtime.content.camera import project
+from runtime.content.images import image_from_view
+from runtime.content.procedural import ProceduralSource
+from runtime.content.scenes import SCENES, Part, Scene
+from runtime.optics.stack import PanelStack
+from tests.content.conftest import image_view, panel_view
+
+EYES = {
+    "ahead": (0.7, -0.03, 0.1),
+    "near": (0.3, 0.03, -0.05),
+    "65 degrees to the right": (0.25, 0.25 * np.tan(np.radians(65)), 0.1),
+    "65 degrees to the left": (0.25, -0.25 * np.tan(np.radians(65)), 0.0),
+    "from above": (0.4, 0.0, 0.5),
+}
+POINTS = ((0.0, 0.0, 0.0), (-0.1, 0.03, 0.02), (0.09, -0.02, -0.03))
+
+
+def bead(centre_m: tuple[float, float, float], colour: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Part:
+    return Part(shapes.sphere(0.004), "plain", centre_m, colour, lit=False)
+
+
+def centroid_px(picture: np.ndarray) -> np.ndarray:
+    rows, columns = np.nonzero(picture[..., 3] > 0)
+    weight = picture[rows, columns, 3].astype(float)
+    return np.array([np.average(columns + 0.5, weights=weight), np.average(rows + 0.5, weights=weight)])
+
+
+@pytest.mark.parametrize("eye", EYES.values(), ids=EYES.keys())
+@pytest.mark.parametrize("point", POINTS)
+def test_a_point_lands_where_the_projection_says(
+    context: Any, stack: PanelStack, eye: tuple[float, ...], point: tuple[float, float, float]
+) -> None:
+    source = ProceduralSource(Scene("bead", (bead(point),)), stack=stack, context=context)
+    seen = 0
+    for view in (
+        panel_view(eye, stack.panel(1)),
+        panel_view(eye, stack.panel(0)),
+        image_view(eye, 640, 360, fov_deg=60),
+    ):
+        expected = project(view.pixels_from_stack, np.array([point]))[0][0]
+        margin = 20
+        if not (margin < expected[0] < view.width_px - margin and margin < expected[1] < view.height_px - margin):
+            continue
+        seen += 1
+        found = centroid_px(source.render(view, time_ns=0))
+        assert np.abs(found - expected).max() < 0.45
+    source.close()
+    assert seen >= 1
+
+
+def test_row_0_is_the_top_and_column_0_the_left(context: Any, stack: PanelStack) -> None:
+    source = ProceduralSource(Scene("bead", (bead((0.0, 0.2, 0.1)),)), stack=stack, context=context)
+    u, v = centroid_px(source.render(panel_view((0.7, 0.0, 0.0), stack.panel(1)), time_ns=0))
+    assert u > 0.8 * stack.width_px
+    assert v < 0.2 * stack.height_px
+    source.close()
+
+
+@pytest.mark.parametrize("make", [panel_view, image_view], ids=["raster", "image"])
+def test_the_nearer_of_two_surfaces_hides_the_other(context: Any, stack: PanelStack, make: Any) -> None:
+    eye = np.array([0.6, 0.1, 0.05])
+    front, rear = eye * 0.1, eye * -0.1
+    red, blue = bead(tuple(front), (1.0, 0.0, 0.0)), bead(tuple(rear), (0.0, 0.0, 1.0))
+    view = panel_view(eye, stack.panel(1)) if make is panel_view else image_view(eye, 480, 270)
+    for parts in ((red, blue), (blue, red)):
+        source = ProceduralSource(Scene("two", parts), stack=stack, context=context)
+        picture = source.render(view, time_ns=0)
+        u, v = (int(value) for value in project(view.pixels_from_stack, front[None])[0][0])
+        assert picture[v, u].tolist() == [255, 0, 0, 255]
+        source.close()
+
+
+@pytest.mark.parametrize("eye", [EYES["ahead"], EYES["near"], EYES["65 degrees to the right"]])
+def test_raster_and_eye_image_agree_under_the_plane_induced_homography(
+    context: Any, stack: PanelStack, eye: tuple[float, ...]
+) -> None:
+    source = ProceduralSource("demo", stack=stack, context=context)
+    raster = panel_view(eye, stack.panel(1), side=0)
+    image = image_view(eye, 1920, 1080, fov_deg=75, side=1)
+    straight = source.render(raster, time_ns=0).copy()
+    seen = source.render(image, time_ns=0)
+    matrix = image_from_view(image.pixels_from_stack, raster.pixels_from_stack, x_m=0.0)
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
+    warped = cv2.warpPerspective(
+        cv2.GaussianBlur(seen, (0, 0), 1.0),
+        np.linalg.inv(half) @ matrix @ half,
+        (raster.width_px, raster.height_px),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+    )
+    inside = cv2.warpPerspective(
+        np.ones(seen.shape[:2], np.uint8), matrix, (raster.width_px, raster.height_px), flags=cv2.WARP_INVERSE_MAP
+    ).astype(bool)
+    blurred = cv2.GaussianBlur(straight, (0, 0), 1.0).astype(float), cv2.GaussianBlur(warped, (0, 0), 1.0).astype(float)
+    right, wrong = blurred[0] - blurred[1], blurred[0] - np.roll(blurred[1], 2, axis=1)
+    assert inside.mean() > 0.3
+    assert (straight[..., 3] > 0).mean() > 0.1
+    assert np.sqrt((right[inside] ** 2).mean()) < 12
+    assert np.sqrt((right[inside] ** 2).mean()) < 0.6 * np.sqrt((wrong[inside] ** 2).mean())
+    source.close()
+
+
+def test_the_same_view_and_time_give_the_same_bytes_in_another_context_too(context: Any, stack: PanelStack) -> None:
+    from runtime.gl import offscreen_context
+
+    view = panel_view(EYES["ahead"], stack.panel(1))
+    first = ProceduralSource("demo", stack=stack, context=context).render(view, time_ns=0).copy()
+    with offscreen_context() as other:
+        second = ProceduralSource("demo", stack=stack, context=other).render(view, time_ns=10**10).copy()
+    assert first.tobytes() == second.tobytes()
+
+
+def test_one_side_s_picture_survives_the_other_side_s_rendering(context: Any, stack: PanelStack) -> None:
+    source = ProceduralSource("demo", stack=stack, context=context)
+    left = source.render(panel_view((0.7, -0.03, 0.0), stack.panel(1), side=0), time_ns=0)
+    before = left.copy()
+    right = source.render(panel_view((0.7, 0.03, 0.0), stack.panel(1), side=1), time_ns=0)
+    assert (left == before).all()
+    assert (left != right).any()
+
+
+def test_alpha_is_zero_exactly_where_only_the_background_shows(context: Any, stack: PanelStack) -> None:
+    source = ProceduralSource("sparse", stack=stack, context=context, background=(1.0, 0.5, 0.0))
+    picture = source.render(panel_view(EYES["ahead"], stack.panel(1)), time_ns=0)
+    empty = picture[..., 3] == 0
+    assert 0.9 < empty.mean() < 0.99
+    assert (picture[empty][:, :3] == [255, 128, 0]).all()
+    assert (picture[..., 3] == 255).mean() > 0.02
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_scene_is_what_it_says_of_itself(context: Any, stack: PanelStack, name: str) -> None:
+    source = ProceduralSource(name, stack=stack, context=context)
+    view = panel_view(EYES["ahead"], stack.panel(1))
+    picture = source.render(view, time_ns=0).copy()
+    later = source.render(view, time_ns=10**9)
+    rear, front = source.info.depth_range_m or (0.0, 0.0)
+    assert -0.13 < rear <= front < 0.13
+    assert source.info.moving == bool((picture != later).any())
+    assert source.info.moving == (source.revision(time_ns=0) != source.revision(time_ns=10**9))
+    assert source.info.grey == bool((np.ptp(picture[..., :3].astype(int), axis=2) == 0).all())
+    assert (name == "texture") == bool((picture[..., 3] == 255).all())
+    source.close()
+
+
+def test_a_scene_grows_with_the_display(context: Any, stack: PanelStack) -> None:
+    large = PanelStack(1.0368, 0.5832, (-0.12, 0.0, 0.12), 480, 270)
+    small_picture = ProceduralSource("demo", stack=stack, context=context).render(
+        panel_view((0.7, 0.1, 0.0), stack.panel(1)), time_ns=0
+    )
+    large_picture = ProceduralSource("demo", stack=large, context=context).render(
+        panel_view((1.4, 0.2, 0.0), large.panel(1)), time_ns=0
+    )
+    assert (np.abs(small_picture.astype(int) - large_picture) <= 2).mean() > 0.995
+
+
+def test_an_eye_that_looks_away_or_stands_in_the_scene_gets_a_picture_and_no_error(
+    context: Any, stack: PanelStack
+) -> None:
+    source = ProceduralSource("demo", stack=stack, context=context)
+    inside = source.render(panel_view((0.05, 0.0, 0.0), stack.panel(0)), time_ns=0)
+    assert inside.shape == (270, 480, 4)
+    behind = View(
+        np.array([-1.0, 0.0, 0.0]), 0, panel_view((-1.0, 0.0, 0.0), stack.panel(1)).pixels_from_stack, 480, 270
+    )
+    assert (source.render(behind, time_ns=0)[..., 3] == 0).all()
