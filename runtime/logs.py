@@ -1,0 +1,104 @@
+"""Log lines for people, for journald and for machines; a fault that repeats does not flood them."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Any, TextIO
+
+from runtime.clock import NS_PER_S, Clock, MonotonicClock
+from runtime.config import ServiceSettings
+
+# What sd-daemon(3) puts before a line so that journald files it under its level.
+PRIORITY = {logging.DEBUG: "<7>", logging.INFO: "<6>", logging.WARNING: "<4>", logging.ERROR: "<3>"}
+BURST = 5
+QUIET_NS = 30 * NS_PER_S
+
+
+def event(logger: logging.Logger, level: int, message: str, **fields: Any) -> None:
+    """One structured line: a constant message (which the rate limit counts by) and named values."""
+    logger.log(level, message, extra={"fields": fields})
+
+
+def _fields(record: logging.LogRecord) -> dict[str, Any]:
+    return getattr(record, "fields", {})
+
+
+class TextFormat(logging.Formatter):
+    """`message key=value`; under journald with a priority and no time (it has its own), else with the time."""
+
+    def __init__(self, *, journald: bool) -> None:
+        super().__init__()
+        self._journald = journald
+
+    def format(self, record: logging.LogRecord) -> str:
+        pairs = "".join(f" {key}={value}" for key, value in _fields(record).items())
+        text = record.getMessage() + pairs
+        if record.exc_info:
+            text += "\n" + self.formatException(record.exc_info)
+        if self._journald:
+            prefix = PRIORITY.get(record.levelno, "<6>")
+            return "\n".join(prefix + line for line in text.splitlines())
+        when = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
+        return f"{when} {record.levelname.lower():7} {text}"
+
+
+class JsonFormat(logging.Formatter):
+    """One JSON object a line: time, level, logger, message, and the event's own fields."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        line: dict[str, Any] = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+            **_fields(record),
+        }
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
+        return json.dumps(line, default=str)
+
+
+class RateLimit(logging.Filter):
+    """Lets five lines of one message through in any half minute; the next that passes says how many did not."""
+
+    def __init__(self, clock: Clock) -> None:
+        super().__init__()
+        self._clock = clock
+        self._seen: dict[tuple[str, str], tuple[int, int, int]] = {}  # start of the window, passed, suppressed
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        key = (record.name, str(record.msg))
+        now_ns = self._clock.now_ns()
+        start_ns, passed, suppressed = self._seen.get(key, (now_ns, 0, 0))
+        if now_ns - start_ns >= QUIET_NS:
+            start_ns, passed = now_ns, 0
+        if passed >= BURST:
+            self._seen[key] = (start_ns, passed, suppressed + 1)
+            return False
+        self._seen[key] = (start_ns, passed + 1, 0)
+        if suppressed:
+            record.msg, record.args = f"{record.getMessage()} ({suppressed} more like this were not shown)", ()
+        return True
+
+
+def configure(
+    settings: ServiceSettings,
+    *,
+    stream: TextIO | None = None,
+    clock: Clock | None = None,
+    environment: Mapping[str, str] = os.environ,
+) -> None:
+    """Send every `phasestack` log line to a stream (stderr), in the configured form. Calling it again replaces."""
+    handler = logging.StreamHandler(stream or sys.stderr)
+    journald = "JOURNAL_STREAM" in environment
+    handler.setFormatter(JsonFormat() if settings.log_format == "json" else TextFormat(journald=journald))
+    handler.addFilter(RateLimit(clock or MonotonicClock()))
+    root = logging.getLogger("phasestack")
+    root.handlers[:] = [handler]
+    root.setLevel(settings.log_level.upper())
+    root.propagate = False

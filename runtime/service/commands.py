@@ -1,0 +1,57 @@
+"""What can be told to the running daemon, checked before it reaches the loop."""
+
+from __future__ import annotations
+
+import math
+import queue
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+Name = Literal["scene", "pause", "resume", "flat", "budget", "reload"]
+NAMES: tuple[Name, ...] = get_args(Name)
+BUDGET_MAX_MS = 10_000.0
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One wish of an operator. The loop carries it out between two turns, and answers exactly once.
+
+    `flat` with value True holds the 2D picture until `resume`; `pause` freezes the picture until `resume`.
+    """
+
+    name: Name
+    value: Any = None  # scene: str; budget: milliseconds, 0 for none; the others: None
+    _answers: queue.SimpleQueue[str] = field(default_factory=queue.SimpleQueue)
+
+    def done(self) -> None:
+        """It was carried out."""
+        self._answers.put("")
+
+    def refuse(self, why: str) -> None:
+        """It could not be carried out; nothing has changed."""
+        self._answers.put(why or "refused")
+
+    def wait(self, timeout_s: float) -> str | None:
+        """Empty: done. Text: why not. None: the loop did not answer in time."""
+        try:
+            return self._answers.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+
+
+def parse(request: Any) -> Command:
+    """A request as it came through the socket. Raises ValueError with one line that says what is wrong."""
+    if not isinstance(request, dict):
+        raise ValueError("a request is one JSON object")
+    name, value = request.get("command"), request.get("value")
+    if name not in NAMES:
+        raise ValueError(f"command: unknown; one of status, {', '.join(NAMES)}")
+    if name == "scene" and not (isinstance(value, str) and value):
+        raise ValueError("value: scene wants a name")
+    if name == "budget":
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ValueError("value: budget wants milliseconds")
+        if not (math.isfinite(value) and 0 <= value <= BUDGET_MAX_MS):
+            raise ValueError(f"value: budget must lie in 0 to {BUDGET_MAX_MS:.0f} ms")
+        return Command(name, float(value))
+    return Command(name, value if name == "scene" else None)

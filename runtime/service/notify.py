@@ -1,0 +1,96 @@
+"""What systemd is told (sd_notify, watchdog). Without a supervisor every call does nothing."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+
+import sdnotify
+
+from runtime.clock import NS_PER_S, Clock
+from runtime.records import State
+
+NS_PER_US = 1000
+
+
+class Notifier:
+    """The supervisor's side of the daemon. Never blocks, never raises."""
+
+    def __init__(self, clock: Clock, environment: Mapping[str, str] = os.environ) -> None:
+        """`environment` only says whether and how often the watchdog wants to be fed (sd_watchdog_enabled)."""
+        self._clock = clock
+        self._channel = sdnotify.SystemdNotifier()
+        if self._channel.socket is not None:
+            self._channel.socket.setblocking(False)
+        self._watchdog_ns = watchdog_ns(environment)
+        self._fed_ns = -self._watchdog_ns
+        self._status = ""
+        self._ready = False
+
+    @property
+    def supervised(self) -> bool:
+        """True under a supervisor: wait for what is missing, rather than refuse."""
+        return self._channel.socket is not None
+
+    def ready(self) -> None:
+        """The first frame is on the panels. Later calls do nothing."""
+        if not self._ready:
+            self._ready = True
+            self._send("READY=1")
+
+    def status(self, text: str) -> None:
+        """One line for `systemctl status`; sent when it changes."""
+        line = " ".join(text.split())
+        if line != self._status:
+            self._status = line
+            self._send(f"STATUS={line}")
+
+    def extend_start(self, seconds: float) -> None:
+        """Still starting, and for a good reason: give it this much more time. Call again well before it is over."""
+        if not self._ready:
+            self._send(f"EXTEND_TIMEOUT_USEC={int(seconds * 1e6)}")
+
+    def turn(self, state: State, missing: tuple[str, ...], *, presented: bool) -> None:
+        """One turn of the loop is complete: feeds the watchdog, if it presented a frame.
+
+        Where a panel is missing no frame can be presented, and a completed turn is enough. While it starts,
+        the start's own limit watches. Sent at most four times per watchdog period.
+        """
+        alive = presented or (state is State.DEGRADED and "panel" in missing)
+        if not (alive and self._watchdog_ns):
+            return
+        now_ns = self._clock.now_ns()
+        if now_ns - self._fed_ns >= self._watchdog_ns // 4:
+            self._fed_ns = now_ns
+            self._send("WATCHDOG=1")
+
+    def reloading(self) -> None:
+        """The configuration is being read again; `reloaded` ends it."""
+        self._send(f"RELOADING=1\nMONOTONIC_USEC={self._clock.now_ns() // NS_PER_US}")
+
+    def reloaded(self) -> None:
+        """Reading the configuration is over, whether it was taken or refused."""
+        self._send("READY=1")
+
+    def stopping(self, reason: str) -> None:
+        """The daemon is going down on purpose."""
+        self._send(f"STOPPING=1\nSTATUS=stopping: {' '.join(reason.split())}")
+
+    def close(self) -> None:
+        """Release the socket. May be called twice."""
+        if self._channel.socket is not None:
+            self._channel.socket.close()
+            self._channel.socket = None
+
+    def _send(self, message: str) -> None:
+        self._channel.notify(message)
+
+
+def watchdog_ns(environment: Mapping[str, str]) -> int:
+    """The watchdog's period; 0 where there is none or it is another process's."""
+    try:
+        period_ns = int(environment.get("WATCHDOG_USEC", "0")) * NS_PER_US
+        pid = int(environment.get("WATCHDOG_PID", os.getpid()))
+    except ValueError:
+        return 0
+    return period_ns if 0 < period_ns < 3600 * NS_PER_S and pid == os.getpid() else 0
