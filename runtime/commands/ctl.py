@@ -1,0 +1,82 @@
+"""`phasestack ctl`: tells the running daemon what to do between two of its turns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+app = typer.Typer(no_args_is_help=True, help="Tell the running daemon. Example: phasestack ctl scene lego_bulldozer")
+
+Config = Annotated[Path | None, typer.Option(help="configuration of the daemon: says where its socket is")]
+Socket = Annotated[Path | None, typer.Option(help="the socket itself, whatever the configuration says")]
+
+
+@app.command()
+def scene(name: str, config: Config = None, socket: Socket = None) -> None:
+    """Show another scene: a preset's name, `demo`, or a file on the daemon's machine.
+
+    Example: phasestack ctl scene demo
+    """
+    tell({"command": "scene", "value": name}, config, socket)
+
+
+@app.command()
+def pause(config: Config = None, socket: Socket = None) -> None:
+    """Freeze the picture as it is, until `resume`.
+
+    Example: phasestack ctl pause
+    """
+    tell({"command": "pause"}, config, socket)
+
+
+@app.command()
+def resume(config: Config = None, socket: Socket = None) -> None:
+    """Follow the viewer again, after `pause` or `flat`.
+
+    Example: phasestack ctl resume
+    """
+    tell({"command": "resume"}, config, socket)
+
+
+@app.command()
+def flat(config: Config = None, socket: Socket = None) -> None:
+    """Show the flat (2D) picture whoever looks, until `resume`.
+
+    Example: phasestack ctl flat
+    """
+    tell({"command": "flat"}, config, socket)
+
+
+@app.command()
+def budget(milliseconds: float, config: Config = None, socket: Socket = None) -> None:
+    """Time for one frame, 0 for none: model and resolution are chosen to fit.
+
+    Example: phasestack ctl budget 16
+    """
+    tell({"command": "budget", "value": milliseconds}, config, socket)
+
+
+@app.command()
+def reload(config: Config = None, socket: Socket = None) -> None:
+    """Read the configuration again; a bad one is refused and the old one stays.
+
+    Example: phasestack ctl reload
+    """
+    tell({"command": "reload"}, config, socket)
+
+
+def tell(request: dict[str, Any], config: Path | None, socket: Path | None) -> None:
+    """Send one request. Exits with 1 where no daemon answers, 2 where it refuses."""
+    from runtime.commands.status import sockets
+    from runtime.errors import InputError
+    from runtime.service.client import NotRunning, ask
+
+    try:
+        answer = ask(sockets(config, socket), request)
+    except NotRunning as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(1) from None
+    if not answer.get("ok"):
+        raise InputError(f"ctl {request['command']}", "", str(answer.get("error", "refused")))
