@@ -76,6 +76,14 @@ class TrackerSettings(Section):
     blend_s: NonNegative = Field(0.3, description="time to blend to the flat picture and back")
     ipd_min_m: Positive = Field(0.050, description="smaller eye separations are implausible for a person")
     ipd_max_m: Positive = Field(0.075, description="larger eye separations are implausible for a person")
+    noise_m: Positive = Field(0.003, description="the sensor's noise on an eye, standard deviation of an axis")
+    acceleration: Positive = Field(1.0, description="how freely the head starts and stops, m²/s³ (noise density)")
+    turn_acceleration: Positive = Field(0.02, description="the same of half the line between the eyes: turn and roll")
+    speed_max: Positive = Field(2.0, description="faster heads, in m/s, are outliers until a second sample confirms")
+    confidence_min: NonNegative = Field(0.3, description="less certain samples (a blink) are not used")
+    loss_s: NonNegative = Field(0.2, description="without any sample for this long the eyes are held, not predicted")
+    decay_s: Positive = Field(0.06, description="time constant with which a lost head comes to rest")
+    revive_s: Positive = Field(0.1, description="time in which a found head's jump is smoothed")
 
 
 class CalibrationSettings(Section):
