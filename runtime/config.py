@@ -53,7 +53,10 @@ class SensorSettings(Section):
     source: str = Field("demo", description="what to open: a recording, `demo`, a serial number, a device URI")
     timeout_s: Positive = Field(0.5, description="without a new sample for this long the sensor counts as stalled")
     reopen_backoff_s: Positive = Field(0.25, description="first wait before a lost sensor is reopened; doubles")
-    reopen_backoff_max_s: Positive = Field(1.0, description="longest wait between attempts")
+    reopen_backoff_max_s: Positive = Field(0.5, description="longest wait between attempts")
+    open_timeout_s: Positive = Field(10.0, description="an SDK that takes longer to open is given up and opened anew")
+    loop: bool = Field(False, description="driver `replay`: begin again at the end")
+    start_s: NonNegative = Field(0.0, description="driver `replay`: begin this far into the recording")
     fixed_eyes_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None = Field(
         None, description="driver `fixed`: left and right eye in the stack frame; no sensor is opened"
     )

@@ -18,6 +18,7 @@ class Capabilities:
     depth: bool = False
     infrared: bool = False
     eye_points: bool = False  # it finds the eyes itself: no detector is needed
+    in_stack_frame: bool = False  # its eye points are in frame `stack` already: no calibration is applied
 
 
 class SensorDriver(ABC):
@@ -29,7 +30,9 @@ class SensorDriver(ABC):
 
     name: str
     capabilities: Capabilities
-    serial: str = ""  # known after `open`; empty where the device has none
+    serial: str = ""  # known after `open`, empty where the device has none; set before: `open` takes that device only
+    overtaken: int = 0  # samples that arrived and that `read_newest` passed over for a newer one
+    missed: int = 0  # samples that never arrived: gaps in the device's own count
 
     @abstractmethod
     def open(self) -> None:
@@ -54,3 +57,15 @@ class SensorDriver(ABC):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+class SteppedDriver(SensorDriver):
+    """A driver that also delivers sample after sample without waiting, for runs on a simulated clock."""
+
+    @abstractmethod
+    def next_sample(self) -> SensorFrame:
+        """The next sample, in order, none left out, at once. Raises EndOfRecording, SensorLost."""
+
+    @abstractmethod
+    def available_ns(self, frame: SensorFrame) -> int:
+        """When a sample arrives, on the run's clock: the caller lets its clock pass until then."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
 from runtime.errors import EndOfRecording, InputError, SensorLost, SensorTimeout
 from runtime.records import SensorFrame
-from runtime.sensor.base import Capabilities, SensorDriver
+from runtime.sensor.base import Capabilities, SteppedDriver
 from runtime.sensor.recording import Recording
 
 
@@ -19,7 +19,7 @@ def demo_recording_path() -> Path:
     return Path(str(files("runtime.sensor") / "data" / "demo.mcap"))
 
 
-class ReplayDriver(SensorDriver):
+class ReplayDriver(SteppedDriver):
     """Recorded times are shifted on to the run's clock: the first sample is captured at `open`.
 
     `next_sample` delivers every sample once, in order, and never waits: the caller's simulated clock is
@@ -76,11 +76,9 @@ class ReplayDriver(SensorDriver):
                 return
 
     def available_ns(self, frame: SensorFrame) -> int:
-        """When a sample arrives, on the run's clock."""
         return frame.capture_ns + self._latency_ns
 
     def next_sample(self) -> SensorFrame:
-        """The next recorded sample, without waiting. Raises EndOfRecording, SensorLost before `open`."""
         if self._frames is None:
             raise SensorLost("the recording is not open")
         if self._next is None:
@@ -100,7 +98,7 @@ class ReplayDriver(SensorDriver):
         self._clock.sleep_until_ns(self.available_ns(self._next))
         frame = self.next_sample()
         while self._next is not None and self.available_ns(self._next) <= self._clock.now_ns():
-            frame = self.next_sample()
+            frame, self.overtaken = self.next_sample(), self.overtaken + 1
         return frame
 
     def close(self) -> None:

@@ -1,0 +1,59 @@
+"""Driver `fixed`: eyes that stand still where the configuration says. No sensor, no calibration."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from runtime.clock import NS_PER_S, Clock
+from runtime.config import SensorSettings
+from runtime.errors import InputError, SensorLost, SensorTimeout
+from runtime.records import EyePoints, SensorFrame
+from runtime.sensor.base import Capabilities, SteppedDriver
+
+PERIOD_NS = NS_PER_S // 30
+
+
+class FixedDriver(SteppedDriver):
+    """Thirty samples a second of one pair of eyes in the `stack` frame."""
+
+    name = "fixed"
+    capabilities = Capabilities(eye_points=True, in_stack_frame=True)
+
+    def __init__(self, settings: SensorSettings, clock: Clock) -> None:
+        """Raises InputError without eyes in the settings."""
+        if settings.fixed_eyes_m is None:
+            raise InputError("sensor", "fixed_eyes_m", "is needed by the driver `fixed`")
+        self._eyes = EyePoints(np.array(settings.fixed_eyes_m, dtype=np.float64), np.ones(2))
+        self._clock = clock
+        self._start_ns: int | None = None
+        self._count = 0
+
+    def open(self) -> None:
+        self._start_ns, self._count = self._clock.now_ns(), 0
+
+    def next_sample(self) -> SensorFrame:
+        if self._start_ns is None:
+            raise SensorLost("not open")
+        self._count += 1
+        capture_ns = self._start_ns + (self._count - 1) * PERIOD_NS
+        return SensorFrame(self._count, capture_ns, self._eyes, true_eyes_m=self._eyes.eyes_m)
+
+    def available_ns(self, frame: SensorFrame) -> int:
+        return frame.capture_ns
+
+    def read_newest(self, timeout_s: float) -> SensorFrame:
+        if self._start_ns is None:
+            raise SensorLost("not open")
+        now_ns = self._clock.now_ns()
+        due = max((now_ns - self._start_ns) // PERIOD_NS, self._count)
+        due_ns = self._start_ns + due * PERIOD_NS
+        if due_ns > now_ns + timeout_s * NS_PER_S:
+            self._clock.sleep_until_ns(now_ns + round(timeout_s * NS_PER_S))
+            raise SensorTimeout("the next sample is not due yet")
+        self._clock.sleep_until_ns(due_ns)
+        self.overtaken += due - self._count
+        self._count = due
+        return self.next_sample()
+
+    def close(self) -> None:
+        self._start_ns = None

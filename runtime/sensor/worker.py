@@ -1,0 +1,220 @@
+"""The thread that a sensor lives in: the newest sample wins, and a hanging SDK is left behind."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from enum import StrEnum
+
+from runtime.clock import NS_PER_S, Clock
+from runtime.config import SensorSettings
+from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout, TransientError
+from runtime.records import SensorFrame
+from runtime.sensor.base import Capabilities, SensorDriver
+
+TIMEOUTS_TO_REOPEN = 2
+HANG_MARGIN_S = 0.5
+ABANDONED_MAX = 8
+
+log = logging.getLogger(__name__)
+
+
+class SensorState(StrEnum):
+    """What the sensor is doing."""
+
+    OPENING = "opening"
+    RUNNING = "running"
+    STALLED = "stalled"  # open, but nothing new comes
+    LOST = "lost"  # closed; reopened with back-off
+    HUNG = "hung"  # a call into the SDK does not return; a fresh attempt follows
+    ENDED = "ended"  # a recording is over
+    FAILED = "failed"  # fatal: not tried again
+    STOPPED = "stopped"
+
+
+class _Attempt:
+    """One thread with one driver. Once `abandoned`, nothing it says counts any more."""
+
+    def __init__(self, number: int, now_ns: int, limit_s: float) -> None:
+        self.number, self.abandoned = number, threading.Event()
+        self.deadline_ns = now_ns + round(limit_s * NS_PER_S)
+        self.thread: threading.Thread | None = None
+        self.received = 0
+
+
+class SensorWorker:
+    """Runs a driver in a thread of its own. No method blocks, `stop` but for its time-out."""
+
+    def __init__(self, make_driver: Callable[[], SensorDriver], settings: SensorSettings, clock: Clock) -> None:
+        """make_driver: an unopened driver, a fresh one at each call."""
+        self._make, self._settings, self._clock = make_driver, settings, clock
+        self._lock = threading.Lock()
+        self._frame: SensorFrame | None = None
+        self._attempt: _Attempt | None = None
+        self._hung: list[_Attempt] = []
+        self._state, self.reason = SensorState.STOPPED, ""
+        self._overwritten = self._overtaken = self._missed = 0
+        self._driver: SensorDriver | None = None
+        self._serial = ""
+        self.error: FatalError | None = None
+        self.reopened = 0
+
+    def start(self) -> None:
+        """Begin, in the background."""
+        self._set(None, SensorState.OPENING, "")
+        self._begin(0.0)
+
+    def _begin(self, wait_s: float) -> None:
+        limit_s = wait_s + self._settings.open_timeout_s
+        number = self._attempt.number + 1 if self._attempt else 1
+        attempt = _Attempt(number, self._clock.now_ns(), limit_s)
+        attempt.thread = threading.Thread(
+            target=self._run, args=(attempt, wait_s), name=f"sensor-{number}", daemon=True
+        )
+        self._attempt = attempt
+        attempt.thread.start()
+
+    def newest(self) -> SensorFrame | None:
+        """The newest sample that was not read yet, or None. Never waits."""
+        self._watch()
+        with self._lock:
+            frame, self._frame = self._frame, None
+        return frame
+
+    @property
+    def state(self) -> SensorState:
+        """What the sensor is doing; `reason` says why."""
+        self._watch()
+        return self._state
+
+    @property
+    def stale_inputs(self) -> int:
+        """Samples that a newer one overtook before anybody read them."""
+        return self._overwritten + self._overtaken + (self._driver.overtaken if self._driver else 0)
+
+    @property
+    def missed_inputs(self) -> int:
+        """Samples that the device counted and that never arrived."""
+        return self._missed + (self._driver.missed if self._driver else 0)
+
+    @property
+    def capabilities(self) -> Capabilities | None:
+        """Of the driver, once it was open."""
+        return self._driver.capabilities if self._driver else None
+
+    @property
+    def serial(self) -> str:
+        """Of the device, once it was open; it is reopened by this."""
+        return self._serial
+
+    def stop(self, timeout_s: float = 1.0) -> None:
+        """Close the driver; where that takes longer than the time-out, leave it behind."""
+        attempt = self._attempt
+        if attempt is not None:
+            attempt.abandoned.set()
+            if attempt.thread is not None and attempt.thread is not threading.current_thread():
+                attempt.thread.join(timeout_s)
+        self._attempt = None
+        self._state, self.reason = SensorState.STOPPED, ""
+
+    def _watch(self) -> None:
+        """Leave a thread behind that is in one call for too long, and begin another."""
+        attempt = self._attempt
+        if attempt is None or self._clock.now_ns() <= attempt.deadline_ns:
+            return
+        if attempt.thread is None or not attempt.thread.is_alive():
+            return
+        self._hung = [a for a in self._hung if a.thread is not None and a.thread.is_alive()]
+        reason = f"a call into the sensor's driver does not return ({len(self._hung) + 1} left behind)"
+        if not attempt.abandoned.is_set():
+            log.warning("sensor: %s", reason)
+            self._set(attempt, SensorState.HUNG, reason)
+            attempt.abandoned.set()
+            self._account(self._driver)
+            self._hung.append(attempt)
+        if len(self._hung) <= ABANDONED_MAX:
+            self.reopened += 1
+            self._begin(self._settings.reopen_backoff_s)
+
+    def _set(self, attempt: _Attempt | None, state: SensorState, reason: str) -> None:
+        with self._lock:
+            if attempt is None or not attempt.abandoned.is_set():
+                if state != self._state:
+                    log.info("sensor: %s%s", state, f" ({reason})" if reason else "")
+                self._state, self.reason = state, reason
+
+    def _account(self, driver: SensorDriver | None) -> None:
+        """Keep a driver's counts when it goes."""
+        with self._lock:
+            if driver is not None and driver is self._driver:
+                self._overtaken += driver.overtaken
+                self._missed += driver.missed
+                self._driver = None
+
+    def _allow(self, attempt: _Attempt, limit_s: float) -> None:
+        attempt.deadline_ns = self._clock.now_ns() + round(limit_s * NS_PER_S)
+
+    def _run(self, attempt: _Attempt, wait_s: float) -> None:
+        s = self._settings
+        backoff_s = s.reopen_backoff_s
+        while not attempt.abandoned.wait(wait_s):
+            driver: SensorDriver | None = None
+            attempt.received = 0
+            try:
+                driver = self._make()
+                driver.serial = driver.serial or self._serial
+                self._allow(attempt, s.open_timeout_s)
+                driver.open()
+                self._receive(attempt, driver)
+            except EndOfRecording as error:
+                self._set(attempt, SensorState.ENDED, str(error))
+                return
+            except FatalError as error:
+                if not attempt.abandoned.is_set():
+                    self.error = error
+                self._set(attempt, SensorState.FAILED, str(error))
+                return
+            except TransientError as error:
+                self._set(attempt, SensorState.LOST, str(error))
+            except Exception as error:
+                # An SDK's own exception must not end the daemon: what is broken may come back.
+                log.exception("sensor: unexpected error")
+                self._set(attempt, SensorState.LOST, f"{type(error).__name__}: {error}")
+            finally:
+                if driver is not None:
+                    self._allow(attempt, s.open_timeout_s)
+                    driver.close()
+                    self._account(driver)
+            if attempt.received:
+                backoff_s = s.reopen_backoff_s
+            wait_s, backoff_s = backoff_s, min(2 * backoff_s, s.reopen_backoff_max_s)
+            self._allow(attempt, wait_s + s.open_timeout_s)
+            self.reopened += 1
+
+    def _receive(self, attempt: _Attempt, driver: SensorDriver) -> None:
+        """Read until the driver fails or the worker stops."""
+        s = self._settings
+        timeouts = 0
+        if attempt.abandoned.is_set():
+            return
+        with self._lock:
+            self._driver, self._serial = driver, driver.serial
+        while not attempt.abandoned.is_set():
+            self._allow(attempt, s.timeout_s + HANG_MARGIN_S)
+            try:
+                frame = driver.read_newest(s.timeout_s)
+            except SensorTimeout as error:
+                timeouts += 1
+                self._set(attempt, SensorState.STALLED, str(error))
+                if timeouts >= TIMEOUTS_TO_REOPEN:
+                    raise SensorLost(f"nothing new for {timeouts * s.timeout_s:g} s") from error
+                continue
+            attempt.received, timeouts = attempt.received + 1, 0
+            with self._lock:
+                if attempt.abandoned.is_set():
+                    return
+                self._overwritten += self._frame is not None
+                self._frame = frame
+            if self._state is not SensorState.RUNNING:
+                self._set(attempt, SensorState.RUNNING, "")
