@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -116,19 +117,24 @@ def torus(radius_m: float, tube_m: float, *, columns: int = 64, rows: int = 24) 
     return _shape(centre + normal * tube_m, normal, np.column_stack([6 * s, 2 * t]), triangles)
 
 
+def _runs(marks: str) -> list[tuple[int, int]]:
+    """Start and length of each unbroken run of `#`."""
+    return [(match.start(), match.end() - match.start()) for match in re.finditer("#+", marks)]
+
+
 def lettering(text: str, *, cell_m: float, depth_m: float) -> Shape:
     """Letters of square bars, 5 x 7 cells each with a gap of one, centred on the origin, read from +x."""
     left = -(len(text) * 6 - 1) / 2
-    cells = [
-        box((depth_m, cell_m * 0.92, cell_m * 0.92)).moved(
-            offset_m=(0.0, (left + index * 6 + column + 0.5) * cell_m, (3 - row) * cell_m)
-        )
-        for index, letter in enumerate(text)
-        for row, line in enumerate(GLYPHS[letter])
-        for column, mark in enumerate(line)
-        if mark == "#"
-    ]
-    return join(cells)
+    bars = []
+    for index, letter in enumerate(text):
+        rows = GLYPHS[letter]
+        columns = ["".join(row[column] for row in rows) for column in range(5)]
+        across = [(row, start, 1, length) for row, line in enumerate(rows) for start, length in _runs(line)]
+        down = [(start, column, length, 1) for column, line in enumerate(columns) for start, length in _runs(line)]
+        for row, column, high, wide in (*across, *(bar for bar in down if bar[2] > 1)):
+            centre = (0.0, (left + index * 6 + column + wide / 2) * cell_m, (3.5 - row - high / 2) * cell_m)
+            bars.append(box((depth_m, wide * cell_m, high * cell_m)).moved(offset_m=centre))
+    return join(bars)
 
 
 def fence(width_m: float, height_m: float, *, bars: int, bar_m: float) -> Shape:

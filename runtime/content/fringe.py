@@ -1,0 +1,100 @@
+"""Smooth outlines without multisampling: a ramp one pixel wide outside each silhouette edge.
+
+A software rasteriser pays four times for four samples; outlines are a few hundred edges. The object grows by
+half a pixel on average.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.content.shapes import I32, Shape
+from runtime.records import F32, F64
+
+RAMP_PX = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Edges:
+    """Every edge of a triangle mesh with the one or two faces that meet there."""
+
+    faces: I32  # (e, 2) faces; the second is -1 on a border
+    ends: I32  # (e, 2, 2) per face: the vertices of the edge, in one order for both
+    apex: I32  # (e, 2) per face: its third vertex
+    normals: F64  # (t, 3) of faces, not normalised
+    centres: F64  # (t, 3)
+
+
+def edges_of(shape: Shape) -> Edges:
+    """The edges of a shape. Vertices at the same place count as one, whatever their normals and textures."""
+    positions = shape.positions_m.astype(np.float64)
+    extent = max(float(np.ptp(positions, axis=0).max()), 1e-9)
+    welded = np.unique(np.rint(positions / extent * 1e6).astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)
+    triangles = shape.triangles
+    vertices = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    apex = np.concatenate([triangles[:, 2], triangles[:, 0], triangles[:, 1]])
+    face = np.tile(np.arange(len(triangles)), 3)
+    swapped = welded[vertices[:, 0]] > welded[vertices[:, 1]]
+    vertices[swapped] = vertices[swapped][:, ::-1]
+    key = welded[vertices[:, 0]] * (int(welded.max()) + 1) + welded[vertices[:, 1]]
+    places = np.sort(welded[triangles], axis=1)
+    real = np.tile((np.diff(places, axis=1) > 0).all(1), 3)  # a sphere's poles have triangles without area
+    order = np.flatnonzero(real)[np.argsort(key[real], kind="stable")]
+    first = np.flatnonzero(np.r_[True, np.diff(key[order]) != 0]) if order.size else np.empty(0, np.int64)
+    second = np.minimum(first + 1, max(order.size - 1, 0))
+    paired = (second > first) & (key[order[second]] == key[order[first]])
+    one, two = order[first], order[second]
+    corner = positions[triangles]
+    return Edges(
+        faces=np.column_stack([face[one], np.where(paired, face[two], -1)]).astype(np.int32),
+        ends=np.stack([vertices[one], np.where(paired[:, None], vertices[two], vertices[one])], axis=1).astype(
+            np.int32
+        ),
+        apex=np.column_stack([apex[one], np.where(paired, apex[two], apex[one])]).astype(np.int32),
+        normals=np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]),
+        centres=corner.mean(1),
+    )
+
+
+def silhouette(edges: Edges, eye: F64) -> tuple[I32, I32]:
+    """(k, 2) vertices and (k,) apexes, of the visible face, of the edges that an eye sees as outlines.
+
+    eye: (3,) in the shape's own frame. Normals must point outwards.
+    """
+    facing = np.einsum("ij,ij->i", edges.normals, eye - edges.centres) > 0
+    border = edges.faces[:, 1] < 0
+    chosen = np.flatnonzero(border | (facing[edges.faces[:, 0]] != facing[edges.faces[:, 1]]))
+    which = np.where(border[chosen] | facing[edges.faces[chosen, 0]], 0, 1)
+    return edges.ends[chosen, which], edges.apex[chosen, which]
+
+
+def ramps(clip: F64, ends: I32, apex: I32, *, width_px: int, height_px: int) -> tuple[F32, I32, NDArray[np.bool_]]:
+    """Two triangles along each outline edge, from the edge (coverage 1) to a pixel outside it (coverage 0).
+
+    clip: (v, 4) clip coordinates of the shape's vertices.
+    Returns (k, 6, 5) clip coordinates and coverage, (k, 6) the vertex whose colour each corner has, and the
+    (n,) mask of the edges that were kept: those wholly before the eye and long enough to have a direction.
+    """
+    scale = np.array([width_px / 2, height_px / 2])
+    points = clip[np.column_stack([ends, apex])]
+    before: NDArray[np.bool_] = np.asarray((points[..., 3] > 1e-6).all(1))
+    points = points[before]
+    pixels = points[..., :2] / points[..., 3:] * scale
+    along = pixels[:, 1] - pixels[:, 0]
+    length = np.hypot(along[:, 0], along[:, 1])
+    long_enough = length > 1e-3
+    points, pixels, along = points[long_enough], pixels[long_enough], along[long_enough] / length[long_enough, None]
+    outward = np.column_stack([-along[:, 1], along[:, 0]])
+    inside = ((pixels[:, 2] - pixels[:, 0]) * outward).sum(1)
+    outward *= np.where(inside > 0, -RAMP_PX, RAMP_PX)[:, None]
+    corners = np.repeat(points[:, :2], 2, axis=1)
+    coverage = np.tile([1.0, 0.0, 1.0, 0.0], (len(points), 1))
+    corners[:, 1::2, :2] += (outward / scale)[:, None] * corners[:, 1::2, 3:]
+    kept = before.copy()
+    kept[before] = long_enough
+    quad = [0, 1, 2, 2, 1, 3]
+    packed = np.concatenate([corners, coverage[..., None]], axis=2)[:, quad]
+    return packed.astype(np.float32), ends[kept][:, [0, 0, 1, 1, 0, 1]], kept
