@@ -26,7 +26,11 @@ def open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, conte
 
     Raises InputError (settings that don't fit), PanelLost (a monitor is not there yet: wait and retry).
     """
+    panels = panel_settings(settings, stack.count)
+    if settings.kind != "offscreen":
+        from runtime.panels.window import WindowPanels
+
+        return WindowPanels(settings, panels, stack, clock, context)
     from runtime.panels.offscreen import OffscreenPanels
 
-    panels = panel_settings(settings, stack.count)
     return OffscreenPanels(context, clock=clock, width_px=stack.width_px, height_px=stack.height_px, panels=panels)

@@ -1,0 +1,205 @@
+"""GLFW on X11: the monitors, and windows whose contexts share one root. Main thread only."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+from typing import Any
+
+import glfw as _glfw
+import moderngl
+
+from runtime.errors import MissingPart, PanelLost
+from runtime.gl import MINIMUM_VERSION
+from runtime.panels import edid, xlib
+from runtime.panels.monitors import Monitor, in_order
+
+log = logging.getLogger("phasestack.panels")
+
+glfw: Any = _glfw  # its stubs are wrong about bytes, None and pointers
+
+# GLFW's own answer to an error is a Python warning; here every error has someone who catches it.
+glfw.ERROR_REPORTING = "exception"
+
+
+class WindowContext:
+    """What moderngl needs to know of a GLFW window: where its functions are, and how it becomes current."""
+
+    def __init__(self, window: Any) -> None:
+        self._window = window
+
+    def load_opengl_function(self, name: str) -> int:
+        """Address of an OpenGL function."""
+        return _address(glfw.get_proc_address(name))
+
+    load = load_opengl_function
+
+    def __enter__(self) -> None:
+        glfw.make_context_current(self._window)
+
+    def __exit__(self, *exception: object) -> None:
+        """Leaves it current: whoever needs another makes that current."""
+
+    def release(self) -> None:
+        """The window owns its context."""
+
+
+@dataclass
+class Window:
+    """A GLFW window and its moderngl context."""
+
+    handle: Any
+    context: moderngl.Context
+    faults: list[str] = field(default_factory=list)  # what its callbacks saw: closed, another size
+
+    def make_current(self) -> None:
+        """Its context on this thread."""
+        glfw.make_context_current(self.handle)
+
+
+class Display:
+    """The connection to the X server, with a hidden root window whose objects all others share.
+
+    Nothing of it outlives `close`; a lost server is opened again with a new Display.
+    """
+
+    def __init__(self) -> None:
+        """Raises PanelLost (no X server, or none that lets us in: it may come), MissingPart (no X11 library)."""
+        self.faults: list[str] = []
+        self._windows: list[Window] = []
+        try:
+            if glfw.platform_supported(glfw.PLATFORM_X11):
+                glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
+            glfw.init()
+        except glfw.GLFWError as error:
+            raise PanelLost(f"no X server: {_text(error)} (DISPLAY and XAUTHORITY say where)") from None
+        try:
+            if glfw.get_platform() != glfw.PLATFORM_X11:
+                raise MissingPart("GLFW without X11: only X11 can put a window on a chosen monitor")
+            xlib.survive_errors()
+            self._guard = xlib.survive_server(_address(glfw.get_x11_display()), self._server_died)
+            glfw.set_monitor_callback(self._monitor_changed)
+            _hints()
+            self.root = self.window(width_px=16, height_px=16, title="phasestack", monitor=None, visible=False)
+        except glfw.GLFWError as error:
+            glfw.terminate()
+            raise PanelLost(f"no OpenGL on the X server: {_text(error)}") from None
+        except BaseException:
+            glfw.terminate()
+            raise
+
+    def monitors(self) -> tuple[Monitor, ...]:
+        """The active monitors, from left to right."""
+        return in_order([monitor for monitor, _ in self._pairs()])
+
+    def window(
+        self, *, width_px: int, height_px: int, title: str, monitor: Monitor | None, visible: bool = True
+    ) -> Window:
+        """A borderless window: fullscreen on a monitor, or hidden. Its context is current afterwards."""
+        handles = {found.connector: handle for found, handle in self._pairs()} if monitor else {}
+        if monitor and monitor.connector not in handles:
+            raise PanelLost(f"{monitor.connector} has gone")
+        glfw.window_hint(glfw.VISIBLE, visible)
+        share = self._windows[0].handle if self._windows else None
+        handle = glfw.create_window(width_px, height_px, title, handles[monitor.connector] if monitor else None, share)
+        return self._adopt(handle)
+
+    def spanning_window(self, *, x_px: int, y_px: int, width_px: int, height_px: int, title: str) -> Window:
+        """One borderless window over a part of the X screen, whatever monitors are there."""
+        glfw.window_hint(glfw.VISIBLE, False)
+        glfw.window_hint(glfw.DECORATED, False)
+        handle = glfw.create_window(width_px, height_px, title, None, self._windows[0].handle)
+        glfw.window_hint(glfw.DECORATED, True)
+        glfw.set_window_pos(handle, x_px, y_px)
+        glfw.show_window(handle)
+        return self._adopt(handle)
+
+    def poll(self) -> str:
+        """Take in what the X server says. Answers what makes the windows useless; empty: nothing."""
+        glfw.poll_events()
+        faults = self.faults + [fault for window in self._windows for fault in window.faults]
+        return "; ".join(faults)
+
+    def close(self) -> None:
+        """Close every window and the connection. May be called twice."""
+        windows, self._windows = self._windows, []
+        for window in windows:
+            window.context.release()
+        if windows:
+            glfw.make_context_current(None)
+            glfw.terminate()
+
+    def _adopt(self, handle: Any) -> Window:
+        glfw.make_context_current(handle)
+        context = _attach(handle)
+        window = Window(handle, context)
+        size = glfw.get_framebuffer_size(handle)
+
+        def closed(_handle: Any) -> None:
+            window.faults.append("a panel's window was closed")
+
+        def resized(_handle: Any, width_px: int, height_px: int) -> None:
+            if (width_px, height_px) != size:
+                window.faults.append(f"a panel's window became {width_px}x{height_px}")
+
+        glfw.set_window_close_callback(handle, closed)
+        glfw.set_framebuffer_size_callback(handle, resized)
+        glfw.set_input_mode(handle, glfw.CURSOR, glfw.CURSOR_HIDDEN)
+        self._windows.append(window)
+        return window
+
+    def _pairs(self) -> list[tuple[Monitor, Any]]:
+        identities = {name: edid.parse(data) for name, data in xlib.edids().items()}
+        pairs = []
+        for handle in glfw.get_monitors():
+            connector = glfw.get_monitor_name(handle).decode()
+            mode = glfw.get_video_mode(handle)
+            x_px, y_px = glfw.get_monitor_pos(handle)
+            identity = identities.get(connector)
+            monitor = Monitor(
+                connector=connector,
+                serial=identity.serial if identity else "",
+                model=" ".join(part for part in (identity.maker, identity.name) if part) if identity else "",
+                x_px=x_px,
+                y_px=y_px,
+                width_px=mode.size.width,
+                height_px=mode.size.height,
+                refresh_hz=float(mode.refresh_rate),
+            )
+            pairs.append((monitor, handle))
+        return pairs
+
+    def _monitor_changed(self, handle: Any, what: int) -> None:
+        name = glfw.get_monitor_name(handle).decode()
+        self.faults.append(f"{name} was {'connected' if what == glfw.CONNECTED else 'disconnected'}")
+
+    def _server_died(self) -> None:
+        self.faults.append("the X server died")
+
+
+def _attach(handle: Any) -> moderngl.Context:
+    settings: dict[str, Any] = {"context": WindowContext(handle)}
+    return moderngl.create_context(require=MINIMUM_VERSION, **settings)
+
+
+def _hints() -> None:
+    glfw.default_window_hints()
+    # EGL, as the offscreen context has: a thread can't have contexts of GLX and of EGL in turn.
+    glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API)
+    glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, MINIMUM_VERSION // 100)
+    glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, MINIMUM_VERSION // 10 % 10)
+    glfw.window_hint(glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE)
+    glfw.window_hint(glfw.CONTEXT_ROBUSTNESS, glfw.LOSE_CONTEXT_ON_RESET)
+    glfw.window_hint(glfw.AUTO_ICONIFY, False)
+    glfw.window_hint(glfw.FOCUS_ON_SHOW, False)
+    glfw.window_hint(glfw.RESIZABLE, False)
+
+
+def _address(pointer: Any) -> int:
+    value = getattr(pointer, "value", pointer)
+    return int(value or 0)
+
+
+def _text(error: Exception) -> str:
+    text = error.args[0] if error.args else type(error).__name__
+    return text.decode(errors="replace") if isinstance(text, bytes) else str(text)

@@ -1,0 +1,239 @@
+"""Panels on monitors: one fullscreen window a panel, or one window over all of them; a frame is on all or on none."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+import moderngl
+import numpy as np
+
+from runtime.clock import NS_PER_MS, NS_PER_S, Clock
+from runtime.config import OutputSettings, PanelSettings
+from runtime.errors import PanelLost
+from runtime.optics.stack import PanelStack
+from runtime.panels.base import PanelSink
+from runtime.panels.display import Display, Window, glfw
+from runtime.panels.monitors import Monitor, bind, check_shape
+from runtime.panels.presentation import Mounting, Painter
+from runtime.records import LayerFrame, PresentReport
+
+log = logging.getLogger("phasestack.panels")
+
+RETRY_NS = NS_PER_S // 2
+
+
+@dataclass
+class Spot:
+    """Where one panel's picture goes in a window."""
+
+    index: int  # of the panel
+    viewport: tuple[int, int, int, int]  # x, y (from the bottom), width, height
+    painter: Painter
+
+
+@dataclass
+class Surface:
+    """One window and the panels in it."""
+
+    window: Window
+    spots: tuple[Spot, ...]
+
+
+class WindowPanels(PanelSink):
+    """All panels of the stack on X11 monitors.
+
+    `present` uploads the frame once into a texture that all windows share, draws every window and waits for
+    the drawing, and only then swaps them, one directly after the other: a fault before the first swap leaves
+    the old frame on all. Only the first window waits for its vertical blank: N windows that each waited in
+    turn would divide the rate by N. `skew_ms` is the time between the first and the last return from a swap;
+    what it can't know is how far the monitors' own blanks lie apart (`kind = "span"` has one swap).
+
+    Where a monitor, a window, the context or the X server is lost, everything is closed, `present` raises
+    PanelLost, and every half second a later `present` tries to build it anew.
+    Uses GLFW, so: one thread, the main one. The `content` context is current again after every call.
+    """
+
+    def __init__(
+        self, settings: OutputSettings, panels: tuple[PanelSettings, ...], stack: PanelStack, clock: Clock,
+        content: moderngl.Context,
+    ) -> None:  # fmt: skip
+        """Raises InputError (settings), PanelLost (a panel is missing or ambiguous, no X server: it may come)."""
+        self.name = settings.kind
+        self._settings, self._panels, self._stack = settings, panels, stack
+        self._clock, self._content = clock, content
+        self._display: Display | None = None
+        self._surfaces: list[Surface] = []
+        self._layers: moderngl.TextureArray | None = None
+        self._retry_ns = 0
+        self._swapped_ns = 0
+        self.monitors: tuple[Monitor, ...] = ()
+        try:
+            self._open()
+        except BaseException:
+            self._drop()
+            raise
+        finally:
+            self._give_back()
+
+    def present(self, frame: LayerFrame) -> PresentReport:
+        """Show a frame on every panel at once. Raises PanelLost; ValueError for layers of another shape."""
+        try:
+            if self._display is None:
+                self._open_again()
+            return self._present(frame)
+        except PanelLost:
+            self._drop()
+            raise
+        except (glfw.GLFWError, moderngl.Error) as error:
+            self._drop()
+            raise PanelLost(f"panels: {error}") from error
+        finally:
+            self._give_back()
+
+    def screen_size_px(self) -> tuple[int, int]:
+        """Columns and rows that the bound monitors cover on the X screen, from its origin."""
+        return (
+            max(monitor.x_px + monitor.width_px for monitor in self.monitors),
+            max(monitor.y_px + monitor.height_px for monitor in self.monitors),
+        )
+
+    def close(self) -> None:
+        """Close windows and the display. May be called twice."""
+        self._drop()
+        self._give_back()
+
+    def _present(self, frame: LayerFrame) -> PresentReport:
+        display, layers = self._display, self._layers
+        assert display is not None and layers is not None
+        if fault := display.poll():
+            raise PanelLost(fault)
+        width, height, count = layers.size[0], layers.size[1], len(self._panels)
+        if frame.layers.shape != (count, height, width, 4):
+            raise ValueError(f"layers are {frame.layers.shape}, the panels {count} of {width}x{height}")
+        display.root.make_current()
+        layers.write(np.ascontiguousarray(frame.layers))
+        # Another context may use what this one has uploaded only after this one is known to be done.
+        display.root.context.finish()
+        for surface in self._surfaces:
+            self._draw(surface, layers)
+        swapped_ns = [self._swap(surface) for surface in self._surfaces]
+        missed = self._missed_vblanks(swapped_ns[0])
+        return PresentReport(frame.number, swapped_ns[-1], (swapped_ns[-1] - swapped_ns[0]) / NS_PER_MS, missed)
+
+    def _draw(self, surface: Surface, layers: moderngl.TextureArray) -> None:
+        surface.window.make_current()
+        context = surface.window.context
+        context.screen.use()
+        if len(surface.spots) > 1:
+            context.screen.viewport = (0, 0, *context.screen.size)
+            context.clear()
+        for spot in surface.spots:
+            context.viewport = spot.viewport
+            spot.painter.draw(layers, spot.index)
+        context.finish()
+        if fault := _reset_status() or _error(context):
+            raise PanelLost(f"the GL context of panel {surface.spots[0].index}: {fault}")
+
+    def _swap(self, surface: Surface) -> int:
+        surface.window.make_current()
+        glfw.swap_buffers(surface.window.handle)
+        return self._clock.now_ns()
+
+    def _missed_vblanks(self, swapped_ns: int) -> int:
+        """Vertical blanks since the last swap that brought no new frame."""
+        before_ns, self._swapped_ns = self._swapped_ns, swapped_ns
+        refresh_hz = self.monitors[0].refresh_hz
+        if not (before_ns and refresh_hz):
+            return 0
+        return max(0, round((swapped_ns - before_ns) * refresh_hz / NS_PER_S) - 1)
+
+    def _open_again(self) -> None:
+        now_ns = self._clock.now_ns()
+        if now_ns < self._retry_ns:
+            raise PanelLost("panels: not back yet")
+        self._open()
+        log.info("panels are back: %s", ", ".join(monitor.connector for monitor in self.monitors))
+
+    def _open(self) -> None:
+        self._display = display = Display()
+        self.monitors = bind(self._panels, display.monitors())
+        for number, (panel, monitor) in enumerate(zip(self._panels, self.monitors, strict=True)):
+            check_shape(number, panel, monitor, width_px=self._stack.width_px, height_px=self._stack.height_px)
+        display.root.make_current()
+        self._layers = display.root.context.texture_array(
+            (self._stack.width_px, self._stack.height_px, len(self._panels)), 4
+        )
+        self._layers.filter = (moderngl.LINEAR, moderngl.LINEAR)
+        self._layers.repeat_x = self._layers.repeat_y = False
+        spanning = self._settings.kind == "span"
+        self._surfaces = [self._span(display)] if spanning else self._windows(display)
+        for number, surface in enumerate(self._surfaces):
+            surface.window.make_current()
+            glfw.swap_interval(1 if self._settings.vsync and number == 0 else 0)
+        glfw.poll_events()
+
+    def _windows(self, display: Display) -> list[Surface]:
+        surfaces = []
+        for index, monitor in enumerate(self.monitors):
+            window = display.window(
+                width_px=monitor.width_px, height_px=monitor.height_px, title=f"panel {index}", monitor=monitor
+            )
+            viewport = (0, 0, monitor.width_px, monitor.height_px)
+            surfaces.append(Surface(window, (self._spot(window, index, viewport),)))
+        return surfaces
+
+    def _span(self, display: Display) -> Surface:
+        left, top = min(m.x_px for m in self.monitors), min(m.y_px for m in self.monitors)
+        right, bottom = self.screen_size_px()
+        window = display.spanning_window(
+            x_px=left, y_px=top, width_px=right - left, height_px=bottom - top, title="panels"
+        )
+        spots = []
+        for index, monitor in enumerate(self.monitors):
+            below = bottom - (monitor.y_px + monitor.height_px)
+            viewport = (monitor.x_px - left, below, monitor.width_px, monitor.height_px)
+            spots.append(self._spot(window, index, viewport))
+        return Surface(window, tuple(spots))
+
+    def _spot(self, window: Window, index: int, viewport: tuple[int, int, int, int]) -> Spot:
+        mounting = Mounting.of(
+            self._panels[index],
+            screen_width_px=viewport[2],
+            screen_height_px=viewport[3],
+            layer_width_px=self._stack.width_px,
+            layer_height_px=self._stack.height_px,
+        )
+        return Spot(index, viewport, Painter(window.context, mounting))
+
+    def _drop(self) -> None:
+        display, self._display = self._display, None
+        self._surfaces, self._layers = [], None
+        self._retry_ns = self._clock.now_ns() + RETRY_NS
+        self._swapped_ns = 0
+        if display is not None:
+            try:
+                display.close()
+            except Exception:
+                log.exception("closing the display")
+
+    def _give_back(self) -> None:
+        content: Any = self._content
+        content.__enter__()
+
+
+def _error(context: moderngl.Context) -> str:
+    fault = context.error
+    return "" if fault == "GL_NO_ERROR" else fault
+
+
+def _reset_status() -> str:
+    """What the driver says of a lost context (GPU reset); empty where all is well or it can't say."""
+    address = glfw.get_proc_address("glGetGraphicsResetStatus")
+    address = getattr(address, "value", address)
+    if not address:
+        return ""
+    status: int = ctypes.CFUNCTYPE(ctypes.c_uint)(address)()
+    return f"was reset (0x{status:x})" if status else ""
