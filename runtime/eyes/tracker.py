@@ -11,7 +11,7 @@ import numpy as np
 
 from runtime.clock import NS_PER_S
 from runtime.config import TrackerSettings
-from runtime.eyes import kalman
+from runtime.eyes import imm
 from runtime.records import F64, EyePoints, EyesEstimate, EyesLabel
 
 HISTORY = 256  # filtered samples kept: four seconds at 60 Hz
@@ -26,8 +26,9 @@ class _Sample(NamedTuple):
     """A filtered sample."""
 
     capture_ns: int
-    middle: kalman.PointState  # between the eyes, frame `stack`
-    half: kalman.PointState  # from the middle to the right eye
+    middle: tuple[imm.Model, ...]  # between the eyes, frame `stack`
+    half: tuple[imm.Model, ...]  # from the middle to the right eye
+    place: F64  # (4, 3) what follows from both: middle, its velocity, half, its velocity
     jump_m: F64  # (2, 3) what a revival hides, as it stood at `jump_ns`
     jump_ns: int
 
@@ -79,17 +80,17 @@ class Tracker:
         last = self._history[-1] if self._history else None
         age_s = (capture_ns - last.capture_ns) / NS_PER_S if last else math.inf
         if last is not None and age_s <= self.settings.horizon_max_s:
-            s = self.settings
-            now = kalman.predicted(last.middle, age_s, acceleration=s.acceleration)
-            side = kalman.predicted(last.half, age_s, acceleration=s.turn_acceleration)
+            s, place, turn = self.settings, middle.tolist(), half.tolist()
+            now = imm.predicted(last.middle, age_s, acceleration=s.acceleration, stay_s=s.stay_s)
+            side = imm.predicted(last.half, age_s, acceleration=(s.turn_acceleration,), stay_s=s.stay_s)
             if (
-                kalman.surprise(now, middle, variance=variance) <= CHI2_GATE
-                and kalman.surprise(side, half, variance=variance) <= CHI2_GATE
+                imm.surprise(now, place, variance=variance) <= CHI2_GATE
+                and imm.surprise(side, turn, variance=variance) <= CHI2_GATE
             ):
                 self._keep(
                     capture_ns,
-                    kalman.corrected(now, middle, variance=variance),
-                    kalman.corrected(side, half, variance=variance),
+                    imm.corrected(now, place, variance=variance),
+                    imm.corrected(side, turn, variance=variance),
                     last.jump_m,
                     last.jump_ns,
                 )
@@ -100,8 +101,9 @@ class Tracker:
                 return
         before = self.at(capture_ns).eyes_m
         jump = NO_JUMP if before is None else before - np.array([middle - half, middle + half])
-        found = kalman.started(middle, variance=variance, speed=FIRST_SPEED)
-        side = kalman.started(half, variance=variance, speed=FIRST_SPEED / 3)
+        count = len(self.settings.acceleration)
+        found = imm.started(middle.tolist(), count=count, variance=variance, speed=FIRST_SPEED)
+        side = imm.started(half.tolist(), count=1, variance=variance, speed=FIRST_SPEED / 3)
         self._keep(capture_ns, found, side, jump, capture_ns)
 
     def _is_confirmed(self, middle: F64, capture_ns: int) -> bool:
@@ -113,9 +115,10 @@ class Tracker:
         return float(np.linalg.norm(middle - then)) <= reach_m
 
     def _keep(
-        self, capture_ns: int, middle: kalman.PointState, half: kalman.PointState, jump_m: F64, jump_ns: int
+        self, capture_ns: int, middle: tuple[imm.Model, ...], half: tuple[imm.Model, ...], jump_m: F64, jump_ns: int
     ) -> None:
-        self._history.append(_Sample(capture_ns, middle, half, jump_m, jump_ns))
+        place = np.array([*imm.combined(middle), *imm.combined(half)])
+        self._history.append(_Sample(capture_ns, middle, half, place, jump_m, jump_ns))
         self._refused = self._lost_ns = None
 
     def at(self, time_ns: int) -> EyesEstimate:
@@ -156,8 +159,7 @@ class Tracker:
         return EyesEstimate(time_ns, after.capture_ns, eyes, "interpolated", time_ns - after.capture_ns)
 
     def _eyes(self, sample: _Sample, ahead_s: float, time_ns: int) -> F64:
-        middle = sample.middle.position_m + sample.middle.velocity * ahead_s
-        half = sample.half.position_m + sample.half.velocity * ahead_s
+        middle, half = sample.place[0::2] + sample.place[1::2] * ahead_s
         eyes = np.array([middle - half, middle + half])
         since_s = (time_ns - sample.jump_ns) / NS_PER_S
         if sample.jump_m is not NO_JUMP and 0.0 <= since_s < self.settings.revive_s:

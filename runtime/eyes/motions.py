@@ -1,0 +1,131 @@
+"""Heads that move as viewers do, and what a depth camera makes of them: for the benchmark and the tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from runtime.clock import NS_PER_S
+from runtime.records import F64, EyePoints
+
+IPD_M = 0.063
+NECK_TO_EYES_M = np.array([-0.09, 0.0, 0.14])  # forward (towards the display), aside, up
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What arrives at the tracker."""
+
+    capture_ns: int
+    points: EyePoints | None  # frame `stack`
+
+
+Motion = Callable[[F64], tuple[F64, F64]]  # times (n,) s -> neck (n, 3) m, frame `stack`; pitch (n,) rad
+
+
+def _minimum_jerk(times_s: F64, *, knots_s: F64, values: F64) -> F64:
+    """Point-to-point movements at rest in each knot (Flash and Hogan 1985); values (k, ...)."""
+    index = np.clip(np.searchsorted(knots_s, times_s, side="right") - 1, 0, len(knots_s) - 2)
+    s = np.clip((times_s - knots_s[index]) / (knots_s[index + 1] - knots_s[index]), 0, 1)
+    blend = s**3 * (10 + s * (6 * s - 15))
+    return values[index] + (values[index + 1] - values[index]) * blend.reshape(-1, *[1] * (values.ndim - 1))
+
+
+def _still(times_s: F64) -> tuple[F64, F64]:
+    """A seated head: breathing and sway of some millimetres."""
+    sway = [0.0015 * np.sin(1.7 * times_s), 0.002 * np.sin(0.9 * times_s + 1), 0.0015 * np.sin(1.6 * times_s)]
+    return np.stack(sway, 1), np.zeros_like(times_s)
+
+
+def _lean(times_s: F64) -> tuple[F64, F64]:
+    """Side to side by 30 cm and back, without a stop: 0.3 m/s at most."""
+    phase = 2 * np.pi * times_s / 3.2
+    neck, pitch = _still(times_s)
+    return neck + np.stack([0.03 * np.cos(phase), 0.15 * np.sin(phase), -0.03 * np.sin(phase) ** 2], 1), pitch
+
+
+def _nod(times_s: F64) -> tuple[F64, F64]:
+    """A nod of 12 degrees at 1 Hz, three at a time, then a pause."""
+    neck, _ = _still(times_s)
+    within = times_s % 5.0
+    envelope = np.clip(np.minimum(within, 3.0 - within) / 0.5, 0, 1)
+    return neck, np.deg2rad(12) * np.sin(2 * np.pi * within) * envelope
+
+
+def _walk(times_s: F64) -> tuple[F64, F64]:
+    """To and fro past the display, 2.4 m at up to 1 m/s, with the bob of steps at 1.9 Hz."""
+    knots = np.arange(0.0, times_s.max() + 4.0, 3.5)
+    side = _minimum_jerk(times_s, knots_s=knots, values=np.where(np.arange(len(knots)) % 2, 1.0, -1.0))
+    bob = 0.02 * np.sin(2 * np.pi * 1.9 * times_s)
+    sway = 0.02 * np.sin(np.pi * 1.9 * times_s)
+    return np.stack([0.3 + 0.1 * side + sway, side, bob], 1), np.zeros_like(times_s)
+
+
+def _stop_and_go(times_s: F64) -> tuple[F64, F64]:
+    """Quick moves of 10 to 30 cm in half a second to a second, between pauses of as long."""
+    random = np.random.default_rng(7)
+    knots, places, place = [0.0], [np.zeros(3)], np.zeros(3)
+    while knots[-1] <= times_s.max():
+        pause, move = random.uniform(0.4, 1.2), random.uniform(0.5, 1.0)
+        target = random.uniform([-0.1, -0.2, -0.05], [0.2, 0.2, 0.05])
+        knots += [knots[-1] + pause, knots[-1] + pause + move]
+        places += [place, target]
+        place = target
+    neck, pitch = _still(times_s)
+    return neck + _minimum_jerk(times_s, knots_s=np.array(knots), values=np.array(places)), pitch
+
+
+MOTIONS: dict[str, Motion] = {
+    "still": _still,
+    "lean": _lean,
+    "nod": _nod,
+    "walk": _walk,
+    "stop-and-go": _stop_and_go,
+}
+
+
+def true_eyes(motion: str, times_s: F64, *, distance_m: float = 0.6) -> F64:
+    """(n, 2, 3) left and right eye in `stack`, metres."""
+    neck, pitch = MOTIONS[motion](times_s)
+    forward, _, up = NECK_TO_EYES_M
+    c, s = np.cos(pitch), np.sin(pitch)
+    middle = neck + np.stack([forward * c + up * s, np.zeros_like(c), up * c - forward * s], 1)
+    middle += np.array([distance_m - forward, 0.0, -up])
+    # The head turns towards the display, and tilts into a lean.
+    yaw, roll = np.arctan2(middle[:, 1], middle[:, 0]), -0.6 * neck[:, 1]
+    across = [-np.sin(yaw) * np.cos(roll), np.cos(yaw) * np.cos(roll), np.sin(roll)]
+    half = IPD_M / 2 * np.stack(across, 1)
+    return np.stack([middle - half, middle + half], 1)
+
+
+def observe(
+    motion: str,
+    *,
+    seconds: float,
+    rate_hz: float,
+    noise_m: float = 0.003,
+    outliers: float = 0.05,
+    dropout_every_s: float = 4.0,
+    dropout_s: float = 0.2,
+    seed: int = 1,
+) -> list[Observation]:
+    """What a sensor delivers of a motion. Outliers put one eye or both 4 to 20 cm off."""
+    random = np.random.default_rng([seed, *motion.encode(), round(rate_hz)])
+    times_s = np.arange(round(seconds * rate_hz)) / rate_hz
+    eyes = true_eyes(motion, times_s) + random.normal(0.0, noise_m, (len(times_s), 2, 3))
+    wrong = random.random(len(times_s)) < outliers
+    direction = random.normal(size=(len(times_s), 3))
+    offset = direction / np.linalg.norm(direction, axis=1, keepdims=True) * random.uniform(0.04, 0.2, (len(times_s), 1))
+    which = random.integers(0, 3, len(times_s))  # 0 left, 1 right, 2 both
+    for eye in (0, 1):
+        hit = wrong & ((which == eye) | (which == 2))
+        eyes[hit, eye] += offset[hit]
+    gap_phase = times_s % dropout_every_s
+    missing = (times_s > 1.0) & (gap_phase >= dropout_every_s - dropout_s) if dropout_every_s else times_s < 0
+    confidence = np.ones(2)
+    return [
+        Observation(round(t * NS_PER_S), None if gone else EyePoints(pair, confidence))
+        for t, pair, gone in zip(times_s, eyes, missing)
+    ]
