@@ -17,24 +17,24 @@ WHITE: Colour = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class Thing:
     """One object: lengths in metres of a display 0.2916 m high, frame `stack` after `centre_m`."""
 
     shape: Shape  # around its own origin
     texture: str
     centre_m: tuple[float, float, float]
     colour: Colour = WHITE  # multiplies the texture
-    rotation: F64 | None = None  # 3x3 stack_from_part
+    rotation: F64 | None = None  # 3x3 stack_from_thing
     turns_per_s: float = 0.0  # about the vertical, where the scene moves
     lit: bool = True
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Parts on a uniform background."""
+    """Things on a uniform background."""
 
     name: str
-    parts: tuple[Part, ...]
+    things: tuple[Thing, ...]
     moving: bool = False
     grey: bool = False
     flat: bool = False  # everything in the middle panel's plane
@@ -44,36 +44,38 @@ def _turned(yaw_deg: float, pitch_deg: float = 0.0) -> F64:
     return shapes.rotation_about(2, np.radians(yaw_deg)) @ shapes.rotation_about(1, np.radians(pitch_deg))
 
 
-def _table() -> Part:
+def _table() -> Thing:
     flat_on_the_ground = shapes.rotation_about(1, -np.pi / 2)
     board = shapes.card(0.20, 0.40, repeat=(1.0, 2.0))
-    return Part(board, "checker", (0.0, 0.0, -0.105), rotation=flat_on_the_ground @ shapes.rotation_about(0, np.pi / 2))
+    return Thing(
+        board, "checker", (0.0, 0.0, -0.105), rotation=flat_on_the_ground @ shapes.rotation_about(0, np.pi / 2)
+    )
 
 
-def _demo(turns_per_s: float = 0.0) -> tuple[Part, ...]:
+def _demo(turns_per_s: float = 0.0) -> tuple[Thing, ...]:
     return (
         _table(),
-        Part(shapes.card(0.17, 0.11), "picture", (-0.11, -0.085, 0.005), rotation=_turned(8), lit=False),
-        Part(shapes.fence(0.13, 0.09, bars=14, bar_m=0.0016), "plain", (-0.09, 0.10, -0.05), (0.20, 0.32, 0.42)),
-        Part(shapes.sphere(0.038), "globe", (-0.035, 0.095, 0.045), turns_per_s=turns_per_s),
-        Part(
+        Thing(shapes.card(0.17, 0.11), "picture", (-0.11, -0.085, 0.005), rotation=_turned(8), lit=False),
+        Thing(shapes.fence(0.13, 0.09, bars=14, bar_m=0.0016), "plain", (-0.09, 0.10, -0.05), (0.20, 0.32, 0.42)),
+        Thing(shapes.sphere(0.038), "globe", (-0.035, 0.095, 0.045), turns_per_s=turns_per_s),
+        Thing(
             shapes.box((0.062,) * 3),
             "crate",
             (-0.005, -0.02, -0.073),
             rotation=_turned(28),
             turns_per_s=turns_per_s / 2,
         ),
-        Part(
+        Thing(
             shapes.torus(0.032, 0.0115),
             "stripes",
             (0.06, 0.085, -0.062),
             rotation=_turned(-32, -18),
             turns_per_s=-turns_per_s,
         ),
-        Part(
+        Thing(
             shapes.lettering("PHASE", cell_m=0.0042, depth_m=0.004), "plain", (0.07, -0.055, 0.052), (0.93, 0.36, 0.12)
         ),
-        Part(
+        Thing(
             shapes.lettering("3D", cell_m=0.0046, depth_m=0.008),
             "plain",
             (0.095, -0.115, -0.070),
@@ -83,24 +85,24 @@ def _demo(turns_per_s: float = 0.0) -> tuple[Part, ...]:
     )
 
 
-def _sparse() -> tuple[Part, ...]:
-    return (Part(shapes.torus(0.032, 0.0115), "stripes", (0.02, 0.03, 0.0), rotation=_turned(-32, -18)),)
+def _sparse() -> tuple[Thing, ...]:
+    return (Thing(shapes.torus(0.032, 0.0115), "stripes", (0.02, 0.03, 0.0), rotation=_turned(-32, -18)),)
 
 
-def _texture() -> tuple[Part, ...]:
+def _texture() -> tuple[Thing, ...]:
     """A wall that fills the picture from everywhere before the display, with things before it."""
     wall = shapes.card(3.2, 2.4, repeat=(12.0, 9.0))
-    return (Part(wall, "picture", (-0.10, 0.0, 0.0), lit=False), *_demo()[3:])
+    return (Thing(wall, "mosaic", (-0.10, 0.0, 0.0), lit=False), *_demo()[3:])
 
 
-def _flat() -> tuple[Part, ...]:
-    return (Part(shapes.card(0.44, 0.25, repeat=(1.76, 1.0)), "picture", (0.0, 0.0, 0.0), lit=False),)
+def _flat() -> tuple[Thing, ...]:
+    return (Thing(shapes.card(0.44, 0.25, repeat=(1.76, 1.0)), "picture", (0.0, 0.0, 0.0), lit=False),)
 
 
-def _thin() -> tuple[Part, ...]:
+def _thin() -> tuple[Thing, ...]:
     """Everything within 6 mm of the middle panel's plane."""
-    near = Part(shapes.lettering("PHASE", cell_m=0.007, depth_m=0.002), "plain", (0.005, 0.0, 0.0), (0.93, 0.36, 0.12))
-    return (Part(shapes.card(0.34, 0.20, repeat=(1.7, 1.0)), "globe", (-0.006, 0.0, 0.0), lit=False), near)
+    near = Thing(shapes.lettering("PHASE", cell_m=0.007, depth_m=0.002), "plain", (0.005, 0.0, 0.0), (0.93, 0.36, 0.12))
+    return (Thing(shapes.card(0.34, 0.20, repeat=(1.7, 1.0)), "globe", (-0.006, 0.0, 0.0), lit=False), near)
 
 
 SCENES: dict[str, tuple[str, Callable[[], Scene]]] = {

@@ -34,11 +34,6 @@ def _noise(seed: int, octaves: int = 4) -> F64:
     return (total - total.min()) / np.ptp(total)
 
 
-def plain() -> U8:
-    """White: the object's own colour shows."""
-    return _mixed(np.ones((SIZE_PX, SIZE_PX)), (255, 255, 255), (255, 255, 255))
-
-
 def checker() -> U8:
     """Squares, 8 x 8, with fine lines between them."""
     u, v = _coordinates()
@@ -85,9 +80,26 @@ def picture() -> U8:
     return np.clip(np.rint(rgb), 0, 255).astype(np.uint8)
 
 
-LAYERS = {"plain": plain, "checker": checker, "crate": crate, "globe": globe, "stripes": stripes, "picture": picture}
+def mosaic() -> U8:
+    """Coloured tiles with grout and grain; repeats without a seam."""
+    u, v = _coordinates()
+    column, row = (np.floor(u * 12)).astype(int), (np.floor(v * 12)).astype(int)
+    colours = np.random.default_rng(23).uniform(0.25, 1.0, (12, 12, 3))[row, column]
+    grout = np.minimum(np.abs(u * 12 - np.rint(u * 12)), np.abs(v * 12 - np.rint(v * 12))) < 0.06
+    rgb = np.where(grout[..., None], 0.82, colours * (0.7 + 0.3 * _noise(29, 5)[..., None]))
+    return np.concatenate([np.rint(rgb * 255), np.full((SIZE_PX, SIZE_PX, 1), 255.0)], axis=2).astype(np.uint8)
 
 
-def texture_array() -> tuple[U8, dict[str, int]]:
-    """(n, 256, 256, 4) of all textures, and each one's index by name."""
-    return np.stack([make() for make in LAYERS.values()]), {name: index for index, name in enumerate(LAYERS)}
+TEXTURES = {
+    "checker": checker,
+    "crate": crate,
+    "globe": globe,
+    "stripes": stripes,
+    "mosaic": mosaic,
+    "picture": picture,
+}
+
+
+def texture(name: str) -> U8 | None:
+    """A texture by name, (256, 256, 4); None for `plain`: the object's own colour shows."""
+    return None if name == "plain" else TEXTURES[name]()

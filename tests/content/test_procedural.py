@@ -13,7 +13,7 @@ from runtime.content.base import View
 from runtime.content.camera import project
 from runtime.content.images import image_from_view
 from runtime.content.procedural import ProceduralSource
-from runtime.content.scenes import SCENES, Part, Scene
+from runtime.content.scenes import SCENES, Scene, Thing
 from runtime.optics.stack import PanelStack
 from tests.content.conftest import image_view, panel_view
 
@@ -27,8 +27,8 @@ EYES = {
 POINTS = ((0.0, 0.0, 0.0), (-0.1, 0.03, 0.02), (0.09, -0.02, -0.03))
 
 
-def bead(centre_m: tuple[float, float, float], colour: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Part:
-    return Part(shapes.sphere(0.004), "plain", centre_m, colour, lit=False)
+def bead(centre_m: tuple[float, float, float], colour: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Thing:
+    return Thing(shapes.sphere(0.004), "plain", centre_m, colour, lit=False)
 
 
 def centroid_px(picture: np.ndarray) -> np.ndarray:

@@ -1,0 +1,278 @@
+"""Triangles with colours, pictures and one lamp, drawn straight into the pixels that a view asks for.
+
+A part pays only for what it has: without lamp, picture, vertex colours or holes its shader has none of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import moderngl
+import numpy as np
+
+from runtime.content import camera
+from runtime.content.base import View
+from runtime.content.canvas import Canvas
+from runtime.content.fringe import Edges, edges_of, ramps, silhouette
+from runtime.content.shapes import Shape
+from runtime.records import F32, F64, U8
+
+MOST_OUTLINED = 200_000  # triangles of a part; beyond, finding its outline costs more than drawing it
+OUTLINE_BYTES = 6 * (5 + 8) * 4  # two triangles an edge: clip coordinates and coverage, then the attributes
+OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
+
+VERTEX = """
+#ifdef OUTLINE
+in vec4 in_clip;
+in float in_coverage;
+#else
+uniform mat4 clip_from_part;
+in vec3 in_position;
+#endif
+in vec3 in_normal;
+in vec2 in_uv;
+in vec3 in_colour;
+uniform mat3 stack_from_part;
+uniform vec3 colour;
+out vec2 uv;
+out vec3 shade;
+out float coverage;
+const vec3 TO_LAMP = vec3(0.66, -0.36, 0.66);
+void main() {
+    shade = colour;
+#ifdef COLOURED
+    shade *= in_colour;
+#endif
+#ifdef LIT
+    float lamp = 0.5 + 0.5 * dot(stack_from_part * in_normal, TO_LAMP);
+    shade *= 0.38 + 0.62 * lamp;
+#endif
+    uv = in_uv;
+#ifdef OUTLINE
+    coverage = in_coverage;
+    gl_Position = in_clip;
+#else
+    coverage = 1.0;
+    gl_Position = clip_from_part * vec4(in_position, 1.0);
+#endif
+}
+"""
+FRAGMENT = """
+in vec2 uv;
+in vec3 shade;
+in float coverage;
+out vec4 pixel;
+uniform sampler2D picture;
+void main() {
+    vec3 rgb = shade;
+#ifdef PICTURE
+    vec4 texel = texture(picture, uv);
+    rgb *= texel.rgb;
+#ifdef HOLES
+    if (texel.a < 0.5) discard;
+#endif
+#endif
+#ifdef GREY
+    rgb = vec3(dot(rgb, vec3(0.299, 0.587, 0.114)));
+#endif
+    pixel = vec4(rgb, coverage);
+}
+"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """Triangles of one material, in their own frame."""
+
+    shape: Shape
+    picture: U8 | None = None  # (h, w, 4) RGBA, row 0 at uv 0; parts may share one array
+    colour: tuple[float, float, float] = (1.0, 1.0, 1.0)  # multiplies everything, 0-1
+    vertex_colours: F32 | None = None  # (v, 3), 0-1
+    lit: bool = True
+    grey: bool = False
+    turning: bool = False  # its placement changes: it is boxed for every orientation
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """The shader switches that it needs."""
+        switches = {
+            "LIT": self.lit,
+            "PICTURE": self.picture is not None,
+            "HOLES": self.picture is not None and bool((self.picture[..., 3] < 128).any()),
+            "COLOURED": self.vertex_colours is not None,
+            "GREY": self.grey,
+        }
+        return tuple(name for name, wanted in switches.items() if wanted)
+
+
+@dataclass(frozen=True, slots=True)
+class _Uploaded:
+    part: Part
+    surface: Any
+    outline: Any
+    outline_buffer: Any
+    edges: Edges | None
+    texture: Any
+    surface_program: Any
+    outline_program: Any
+    corners_m: F64  # (8, 3) of the box that holds it; frame of the part
+    attributes: F32  # (v, 8)
+
+
+class TrianglePainter:
+    """Uploads parts once and draws them through any view."""
+
+    def __init__(
+        self,
+        parts: Sequence[Part],
+        *,
+        context: Any,
+        background: tuple[float, float, float],
+        samples: int = 0,
+    ) -> None:
+        """samples: per pixel, for outlines; 0: ramps along the outlines, which a software rasteriser draws faster."""
+        self._context = context
+        self._canvas = Canvas(context, samples=samples, background=background)
+        self._with_ramps = samples == 0
+        self._programs: dict[tuple[str, ...], Any] = {}
+        self._textures: dict[int, Any] = {}
+        self._parts = [self._upload(part) for part in parts]
+
+    def corners_m(self, stack_from_parts: Sequence[F64]) -> F64:
+        """(8n, 3) corners in the stack frame of the boxes that hold the parts."""
+        placed = zip(self._parts, stack_from_parts, strict=True)
+        return np.concatenate([item.corners_m @ matrix[:3, :3].T + matrix[:3, 3] for item, matrix in placed])
+
+    def paint(self, view: View, stack_from_parts: Sequence[F64]) -> U8:
+        """The parts at their places (4x4 each, a similarity), over the background."""
+        size = {"width_px": view.width_px, "height_px": view.height_px}
+        corners = self.corners_m(stack_from_parts).reshape(-1, 8, 3)
+        bounds = camera.depth_bounds(view.pixels_from_stack, corners.reshape(-1, 3))
+        boxes = [camera.covered_box(view.pixels_from_stack, part, **size) for part in corners]
+        area = camera.union(boxes) if bounds else camera.PixelBox(0, 0, 0, 0)
+        # Nearest first: what they hide need not be shaded.
+        order = np.argsort(-corners[..., 0].mean(1), kind="stable")
+        placed = [(self._parts[index], stack_from_parts[index]) for index in order]
+
+        def draw() -> None:
+            near_m, far_m = bounds or (0.0, 0.0)
+            clip = camera.clip_from_stack(view.pixels_from_stack, near_m=near_m, far_m=far_m, **size)
+            self._context.enable_only(self._context.DEPTH_TEST)
+            for item, stack_from_part in placed:
+                self._describe(item.surface_program, item, stack_from_part)
+                item.surface_program["clip_from_part"].write(_gl(clip @ stack_from_part))
+                item.surface.render()
+            if self._with_ramps:
+                self._draw_outlines(placed, clip, view)
+
+        return self._canvas.draw(side=view.side, box=area, paint=draw, **size)
+
+    def close(self) -> None:
+        """Release every GL object. May be called twice."""
+        self._canvas.close()
+        for item in self._parts:
+            for held in (item.surface, item.outline, item.outline_buffer):
+                held.release()
+        for shared in (*self._textures.values(), *self._programs.values()):
+            shared.release()
+        self._parts, self._textures, self._programs = [], {}, {}
+
+    def _upload(self, part: Part) -> _Uploaded:
+        mesh, context = part.shape, self._context
+        surface_program, outline_program = self._program(part.features), self._program((*part.features, "OUTLINE"))
+        attributes = _attributes(part)
+        packed = np.concatenate([mesh.positions_m, attributes], axis=1, dtype=np.float32)
+        triangles = context.buffer(np.ascontiguousarray(mesh.triangles, np.int32).tobytes())
+        names = ("in_normal", "in_uv", "in_colour")
+        surface = context.vertex_array(
+            surface_program,
+            [_layout(surface_program, context.buffer(packed.tobytes()), ("in_position", *names), (3, 3, 2, 3))],
+            index_buffer=triangles,
+        )
+        outlined = self._with_ramps and len(mesh.triangles) <= MOST_OUTLINED
+        edges = edges_of(mesh) if outlined else None
+        buffer = context.buffer(reserve=max(len(edges.faces) if edges else 0, 1) * OUTLINE_BYTES, dynamic=True)
+        layout = _layout(outline_program, buffer, ("in_clip", "in_coverage", *names), (4, 1, 3, 2, 3))
+        low, high = mesh.positions_m.min(0), mesh.positions_m.max(0)
+        if part.turning:
+            reach = float(np.linalg.norm(mesh.positions_m, axis=1).max())
+            low, high = np.full(3, -reach), np.full(3, reach)
+        return _Uploaded(
+            part=part,
+            surface=surface,
+            outline=context.vertex_array(outline_program, [layout]),
+            outline_buffer=buffer,
+            edges=edges,
+            texture=None if part.picture is None else self._texture(part.picture),
+            surface_program=surface_program,
+            outline_program=outline_program,
+            corners_m=camera.box_corners(low, high),
+            attributes=attributes,
+        )
+
+    def _program(self, features: tuple[str, ...]) -> Any:
+        if features not in self._programs:
+            head = "#version 330\n" + "".join(f"#define {name}\n" for name in features)
+            self._programs[features] = self._context.program(
+                vertex_shader=head + VERTEX, fragment_shader=head + FRAGMENT
+            )
+        return self._programs[features]
+
+    def _texture(self, picture: U8) -> Any:
+        if id(picture) not in self._textures:
+            height, width = picture.shape[:2]
+            texture = self._context.texture((width, height), 4, np.ascontiguousarray(picture).tobytes())
+            texture.build_mipmaps()
+            texture.filter = (self._context.LINEAR_MIPMAP_NEAREST, self._context.LINEAR)
+            self._textures[id(picture)] = texture
+        return self._textures[id(picture)]
+
+    def _describe(self, program: Any, item: _Uploaded, stack_from_part: F64) -> None:
+        linear = stack_from_part[:3, :3]
+        if "stack_from_part" in program:
+            program["stack_from_part"].write(_gl(linear / np.cbrt(abs(np.linalg.det(linear)))))
+        program["colour"] = item.part.colour
+        if item.texture is not None:
+            item.texture.use(0)
+
+    def _draw_outlines(self, placed: list[tuple[_Uploaded, F64]], clip_from_stack: F64, view: View) -> None:
+        context, framebuffer = self._context, self._context.fbo
+        context.enable_only(context.DEPTH_TEST | context.BLEND)
+        context.blend_func = OVER
+        framebuffer.depth_mask = False
+        for item, stack_from_part in reversed(placed):
+            if item.edges is None:
+                continue
+            eye = np.linalg.solve(stack_from_part, np.append(view.eye_m, 1.0))[:3]
+            ends, apex = silhouette(item.edges, eye)
+            clip_from_part = clip_from_stack @ stack_from_part
+            clip = item.part.shape.positions_m @ clip_from_part[:, :3].T + clip_from_part[:, 3]
+            corners, vertices, _ = ramps(clip, ends, apex, width_px=view.width_px, height_px=view.height_px)
+            if not len(corners):
+                continue
+            packed = np.concatenate([corners.reshape(-1, 5), item.attributes[vertices.reshape(-1)]], axis=1)
+            item.outline_buffer.write(packed)
+            self._describe(item.outline_program, item, stack_from_part)
+            item.outline.render(vertices=len(packed))
+        framebuffer.depth_mask = True
+
+
+def _attributes(part: Part) -> F32:
+    """(v, 8): normal, texture coordinates, colour."""
+    mesh = part.shape
+    colours = np.ones_like(mesh.positions_m) if part.vertex_colours is None else part.vertex_colours
+    return np.concatenate([mesh.normals, mesh.uv, colours], axis=1, dtype=np.float32)
+
+
+def _gl(matrix: F64) -> F32:
+    """Column by column, as GL reads a matrix."""
+    return np.ascontiguousarray(matrix.T, np.float32)
+
+
+def _layout(program: Any, buffer: Any, names: tuple[str, ...], sizes: tuple[int, ...]) -> tuple[Any, ...]:
+    """A buffer's description for a program; what the compiler left out is skipped."""
+    used = [name for name in names if name in program]
+    formats = [f"{size}f" if name in used else f"{size * 4}x" for name, size in zip(names, sizes, strict=True)]
+    return (buffer, " ".join(formats), *used)
