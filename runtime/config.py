@@ -22,6 +22,7 @@ S = TypeVar("S", bound=Section)
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
+Unit = Annotated[float, Field(ge=0, le=1)]
 
 
 class StackGeometry(Section):
@@ -108,7 +109,37 @@ class ContentSettings(Section):
     scene: str = Field("demo", description="a preset's name, `demo`, or a file or folder")
     reading: Literal["seed", "published-code"] = Field("seed", description="how a preset's d_thick is read")
     fov_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="horizontal field of view of eye images")
-    background: tuple[float, float, float] = Field((1.0, 1.0, 1.0), description="colour behind the scene, 0-1")
+    background: tuple[Unit, Unit, Unit] = Field((1.0, 1.0, 1.0), description="colour behind the scene, 0-1")
+    file: str = Field("", description="a preset's data: its .ply or .glb, or its data-set folder; empty: a stand-in")
+    layout: Literal["auto", "mono", "side-by-side", "top-bottom", "quilt", "rgbd"] = Field(
+        "auto", description="how a picture or video holds its views; auto: by its name (_sbs, _tb, _qs8x6, _rgbd)"
+    )
+    quilt: tuple[int, int] = Field((0, 0), description="columns and rows of a quilt; 0, 0: from the file's name")
+    cone_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="angle that a quilt's views span")
+    depth_m: tuple[float, float] = Field(
+        (-0.05, 0.05), description="rear and front between which an RGBD picture or a fitted mesh lies, along x"
+    )
+    picture_rate_hz: Positive = Field(30.0, description="pictures a second of a folder of pictures")
+    at_end: Literal["repeat", "hold"] = Field("repeat", description="what a video does at its end")
+    fit: bool = Field(True, description="scale and centre a mesh or splat without a preset to the display")
+    up: Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"] = Field(
+        "auto", description="the axis of a mesh or splat that is up; auto: +y, for PLY +z (see `out`)"
+    )
+    out: Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"] = Field(
+        "auto", description="the axis of a mesh or splat that faces the viewer; auto: +z, for PLY +x"
+    )
+    samples: Annotated[int, Field(ge=0, le=16)] = Field(
+        0, description="samples a pixel for outlines; 0: smooth outlines that a software rasteriser draws faster"
+    )
+    external: str = Field("/run/phasestack/content.sock", description="socket of another program's pictures")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ContentSettings:
+        if self.depth_m[0] >= self.depth_m[1]:
+            raise ValueError("depth_m: must be rear, then front")
+        if (self.up == "auto") != (self.out == "auto") or (self.up != "auto" and self.up[1] == self.out[1]):
+            raise ValueError("up and out: must be two different axes, or both auto")
+        return self
 
 
 class ModelSettings(Section):
