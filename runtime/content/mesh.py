@@ -1,0 +1,171 @@
+"""glTF/GLB, OBJ and PLY meshes, loaded by trimesh and drawn with one lamp."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.shapes import Shape
+from runtime.content.triangles import Part, TrianglePainter
+from runtime.errors import InputError, MissingPart
+from runtime.records import F64, U8
+
+SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
+LARGEST_TEXTURE_PX = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class MeshData:
+    """A loaded file, in its own coordinates."""
+
+    name: str
+    parts: tuple[Part, ...]
+    low: F64  # (3,) corner of the box that holds it
+    high: F64
+
+
+def load_mesh(path: Path) -> MeshData:
+    """Read a file. Raises InputError: unreadable, no faces, NaN vertices, a texture missing."""
+    try:
+        import trimesh
+    except ImportError:
+        raise MissingPart("meshes need trimesh: pip install trimesh") from None
+    if not path.is_file():
+        raise InputError(path, "", "is not there")
+    _refuse_what_loaders_hide(path)
+    try:
+        scene = trimesh.load_scene(path, process=False)
+        geometries: list[Any] = list(scene.dump())
+    except Exception as error:  # loaders raise whatever their parsers do
+        raise InputError(path, "", f"cannot be read as a mesh ({type(error).__name__}: {str(error)[:120]})") from None
+    meshes = [item for item in geometries if getattr(item, "faces", None) is not None and len(item.faces)]
+    if not meshes:
+        raise InputError(path, "faces", "there are none")
+    pictures: dict[int, U8] = {}
+    parts = tuple(_part(mesh, path, pictures) for mesh in meshes)
+    corners = np.array([bound(part.shape.positions_m, axis=0) for part in parts for bound in (np.min, np.max)])
+    return MeshData(path.stem, parts, corners.min(0).astype(np.float64), corners.max(0).astype(np.float64))
+
+
+def _part(mesh: Any, path: Path, pictures: dict[int, U8]) -> Part:
+    vertices = np.asarray(mesh.vertices)
+    if not np.isfinite(vertices).all():
+        broken = int((~np.isfinite(vertices).all(1)).sum())
+        raise InputError(path, "vertices", f"{broken} of {len(vertices)} are not finite")
+    faces = np.asarray(mesh.faces)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(path, "faces", "refer to vertices that are not there")
+    uv, picture, colour, colours = None, None, (1.0, 1.0, 1.0), None
+    kind = mesh.visual.kind
+    if kind == "texture":
+        uv = mesh.visual.uv
+        picture, colour = _material(mesh.visual.material, pictures)
+        attributes = getattr(mesh.visual, "vertex_attributes", {})
+        if picture is None and "color" in attributes:
+            colours = _unit(np.asarray(attributes["color"])[:, :3])
+    elif kind == "face":
+        colours_of_faces = _unit(np.asarray(mesh.visual.face_colors)[:, :3])
+        vertices, colours = vertices[faces].reshape(-1, 3), np.repeat(colours_of_faces, 3, axis=0)
+        normals = np.repeat(mesh.face_normals, 3, axis=0)
+        faces = np.arange(len(vertices)).reshape(-1, 3)
+    elif kind == "vertex":
+        colours = _unit(np.asarray(mesh.visual.vertex_colors)[:, :3])
+    if kind != "face":
+        normals = np.asarray(mesh.vertex_normals)
+    textured = picture is not None and uv is not None
+    flipped = (
+        np.column_stack([uv[:, 0], 1.0 - uv[:, 1]]) if textured and uv is not None else np.zeros((len(vertices), 2))
+    )
+    if not np.isfinite(flipped).all():
+        raise InputError(path, "texture coordinates", "are not all finite")
+    shape = Shape(
+        vertices.astype(np.float32), normals.astype(np.float32), flipped.astype(np.float32), faces.astype(np.int32)
+    )
+    return Part(shape, picture=picture if textured else None, colour=colour, vertex_colours=colours)
+
+
+def _unit(colours: Any) -> Any:
+    """Colours of either type as floats in [0, 1]."""
+    scale = 255.0 if colours.dtype.kind in "ui" and colours.dtype.itemsize == 1 else 1.0
+    return np.clip(colours.astype(np.float32) / scale, 0.0, 1.0)
+
+
+def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, tuple[float, float, float]]:
+    """Texture (RGBA) and colour of a trimesh material of either kind."""
+    image = getattr(material, "baseColorTexture", None)
+    factor = getattr(material, "baseColorFactor", None)
+    if image is None and factor is None:
+        image, factor = getattr(material, "image", None), getattr(material, "diffuse", None)
+        if image is not None:
+            factor = None
+    colour = (1.0, 1.0, 1.0) if factor is None else tuple(float(value) for value in _unit(np.asarray(factor)[:3]))
+    if image is None:
+        return None, colour  # type: ignore[return-value]
+    if id(image) not in pictures:
+        if max(image.size) > LARGEST_TEXTURE_PX:
+            image.thumbnail((LARGEST_TEXTURE_PX, LARGEST_TEXTURE_PX))
+        pictures[id(image)] = np.asarray(image.convert("RGBA"))
+    return pictures[id(image)], colour  # type: ignore[return-value]
+
+
+def _refuse_what_loaders_hide(path: Path) -> None:
+    """The loader passes over a texture that isn't there, and over an OBJ's vertices that aren't numbers."""
+    wanted: list[str] = []
+    if path.suffix.lower() == ".gltf":
+        try:
+            table = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InputError(path, "", f"malformed: {error}") from None
+        wanted = [str(image.get("uri", "")) for image in table.get("images", []) if isinstance(image, dict)]
+    elif path.suffix.lower() == ".obj":
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        positions = [line for line in lines if line.startswith("v ")]
+        broken = sum("nan" in line.lower() or "inf" in line.lower() for line in positions)
+        if broken:
+            raise InputError(path, "vertices", f"{broken} of {len(positions)} are not finite")
+        for line in lines:
+            if line.startswith("mtllib "):
+                library = path.parent / line.split(maxsplit=1)[1].strip()
+                if not library.is_file():
+                    raise InputError(path, "mtllib", f"{library.name} is not there")
+                text = library.read_text(encoding="utf-8", errors="replace").splitlines()
+                wanted += [item.split()[-1] for item in text if item.strip().startswith("map_Kd")]
+    for name in wanted:
+        if name and not name.startswith("data:") and not (path.parent / name).is_file():
+            raise InputError(path, "texture", f"{name} is not there")
+
+
+class MeshSource(ContentSource):
+    """A loaded mesh at its place in the stack frame."""
+
+    def __init__(
+        self,
+        data: MeshData,
+        *,
+        stack_from_scene: F64,
+        context: Any,
+        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        samples: int = 0,
+    ) -> None:
+        self._painter = TrianglePainter(data.parts, context=context, background=background, samples=samples)
+        self._placed = [stack_from_scene] * len(data.parts)
+        corners = self._painter.corners_m(self._placed)
+        used = {feature for part in data.parts for feature in part.features}
+        names = {"PICTURE": "textures", "COLOURED": "vertex colours", "HOLES": "cut-outs"}
+        self.info = ContentInfo(
+            name=data.name,
+            depth_range_m=(float(corners[:, 0].min()), float(corners[:, 0].max())),
+            background=background,
+            left_out=tuple(text for feature, text in names.items() if feature not in used),
+        )
+
+    def render(self, view: View, *, time_ns: int) -> U8:
+        return self._painter.paint(view, self._placed)
+
+    def close(self) -> None:
+        self._painter.close()

@@ -1,0 +1,163 @@
+"""Meshes from files: placed, coloured, textured; and what a broken file is told."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from runtime.config import ContentSettings
+from runtime.content.camera import project
+from runtime.content.mesh import MeshSource, load_mesh
+from runtime.content.placing import stack_from_scene
+from runtime.errors import InputError
+from runtime.optics.stack import PanelStack
+from tests.content.conftest import panel_view
+
+EYE = (0.7, 0.05, 0.1)
+
+
+def source_of(path: Path, context: Any, stack: PanelStack, **settings: Any) -> MeshSource:
+    data = load_mesh(path)
+    matrix = stack_from_scene(
+        data.low, data.high, settings=ContentSettings(**settings), path=path, stack=stack, scene_from_stack=None
+    )
+    return MeshSource(data, stack_from_scene=matrix, context=context)
+
+
+def textured_quad(folder: Path, suffix: str) -> Path:
+    """A square that faces +z with y up, its picture red above, green below left, blue below right."""
+    picture = np.zeros((64, 64, 3), np.uint8)
+    picture[:32] = (255, 0, 0)
+    picture[32:, :32] = (0, 255, 0)
+    picture[32:, 32:] = (0, 0, 255)
+    vertices = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
+    uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(picture))
+    if suffix == ".obj":
+        material = trimesh.visual.material.SimpleMaterial(image=Image.fromarray(picture))
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    mesh = trimesh.Trimesh(vertices, [[0, 1, 2], [0, 2, 3]], visual=visual, process=False)
+    path = folder / f"quad{suffix}"
+    mesh.export(path)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+def test_a_picture_is_upright_and_not_mirrored(tmp_path: Path, context: Any, stack: PanelStack, suffix: str) -> None:
+    source = source_of(textured_quad(tmp_path, suffix), context, stack)
+    picture = source.render(panel_view((0.7, 0.0, 0.0), stack.panel(1)), time_ns=0)
+    rows, columns = np.nonzero(picture[..., 3] == 255)
+    top, bottom = rows.min() + 20, rows.max() - 20
+    left, right = columns.min() + 20, columns.max() - 20
+    assert picture[top, left].argmax() in (0, 3)
+    assert picture[top, left, :3].argmax() == 0
+    assert picture[top, right, :3].argmax() == 0
+    assert picture[bottom, left, :3].argmax() == 1
+    assert picture[bottom, right, :3].argmax() == 2
+    assert "textures" not in source.info.left_out
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".ply", ".obj"])
+def test_vertex_colours_are_kept(tmp_path: Path, context: Any, stack: PanelStack, suffix: str) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    ball.visual.vertex_colors = np.tile([20, 200, 60, 255], (len(ball.vertices), 1))
+    path = tmp_path / f"ball{suffix}"
+    ball.export(path)
+    source = source_of(path, context, stack)
+    picture = source.render(panel_view(EYE, stack.panel(1)), time_ns=0)
+    seen = picture[picture[..., 3] == 255][:, :3].astype(float)
+    assert len(seen) > 1000
+    assert np.median(seen[:, 0] / seen[:, 1]) == pytest.approx(0.1, abs=0.03)
+    assert np.median(seen[:, 2] / seen[:, 1]) == pytest.approx(0.3, abs=0.03)
+    assert "textures" in source.info.left_out
+
+
+def test_a_vertex_lands_where_the_projection_says(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    tip = np.array([[0.05, 0.1, 0.06]])
+    cone = trimesh.Trimesh(
+        [*tip, [0.0, 0.0, 0.0], [0.0, 0.02, 0.0], [0.0, 0.0, 0.02]], [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]]
+    )
+    path = tmp_path / "cone.ply"
+    cone.export(path)
+    source = source_of(path, context, stack, fit=False)
+    view = panel_view((0.6, 0.0, 0.0), stack.panel(1))
+    picture = source.render(view, time_ns=0)
+    expected = project(view.pixels_from_stack, tip)[0][0]
+    rows, columns = np.nonzero(picture[..., 3] > 0)
+    farthest = columns.argmax()
+    assert np.hypot(columns[farthest] + 0.5 - expected[0], rows[farthest] + 0.5 - expected[1]) < 2.5
+
+
+def test_a_fitted_mesh_fills_the_display_or_its_depth(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    path = tmp_path / "box.glb"
+    trimesh.creation.box((100.0, 20.0, 30.0)).export(path)
+    rear, front = source_of(path, context, stack, depth_m=(-0.3, 0.3)).info.depth_range_m or (0, 0)
+    assert front == pytest.approx(-rear)
+    assert front - rear == pytest.approx(30 * 0.85 * stack.width_m / 100, rel=1e-3)
+    rear, front = source_of(path, context, stack, depth_m=(-0.01, 0.03)).info.depth_range_m or (0, 0)
+    assert (rear, front) == pytest.approx((-0.01, 0.03), abs=1e-4)
+
+
+def test_a_mesh_without_faces_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "points.ply"
+    trimesh.PointCloud(np.random.default_rng(0).random((10, 3))).export(path)
+    with pytest.raises(InputError, match=r"points.ply: faces: there are none"):
+        load_mesh(path)
+
+
+def test_nan_vertices_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "nan.obj"
+    path.write_text("v 0 0 0\nv 1 0 nan\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n")
+    with pytest.raises(InputError, match=r"nan.obj: vertices: 1 of 4 are not finite"):
+        load_mesh(path)
+
+
+def test_nan_vertices_of_a_ply_are_refused(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    vertices = ball.vertices.copy()
+    vertices[3, 1] = np.nan
+    path = tmp_path / "nan.ply"
+    trimesh.Trimesh(vertices, ball.faces, process=False).export(path)
+    with pytest.raises(InputError, match=r"nan.ply: vertices: 1 of 42 are not finite"):
+        load_mesh(path)
+
+
+def test_a_missing_texture_is_named(tmp_path: Path) -> None:
+    path = textured_quad(tmp_path, ".obj")
+    for image in [*tmp_path.glob("*.png"), *tmp_path.glob("*.jpeg"), *tmp_path.glob("*.jpg")]:
+        image.unlink()
+    with pytest.raises(InputError, match=r"quad.obj: texture: .* is not there"):
+        load_mesh(path)
+
+
+def test_a_missing_gltf_image_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.gltf"
+    path.write_text(json.dumps({"asset": {"version": "2.0"}, "images": [{"uri": "skin.png"}]}))
+    with pytest.raises(InputError, match=r"a.gltf: texture: skin.png is not there"):
+        load_mesh(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a mesh", b"glTF\x02\x00\x00\x00"])
+@pytest.mark.parametrize("suffix", [".glb", ".ply", ".obj", ".gltf"])
+def test_a_broken_file_is_one_line(tmp_path: Path, suffix: str, content: bytes) -> None:
+    path = tmp_path / f"broken{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(InputError) as refused:
+        load_mesh(path)
+    assert "\n" not in str(refused.value)
+    assert str(path) in str(refused.value)
+
+
+def test_a_scene_wholly_behind_the_viewer_is_refused(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    box.apply_translation([2.0, 0.0, 0.0])
+    path = tmp_path / "behind.ply"
+    box.export(path)
+    with pytest.raises(InputError, match=r"behind.ply: position: .*wholly behind the viewer"):
+        source_of(path, context, stack, fit=False)
