@@ -1,0 +1,94 @@
+"""Where the sensor sees the eyes, over the last half second: what is paired with a viewpoint when it is accepted."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import theilslopes
+
+from runtime.clock import NS_PER_S
+from runtime.records import F64, EyePoints
+
+LEAST_SAMPLES = 5
+LEAST_CONFIDENCE = 0.3
+OUTLIER_MADS = 5.0
+OUTLIER_FLOOR_M = 0.01
+MAD_TO_SIGMA = 1.4826
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """The midpoint of the eyes over a window."""
+
+    midpoint_m: F64  # (3,) frame `sensor`
+    spread_m: float  # robust RMS distance of the samples from it
+    samples: int
+
+
+@dataclass(frozen=True, slots=True)
+class TruePair:
+    """A stretch of a recording that knows its truth."""
+
+    measured: Measured
+    true_m: F64  # (3,) frame `stack`, over the same samples
+    start_s: float  # from the recording's beginning
+
+
+def midpoint(eyes: EyePoints | None) -> F64 | None:
+    """(3,) middle of two measured eyes; None where one is missing, uncertain or filled in."""
+    if eyes is None or eyes.completed or eyes.confidence.min() < LEAST_CONFIDENCE:
+        return None
+    middle = eyes.eyes_m.mean(axis=0)
+    return middle if np.isfinite(middle).all() else None
+
+
+class EyeWindow:
+    """The samples of the last `window_s` before the newest one."""
+
+    def __init__(self, window_s: float) -> None:
+        self._length_ns = round(window_s * NS_PER_S)
+        self._samples: deque[tuple[int, F64]] = deque()
+
+    def add(self, capture_ns: int, eyes: EyePoints | None) -> None:
+        """Take in a sample in frame `sensor`; unusable ones only let time pass."""
+        middle = midpoint(eyes)
+        if middle is not None:
+            self._samples.append((capture_ns, middle))
+        while self._samples and self._samples[0][0] <= capture_ns - self._length_ns:
+            self._samples.popleft()
+
+    def clear(self) -> None:
+        """Forget all: what was seen before does not belong to what comes."""
+        self._samples.clear()
+
+    def measure(self) -> Measured | None:
+        """Median and spread; None with fewer than `LEAST_SAMPLES` samples."""
+        if len(self._samples) < LEAST_SAMPLES:
+            return None
+        points = np.array([point for _, point in self._samples])
+        centre = np.median(points, axis=0)
+        mad_m = np.median(np.abs(points - centre), axis=0) * MAD_TO_SIGMA
+        return Measured(centre, float(np.linalg.norm(mad_m)), len(points))
+
+
+def true_pair(times_s: F64, sensor_m: F64, true_m: F64) -> TruePair | None:
+    """One pair from a stretch of samples (n,), (n, 3), (n, 3) of a moving head whose true place is known.
+
+    A similarity takes means to means, so that motion within the stretch does no harm; samples off the stretch's
+    own straight line (Theil and Sen) by far more than the others are left out. None with too few samples.
+    """
+    if len(times_s) < LEAST_SAMPLES:
+        return None
+    centred_s = times_s - times_s.mean()
+    fits = [theilslopes(sensor_m[:, axis], centred_s) for axis in range(3)]
+    line_m = np.stack([fit.intercept + fit.slope * centred_s for fit in fits], axis=1)
+    distance_m = np.linalg.norm(sensor_m - line_m, axis=1)
+    limit_m = max(OUTLIER_MADS * MAD_TO_SIGMA * float(np.median(distance_m)), OUTLIER_FLOOR_M)
+    good = distance_m <= limit_m
+    if good.sum() < LEAST_SAMPLES:
+        return None
+    spread_m = float(np.sqrt((distance_m[good] ** 2).mean()))
+    measured = Measured(sensor_m[good].mean(axis=0), spread_m, int(good.sum()))
+    return TruePair(measured, true_m[good].mean(axis=0), float(times_s[0]))

@@ -1,0 +1,143 @@
+"""What pairs can and cannot support: refusals (InputError) and warnings, each in one line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.pairs import Pairs
+from calib.robust import fit_robust
+from calib.similarity import Degenerate, Similarity, extents, fit
+from calib.solution import Solution
+from calib.viewpoints import viewing_volume_m
+from runtime.errors import InputError
+from runtime.records import F64
+
+RESIDUAL_LIMIT_M = 0.05  # the seed's (its figure S5)
+SENSOR_NOISE_FLOOR_M = 0.001  # no depth camera does better on a face
+REFUSE_EYE_ERROR_M = 0.05
+WARN_EYE_ERROR_M = 0.01
+COPLANAR = 0.01  # third extent over the first
+MIRROR_GAIN = 0.5  # mirrored data fit a mirrored sensor this much better at least
+NAMED = 8  # pairs that a message lists
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """Pairs that may be solved, and what was noticed about them."""
+
+    pairs: Pairs
+    warnings: tuple[str, ...]
+
+
+def check_pairs(pairs: Pairs) -> Checked:
+    """Refuse what no method can solve; drop exact duplicates. Raises InputError with the pairs' file.
+
+    Refused: fewer than 3 pairs, coincident, collinear, beyond double precision, mirrored, mixed units.
+    """
+    warnings = []
+    unique = _unique_rows(pairs)
+    if len(unique) < len(pairs):
+        dropped = sorted(set(range(len(pairs))) - set(unique))
+        warnings.append(f"{_listed(pairs, dropped)}: repeats an earlier pair exactly; left out")
+        pairs = pairs.only(unique)
+    try:
+        plain = fit(pairs.sensor_m, pairs.stack_m, rule="inverse")
+    except Degenerate as problem:
+        if _is_mirrored(pairs):
+            raise InputError(pairs.source, "pairs", _MIRRORED) from None
+        raise InputError(pairs.source, "pairs", str(problem)) from None
+    if _is_mirrored(pairs):
+        raise InputError(pairs.source, "pairs", _MIRRORED)
+    _refuse_units(pairs, float(plain.scale))
+    first, _, third = extents(pairs.stack_m)
+    if third <= COPLANAR * first:
+        warnings.append(
+            "the viewpoints lie in one plane: enough for the rotation, but mirrored axes would go unnoticed"
+        )
+    return Checked(pairs, tuple(warnings))
+
+
+_MIRRORED = (
+    "sensor and stack are mirror images (determinant negative): an axis points the wrong way; "
+    "sensor is x right, y down, z away from the camera, stack is x to the viewer, y right, z up"
+)
+
+
+def check_solution(pairs: Pairs, solution: Solution) -> tuple[str, ...]:
+    """Warnings about a solution. Raises InputError where it must not be used."""
+    warnings = []
+    axis = "xyz"[int(np.argmax(solution.axis_rms_m))]
+    if solution.axis_rms_m.max() > RESIDUAL_LIMIT_M:
+        hint = "" if solution.method == "robust" else "; if some pairs are wrong, try --method robust"
+        raise InputError(
+            pairs.source,
+            "pairs",
+            f"do not fit: RMS residual along {axis} is {solution.axis_rms_m.max() * 1e3:.0f} mm, "
+            f"more than {RESIDUAL_LIMIT_M * 1e3:.0f} mm{hint}",
+        )
+    noise_m = max(solution.noise_m, SENSOR_NOISE_FLOOR_M)
+    error_m = float(solution.eye_error_m(viewing_volume_m(), noise_m=noise_m).mean())
+    if not error_m <= REFUSE_EYE_ERROR_M:
+        raise InputError(
+            pairs.source,
+            "pairs",
+            f"do not determine the calibration: with {noise_m * 1e3:.1f} mm of noise the eyes would be off by "
+            f"{error_m * 1e3:.0f} mm on average (condition {solution.condition:.3g}): "
+            "the viewpoints are too few, too close together or nearly on one line",
+        )
+    if error_m > WARN_EYE_ERROR_M:
+        warnings.append(
+            f"expect {error_m * 1e3:.0f} mm of error at the eye (condition {solution.condition:.3g}): "
+            "more viewpoints, wider apart, would help"
+        )
+    rejected = np.flatnonzero(~solution.used).tolist()
+    if rejected:
+        warnings.append(f"{_listed(pairs, rejected)}: rejected as outliers")
+    beyond = np.flatnonzero(solution.used & (np.abs(solution.residual_m).max(-1) > RESIDUAL_LIMIT_M)).tolist()
+    if beyond:
+        warnings.append(f"{_listed(pairs, beyond)}: residual beyond {RESIDUAL_LIMIT_M * 1e3:.0f} mm")
+    scale = float(solution.similarity.scale)
+    if not 0.8 <= scale <= 1.25:
+        warnings.append(f"the scale is {scale:.5g}: the runtime expects metres in both frames")
+    if not np.isfinite(solution.leave_one_out_m).all():
+        warnings.append("some pair cannot be left out without losing the solution: take more viewpoints")
+    return tuple(warnings)
+
+
+def _unique_rows(pairs: Pairs) -> list[int]:
+    table = np.column_stack([pairs.sensor_m, pairs.stack_m])
+    _, index = np.unique(table, axis=0, return_index=True)
+    return sorted(index.tolist())
+
+
+def _listed(pairs: Pairs, index: list[int]) -> str:
+    names = [pairs.names[i] for i in index[:NAMED]]
+    return ", ".join(names) + (f" and {len(index) - NAMED} more" if len(index) > NAMED else "")
+
+
+def _refuse_units(pairs: Pairs, scale: float) -> None:
+    for wrong, side, option in ((1e-3, "sensor", "--sensor-unit 0.001"), (1e3, "stack", "--stack-unit 0.001")):
+        if 0.8 < scale / wrong < 1.25:
+            raise InputError(
+                pairs.source, f"{side}_x", f"units are mixed (scale {scale:.4g}): {side} is in millimetres? ({option})"
+            )
+
+
+def _is_mirrored(pairs: Pairs) -> bool:
+    """True where the pairs fit a mirrored sensor far better, and its points span space."""
+    if len(pairs) < 4 or extents(pairs.stack_m)[2] <= COPLANAR * extents(pairs.stack_m)[0]:
+        return False
+    straight = _typical_error_m(pairs.sensor_m, pairs.stack_m)
+    mirrored = _typical_error_m(pairs.sensor_m * [1.0, 1.0, -1.0], pairs.stack_m)
+    rounding = 1e-9 * float(extents(pairs.stack_m)[0])
+    return straight > rounding and mirrored < MIRROR_GAIN * straight
+
+
+def _typical_error_m(sensor_m: F64, stack_m: F64) -> float:
+    try:
+        similarity: Similarity = fit_robust(sensor_m, stack_m).similarity
+    except Degenerate:
+        return float(np.inf)
+    return float(np.median(np.sqrt(((similarity.points(sensor_m) - stack_m) ** 2).sum(-1))))

@@ -1,0 +1,166 @@
+"""Pairs of a measured sensor point and the known stack point: reading, checking, and keeping them safe."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from runtime.artifacts import write_text
+from runtime.errors import InputError
+from runtime.records import F64
+
+COLUMNS = ("sensor_x", "sensor_y", "sensor_z", "stack_x", "stack_y", "stack_z")
+NOTES = ("viewpoint", "spread_mm", "samples", "accepted_at", "sensor_serial")
+MAXIMUM_PAIRS = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """K pairs with a name each, for messages."""
+
+    sensor_m: F64  # (K, 3)
+    stack_m: F64  # (K, 3)
+    names: tuple[str, ...]
+    source: str
+    sensor_serial: str = ""  # of the device that measured all of them; empty: not known
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def only(self, keep: Iterable[int]) -> Pairs:
+        """Some of them, by index."""
+        index = np.array(list(keep), dtype=int)
+        names = tuple(self.names[i] for i in index.tolist())
+        return replace(self, sensor_m=self.sensor_m[index], stack_m=self.stack_m[index], names=names)
+
+
+@dataclass(frozen=True, slots=True)
+class CapturedPair:
+    """One accepted viewpoint, as a row of the CSV."""
+
+    sensor_m: tuple[float, float, float]
+    stack_m: tuple[float, float, float]
+    viewpoint: str
+    spread_mm: float
+    samples: int
+    accepted_at: str
+    sensor_serial: str = ""
+
+    def row(self) -> dict[str, str]:
+        numbers = zip(COLUMNS, (*self.sensor_m, *self.stack_m), strict=True)
+        return {name: f"{value:.9g}" for name, value in numbers} | {
+            "viewpoint": self.viewpoint,
+            "spread_mm": f"{self.spread_mm:.3f}",
+            "samples": str(self.samples),
+            "accepted_at": self.accepted_at,
+            "sensor_serial": self.sensor_serial,
+        }
+
+
+def read_pairs(path: Path) -> Pairs:
+    """Pairs from CSV (a header with `COLUMNS`, others ignored) or JSON (a list of objects, or `{"pairs": [...]}`).
+
+    Raises InputError, naming the file and the row and column: unreadable, columns missing, not a finite number.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(path, "", f"cannot be read ({getattr(error, 'strerror', None) or error})") from None
+    rows = _json_rows(path, text) if path.suffix.lower() == ".json" else _csv_rows(path, text)
+    if len(rows) > MAXIMUM_PAIRS:
+        raise InputError(path, "", f"holds {len(rows)} pairs, more than {MAXIMUM_PAIRS}")
+    values = np.empty((len(rows), 6))
+    for index, (label, row) in enumerate(rows):
+        for column, name in enumerate(COLUMNS):
+            values[index, column] = _number(path, label, name, row.get(name))
+    names = tuple(_name(label, row) for label, row in rows)
+    serials = {str(row.get("sensor_serial") or "") for _, row in rows} - {""}
+    if len(serials) > 1:
+        raise InputError(path, "sensor_serial", f"pairs of different sensors: {', '.join(sorted(serials))}")
+    return Pairs(values[:, :3].copy(), values[:, 3:].copy(), names, str(path), "".join(serials))
+
+
+def _csv_rows(path: Path, text: str) -> list[tuple[str, Mapping[str, Any]]]:
+    reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
+    try:
+        header = [name.strip() for name in reader.fieldnames or ()]
+        reader.fieldnames = header
+        for name in COLUMNS:
+            if name not in header:
+                raise InputError(path, name, "column is missing (wanted: " + ", ".join(COLUMNS) + ")")
+        return [(f"line {reader.line_num}", row) for row in reader]
+    except csv.Error as error:
+        raise InputError(path, f"line {reader.line_num}", f"malformed: {error}") from None
+
+
+def _json_rows(path: Path, text: str) -> list[tuple[str, Mapping[str, Any]]]:
+    try:
+        value = json.loads(text)
+    except ValueError as error:
+        raise InputError(path, "", f"malformed: {error}") from None
+    items = value.get("pairs") if isinstance(value, dict) else value
+    if not isinstance(items, list):
+        raise InputError(path, "pairs", "must be a list of objects")
+    for number, item in enumerate(items, start=1):
+        if not isinstance(item, dict):
+            raise InputError(path, f"pair {number}", "must be an object with " + ", ".join(COLUMNS))
+    return [(f"pair {number}", item) for number, item in enumerate(items, start=1)]
+
+
+def _number(path: Path, label: str, name: str, value: Any) -> float:
+    if value is None or value == "":
+        raise InputError(path, f"{label}, {name}", "is missing")
+    if isinstance(value, bool | list | dict):
+        raise InputError(path, f"{label}, {name}", "is not a number")
+    try:
+        number = float(value)
+    except ValueError:
+        raise InputError(path, f"{label}, {name}", f"is not a number: {str(value)[:40]}") from None
+    if not math.isfinite(number):
+        raise InputError(path, f"{label}, {name}", f"is not finite: {number}")
+    return number
+
+
+def _name(label: str, row: Mapping[str, Any]) -> str:
+    viewpoint = row.get("viewpoint")
+    return f"{label} ({viewpoint})" if isinstance(viewpoint, str) and viewpoint else label
+
+
+class PairsFile:
+    """The CSV that capture fills: every accepted pair is on disk, whole, before the next one is measured."""
+
+    def __init__(self, path: Path) -> None:
+        """Resume an existing file or begin one. Raises InputError where it exists and is not ours."""
+        self.path = path
+        self._rows: list[dict[str, str]] = []
+        if path.exists():
+            read_pairs(path)
+            with path.open(encoding="utf-8-sig", newline="") as file:
+                for row in csv.DictReader(file, skipinitialspace=True):
+                    self._rows.append({name: row.get(name) or "" for name in (*COLUMNS, *NOTES)})
+
+    @property
+    def viewpoints(self) -> frozenset[str]:
+        """Names of the viewpoints that are already there."""
+        return frozenset(row["viewpoint"] for row in self._rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def accept(self, pair: CapturedPair) -> None:
+        """Add a pair; one of the same viewpoint is replaced. On disk when this returns."""
+        self._rows = [row for row in self._rows if not pair.viewpoint or row["viewpoint"] != pair.viewpoint]
+        self._rows.append(pair.row())
+        text = io.StringIO()
+        writer = csv.DictWriter(text, (*COLUMNS, *NOTES), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self._rows)
+        write_text(self.path, text.getvalue())

@@ -1,0 +1,161 @@
+"""A calibration with its error: the methods, their residuals and covariance, and which one to trust."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.robust import fit_robust
+from calib.similarity import Similarity, fit
+from runtime.eyes.calibration import position_jacobian
+from runtime.records import F64
+
+Method = Literal["seed", "least-squares", "inverse", "robust", "fixed-scale"]
+METHODS: tuple[Method, ...] = get_args(Method)
+SCALE_SIGMAS = 3.0  # a scale that parts from 1 by less of its own standard deviations is taken as 1
+EXACT_SCALE = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """What a method made of K pairs. Parameters and pivot as in `runtime.eyes.calibration`."""
+
+    method: Method
+    similarity: Similarity
+    residual_m: F64  # (K, 3) fitted minus known, frame `stack`, all pairs
+    used: NDArray[np.bool_]  # (K,) False: rejected as an outlier
+    noise_m: float  # standard deviation of one coordinate of the used pairs, in `stack`
+    pivot_m: F64  # (3,) frame `stack`: the centre of the used pairs
+    unit_covariance: F64  # (7, 7) for noise of 1 m; the scale's row is zero where it is fixed
+    condition: float  # of the design, lengths in units of the pairs' RMS radius
+    leave_one_out_m: F64  # (used, 3) error of each used pair when the others predict it
+    reason: str = ""  # why this method was chosen
+
+    @property
+    def covariance(self) -> F64:
+        """(7, 7) of rotation (rad), shift (m) and log scale about the pivot."""
+        return self.unit_covariance * self.noise_m**2
+
+    @property
+    def rms_m(self) -> float:
+        """RMS distance of the used pairs."""
+        return _rms(self.residual_m[self.used])
+
+    @property
+    def max_m(self) -> float:
+        """Largest distance of the used pairs."""
+        return float(np.sqrt((self.residual_m[self.used] ** 2).sum(-1)).max())
+
+    @property
+    def axis_rms_m(self) -> F64:
+        """(3,) RMS along x, y, z of the used pairs."""
+        return np.sqrt((self.residual_m[self.used] ** 2).mean(0))
+
+    @property
+    def leave_one_out_rms_m(self) -> float:
+        """RMS error of the used pairs when the others predict them; infinite where one cannot be left out."""
+        return _rms(self.leave_one_out_m)
+
+    @property
+    def scale_sigma(self) -> float:
+        """Standard deviation of the logarithm of the scale."""
+        return float(np.sqrt(self.covariance[6, 6]))
+
+    def eye_error_m(self, stack_m: F64, *, noise_m: float | None = None) -> F64:
+        """(...) expected (RMS) error at points (..., 3) in `stack`, for the observed or another noise."""
+        jacobian = position_jacobian(stack_m, pivot_m=self.pivot_m)
+        covariance = self.unit_covariance * (self.noise_m if noise_m is None else noise_m) ** 2
+        return np.sqrt(np.trace(jacobian @ covariance @ np.swapaxes(jacobian, -1, -2), axis1=-2, axis2=-1))
+
+
+def _rms(vectors: F64) -> float:
+    return float(np.sqrt((vectors**2).sum(-1).mean()))
+
+
+def design_covariance(stack_m: F64, *, fixed_scale: bool) -> tuple[F64, F64, float]:
+    """Pivot (3,), covariance (7, 7) of the parameters for noise of 1 m, and the condition of the design.
+
+    To first order, for equal and independent noise in every coordinate; on the sensor's side it is the noise times
+    the scale. A design that leaves a parameter free has infinite condition and infinite covariance.
+    """
+    pivot_m = stack_m.mean(0)
+    radius_m = float(np.sqrt(((stack_m - pivot_m) ** 2).sum(-1).mean())) or 1.0
+    parameters = 6 if fixed_scale else 7
+    jacobian = position_jacobian((stack_m - pivot_m) / radius_m, pivot_m=np.zeros(3))[..., :parameters].reshape(
+        -1, parameters
+    )
+    _, values, axes = np.linalg.svd(np.linalg.qr(jacobian, mode="r"))
+    covariance = np.zeros((7, 7))
+    if values[-1] <= 1e-14 * values[0]:
+        covariance[:parameters, :parameters] = np.inf
+        return pivot_m, covariance, float(np.inf)
+    units = np.array([1 / radius_m] * 3 + [1.0] * 3 + [1 / radius_m])[:parameters]
+    root = (axes.T / values) * units[:, None]
+    covariance[:parameters, :parameters] = root @ root.T
+    return pivot_m, covariance, float(values[0] / values[-1])
+
+
+def leave_one_out(residual_m: F64, stack_m: F64, *, pivot_m: F64, unit_covariance: F64) -> F64:
+    """(K, 3) error of each pair when it is left out: (I - J C J^T)^-1 r, exact for the linearised fit."""
+    jacobian = position_jacobian(stack_m, pivot_m=pivot_m)
+    leverage = jacobian @ unit_covariance @ np.swapaxes(jacobian, -1, -2)
+    remaining = np.eye(3) - leverage
+    alone = np.linalg.eigvalsh(remaining).min(-1) < 1e-9
+    remaining[alone] = np.eye(3)
+    errors = np.linalg.solve(remaining, residual_m[..., None])[..., 0]
+    errors[alone] = np.inf
+    return errors
+
+
+def solve(sensor_m: F64, stack_m: F64, *, method: Method, known_scale: float = 1.0, reason: str = "") -> Solution:
+    """One method's similarity of (K, 3) pairs with all its error figures. Raises `similarity.Degenerate`."""
+    used = np.ones(len(sensor_m), bool)
+    if method == "robust":
+        robust = fit_robust(sensor_m, stack_m)
+        similarity, used = robust.similarity, robust.inlier
+    else:
+        similarity = fit(sensor_m, stack_m, rule=known_scale if method == "fixed-scale" else method)
+    residual_m = similarity.points(sensor_m) - stack_m
+    pivot_m, unit_covariance, condition = design_covariance(stack_m[used], fixed_scale=method == "fixed-scale")
+    freedom = 3 * int(used.sum()) - (6 if method == "fixed-scale" else 7)
+    return Solution(
+        method=method,
+        similarity=similarity,
+        residual_m=residual_m,
+        used=used,
+        noise_m=float(np.sqrt((residual_m[used] ** 2).sum() / freedom)),
+        pivot_m=pivot_m,
+        unit_covariance=unit_covariance,
+        condition=condition,
+        leave_one_out_m=leave_one_out(
+            residual_m[used], stack_m[used], pivot_m=pivot_m, unit_covariance=unit_covariance
+        ),
+        reason=reason,
+    )
+
+
+def scale_is_one(scale: F64 | float, *, sigma: F64 | float) -> NDArray[np.bool_]:
+    """True where a fitted scale cannot be told from 1; `sigma`: the standard deviation of its logarithm."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.abs(np.log(scale)) <= np.maximum(SCALE_SIGMAS * np.asarray(sigma), EXACT_SCALE)
+
+
+def solve_default(sensor_m: F64, stack_m: F64) -> Solution:
+    """The method that the error table (docs/calibration.md) shows to be best at the eye for pairs like these.
+
+    `robust` where pairs are grossly wrong; else `fixed-scale` at 1 (both frames are in metres) unless the data
+    tell another scale with confidence; then `inverse`. Raises `similarity.Degenerate`.
+    """
+    robust = solve(sensor_m, stack_m, method="robust")
+    rejected = int((~robust.used).sum())
+    if rejected:
+        return replace(robust, reason=f"{rejected} of {len(sensor_m)} pairs do not agree with the others")
+    inverse = solve(sensor_m, stack_m, method="inverse")
+    scale = float(inverse.similarity.scale)
+    text = f"the fitted scale, {scale:.5g} ± {inverse.scale_sigma * scale:.2g},"
+    if scale_is_one(scale, sigma=inverse.scale_sigma):
+        return solve(sensor_m, stack_m, method="fixed-scale", reason=f"{text} cannot be told from 1")
+    return replace(inverse, reason=f"{text} is not 1, and the noise is on the sensor's side")
