@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -201,5 +202,4 @@ def _address(pointer: Any) -> int:
 
 
 def _text(error: Exception) -> str:
-    text = error.args[0] if error.args else type(error).__name__
-    return text.decode(errors="replace") if isinstance(text, bytes) else str(text)
+    return re.sub(r"^\(\d+\) b?['\"]?(.*?)['\"]?$", r"\1", str(error)) or type(error).__name__

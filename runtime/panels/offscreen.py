@@ -90,6 +90,9 @@ class OffscreenPanels(PanelSink):
 
     def close(self) -> None:
         """Release textures and framebuffers; the context stays its owner's."""
+        if self._painters:
+            # moderngl binds the last framebuffer again on later calls: it must not be one that is no more.
+            self._context.detect_framebuffer(0).use()
         for painter in self._painters:
             painter.release()
         for target in self._targets:

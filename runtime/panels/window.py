@@ -67,7 +67,7 @@ class WindowPanels(PanelSink):
         self._display: Display | None = None
         self._surfaces: list[Surface] = []
         self._layers: moderngl.TextureArray | None = None
-        self._retry_ns = 0
+        self._retry_ns, self._lost = 0, ""
         self._swapped_ns = 0
         self.monitors: tuple[Monitor, ...] = ()
         try:
@@ -80,16 +80,17 @@ class WindowPanels(PanelSink):
 
     def present(self, frame: LayerFrame) -> PresentReport:
         """Show a frame on every panel at once. Raises PanelLost; ValueError for layers of another shape."""
+        if self._display is None and self._clock.now_ns() < self._retry_ns:
+            raise PanelLost(self._lost)
         try:
             if self._display is None:
-                self._open_again()
+                self._open()
+                log.info("panels are back: %s", ", ".join(str(monitor) for monitor in self.monitors))
             return self._present(frame)
-        except PanelLost:
+        except (PanelLost, glfw.GLFWError, moderngl.Error) as error:
+            self._lost = str(error)
             self._drop()
-            raise
-        except (glfw.GLFWError, moderngl.Error) as error:
-            self._drop()
-            raise PanelLost(f"panels: {error}") from error
+            raise PanelLost(self._lost) from error
         finally:
             self._give_back()
 
@@ -149,13 +150,6 @@ class WindowPanels(PanelSink):
         if not (before_ns and refresh_hz):
             return 0
         return max(0, round((swapped_ns - before_ns) * refresh_hz / NS_PER_S) - 1)
-
-    def _open_again(self) -> None:
-        now_ns = self._clock.now_ns()
-        if now_ns < self._retry_ns:
-            raise PanelLost("panels: not back yet")
-        self._open()
-        log.info("panels are back: %s", ", ".join(monitor.connector for monitor in self.monitors))
 
     def _open(self) -> None:
         self._display = display = Display()

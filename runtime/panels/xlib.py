@@ -14,6 +14,7 @@ from ctypes import POINTER, byref, c_char_p, c_int, c_long, c_ubyte, c_ulong, c_
 log = logging.getLogger("phasestack.panels")
 
 ErrorHandler = ctypes.CFUNCTYPE(c_int, c_void_p, c_void_p)
+IOErrorHandler = ctypes.CFUNCTYPE(c_int, c_void_p)
 ExitHandler = ctypes.CFUNCTYPE(None, c_void_p, c_void_p)
 
 
@@ -67,7 +68,14 @@ def _note_error(_display: int, _event: int) -> int:
     return 0
 
 
-_ERROR_HANDLER = ErrorHandler(_note_error)  # Xlib keeps its address for the life of the process
+def _note_io_error(_display: int) -> int:
+    log.warning("the connection to the X server broke")
+    return 0
+
+
+# Xlib keeps their addresses for the life of the process.
+_ERROR_HANDLER = ErrorHandler(_note_error)
+_IO_ERROR_HANDLER = IOErrorHandler(_note_io_error)
 
 
 def survive_errors() -> None:
@@ -84,6 +92,8 @@ def survive_server(display: int, lost: Callable[[], None]) -> object:
     if not hasattr(x11, "XSetIOErrorExitHandler"):
         return None
 
+    x11.XSetIOErrorHandler.argtypes = [IOErrorHandler]
+    x11.XSetIOErrorHandler(_IO_ERROR_HANDLER)
     handler = ExitHandler(lambda _display, _data: lost())
     x11.XSetIOErrorExitHandler.argtypes = [c_void_p, ExitHandler, c_void_p]
     x11.XSetIOErrorExitHandler(display, handler, None)

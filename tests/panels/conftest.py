@@ -1,0 +1,27 @@
+"""Contexts and X servers that the panels' tests share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import moderngl
+import pytest
+
+from runtime.gl import offscreen_context
+from tests.panels import xserver
+
+
+@pytest.fixture(scope="session")
+def context() -> Iterator[moderngl.Context]:
+    made = offscreen_context()
+    yield made
+    made.release()
+
+
+@pytest.fixture(scope="module")
+def screen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[xserver.XServer]:
+    if absent := xserver.missing():
+        pytest.skip(f"no virtual monitors without {absent}")
+    server = xserver.XServer(tmp_path_factory.mktemp("xorg"))
+    yield server
+    server.stop()

@@ -1,0 +1,81 @@
+"""A monitor's pixel shows the layer's pixel that lies behind it for the viewer, however the panel is mounted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runtime.panels.geometry import IDENTITY, layer_from_screen, panel_from_screen, permutes_pixels
+
+SIZES = st.tuples(st.integers(16, 4096), st.integers(16, 4096))
+MOUNTED = st.sampled_from([0, 90, 180, 270])
+MIRRORED = st.sampled_from(["none", "horizontal", "vertical"])
+
+
+def apply(matrix, x, y):
+    u, v, w = matrix @ np.array([x, y, 1.0])
+    return u / w, v / w
+
+
+def test_a_panel_turned_a_quarter_counter_clockwise_has_its_top_edge_on_the_viewers_left():
+    matrix = panel_from_screen(screen_width_px=1920, screen_height_px=1080, rotation_deg=90, mirror="none")
+    assert apply(matrix, 0, 0) == (0, 1920)  # its top left corner is at the viewer's bottom left
+    assert apply(matrix, 1920, 0) == (0, 0)
+    assert apply(matrix, 0, 1080) == (1080, 1920)
+
+
+def test_a_panel_upside_down_has_its_corners_exchanged():
+    matrix = panel_from_screen(screen_width_px=1920, screen_height_px=1080, rotation_deg=180, mirror="none")
+    assert apply(matrix, 0, 0) == (1920, 1080)
+
+
+def test_mirroring_is_the_viewers_left_and_right_even_on_a_turned_panel():
+    matrix = panel_from_screen(screen_width_px=1920, screen_height_px=1080, rotation_deg=90, mirror="horizontal")
+    assert apply(matrix, 0, 0) == (1080, 1920)
+
+
+@given(size=SIZES, rotation_deg=MOUNTED, mirror=MIRRORED)
+def test_without_registration_pixels_are_only_permuted(size, rotation_deg, mirror):
+    width, height = size
+    matrix = panel_from_screen(screen_width_px=width, screen_height_px=height, rotation_deg=rotation_deg, mirror=mirror)
+    assert permutes_pixels(matrix)
+    corners = {apply(matrix, x, y) for x in (0, width) for y in (0, height)}
+    columns, rows = (height, width) if rotation_deg in (90, 270) else (width, height)
+    assert corners == {(x, y) for x in (0, columns) for y in (0, rows)}
+
+
+@given(size=SIZES, rotation_deg=MOUNTED, mirror=MIRRORED, dx=st.floats(-20, 20), tilt=st.floats(-1e-5, 1e-5))
+def test_what_should_be_at_an_ideal_pixel_is_drawn_where_registration_found_it(size, rotation_deg, mirror, dx, tilt):
+    width, height = size
+    homography = np.array([[1.01, 0.002, dx], [-0.003, 0.99, 2.0], [tilt, 0.0, 1.0]])
+    common = {"screen_width_px": width, "screen_height_px": height, "rotation_deg": rotation_deg, "mirror": mirror}
+    columns, rows = (height, width) if rotation_deg in (90, 270) else (width, height)
+    layer = layer_from_screen(**common, layer_width_px=columns, layer_height_px=rows, homography=homography)
+    ideal = (0.3 * columns, 0.7 * rows)
+    true = apply(homography, *ideal)
+    screen = apply(np.linalg.inv(panel_from_screen(**common)), *true)
+    assert apply(layer, *screen) == pytest.approx(ideal, abs=1e-6 * max(size))
+
+
+def test_layers_of_half_the_resolution_fill_the_panel():
+    matrix = layer_from_screen(
+        screen_width_px=1920, screen_height_px=1080, layer_width_px=960, layer_height_px=540,
+        rotation_deg=0, mirror="none", homography=IDENTITY,
+    )  # fmt: skip
+    assert apply(matrix, 1920, 1080) == pytest.approx((960, 540))
+    assert not permutes_pixels(matrix)
+
+
+def test_a_shift_by_half_a_pixel_is_no_permutation_and_one_by_a_pixel_is():
+    assert not permutes_pixels(np.array([[1, 0, 0.5], [0, 1, 0], [0, 0, 1.0]]))
+    assert permutes_pixels(np.array([[1, 0, 1.0], [0, 1, 0], [0, 0, 1.0]]))
+
+
+def test_a_singular_homography_is_refused():
+    with pytest.raises(ValueError, match="invertible"):
+        layer_from_screen(
+            screen_width_px=16, screen_height_px=16, layer_width_px=16, layer_height_px=16,
+            rotation_deg=0, mirror="none", homography=((1, 0, 0), (2, 0, 0), (0, 0, 1)),
+        )  # fmt: skip

@@ -1,0 +1,151 @@
+"""A real X server with three virtual monitors (Xorg's dummy driver), and what a test asks of it."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import select
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+WIDTH_PX, HEIGHT_PX = 320, 180
+MODE = f"{WIDTH_PX}x{HEIGHT_PX}p"
+TIMINGS = ("6.0", "320", "336", "368", "400", "180", "183", "188", "250")  # 60 Hz
+CONFIG = """
+Section "ServerFlags"
+  Option "AutoAddDevices" "false"
+  Option "AutoAddGPU" "false"
+EndSection
+Section "Device"
+  Identifier "dummy"
+  Driver "dummy"
+  VideoRam 64000
+EndSection
+Section "Monitor"
+  Identifier "monitor"
+  HorizSync 5-1000
+  VertRefresh 5-200
+EndSection
+Section "Screen"
+  Identifier "screen"
+  Device "dummy"
+  Monitor "monitor"
+  DefaultDepth 24
+  SubSection "Display"
+    Depth 24
+    Virtual 960 400
+  EndSubSection
+EndSection
+"""
+NEEDED = ("Xorg", "xrandr", "xwd")
+
+
+def missing() -> str:
+    """What this machine lacks for it; empty: nothing."""
+    absent = [name for name in NEEDED if shutil.which(name) is None]
+    if not any(Path(folder, "dummy_drv.so").exists() for folder in ("/usr/lib/xorg/modules/drivers",)):
+        absent.append("xserver-xorg-video-dummy")
+    return ", ".join(absent)
+
+
+class XServer:
+    """Monitors DUMMY0, DUMMY1, DUMMY2 from left to right, 320x180 each."""
+
+    def __init__(self, folder: Path, display: int | None = None) -> None:
+        config = folder / "xorg.conf"
+        config.write_text(CONFIG)
+        where = [] if display is None else [f":{display}"]
+        reader, writer = os.pipe()
+        self._output = (folder / "xorg.out").open("wb")
+        self._process = subprocess.Popen(
+            ["Xorg", *where, "-displayfd", str(writer), "-config", str(config), "-logfile", str(folder / "xorg.log"),
+             "-noreset", "-nolisten", "tcp"],
+            pass_fds=(writer,), stdout=self._output, stderr=self._output,
+        )  # fmt: skip
+        os.close(writer)
+        answer = b""
+        while not answer.endswith(b"\n") and select.select([reader], [], [], 20.0)[0]:
+            if not (part := os.read(reader, 16)):
+                break
+            answer += part
+        os.close(reader)
+        if not answer:
+            self.stop()
+            raise RuntimeError((folder / "xorg.out").read_text()[-500:])
+        self.number = int(answer)
+        self.name = f":{self.number}"
+        self.xrandr("--newmode", MODE, *TIMINGS)
+        for index in range(3):
+            self.xrandr("--addmode", f"DUMMY{index}", MODE)
+            self.plug(index)
+
+    def xrandr(self, *arguments: str) -> None:
+        subprocess.run(["xrandr", "-d", self.name, *arguments], check=True, capture_output=True, timeout=20)
+
+    def plug(self, index: int) -> None:
+        """Monitor `index` at its place."""
+        self.xrandr("--output", f"DUMMY{index}", "--mode", MODE, "--pos", f"{WIDTH_PX * index}x0")
+        self.xrandr("--query")  # the dummy driver looks at what is connected only when it is asked
+
+    def unplug(self, index: int) -> None:
+        """As if its cable had been pulled."""
+        self.xrandr("--output", f"DUMMY{index}", "--off")
+        self.xrandr("--query")
+
+    def screenshot(self) -> npt.NDArray[np.uint8]:
+        """(h, w, 3) RGB of the whole X screen."""
+        data = subprocess.run(
+            ["xwd", "-root", "-silent", "-display", self.name], check=True, capture_output=True, timeout=20
+        ).stdout
+        header = np.frombuffer(data, ">u4", 25)
+        start, stride, width, height = int(header[0] + 12 * header[19]), int(header[12]), int(header[4]), int(header[5])
+        pixel_bytes = int(header[11]) // 8  # 4, or 3 where windows of several visuals are put together
+        rows = np.frombuffer(data, np.uint8, stride * height, start).reshape(height, stride)
+        return np.ascontiguousarray(rows[:, : pixel_bytes * width].reshape(height, width, pixel_bytes)[..., 2::-1])
+
+    def panel(self, index: int) -> npt.NDArray[np.uint8]:
+        """(180, 320, 3) what monitor `index` shows."""
+        return self.screenshot()[:HEIGHT_PX, WIDTH_PX * index : WIDTH_PX * (index + 1)]
+
+    def set_edid(self, index: int, data: bytes) -> None:
+        """Give an output the EDID that a real monitor would have brought."""
+        x11, randr = ctypes.CDLL("libX11.so.6"), ctypes.CDLL("libXrandr.so.2")
+        x11.XOpenDisplay.restype = ctypes.c_void_p
+        x11.XDefaultRootWindow.restype = ctypes.c_ulong
+        x11.XInternAtom.restype = ctypes.c_ulong
+        randr.XRRGetScreenResourcesCurrent.restype = ctypes.POINTER(ctypes.c_ulong)
+        display = ctypes.c_void_p(x11.XOpenDisplay(self.name.encode()))
+        root = ctypes.c_ulong(x11.XDefaultRootWindow(display))
+        resources = randr.XRRGetScreenResourcesCurrent(display, root)
+        # XRRScreenResources: two times, count and pointer of CRTCs, count and pointer of outputs.
+        outputs = ctypes.cast(ctypes.c_void_p(resources[5]), ctypes.POINTER(ctypes.c_ulong))
+        edid, integer, replace = x11.XInternAtom(display, b"EDID", 0), 19, 0
+        randr.XRRChangeOutputProperty(
+            display, ctypes.c_ulong(outputs[index]), ctypes.c_ulong(edid), ctypes.c_ulong(integer), 8, replace,
+            data, len(data),
+        )  # fmt: skip
+        x11.XCloseDisplay(display)
+
+    def stop(self) -> None:
+        """End it, as a crash would: at once."""
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGKILL)
+        self._process.wait(timeout=10)
+        self._output.close()
+
+
+def eventually(holds: Callable[[], bool], *, within_s: float = 10.0) -> bool:
+    """True as soon as it holds; False if it doesn't in all that time."""
+    deadline = time.monotonic() + within_s
+    while not holds():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.02)
+    return True
