@@ -133,6 +133,20 @@ class XServer:
         )  # fmt: skip
         x11.XCloseDisplay(display)
 
+    def ask_to_close(self, window: int) -> None:
+        """What a window manager's close button sends: WM_DELETE_WINDOW."""
+        x11 = ctypes.CDLL("libX11.so.6")
+        x11.XOpenDisplay.restype = ctypes.c_void_p
+        x11.XInternAtom.restype = ctypes.c_ulong
+        display = ctypes.c_void_p(x11.XOpenDisplay(self.name.encode()))
+        protocols = x11.XInternAtom(display, b"WM_PROTOCOLS", 0)
+        delete = x11.XInternAtom(display, b"WM_DELETE_WINDOW", 0)
+        # XClientMessageEvent: type, serial, send_event, display, window, message_type, format, five longs.
+        client_message, bits = 33, 32
+        event = (ctypes.c_ulong * 24)(client_message, 0, 1, display.value, window, protocols, bits, delete)
+        x11.XSendEvent(display, ctypes.c_ulong(window), 0, ctypes.c_long(0), event)
+        x11.XCloseDisplay(display)
+
     def stop(self) -> None:
         """End it, as a crash would: at once."""
         if self._process.poll() is None:

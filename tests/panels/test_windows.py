@@ -1,0 +1,198 @@
+"""Real windows on three virtual monitors of a real X server, judged by screenshots."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from runtime.clock import MonotonicClock
+from runtime.config import OutputSettings, PanelSettings
+from runtime.errors import PanelLost
+from runtime.optics.stack import PanelStack
+from runtime.panels import window
+from runtime.panels.display import glfw
+from runtime.panels.registry import open_panels
+from runtime.records import LayerFrame
+from tests.panels import xserver
+from tests.panels.edids import block
+from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, eventually
+
+pytestmark = pytest.mark.windows
+STACK = PanelStack(0.5, 0.28, (-0.06, 0.0, 0.06), WIDTH_PX, HEIGHT_PX)
+
+
+def picture(number: int, index: int) -> np.ndarray:
+    """A layer that tells its panel, its frame and its orientation: no rotation or mirroring of it looks alike."""
+    layer = np.zeros((HEIGHT_PX, WIDTH_PX, 4), np.uint8)
+    layer[..., 0] = np.linspace(0, 255, WIDTH_PX).astype(np.uint8)
+    layer[..., 1] = np.linspace(0, 255, HEIGHT_PX).astype(np.uint8)[:, None]
+    layer[..., 2] = 60 * index + number % 60
+    return layer
+
+
+def frame(number: int) -> LayerFrame:
+    return LayerFrame(number, np.stack([picture(number, index) for index in range(3)]))
+
+
+@pytest.fixture
+def x(screen, monkeypatch):
+    monkeypatch.setenv("DISPLAY", screen.name)
+    yield screen
+    for index in range(3):
+        screen.plug(index)
+
+
+@pytest.fixture
+def opened(x, context):
+    sinks = []
+
+    def open_(*panels: PanelSettings, kind="windows"):
+        sinks.append(open_panels(OutputSettings(kind=kind, panels=panels), STACK, MonotonicClock(), context))
+        return sinks[-1]
+
+    yield open_
+    for sink in sinks:
+        sink.close()
+
+
+BY_CONNECTOR = tuple(PanelSettings(connector=f"DUMMY{index}") for index in (2, 0, 1))
+
+
+def shows(x, monitor: int, expected: np.ndarray) -> bool:
+    return eventually(lambda: np.array_equal(x.panel(monitor), expected[..., :3]))
+
+
+@pytest.mark.parametrize("kind", ["windows", "span"])
+def test_every_panel_shows_its_own_layer_of_the_same_frame_at_its_place(x, opened, kind):
+    sink = opened(*BY_CONNECTOR, kind=kind)
+    for number in range(5):
+        assert sink.present(frame(number)).number == number
+        for index, monitor in enumerate((2, 0, 1)):
+            assert shows(x, monitor, picture(number, index))
+
+
+@pytest.mark.parametrize("kind", ["windows", "span"])
+def test_a_panel_mounted_upside_down_and_one_mirrored_are_sent_what_sets_it_right(x, opened, kind):
+    sink = opened(
+        PanelSettings(connector="DUMMY0", rotation_deg=180),
+        PanelSettings(connector="DUMMY1", mirror="horizontal"),
+        PanelSettings(connector="DUMMY2", gamma=2.0),
+        kind=kind,
+    )
+    sink.present(frame(3))
+    assert shows(x, 0, picture(3, 0)[::-1, ::-1])
+    assert shows(x, 1, picture(3, 1)[:, ::-1])
+    expected = 255 * np.sqrt(picture(3, 2)[..., :3] / 255)
+    assert eventually(lambda: np.abs(x.panel(2) - expected).max() <= 0.51)
+
+
+def test_panels_are_found_by_edid_serial_wherever_they_are_plugged_in(x, opened):
+    for index, serial in enumerate(("MIDDLE", "FRONT", "REAR")):
+        x.set_edid(index, block(serial_text=serial))
+    sink = opened(*(PanelSettings(edid_serial=serial) for serial in ("REAR", "MIDDLE", "FRONT")))
+    assert [monitor.connector for monitor in sink.monitors] == ["DUMMY2", "DUMMY0", "DUMMY1"]
+    assert sink.monitors[0].model == "EIZ CG2700X"
+    sink.present(frame(0))
+    assert shows(x, 2, picture(0, 0))
+
+
+def test_a_panel_that_is_not_there_is_named_and_no_window_is_left(x, context):
+    panels = (*BY_CONNECTOR[:2], PanelSettings(connector="HDMI-7"))
+    with pytest.raises(PanelLost, match=r"panel 2: no monitor with connector HDMI-7 .*DUMMY0"):
+        open_panels(OutputSettings(kind="windows", panels=panels), STACK, MonotonicClock(), context)
+    assert eventually(lambda: not x.screenshot().any())
+
+
+def presents(sink, number: int) -> bool:
+    try:
+        return sink.present(frame(number)).number == number
+    except PanelLost:
+        return False
+
+
+@pytest.mark.parametrize("kind", ["windows", "span"])
+def test_a_monitor_that_goes_is_named_and_one_that_returns_is_used_again(x, opened, kind):
+    sink = opened(*BY_CONNECTOR, kind=kind)
+    assert presents(sink, 0)
+    x.unplug(1)
+    with pytest.raises(PanelLost, match="DUMMY1"):
+        for number in range(1, 50):
+            sink.present(frame(number))
+    with pytest.raises(PanelLost, match="DUMMY1"):
+        sink.present(frame(50))
+    x.plug(1)
+    assert eventually(lambda: presents(sink, 51))
+    assert shows(x, 1, picture(51, 2))
+
+
+def test_a_closed_window_is_a_lost_panel_and_comes_back(x, opened):
+    sink = opened(*BY_CONNECTOR)
+    assert presents(sink, 0)
+    x.ask_to_close(glfw.get_x11_window(sink._surfaces[1].window.handle))
+    with pytest.raises(PanelLost, match="closed"):
+        for number in range(1, 50):
+            sink.present(frame(number))
+    assert eventually(lambda: presents(sink, 2))
+    assert shows(x, 0, picture(2, 1))
+
+
+def test_a_fault_while_drawing_leaves_the_new_frame_on_no_panel(x, opened, monkeypatch):
+    sink = opened(*BY_CONNECTOR)
+    assert presents(sink, 0)
+    with monkeypatch.context() as patch:
+        patch.setattr(window, "_reset_status", lambda: "was reset (0x8253)")  # no software driver ever loses one
+        with pytest.raises(PanelLost, match="GL context of panel 0: was reset"):
+            sink.present(frame(1))
+    for index, monitor in enumerate((2, 0, 1)):
+        assert not np.array_equal(x.panel(monitor), picture(1, index)[..., :3])
+    assert eventually(lambda: presents(sink, 2))
+
+
+def test_skew_and_rate_are_reported(opened):
+    sink = opened(*BY_CONNECTOR)
+    reports = [sink.present(frame(number)) for number in range(20)]
+    times = [report.present_ns for report in reports]
+    assert times == sorted(times)
+    interval_ms = np.median(np.diff(times)) / 1e6
+    skew_ms = np.median([report.skew_ms for report in reports])
+    assert 0 < skew_ms < interval_ms
+
+
+def test_content_can_draw_in_its_own_context_between_two_frames(context, opened):
+    sink = opened(*BY_CONNECTOR)
+    target = context.simple_framebuffer((4, 4))
+    for number, red in enumerate((0.0, 1.0, 0.0)):
+        target.use()
+        target.clear(red, 0, 0)
+        assert target.read(components=1)[0] == round(255 * red)
+        sink.present(frame(number))
+    assert context.error == "GL_NO_ERROR"
+
+
+def test_the_x_server_dies_and_returns_and_the_process_lives(tmp_path, monkeypatch, context):
+    if absent := xserver.missing():
+        pytest.skip(f"no virtual monitors without {absent}")
+    server = xserver.XServer(tmp_path)
+    monkeypatch.setenv("DISPLAY", server.name)
+    sink = open_panels(OutputSettings(kind="windows", panels=BY_CONNECTOR), STACK, MonotonicClock(), context)
+    assert presents(sink, 0)
+    server.stop()
+    with pytest.raises(PanelLost, match="X server"):
+        sink.present(frame(1))
+    assert not eventually(lambda: presents(sink, 2), within_s=1.0)
+    server = xserver.XServer(tmp_path, display=server.number)
+    try:
+        assert eventually(lambda: presents(sink, 3))
+        assert shows(server, 2, picture(3, 0))
+    finally:
+        sink.close()
+        server.stop()
+
+
+def test_the_cursor_is_hidden_and_windows_stay_when_focus_goes(opened):
+    sink = opened(*BY_CONNECTOR)
+    for surface in sink._surfaces:
+        handle = surface.window.handle
+        assert glfw.get_input_mode(handle, glfw.CURSOR) == glfw.CURSOR_HIDDEN
+        assert not glfw.get_window_attrib(handle, glfw.AUTO_ICONIFY)
+        assert not glfw.get_window_attrib(handle, glfw.ICONIFIED)
