@@ -1,0 +1,118 @@
+"""The common raster in which the eyes' difference splits into chains (one small linear system each).
+
+With +g on the front and -g on the rear panel, the difference between the eyes' phases is
+D(p) = 2·[g(p + s) - g(p - s)]. On a raster whose columns make s a whole number K, columns 2K apart form chains
+that don't interact: D = A·g along each, with one bidiagonal A for all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from math import ceil
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.optics.stack import PanelStack
+from runtime.records import F32, F64
+
+CELLS_STEP = 8  # chains' lengths are rounded up to this, so that a moving viewer meets few shapes
+ROWS_STEP = 64
+CELLS_MAX = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class ChainFrame:
+    """The raster on the plane where both outer panels have the same parallax, seen from between the eyes."""
+
+    x_m: float  # of the plane: a²/ex
+    plane_from_raster: F64  # 3x3, (y, z, 1) from (u, v, 1); u along the line of the eyes
+    cells: int  # chain cells a row; the raster has cells·2K columns
+    cell_px: int  # K
+    rows: int
+    middle_m: F64  # (3,) between the eyes, frame `stack`
+
+    @property
+    def width_px(self) -> int:
+        return self.cells * 2 * self.cell_px
+
+
+def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int) -> ChainFrame:
+    """The raster for two eyes (2, 3), left and right, frame `stack`.
+
+    Columns are scaled so that the outer panels' parallax is `cell_px` columns; rows are `reduction` panel
+    rows high and sheared along the line of the eyes. It covers what both see of all panels, and a margin.
+    Raises ValueError where the eyes have no horizontal separation.
+    """
+    middle = eyes_m.mean(axis=0)
+    half = (eyes_m[1] - eyes_m[0]) / 2
+    gap_m = stack.x_m[-1] - stack.x_m[1]
+    plane_m = stack.x_m[1] + gap_m**2 / (middle[0] - stack.x_m[1])
+    reach = (stack.x_m[-1] - plane_m) / (middle[0] - stack.x_m[-1])
+    step_y_m, step_z_m = half[1:] * (reach / cell_px)
+    if abs(step_y_m) < 1e-12:
+        raise ValueError("the line of the eyes is vertical or has no length")
+    low, high = _common_extent(middle, stack, plane_m=plane_m, axis=1)
+    cells = ceil((high - low) / (2 * abs(step_y_m) * cell_px)) + 1
+    cells = min(CELLS_MAX, CELLS_STEP * ceil(cells / CELLS_STEP))
+    width = cells * 2 * cell_px
+    middle_y = (low + high) / 2
+    bottom, top = _panel_extent(middle, stack, plane_m=plane_m)
+    pitch_v_m = (top - bottom) / (stack.height_px / reduction)
+    rise_m = abs(step_z_m) * width
+    rows = ceil(stack.height_px / reduction + rise_m / pitch_v_m)
+    if rise_m / pitch_v_m > 0.01:
+        rows = ROWS_STEP * ceil(rows / ROWS_STEP)
+    middle_z = (bottom + top) / 2
+    plane_from_raster = np.array(
+        [
+            [step_y_m, 0.0, middle_y - step_y_m * width / 2],
+            [step_z_m, -pitch_v_m, middle_z - step_z_m * width / 2 + pitch_v_m * rows / 2],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    return ChainFrame(plane_m, plane_from_raster, cells, cell_px, rows, middle)
+
+
+def _common_extent(middle: F64, stack: PanelStack, *, plane_m: float, axis: int) -> tuple[float, float]:
+    """(low, high) on the plane, metres, that rays from `middle` through all panels reach; the centre's at least 10%."""
+    half_m = stack.width_m / 2
+    lows, highs = [], []
+    for x_m in stack.x_m:
+        t = (x_m - plane_m) / (middle[0] - plane_m)
+        lows.append((-half_m - middle[axis] * t) / (1 - t))
+        highs.append((half_m - middle[axis] * t) / (1 - t))
+    low, high = max(lows), min(highs)
+    if high - low < stack.width_m / 10:
+        centre = (low + high) / 2
+        low, high = centre - stack.width_m / 20, centre + stack.width_m / 20
+    return low, high
+
+
+def _panel_extent(middle: F64, stack: PanelStack, *, plane_m: float) -> tuple[float, float]:
+    """(bottom, top) of the centre panel, seen on the plane, metres."""
+    t = (stack.x_m[1] - plane_m) / (middle[0] - plane_m)
+    half_m = stack.height_m / 2
+    return (-half_m - middle[2] * t) / (1 - t), (half_m - middle[2] * t) / (1 - t)
+
+
+@lru_cache(maxsize=8)
+def chain_modes(cells: int) -> tuple[F32, F32, F32]:
+    """Singular value decomposition of A, in closed form: A = U·diag(s)·V^T for `cells` equations.
+
+    A is (cells, cells + 1) with rows [.. -2 2 ..]; A·A^T is tridiagonal and Toeplitz, so U is the sine transform.
+    Returns V (cells + 1, cells), s (cells,) and U^T (cells, cells), float32.
+    """
+    index = np.arange(1, cells + 1)
+    angle = np.pi * index / (cells + 1)
+    u = np.sqrt(2 / (cells + 1)) * np.sin(np.outer(index, angle))
+    s = 4 * np.sin(angle / 2)
+    padded = np.vstack([np.zeros(cells), u, np.zeros(cells)])
+    v = 2 * (padded[:-1] - padded[1:]) / s
+    return v.astype(np.float32), s.astype(np.float32), np.ascontiguousarray(u.T, dtype=np.float32)
+
+
+def cells_of(image: NDArray[np.float32], frame: ChainFrame) -> NDArray[np.float32]:
+    """(rows, cells, 2K·C) view of an image (rows, width, C)."""
+    return image.reshape(frame.rows, frame.cells, -1)

@@ -1,0 +1,73 @@
+"""What a model file says about itself (design 5.4), checked at load."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from runtime.config import Section, validated
+from runtime.errors import InputError
+
+METADATA_KEY = "phasestack.contract"
+VERSION = 1
+
+
+class Step(Section):
+    """One unrolled correction step of a `chain` model."""
+
+    kind: Literal["chain", "sweep"] = Field(description="the network along the eyes' line, or a local correction")
+    size: Annotated[float, Field(gt=0, le=2)] = Field(1.0, description="learned step size")
+
+
+class TrainedFor(Section):
+    """The range of poses that the model was trained on."""
+
+    distance_m: tuple[float, float]
+    off_axis_deg: tuple[float, float]
+    separation_m: tuple[float, float]
+    spacing_m: tuple[float, float]
+
+
+class Contract(Section):
+    """The metadata entry `phasestack.contract`."""
+
+    version: Literal[1]
+    arch: str
+    name: str
+    panels: Annotated[int, Field(ge=2, le=8)]
+    eyes: Literal[2]
+    input_frame: Literal["panel", "centre", "chain"]
+    input_value: Literal["intensity", "phase"]
+    layout: Literal["NCHW", "RNC"] = Field(description="RNC: rows, chain cells, columns of a cell by channels")
+    eye_order: Literal["left-right", "right-left"]
+    output: Literal["panels", "outer"]
+    branch: Literal[1, 2]
+    value_range: tuple[float, float]
+    trained_for: TrainedFor
+    recipe_sha256: str
+    width_px: int = Field(0, description="fixed input width; 0: any")
+    height_px: int = Field(0, description="fixed input height; 0: any")
+    precision: Literal["fp32", "fp16", "int8"] = "fp32"
+    parameters: int = 0
+    cell_px: int = Field(4, description="chain: parallax of the outer panels in columns of the network's raster")
+    reduction: Literal[1, 2, 4] = Field(2, description="chain: the network's raster is so much coarser than a panel")
+    steps: tuple[Step, ...] = ()
+
+
+def parse_contract(metadata: dict[str, str], *, source: str | Path) -> Contract:
+    """The contract in an ONNX file's metadata. Raises InputError where it is missing, unknown or does not fit."""
+    text = metadata.get(METADATA_KEY)
+    if text is None:
+        raise InputError(source, METADATA_KEY, "the model carries no contract: it is not one of phasestack's")
+    try:
+        table: Any = json.loads(text)
+    except ValueError as error:
+        raise InputError(source, METADATA_KEY, f"malformed: {error}") from None
+    if not isinstance(table, dict):
+        raise InputError(source, METADATA_KEY, "must be one JSON object")
+    if table.get("version") != VERSION:
+        raise InputError(source, f"{METADATA_KEY}.version", f"is {table.get('version')!r}, this runtime knows {VERSION}")
+    return validated(Contract, table, source=source)

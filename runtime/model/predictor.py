@@ -1,0 +1,95 @@
+"""Models behind one interface: which pictures a model wants drawn, and the layers it makes of them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+
+from runtime.config import ModelSettings
+from runtime.errors import InputError
+from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.records import F64, U8
+
+SHIPPED = ("fast", "balanced", "best")
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """The layers for two eyes, and what they took."""
+
+    layers: U8  # (N, height_px, width_px, 4) RGBA, rear to front; the predictor's own until its next call
+    stage_ms: dict[str, float] = field(default_factory=dict)  # prepare, inference (the network alone), finish
+
+
+class Predictor(ABC):
+    """Two pictures in, N layers out. One thread uses it."""
+
+    name: str
+    provider: str
+    parameters: int
+    stack: PanelStack
+
+    @abstractmethod
+    def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
+        """The rasters that each eye's picture must be drawn on, for eyes (2, 3), frame `stack`."""
+
+    @abstractmethod
+    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64) -> Prediction:
+        """Layers for `images[eye][raster]`, (h, w, 4) RGBA, left eye first, drawn on `rasters(eyes_m)`.
+
+        Raises ModelFailure where inference fails or does not answer with finite numbers.
+        """
+
+    def warm_up(self, eyes_m: F64) -> None:
+        """Run once on grey pictures, so that the first frame does not pay for allocation."""
+        import numpy as np
+
+        rasters = self.rasters(eyes_m)
+        grey = [np.full((raster.height_px, raster.width_px, 4), 128, np.uint8) for raster in rasters]
+        self.predict([grey, grey], eyes_m)
+
+    def close(self) -> None:  # noqa: B027 - most hold nothing
+        """Release threads and sessions. May be called twice."""
+
+
+def model_path(name: str) -> Path | None:
+    """The file of a shipped model or of a path; None for `sart`. Raises InputError for an unknown name."""
+    if name == "sart":
+        return None
+    if name in SHIPPED:
+        return Path(str(resources.files("runtime.model") / "data" / f"{name}.onnx"))
+    path = Path(name)
+    if path.suffix != ".onnx" and not path.exists():
+        raise InputError("model", "name", f"{name!r} is neither {', '.join(SHIPPED)}, sart nor an ONNX file")
+    return path
+
+
+def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None = None) -> Predictor:
+    """The model `name` (shipped name, `sart` or an ONNX file) for a stack.
+
+    A stack that the network was not made for (not three evenly spaced panels) is served by `sart` where a
+    shipped name was asked for; `Predictor.name` says so. Raises InputError, MissingPart.
+    """
+    settings = settings or ModelSettings()
+    path = model_path(name)
+    if path is None or (name in SHIPPED and not (stack.count == 3 and stack.is_evenly_spaced)):
+        from runtime.model.sart import SartPredictor
+
+        return SartPredictor(stack, why="" if path is None else f"instead of {name}: needs three even panels")
+    from runtime.model.session import ModelSession
+
+    session = ModelSession(path, provider=settings.provider, threads=settings.threads)
+    if session.contract.panels != stack.count:
+        raise InputError(path, "contract.panels", f"made for {session.contract.panels} panels, the stack has {stack.count}")
+    if session.contract.input_frame == "chain":
+        if not stack.is_evenly_spaced:
+            raise InputError(path, "contract.panels", "needs evenly spaced panels; use the model sart")
+        from runtime.model.unrolled import UnrolledPredictor
+
+        return UnrolledPredictor(session, stack, tolerance_mm=settings.tolerance_mm)
+    from runtime.model.network import NetworkPredictor
+
+    return NetworkPredictor(session, stack, source=path)

@@ -1,0 +1,49 @@
+"""One still stereo pair to layers: what `solve`, the report and the calibration charts drive."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from runtime.model.predictor import Prediction, Predictor
+from runtime.optics.views import image_from_raster, image_from_stack
+from runtime.records import F64, U8
+
+
+def solve_still(left: U8, right: U8, *, eyes_m: F64, fov_deg: float, predictor: Predictor) -> Prediction:
+    """Layers for two pictures (h, w, 3 or 4) that a left and a right eye (2, 3), frame `stack`, should see.
+
+    The pictures' horizontal field of view is `fov_deg`; each eye looks at the stack's origin. Warps each picture
+    to the rasters that the predictor wants (seed 47). Its prepare time includes the warps.
+    """
+    import cv2
+
+    start = cv2.getTickCount()
+    rasters = predictor.rasters(eyes_m)
+    images = []
+    for picture, eye_m in zip((left, right), eyes_m, strict=True):
+        height, width = picture.shape[:2]
+        rgba = picture if picture.shape[2] == 4 else cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA)
+        projection = image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg)
+        warped = []
+        for raster in rasters:
+            # OpenCV puts pixel centres at integers.
+            matrix = _shifted(-0.5) @ image_from_raster(projection, raster) @ _shifted(0.5)
+            warped.append(
+                cv2.warpPerspective(
+                    rgba,
+                    matrix,
+                    (raster.width_px, raster.height_px),
+                    flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                    borderMode=cv2.BORDER_REPLICATE,
+                )
+            )
+        images.append(warped)
+    warps_ms = (cv2.getTickCount() - start) / cv2.getTickFrequency() * 1e3
+    prediction = predictor.predict(images, eyes_m)
+    stage_ms = dict(prediction.stage_ms)
+    stage_ms["prepare"] = stage_ms.get("prepare", 0.0) + warps_ms
+    return Prediction(prediction.layers, stage_ms)
+
+
+def _shifted(by: float) -> F64:
+    return np.array([[1.0, 0.0, by], [0.0, 1.0, by], [0.0, 0.0, 1.0]])

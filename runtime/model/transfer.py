@@ -1,0 +1,20 @@
+"""Between 8-bit code values and phases, by tables."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.optics.malus import Branch, phase_from_intensity
+
+SUBCODE = 16  # fixed point: sixteenths of an 8-bit panel code
+FULL = 255 * SUBCODE  # one panel's whole range, a quarter turn
+
+
+@lru_cache(maxsize=4)
+def phase_codes(branch: Branch = 2) -> NDArray[np.int16]:
+    """(256,) phase sum, in sixteenths of a panel code, for each 8-bit code value an eye should see."""
+    codes = np.arange(256) / 255.0
+    return np.rint(phase_from_intensity(codes, branch) * FULL).astype(np.int16)
