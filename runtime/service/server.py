@@ -52,7 +52,7 @@ class StatusServer:
             self._lock.close()
             raise
         self._thread = threading.Thread(
-            target=self._server.serve_forever, kwargs={"poll_interval": 0.2}, name="status", daemon=True
+            target=self._server.serve_forever, kwargs={"poll_interval": 0.1}, name="status", daemon=True
         )
         self._thread.start()
 
