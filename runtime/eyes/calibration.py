@@ -30,7 +30,13 @@ Vector3 = tuple[Number, Number, Number]
 Row7 = tuple[Number, Number, Number, Number, Number, Number, Number]
 
 
-class ResidualTable(Section):
+class Lenient(Section):
+    """A table in which keys of other programs and later versions are left alone."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+
+
+class ResidualTable(Lenient):
     """`[residuals]`: how well the pairs fit, metres."""
 
     rms_m: Annotated[float, Field(ge=0)]
@@ -39,7 +45,7 @@ class ResidualTable(Section):
     leave_one_out_rms_m: Annotated[float, Field(ge=0)] | None = None
 
 
-class CovarianceTable(Section):
+class CovarianceTable(Lenient):
     """`[covariance]`: of the parameters in the module's text."""
 
     pivot_m: Vector3
@@ -57,10 +63,8 @@ class CovarianceTable(Section):
         return rows
 
 
-class CalibrationFile(Section):
-    """A calibration file's tables; only `stack_from_sensor` is required, keys of others are left alone."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+class CalibrationFile(Lenient):
+    """A calibration file's tables; only `stack_from_sensor` is required."""
 
     stack_from_sensor: tuple[Row4, Row4, Row4, Row4]
     units: Literal["m"] = "m"

@@ -1,0 +1,215 @@
+"""`calibrate report`: the error of every point (seed's figure S5), and camera, panels and points, on one page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.checks import RESIDUAL_LIMIT_M
+from calib.figures import eye_error_figure, geometry_figure, residual_figure
+from calib.page import Picture, page
+from calib.pairs import Pairs, read_pairs
+from calib.viewpoints import spherical_m, viewing_volume_m
+from runtime.artifacts import OutputFolder, write_bytes, write_json, write_text
+from runtime.config import read_table
+from runtime.errors import InputError
+from runtime.eyes.calibration import Calibration, load_calibration, similarity_defect
+from runtime.optics.stack import PanelStack
+from runtime.records import F64
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """The pairs behind a calibration."""
+
+    pairs: Pairs
+    used: NDArray[np.bool_]  # (K,)
+    residual_m: F64  # (K, 3) calibrated minus known, frame `stack`
+
+
+def stored_points(path: Path, calibration: Calibration) -> Points | None:
+    """The pairs that a calibration file holds in `[data]`; None where it holds none. Raises InputError."""
+    data = read_table(path).get("data")
+    if not isinstance(data, dict) or "sensor_m" not in data:
+        return None
+    try:
+        sensor_m, stack_m = (np.array(data[name], dtype=np.float64) for name in ("sensor_m", "stack_m"))
+        used = np.array(data.get("used", [True] * len(sensor_m)), dtype=bool)
+        names = tuple(str(name) for name in data.get("names", range(1, len(sensor_m) + 1)))
+    except (KeyError, ValueError, TypeError):
+        raise InputError(path, "data", "sensor_m and stack_m must be lists of three numbers each") from None
+    count = len(sensor_m)
+    if not count or sensor_m.shape != (count, 3) or stack_m.shape != (count, 3):
+        raise InputError(path, "data", "sensor_m and stack_m must be lists of three numbers each, equally long")
+    if used.shape != (count,) or len(names) != count or not np.isfinite([sensor_m, stack_m]).all() or not used.any():
+        raise InputError(path, "data", "names, used, sensor_m and stack_m do not fit together")
+    pairs = Pairs(sensor_m, stack_m, names, str(path))
+    return Points(pairs, used, calibration.points(sensor_m) - stack_m)
+
+
+def write_report(file: Path, out: Path, *, pairs_path: Path | None, stack: PanelStack) -> dict[str, Any]:
+    """Write `index.html`, its PNGs and `report.json`. Raises InputError."""
+    calibration = load_calibration(file)
+    points = stored_points(file, calibration)
+    if pairs_path is not None:
+        pairs = read_pairs(pairs_path)
+        if not len(pairs):
+            raise InputError(pairs_path, "pairs", "there are none")
+        points = Points(pairs, np.ones(len(pairs), bool), calibration.points(pairs.sensor_m) - pairs.stack_m)
+    pictures = list(_pictures(calibration, points, stack))
+    summary = _summary(calibration, points)
+    tables = [("Numbers", _numbers(calibration, summary)), ("stack_from_sensor", _matrix(calibration))]
+    if points is not None:
+        tables.append(("Points", _point_rows(points)))
+    with OutputFolder(out) as folder:
+        for picture in pictures:
+            write_bytes(folder.staging / picture.name, picture.png)
+        write_json(folder.staging / "report.json", summary)
+        html = page(
+            title=f"Calibration {file.name}",
+            lead="Where the depth camera stands before the stack of panels, and how well that is known.",
+            notes=_notes(calibration, points, file),
+            tables=tables,
+            pictures=pictures,
+        )
+        write_text(folder.staging / "index.html", html)
+    return summary | {"out": str(out), "pictures": [picture.name for picture in pictures]}
+
+
+def _pictures(calibration: Calibration, points: Points | None, stack: PanelStack) -> list[Picture]:
+    matrix = calibration.stack_from_sensor
+    gaze = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
+    found = []
+    if points is not None:
+        found.append(
+            Picture(
+                "residuals.png",
+                residual_figure(points.residual_m, points.used, limit_m=RESIDUAL_LIMIT_M),
+                "X, Y and Z error of every calibration point (the seed's figure S5)",
+            )
+        )
+    found.append(
+        Picture(
+            "geometry.png",
+            geometry_figure(
+                matrix[:3, 3],
+                gaze,
+                stack,
+                points_m=None if points is None else points.pairs.stack_m,
+                fitted_m=None if points is None else calibration.points(points.pairs.sensor_m),
+                used=None if points is None else points.used,
+            ),
+            "Camera, panels and points; the arrow is the camera's line of sight",
+        )
+    )
+    distances_m = np.linspace(0.2, 1.5, 40)
+    straight, aside = (
+        calibration.position_error_m(np.array([spherical_m(r, phi_deg=90, theta_deg=t) for r in distances_m]))
+        for t in (90, 65)
+    )
+    if straight is not None and aside is not None:
+        found.append(
+            Picture(
+                "eye-error.png",
+                eye_error_figure(distances_m, straight, aside),
+                "Expected error at the eye from the parameters' covariance",
+            )
+        )
+    return found
+
+
+def _summary(calibration: Calibration, points: Points | None) -> dict[str, Any]:
+    eye_error = calibration.position_error_m(viewing_volume_m())
+    found: dict[str, Any] = {
+        "file": calibration.source,
+        "method": calibration.method,
+        "date": calibration.date,
+        "sensor_serial": calibration.sensor_serial,
+        "scale": calibration.scale,
+        "similarity_defect": similarity_defect(calibration.stack_from_sensor),
+        "condition": calibration.condition,
+        "eye_error_mm": None if eye_error is None else float(eye_error.mean()) * 1e3,
+        "eye_error_p95_mm": None if eye_error is None else float(np.percentile(eye_error, 95)) * 1e3,
+    }
+    if calibration.residuals is not None and calibration.residuals.leave_one_out_rms_m is not None:
+        found["leave_one_out_mm"] = calibration.residuals.leave_one_out_rms_m * 1e3
+    if points is not None:
+        residual_m = points.residual_m[points.used]
+        distance_m = np.linalg.norm(residual_m, axis=-1)
+        found |= {
+            "points": len(points.pairs),
+            "rejected": int((~points.used).sum()),
+            "rms_mm": float(np.sqrt((distance_m**2).mean())) * 1e3,
+            "max_mm": float(distance_m.max()) * 1e3,
+            "axis_rms_mm": (np.sqrt((residual_m**2).mean(axis=0)) * 1e3).tolist(),
+        }
+    return found
+
+
+def _notes(calibration: Calibration, points: Points | None, file: Path) -> list[str]:
+    notes = list(calibration.warnings)
+    stored = read_table(file).get("warnings")
+    if isinstance(stored, list):
+        notes += [str(text) for text in stored]
+    if points is None:
+        notes.append("This file holds no pairs (or too many): give them with --pairs to see each point's error.")
+    if calibration.covariance is None:
+        notes.append("This file holds no covariance: the error at the eye is not known.")
+    return notes
+
+
+def _numbers(calibration: Calibration, summary: dict[str, Any]) -> list[list[str]]:
+    rows = [["", ""]]
+    names = {
+        "method": "method",
+        "date": "date",
+        "sensor_serial": "sensor",
+        "points": "points",
+        "rejected": "rejected as outliers",
+        "scale": "scale",
+        "similarity_defect": "departure from a similarity",
+        "condition": "condition",
+        "rms_mm": "residual, RMS (mm)",
+        "max_mm": "residual, largest (mm)",
+        "axis_rms_mm": "residual along x, y, z (mm)",
+        "leave_one_out_mm": "error of a point left out, RMS (mm)",
+        "eye_error_mm": "expected error at the eye, mean over the viewing volume (mm)",
+        "eye_error_p95_mm": "expected error at the eye, 95th percentile (mm)",
+    }
+    for key, name in names.items():
+        value = summary.get(key)
+        if value not in (None, ""):
+            rows.append([name, _shown(value)])
+    if calibration.covariance is not None:
+        sigma = np.sqrt(np.diag(calibration.covariance))
+        rows.append(["uncertainty of the rotation about x, y, z (degrees)", _shown(np.degrees(sigma[:3]).tolist())])
+        rows.append(["uncertainty of the shift along x, y, z (mm)", _shown((sigma[3:6] * 1e3).tolist())])
+        rows.append(["uncertainty of the scale", f"{sigma[6]:.2g}" if sigma[6] else "fixed"])
+    return rows
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(f"{item:.3g}" for item in value)
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+def _matrix(calibration: Calibration) -> list[list[str]]:
+    return [["", "sensor x", "sensor y", "sensor z", "1"]] + [
+        [f"stack {name}", *[f"{value:.6f}" for value in row]]
+        for name, row in zip("xyz", calibration.stack_from_sensor[:3].tolist(), strict=True)
+    ]
+
+
+def _point_rows(points: Points) -> list[list[str]]:
+    rows = [["", "point", "X error, mm", "Y error, mm", "Z error, mm", "distance, mm", ""]]
+    for number, (name, error, used) in enumerate(
+        zip(points.pairs.names, points.residual_m * 1e3, points.used, strict=True), start=1
+    ):
+        rows.append([str(number), name, *[f"{value:.2f}" for value in error], f"{np.linalg.norm(error):.2f}",
+                     "" if used else "rejected"])  # fmt: skip
+    return rows
