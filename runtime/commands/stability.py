@@ -1,0 +1,76 @@
+"""`phasestack stability`: stiff and extreme cases of every numerical step."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from runtime.report.stability.calibration import Fit
+
+
+def stability(
+    out: Annotated[Path | None, typer.Option(help="folder for stability.json, the plots and index.html")] = None,
+    full: Annotated[bool, typer.Option("--full", help="the long cases as well: minutes instead of seconds")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
+) -> None:
+    """Try every numerical step on stiff and extreme cases, against references of 50 digits.
+
+    Exits with 1 where a case fails. Needs mpmath: pip install phasestack[test]
+
+    Example: phasestack stability --out stability
+    """
+    import time
+    from dataclasses import asdict
+
+    from rich.console import Console
+
+    from runtime.artifacts import OutputFolder, to_json, write_json, write_text
+    from runtime.report.machine import describe
+    from runtime.report.progress import progress_bar
+    from runtime.report.stability import suite
+    from runtime.report.stability.page import stability_page, stages_of
+
+    started = time.perf_counter()
+    trials = list(suite.every_trial(_fit(), methods={}, full=full, extra=[]))
+    with progress_bar("stability") as tell:
+        cases = suite.run(trials, progress=tell)
+    seconds = time.perf_counter() - started
+    failed = [case for case in cases if not case.passed]
+    machine = describe(seed=0, packages=("mpmath",))
+    record = {"cases": [asdict(case) for case in cases], "machine": machine, "seconds": round(seconds, 1)}
+    if out is not None:
+        command = "phasestack stability" + (" --full" if full else "")
+        page = stability_page(cases, machine=machine, seconds=seconds, command=command)
+        with OutputFolder(out) as folder:
+            write_json(folder.staging / "stability.json", record)
+            write_text(folder.staging / "index.html", page.html())
+            for figure in page.figures():
+                (folder.staging / f"{figure.name}.png").write_bytes(figure.png)
+    if as_json:
+        print(to_json(record))
+    else:
+        console = Console(highlight=False)
+        for stage in stages_of(cases):
+            own = [case for case in cases if case.stage == stage]
+            refused = sum(case.behaviour == "refuses" for case in own)
+            bad = sum(not case.passed for case in own)
+            console.print(
+                f"{stage:14}{len(own):4} cases {refused:4} refused {bad:4} failed", style="red" if bad else None
+            )
+        for case in failed:
+            error = f"error {case.forward_error:.2g}, tolerance {case.tolerance:.2g} ({case.measure})"
+            console.print(f"FAILS {case.stage}: {case.name}: {case.behaviour}, {error} {case.note}", style="red")
+        verdict = f"{len(failed)} of {len(cases)} cases fail" if failed else f"all {len(cases)} cases pass"
+        console.print(f"{verdict}, in {seconds:.0f} s" + (f"; see {out / 'index.html'}" if out else ""))
+    if failed:
+        raise typer.Exit(1)
+
+
+def _fit() -> Fit:
+    """The calibration's closed form, with the scale of least squares."""
+    from calib.similarity import fit
+
+    return lambda sensor_m, stack_m: fit(sensor_m, stack_m, rule="least-squares").matrix

@@ -1,0 +1,88 @@
+"""One self-contained HTML page out of sections: text, pictures and tables."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A picture, and what a person should see in it."""
+
+    name: str  # of its file beside the page, without .png
+    png: bytes
+    caption: str
+
+    @property
+    def source(self) -> str:
+        """The picture as a data URI: the page needs no other file."""
+        return "data:image/png;base64," + base64.b64encode(self.png).decode()
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of texts under headings. A row's style is `good`, `bad` or empty."""
+
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+    styles: Sequence[str] = ()
+    folded: bool = False  # long tables open on a click
+
+    def styled_rows(self) -> list[tuple[str, Sequence[str]]]:
+        styles = [*self.styles, *[""] * (len(self.rows) - len(self.styles))]
+        return list(zip(styles, self.rows, strict=True))
+
+    def numeric(self) -> list[bool]:
+        """Which columns hold numbers: they are set flush right."""
+        return [
+            any(row[index] for row in self.rows)
+            and all(not row[index] or row[index][0] in "-+0123456789.∞" for row in self.rows)
+            for index in range(len(self.headings))
+        ]
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A part of the page."""
+
+    title: str
+    text: Sequence[str] = ()  # paragraphs, plain text
+    figures: Sequence[Figure] = ()
+    tables: Sequence[Table] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Tile:
+    """One large number at the head of the page."""
+
+    value: str
+    label: str
+    style: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A whole page."""
+
+    title: str
+    lead: str  # one sentence that says what the page found
+    sections: Sequence[Section]
+    machine: Mapping[str, str]
+    command: str  # that makes this page again
+    tiles: Sequence[Tile] = field(default_factory=tuple)
+
+    def html(self) -> str:
+        """The page. Every text is escaped; no request leaves it."""
+        from jinja2 import Environment, StrictUndefined
+
+        template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
+        environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+        return environment.from_string(template).render(page=self)
+
+    def figures(self) -> list[Figure]:
+        """Every picture of the page, in its order."""
+        return [figure for section in self.sections for figure in section.figures]

@@ -1,0 +1,141 @@
+"""The tracker's filter against a Kalman filter of 50 digits, and the tracker at extreme time steps and gains."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from runtime.clock import NS_PER_S
+from runtime.config import TrackerSettings
+from runtime.eyes import imm
+from runtime.eyes.tracker import Tracker
+from runtime.records import F64, EyePoints
+from runtime.report.stability import exact
+from runtime.report.stability.trial import EPS64, Answer, Trial
+
+STAGE = "tracker"
+EYES_M = np.array([[0.6, -0.031, 0.05], [0.6, 0.032, 0.05]])
+FRAME_NS = NS_PER_S // 30
+
+
+def exact_kalman(places: F64, dt_s: float, *, q: float, variance: float) -> tuple[Any, Any]:
+    """Position and velocity of one axis after all measurements: the textbook's matrices, 50 digits."""
+    mpf = exact.mpf
+    x, v = mpf(float(places[0])), mpf(0)
+    r, dt, noise = mpf(variance), mpf(dt_s), mpf(q)
+    p, s, c = r, mpf(0), mpf(1)  # variance of position, covariance, variance of velocity
+    for place in places[1:]:
+        x += v * dt
+        p, s, c = p + 2 * dt * s + dt * dt * c + noise * dt**3 / 3, s + dt * c + noise * dt**2 / 2, c + noise * dt
+        gain, gain_v = p / (p + r), s / (p + r)
+        x, v = x + gain * (mpf(float(place)) - x), v + gain_v * (mpf(float(place)) - x)
+        p, s, c = (1 - gain) * p, (1 - gain) * s, c - gain_v * s
+    return x, v
+
+
+def filtered(dt_s: float, *, q: float, noise_m: float, steps: int = 200) -> Answer:
+    """A plain Kalman filter (one model) over a noisy walk; its stiffness is the ratio of its two gains."""
+    rng = np.random.default_rng(3)
+    places = np.cumsum(rng.normal(0, 0.3 * min(dt_s, 1.0), (steps, 3)), axis=0) + rng.normal(0, noise_m, (steps, 3))
+    variance = noise_m**2
+    models = imm.started(places[0].tolist(), count=1, variance=variance, speed=1.0)
+    for place in places[1:]:
+        models = imm.predicted(models, dt_s, acceleration=(q,), stay_s=1.0)
+        models = imm.corrected(models, place.tolist(), variance=variance)
+    found, speed = imm.combined(models)
+    error = 0.0
+    for axis in range(3):
+        truth, truth_speed = exact_kalman(places[:, axis], dt_s, q=q, variance=variance)
+        error = max(error, exact.distance(found[axis], truth), dt_s * exact.distance(speed[axis], truth_speed))
+    index = math.sqrt(q * dt_s**3 / variance)  # Kalata's tracking index: how much the filter believes a sample
+    stiff = max(index, 1 / index)
+    span = float(np.abs(places).max())
+    return Answer(error / span, 64 * EPS64 * max(stiff, steps), stiff)
+
+
+def still(updates: int) -> Answer:
+    """A head that does not move must not drift."""
+    tracker = Tracker()
+    confidence = np.ones(2)
+    for index in range(updates):
+        tracker.update(EyePoints(EYES_M, confidence), capture_ns=index * FRAME_NS)
+    found = tracker.at((updates - 1) * FRAME_NS).eyes_m
+    assert found is not None
+    return Answer(float(np.abs(found - EYES_M).max()), 1e-12, float(updates))
+
+
+def after(steps_ns: list[int], ask_ns: int, *, settings: TrackerSettings | None = None, tolerance: float) -> Answer:
+    """A still head sampled at odd intervals, asked for at an odd time: it is where it was, or nowhere."""
+    tracker = Tracker(settings)
+    now = 0
+    tracker.update(EyePoints(EYES_M, np.ones(2)), capture_ns=now)
+    for step in steps_ns:
+        now += step
+        tracker.update(EyePoints(EYES_M, np.ones(2)), capture_ns=now)
+    estimate = tracker.at(now + ask_ns)
+    if estimate.eyes_m is None:
+        return Answer(0.0, tolerance, note=f"label {estimate.label}")
+    return Answer(float(np.abs(estimate.eyes_m - EYES_M).max()), tolerance, note=f"label {estimate.label}")
+
+
+def nonsense(eyes_m: F64, capture_ns: int) -> Answer:
+    """One bad sample among good ones must change nothing."""
+    trackers = Tracker(), Tracker()
+    for index in range(30):
+        for tracker in trackers:
+            tracker.update(EyePoints(EYES_M, np.ones(2)), capture_ns=(index + 1) * FRAME_NS)
+    trackers[1].update(EyePoints(eyes_m, np.ones(2)), capture_ns=capture_ns)
+    one, other = (tracker.at(30 * FRAME_NS + FRAME_NS // 2).eyes_m for tracker in trackers)
+    assert one is not None and other is not None
+    return Answer(float(np.abs(one - other).max()), 0.0)
+
+
+def trials(*, full: bool = False) -> Iterator[Trial]:
+    """Every case of the tracker; `full` adds the long one."""
+    for updates in (10_000, *((1_000_000,) if full else ())):
+        yield Trial(STAGE, f"{updates} updates of a still head", partial(still, updates), measure="m")
+    for name, dt_s, q, noise_m in (
+        ("as it is used", 1 / 30, 1.0, 0.003),
+        ("1 kHz", 1e-3, 1.0, 0.003),
+        ("a sample a second", 1.0, 1.0, 0.003),
+        ("believes every sample", 1 / 30, 1e4, 1e-3),
+        ("believes hardly any", 1 / 30, 1e-6, 0.03),
+        ("microseconds apart", 1e-6, 1.0, 0.003),
+    ):
+        run = partial(filtered, dt_s, q=q, noise_m=noise_m)
+        yield Trial(STAGE, f"Kalman filter, {name}", run, measure="of the walk")
+    hour, usual = 3600 * NS_PER_S, [FRAME_NS] * 30
+    for name, steps, ask in (
+        ("the same instant twice", [*usual, 0], 0),
+        ("1 ns apart", [*usual, 1], 0),
+        ("1 ns apart, all of them", [1] * 100, 0),
+        ("one hour apart", [*usual, hour], 0),
+        ("a day from the clock's zero", [24 * hour, *usual], FRAME_NS),
+        ("300 years from the clock's zero", [9_200_000_000 * NS_PER_S, *usual], FRAME_NS),
+        ("time set back", [*usual, -2 * NS_PER_S, *usual], 0),
+        ("asked 60 ms ahead", usual, 60_000_000),
+        ("asked an hour ahead", usual, hour),
+    ):
+        yield Trial(STAGE, name, partial(after, steps, ask, tolerance=1e-12), measure="m")
+    for name, values in (
+        ("acceleration noise 1e12", {"acceleration": (1e12,)}),
+        ("acceleration noise 1e-12", {"acceleration": (1e-12,)}),
+        ("sensor noise 1 nm", {"noise_m": 1e-9}),
+        ("sensor noise 1 m", {"noise_m": 1.0}),
+    ):
+        settings = TrackerSettings().model_copy(update=values)
+        run = partial(after, usual, 60_000_000, settings=settings, tolerance=1e-12)
+        yield Trial(STAGE, f"stiff gains: {name}", run, measure="m")
+    later = 30 * FRAME_NS + FRAME_NS // 4
+    for name, eyes, when in (
+        ("NaN", np.full((2, 3), np.nan), later),
+        ("infinitely far", np.full((2, 3), np.inf), later),
+        ("both eyes at one place", np.repeat(EYES_M[:1], 2, axis=0), later),
+        ("1e300 m away", EYES_M + 1e300, later),
+        ("late by a frame", EYES_M + 0.01, 29 * FRAME_NS),
+    ):
+        yield Trial(STAGE, f"one bad sample: {name}", partial(nonsense, eyes, when), measure="m")

@@ -1,0 +1,98 @@
+"""A trial is one extreme case; running it gives a Case, whatever the code under trial does."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+from runtime.errors import PhasestackError
+
+Behaviour = Literal["answers", "warns", "refuses"]
+EPS64 = 2.0**-52
+EPS32 = 2.0**-23
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What the code under trial came to, measured against the reference."""
+
+    forward_error: float  # of the result, in the trial's measure
+    tolerance: float  # largest forward error that passes, stated before the trial is run
+    condition: float = 1.0  # how much the problem itself enlarges a relative error of its input
+    backward_error: float | None = None  # relative change of the input that explains the result; None: the forward one
+    warned: bool = False
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One extreme case, not yet run."""
+
+    stage: str
+    name: str
+    run: Callable[[], Answer | None]  # None: it answered where it must refuse
+    expected: Behaviour = "answers"
+    measure: str = "relative"  # unit of the forward error
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One extreme case and how it ended: a row of `stability.json`."""
+
+    name: str
+    stage: str
+    condition: float
+    forward_error: float
+    backward_error: float
+    behaviour: Behaviour
+    tolerance: float
+    passed: bool
+    expected: Behaviour
+    measure: str
+    note: str = field(default="")
+
+
+def refusal(stage: str, name: str, call: Callable[[], object]) -> Trial:
+    """A trial that passes when the code refuses, in its own words, to answer."""
+
+    def run() -> None:
+        call()
+
+    return Trial(stage, name, run, expected="refuses", measure="-")
+
+
+def settle(trial: Trial) -> Case:
+    """Run a trial. Nothing that the code under trial raises escapes; only its own errors count as a refusal."""
+    nothing = float("nan")
+    try:
+        with warnings.catch_warnings():
+            # numpy's complaints about inf and NaN are not how the runtime warns: what comes out is measured.
+            warnings.simplefilter("ignore", RuntimeWarning)
+            answer = trial.run()
+    except (PhasestackError, ValueError) as error:
+        passed = trial.expected == "refuses"
+        return Case(
+            trial.name, trial.stage, float("inf"), nothing, nothing, "refuses", 0.0, passed, trial.expected,
+            trial.measure, str(error),
+        )  # fmt: skip
+    except Exception as error:
+        note = f"{type(error).__name__}: {error}"
+        return Case(
+            trial.name, trial.stage, float("inf"), nothing, nothing, "refuses", 0.0, False, trial.expected,
+            trial.measure, note,
+        )  # fmt: skip
+    if answer is None:
+        return Case(
+            trial.name, trial.stage, float("inf"), nothing, nothing, "answers", 0.0, False, trial.expected,
+            trial.measure, "it answered where no answer exists",
+        )  # fmt: skip
+    behaviour: Behaviour = "warns" if answer.warned else "answers"
+    backward = answer.forward_error if answer.backward_error is None else answer.backward_error
+    # A NaN compares false with everything: it fails.
+    passed = behaviour == trial.expected and answer.forward_error <= answer.tolerance
+    return Case(
+        trial.name, trial.stage, answer.condition, answer.forward_error, backward, behaviour, answer.tolerance,
+        passed, trial.expected, trial.measure, answer.note,
+    )  # fmt: skip
