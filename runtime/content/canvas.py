@@ -16,7 +16,7 @@ SIDES = 2
 
 @dataclass(slots=True)
 class _Target:
-    smooth: Any  # multisampled framebuffer; the same as `plain` where edges are left as they are
+    smooth: Any  # framebuffer with several samples or half floats; `plain` where neither is wanted
     plain: Any
     pictures: list[U8]  # one (h, w, 4) array a side, reused
 
@@ -28,8 +28,12 @@ class Canvas:
     software rasteriser resolving is the dearest step.
     """
 
-    def __init__(self, context: Any, *, samples: int, background: tuple[float, float, float]) -> None:
+    def __init__(
+        self, context: Any, *, samples: int, background: tuple[float, float, float], deep: bool = False
+    ) -> None:
+        """deep: draw in half floats, for sums of many layers, some brighter than white."""
         self._context = context
+        self._deep = deep
         self._samples = min(samples, context.max_samples)
         self.clear_colour = (*background, 0.0)
         self._targets: dict[tuple[int, int], _Target] = {}
@@ -70,11 +74,12 @@ class Canvas:
         size = (width_px, height_px)
         if size not in self._targets:
             plain = self._framebuffer(size, 0)
-            smooth = self._framebuffer(size, self._samples) if self._samples > 1 else plain
+            other = self._samples > 1 or self._deep
+            smooth = self._framebuffer(size, self._samples, "f2" if self._deep else "f1") if other else plain
             pictures = [np.zeros((height_px, width_px, 4), np.uint8) for _ in range(SIDES)]
             self._targets[size] = _Target(smooth, plain, pictures)
         return self._targets[size]
 
-    def _framebuffer(self, size: tuple[int, int], samples: int) -> Any:
-        colour = self._context.renderbuffer(size, 4, samples=samples)
+    def _framebuffer(self, size: tuple[int, int], samples: int, dtype: str = "f1") -> Any:
+        colour = self._context.renderbuffer(size, 4, samples=samples, dtype=dtype)
         return self._context.framebuffer([colour], self._context.depth_renderbuffer(size, samples=samples))

@@ -1,0 +1,116 @@
+"""3D Gaussian splats, sorted and blended straight into the pixels that a view asks for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import moderngl
+import numpy as np
+
+from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.camera import PixelBox
+from runtime.content.canvas import Canvas
+from runtime.content.gaussians import Gaussians, colours_towards, moved, seen_splats
+from runtime.records import F64, U8
+
+OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
+FLOATS = 8  # a corner: place in clip space (2), place in standard deviations (2), colour and opacity (4)
+VERTEX = """
+#version 330
+in vec2 in_place;
+in vec2 in_deviations;
+in vec4 in_colour;
+out vec2 deviations;
+flat out vec4 colour;
+void main() {
+    deviations = in_deviations;
+    colour = in_colour;
+    gl_Position = vec4(in_place, 0.0, 1.0);
+}
+"""
+FRAGMENT = """
+#version 330
+in vec2 deviations;
+flat in vec4 colour;
+out vec4 pixel;
+void main() {
+    float alpha = min(0.99, colour.a * exp(-0.5 * dot(deviations, deviations)));
+    if (alpha < 1.0 / 255.0) discard;
+    pixel = vec4(colour.rgb, alpha);
+}
+"""
+
+
+class SplatSource(ContentSource):
+    """A scene of splats at its place in the stack frame."""
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        *,
+        stack_from_scene: F64,
+        context: Any,
+        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        name: str = "splats",
+    ) -> None:
+        self._gaussians = moved(gaussians, stack_from_scene)
+        linear = stack_from_scene[:3, :3]
+        self._scene_from_stack_rotation = (np.linalg.inv(linear) * np.cbrt(np.linalg.det(linear))).astype(np.float32)
+        self._context = context
+        self._canvas = Canvas(context, samples=0, background=background, deep=True)
+        self._program = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
+        count = len(gaussians.centres)
+        self._corners = np.empty((count, 4, FLOATS), np.float32)
+        self._buffer = context.buffer(reserve=max(self._corners.nbytes, 1), dynamic=True)
+        quads = np.arange(count, dtype=np.int32)[:, None] * 4 + np.array([0, 1, 2, 2, 1, 3], np.int32)
+        self._vertices = context.vertex_array(
+            self._program,
+            [(self._buffer, "2f 2f 4f", "in_place", "in_deviations", "in_colour")],
+            index_buffer=context.buffer(np.ascontiguousarray(quads).tobytes()),
+        )
+        x = np.percentile(self._gaussians.centres[:, 0], [1, 99])
+        self.info = ContentInfo(
+            name=name,
+            depth_range_m=(float(x[0]), float(x[1])),
+            background=background,
+            left_out=("lights", "textures") + (("harmonics",) if gaussians.harmonics.shape[1] == 1 else ()),
+        )
+
+    def render(self, view: View, *, time_ns: int) -> U8:
+        """Every splat that the eye can see, farthest first."""
+        count = self._prepare(view)
+
+        def paint() -> None:
+            self._context.enable_only(self._context.BLEND)
+            self._context.blend_func = OVER
+            self._vertices.render(vertices=6 * count)
+
+        whole = PixelBox(0, 0, view.width_px, view.height_px if count else 0)
+        return self._canvas.draw(
+            width_px=view.width_px, height_px=view.height_px, side=view.side, box=whole, paint=paint
+        )
+
+    def close(self) -> None:
+        self._canvas.close()
+        for held in (self._vertices, self._buffer, self._program):
+            held.release()
+
+    def _prepare(self, view: View) -> int:
+        """Fill the vertex buffer for a view; returns how many splats it holds."""
+        splats = seen_splats(self._gaussians, view.pixels_from_stack, width_px=view.width_px, height_px=view.height_px)
+        count = len(splats.index)
+        directions = self._gaussians.centres[splats.index] - view.eye_m.astype(np.float32)
+        directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), np.float32(1e-9))
+        directions = directions @ self._scene_from_stack_rotation.T
+        corners = self._corners[:count]
+        scale = np.array([2 / view.width_px, 2 / view.height_px], np.float32)
+        for corner, (right, down) in enumerate(((-1, -1), (1, -1), (-1, 1), (1, 1))):
+            offset = splats.major_px * np.float32(right) + splats.minor_px * np.float32(down)
+            corners[:, corner, 0:2] = (splats.centres_px + offset * splats.reach[:, None]) * scale - 1
+            corners[:, corner, 2] = splats.reach * right
+            corners[:, corner, 3] = splats.reach * down
+        corners[:, :, 4:7] = colours_towards(self._gaussians.harmonics[splats.index], directions)[:, None]
+        corners[:, :, 7] = splats.opacities[:, None]
+        if count:
+            self._buffer.write(corners)
+        return count

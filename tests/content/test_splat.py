@@ -1,0 +1,163 @@
+"""Gaussian splats: the same picture as an exact renderer of the same equations; files as others write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from plyfile import PlyData, PlyElement
+
+from runtime.config import ContentSettings
+from runtime.content.gaussians import harmonic_basis, load_gaussians
+from runtime.content.placing import stack_from_scene
+from runtime.content.splat import SplatSource
+from runtime.errors import InputError
+from runtime.optics.stack import PanelStack
+from tests.content.conftest import image_view, panel_view
+from tests.content.splat_reference import harmonics, render
+
+COUNT = 400
+
+
+def splat_table(count: int = COUNT, degree: int = 3, seed: int = 0) -> np.ndarray:
+    """Random splats in a box of 2 x 4 x 2.4 units, as the reference implementation's file has them."""
+    random = np.random.default_rng(seed)
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest))]
+    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    table = np.zeros(count, dtype=[(name, "f4") for name in names])
+    for name, half in (("x", 1.0), ("y", 2.0), ("z", 1.2)):
+        table[name] = random.uniform(-half, half, count)
+    for name in names[6:9]:
+        table[name] = random.uniform(-1.5, 1.5, count)
+    for name in names[9 : 9 + rest]:
+        table[name] = random.normal(0, 0.15, count)
+    table["opacity"] = random.normal(1.0, 2.0, count)
+    for axis in range(3):
+        table[f"scale_{axis}"] = random.normal(-2.6, 0.5, count)
+    for axis in range(4):
+        table[f"rot_{axis}"] = random.normal(0, 1, count)
+    return table
+
+
+def written(folder: Path, table: np.ndarray, name: str = "scene.ply") -> Path:
+    path = folder / name
+    PlyData([PlyElement.describe(table, "vertex")]).write(path)
+    return path
+
+
+def placed(path: Path, context: Any, stack: PanelStack, **settings: Any) -> tuple[SplatSource, np.ndarray]:
+    gaussians = load_gaussians(path)
+    low, high = gaussians.centres.min(0).astype(float), gaussians.centres.max(0).astype(float)
+    matrix = stack_from_scene(
+        low, high, settings=ContentSettings(**settings), path=path, stack=stack, scene_from_stack=None
+    )
+    return SplatSource(gaussians, stack_from_scene=matrix, context=context, background=(1.0, 0.9, 0.8)), matrix
+
+
+def exact(table: np.ndarray, matrix: np.ndarray, view: Any) -> np.ndarray:
+    def columns(*names: str) -> np.ndarray:
+        return np.column_stack([table[name] for name in names]).astype(np.float64)
+
+    rest = sorted((name for name in table.dtype.names or () if name.startswith("f_rest")), key=lambda n: int(n[7:]))
+    first = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
+    higher = columns(*rest).reshape(len(table), 3, -1).transpose(0, 2, 1) if rest else first[:, :0]
+    quaternions = columns("rot_0", "rot_1", "rot_2", "rot_3")
+    return render(
+        columns("x", "y", "z"),
+        np.exp(columns("scale_0", "scale_1", "scale_2")),
+        quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True),
+        1 / (1 + np.exp(-table["opacity"].astype(np.float64))),
+        np.concatenate([first, higher], axis=1),
+        stack_from_scene=matrix,
+        projection=view.pixels_from_stack,
+        eye=view.eye_m,
+        width=view.width_px,
+        height=view.height_px,
+        background=(1.0, 0.9, 0.8),
+    )
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("eye", [(0.6, 0.03, 0.1), (0.3, 0.5, -0.1)], ids=["ahead", "60 degrees off"])
+def test_the_picture_agrees_with_an_exact_renderer_of_the_same_equations(
+    tmp_path: Path, context: Any, degree: int, eye: tuple[float, ...]
+) -> None:
+    stack = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 160, 90)
+    table = splat_table(degree=degree)
+    source, matrix = placed(written(tmp_path, table), context, stack, depth_m=(-0.1, 0.1))
+    for view in (panel_view(eye, stack.panel(1)), image_view(eye, 160, 90, fov_deg=50)):
+        picture = source.render(view, time_ns=0)
+        wanted = np.clip(exact(table, matrix, view), 0, 1)
+        assert wanted.std() > 0.05
+        error = (picture[..., :3] / 255 - wanted) ** 2
+        assert -10 * np.log10(error.mean()) > 40
+
+
+def test_the_nearer_splat_shows(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    """Two opaque splats on one ray: the nearer one shows, in whichever order the file has them."""
+    eye = np.array([0.6, 0.0, 0.0])
+    for order in ((0, 1), (1, 0)):
+        table = splat_table(2, degree=0)
+        table["x"], table["y"], table["z"] = [-0.05, 0.05], 0, 0
+        table["opacity"] = 8
+        for axis in range(3):
+            table[f"scale_{axis}"] = np.log(0.005)
+        table["f_dc_0"], table["f_dc_1"], table["f_dc_2"] = [-1.77, 1.77], [1.77, -1.77], -1.77
+        source, _ = placed(written(tmp_path, table[list(order)]), context, stack, fit=False)
+        picture = source.render(panel_view(eye, stack.panel(1)), time_ns=0)
+        assert picture[135, 240, 0] > 245
+        assert picture[135, 240, 1] < 10
+
+
+def test_the_harmonics_are_the_textbook_s() -> None:
+    for direction in np.random.default_rng(1).normal(size=(20, 3)):
+        direction /= np.linalg.norm(direction)
+        ours = harmonic_basis(direction[None].astype(np.float32), 16)[0]
+        assert ours == pytest.approx(harmonics(direction, 16), abs=1e-5)
+
+
+@pytest.mark.parametrize("missing", ["x", "f_dc_1", "opacity", "scale_2", "rot_3"])
+def test_a_missing_property_is_named(tmp_path: Path, missing: str) -> None:
+    table = splat_table(3)
+    kept = table[[name for name in table.dtype.names or () if name != missing]]
+    packed = np.array(kept.tolist(), dtype=[(name, "f4") for name in kept.dtype.names or ()])
+    with pytest.raises(InputError, match=rf"scene.ply: {missing}: the property is missing"):
+        load_gaussians(written(tmp_path, packed))
+
+
+def test_a_wrong_number_of_harmonics_is_told(tmp_path: Path) -> None:
+    table = splat_table(3, degree=1)
+    kept = table[[name for name in table.dtype.names or () if name != "f_rest_8"]]
+    packed = np.array(kept.tolist(), dtype=[(name, "f4") for name in kept.dtype.names or ()])
+    with pytest.raises(InputError, match=r"scene.ply: f_rest: 8 properties"):
+        load_gaussians(written(tmp_path, packed))
+
+
+@pytest.mark.parametrize(("name", "value"), [("scale_1", 60.0), ("scale_1", np.inf), ("x", np.nan), ("rot_2", np.nan)])
+def test_absurd_values_are_told(tmp_path: Path, name: str, value: float) -> None:
+    table = splat_table(50)
+    table[name][7] = value
+    with pytest.raises(InputError, match=rf"scene.ply: {name[:3]}.*: (1 splats|1 of 50)"):
+        load_gaussians(written(tmp_path, table))
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nend_header\n", b"\x00" * 99]
+)
+def test_a_broken_file_is_one_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "broken.ply"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"broken.ply"):
+        load_gaussians(path)
+
+
+def test_splats_behind_the_eye_or_beside_the_raster_draw_nothing(
+    tmp_path: Path, context: Any, stack: PanelStack
+) -> None:
+    table = splat_table(50)
+    source, _ = placed(written(tmp_path, table), context, stack)
+    picture = source.render(panel_view((-1.0, 0.0, 0.0), stack.panel(1)), time_ns=0)
+    assert (picture[..., 3] == 0).all()
