@@ -178,6 +178,18 @@ class Display:
         self.faults.append("the X server died")
 
 
+def connected_monitors() -> tuple[Monitor, ...]:
+    """The active monitors, from left to right. Raises PanelLost (no X server, no monitor), MissingPart."""
+    display = Display()
+    try:
+        found = display.monitors()
+    finally:
+        display.close()
+    if not found:
+        raise PanelLost("the X server has no active monitor")
+    return found
+
+
 def _attach(handle: Any) -> moderngl.Context:
     settings: dict[str, Any] = {"context": WindowContext(handle)}
     return moderngl.create_context(require=MINIMUM_VERSION, **settings)

@@ -58,9 +58,13 @@ class WindowPanels(PanelSink):
 
     def __init__(
         self, settings: OutputSettings, panels: tuple[PanelSettings, ...], stack: PanelStack, clock: Clock,
-        content: moderngl.Context,
+        content: moderngl.Context, *, any_shape: bool = False,
     ) -> None:  # fmt: skip
-        """Raises InputError (settings), PanelLost (a panel is missing or ambiguous, no X server: it may come)."""
+        """`any_shape`: fill monitors whose shape is not the stack's (identify), rather than refuse them.
+
+        Raises InputError (settings), PanelLost (a panel is missing or ambiguous, no X server: it may come).
+        """
+        self._any_shape = any_shape
         self.name = settings.kind
         self._settings, self._panels, self._stack = settings, panels, stack
         self._clock, self._content = clock, content
@@ -154,8 +158,9 @@ class WindowPanels(PanelSink):
     def _open(self) -> None:
         self._display = display = Display()
         self.monitors = bind(self._panels, display.monitors())
-        for number, (panel, monitor) in enumerate(zip(self._panels, self.monitors, strict=True)):
-            check_shape(number, panel, monitor, width_px=self._stack.width_px, height_px=self._stack.height_px)
+        if not self._any_shape:
+            for number, (panel, monitor) in enumerate(zip(self._panels, self.monitors, strict=True)):
+                check_shape(number, panel, monitor, width_px=self._stack.width_px, height_px=self._stack.height_px)
         display.root.make_current()
         self._layers = display.root.context.texture_array(
             (self._stack.width_px, self._stack.height_px, len(self._panels)), 4

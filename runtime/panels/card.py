@@ -1,0 +1,65 @@
+"""What `identify` shows on a panel: which one it is, which way is up, whether its colours and edges are right."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from runtime.records import U8
+
+INK = (255, 255, 255, 255)
+PAPER = (24, 28, 36, 255)
+BARS = ((255, 0, 0), (0, 255, 0), (0, 0, 255), (0, 255, 255), (255, 0, 255), (255, 255, 0), (255, 255, 255))
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+def identity_card(width_px: int, height_px: int, *, title: str, lines: Sequence[str]) -> U8:
+    """(height_px, width_px, 4) RGBA, upright for the viewer: title, lines, an arrow up, colour bars, grey steps.
+
+    A line of one pixel runs along every edge: where one is missing, the panel is cropped or misaligned.
+    """
+    card = np.empty((height_px, width_px, 4), np.uint8)
+    card[:] = PAPER
+    unit = min(width_px, height_px) / 100
+    _bars(card, top=round(height_px * 0.80))
+    _arrow(card, x_px=round(width_px * 0.86), top=round(height_px * 0.10), bottom=round(height_px * 0.70), unit=unit)
+    room = 0.72 * width_px
+    baseline = round(height_px * 0.22)
+    _text(card, title, x_px=round(4 * unit), y_px=baseline, height=14 * unit, room=room)
+    baseline += round(3 * unit)
+    for line in lines:
+        baseline += round(9.5 * unit)
+        _text(card, line, x_px=round(4 * unit), y_px=baseline, height=5 * unit, room=room)
+    edge = ((0, 0), (width_px - 1, height_px - 1))
+    cv2.rectangle(card, *edge, INK, 1)
+    corner = round(3 * unit)
+    cv2.rectangle(card, (corner, corner), (width_px - 1 - corner, height_px - 1 - corner), (120, 130, 150, 255), 1)
+    return card
+
+
+def _bars(card: U8, *, top: int) -> None:
+    height, width = card.shape[:2]
+    middle = (top + height) // 2
+    for index, colour in enumerate(BARS):
+        card[top:middle, width * index // len(BARS) : width * (index + 1) // len(BARS), :3] = colour
+    steps = 16
+    for index in range(steps):
+        columns = slice(width * index // steps, width * (index + 1) // steps)
+        card[middle:, columns, :3] = round(255 * index / (steps - 1))
+
+
+def _arrow(card: U8, *, x_px: int, top: int, bottom: int, unit: float) -> None:
+    width = max(2, round(2 * unit))
+    cv2.arrowedLine(card, (x_px, bottom), (x_px, top), INK, width, cv2.LINE_AA, tipLength=0.25)
+    _text(card, "UP", x_px=x_px + round(4 * unit), y_px=(top + bottom) // 2, height=6 * unit, room=14 * unit)
+    _text(card, "RIGHT >", x_px=x_px - round(10 * unit), y_px=bottom + round(8 * unit), height=4 * unit, room=26 * unit)
+
+
+def _text(card: U8, text: str, *, x_px: int, y_px: int, height: float, room: float) -> None:
+    # OpenCV's Hershey fonts know ASCII only.
+    plain = text.encode("ascii", "replace").decode()
+    (full, tall), _ = cv2.getTextSize(plain, FONT, 1.0, 1)
+    scale = min(height / tall, room / max(full, 1))
+    cv2.putText(card, plain, (x_px, y_px), FONT, scale, INK, max(1, round(scale * 1.6)), cv2.LINE_AA)
