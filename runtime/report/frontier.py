@@ -1,0 +1,185 @@
+"""Error against run time: every method on every pair, in one run, each method in a process of its own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from runtime.errors import InputError
+from runtime.records import U8
+from runtime.report.eyesight import Seen, judged
+from runtime.report.methods import Kind, Method, opened
+from runtime.report.pairs import StillPair
+
+ENOUGH_S = 2.0  # of timed runs on one pair; slow methods run once
+MOST_RUNS = 25
+FEWEST_RUNS = 3
+SLOW_S = 1.5  # a run that takes longer isn't repeated
+
+
+@dataclass(frozen=True, slots=True)
+class Timed:
+    """One method on one pair, as the process that ran it saw it."""
+
+    layers: U8
+    run_ms: list[float]  # whole predictions: two decoded images to N 8-bit layers
+    memory_mib: float  # the process's peak
+    parameters: int
+    precision: str
+
+
+@dataclass(frozen=True, slots=True)
+class PairResult:
+    """One method on one pair."""
+
+    pair: str
+    psnr_db: float
+    ssim: float
+    eye_psnr_db: tuple[float, ...]
+    psnr_db_off_eye: dict[str, float]
+    ms_p50: float
+
+
+@dataclass(frozen=True, slots=True)
+class MethodResult:
+    """One method over all pairs of one resolution: an entry of `methods` in report.json."""
+
+    name: str
+    kind: Kind
+    precision: str
+    width_px: int
+    height_px: int
+    ms_p50: float
+    ms_p99: float
+    runs: int
+    memory_mib: float
+    parameters: int
+    psnr_db: float  # mean over pairs
+    ssim: float
+    worst_eye_psnr_db: float  # least of all eyes and pairs
+    psnr_db_off_eye: dict[str, float]
+    pairs: list[PairResult] = field(default_factory=list)
+
+    def record(self) -> dict[str, Any]:
+        """As report.json has it."""
+        return asdict(self)
+
+
+def run_method(method: Method, pair: StillPair, threads: int) -> Timed:
+    """Open, warm up, time, and note the peak of memory. Runs in a process of its own."""
+    import cv2
+
+    cv2.setNumThreads(threads)
+    ready = opened(method, pair, threads=threads)
+    _forget_peak()
+    start = time.perf_counter()
+    layers = ready.solve(pair)
+    first_s = time.perf_counter() - start
+    run_ms = [first_s * 1e3]
+    if first_s < SLOW_S:
+        run_ms = []
+        while len(run_ms) < FEWEST_RUNS or (sum(run_ms) < ENOUGH_S * 1e3 and len(run_ms) < MOST_RUNS):
+            start = time.perf_counter()
+            layers = ready.solve(pair)
+            run_ms.append((time.perf_counter() - start) * 1e3)
+    return Timed(np.array(layers[..., :3]), run_ms, _peak_mib(), ready.parameters, ready.precision)
+
+
+def _forget_peak() -> None:
+    try:
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    except OSError:
+        return  # an older kernel: the peak then includes the start of the interpreter, which is less
+
+
+def _peak_mib() -> float:
+    for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) / 1024
+    return float("nan")
+
+
+def measure(
+    methods: Sequence[Method],
+    pairs: Sequence[StillPair],
+    *,
+    threads: int = 2,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> list[MethodResult]:
+    """Every method on every pair. Pairs of one call share a resolution.
+
+    A method that can't serve these panels is left out of the result. Raises InputError where none can.
+    """
+    results: list[MethodResult] = []
+    context = multiprocessing.get_context("spawn")
+    for index, method in enumerate(methods):
+        timed: list[tuple[StillPair, Timed]] = []
+        with ProcessPoolExecutor(max_workers=1, mp_context=context) as pool:
+            timed += [(pair, pool.submit(run_method, method, pair, threads).result()) for pair in pairs]
+        results.append(_together(method, [(p, t, judged(p, t.layers)) for p, t in timed]))
+        progress(index + 1, len(methods))
+    return results
+
+
+def _together(method: Method, runs: Sequence[tuple[StillPair, Timed, Seen]]) -> MethodResult:
+    all_ms = np.concatenate([timed.run_ms for _, timed, _ in runs])
+    pairs = [
+        PairResult(
+            pair.name,
+            seen.quality.psnr_db,
+            seen.quality.ssim,
+            seen.quality.eye_psnr_db,
+            seen.off_db,
+            float(np.median(timed.run_ms)),
+        )
+        for pair, timed, seen in runs
+    ]
+    distances = list(dict.fromkeys(name for result in pairs for name in result.psnr_db_off_eye))
+    first = runs[0][0].stack
+    return MethodResult(
+        name=method.name,
+        kind=method.kind,
+        precision=runs[0][1].precision,
+        width_px=first.width_px,
+        height_px=first.height_px,
+        ms_p50=float(np.median(all_ms)),
+        ms_p99=float(np.percentile(all_ms, 99)),
+        runs=len(all_ms),
+        memory_mib=max(timed.memory_mib for _, timed, _ in runs),
+        parameters=runs[0][1].parameters,
+        psnr_db=float(np.mean([result.psnr_db for result in pairs])),
+        ssim=float(np.mean([result.ssim for result in pairs])),
+        worst_eye_psnr_db=min(min(result.eye_psnr_db) for result in pairs),
+        psnr_db_off_eye={
+            name: float(np.mean([r.psnr_db_off_eye[name] for r in pairs if name in r.psnr_db_off_eye]))
+            for name in distances
+        },
+        pairs=pairs,
+    )
+
+
+def pareto(results: Sequence[MethodResult]) -> list[MethodResult]:
+    """Those that nothing else beats in both time and quality, fastest first."""
+    front: list[MethodResult] = []
+    for result in sorted(results, key=lambda r: (r.ms_p50, -r.psnr_db)):
+        if not front or result.psnr_db > front[-1].psnr_db:
+            front.append(result)
+    return front
+
+
+def check_models(names: Sequence[str]) -> None:
+    """Raises InputError for an ONNX file that isn't there or isn't ours, before anything is measured."""
+    from runtime.model.session import ModelSession
+
+    for name in names:
+        path = Path(name)
+        if not path.is_file():
+            raise InputError(path, "", "is not a file")
+        ModelSession(path, provider="cpu", threads=1)

@@ -1,0 +1,197 @@
+"""Stereo pairs with their geometry and the truth beside the eyes: case files, and the built-in scenes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from runtime.artifacts import read_image
+from runtime.config import StackGeometry, read_table, validated
+from runtime.errors import InputError
+from runtime.optics.stack import PanelStack
+from runtime.optics.views import image_from_stack, stack_from_eye
+from runtime.records import F64, U8
+
+OFF_MM = (2, 4, 6)
+FOV_DEG = 40.0
+
+
+@dataclass(frozen=True, slots=True)
+class OffView:
+    """What an eye should see from a place beside its nominal one."""
+
+    mm: float
+    eye_m: F64  # (3,) frame `stack`
+    image: U8  # (h, w, 3)
+
+
+@dataclass(frozen=True, slots=True)
+class StillPair:
+    """Two pictures, the eyes that should see them, and the panels."""
+
+    name: str
+    stack: PanelStack
+    eyes_m: F64  # (2, 3) left, right; frame `stack`
+    images: tuple[U8, U8]  # (h, w, 3)
+    fov_deg: float  # horizontal
+    off: tuple[OffView, ...] = ()
+
+
+def read_pairs(folder: Path) -> list[StillPair]:
+    """Every case file in a folder, by name. Other JSON files are passed over; a case with a mistake is not.
+
+    Raises InputError, naming file and field; also where the folder holds no case at all.
+    """
+    if not folder.is_dir():
+        raise InputError(folder, "", "is not a folder")
+    pairs = []
+    for path in sorted(folder.glob("*.json")):
+        table = read_table(path)
+        if {"panels", "eyes", "images"} <= table.keys():
+            pairs.append(_case(path, table))
+    if not pairs:
+        raise InputError(folder, "", "holds no case file (JSON with panels, eyes, images, fov)")
+    return pairs
+
+
+def _case(path: Path, table: dict[str, Any]) -> StillPair:
+    names = table["images"]
+    if not (isinstance(names, list) and len(names) == 2 and all(isinstance(name, str) for name in names)):
+        raise InputError(path, "images", "must name the left and the right picture")
+    left, right = (read_image(path.parent / name) for name in names)
+    if left.shape != right.shape:
+        raise InputError(path, "images", f"differ in size: {left.shape[1::-1]} and {right.shape[1::-1]}")
+    if not isinstance(table["panels"], dict):
+        raise InputError(path, "panels", "must be a table")
+    size = {"width_px": left.shape[1], "height_px": left.shape[0]}
+    stack = validated(StackGeometry, size | table["panels"], source=f"{path}: panels").stack()
+    eyes = np.array([_place(eye, path, "eyes") for eye in _items(table["eyes"], path, "eyes")])
+    if eyes.shape != (2, 3):
+        raise InputError(path, "eyes", "must be the left and the right eye")
+    if not (eyes[:, 0] > max(stack.x_m)).all():
+        raise InputError(path, "eyes", "must be before every panel")
+    fov_deg = table.get("fov")
+    if not (isinstance(fov_deg, int | float) and 0 < fov_deg < 180):
+        raise InputError(path, "fov", "must be the pictures' horizontal field of view in degrees")
+    off = tuple(_off_view(item, path, left.shape) for item in _items(table.get("off", []), path, "off"))
+    return StillPair(path.stem, stack, eyes, (left, right), float(fov_deg), off)
+
+
+def _items(value: Any, path: Path, field: str) -> list[Any]:
+    if not isinstance(value, list):
+        raise InputError(path, field, "must be a list")
+    return value
+
+
+def _place(value: Any, path: Path, field: str) -> F64:
+    numbers = isinstance(value, list) and len(value) == 3 and all(isinstance(c, int | float) for c in value)
+    if not numbers or not all(math.isfinite(c) for c in value):
+        raise InputError(path, field, "must be three finite numbers, metres")
+    return np.array(value, dtype=np.float64)
+
+
+def _off_view(item: Any, path: Path, shape: tuple[int, ...]) -> OffView:
+    if not (isinstance(item, dict) and {"mm", "eye", "image"} <= item.keys()):
+        raise InputError(path, "off", "entries need mm, eye and image")
+    if not isinstance(item["mm"], int | float) or not isinstance(item["image"], str):
+        raise InputError(path, "off", "mm must be a number and image a file name")
+    image = read_image(path.parent / item["image"])
+    if image.shape != shape:
+        raise InputError(path.parent / item["image"], "", "differs in size from the pair")
+    return OffView(float(item["mm"]), _place(item["eye"], path, "off.eye"), image)
+
+
+def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0, ipd_m: float = 0.063) -> F64:
+    """(2, 3) eyes whose middle is at a distance from the origin and an angle off +x towards +y, head turned to it."""
+    angle = math.radians(angle_deg)
+    level = math.sqrt(max(distance_m**2 - height_m**2, 0.0))
+    middle = np.array([level * math.cos(angle), level * math.sin(angle), height_m])
+    right = stack_from_eye(middle)[:3, 0]
+    return np.array([middle - right * ipd_m / 2, middle + right * ipd_m / 2])
+
+
+def beside(eye_m: ArrayLike, mm: float, directions: int = 4) -> list[F64]:
+    """Places `mm` beside an eye: right, up, left, down (or more) in its own frame."""
+    pose = stack_from_eye(eye_m)
+    angles = [2 * math.pi * index / directions for index in range(directions)]
+    return [pose[:3, 3] + mm / 1000 * (math.cos(a) * pose[:3, 0] + math.sin(a) * pose[:3, 1]) for a in angles]
+
+
+class Painter:
+    """Pictures of a built-in scene from anywhere. Owns a GL context: one thread, closed at the end."""
+
+    def __init__(self, scene: str, stack: PanelStack) -> None:
+        """Raises InputError for an unknown scene, MissingPart without OpenGL."""
+        from runtime.config import ContentSettings
+        from runtime.content.registry import open_content
+        from runtime.gl import offscreen_context
+
+        self._context = offscreen_context()
+        self._source = open_content(ContentSettings(scene=scene), stack, self._context)
+
+    def __enter__(self) -> Painter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._source.close()
+        self._context.release()
+
+    def image(self, eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float = FOV_DEG) -> U8:
+        """(h, w, 3) what an eye that looks at the stack's origin sees."""
+        from runtime.content.base import View
+
+        eye = np.asarray(eye_m, dtype=np.float64)
+        projection = image_from_stack(eye, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
+        picture = self._source.render(View(eye, 0, projection, width_px, height_px), time_ns=0)
+        return np.ascontiguousarray(picture[..., :3])
+
+    def pair(
+        self, name: str, eyes_m: F64, stack: PanelStack, *, fov_deg: float = FOV_DEG, off_mm: Sequence[float] = OFF_MM
+    ) -> StillPair:
+        """A pair in the stack's resolution, with the views beside both eyes drawn anew."""
+        size = {"width_px": stack.width_px, "height_px": stack.height_px}
+        left, right = (self.image(eye, **size, fov_deg=fov_deg) for eye in eyes_m)
+        off = tuple(
+            OffView(mm, place, self.image(place, **size, fov_deg=fov_deg))
+            for mm in off_mm
+            for eye in eyes_m
+            for place in beside(eye, mm)
+        )
+        return StillPair(name, stack, eyes_m, (left, right), fov_deg, off)
+
+
+PROCEDURAL = (
+    ("demo", "objects, 0.6 m", {"distance_m": 0.6, "height_m": 0.05}),
+    ("texture", "full texture, 0.45 m, 20 degrees", {"distance_m": 0.45, "angle_deg": 20.0}),
+    ("demo", "objects, 1.2 m, 45 degrees", {"distance_m": 1.2, "angle_deg": -45.0, "height_m": 0.2}),
+)
+
+
+def procedural_pairs(stack: PanelStack) -> list[StillPair]:
+    """The report's own pairs: built-in scenes from three places, with the views beside the eyes."""
+    pairs = []
+    for scene, name, place in PROCEDURAL:
+        with Painter(scene, stack) as painter:
+            pairs.append(painter.pair(name, eyes_at(**place), stack))
+    return pairs
+
+
+def reduced(pair: StillPair, factor: float) -> StillPair:
+    """The same pair on panels and pictures of another resolution."""
+    import cv2
+
+    width, height = round(pair.stack.width_px * factor), round(pair.stack.height_px * factor)
+
+    def smaller(image: U8) -> U8:
+        return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+    left, right = (smaller(image) for image in pair.images)
+    stack = replace(pair.stack, width_px=width, height_px=height)
+    off = tuple(replace(view, image=smaller(view.image)) for view in pair.off)
+    return replace(pair, stack=stack, images=(left, right), off=off)
