@@ -237,6 +237,31 @@ class Settings(Section):
     service: ServiceSettings = Field(default_factory=ServiceSettings, description="socket, metrics, logs")
 
 
+class Overrides(Section):
+    """What the command line says instead of the configuration."""
+
+    replay: str | None = None
+    headless: bool = False
+    scene: str | None = None
+    model: str | None = None
+    budget_ms: float | None = None
+
+    def applied(self, settings: Settings) -> Settings:
+        """The settings with these in force."""
+        changes: dict[str, Any] = {}
+        if self.replay is not None:
+            changes["sensor"] = settings.sensor.model_copy(update={"driver": "replay", "source": self.replay})
+        if self.headless:
+            changes["output"] = settings.output.model_copy(update={"kind": "offscreen"})
+        if self.scene is not None:
+            changes["content"] = settings.content.model_copy(update={"scene": self.scene})
+        model = {"name": self.model, "budget_ms": self.budget_ms}
+        given = {key: value for key, value in model.items() if value is not None}
+        if given:
+            changes["model"] = settings.model.model_copy(update=given)
+        return settings.model_copy(update=changes)
+
+
 def read_table(path: Path) -> dict[str, Any]:
     """A TOML or JSON file as a table. Raises InputError, naming the file and the line of the mistake."""
     try:

@@ -1,0 +1,44 @@
+"""The `phasestack` command. Only names and options are here; each command imports what it needs when it runs."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from calib.commands import app as calibrate_app
+from runtime.commands.config import config
+from runtime.commands.ctl import app as ctl_app
+from runtime.commands.demo import demo
+from runtime.commands.run import run
+from runtime.commands.solve import solve
+from runtime.commands.status import status
+from runtime.errors import PhasestackError
+
+app = typer.Typer(
+    name="phasestack",
+    help="Realtime runtime of a glasses-free 3D display made of stacked LCD panels.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+for command in (demo, run, solve, status, config):
+    app.command()(command)
+app.add_typer(ctl_app, name="ctl")
+app.add_typer(calibrate_app, name="calibrate")
+
+
+def main() -> None:
+    """The entry point: one line on stderr and exit 2 for what a user can mend, never a traceback."""
+    try:
+        app()
+    except PhasestackError as error:
+        print(f"phasestack: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""`phasestack config`: every setting with its default and meaning."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+
+def config(
+    check: Annotated[Path | None, typer.Option(help="a configuration to validate instead of printing")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="defaults as one JSON object")] = False,
+) -> None:
+    """Print a complete configuration: every setting, its default and what it means. It is valid TOML.
+
+    Example: phasestack config > phasestack.toml
+    """
+    from runtime.config import Settings, load_settings
+
+    settings = load_settings(check)
+    if check is not None:
+        typer.echo(f"{check}: valid")
+    elif as_json:
+        typer.echo(json.dumps(settings.model_dump(mode="json")))
+    else:
+        typer.echo("\n".join(_lines(type(settings), settings, "")))
+
+
+def _lines(model: Any, values: Any, prefix: str) -> list[str]:
+    """TOML with a comment above each key."""
+    from pydantic import BaseModel
+
+    plain: list[str] = []
+    tables: list[str] = []
+    for name, info in model.model_fields.items():
+        value = getattr(values, name)
+        if isinstance(value, BaseModel):
+            title = f"{prefix}{name}"
+            tables += ["", f"# {info.description or ''}", f"[{title}]", *_lines(type(value), value, f"{title}.")]
+            continue
+        plain.append(f"# {info.description or ''}")
+        text = _toml(value)
+        plain.append(f"# {name} =" if text is None else f"{name} = {text}")
+    return plain + tables
+
+
+def _toml(value: Any) -> str | None:
+    if value is None:
+        return None
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(str(_toml(item)) for item in value) + "]"
+    return json.dumps(value)

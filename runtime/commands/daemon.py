@@ -1,0 +1,212 @@
+"""The supervised run: signals, systemd, the status socket, reload. Imported when `run` starts."""
+
+from __future__ import annotations
+
+import logging
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from runtime import logs
+from runtime.assembly import RunOptions, build_pipeline
+from runtime.clock import MonotonicClock
+from runtime.commands.running import drive, print_summary
+from runtime.config import Overrides, Settings, load_settings
+from runtime.errors import InputError, PhasestackError
+from runtime.eyes.calibration import load_calibration
+from runtime.eyes.tracker import Tracker
+from runtime.loop import Loop
+from runtime.records import FrameAccount
+from runtime.service import Command, Notifier, Signals, StatusServer, open_status_server
+
+log = logging.getLogger("phasestack.daemon")
+
+PANEL_RETRY_S = 1.0
+START_EXTENSION_S = 10.0
+NEEDS_RESTART = ("stack", "sensor", "output", "service")
+
+
+class Daemon:
+    """The loop's supervisor: carries wishes in and news out, once a turn."""
+
+    def __init__(
+        self,
+        config: Path | None,
+        overrides: Overrides,
+        settings: Settings,
+        *,
+        signals: Signals,
+        notifier: Notifier,
+        server: StatusServer | None,
+        metrics: Any | None,
+    ) -> None:
+        self._config, self._overrides, self._settings = config, overrides, settings
+        self._signals, self._notifier, self._server, self._metrics = signals, notifier, server, metrics
+        self._faults_told: dict[str, int] = {}
+
+    def stop_reason(self) -> str:
+        return f"{self._signals.stop} received" if self._signals.stop else ""
+
+    def obey(self, loop: Loop) -> None:
+        if self._signals.take_reload():
+            self._notifier.reloading()
+            if refused := self._reload(loop):
+                log.error("reload refused, the old configuration stays: %s", refused)
+            self._notifier.reloaded()
+        while self._server is not None and not self._server.commands.empty():
+            command = self._server.commands.get()
+            refused = self._carry_out(command, loop)
+            command.refuse(refused) if refused else command.done()
+
+    def turn(self, loop: Loop, account: FrameAccount) -> None:
+        machine = loop.machine
+        if account.presented:
+            self._notifier.ready()
+        self._notifier.status(f"{machine.name} ({machine.reason})")
+        self._notifier.turn(machine.state, machine.missing, presented=account.presented)
+        if self._server is not None:
+            self._server.publish(lambda: snapshot(loop, account))
+        if self._metrics is not None:
+            self._metrics.frame(account)
+            for part, count in loop.stats.faults.items():
+                for _ in range(count - self._faults_told.get(part, 0)):
+                    self._metrics.fault(part)
+                self._faults_told[part] = count
+
+    def wait_for_panels(self, why: str) -> bool:
+        """A panel is not there yet: under a supervisor wait for it, by hand refuse."""
+        if not self._notifier.supervised or self._signals.stop:
+            return False
+        log.warning("waiting for a panel: %s", why)
+        self._notifier.extend_start(START_EXTENSION_S)
+        self._notifier.status(f"starting (waiting for a panel: {why})")
+        time.sleep(PANEL_RETRY_S)
+        return not self._signals.stop
+
+    def _carry_out(self, command: Command, loop: Loop) -> str:
+        match command.name:
+            case "pause":
+                loop.paused = True
+            case "resume":
+                loop.paused = loop.flat_wanted = False
+            case "flat":
+                loop.flat_wanted = True
+            case "reload":
+                return self._reload(loop)
+            case "scene":
+                content = self._settings.content.model_copy(update={"scene": command.value})
+                return self._replace(loop, self._settings.model_copy(update={"content": content}))
+            case "budget":
+                model = self._settings.model.model_copy(update={"budget_ms": command.value})
+                return self._replace(loop, self._settings.model_copy(update={"model": model}))
+        return ""
+
+    def _reload(self, loop: Loop) -> str:
+        """Read the configuration again; answers why it was refused, or nothing."""
+        try:
+            settings = self._overrides.applied(load_settings(self._config))
+        except PhasestackError as error:
+            return str(error)
+        changed = [name for name in NEEDS_RESTART if getattr(settings, name) != getattr(self._settings, name)]
+        if changed:
+            return f"{self._config}: {changed[0]}: a change needs a restart of the service"
+        return self._replace(loop, settings)
+
+    def _replace(self, loop: Loop, settings: Settings) -> str:
+        """Swap what the settings change; the old parts stay where the new ones can't be built."""
+        old = self._settings
+        try:
+            calibration = load_calibration(Path(settings.calibration.file) if settings.calibration.file else None)
+            if (settings.content, settings.model) != (old.content, old.model):
+                import numpy as np
+
+                from runtime.assembly import WARM_EYES_M
+
+                pipeline = build_pipeline(settings, loop.pipeline.stack, self.context, loop.fault)
+                pipeline.predictor.warm_up(np.array(WARM_EYES_M))
+                previous, loop.pipeline = loop.pipeline, pipeline
+                previous.close()
+        except PhasestackError as error:
+            return str(error)
+        loop.calibration = calibration
+        if settings.tracker != old.tracker:
+            loop.tracker = Tracker(settings.tracker)
+        loop.settings = self._settings = settings
+        return ""
+
+    @property
+    def context(self) -> Any:
+        """The GL context of the loop's thread."""
+        import moderngl
+
+        return moderngl.get_context()
+
+
+def snapshot(loop: Loop, account: FrameAccount) -> dict[str, Any]:
+    """What `status` answers."""
+    machine, stats = loop.machine, loop.stats
+    counted = stats.summary(seconds=loop.seconds(), stale_inputs=loop.source.stale_inputs)
+    return {
+        "state": machine.name,
+        "reason": machine.reason,
+        "scene": loop.settings.content.scene,
+        "model": loop.pipeline.predictor.name,
+        "provider": loop.pipeline.predictor.provider,
+        "panels": loop.panels.name,
+        "eyes_m": account.eyes_m,
+        "eyes_label": account.eyes_label,
+        "skew_ms": account.skew_ms,
+        **{key: counted[key] for key in counted if key != "skew_ms"},
+    }
+
+
+def run_daemon(
+    config: Path | None,
+    overrides: Overrides,
+    *,
+    frames: int | None,
+    max_speed: bool,
+    out: Path | None,
+    scale: float,
+    quiet: bool,
+) -> dict[str, Any]:
+    """The whole life of `phasestack run`; answers the summary. Raises FatalError."""
+    settings = overrides.applied(load_settings(config))
+    logs.configure(settings.service)
+    if settings.model.budget_ms and max_speed:
+        raise InputError("run", "--budget-ms", "measures real time: it can't be combined with --max-speed")
+    clock = MonotonicClock()
+    with ExitStack() as cleanup:
+        signals = cleanup.enter_context(Signals())
+        notifier = Notifier(clock)
+        cleanup.callback(notifier.close)
+        server = None if max_speed else open_status_server(settings.service, clock=clock, supervised=notifier.supervised)
+        if server is not None:
+            cleanup.callback(server.close)
+        metrics = None
+        if settings.service.metrics_port:
+            from runtime.metrics import Metrics
+
+            metrics = Metrics()
+            metrics.serve(settings.service.metrics_port)
+            cleanup.callback(metrics.close)
+        daemon = Daemon(
+            config, overrides, settings, signals=signals, notifier=notifier, server=server, metrics=metrics
+        )
+        summary = drive(
+            settings,
+            RunOptions(max_speed=max_speed, measure=out is not None, scale=scale),
+            out=out,
+            frames=frames,
+            total=frames,
+            progress=max_speed and not quiet,
+            measured_times=not max_speed,
+            supervisor=daemon,
+            wait_for_panels=daemon.wait_for_panels,
+        )
+        notifier.stopping(summary["stopped"])
+    log.info("stopped: %s", summary["stopped"])
+    if not quiet and not notifier.supervised:
+        print_summary(summary, out)
+    return summary

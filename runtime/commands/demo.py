@@ -1,0 +1,45 @@
+"""`phasestack demo`: the main job on the built-in recording and scene."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = Path("out/demo"),
+    frames: Annotated[int | None, typer.Option(min=1, help="turns; default: the whole recording")] = None,
+    scale: Annotated[float, typer.Option(min=0.05, max=2.0, help="panel resolution, times 1920x1080")] = 1.0,
+    model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="the summary as one JSON object on stdout")] = False,
+) -> None:
+    """Replay a built-in recording of a moving head through the whole pipeline, on panels that need no screen.
+
+    Example: phasestack demo --out out/demo
+    """
+    from runtime.assembly import RunOptions
+    from runtime.commands.running import drive, print_summary
+    from runtime.config import Settings
+    from runtime.sensor.recording import Recording
+    from runtime.sensor.replay import demo_recording_path
+
+    settings = Settings()
+    if model is not None:
+        settings = settings.model_copy(update={"model": settings.model.model_copy(update={"name": model})})
+    samples = sum(1 for _ in Recording(demo_recording_path()).samples())
+    summary = drive(
+        settings,
+        RunOptions(max_speed=True, measure=True, scale=scale),
+        out=out,
+        frames=frames,
+        total=min(samples, frames or samples),
+        progress=True,
+        measured_times=True,
+    )
+    if as_json:
+        typer.echo(json.dumps(summary))
+    else:
+        print_summary(summary, out)

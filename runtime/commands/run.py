@@ -1,0 +1,41 @@
+"""`phasestack run`: the daemon, or a recording through the same code."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def run(
+    config: Annotated[Path | None, typer.Option(help="TOML file; see `phasestack config`")] = None,
+    replay: Annotated[str | None, typer.Option(help="a recording, or `demo`, instead of the sensor")] = None,
+    headless: Annotated[bool, typer.Option("--headless", help="offscreen panels, whatever is configured")] = False,
+    frames: Annotated[int | None, typer.Option(min=1, help="stop after so many turns")] = None,
+    max_speed: Annotated[
+        bool, typer.Option("--max-speed", help="every recorded sample, simulated clock, no waiting: reproducible")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = None,
+    scene: Annotated[str | None, typer.Option(help="a preset's name, or a file")] = None,
+    model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
+    scale: Annotated[float, typer.Option(min=0.05, max=2.0, help="panel resolution, times the configured one")] = 1.0,
+    budget_ms: Annotated[float | None, typer.Option(min=0, help="time for a frame; picks model and size")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="the summary as one JSON object on stdout")] = False,
+) -> None:
+    """Run the display: eyes in, layers out, until SIGTERM. SIGHUP reads the configuration again.
+
+    Example: phasestack run --config /etc/phasestack/phasestack.toml
+
+    Example: phasestack run --replay demo --headless --max-speed --frames 30 --out out/run
+    """
+    from runtime.commands.daemon import run_daemon
+    from runtime.config import Overrides
+
+    overrides = Overrides(
+        replay=replay, headless=headless, scene=scene, model=model, budget_ms=budget_ms
+    )
+    summary = run_daemon(config, overrides, frames=frames, max_speed=max_speed, out=out, scale=scale, quiet=as_json)
+    if as_json:
+        typer.echo(json.dumps(summary))

@@ -1,0 +1,44 @@
+"""`phasestack solve`: one still stereo pair to layers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def solve(
+    left: Annotated[Path, typer.Option(help="picture for the left eye")],
+    right: Annotated[Path, typer.Option(help="picture for the right eye")],
+    left_eye: Annotated[tuple[float, float, float], typer.Option(help="left eye, metres, stack frame", metavar="X Y Z")],
+    right_eye: Annotated[tuple[float, float, float], typer.Option(help="right eye, metres", metavar="X Y Z")],
+    panels: Annotated[Path, typer.Option(help="TOML or JSON: width_m, height_m, x_m")],
+    out: Annotated[Path, typer.Option(help="folder for the layers")],
+    fov: Annotated[float, typer.Option(help="the pictures' horizontal field of view, degrees")] = 40.0,
+    model: Annotated[str, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = "balanced",
+    repeat: Annotated[int, typer.Option(min=1, max=10000, help="timed runs, after the warm-up")] = 1,
+    tolerance_mm: Annotated[
+        float | None, typer.Option(min=0, help="how far off the eyes the picture should still hold; 0: exact")
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="configuration, for the model's settings")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="solve.json's object on stdout")] = False,
+) -> None:
+    """Solve the layers for two still pictures and two eyes, and measure what the eyes then see.
+
+    Example: phasestack solve --left l.png --right r.png --left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0 --fov 40
+    --panels panels.json --out out/solve
+    """
+    from runtime.commands.solving import SolveRequest, solve_pair
+
+    result = solve_pair(
+        SolveRequest(left, right, left_eye, right_eye, fov, panels, out, model, repeat, tolerance_mm, config)
+    )
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        typer.echo(
+            f"{result['model']}: displayed {result['psnr_db']:.2f} dB, SSIM {result['ssim']:.4f}; "
+            f"{result['total_ms']:.1f} ms in all, {result['inference_ms']:.1f} ms of it the network; {out}"
+        )

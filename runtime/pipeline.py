@@ -1,0 +1,165 @@
+"""One frame, start to end: eyes to pictures to layers to panels. No threads, no sleeping."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from runtime.content.base import ContentSource, View
+from runtime.errors import ContentFailure, ModelFailure
+from runtime.model.flat import flat_layers
+from runtime.model.predictor import Predictor
+from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.views import image_from_stack, raster_from_stack
+from runtime.records import F64, U8, Inference
+from runtime.stages import StageTimes
+
+log = logging.getLogger("phasestack.pipeline")
+
+FLAT_EYE_M = (0.7, 0.0, 0.0)  # where the flat picture is drawn from before any viewer was seen
+
+
+def raster_views(eyes_m: F64, raster: PlaneRaster) -> tuple[View, View]:
+    """Left and right eye's views of one raster; eyes (2, 3), frame `stack`."""
+    left, right = (
+        View(eye, side, raster_from_stack(eye, raster), raster.width_px, raster.height_px)
+        for side, eye in enumerate(eyes_m)
+    )
+    return left, right
+
+
+def retina_view(eye_m: F64, side: int, *, width_px: int, height_px: int, fov_deg: float) -> View:
+    """The view of an eye's own image, looking at the stack's origin."""
+    projection = image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
+    return View(eye_m, side, projection, width_px, height_px)
+
+
+@dataclass(slots=True)
+class Drawn:
+    """What one turn put together."""
+
+    layers: U8
+    inference: Inference
+    missing: dict[str, str] = field(default_factory=dict)  # parts that failed: content, model
+
+
+class Pipeline:
+    """Content and model for one stack. Keeps the last good layers, and answers with them when a part fails."""
+
+    def __init__(
+        self,
+        stack: PanelStack,
+        *,
+        content: ContentSource,
+        predictor: Predictor,
+        on_fault: Callable[[str], None] = lambda part: None,
+    ) -> None:
+        self.stack, self.content, self.predictor = stack, content, predictor
+        self._on_fault = on_fault
+        self._solved: U8 | None = None  # the last layers for two eyes
+        self._solved_for: tuple[Any, ...] | None = None
+        self._flat: U8 | None = None
+        self._flat_for: tuple[Any, ...] | None = None
+        self._middle_m = np.array(FLAT_EYE_M)
+        self._blend = np.empty((stack.count, stack.height_px, stack.width_px, 4), np.uint8)
+        self.missing: dict[str, str] = {}
+
+    def draw(self, eyes_m: F64 | None, *, flatness: float, time_ns: int, stages: StageTimes) -> Drawn:
+        """Layers for two eyes (2, 3), frame `stack`, blended with the flat picture.
+
+        flatness: 0 solved for the eyes, 1 flat. A part that fails is named in `missing` and its last good
+        answer is used.
+        """
+        inference: Inference = "skipped"
+        self.missing = {}
+        if flatness < 1.0 and eyes_m is not None:
+            inference = self._solve(eyes_m, time_ns=time_ns, stages=stages)
+        if flatness > 0.0 or self._solved is None:
+            self._draw_flat(time_ns=time_ns, stages=stages)
+        layers = self._blended(flatness if self._solved is not None else 1.0)
+        return Drawn(layers, inference, dict(self.missing))
+
+    def forget(self) -> None:
+        """Drop what was drawn: the content, the model or the settings have changed."""
+        self._solved_for = self._flat_for = None
+
+    def _solve(self, eyes_m: F64, *, time_ns: int, stages: StageTimes) -> Inference:
+        key = (eyes_m.tobytes(), self.content.revision(time_ns=time_ns))
+        if self._solved is not None and key == self._solved_for:
+            return "reused"
+        try:
+            images = self._render(eyes_m, time_ns=time_ns)
+        except Exception as error:
+            self._failed("content", error, expected=ContentFailure)
+            stages.lap("render")
+            return "reused" if self._solved is not None else "skipped"
+        stages.lap("render")
+        try:
+            prediction = self.predictor.predict(images, eyes_m)
+        except Exception as error:
+            self._failed("model", error, expected=ModelFailure)
+            stages.lap("inference")
+            return "reused" if self._solved is not None else "skipped"
+        stages.laps(prediction.stage_ms, rest="finish")
+        self._solved, self._solved_for = prediction.layers, key
+        self._middle_m = eyes_m.mean(axis=0)
+        return "ran"
+
+    def _render(self, eyes_m: F64, *, time_ns: int) -> list[list[U8]]:
+        """images[side][raster]; copied only where a source's array would be drawn over by the next raster."""
+        images: list[list[U8]] = [[], []]
+        rasters = self.predictor.rasters(eyes_m)
+        for raster in rasters:
+            for view in raster_views(eyes_m, raster):
+                picture = self.content.render(view, time_ns=time_ns)
+                images[view.side].append(picture.copy() if len(rasters) > 1 else picture)
+        return images
+
+    def _draw_flat(self, *, time_ns: int, stages: StageTimes) -> None:
+        # The viewpoint of the flat picture stays where it was drawn first: without a viewer nothing should move.
+        key = (self.content.revision(time_ns=time_ns),)
+        if self._flat is not None and key == self._flat_for:
+            return
+        try:
+            raster = self.stack.panel(self.stack.count // 2)
+            middle = self._middle_m
+            view = View(middle, 0, raster_from_stack(middle, raster), raster.width_px, raster.height_px)
+            self._flat = flat_layers(self.content.render(view, time_ns=time_ns), self.stack)
+            self._flat_for = key
+        except Exception as error:
+            self._failed("content", error, expected=ContentFailure)
+            if self._flat is None:
+                self._flat = flat_layers(
+                    np.full((self.stack.height_px, self.stack.width_px, 4), 255, np.uint8), self.stack
+                )
+        stages.lap("render")
+
+    def _blended(self, flatness: float) -> U8:
+        if flatness >= 1.0:
+            assert self._flat is not None
+            return self._flat
+        assert self._solved is not None
+        if flatness <= 0.0 or self._flat is None:
+            return self._solved
+        import cv2
+
+        for solved, flat, out in zip(self._solved, self._flat, self._blend, strict=True):
+            cv2.addWeighted(solved, 1.0 - flatness, flat, flatness, 0.0, dst=out)
+        return self._blend
+
+    def _failed(self, part: str, error: Exception, *, expected: type[Exception]) -> None:
+        self.missing[part] = str(error).splitlines()[0] if str(error) else type(error).__name__
+        self._on_fault(part)
+        if isinstance(error, expected):
+            log.warning("%s: %s", part, error)
+        else:
+            log.exception("%s: unexpected error", part)
+
+    def close(self) -> None:
+        """Release content and model. May be called twice."""
+        self.content.close()
+        self.predictor.close()
