@@ -54,13 +54,19 @@ class WarpedPicture:
     def __init__(self, rgba: U8, *, background: tuple[float, float, float]) -> None:
         self._levels = [np.ascontiguousarray(rgba)]
         self._border = (*(round(value * 255) for value in background), 0)
-        self._out: dict[tuple[int, int], U8] = {}
+        self._out: dict[tuple[int, int, int], U8] = {}
 
-    def warped(self, picture_from_view: F64, *, width_px: int, height_px: int) -> U8:
-        """(h, w, 4): the picture at each of the view's pixels; the background with alpha 0 beside it."""
+    def warped(self, picture_from_view: F64, *, width_px: int, height_px: int, side: int) -> U8:
+        """(h, w, 4): the picture at each of the view's pixels; the background with alpha 0 beside it.
+
+        The array is kept and written again by the next call of the same size and side.
+        """
         level = reduction(picture_from_view, width_px=width_px, height_px=height_px)
         picture, shrink = self._level(level)
-        out = self._out.setdefault((width_px, height_px), np.empty((height_px, width_px, 4), np.uint8))
+        key = (width_px, height_px, side)
+        if key not in self._out:
+            self._out[key] = np.empty((height_px, width_px, 4), np.uint8)
+        out = self._out[key]
         matrix = _MINUS_HALF @ np.diag([*shrink, 1.0]) @ picture_from_view @ _HALF
         cv2.warpPerspective(
             picture,
@@ -107,4 +113,5 @@ class StereoPair(ContentSource):
 
     def render(self, view: View, *, time_ns: int) -> U8:
         matrix = image_from_view(self._image_from_stack[view.side], view.pixels_from_stack, x_m=self._plane_x_m)
-        return self._pictures[view.side].warped(matrix, width_px=view.width_px, height_px=view.height_px)
+        picture = self._pictures[view.side]
+        return picture.warped(matrix, width_px=view.width_px, height_px=view.height_px, side=view.side)

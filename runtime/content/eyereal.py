@@ -1,0 +1,112 @@
+"""A folder of the EyeReal data set: picture pairs that carry their eyes in their names."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from runtime.artifacts import read_image
+from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.images import WarpedPicture, image_from_view, rgba_from_rgb
+from runtime.content.presets import Preset
+from runtime.errors import ContentFailure, InputError
+from runtime.optics.views import image_from_stack
+from runtime.records import F64, U8
+
+NAME = re.compile(r"pair(\d+)_x(-?[\d.]+)_y(-?[\d.]+)_z(-?[\d.]+)_([01])\.(?:jpg|jpeg|png)$", re.IGNORECASE)
+KEPT = 4  # pairs in memory
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """Two files of one pair, the viewer's left first."""
+
+    number: int
+    paths: tuple[Path, Path]
+    eyes_m: F64  # (2, 3) left, right; frame `stack`
+
+
+def is_data_set(folder: Path) -> bool:
+    """True where a folder holds pictures named as the data set's."""
+    return folder.is_dir() and any(NAME.match(path.name) for path in folder.iterdir())
+
+
+def read_folder(folder: Path, preset: Preset) -> tuple[Pair, ...]:
+    """Every pair, by number. Raises InputError: no pair, half a pair, coordinates that are no eye.
+
+    Names hold the eyes in the scene's digital units around the display; which one is left is told by geometry.
+    """
+    found: dict[int, dict[int, tuple[Path, F64]]] = {}
+    for path in sorted(folder.iterdir()):
+        match = NAME.match(path.name)
+        if not match:
+            continue
+        try:
+            digital = np.array([float(match[2]), float(match[3]), float(match[4])])
+        except ValueError:
+            raise InputError(path, "name", "its coordinates are not numbers") from None
+        eye = preset.eye_axes.T @ digital / preset.scale_per_m
+        if eye[0] <= 0:
+            raise InputError(
+                path, "name", f"its eye is behind the display (x = {eye[0]:.3f} m) with preset {preset.name}"
+            )
+        found.setdefault(int(match[1]), {})[int(match[5])] = (path, eye)
+    if not found:
+        raise InputError(folder, "", "holds no pair0_x.._y.._z.._0.jpg")
+    pairs = []
+    for number, halves in sorted(found.items()):
+        missing = {0, 1} - set(halves)
+        if missing:
+            path = next(iter(halves.values()))[0]
+            raise InputError(path, f"pair{number}", f"has no _{missing.pop()} beside it")
+        (first, first_eye), (second, second_eye) = halves[0], halves[1]
+        if first_eye[1] == second_eye[1]:
+            raise InputError(first, f"pair{number}", "both eyes are at the same y: left can't be told from right")
+        if first_eye[1] > second_eye[1]:
+            first, second, first_eye, second_eye = second, first, second_eye, first_eye
+        pairs.append(Pair(number, (first, second), np.array([first_eye, second_eye])))
+    return tuple(pairs)
+
+
+class EyeRealSource(ContentSource):
+    """The pair that was taken nearest to the viewer, warped by way of the display's centre for the rest of the way."""
+
+    def __init__(
+        self, pairs: tuple[Pair, ...], *, fov_deg: float, background: tuple[float, float, float], name: str
+    ) -> None:
+        self._pairs = pairs
+        self._eyes_m = np.stack([pair.eyes_m for pair in pairs])
+        self._fov_deg = fov_deg
+        self._background = background
+        self._loaded: dict[int, tuple[tuple[WarpedPicture, F64], tuple[WarpedPicture, F64]]] = {}
+        self._chosen = 0
+        self._load(0)
+        self.info = ContentInfo(name=name, background=background)
+
+    def render(self, view: View, *, time_ns: int) -> U8:
+        if view.side == 0:  # the right eye gets the same pair
+            self._chosen = int(np.linalg.norm(self._eyes_m[:, 0] - view.eye_m, axis=1).argmin())
+        try:
+            picture, projection = self._load(self._chosen)[view.side]
+        except InputError as error:
+            raise ContentFailure(str(error)) from None
+        matrix = image_from_view(projection, view.pixels_from_stack, x_m=0.0)
+        return picture.warped(matrix, width_px=view.width_px, height_px=view.height_px, side=view.side)
+
+    def _load(self, index: int) -> tuple[tuple[WarpedPicture, F64], tuple[WarpedPicture, F64]]:
+        if index not in self._loaded:
+            pair = self._pairs[index]
+            left, right = (self._opened(path, eye) for path, eye in zip(pair.paths, pair.eyes_m, strict=True))
+            while len(self._loaded) >= KEPT:
+                self._loaded.pop(next(iter(self._loaded)))
+            self._loaded[index] = (left, right)
+        return self._loaded[index]
+
+    def _opened(self, path: Path, eye_m: F64) -> tuple[WarpedPicture, F64]:
+        rgb = read_image(path)
+        height, width = rgb.shape[:2]
+        projection = image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=self._fov_deg)
+        return WarpedPicture(rgba_from_rgb(rgb), background=self._background), projection

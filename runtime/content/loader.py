@@ -1,0 +1,76 @@
+"""Loading off the loop: another scene is read in the background while the present one goes on."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import Any
+
+from runtime.config import ContentSettings
+from runtime.content.base import ContentSource
+from runtime.content.registry import Opener, prepare_content
+from runtime.errors import PhasestackError
+from runtime.optics.stack import PanelStack
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """What came of a request: a source that is ready to draw, or why there is none."""
+
+    scene: str
+    source: ContentSource | None
+    problem: str = ""
+
+
+class ContentLoader:
+    """One request at a time; a newer one overtakes an older. `poll` belongs to the thread with the GL context."""
+
+    def __init__(self, stack: PanelStack) -> None:
+        self._stack = stack
+        self._lock = threading.Lock()
+        self._wanted = 0
+        self._result: tuple[int, str, Opener | None, str] | None = None
+        self.progress = ""  # one line for the status; empty: nothing is being loaded
+
+    def request(self, settings: ContentSettings) -> None:
+        """Begin to load; returns at once."""
+        with self._lock:
+            self._wanted += 1
+            number = self._wanted
+            self.progress = f"loading {settings.scene}"
+        threading.Thread(target=self._load, args=(number, settings), name="content-loader", daemon=True).start()
+
+    def poll(self, context: Any) -> Loaded | None:
+        """The newest request's outcome, once; None while it is under way. Uploads to GL."""
+        with self._lock:
+            if self._result is None:
+                return None
+            _, scene, opener, problem = self._result
+            self._result, self.progress = None, ""
+        if opener is None:
+            return Loaded(scene, None, problem)
+        try:
+            return Loaded(scene, opener(context))
+        except PhasestackError as error:
+            return Loaded(scene, None, str(error))
+        except Exception as error:  # a GL driver's or a library's own: the present scene goes on
+            return Loaded(scene, None, f"{scene}: {type(error).__name__}: {error}")
+
+    def _load(self, number: int, settings: ContentSettings) -> None:
+        opener: Opener | None = None
+        problem = ""
+
+        def tell(text: str) -> None:
+            with self._lock:
+                if number == self._wanted:
+                    self.progress = text
+
+        try:
+            opener = prepare_content(settings, self._stack, progress=tell)
+        except PhasestackError as error:
+            problem = str(error)
+        except Exception as error:  # whatever a file provokes in a loader, the loop goes on
+            problem = f"{settings.scene}: {type(error).__name__}: {error}"
+        with self._lock:
+            if number == self._wanted:
+                self._result = (number, settings.scene, opener, problem)

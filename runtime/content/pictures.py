@@ -1,0 +1,248 @@
+"""Pictures, picture folders and videos on the screen's plane: side by side, top-bottom, quilt."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from runtime.artifacts import read_image
+from runtime.clock import NS_PER_S
+from runtime.config import ContentSettings
+from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.images import WarpedPicture, rgba_from_rgb
+from runtime.errors import ContentFailure, InputError
+from runtime.optics.rpu import panel_from_image
+from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.records import U8
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+VIDEOS = (".mp4", ".mkv", ".avi", ".mov", ".webm", ".m4v")
+QUILT_NAME = re.compile(r"_qs(\d+)x(\d+)")
+
+
+def layout_of(path: Path, settings: ContentSettings) -> str:
+    """How a file holds its views: the setting, or what its name says. A pair's name is `_sbs`, else `mono`."""
+    if settings.layout != "auto":
+        return settings.layout
+    stem = path.stem.lower()
+    if QUILT_NAME.search(stem):
+        return "quilt"
+    for mark, layout in (("_rgbd", "rgbd"), ("_sbs", "side-by-side"), ("_tb", "top-bottom"), ("_ou", "top-bottom")):
+        if stem.endswith(mark) or f"{mark}_" in stem:
+            return layout
+    return "mono"
+
+
+def quilt_size(path: Path, settings: ContentSettings) -> tuple[int, int]:
+    """Columns and rows of a quilt. Raises InputError where neither the settings nor the name tell."""
+    if all(settings.quilt):
+        return settings.quilt
+    found = QUILT_NAME.search(path.stem.lower())
+    if not found or not int(found[1]) or not int(found[2]):
+        raise InputError(path, "quilt", "columns and rows are in neither the name (_qs8x6) nor content.quilt")
+    return int(found[1]), int(found[2])
+
+
+def screen(stack: PanelStack, *, width_px: int, height_px: int) -> PlaneRaster:
+    """A picture's pixels on the plane through the stack's centre: as large as the display lets its shape be."""
+    pitch_m = min(stack.width_m / width_px, stack.height_m / height_px)
+    return PlaneRaster(
+        x_m=0.0,
+        left_m=-pitch_m * width_px / 2,
+        top_m=pitch_m * height_px / 2,
+        pitch_u_m=pitch_m,
+        pitch_v_m=pitch_m,
+        width_px=width_px,
+        height_px=height_px,
+    )
+
+
+class Frames(ABC):
+    """Pictures in time. Constructors raise InputError; later failures are ContentFailure."""
+
+    count: int
+    rate_hz: float
+
+    @abstractmethod
+    def frame(self, index: int) -> U8:
+        """(h, w, 3) RGB. Raises ContentFailure."""
+
+    def close(self) -> None:  # noqa: B027 - most hold nothing
+        """Release files."""
+
+
+class Picture(Frames):
+    """One picture for ever."""
+
+    count, rate_hz = 1, 1.0
+
+    def __init__(self, rgb: U8) -> None:
+        self._rgb = rgb
+
+    def frame(self, index: int) -> U8:
+        return self._rgb
+
+
+class PictureFolder(Frames):
+    """The pictures of a folder in the order of their names."""
+
+    def __init__(self, paths: Sequence[Path], *, rate_hz: float) -> None:
+        self._paths = list(paths)
+        self._shape = read_image(self._paths[0]).shape
+        self.count, self.rate_hz = len(self._paths), rate_hz
+
+    def frame(self, index: int) -> U8:
+        try:
+            picture = read_image(self._paths[index])
+        except InputError as error:
+            raise ContentFailure(str(error)) from None
+        if picture.shape != self._shape:
+            raise ContentFailure(f"{self._paths[index]}: its size differs from the first picture's")
+        return picture
+
+
+class Video(Frames):
+    """A video file, read by OpenCV as it goes."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._capture = cv2.VideoCapture(str(path))
+        if not self._capture.isOpened():
+            raise InputError(path, "", "is not a video that can be decoded")
+        self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.rate_hz = float(self._capture.get(cv2.CAP_PROP_FPS))
+        if self.count < 1 or not 0.1 < self.rate_hz < 1000:
+            self._capture.release()
+            raise InputError(path, "frames", f"{self.count} at {self.rate_hz:g} Hz cannot be played")
+        self._next = 0
+        self._last: U8 = np.empty((0, 0, 3), np.uint8)
+        self.frame(0)
+
+    def frame(self, index: int) -> U8:
+        if index == self._next - 1 and self._last.size:
+            return self._last
+        if index < self._next or index > self._next + 60:
+            self._capture.set(cv2.CAP_PROP_POS_FRAMES, index)
+            self._next = index
+        while self._next < index:
+            self._capture.grab()
+            self._next += 1
+        done, bgr = self._capture.read()
+        if not done:
+            if self._next == 0:
+                raise InputError(self._path, "frames", "the first one cannot be decoded")
+            self.count = self._next  # containers count more frames than they hold
+            raise ContentFailure(f"{self._path}: frame {index} cannot be decoded")
+        self._next = index + 1
+        self._last = np.ascontiguousarray(bgr[..., ::-1], np.uint8)
+        return self._last
+
+    def close(self) -> None:
+        self._capture.release()
+
+
+def open_frames(path: Path, settings: ContentSettings) -> Frames:
+    """A picture, a video, or a folder of pictures. Raises InputError."""
+    if path.is_dir():
+        paths = sorted(item for item in path.iterdir() if item.suffix.lower() in PICTURES)
+        if not paths:
+            raise InputError(path, "", "the folder holds no pictures")
+        return PictureFolder(paths, rate_hz=settings.picture_rate_hz)
+    if not path.is_file():
+        raise InputError(path, "", "is not there")
+    return Video(path) if path.suffix.lower() in VIDEOS else Picture(read_image(path))
+
+
+def split(rgb: U8, layout: str, quilt: tuple[int, int] = (1, 1)) -> list[U8]:
+    """The views of one picture: [left, right], [one], or a quilt's from the leftmost camera to the rightmost."""
+    height, width = rgb.shape[:2]
+    if layout == "side-by-side":
+        return [rgb[:, : width // 2], rgb[:, width - width // 2 :]]
+    if layout == "top-bottom":
+        return [rgb[: height // 2], rgb[height - height // 2 :]]
+    if layout == "quilt":
+        columns, rows = quilt
+        wide, high = width // columns, height // rows
+        # The first view is at the bottom left, then rightwards, then upwards.
+        return [
+            rgb[height - (row + 1) * high : height - row * high, column * wide : (column + 1) * wide]
+            for row in range(rows)
+            for column in range(columns)
+        ]
+    return [rgb]
+
+
+class ScreenPictures(ContentSource):
+    """Views of pictures or videos that hang in the plane of the display's centre."""
+
+    def __init__(
+        self,
+        frames: Frames,
+        *,
+        layout: str,
+        stack: PanelStack,
+        settings: ContentSettings,
+        name: str,
+        quilt: tuple[int, int],
+    ) -> None:
+        self._frames, self._layout, self._quilt = frames, layout, quilt
+        self._cone_rad = np.radians(settings.cone_deg)
+        self._repeat = settings.at_end == "repeat"
+        self._background = settings.background
+        views = split(frames.frame(0), layout, quilt)
+        height, width = views[0].shape[:2]
+        if not height or not width:
+            raise InputError(name, "layout", f"a picture of this size has no {layout} views")
+        self._screen = screen(stack, width_px=width, height_px=height)
+        self._shown: dict[int, WarpedPicture] = {}
+        self._at = -1
+        self._views: list[U8] = []
+        moving = frames.count > 1
+        self.info = ContentInfo(
+            name=name,
+            moving=moving,
+            grey=not moving and _is_grey(frames.frame(0)),
+            depth_range_m=(0.0, 0.0) if layout == "mono" else None,
+            background=settings.background,
+            flat_x_m=0.0 if layout == "mono" else None,
+        )
+
+    def index_at(self, time_ns: int) -> int:
+        """Which frame the run's clock calls for; a video that ended repeats or holds its last."""
+        index = int(time_ns * self._frames.rate_hz / NS_PER_S)
+        return index % self._frames.count if self._repeat else min(index, self._frames.count - 1)
+
+    def revision(self, *, time_ns: int) -> int:
+        return self.index_at(time_ns)
+
+    def view_for(self, view: View) -> int:
+        """Which of the pictures an eye gets: its side's, or a quilt's nearest in angle about the vertical."""
+        if len(self._views) <= 2:
+            return min(view.side, len(self._views) - 1)
+        angle = np.arctan2(view.eye_m[1], view.eye_m[0])
+        place = (angle / self._cone_rad + 0.5) * (len(self._views) - 1)
+        return int(np.clip(np.rint(place), 0, len(self._views) - 1))
+
+    def render(self, view: View, *, time_ns: int) -> U8:
+        index = self.index_at(time_ns)
+        if index != self._at:
+            self._views = split(self._frames.frame(index), self._layout, self._quilt)
+            self._shown, self._at = {}, index
+        which = self.view_for(view)
+        if which not in self._shown:
+            self._shown[which] = WarpedPicture(rgba_from_rgb(self._views[which]), background=self._background)
+        matrix = panel_from_image(view.pixels_from_stack, self._screen)
+        return self._shown[which].warped(matrix, width_px=view.width_px, height_px=view.height_px, side=view.side)
+
+    def close(self) -> None:
+        self._frames.close()
+
+
+def _is_grey(rgb: U8) -> bool:
+    small = rgb[::4, ::4].astype(np.int16)
+    return bool((np.ptp(small, axis=2) <= 2).all())

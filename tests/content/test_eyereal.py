@@ -1,0 +1,93 @@
+"""Folders of the published data set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runtime.artifacts import write_png
+from runtime.content.eyereal import EyeRealSource, is_data_set, read_folder
+from runtime.content.presets import preset
+from runtime.content.procedural import ProceduralSource
+from runtime.errors import InputError
+from runtime.optics.stack import PanelStack
+from tests.content.conftest import image_view, panel_view
+
+LEGO = preset("lego_bulldozer", "published-code")
+LEFT, RIGHT = (6.486, -0.263, 2.004), (6.487, 0.237, 2.004)
+
+
+def write_pair(folder: Path, context: Any, stack: PanelStack, number: int = 0, dy: float = 0.0) -> list[np.ndarray]:
+    """A pair as the data set names it (the right eye is _0 in this scene); returns left and right pictures."""
+    scene = ProceduralSource("demo", stack=stack, context=context)
+    pictures = []
+    for side, (eye, half) in enumerate(((LEFT, 1), (RIGHT, 0))):
+        x, y, z = eye[0], eye[1] + dy, eye[2]
+        view = image_view(np.array([x, y, z]) / 8.3, 480, 270, side=side)
+        pictures.append(scene.render(view, time_ns=0).copy())
+        write_png(folder / f"pair{number}_x{x:.3f}_y{y:.3f}_z{z:.3f}_{half}.png", pictures[-1])
+    scene.close()
+    return pictures
+
+
+def test_eyes_are_read_from_names_and_left_is_on_the_left(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    write_pair(tmp_path, context, stack)
+    assert is_data_set(tmp_path)
+    (pair,) = read_folder(tmp_path, LEGO)
+    assert pair.eyes_m == pytest.approx(
+        np.array([[0.781446, -0.031687, 0.241446], [0.781566, 0.028554, 0.241446]]), abs=1e-5
+    )
+    assert pair.paths[0].name.endswith("_1.png")
+
+
+def test_at_its_own_eyes_a_pair_is_what_the_scene_was(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    write_pair(tmp_path, context, stack)
+    (pair,) = read_folder(tmp_path, LEGO)
+    source = EyeRealSource((pair,), fov_deg=40, background=(1, 1, 1), name="lego")
+    scene = ProceduralSource("demo", stack=stack, context=context)
+    for side in (0, 1):
+        view = panel_view(pair.eyes_m[side], stack.panel(1), side=side)
+        wanted, given = scene.render(view, time_ns=0).astype(int), source.render(view, time_ns=0).astype(int)
+        inside = given[..., 3] == 255
+        assert inside.mean() > 0.7
+        right = np.abs(wanted - given)[inside][:, :3].mean()
+        wrong = np.abs(np.roll(wanted, 4, axis=1) - given)[inside][:, :3].mean()
+        assert right < 0.5 * wrong
+
+
+def test_the_nearest_pair_is_shown(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    for number, dy in enumerate((0.0, 1.0, -1.0)):
+        write_pair(tmp_path, context, stack, number, dy)
+    pairs = read_folder(tmp_path, LEGO)
+    several = EyeRealSource(pairs, fov_deg=40, background=(1, 1, 1), name="lego")
+    for index, pair in enumerate(pairs):
+        alone = EyeRealSource((pairs[index],), fov_deg=40, background=(1, 1, 1), name="lego")
+        for side in (0, 1):
+            view = panel_view(pair.eyes_m[side] + [0.01, 0.01, 0.0], stack.panel(1), side=side)
+            assert (several.render(view, time_ns=0) == alone.render(view, time_ns=0)).all()
+
+
+def test_half_a_pair_is_named(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    write_pair(tmp_path, context, stack)
+    next(tmp_path.glob("*_0.png")).unlink()
+    with pytest.raises(InputError, match=r"_1.png: pair0: has no _0 beside it"):
+        read_folder(tmp_path, LEGO)
+
+
+def test_a_folder_without_pairs_and_a_truncated_picture_are_told(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no pair0"):
+        read_folder(tmp_path, LEGO)
+    for half, y in ((0, 0.2), (1, -0.2)):
+        (tmp_path / f"pair0_x6.0_y{y}_z2.0_{half}.jpg").write_bytes(b"\xff\xd8\xff broken")
+    with pytest.raises(InputError, match="not an image"):
+        EyeRealSource(read_folder(tmp_path, LEGO), fov_deg=40, background=(1, 1, 1), name="lego")
+
+
+def test_an_eye_behind_the_display_is_told(tmp_path: Path) -> None:
+    for half, y in ((0, 0.2), (1, -0.2)):
+        (tmp_path / f"pair0_x-6.0_y{y}_z2.0_{half}.jpg").write_bytes(b"")
+    with pytest.raises(InputError, match="behind the display"):
+        read_folder(tmp_path, LEGO)

@@ -1,0 +1,166 @@
+"""Pictures, folders and videos: which view an eye gets, where it hangs, and what happens at the end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from runtime.artifacts import write_png
+from runtime.config import ContentSettings
+from runtime.content.base import ContentSource
+from runtime.content.registry import open_content
+from runtime.errors import ContentFailure, InputError
+from runtime.optics.stack import PanelStack
+from tests.content.conftest import panel_view
+
+RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
+EYES = ((0.6, -0.03, 0.0), (0.6, 0.03, 0.0))
+
+
+def solid(colour: tuple[int, int, int], width: int = 160, height: int = 90) -> np.ndarray:
+    return np.full((height, width, 3), colour, np.uint8)
+
+
+def centre(source: ContentSource, stack: PanelStack, side: int, time_ns: int = 0, eye: Any = None) -> list[int]:
+    picture = source.render(panel_view(EYES[side] if eye is None else eye, stack.panel(1), side=side), time_ns=time_ns)
+    return picture[stack.height_px // 2, stack.width_px // 2, :3].tolist()
+
+
+def opened(path: Path, context: Any, stack: PanelStack, **settings: Any) -> ContentSource:
+    return open_content(ContentSettings(scene=str(path), **settings), stack, context)
+
+
+@pytest.mark.parametrize(("name", "axis"), [("a_sbs.png", 1), ("a_tb.png", 0)])
+def test_each_eye_gets_its_half(tmp_path: Path, context: Any, stack: PanelStack, name: str, axis: int) -> None:
+    write_png(tmp_path / name, np.concatenate([solid(RED), solid(BLUE)], axis=axis))
+    source = opened(tmp_path / name, context, stack)
+    assert centre(source, stack, 0) == list(RED)
+    assert centre(source, stack, 1) == list(BLUE)
+    assert not source.info.moving
+
+
+def test_a_plain_picture_lies_in_the_middle_plane_and_both_eyes_see_the_same(
+    tmp_path: Path, context: Any, stack: PanelStack
+) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (90, 160, 3), np.uint8)
+    picture = np.clip((cv2.GaussianBlur(noise, (0, 0), 3).astype(float) - 128) * 4 + 128, 0, 255).astype(np.uint8)
+    write_png(tmp_path / "a.png", picture)
+    source = opened(tmp_path / "a.png", context, stack)
+    left, right = (source.render(panel_view(EYES[side], stack.panel(1), side=side), time_ns=0) for side in (0, 1))
+    assert (left == right).all()
+    assert source.info.flat_x_m == 0.0
+    back = cv2.resize(left, (160, 90), interpolation=cv2.INTER_AREA)[..., :3].astype(int)
+    # The display is a little wider than the picture's shape: 0.4 of a column each side.
+    assert np.abs(back[20:-20, 20:-20] - picture[20:-20, 20:-20]).mean() < 4
+
+
+def test_a_narrow_picture_has_the_background_beside_it(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    write_png(tmp_path / "a.png", solid(GREEN, 90, 90))
+    picture = opened(tmp_path / "a.png", context, stack).render(panel_view(EYES[0], stack.panel(1)), time_ns=0)
+    assert picture[135, 20].tolist() == [255, 255, 255, 0]
+    assert picture[135, 240].tolist() == [0, 255, 0, 255]
+
+
+def test_a_quilt_gives_each_eye_the_view_nearest_in_angle(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    """Views run from the bottom left, rightwards, upwards; their grey levels tell which one is seen."""
+    views = [solid((10 * index, 0, 0), 32, 18) for index in range(15)]
+    rows = [np.concatenate(views[row * 5 : row * 5 + 5], axis=1) for row in range(3)]
+    path = tmp_path / "a_qs5x3a1.78.png"
+    write_png(path, np.concatenate(rows[::-1], axis=0))
+    source = opened(path, context, stack, cone_deg=70.0)
+    for degrees in (-35, -20, 0, 5, 30, 50):
+        eye = 0.6 * np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
+        expected = round(np.clip(degrees / 70 + 0.5, 0, 1) * 14)
+        assert centre(source, stack, 0, eye=eye)[0] == 10 * expected
+
+
+def test_a_folder_of_pictures_plays_and_repeats(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    for index, colour in enumerate((RED, GREEN, BLUE)):
+        write_png(tmp_path / f"{index:03}.png", solid(colour))
+    source = opened(tmp_path, context, stack, picture_rate_hz=10.0)
+    seen = [centre(source, stack, 0, time_ns=tenth * 10**8) for tenth in range(4)]
+    assert seen == [list(RED), list(GREEN), list(BLUE), list(RED)]
+    assert source.info.moving
+    assert source.revision(time_ns=0) == source.revision(time_ns=99_000_000) != source.revision(time_ns=10**8)
+
+
+def make_video(path: Path, colours: list[tuple[int, int, int]], size: tuple[int, int] = (160, 96)) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, size)
+    for colour in colours:
+        writer.write(np.full((size[1], size[0], 3), colour[::-1], np.uint8))
+    writer.release()
+    return path
+
+
+@pytest.mark.parametrize(("at_end", "after"), [("repeat", RED), ("hold", BLUE)])
+def test_a_video_that_ends_repeats_or_holds(
+    tmp_path: Path, context: Any, stack: PanelStack, at_end: Any, after: tuple[int, int, int]
+) -> None:
+    path = make_video(tmp_path / "a.avi", [RED, GREEN, BLUE])
+    source = opened(path, context, stack, at_end=at_end)
+    seen = [centre(source, stack, 0, time_ns=tenth * 10**8) for tenth in (0, 1, 2, 3)]
+    for found, wanted in zip(seen, (RED, GREEN, BLUE, after), strict=True):
+        assert np.abs(np.array(found) - wanted).max() < 12
+    assert np.abs(np.array(centre(source, stack, 0, time_ns=0)) - RED).max() < 12
+    source.close()
+
+
+def test_a_truncated_video_is_a_failure_that_passes(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    path = make_video(tmp_path / "a.avi", [RED] * 40)
+    source = opened(path, context, stack)
+    source._frames.count = 400  # type: ignore[attr-defined]  # as a damaged container would say
+    with pytest.raises(ContentFailure, match=r"a.avi: frame 300"):
+        source.render(panel_view(EYES[0], stack.panel(1)), time_ns=30 * 10**9)
+    assert np.abs(np.array(centre(source, stack, 0, time_ns=0)) - RED).max() < 12
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.png"])
+def test_a_file_that_is_none_is_one_line(tmp_path: Path, context: Any, stack: PanelStack, name: str) -> None:
+    (tmp_path / name).write_bytes(b"nothing of the kind")
+    with pytest.raises(InputError, match=rf"{name}: is not"):
+        opened(tmp_path / name, context, stack)
+
+
+def test_a_quilt_without_its_size_is_told(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    write_png(tmp_path / "a.png", solid(RED))
+    with pytest.raises(InputError, match=r"a.png: quilt: columns and rows"):
+        opened(tmp_path / "a.png", context, stack, layout="quilt")
+
+
+def test_an_empty_folder_and_a_missing_file_are_told(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    with pytest.raises(InputError, match="holds no pictures"):
+        opened(tmp_path, context, stack)
+    with pytest.raises(InputError, match="content: scene: "):
+        opened(tmp_path / "b.png", context, stack)
+
+
+def rgbd_picture() -> np.ndarray:
+    """A green square that is near, on a red ground that is far."""
+    colour, depth = solid(RED, 320, 180), np.zeros((180, 320, 3), np.uint8)
+    colour[60:120, 130:190] = GREEN
+    depth[60:120, 130:190] = 255
+    return np.concatenate([colour, depth], axis=1)
+
+
+def test_an_rgbd_picture_has_parallax_of_the_right_size(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    write_png(tmp_path / "a_rgbd.png", rgbd_picture())
+    source = opened(tmp_path / "a_rgbd.png", context, stack, depth_m=(-0.05, 0.05))
+    assert source.info.depth_range_m == pytest.approx((-0.05, 0.05))
+    middles = []
+    for eye in EYES:
+        picture = source.render(panel_view(eye, stack.panel(1)), time_ns=0)
+        columns = np.nonzero((picture[..., 1] > 200) & (picture[..., 0] < 50))[1]
+        middles.append(columns.mean())
+    # A point at x is seen on the centre plane shifted by -eye_y·x/(eye_x - x).
+    expected = -0.06 * 0.05 / (0.6 - 0.05) / (stack.width_m / stack.width_px)
+    assert middles[1] - middles[0] == pytest.approx(expected, abs=0.5)
+
+
+def test_an_rgbd_picture_without_depth_is_told(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    write_png(tmp_path / "a_rgbd.png", np.concatenate([solid(RED), solid(BLUE)], axis=1))
+    with pytest.raises(InputError, match=r"a_rgbd.png: layout: the right half is no grey depth map"):
+        opened(tmp_path / "a_rgbd.png", context, stack)
