@@ -182,14 +182,14 @@ def _listen(path: Path, group: str, owner: StatusServer) -> _Server:
 
 
 def open_status_server(settings: ServiceSettings, *, clock: Clock, supervised: bool) -> StatusServer | None:
-    """The socket that the settings name; a person's own run, where that can't be made, uses their runtime folder.
+    """The socket that the settings name; in a person's session, where its default can't be made, their own.
 
     Under a supervisor it is the socket or nothing: raises InputError where another phasestack has it or it
     can't be made. A run by hand then goes on without one, and the log says why.
     """
     path = Path(settings.socket)
     own = user_socket()
-    if not supervised and own is not None and path == Path(ServiceSettings().socket) and not _may_write(path.parent):
+    if own is not None and path == Path(ServiceSettings().socket) and not _may_write(path.parent):
         path = own
     try:
         return StatusServer(path, group=settings.group, clock=clock)

@@ -1,0 +1,64 @@
+#!/bin/sh
+# Installs phasestack for the whole machine: sh systemd/install.sh (as root), or `make install`.
+#   DESTDIR=/some/root  build a package's tree there; nothing on this machine is started or reloaded
+#   PYTHON=python3.11   the Python that will run it (3.11 or later)
+#   APP=no              only units, rules and configuration: the program comes from elsewhere
+set -eu
+here=$(CDPATH='' cd -- "$(dirname -- "$0")" && pwd)
+source=$(dirname -- "$here")
+DESTDIR=${DESTDIR:-}
+python=$(command -v "${PYTHON:-python3}") || { echo "install: ${PYTHON:-python3}: not found" >&2; exit 2; }
+"$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+  || { echo "install: $python: Python 3.11 or later is needed" >&2; exit 2; }
+if [ -z "$DESTDIR" ] && [ "$(id -u)" != 0 ]; then
+  echo "install: run as root, or set DESTDIR" >&2
+  exit 2
+fi
+
+library=/opt/phasestack/lib
+put() { install -D -m "$1" "$here/$2" "$DESTDIR$3"; }
+
+if [ "${APP:-yes}" != no ]; then
+  rm -rf "$DESTDIR$library.new"
+  "$python" -m pip install --quiet --no-compile --target "$DESTDIR$library.new" -r "$source/requirements/runtime.lock"
+  "$python" -m pip install --quiet --no-compile --no-deps --target "$DESTDIR$library.new" "$source"
+  # The old program stays whole until the new one is.
+  rm -rf "$DESTDIR$library"
+  mv "$DESTDIR$library.new" "$DESTDIR$library"
+fi
+
+mkdir -p "$DESTDIR/usr/bin"
+cat > "$DESTDIR/usr/bin/phasestack" <<LAUNCHER
+#!/bin/sh
+PYTHONPATH=$library exec $python -sP -c 'import sys; sys.argv[0] = "phasestack"; from runtime.cli import main; main()' "\$@"
+LAUNCHER
+chmod 755 "$DESTDIR/usr/bin/phasestack"
+
+put 644 phasestack.service /usr/lib/systemd/system/phasestack.service
+put 644 phasestack-x.service /usr/lib/systemd/system/phasestack-x.service
+put 644 phasestack-user.service /usr/lib/systemd/user/phasestack.service
+put 644 phasestack.sysusers.conf /usr/lib/sysusers.d/phasestack.conf
+put 644 phasestack.tmpfiles.conf /usr/lib/tmpfiles.d/phasestack.conf
+put 644 70-phasestack-sensors.rules /usr/lib/udev/rules.d/70-phasestack-sensors.rules
+put 755 x-authority /usr/lib/phasestack/x-authority
+version=$(systemctl --version 2>/dev/null | sed -n '1s/[^0-9]*\([0-9]*\).*/\1/p')
+if [ "${version:-0}" -ge 254 ]; then
+  put 644 50-backoff.conf /usr/lib/systemd/system/phasestack.service.d/50-backoff.conf
+fi
+put 644 ../docs/operation.md /usr/share/doc/phasestack/operation.md
+put 644 ../docs/hardware.md /usr/share/doc/phasestack/hardware.md
+put 644 ../THIRD_PARTY.md /usr/share/doc/phasestack/THIRD_PARTY.md
+# What the operator has written is never replaced.
+[ -e "$DESTDIR/etc/phasestack/phasestack.toml" ] || put 644 phasestack.toml /etc/phasestack/phasestack.toml
+
+if [ -z "$DESTDIR" ] && [ -d /run/systemd/system ]; then
+  systemd-sysusers
+  systemd-tmpfiles --create phasestack.conf
+  udevadm control --reload && udevadm trigger --subsystem-match=usb
+  systemctl daemon-reload
+fi
+cat <<NEXT
+phasestack is installed${DESTDIR:+ in $DESTDIR}. Next:
+  1. edit /etc/phasestack/phasestack.toml (phasestack identify, phasestack doctor)
+  2. systemctl enable --now phasestack
+NEXT

@@ -1,0 +1,29 @@
+"""Prints the udev rules for every sensor that phasestack knows: python systemd/make_udev_rules.py"""
+
+from __future__ import annotations
+
+from runtime.sensor.known_devices import KNOWN_DEVICES
+
+HEADER = """\
+# Depth cameras and eye trackers that phasestack knows: the group plugdev, and whoever sits at the seat, may open
+# them; they are never put to sleep. Made by systemd/make_udev_rules.py from runtime/sensor/known_devices.py.
+ACTION=="remove", GOTO="phasestack_end"
+SUBSYSTEM!="usb", GOTO="phasestack_end"
+"""
+FOOTER = 'LABEL="phasestack_end"\n'
+
+
+def rules() -> str:
+    """The whole file."""
+    lines = []
+    for device in KNOWN_DEVICES:
+        lines.append(f"# {device.name}")
+        lines.append(
+            f'ATTR{{idVendor}}=="{device.vendor_id:04x}", ATTR{{idProduct}}=="{device.product_id:04x}", '
+            'MODE="0660", GROUP="plugdev", TAG+="uaccess", TEST=="power/control", ATTR{power/control}="on"'
+        )
+    return HEADER + "\n".join(lines) + "\n" + FOOTER
+
+
+if __name__ == "__main__":
+    print(rules(), end="")

@@ -1,0 +1,32 @@
+#!/bin/sh
+# Removes what install.sh has put there: sh systemd/uninstall.sh (as root), or `make uninstall`.
+#   DESTDIR=/some/root  the tree that it was installed in
+#   PURGE=yes           also the configuration, the state and the cache
+set -eu
+DESTDIR=${DESTDIR:-}
+if [ -z "$DESTDIR" ] && [ "$(id -u)" != 0 ]; then
+  echo "uninstall: run as root, or set DESTDIR" >&2
+  exit 2
+fi
+live=no
+if [ -z "$DESTDIR" ] && [ -d /run/systemd/system ]; then
+  live=yes
+  systemctl disable --now phasestack.service phasestack-x.service 2>/dev/null || true
+fi
+rm -f "$DESTDIR/usr/bin/phasestack" \
+  "$DESTDIR/usr/lib/systemd/system/phasestack.service" \
+  "$DESTDIR/usr/lib/systemd/system/phasestack-x.service" \
+  "$DESTDIR/usr/lib/systemd/user/phasestack.service" \
+  "$DESTDIR/usr/lib/sysusers.d/phasestack.conf" \
+  "$DESTDIR/usr/lib/tmpfiles.d/phasestack.conf" \
+  "$DESTDIR/usr/lib/udev/rules.d/70-phasestack-sensors.rules"
+rm -rf "$DESTDIR/usr/lib/phasestack" "$DESTDIR/opt/phasestack" "$DESTDIR/usr/share/doc/phasestack" \
+  "$DESTDIR/usr/lib/systemd/system/phasestack.service.d"
+if [ "${PURGE:-no}" = yes ]; then
+  rm -rf "$DESTDIR/etc/phasestack" "$DESTDIR/var/lib/phasestack" "$DESTDIR/var/cache/phasestack"
+fi
+if [ "$live" = yes ]; then
+  systemctl daemon-reload
+  udevadm control --reload
+fi
+echo "phasestack is removed${DESTDIR:+ from $DESTDIR}"
