@@ -54,7 +54,7 @@ def residual_figure(residual_m: F64, used: Any, *, limit_m: float) -> bytes:
             panel.axhline(limit_m * 1e3, color="#c0392b", linestyle="--", linewidth=0.8)
             panel.axhline(-limit_m * 1e3, color="#c0392b", linestyle="--", linewidth=0.8)
     if (~used).any():
-        axes[0].legend(loc="upper right", fontsize=8)
+        axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, fontsize=8, frameon=False)
     axes[-1].set_xlabel("calibration point")
     canvas.suptitle("What the calibration makes of each point, less where it truly was", fontsize=11)
     return png(canvas)
@@ -91,7 +91,6 @@ def geometry_figure(
         panel.set_ylabel(label)
         panel.set_title(f"Seen {title}", fontsize=10)
         panel.grid(alpha=0.3)
-    axes[0].invert_yaxis()
     axes[1].legend(loc="best", fontsize=8)
     return png(canvas)
 

@@ -1,0 +1,207 @@
+"""A panel's grey curve: from a short series of luminances to phase against grey, and its inverse, the LUT.
+
+Between crossed polarizers, with the other panels at zero, a panel of phase p shows L = dark + range·sin²(pi/2·p)
+(seed 4). Either the phase or the intensity sin²(pi/2·p) is modelled as B(g^gamma), whichever explains the series
+with fewer parameters: a bare panel is smooth in the one, a monitor with its own tone curve in the other. B is a
+polynomial in Bernstein form whose coefficients ascend from 0 to 1: monotone and smooth whatever the noise. Dark and
+range are fitted too. That full white is a phase of 1 is assumed: luminance alone cannot tell a panel that does not
+reach it.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import PchipInterpolator
+from scipy.optimize import least_squares
+from scipy.special import comb
+
+from runtime.errors import InputError
+from runtime.optics.malus import intensity_from_phase, phase_from_intensity
+from runtime.records import F64
+
+CHANNELS = ("red", "green", "blue")
+LEAST_LEVELS = 4
+HIGHEST_DEGREE = 6
+LUT_ROWS = 256
+
+
+@dataclass(frozen=True, slots=True)
+class GreyCurve:
+    """Phase against grey of one channel."""
+
+    of_intensity: bool  # the polynomial is of the intensity; else of the phase
+    gamma: float
+    coefficients: F64  # (degree + 1,) ascending from 0 to 1
+    dark: float  # luminance at phase 0
+    span: float  # luminance at phase 1 less that
+    residual: float  # RMS of the luminances, as a share of `span`
+
+    def phase(self, grey: ArrayLike) -> F64:
+        """Phase in [0, 1] of grey in [0, 1]."""
+        value = self._polynomial(grey)
+        return phase_from_intensity(value, branch=1) if self.of_intensity else value
+
+    def intensity(self, grey: ArrayLike) -> F64:
+        """Intensity in [0, 1] of grey in [0, 1]."""
+        value = self._polynomial(grey)
+        return value if self.of_intensity else intensity_from_phase(value)
+
+    def _polynomial(self, grey: ArrayLike) -> F64:
+        return _bernstein(np.clip(np.asarray(grey, dtype=np.float64), 0, 1) ** self.gamma, self.coefficients)
+
+    def grey(self, phase: ArrayLike) -> F64:
+        """Grey in [0, 1] for a phase in [0, 1]: the inverse, by monotone interpolation of a dense table."""
+        # Even steps of g^gamma would leave one end coarse, even steps of g the other.
+        steps = np.linspace(0, 1, 2001)
+        greys = np.unique(np.concatenate([steps, steps ** (1 / self.gamma), steps**3, 1 - steps**3]))
+        phases = self.phase(greys)
+        rising = np.concatenate([[True], np.diff(np.maximum.accumulate(phases)) > 1e-12])
+        inverse = PchipInterpolator(phases[rising], greys[rising])
+        return np.clip(inverse(np.clip(phase, 0.0, phases[-1])), 0.0, 1.0)
+
+
+def _bernstein(x: F64, coefficients: F64) -> F64:
+    degree = len(coefficients) - 1
+    order = np.arange(degree + 1)
+    basis = comb(degree, order) * x[..., None] ** order * (1 - x[..., None]) ** (degree - order)
+    return basis @ coefficients
+
+
+def _coefficients(free: F64) -> F64:
+    """Ascending from 0 to 1 from unbounded numbers: shares of a whole."""
+    shares = np.exp(np.concatenate([[0.0], free]) - np.max(free, initial=0.0))
+    return np.concatenate([[0.0], np.cumsum(shares) / shares.sum()])
+
+
+def fit_grey_curve(grey: F64, luminance: F64) -> GreyCurve:
+    """The curve of one channel from (n,) greys in [0, 1] and (n,) luminances, n >= 4 different greys.
+
+    Kind and degree of the polynomial are those of the lowest corrected AIC.
+    Raises ValueError, saying what is wrong with the series.
+    """
+    levels = np.unique(grey)
+    if len(levels) < LEAST_LEVELS:
+        raise ValueError(f"{len(levels)} grey levels: at least {LEAST_LEVELS} are needed")
+    if levels[0] > 0.02 or levels[-1] < 0.98:
+        raise ValueError("the series must reach from black to full white")
+    low, high = float(np.mean(luminance[grey == levels[0]])), float(np.mean(luminance[grey == levels[-1]]))
+    if not high > low:
+        raise ValueError("white is not brighter than black: is the panel's polarizer the wrong way round?")
+    values = (luminance - low) / (high - low)
+    best: tuple[float, GreyCurve] | None = None
+    for of_intensity in (False, True):
+        for degree in range(1, HIGHEST_DEGREE + 1):
+            parameters = 3 + degree - 1
+            if degree > 1 and parameters + 2 > len(levels):
+                break
+            curve, cost = _fit(grey, values, degree, of_intensity=of_intensity)
+            score = _information(cost, count=len(grey), parameters=parameters)
+            if best is None or score < best[0] - 1e-9:
+                best = (score, curve)
+    assert best is not None
+    return replace(best[1], dark=low + best[1].dark * (high - low), span=best[1].span * (high - low))
+
+
+def _information(cost: float, *, count: int, parameters: int) -> float:
+    """Akaike's criterion, corrected for few samples; perfect fits differ by their parameters alone."""
+    variance = max(cost / count, 1e-14)
+    return count * math.log(variance) + 2 * parameters * count / max(count - parameters - 1, 1)
+
+
+def _fit(grey: F64, values: F64, degree: int, *, of_intensity: bool) -> tuple[GreyCurve, float]:
+    def curve_of(p: F64) -> GreyCurve:
+        coefficients = _coefficients(p[3:])
+        return GreyCurve(of_intensity, float(np.exp(p[0])), coefficients, float(p[1]), float(np.exp(p[2])), 0.0)
+
+    def residuals(p: F64) -> F64:
+        curve = curve_of(p)
+        return curve.dark + curve.span * curve.intensity(grey) - values
+
+    start = np.concatenate([[0.0, 0.0, 0.0], np.zeros(degree - 1)])
+    fits = [
+        least_squares(residuals, np.concatenate([[math.log(gamma)], start[1:]]), max_nfev=2000) for gamma in (1.0, 2.2)
+    ]
+    fit = min(fits, key=lambda found: found.cost)
+    curve = curve_of(fit.x)
+    rms = float(np.sqrt((fit.fun**2).mean())) / curve.span
+    return replace(curve, residual=rms), float(2 * fit.cost)
+
+
+def lut_text(curves: tuple[GreyCurve, GreyCurve, GreyCurve]) -> str:
+    """The panel's LUT as the panels read it: 256 rows of phase and grey per channel, all 0 to 1."""
+    from runtime.panels.lut import COLUMNS
+
+    phase = np.linspace(0.0, 1.0, LUT_ROWS)
+    greys = [np.maximum.accumulate(curve.grey(phase)) for curve in curves]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for row in zip(phase, *greys, strict=True):
+        writer.writerow([f"{value:.6f}" for value in row])
+    return text.getvalue()
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Measured luminances of one panel."""
+
+    grey: F64  # (n,) in [0, 1]
+    luminance: F64  # (n, 3) red, green, blue, any unit; a grey series has three equal columns
+
+
+def read_series(path: Path) -> Series:
+    """CSV with columns grey and luminance, or grey, red, green, blue. Greys above 1 are taken as 0 to 255.
+
+    Raises InputError, naming the row and the column.
+    """
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.DictReader(file, skipinitialspace=True)
+            header = [(name or "").strip().lower() for name in reader.fieldnames or ()]
+            reader.fieldnames = header
+            names = CHANNELS if set(CHANNELS) <= set(header) else ("luminance",)
+            for name in ("grey", *names):
+                if name not in header:
+                    raise InputError(
+                        path, name, "column is missing (wanted: grey, luminance or grey, red, green, blue)"
+                    )
+            rows = [[_cell(path, reader.line_num, name, row.get(name)) for name in ("grey", *names)] for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(path, "", f"cannot be read ({getattr(error, 'strerror', None) or error})") from None
+    if not rows:
+        raise InputError(path, "grey", "there are no rows")
+    table = np.array(rows)
+    grey = table[:, 0] / (255.0 if table[:, 0].max() > 1.0 else 1.0)
+    if grey.min() < 0.0 or grey.max() > 1.0:
+        raise InputError(path, "grey", "must lie between 0 and 1, or 0 and 255")
+    if table[:, 1:].min() < 0.0:
+        raise InputError(path, "luminance", "must not be negative")
+    return Series(grey, np.broadcast_to(table[:, 1:], (len(table), 3)).copy())
+
+
+def _cell(path: Path, line: int, name: str, value: str | None) -> float:
+    try:
+        number = float(value or "")
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(path, f"line {line}, {name}", f"is not a number: {value}")
+    return number
+
+
+def fit_series(series: Series, source: Path | str) -> tuple[GreyCurve, GreyCurve, GreyCurve]:
+    """Red, green and blue curve. Raises InputError, naming the channel."""
+    curves = []
+    for channel, name in enumerate(CHANNELS):
+        try:
+            curves.append(fit_grey_curve(series.grey, series.luminance[:, channel]))
+        except ValueError as problem:
+            raise InputError(source, name, str(problem)) from None
+    return curves[0], curves[1], curves[2]

@@ -1,0 +1,93 @@
+"""`calibrate panels grey`: a measured or typed series to a LUT."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.grey import CHANNELS, Series, fit_series, lut_text, read_series
+from calib.panel_figures import grey_figure
+from runtime.artifacts import OutputFolder, write_bytes, write_text
+from runtime.config import Settings
+from runtime.errors import InputError
+from runtime.optics.stack import PanelStack
+from runtime.records import F64, LayerFrame
+
+
+def fit_lut(
+    out: Path, series: Path | None, *, settings: Settings, stack: PanelStack, levels: int, panel: int
+) -> tuple[dict[str, Any], str]:
+    """Write the LUT and its plot. Raises InputError."""
+    source = series or "typed"
+    measured = read_series(series) if series else typed_series(settings, stack, levels=levels, panel=panel)
+    curves = fit_series(measured, source)
+    with OutputFolder(out.parent) as folder:
+        write_text(folder.staging / out.name, lut_text(curves))
+        write_bytes(folder.staging / f"{out.stem}.png", grey_figure(measured, curves))
+    summary = {
+        "file": str(out),
+        "plot": str(out.with_suffix(".png")),
+        "channels": {name: asdict(curve) for name, curve in zip(CHANNELS, curves, strict=True)},
+    }
+    lines = [
+        f"{name}: smooth in {'intensity' if curve.of_intensity else 'phase'}, gamma {curve.gamma:.3f}, contrast "
+        f"{1 + curve.span / max(curve.dark, 1e-9 * curve.span):.4g}, residual {100 * curve.residual:.2f}% of the range"
+        for name, curve in zip(CHANNELS, curves, strict=True)
+    ]
+    return summary, "\n".join([*lines, f"{out}"])
+
+
+def typed_series(settings: Settings, stack: PanelStack, *, levels: int, panel: int) -> Series:
+    """Luminances that a person reads off a photometer; each grey is shown on the panel where one is given."""
+    import typer
+
+    show, close = _screen(settings, stack, panel) if panel >= 0 else (lambda grey: None, lambda: None)
+    try:
+        return ask_series(
+            np.linspace(0.0, 1.0, levels).tolist(), show=show, ask=lambda text: typer.prompt(text, type=float, err=True)
+        )
+    finally:
+        close()
+
+
+def ask_series(greys: Sequence[float], *, show: Callable[[float], None], ask: Callable[[str], float]) -> Series:
+    """A series by asking for every grey's luminance. Raises InputError for a negative or infinite one."""
+    values: list[float] = []
+    for grey in greys:
+        show(grey)
+        value = ask(f"luminance at grey {round(255 * grey)} of 255")
+        if not 0.0 <= value < float("inf"):
+            raise InputError("typed", f"grey {round(255 * grey)}", "must be a luminance, 0 or more")
+        values.append(value)
+    # What is shown is eight bits: the grey that was really there.
+    shown: F64 = np.rint(255 * np.array(greys)) / 255
+    return Series(shown, np.repeat(np.array(values)[:, None], 3, axis=1))
+
+
+def _screen(settings: Settings, stack: PanelStack, panel: int) -> tuple[Callable[[float], None], Callable[[], None]]:
+    from runtime.clock import MonotonicClock
+    from runtime.gl import offscreen_context
+    from runtime.panels.registry import open_panels, panel_settings
+
+    # The bare panel is measured: no curve, whatever is configured.
+    bare = tuple(
+        item.model_copy(update={"lut": "", "gamma": 1.0}) for item in panel_settings(settings.output, stack.count)
+    )
+    sink = open_panels(
+        settings.output.model_copy(update={"panels": bare}), stack, MonotonicClock(), offscreen_context()
+    )
+    layers = np.zeros((stack.count, stack.height_px, stack.width_px, 4), np.uint8)
+    layers[..., 3] = 255
+    number = 0
+
+    def show(grey: float) -> None:
+        nonlocal number
+        number += 1
+        layers[panel, ..., :3] = round(255 * grey)
+        sink.present(LayerFrame(number, layers))
+
+    return show, sink.close

@@ -1,0 +1,261 @@
+"""`calibrate panels charts|vernier|fit`: from verniers to the homographies in the configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.keys import Key, TerminalKeys
+from calib.page import Picture, page
+from calib.panel_figures import registration_figure
+from calib.registration import Setting, StackRegistration, parts, register
+from calib.store import save
+from calib.vernier import STEPS_PX, Nudging, chart, nominal, read_settings, write_settings
+from runtime.artifacts import OutputFolder, write_bytes, write_json, write_png, write_text
+from runtime.clock import NS_PER_MS, MonotonicClock
+from runtime.config import Settings, load_settings
+from runtime.errors import InputError
+from runtime.optics.stack import PanelStack
+from runtime.records import U8, LayerFrame
+
+POLL_NS = 30 * NS_PER_MS
+SHOW_AGAIN_POLLS = 5
+
+
+def asked_settings(stack: PanelStack, *, eye_m: Sequence[float], reference: int) -> list[Setting]:
+    """Every vernier for an eye. Raises InputError where some panel cannot be seen over the reference."""
+    try:
+        return nominal(eye_m, stack, reference=reference)
+    except ValueError as problem:
+        raise InputError("calibrate panels", "--eye", str(problem)) from None
+
+
+def write_vernier_charts(out: Path, stack: PanelStack, *, eye_m: Sequence[float], reference: int) -> dict[str, Any]:
+    """PNGs `vernier-R-P-layer-N.png` of the verniers of panel P against reference R."""
+    asked = asked_settings(stack, eye_m=eye_m, reference=reference)
+    files = []
+    with OutputFolder(out) as folder:
+        for panel in sorted({s.panel for s in asked}):
+            layers = chart(stack, [s for s in asked if s.panel == panel])
+            for index in (reference, panel):
+                files.append(f"vernier-{reference}-{panel}-layer-{index}.png")
+                write_png(folder.staging / files[-1], layers[index])
+    return {"out": str(out), "files": files, "eye_m": list(eye_m)}
+
+
+def nudge_verniers(
+    out: Path, settings: Settings, stack: PanelStack, *, eye_m: Sequence[float], reference: int
+) -> dict[str, Any]:
+    """Let a person set the verniers on the panels. Raises InputError, MissingPart, PanelLost."""
+    import typer
+
+    from runtime.gl import offscreen_context
+    from runtime.panels.registry import open_panels, panel_settings
+
+    asked = asked_settings(stack, eye_m=eye_m, reference=reference)
+    done = read_settings(out, stack) if out.exists() else []
+    # Verniers measure the bare panels: a registration that is already configured would be measured away.
+    bare = tuple(
+        panel.model_copy(update={"homography": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))})
+        for panel in panel_settings(settings.output, stack.count)
+    )
+    output = settings.output.model_copy(update={"panels": bare})
+    context = offscreen_context()
+    keys = TerminalKeys()
+    clock = MonotonicClock()
+    try:
+        sink = open_panels(output, stack, clock, context)
+        if output.kind == "offscreen":
+            typer.echo("warning: output.kind is offscreen: nobody sees these verniers", err=True)
+        number = 0
+
+        def present(layers: U8) -> None:
+            nonlocal number
+            number += 1
+            sink.present(LayerFrame(number, layers))
+
+        try:
+            found = nudge(
+                Nudging(asked, done),
+                stack,
+                poll=keys.poll,
+                present=present,
+                wait=lambda: clock.sleep_until_ns(clock.now_ns() + POLL_NS),
+                keep=lambda settings: write_settings(out, settings),
+                say=lambda text: typer.echo(text, err=True),
+            )
+        finally:
+            sink.close()
+    finally:
+        keys.close()
+    return {"file": str(out), "settings": len(found), "asked": len(asked), "eye_m": list(eye_m)}
+
+
+def nudge(
+    nudging: Nudging,
+    stack: PanelStack,
+    *,
+    poll: Callable[[], Key | None],
+    present: Callable[[U8], None],
+    wait: Callable[[], None],
+    keep: Callable[[list[Setting]], None],
+    say: Callable[[str], None],
+) -> list[Setting]:
+    """Show, move, take, until the last vernier or q. Every setting is kept as soon as it is taken."""
+    shown, layers, idle = None, None, 0
+    while not nudging.finished:
+        if shown != nudging.current or layers is None:
+            if shown is None or shown.reference_px != nudging.current.reference_px:
+                say(f"panel {nudging.current.panel}, vernier {nudging.index + 1} of {len(nudging.asked)}")
+            shown = nudging.current
+            layers, idle = chart(stack, [shown]), SHOW_AGAIN_POLLS
+        if idle >= SHOW_AGAIN_POLLS:  # again and again: it keeps the windows alive
+            present(layers)
+            idle = 0
+        key = poll()
+        if key is None:
+            idle += 1
+            wait()
+            continue
+        if nudging.press(key):
+            keep(nudging.done)
+        elif key in (Key.FINER, Key.COARSER):
+            say(f"steps of {STEPS_PX[nudging.step]} pixels")
+    return nudging.done
+
+
+def fit_registration(
+    vernier: Path, out: Path, settings: Settings, stack: PanelStack, *, reference: int, config: Path | None
+) -> tuple[dict[str, Any], str]:
+    """Fit, report, and put the homographies into `config` where one is given. Raises InputError."""
+    found = read_settings(vernier, stack)
+    try:
+        registration = register(found, stack, reference=reference)
+    except ValueError as problem:
+        raise InputError(vernier, "", str(problem)) from None
+    if config is not None:
+        _check_tables(settings, stack, config)
+    summary = registration_summary(registration, stack) | {"source": str(vernier)}
+    picture = Picture(
+        "registration.png",
+        registration_figure(registration, stack),
+        "Displacement of each panel from its ideal place, enlarged; numbers: pixels at the corners",
+    )
+    with OutputFolder(out) as folder:
+        write_json(folder.staging / "registration.json", summary)
+        write_text(folder.staging / "panels.toml", panels_text(registration))
+        write_bytes(folder.staging / picture.name, picture.png)
+        html = page(
+            title="Registration of the panels",
+            lead=f"{len(found)} vernier settings, panel {reference} as the reference; one setting is exact to "
+            f"{registration.sigma_px:.3f} px.",
+            notes=summary["warnings"],
+            tables=[("Panels", registration_rows(registration, stack))],
+            pictures=[picture],
+        )
+        write_text(folder.staging / "index.html", html)
+    if config is not None:
+        summary["kept_version"] = str(write_homographies(config, registration))
+    return summary, _plain(registration_rows(registration, stack))
+
+
+def _check_tables(settings: Settings, stack: PanelStack, config: Path) -> None:
+    if len(settings.output.panels) not in (0, stack.count):
+        raise InputError(config, "output.panels", f"has {len(settings.output.panels)} tables for {stack.count} panels")
+
+
+def registration_summary(registration: StackRegistration, stack: PanelStack) -> dict[str, Any]:
+    """What `registration.json` holds."""
+    panels = []
+    for index, panel in enumerate(registration.panels):
+        described = asdict(parts(panel.true_from_ideal, width_px=stack.width_px, height_px=stack.height_px))
+        panels.append(
+            described
+            | {
+                "panel": index,
+                "homography": panel.true_from_ideal,
+                "corners_px": panel.corners_px,
+                "setting_sigma_px": panel.setting_sigma_px,
+                "viewpoint_sigma_px": panel.viewpoint_sigma_px,
+                "corner_covariance_px2": panel.setting_covariance,
+                "settings": panel.settings,
+            }
+        )
+    distance = np.linalg.norm(registration.residual_px, axis=1)
+    limit = 4 * max(registration.sigma_px, 0.05)
+    warnings = [
+        f"setting {number + 1} is {distance[number]:.2f} px off the fit: set it again"
+        for number in np.flatnonzero(distance > limit)
+    ]
+    return {
+        "reference": registration.reference,
+        "sigma_px": registration.sigma_px,
+        "largest_residual_px": float(distance.max()),
+        "panels": panels,
+        "warnings": warnings,
+    }
+
+
+def registration_rows(registration: StackRegistration, stack: PanelStack) -> list[list[str]]:
+    """The table for people."""
+    rows = [["panel", "shift u, v (px)", "rotation (°)", "scale u, v", "keystone (px)", "± settings (px)",
+             "± viewpoint (px)"]]  # fmt: skip
+    for index, panel in enumerate(registration.panels):
+        if index == registration.reference:
+            rows.append([str(index), "the reference", "", "", "", "", ""])
+            continue
+        p = parts(panel.true_from_ideal, width_px=stack.width_px, height_px=stack.height_px)
+        rows.append([
+            str(index), f"{p.shift_px[0]:+.2f}, {p.shift_px[1]:+.2f}", f"{p.rotation_deg:+.4f}",
+            f"{p.scale[0]:.5f}, {p.scale[1]:.5f}", f"{p.keystone_px:.2f}", f"{panel.setting_sigma_px:.3f}",
+            f"{panel.viewpoint_sigma_px:.2f}",
+        ])  # fmt: skip
+    return rows
+
+
+def _plain(rows: list[list[str]]) -> str:
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+
+
+def panels_text(registration: StackRegistration) -> str:
+    """`[[output.panels]]` tables with the homographies, to paste into a configuration."""
+    import tomlkit
+
+    document = tomlkit.document()
+    tables = tomlkit.aot()
+    for panel in registration.panels:
+        table = tomlkit.table()
+        table["homography"] = panel.true_from_ideal.tolist()
+        tables.append(table)
+    document["output"] = {"panels": tables}
+    return tomlkit.dumps(document)
+
+
+def write_homographies(config: Path, registration: StackRegistration) -> Path | None:
+    """Put the homographies into a configuration, its comments kept; answers where the old one is kept.
+
+    The new text is checked as a configuration before it takes the old one's place. Raises InputError.
+    """
+    import tempfile
+
+    import tomlkit
+
+    document = tomlkit.parse(config.read_text(encoding="utf-8"))
+    output = document.setdefault("output", tomlkit.table())
+    if "panels" not in output:
+        output["panels"] = tomlkit.aot()
+        for _ in registration.panels:
+            output["panels"].append(tomlkit.table())
+    for table, panel in zip(output["panels"], registration.panels, strict=True):
+        table["homography"] = panel.true_from_ideal.tolist()
+    text = tomlkit.dumps(document)
+    with tempfile.TemporaryDirectory() as folder:
+        trial = Path(folder) / config.name
+        write_text(trial, text)
+        load_settings(trial)
+    return save(config, text)
