@@ -15,6 +15,7 @@ from runtime.config import ServiceSettings
 
 # What sd-daemon(3) puts before a line so that journald files it under its level.
 PRIORITY = {logging.DEBUG: "<7>", logging.INFO: "<6>", logging.WARNING: "<4>", logging.ERROR: "<3>"}
+ROOTS = ("phasestack", "runtime")  # named for what they tell, or after their module
 BURST = 5
 QUIET_NS = 30 * NS_PER_S
 
@@ -93,12 +94,13 @@ def configure(
     clock: Clock | None = None,
     environment: Mapping[str, str] = os.environ,
 ) -> None:
-    """Send every `phasestack` log line to a stream (stderr), in the configured form. Calling it again replaces."""
+    """Send every log line of ours to a stream (stderr), in the configured form. Calling it again replaces."""
     handler = logging.StreamHandler(stream or sys.stderr)
     journald = "JOURNAL_STREAM" in environment
     handler.setFormatter(JsonFormat() if settings.log_format == "json" else TextFormat(journald=journald))
     handler.addFilter(RateLimit(clock or MonotonicClock()))
-    root = logging.getLogger("phasestack")
-    root.handlers[:] = [handler]
-    root.setLevel(settings.log_level.upper())
-    root.propagate = False
+    for name in ROOTS:
+        root = logging.getLogger(name)
+        root.handlers[:] = [handler]
+        root.setLevel(settings.log_level.upper())
+        root.propagate = False

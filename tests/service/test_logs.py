@@ -10,17 +10,18 @@ import pytest
 
 from runtime.clock import NS_PER_S, SimulatedClock
 from runtime.config import ServiceSettings
-from runtime.logs import BURST, configure, event
+from runtime.logs import BURST, ROOTS, configure, event
 
 log = logging.getLogger("phasestack.test")
 
 
 @pytest.fixture(autouse=True)
 def restored():
-    root = logging.getLogger("phasestack")
-    before = root.handlers[:], root.level, root.propagate
+    loggers = [logging.getLogger(name) for name in ROOTS]
+    before = [(logger.handlers[:], logger.level, logger.propagate) for logger in loggers]
     yield
-    root.handlers[:], root.level, root.propagate = before[0], before[1], before[2]
+    for logger, (handlers, level, propagate) in zip(loggers, before, strict=True):
+        logger.handlers[:], logger.level, logger.propagate = handlers, level, propagate
 
 
 def logged(settings=None, clock=None, environment=None):
@@ -58,6 +59,12 @@ def test_a_traceback_stays_inside_its_json_line():
         log.exception("failed")
     assert stream.getvalue().count("\n") == 1
     assert "ValueError: boom" in json.loads(stream.getvalue())["exception"]
+
+
+def test_a_module_that_logs_under_its_own_name_is_heard():
+    stream = logged()
+    logging.getLogger("runtime.sensor.worker").warning("sensor: hung")
+    assert "sensor: hung" in stream.getvalue()
 
 
 def test_what_is_below_the_level_is_not_logged():

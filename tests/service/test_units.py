@@ -1,0 +1,210 @@
+"""The units, rules and scripts that make phasestack a service, checked by systemd's own tools."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shutil
+import stat
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from runtime.config import ServiceSettings, load_settings
+from runtime.sensor.known_devices import KNOWN_DEVICES
+
+ROOT = Path(__file__).parents[2]
+UNITS = ROOT / "systemd"
+SYSTEM = ("phasestack.service", "phasestack-x.service")
+EXPOSURE_MAX = {"phasestack.service": 1.8, "phasestack-x.service": 7.0}
+
+with_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze here")
+
+
+def run(*command: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=60, env={**os.environ, **environment}, check=False
+    )
+
+
+def with_programs_that_exist(unit: str, folder: Path) -> Path:
+    """The unit as it would be where everything is installed: only the paths of its programs are others."""
+    text = re.sub(r"^(Exec\w+=)\S+", rf"\g<1>{shutil.which('true')}", (UNITS / unit).read_text(), flags=re.MULTILINE)
+    copy = folder / unit.replace("-user", "")
+    copy.write_text(text)
+    return copy
+
+
+@with_systemd
+@pytest.mark.parametrize("unit", SYSTEM)
+def test_systemd_finds_nothing_wrong_with_the_system_units(unit, tmp_path):
+    for each in SYSTEM:
+        with_programs_that_exist(each, tmp_path)
+    result = run("systemd-analyze", "verify", "--man=no", str(tmp_path / unit))
+    # An unknown key is only a warning, with exit 0.
+    assert (result.returncode, result.stderr.strip()) == (0, "")
+
+
+@with_systemd
+def test_systemd_finds_nothing_wrong_with_the_user_unit(tmp_path):
+    copy = with_programs_that_exist("phasestack-user.service", tmp_path)
+    result = run("systemd-analyze", "--user", "verify", "--man=no", str(copy), XDG_RUNTIME_DIR=str(tmp_path))
+    assert (result.returncode, result.stderr.strip()) == (0, "")
+
+
+@with_systemd
+@pytest.mark.parametrize("unit", SYSTEM)
+def test_exposure_stays_below_what_the_manual_states(unit):
+    threshold = EXPOSURE_MAX[unit]
+    result = run(
+        "systemd-analyze", "security", "--offline=yes", f"--threshold={round(threshold * 10)}", str(UNITS / unit)
+    )
+    assert result.returncode == 0, result.stdout.splitlines()[-1]
+    stated = re.search(rf"`{unit}`[^\n]*?(\d\.\d)", (ROOT / "docs" / "operation.md").read_text())
+    measured = re.search(r"exposure level for \S+ (\d+\.\d)", result.stdout)
+    assert stated and measured
+    assert float(measured[1]) <= float(stated[1]) + 0.3  # each systemd weighs a little differently
+
+
+def keys(unit: str) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for line in (UNITS / unit).read_text().splitlines():
+        if "=" in line and not line.startswith("#"):
+            key, _, value = line.partition("=")
+            found.setdefault(key, []).append(value)
+    return found
+
+
+@pytest.mark.parametrize("unit", ["phasestack.service", "phasestack-user.service"])
+def test_the_daemon_is_watched_and_restarted_with_limits(unit):
+    unit_keys = keys(unit)
+    assert unit_keys["Type"] == ["notify"]
+    assert unit_keys["Restart"] == ["on-failure"]
+    assert unit_keys["RestartPreventExitStatus"] == ["2"]
+    assert int(unit_keys["WatchdogSec"][0]) > 0
+    assert int(unit_keys["StartLimitBurst"][0]) * int(unit_keys["RestartSec"][0]) < int(
+        unit_keys["StartLimitIntervalSec"][0]
+    )
+
+
+def test_the_socket_of_the_defaults_lies_in_the_units_runtime_folder():
+    settings = ServiceSettings()
+    unit_keys = keys("phasestack.service")
+    assert Path(settings.socket).parent == Path("/run") / unit_keys["RuntimeDirectory"][0]
+    assert settings.group == unit_keys["Group"][0]
+
+
+def test_the_daemon_finds_the_kiosks_x_server():
+    daemon, server = keys("phasestack.service"), keys("phasestack-x.service")
+    environment = dict(entry.split("=", 1) for entry in daemon["Environment"])
+    assert f" {environment['DISPLAY']} " in server["ExecStart"][0]
+    assert environment["XAUTHORITY"] in server["ExecStart"][0]
+    assert environment["XAUTHORITY"] in server["ExecStartPre"][0]
+
+
+def test_the_udev_rules_are_those_of_the_known_devices():
+    spec = importlib.util.spec_from_file_location("make_udev_rules", UNITS / "make_udev_rules.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    text = (UNITS / "70-phasestack-sensors.rules").read_text()
+    assert text == module.rules()
+    for device in KNOWN_DEVICES:
+        assert f'ATTR{{idVendor}}=="{device.vendor_id:04x}", ATTR{{idProduct}}=="{device.product_id:04x}"' in text
+
+
+def test_the_installed_configuration_is_valid():
+    load_settings(UNITS / "phasestack.toml")
+    commented = (UNITS / "phasestack.toml").read_text()
+    for line in commented.splitlines():
+        if line.startswith("# ") and "=" in line:
+            assert line.split("=")[0].removeprefix("# ").strip() in {
+                "driver", "source", "file", "kind", "edid_serial",
+            }  # fmt: skip
+
+
+@with_systemd
+def test_sysusers_and_tmpfiles_make_the_user_and_its_folders(tmp_path):
+    if os.getuid() != 0:
+        pytest.skip("only root can give folders away")
+    install(tmp_path)
+    assert run("systemd-sysusers", f"--root={tmp_path}").returncode == 0
+    groups = (tmp_path / "etc" / "group").read_text()
+    unit_keys = keys("phasestack.service")
+    for group in (*unit_keys["SupplementaryGroups"][0].split(), *unit_keys["Group"]):
+        assert re.search(rf"^{group}:", groups, re.MULTILINE)
+    assert run("systemd-tmpfiles", f"--root={tmp_path}", "--create", "phasestack.conf").returncode == 0
+    assert stat.S_IMODE((tmp_path / "var/lib/phasestack").stat().st_mode) == 0o750
+
+
+def install(root: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    return run("sh", str(UNITS / "install.sh"), DESTDIR=str(root), APP="no", **environment)
+
+
+def files(root: Path) -> set[str]:
+    return {str(path.relative_to(root)) for path in root.rglob("*") if path.is_file()}
+
+
+def test_the_installer_writes_below_destdir_and_the_uninstaller_takes_it_away(tmp_path):
+    result = install(tmp_path)
+    assert result.returncode == 0, result.stderr
+    installed = files(tmp_path)
+    assert {
+        "usr/bin/phasestack",
+        "usr/lib/systemd/system/phasestack.service",
+        "usr/lib/systemd/system/phasestack-x.service",
+        "usr/lib/systemd/user/phasestack.service",
+        "usr/lib/sysusers.d/phasestack.conf",
+        "usr/lib/tmpfiles.d/phasestack.conf",
+        "usr/lib/udev/rules.d/70-phasestack-sensors.rules",
+        "usr/lib/phasestack/x-authority",
+        "etc/phasestack/phasestack.toml",
+    } <= installed
+    assert not any(str(tmp_path).encode() in (tmp_path / name).read_bytes() for name in installed)
+    assert run("sh", str(UNITS / "uninstall.sh"), DESTDIR=str(tmp_path)).returncode == 0
+    assert files(tmp_path) == {"etc/phasestack/phasestack.toml"}
+    assert run("sh", str(UNITS / "uninstall.sh"), DESTDIR=str(tmp_path), PURGE="yes").returncode == 0
+    assert files(tmp_path) == set()
+
+
+def test_installing_again_keeps_the_operators_configuration(tmp_path):
+    install(tmp_path)
+    mine = tmp_path / "etc/phasestack/phasestack.toml"
+    mine.write_text("# mine\n")
+    install(tmp_path)
+    assert mine.read_text() == "# mine\n"
+
+
+def test_every_program_that_a_unit_starts_is_installed(tmp_path):
+    install(tmp_path)
+    for unit in SYSTEM:
+        for key, values in keys(unit).items():
+            for value in values if key.startswith("Exec") else ():
+                program = value.split()[0]
+                assert program == "/usr/bin/Xorg" or (tmp_path / program.lstrip("/")).exists()
+
+
+def test_the_installer_refuses_an_old_or_missing_python(tmp_path):
+    result = install(tmp_path, PYTHON="no-such-python")
+    assert result.returncode == 2
+    assert "no-such-python" in result.stderr
+
+
+@pytest.mark.skipif(shutil.which("shellcheck") is None, reason="no shellcheck here")
+@pytest.mark.parametrize("script", ["install.sh", "uninstall.sh", "x-authority"])
+def test_the_shell_scripts_are_clean(script):
+    result = run("shellcheck", str(UNITS / script))
+    assert result.returncode == 0, result.stdout
+
+
+@pytest.mark.skipif(shutil.which("xauth") is None or shutil.which("mcookie") is None, reason="no xauth or mcookie here")
+def test_the_authority_file_is_fresh_each_time_and_the_groups_alone(tmp_path):
+    file = tmp_path / "authority"
+    cookies = []
+    for _ in range(2):
+        assert run("sh", str(UNITS / "x-authority"), str(file), ":7").returncode == 0
+        assert stat.S_IMODE(file.stat().st_mode) & 0o037 == 0
+        cookies.append(run("xauth", "-f", str(file), "list").stdout.split()[-1])
+    assert re.fullmatch("[0-9a-f]{32}", cookies[0])
+    assert cookies[0] != cookies[1]
