@@ -58,6 +58,14 @@ class SensorSettings(Section):
     open_timeout_s: Positive = Field(10.0, description="an SDK that takes longer to open is given up and opened anew")
     loop: bool = Field(False, description="driver `replay`: begin again at the end")
     start_s: NonNegative = Field(0.0, description="driver `replay`: begin this far into the recording")
+    openni2_folder: str = Field(
+        "", description="driver `openni2`: folder of libOpenNI2.so and OpenNI2/Drivers; empty: the system's"
+    )
+    fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
+        0.0, description="driver `openni2`: horizontal field of view of a camera that does not tell; 0: unknown"
+    )
+    record_max_s: Positive = Field(600.0, description="`record` stops after this")
+    record_max_mib: Positive = Field(2048.0, description="`record` stops before its file is larger")
     fixed_eyes_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None = Field(
         None, description="driver `fixed`: left and right eye in the stack frame; no sensor is opened"
     )
@@ -101,6 +109,7 @@ class CalibrationSettings(Section):
 
     file: str = Field("", description="calibration TOML; empty: the built-in one of the demo recording")
     ipd_m: NonNegative = Field(0.0, description="the viewer's known eye separation, 0: unknown; checks for drift")
+    ipd_tolerance: Positive = Field(0.04, description="warn where the measured separation parts by more than this share")
 
 
 class ContentSettings(Section):
