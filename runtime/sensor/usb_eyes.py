@@ -11,7 +11,8 @@ from runtime.config import SensorSettings
 from runtime.errors import SensorLost, SensorTimeout
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, SensorDriver
-from runtime.sensor.eye_packets import DeviceClock, EyePacket, PacketReader
+from runtime.sensor.device_clock import DeviceClock
+from runtime.sensor.eye_packets import EyePacket, PacketReader
 from runtime.sensor.usb_devices import UDEV_RULE, UsbDevice, find_device, reset_device
 
 READ_BYTES = 16384  # a whole number of USB packets of any speed, so that no transfer overflows

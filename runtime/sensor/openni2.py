@@ -1,0 +1,253 @@
+"""Driver `openni2`: any camera with an OpenNI2 driver, and `.oni` recordings."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from runtime.clock import NS_PER_S, Clock
+from runtime.config import SensorSettings
+from runtime.errors import EndOfRecording, InputError, SensorLost, SensorTimeout
+from runtime.records import U8, U16, Intrinsics, SensorFrame
+from runtime.sensor.base import Capabilities, SensorDriver
+from runtime.sensor.device_clock import DeviceClock
+from runtime.sensor.openni2_library import load
+
+SERIAL_PROPERTY = 3
+DEPTH_1_MM, DEPTH_100_UM, RGB888, GRAY8 = 100, 101, 200, 202
+PAIR_APART_US = 40_000  # depth and colour of one instant are no further apart: a period of a camera without sync
+PAIR_WAIT_S = 0.02
+DUMMY_STOPS_S = 0.1  # three periods of its threads
+DRAIN_MAX = 32  # frames that are passed over in one call: a queue can't keep us
+
+log = logging.getLogger(__name__)
+
+
+class _Picture(NamedTuple):
+    number: int  # the device's own count
+    time_us: int
+    pixels: Any  # U8 (h, w, 3) or U16 (h, w)
+
+
+class OpenNI2Driver(SensorDriver):
+    """Depth in millimetres and colour, registered by the camera where it can."""
+
+    name = "openni2"
+    capabilities = Capabilities(colour=True, depth=True)
+
+    def __init__(self, settings: SensorSettings, clock: Clock) -> None:
+        """settings.source: `demo` or empty for the only camera, a serial number, a device URI, `Dummy`, or a .oni."""
+        self._settings, self._clock = settings, clock
+        self._openni: Any = None
+        self._device: Any = None
+        self._streams: dict[str, Any] = {}
+        self._newest: dict[str, _Picture] = {}
+        self._intrinsics: Intrinsics | None = None
+        self._times = DeviceClock()
+        self._sequence = self._index = 0
+
+    def open(self) -> None:
+        self.close()
+        source = self._settings.source
+        if source.endswith(".oni") and not Path(source).is_file():
+            raise InputError(source, "", "cannot be read")
+        self._openni = load(source, self._settings.openni2_folder)
+        try:
+            self._device = self._find_device()
+            self._start_streams()
+        except SensorLost:
+            self.close()
+            raise
+        except Exception as error:  # the package raises its own, ctypes' and plain AssertionError
+            self.close()
+            raise SensorLost(f"OpenNI2: {_text(error)}") from None
+
+    def _find_device(self) -> Any:
+        source, openni = self._settings.source, self._openni
+        if source == "Dummy" or source.endswith(".oni"):
+            return openni.Device(source.encode())
+        uris = openni.Device.enumerate_uris()
+        wanted = self.serial or ("" if source in ("", "demo", "any") else source)
+        found = []
+        for uri in uris:
+            device = openni.Device(uri)
+            if wanted and wanted not in (_serial(device), uri.decode(errors="replace")):
+                device.close()
+                continue
+            found.append(device)
+        if len(found) == 1:
+            return found[0]
+        for device in found:
+            device.close()
+        if found:
+            raise SensorLost(f"{len(found)} OpenNI2 cameras fit: set sensor.source to one's serial number")
+        raise SensorLost(f"no OpenNI2 camera {wanted!r} among {len(uris)}" if wanted else "no OpenNI2 camera found")
+
+    def _start_streams(self) -> None:
+        device, openni = self._device, self._openni
+        made = {"depth": device.create_depth_stream(), "colour": device.create_color_stream()}
+        self._streams = {kind: stream for kind, stream in made.items() if stream is not None}
+        if not self._streams:
+            raise SensorLost("the camera has neither depth nor colour")
+        both = len(self._streams) == 2
+        mode = openni.IMAGE_REGISTRATION_DEPTH_TO_COLOR
+        if both and device.is_image_registration_mode_supported(mode):
+            device.set_image_registration_mode(mode)
+        elif both and not device.is_file():
+            log.warning("OpenNI2: this camera does not register depth to colour; eyes are off by their parallax")
+        for stream in self._streams.values():
+            if stream.is_property_supported(7):  # mirroring
+                stream.set_mirroring_enabled(False)
+            stream.start()
+        if device.playback is not None:
+            device.playback.set_repeat_enabled(self._settings.loop)
+        self.serial = _serial(device) or self.serial
+        self.capabilities = Capabilities(colour="colour" in self._streams, depth="depth" in self._streams)
+        self._intrinsics = self._read_intrinsics(self._streams.get("colour") or self._streams["depth"])
+        self._times, self._newest, self._index = DeviceClock(), {}, 0
+
+    def _read_intrinsics(self, stream: Any) -> Intrinsics | None:
+        """A pinhole from the field of view, centred; None where neither camera nor settings know it."""
+        mode = stream.video_mode
+        width, height = mode.resolutionX, mode.resolutionY
+        try:  # files have the property, yet say that they don't
+            fov_x, fov_y = stream.get_horizontal_fov(), stream.get_vertical_fov()
+        except Exception:
+            fov_x = fov_y = 0.0
+        if not 0 < fov_x < math.pi:
+            fov_x, fov_y = math.radians(self._settings.fov_deg), 0.0
+        if fov_x == 0.0:
+            log.warning("OpenNI2: the camera does not tell its field of view: set sensor.fov_deg")
+            return None
+        fx = width / 2 / math.tan(fov_x / 2)
+        fy = height / 2 / math.tan(fov_y / 2) if 0 < fov_y < math.pi else fx
+        return Intrinsics(width, height, fx, fy, width / 2, height / 2)
+
+    def read_newest(self, timeout_s: float) -> SensorFrame:
+        if self._device is None:
+            raise SensorLost("not open")
+        deadline_ns = self._clock.now_ns() + round(timeout_s * NS_PER_S)
+        main = "depth" if "depth" in self._streams else "colour"
+        before = self._newest.get(main)
+        while self._newest.get(main) is before:
+            remaining_s = (deadline_ns - self._clock.now_ns()) / NS_PER_S
+            if remaining_s <= 0 or not self._take(remaining_s):
+                self._nothing(timeout_s)
+        passed = 0
+        for _ in range(DRAIN_MAX):
+            newest = self._newest[main]
+            if not self._take(0.0):
+                break
+            passed += self._newest[main] is not newest
+        picture = self._newest[main]
+        other = self._newest.get("colour") if main == "depth" else None
+        if main == "depth" and "colour" in self._streams:
+            wait_until_ns = self._clock.now_ns() + round(PAIR_WAIT_S * NS_PER_S)
+            while (other is None or picture.time_us - other.time_us > PAIR_APART_US) and (
+                self._clock.now_ns() < wait_until_ns and self._take(PAIR_WAIT_S)
+            ):
+                other = self._newest.get("colour")
+                picture = self._newest[main]
+        self._count(picture.number, passed)
+        capture_ns = self._times.host_ns(picture.time_us * 1000, arrival_ns=self._clock.now_ns())
+        if other is not None and abs(other.time_us - picture.time_us) > PAIR_APART_US:
+            other = None
+        shown = picture if main == "colour" else other
+        return SensorFrame(
+            sequence=self._sequence,
+            capture_ns=capture_ns,
+            colour=shown.pixels if shown is not None else None,
+            depth_mm=picture.pixels if main == "depth" else None,
+            intrinsics=self._intrinsics,
+        )
+
+    def _count(self, index: int, passed: int) -> None:
+        ahead = index - self._index if self._index and index > self._index else 1
+        self.overtaken += passed
+        self.missed += max(ahead - 1 - passed, 0)
+        self._index, self._sequence = index, self._sequence + ahead
+
+    def _take(self, timeout_s: float) -> bool:
+        """Copy one frame of whichever stream has one; False where none came in time."""
+        try:
+            # 0 would be "no wait", which the library takes for an error on some devices.
+            stream = self._openni.wait_for_any_stream(list(self._streams.values()), max(timeout_s, 0.001))
+            if stream is None:
+                return False
+            frame = stream.read_frame()
+            try:
+                kind = next(kind for kind, ours in self._streams.items() if ours is stream)
+                self._newest[kind] = _Picture(int(frame.frameIndex), int(frame.timestamp), _pixels(frame))
+            finally:
+                frame.close()
+        except ValueError as error:
+            raise SensorLost(f"OpenNI2: {error}") from None
+        except Exception as error:
+            raise SensorLost(f"OpenNI2: {_text(error)}") from None
+        return True
+
+    def _nothing(self, timeout_s: float) -> None:
+        if self._device.playback is not None and not self._settings.loop:
+            raise EndOfRecording(f"{self._settings.source}: no more frames")
+        raise SensorTimeout(f"no frame for {timeout_s:g} s")
+
+    def close(self) -> None:
+        streams, self._streams = self._streams, {}
+        device, self._device = self._device, None
+        for stream in streams.values():
+            _quietly(stream.stop)
+        if streams and self._settings.source == "Dummy":
+            # Its threads are told to stop but not waited for: without a pause they write to freed memory.
+            time.sleep(DUMMY_STOPS_S)
+        for handle in (*streams.values(), device):
+            if handle is not None:
+                _quietly(handle.close)
+
+
+def _quietly(call: Callable[[], object]) -> None:
+    """Call what may fail on an unplugged camera, of which there is nothing left to stop or close."""
+    try:
+        call()
+    except Exception as error:
+        log.debug("OpenNI2: closing: %s", _text(error))
+
+
+def _serial(device: Any) -> str:
+    """The serial number, where the device has one."""
+    import ctypes
+
+    if not device.is_property_supported(SERIAL_PROPERTY):
+        return ""
+    text = device.get_property(SERIAL_PROPERTY, ctypes.c_char * 128)
+    return bytes(text.value).decode(errors="replace").strip()
+
+
+def _text(error: Exception) -> str:
+    """The library's own words, without the package's wrapping."""
+    words = error.args[1] if len(error.args) > 1 else str(error) or type(error).__name__
+    return words.decode(errors="replace").strip() if isinstance(words, bytes) else str(words)
+
+
+def _pixels(frame: Any) -> U8 | U16:
+    """A frame's pixels, copied: depth as (h, w) uint16 mm, colour as (h, w, 3) RGB. Raises ValueError."""
+    pixel_format, height, width = frame.videoMode.pixelFormat.value, frame.height, frame.width
+    data = np.frombuffer(frame.get_buffer_as_uint8(), np.uint8)
+    kinds = {DEPTH_1_MM: (2, 1), DEPTH_100_UM: (2, 1), RGB888: (1, 3), GRAY8: (1, 1)}
+    if pixel_format not in kinds:
+        raise ValueError(f"pixel format {pixel_format} is not supported")
+    size, channels = kinds[pixel_format]
+    if data.size < height * frame.stride or frame.stride < width * size * channels:
+        raise ValueError("a frame is shorter than its size says")
+    rows = data[: height * frame.stride].reshape(height, frame.stride)[:, : width * size * channels]
+    if size == 2:
+        depth = np.ascontiguousarray(rows).view("<u2").astype(np.uint16)
+        return depth if pixel_format == DEPTH_1_MM else ((depth + np.uint16(5)) // np.uint16(10)).astype(np.uint16)
+    if channels == 1:
+        return np.repeat(rows[..., None], 3, axis=2)
+    return rows.reshape(height, width, 3).copy()
