@@ -72,12 +72,13 @@ class SensorSettings(Section):
 
 
 class DetectorSettings(Section):
-    """Finding two eyes in colour and depth images."""
+    """Finding two eyes in colour and depth images. How far apart eyes may be is the tracker's business."""
 
     kind: Literal["haar", "yunet"] = Field("haar", description="face finder: bundled cascades, or OpenCV's YuNet")
     yunet_model: str = Field("", description="path of face_detection_yunet_*.onnx, for kind = yunet")
-    ipd_min_m: Positive = Field(0.050, description="smaller eye separations are implausible")
-    ipd_max_m: Positive = Field(0.075, description="larger eye separations are implausible")
+    range_min_m: Positive = Field(0.2, description="nearer measurements are not a viewer's face")
+    range_max_m: Positive = Field(4.0, description="farther measurements are not a viewer's face")
+    lock_s: Positive = Field(1.0, description="a viewer who is not seen for this long makes way for another")
 
 
 class TrackerSettings(Section):
@@ -109,7 +110,7 @@ class CalibrationSettings(Section):
 
     file: str = Field("", description="calibration TOML; empty: the built-in one of the demo recording")
     ipd_m: NonNegative = Field(0.0, description="the viewer's known eye separation, 0: unknown; checks for drift")
-    ipd_tolerance: Positive = Field(0.04, description="warn where the measured separation parts by more than this share")
+    ipd_tolerance: Positive = Field(0.04, description="warn where the measured one parts by more than this share")
 
 
 class ContentSettings(Section):
