@@ -13,8 +13,13 @@ class PanelSink(ABC):
     name: str
 
     @abstractmethod
-    def present(self, frame: LayerFrame) -> PresentReport:
-        """Show a frame on every panel. Raises PanelLost: rebuilt in the background, the loop goes on."""
+    def present(self, frame: LayerFrame, *, unchanged: bool = False) -> PresentReport:
+        """Show a frame on every panel.
+
+        unchanged: the caller vouches that the layers are those of the frame before: panels that still show them
+        upload and draw nothing, so that a picture without a viewer costs next to nothing.
+        Raises PanelLost: rebuilt by a later call, the loop goes on.
+        """
 
     @abstractmethod
     def close(self) -> None:

@@ -56,10 +56,13 @@ class OffscreenPanels(PanelSink):
             self._painters.append(Painter(context, mounting))
             self._targets.append(context.framebuffer([context.texture(screen, 4)]))
 
-    def present(self, frame: LayerFrame) -> PresentReport:
+    def present(self, frame: LayerFrame, *, unchanged: bool = False) -> PresentReport:
         """Upload (and draw, if asked to at construction); skew is between the first and the last panel drawn."""
         if frame.layers.shape != (self._count, self._size[1], self._size[0], 4):
             raise ValueError(f"layers are {frame.layers.shape}, the panels {self._count} of {self._size}")
+        if unchanged and self._number >= 0:
+            self._number = frame.number
+            return PresentReport(frame.number, self._clock.now_ns(), 0.0)
         try:
             self._layers.write(np.ascontiguousarray(frame.layers))
             finished_ns = [self._paint(index) for index in range(self._count)] if self._draw else []

@@ -82,15 +82,18 @@ class WindowPanels(PanelSink):
         finally:
             self._give_back()
 
-    def present(self, frame: LayerFrame) -> PresentReport:
-        """Show a frame on every panel at once. Raises PanelLost; ValueError for layers of another shape."""
+    def present(self, frame: LayerFrame, *, unchanged: bool = False) -> PresentReport:
+        """Show a frame on every panel at once; an unchanged one stays as it is, where it is still shown.
+
+        Raises PanelLost; ValueError for layers of another shape.
+        """
         if self._display is None and self._clock.now_ns() < self._retry_ns:
             raise PanelLost(self._lost)
         try:
             if self._display is None:
                 self._open()
                 log.info("panels are back: %s", ", ".join(str(monitor) for monitor in self.monitors))
-            return self._present(frame)
+            return self._present(frame, unchanged)
         except (PanelLost, glfw.GLFWError, moderngl.Error) as error:
             self._lost = str(error)
             self._drop()
@@ -110,7 +113,7 @@ class WindowPanels(PanelSink):
         self._drop()
         self._give_back()
 
-    def _present(self, frame: LayerFrame) -> PresentReport:
+    def _present(self, frame: LayerFrame, unchanged: bool) -> PresentReport:
         display, layers = self._display, self._layers
         assert display is not None and layers is not None
         if fault := display.poll():
@@ -118,6 +121,8 @@ class WindowPanels(PanelSink):
         width, height, count = layers.size[0], layers.size[1], len(self._panels)
         if frame.layers.shape != (count, height, width, 4):
             raise ValueError(f"layers are {frame.layers.shape}, the panels {count} of {width}x{height}")
+        if unchanged and self._swapped_ns:
+            return PresentReport(frame.number, self._clock.now_ns(), 0.0)
         display.root.make_current()
         layers.write(np.ascontiguousarray(frame.layers))
         # Another context may use what this one has uploaded only after this one is known to be done.

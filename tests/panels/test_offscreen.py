@@ -137,6 +137,17 @@ def test_a_later_frame_replaces_an_earlier_one_on_all_panels(context, layers):
     sink.close()
 
 
+def test_an_unchanged_frame_costs_nothing_and_stays(context, layers):
+    sink = OffscreenPanels(
+        context, clock=SimulatedClock(), width_px=WIDTH, height_px=HEIGHT, panels=(PanelSettings(),) * 3
+    )
+    other = np.zeros_like(layers)
+    sink.present(LayerFrame(0, layers), unchanged=True)  # nothing was shown before: it must be uploaded all the same
+    assert sink.present(LayerFrame(1, other), unchanged=True).number == 1
+    assert np.array_equal(sink.read_back()[0][..., :3], layers[0, ..., :3])
+    sink.close()
+
+
 def test_nothing_can_be_read_back_before_the_first_frame(context):
     sink = OffscreenPanels(context, clock=SimulatedClock(), width_px=WIDTH, height_px=HEIGHT, panels=(PanelSettings(),))
     with pytest.raises(ValueError, match="presented"):

@@ -158,6 +158,27 @@ def test_skew_and_rate_are_reported(opened):
     assert 0 < skew_ms < interval_ms
 
 
+def test_an_unchanged_frame_stays_and_is_drawn_anew_where_the_windows_were_lost(x, opened):
+    sink = opened(*BY_CONNECTOR)
+    sink.present(frame(0))
+    assert sink.present(frame(1), unchanged=True).number == 1
+    assert shows(x, 2, picture(0, 0))
+    x.unplug(1)
+    with pytest.raises(PanelLost, match="DUMMY1"):
+        for number in range(2, 50):
+            sink.present(frame(number), unchanged=True)
+    x.plug(1)
+
+    def shown_again() -> bool:
+        try:
+            return sink.present(frame(50), unchanged=True).number == 50
+        except PanelLost:
+            return False
+
+    assert eventually(shown_again)
+    assert shows(x, 2, picture(50, 0))
+
+
 def test_content_can_draw_in_its_own_context_between_two_frames(context, opened):
     sink = opened(*BY_CONNECTOR)
     target = context.simple_framebuffer((4, 4))
