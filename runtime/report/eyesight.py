@@ -65,9 +65,7 @@ def seen_rays(
     total: F32 | None = None
     mask = ray_mask(eye_m, stack, width_px=width_px, height_px=height_px, fov_deg=fov_deg)[::step, ::step]
     for index in range(stack.count):
-        u, v = panel_positions(
-            eye_m, stack, index=index, width_px=width_px, height_px=height_px, fov_deg=fov_deg
-        )
+        u, v = panel_positions(eye_m, stack, index=index, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
         u, v = u[::step, ::step], v[::step, ::step]
         sampled = sample_bilinear(layers[index][..., :3], u=u, v=v)
         total = sampled if total is None else total + sampled

@@ -60,9 +60,7 @@ def opened(method: Method, pair: StillPair, *, threads: int) -> Opened:
         session = getattr(predictor, "session", None)
         precision = session.contract.precision if session is not None else "fp32"
     return Opened(
-        lambda p: solve_still(
-            p.images[0], p.images[1], eyes_m=p.eyes_m, fov_deg=p.fov_deg, predictor=predictor
-        ).layers,
+        lambda p: solve_still(p.images[0], p.images[1], eyes_m=p.eyes_m, fov_deg=p.fov_deg, predictor=predictor).layers,
         predictor.parameters,
         precision,
     )

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +17,9 @@ from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, stack_from_eye
 from runtime.records import F64, U8
+
+if TYPE_CHECKING:
+    from runtime.content.scenes import Scene
 
 OFF_MM = (2, 4, 6)
 FOV_DEG = 40.0
@@ -126,14 +129,13 @@ def beside(eye_m: ArrayLike, mm: float, directions: int = 4) -> list[F64]:
 class Painter:
     """Pictures of a built-in scene from anywhere. Owns a GL context: one thread, closed at the end."""
 
-    def __init__(self, scene: str, stack: PanelStack) -> None:
+    def __init__(self, scene: str | Scene, stack: PanelStack) -> None:
         """Raises InputError for an unknown scene, MissingPart without OpenGL."""
-        from runtime.config import ContentSettings
-        from runtime.content.registry import open_content
+        from runtime.content.procedural import ProceduralSource
         from runtime.gl import offscreen_context
 
         self._context = offscreen_context()
-        self._source = open_content(ContentSettings(scene=scene), stack, self._context)
+        self._source = ProceduralSource(scene, stack=stack, context=self._context)
 
     def __enter__(self) -> Painter:
         return self
@@ -142,14 +144,17 @@ class Painter:
         self._source.close()
         self._context.release()
 
-    def image(self, eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float = FOV_DEG) -> U8:
-        """(h, w, 3) what an eye that looks at the stack's origin sees."""
+    def draw(self, eye_m: ArrayLike, pixels_from_stack: F64, *, width_px: int, height_px: int) -> U8:
+        """(h, w, 4) the scene through any projection."""
         from runtime.content.base import View
 
         eye = np.asarray(eye_m, dtype=np.float64)
-        projection = image_from_stack(eye, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
-        picture = self._source.render(View(eye, 0, projection, width_px, height_px), time_ns=0)
-        return np.ascontiguousarray(picture[..., :3])
+        return self._source.render(View(eye, 0, pixels_from_stack, width_px, height_px), time_ns=0).copy()
+
+    def image(self, eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float = FOV_DEG) -> U8:
+        """(h, w, 3) what an eye that looks at the stack's origin sees."""
+        projection = image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
+        return np.ascontiguousarray(self.draw(eye_m, projection, width_px=width_px, height_px=height_px)[..., :3])
 
     def pair(
         self, name: str, eyes_m: F64, stack: PanelStack, *, fov_deg: float = FOV_DEG, off_mm: Sequence[float] = OFF_MM

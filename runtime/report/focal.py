@@ -1,0 +1,190 @@
+"""Focal parallax (seed 1.4): an eye with a pupil of finite size focuses through the solved layers.
+
+A pupil sees the mean of what its points see, and focusing at a distance means that those pictures are laid on each
+other so that they agree there. From a point of the pupil (right, up) the picture is that of a pinhole, shifted by
+focal_px·right/f to the right and focal_px·up/f up, f the distance in focus along the gaze.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from runtime.config import ModelSettings
+from runtime.optics.malus import intensity_from_phase
+from runtime.optics.quality import psnr_db
+from runtime.optics.retina import Mask, average, pupil_points, sample_bilinear
+from runtime.optics.rpu import panel_from_image
+from runtime.optics.stack import PanelStack
+from runtime.optics.views import image_from_camera, raster_from_stack, stack_from_eye
+from runtime.records import F32, F64, U8
+from runtime.report.pairs import Painter, eyes_at
+
+WIDTH_PX, HEIGHT_PX, FOV_DEG = 720, 300, 18.0
+PUPIL_M = 0.004
+DISTANCE_M = 0.4
+CARDS_M = (-0.05, 0.0, 0.045)  # where three cards stand, along +x of the stack
+OFFSETS_M = (-0.043, 0.0, 0.040)  # and aside
+PLANES_M = (-0.11, -0.08, -0.05, -0.025, 0.0, 0.022, 0.045, 0.07, 0.095)  # what is focused on
+FLIP = np.diag([1.0, -1.0, -1.0])  # cameras look along +z with y down
+
+
+@dataclass(frozen=True, slots=True)
+class Slice:
+    """One setting of the eye's lens."""
+
+    plane_m: float  # x of the place in focus, straight ahead
+    shown: F32  # (h, w, 3) through the layers
+    true: F32  # (h, w, 3) as the scene itself would look
+    mask: Mask
+    psnr_db: float
+    contrast_shown: tuple[float, ...]  # of each card
+    contrast_true: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Accommodation:
+    """Where the eyes converge on a card, and where its picture is sharpest."""
+
+    card_m: float  # distance from the eye: where the two lines of sight meet
+    sharpest_shown_m: float
+    sharpest_true_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class FocalStack:
+    """One eye's focal stack through a model's layers."""
+
+    model: str
+    slices: tuple[Slice, ...]
+    cards: tuple[Accommodation, ...]
+    pinhole_db: float
+
+
+def projection(eye_m: F64, point: F64, *, focus_m: float) -> F64:
+    """3x4 projection of `stack` points through a point (right, up) of the pupil, laid on the plane in focus.
+
+    Its third coordinate is the distance from the eye along the gaze.
+    """
+    pose = stack_from_eye(eye_m)
+    rotation = FLIP @ pose[:3, :3].T
+    place = pose[:3, 3] + pose[:3, 0] * point[0] + pose[:3, 1] * point[1]
+    camera = image_from_camera(width_px=WIDTH_PX, height_px=HEIGHT_PX, fov_deg=FOV_DEG)
+    camera[0, 2] += camera[0, 0] * point[0] / focus_m
+    camera[1, 2] -= camera[1, 1] * point[1] / focus_m
+    return camera @ np.column_stack([rotation, -rotation @ place])
+
+
+def through_layers(matrix: F64, layers: U8, stack: PanelStack) -> tuple[F32, Mask]:
+    """(h, w, 3) what a projection's pinhole sees of the layers, and which rays cross every panel."""
+    u, v = np.arange(WIDTH_PX) + 0.5, (np.arange(HEIGHT_PX) + 0.5)[:, None]
+    total, mask = np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.float32), np.ones((HEIGHT_PX, WIDTH_PX), bool)
+    for index in range(stack.count):
+        h = panel_from_image(matrix, stack.panel(index))
+        weight = h[2, 0] * u + h[2, 1] * v + h[2, 2]
+        x, y = (((r[0] * u + r[1] * v + r[2]) / weight).astype(np.float32) for r in h[:2])
+        total += sample_bilinear(layers[index][..., :3], u=x, v=y)
+        mask &= (x > 0.5) & (x < stack.width_px - 0.5) & (y > 0.5) & (y < stack.height_px - 0.5)
+    return intensity_from_phase(total * np.float32(1 / 255)), mask
+
+
+def card_windows(eye_m: F64) -> list[tuple[slice, slice]]:
+    """Where the cards are in the eye's picture, rows and columns, a little inside their edges."""
+    windows = []
+    matrix = projection(eye_m, np.zeros(2), focus_m=DISTANCE_M)
+    for x, y in zip(CARDS_M, OFFSETS_M, strict=True):
+        corners = [matrix @ [x, y + dy, dz, 1.0] for dy in (-0.012, 0.012) for dz in (-0.014, 0.014)]
+        pixels = np.array([c[:2] / c[2] for c in corners])
+        (left, top), (right, bottom) = pixels.min(0).astype(int), np.ceil(pixels.max(0)).astype(int)
+        windows.append((slice(max(top, 0), bottom), slice(max(left, 0), right)))
+    return windows
+
+
+def contrast(image: F32, window: tuple[slice, slice]) -> float:
+    """RMS of the brightness gradient in a window: it is largest where the picture is sharp."""
+    grey = image[window].mean(axis=2)
+    return float(np.sqrt((np.diff(grey, axis=1) ** 2).mean() + (np.diff(grey, axis=0) ** 2).mean()))
+
+
+def sharpest(distances_m: Sequence[float], values: Sequence[float]) -> float:
+    """The distance at which a parabola through the largest value and its neighbours has its top."""
+    best = int(np.argmax(values))
+    if not 0 < best < len(values) - 1:
+        return distances_m[best]
+    powers = np.polyfit(distances_m[best - 1 : best + 2], values[best - 1 : best + 2], 2)
+    return float(-powers[1] / (2 * powers[0])) if powers[0] < 0 else distances_m[best]
+
+
+def focal_stack(
+    painter: Painter, stack: PanelStack, *, model: str, progress: Callable[[int, int], None] = lambda done, of: None
+) -> FocalStack:
+    """Solve the layers for two pinhole eyes, then focus the right one at every plane."""
+    from runtime.model.predictor import load_predictor
+
+    eyes = eyes_at(distance_m=DISTANCE_M)
+    predictor = load_predictor(model, stack, ModelSettings())
+    rasters = predictor.rasters(eyes)
+    pictures = [
+        [painter.draw(eye, raster_from_stack(eye, r), width_px=r.width_px, height_px=r.height_px) for r in rasters]
+        for eye in eyes
+    ]
+    layers = np.array(predictor.predict(pictures, eyes).layers)
+    predictor.close()
+    eye, points = eyes[1], pupil_points(PUPIL_M)
+    gaze = -stack_from_eye(eye)[:3, 2]
+    windows = card_windows(eye)
+    slices: list[Slice] = []
+    for index, plane_m in enumerate(PLANES_M):
+        focus_m = float((np.array([plane_m, 0.0, 0.0]) - eye) @ gaze)
+        shown, masks, true = [], [], []
+        for point in points:
+            matrix = projection(eye, point, focus_m=focus_m)
+            image, mask = through_layers(matrix, layers, stack)
+            shown.append(image)
+            masks.append(mask)
+            drawn = painter.draw(eye, matrix, width_px=WIDTH_PX, height_px=HEIGHT_PX)
+            true.append(drawn[..., :3].astype(np.float32) / np.float32(255))
+        seen, wanted, mask = average(shown), average(true), np.logical_and.reduce(masks)
+        error = float(np.square(seen[mask] - wanted[mask], dtype=np.float64).mean())
+        slices.append(
+            Slice(
+                plane_m,
+                seen,
+                wanted,
+                mask,
+                psnr_db(error),
+                tuple(contrast(seen, window) for window in windows),
+                tuple(contrast(wanted, window) for window in windows),
+            )
+        )
+        progress(index + 1, len(PLANES_M))
+    matrix = projection(eye, np.zeros(2), focus_m=DISTANCE_M)
+    image, mask = through_layers(matrix, layers, stack)
+    drawn = painter.draw(eye, matrix, width_px=WIDTH_PX, height_px=HEIGHT_PX)[..., :3].astype(np.float32) / 255
+    pinhole_db = psnr_db(float(np.square(image[mask] - drawn[mask], dtype=np.float64).mean()))
+    away = [float(np.linalg.norm(np.array([x, 0.0, 0.0]) - eye)) for x in PLANES_M]
+    cards = tuple(
+        Accommodation(
+            math.dist(eye, (x, y, 0.0)),
+            sharpest(away, [s.contrast_shown[i] for s in slices]),
+            sharpest(away, [s.contrast_true[i] for s in slices]),
+        )
+        for i, (x, y) in enumerate(zip(CARDS_M, OFFSETS_M, strict=True))
+    )
+    return FocalStack(model, tuple(slices), cards, pinhole_db)
+
+
+def cards_painter(stack: PanelStack) -> Painter:
+    """Three finely textured cards: behind the panels' middle, in it, and before it."""
+    from runtime.content import shapes
+    from runtime.content.scenes import Scene, Thing
+
+    card = shapes.card(0.034, 0.036, repeat=(3.4, 3.6))
+    things = tuple(
+        Thing(card, "checker", (x, y, 0.0), colour, lit=False)
+        for x, y, colour in zip(CARDS_M, OFFSETS_M, ((1.0, 0.75, 0.7), (0.75, 1.0, 0.75), (0.7, 0.8, 1.0)), strict=True)
+    )
+    return Painter(Scene("cards", things), stack)
