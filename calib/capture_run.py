@@ -14,7 +14,7 @@ import numpy as np
 from calib.capture import EyeWindow, midpoint, true_pair
 from calib.keys import Key, TerminalKeys
 from calib.pairs import CapturedPair, PairsFile
-from calib.viewpoints import Viewpoint, grid
+from calib.viewpoints import IPD_M, Viewpoint, grid
 from calib.walk import Walk, accept, captured
 from runtime.clock import NS_PER_MS, NS_PER_S, MonotonicClock, SimulatedClock
 from runtime.config import Settings
@@ -24,6 +24,7 @@ from runtime.records import F64, EyePoints, SensorFrame
 from runtime.sensor.base import SensorDriver, SteppedDriver
 
 POLL_NS = 20 * NS_PER_MS
+CHART_MODEL = "sart"
 Find = Callable[[SensorFrame], EyePoints | None]
 
 
@@ -206,9 +207,11 @@ def _finder_of(worker: Any, settings: Settings) -> Find:
 
 
 def _chart_display(settings: Settings, stack: PanelStack) -> Any:
-    from calib.chart_files import ChartDisplay
+    from calib.chart_files import ChartDisplay, Drawer
 
-    return ChartDisplay(settings, stack, kind="solved", ipd_m=0.060, model="sart")
+    ipd_m = settings.calibration.ipd_m or IPD_M
+    drawer = Drawer(stack, kind="solved", ipd_m=ipd_m, model=CHART_MODEL, settings=settings.model)
+    return ChartDisplay(settings, drawer)
 
 
 def _say(text: str) -> None:

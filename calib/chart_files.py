@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -16,11 +16,14 @@ from calib.keys import Key, TerminalKeys
 from calib.viewpoints import Viewpoint
 from runtime.artifacts import OutputFolder, write_json, write_png
 from runtime.clock import NS_PER_MS, MonotonicClock
-from runtime.config import Settings
+from runtime.config import ModelSettings, Settings
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.records import U8, LayerFrame
+
+if TYPE_CHECKING:
+    from runtime.model.predictor import Predictor
 
 EYE_NAMES = ("left", "right")
 THUMBNAIL_PX = 320
@@ -36,23 +39,41 @@ class Chart:
     layers: U8  # (N, H, W, 4) rear to front
 
 
-def charts_of(viewpoint: Viewpoint, *, stack: PanelStack, kind: Kind, ipd_m: float, model: str) -> Iterator[Chart]:
-    """One chart of the solved kind, or one for each eye and panel of the seed's. Raises InputError, MissingPart."""
-    if kind == "seed":
-        for index in range(stack.count):
-            for side, eye in enumerate(EYE_NAMES):
-                picture = eye_chart(viewpoint, stack, side=side, index=index, ipd_m=ipd_m)
-                yield Chart(viewpoint, f"layer-{index}-{eye}", alone(picture, stack, index=index))
-        return
-    yield Chart(viewpoint, "", solved_layers(viewpoint, stack=stack, ipd_m=ipd_m, model=model))
+class Drawer:
+    """Draws the charts of one kind for one stack; a model is loaded when the first chart needs it."""
 
+    def __init__(self, stack: PanelStack, *, kind: Kind, ipd_m: float, model: str, settings: ModelSettings) -> None:
+        self.stack, self.kind, self.ipd_m, self.model = stack, kind, ipd_m, model
+        self._settings = settings
+        self._predictor: Predictor | None = None
 
-def solved_layers(viewpoint: Viewpoint, *, stack: PanelStack, ipd_m: float, model: str) -> U8:
-    """(N, H, W, 4) layers through which both eyes see the line picture at the viewpoint."""
-    from runtime.model.still import solve_still
+    def charts(self, viewpoint: Viewpoint) -> Iterator[Chart]:
+        """One chart of the solved kind, one for each panel and eye of the seed's. Raises InputError, MissingPart."""
+        if self.kind == "seed":
+            for index in range(self.stack.count):
+                for side, eye in enumerate(EYE_NAMES):
+                    picture = eye_chart(viewpoint, self.stack, side=side, index=index, ipd_m=self.ipd_m)
+                    yield Chart(viewpoint, f"layer-{index}-{eye}", alone(picture, self.stack, index=index))
+            return
+        yield Chart(viewpoint, "", self._solved(viewpoint))
 
-    picture = line_picture(width_px=stack.width_px, height_px=stack.height_px)
-    return solve_still(picture, picture, eyes_m=viewpoint.eyes_m(ipd_m), stack=stack, fov_deg=FOV_DEG, model=model)
+    def _solved(self, viewpoint: Viewpoint) -> U8:
+        """(N, H, W, 4) layers through which both eyes see the line picture at the viewpoint."""
+        from runtime.model.predictor import load_predictor
+        from runtime.model.still import solve_still
+
+        if self._predictor is None:
+            self._predictor = load_predictor(self.model, self.stack, self._settings)
+        picture = line_picture(width_px=self.stack.width_px, height_px=self.stack.height_px)
+        eyes_m = viewpoint.eyes_m(self.ipd_m)
+        prediction = solve_still(picture, picture, eyes_m=eyes_m, fov_deg=FOV_DEG, predictor=self._predictor)
+        return np.array(prediction.layers)  # a copy: the predictor uses its own again
+
+    def close(self) -> None:
+        """Release the model. May be called twice."""
+        if self._predictor is not None:
+            self._predictor.close()
+            self._predictor = None
 
 
 def fused_psnr_db(layers: U8, viewpoint: Viewpoint, *, stack: PanelStack, ipd_m: float) -> float:
@@ -62,10 +83,9 @@ def fused_psnr_db(layers: U8, viewpoint: Viewpoint, *, stack: PanelStack, ipd_m:
     return quality([r.image for r in seen], [wanted, wanted], [r.mask for r in seen]).psnr_db
 
 
-def make_charts(
-    out: Path, viewpoints: Sequence[Viewpoint], *, stack: PanelStack, kind: Kind, ipd_m: float, model: str
-) -> dict[str, Any]:
+def make_charts(out: Path, viewpoints: Sequence[Viewpoint], drawer: Drawer) -> dict[str, Any]:
     """Write PNGs, `charts.json` and a contact sheet. Raises InputError, MissingPart."""
+    stack, ipd_m = drawer.stack, drawer.ipd_m
     from rich.console import Console
     from rich.progress import track
 
@@ -79,7 +99,7 @@ def make_charts(
                 "midpoint_m": viewpoint.midpoint_m,
                 "eyes_m": viewpoint.eyes_m(ipd_m),
             }
-            for chart in charts_of(viewpoint, stack=stack, kind=kind, ipd_m=ipd_m, model=model):
+            for chart in drawer.charts(viewpoint):
                 for name, picture in _pictures(chart):
                     write_png(folder.staging / name, picture)
                     files.append(name)
@@ -91,11 +111,11 @@ def make_charts(
         write_png(folder.staging / "contact-sheet.png", _tiled(sheet))
         write_json(
             folder.staging / "charts.json",
-            {"kind": kind, "ipd_m": ipd_m, "fov_deg": FOV_DEG, "model": model, "charts": entries},
+            {"kind": drawer.kind, "ipd_m": ipd_m, "fov_deg": FOV_DEG, "model": drawer.model, "charts": entries},
         )
     return {
         "out": str(out),
-        "kind": kind,
+        "kind": drawer.kind,
         "viewpoints": [viewpoint.name for viewpoint in viewpoints],
         "files": sum(len(entry["files"]) for entry in entries),
         "psnr_db": [entry["psnr_db"] for entry in entries if "psnr_db" in entry],
@@ -131,23 +151,19 @@ def _tiled(pictures: Sequence[U8], columns: int = 3) -> U8:
 class ChartDisplay:
     """The panels, showing one viewpoint's chart at a time."""
 
-    def __init__(self, settings: Settings, stack: PanelStack, *, kind: Kind, ipd_m: float, model: str) -> None:
+    def __init__(self, settings: Settings, drawer: Drawer) -> None:
         """Opens the panels. Raises InputError, MissingPart, PanelLost."""
         from runtime.gl import offscreen_context
         from runtime.panels.registry import open_panels
 
-        self._request: dict[str, Any] = {"stack": stack, "kind": kind, "ipd_m": ipd_m, "model": model}
-        self._context = offscreen_context()
-        self._sink = open_panels(settings.output, stack, MonotonicClock(), self._context)
+        self._drawer = drawer
+        self._sink = open_panels(settings.output, drawer.stack, MonotonicClock(), offscreen_context())
         self._number = 0
-        self._charts = lru_cache(maxsize=2)(self._solve)
-
-    def _solve(self, viewpoint: Viewpoint) -> list[Chart]:
-        return list(charts_of(viewpoint, **self._request))
+        self._kept = lru_cache(maxsize=2)(lambda viewpoint: list(drawer.charts(viewpoint)))
 
     def charts(self, viewpoint: Viewpoint) -> list[Chart]:
         """The charts of a viewpoint; the last two viewpoints' are kept."""
-        return self._charts(viewpoint)
+        return self._kept(viewpoint)
 
     def show(self, viewpoint: Viewpoint) -> None:
         """The viewpoint's (first) chart on all panels."""
@@ -159,32 +175,37 @@ class ChartDisplay:
         self._sink.present(LayerFrame(self._number, chart.layers))
 
     def close(self) -> None:
-        """Close the panels. May be called twice."""
+        """Close the panels and the model. May be called twice."""
         self._sink.close()
+        self._drawer.close()
 
 
-def show_charts(
-    settings: Settings, viewpoints: Sequence[Viewpoint], *, stack: PanelStack, kind: Kind, ipd_m: float, model: str
-) -> None:
+def show_charts(settings: Settings, viewpoints: Sequence[Viewpoint], drawer: Drawer) -> None:
     """Show the charts one after the other until the last one is accepted, or q. Raises as `ChartDisplay`."""
     import typer
 
     keys = TerminalKeys()
-    display = ChartDisplay(settings, stack, kind=kind, ipd_m=ipd_m, model=model)
     if settings.output.kind == "offscreen":
         typer.echo("warning: output.kind is offscreen: nobody sees these charts", err=True)
+    clock = MonotonicClock()
     try:
-        clock = MonotonicClock()
-        for chart in steps(display, viewpoints, keys.poll, wait=lambda: clock.sleep_until_ns(
-            clock.now_ns() + SHOW_AGAIN_NS
-        )):  # fmt: skip
-            typer.echo(f"{chart.viewpoint.name} {chart.label}  (Enter, n: next, p: previous, q: stop)", err=True)
+        display = ChartDisplay(settings, drawer)
+        try:
+            walk = steps(
+                display, viewpoints, keys.poll, wait=lambda: clock.sleep_until_ns(clock.now_ns() + SHOW_AGAIN_NS)
+            )
+            for chart in walk:
+                name = f"{chart.viewpoint.name} {chart.label}".rstrip()
+                typer.echo(f"{name}  (Enter, n: next, p: previous, q: stop)", err=True)
+        finally:
+            display.close()
     finally:
         keys.close()
-        display.close()
 
 
-def steps(display: Any, viewpoints: Sequence[Viewpoint], poll: Any, *, wait: Any) -> Iterator[Chart]:
+def steps(
+    display: ChartDisplay, viewpoints: Sequence[Viewpoint], poll: Callable[[], Key | None], *, wait: Callable[[], None]
+) -> Iterator[Chart]:
     """Present charts as keys say, yielding each one that comes up; ends with q or after the last."""
     index, step = 0, 0
     while index < len(viewpoints):

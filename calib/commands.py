@@ -39,7 +39,7 @@ def charts(
 
     Example: phasestack calibrate charts --out charts --viewpoint R50-phi80-theta90
     """
-    from calib.chart_files import make_charts, show_charts
+    from calib.chart_files import Drawer, make_charts, show_charts
 
     if out is None and not show:
         raise InputError("calibrate charts", "--out", "is missing (or give --show)")
@@ -49,12 +49,15 @@ def charts(
         raise InputError("calibrate charts", "--ipd-mm", "must lie between 5 and 100")
     settings, stack = _settings_and_stack(config, panels)
     chosen = _viewpoints("calibrate charts", viewpoint)
-    request: dict[str, Any] = {"stack": stack, "kind": kind, "ipd_m": ipd_mm / 1000, "model": model}
-    if out is not None:
-        summary = make_charts(out, chosen, **request)
-        _say(summary, as_json, f"{summary['files']} files for {len(chosen)} viewpoints in {out}")
-    if show:
-        show_charts(settings, chosen, **request)
+    drawer = Drawer(stack, kind=kind, ipd_m=ipd_mm / 1000, model=model, settings=settings.model)  # type: ignore[arg-type]
+    try:
+        if out is not None:
+            summary = make_charts(out, chosen, drawer)
+            _say(summary, as_json, f"{summary['files']} files for {len(chosen)} viewpoints in {out}")
+        if show:
+            show_charts(settings, chosen, drawer)
+    finally:
+        drawer.close()
 
 
 @app.command()

@@ -38,14 +38,15 @@ def registration_figure(registration: StackRegistration, stack: PanelStack) -> b
         )  # fmt: skip
         for place, end, shift in zip(corners[:4], true[:4], registration.panels[index].corners_px, strict=True):
             panel.annotate(f"{shift[0]:+.2f}, {shift[1]:+.2f}", end, fontsize=8, ha="center",
+                           bbox={"facecolor": "white", "edgecolor": "none", "pad": 1, "alpha": 0.8},
                            va="bottom" if place[1] == 0 else "top", xytext=(0, 5 if place[1] == 0 else -5),
                            textcoords="offset points")  # fmt: skip
-        panel.set_title(f"panel {index}", fontsize=10)
+        panel.set_title(f"panel {index}", fontsize=10, loc="left")
         panel.margins(0.14)
         panel.invert_yaxis()
         panel.set_aspect("equal", adjustable="datalim")
         panel.set_xlabel("u (px)")
-        panel.legend(loc="center", fontsize=8)
+        panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.06), ncols=2, fontsize=8, frameon=False)
     axes[0][0].set_ylabel("v (px)")
     return png(canvas)
 

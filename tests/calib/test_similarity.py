@@ -1,0 +1,133 @@
+"""Closed forms: exact data are recovered, each scale is the optimum that it claims to be, bad data are refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from calib.similarity import Degenerate, fit, fit_batch
+
+RULES = ["seed", "least-squares", "inverse"]
+
+
+def cloud(seed: int, count: int = 27) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(count, 3)) * [0.08, 0.1, 0.06] + [0.5, 0.0, 0.1]
+
+
+def camera(points: np.ndarray, *, rotation: Rotation, scale: float, shift: np.ndarray) -> np.ndarray:
+    return rotation.inv().apply(points - shift) / scale
+
+
+rotations = st.integers(0, 2**32 - 1).map(lambda seed: Rotation.random(rng=np.random.default_rng(seed)))
+scales = st.floats(1e-4, 1e4)
+shifts = st.tuples(*[st.floats(-10, 10)] * 3).map(np.array)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 1000), st.integers(3, 40), rotations, scales, shifts, st.sampled_from(RULES))
+def test_exact_pairs_give_the_similarity_back(seed, count, rotation, scale, shift, rule) -> None:
+    points = cloud(seed, count)
+    found = fit(camera(points, rotation=rotation, scale=scale, shift=shift), points, rule=rule)
+    assert found.scale == pytest.approx(scale, rel=1e-9)
+    np.testing.assert_allclose(found.rotation, rotation.as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(found.translation_m, shift, atol=1e-7)
+
+
+@given(st.integers(0, 1000), st.floats(0.001, 0.05))
+def test_the_least_squares_residual_is_never_above_the_seeds(seed, sigma_m) -> None:
+    points = cloud(seed)
+    sensor = points + np.random.default_rng(seed + 1).normal(scale=sigma_m, size=points.shape)
+    residual = {rule: ((fit(sensor, points, rule=rule).points(sensor) - points) ** 2).sum() for rule in RULES}
+    assert residual["least-squares"] <= residual["seed"] * (1 + 1e-12)
+    assert residual["least-squares"] <= residual["inverse"] * (1 + 1e-12)
+
+
+@given(st.integers(0, 1000), st.floats(0.001, 0.05))
+def test_the_seeds_scale_lies_between_the_two_optima(seed, sigma_m) -> None:
+    points = cloud(seed)
+    sensor = points + np.random.default_rng(seed + 1).normal(scale=sigma_m, size=points.shape)
+    low, middle, high = (float(fit(sensor, points, rule=rule).scale) for rule in ("least-squares", "seed", "inverse"))
+    assert low <= middle <= high
+    assert middle == pytest.approx(np.sqrt(low * high), rel=1e-12)
+
+
+def test_least_squares_is_the_minimum_of_the_seeds_objective() -> None:
+    """Against a general minimiser that knows nothing of SVD (seed 20)."""
+    points = cloud(3)
+    sensor = camera(points, rotation=Rotation.from_rotvec([0.4, -1.0, 0.3]), scale=2.0, shift=np.array([0.1, 0, 0]))
+    sensor = sensor + np.random.default_rng(0).normal(scale=0.01, size=points.shape)
+
+    def objective(p: np.ndarray) -> float:
+        moved = np.exp(p[6]) * Rotation.from_rotvec(p[:3]).apply(sensor) + p[3:6]
+        return float(((moved - points) ** 2).sum())
+
+    start = np.concatenate([[0.4, -1.0, 0.3], [0.1, 0, 0], [np.log(2.0)]])
+    best = minimize(objective, start, method="BFGS", options={"gtol": 1e-10})
+    found = fit(sensor, points, rule="least-squares")
+    assert ((found.points(sensor) - points) ** 2).sum() == pytest.approx(best.fun, rel=1e-6)
+
+
+def test_inverse_is_least_squares_the_other_way_round() -> None:
+    points = cloud(5)
+    sensor = 0.5 * points + np.random.default_rng(0).normal(scale=0.02, size=points.shape)
+    there, back = fit(sensor, points, rule="inverse"), fit(points, sensor, rule="least-squares")
+    np.testing.assert_allclose(there.matrix @ back.matrix, np.eye(4), atol=1e-12)
+
+
+def test_noise_on_the_sensors_side_shrinks_least_squares_and_not_inverse() -> None:
+    random = np.random.default_rng(0)
+    points = np.broadcast_to(cloud(1), (2000, 27, 3))
+    sensor = points + random.normal(scale=0.03, size=points.shape)
+    shrunk, true = (fit_batch(sensor, points, rule=rule).scale.mean() for rule in ("least-squares", "inverse"))
+    assert shrunk < 0.95
+    assert true == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_known_scale_is_kept() -> None:
+    points = cloud(2)
+    assert fit(points * 1.1, points, rule=0.9).scale == pytest.approx(0.9, rel=1e-15)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_scipys_rotation_is_the_same(rule) -> None:
+    points = cloud(7)
+    sensor = Rotation.from_rotvec([1, 2, 3]).apply(points) + np.random.default_rng(0).normal(scale=0.01, size=(27, 3))
+    reference, _ = Rotation.align_vectors(points - points.mean(0), sensor - sensor.mean(0))
+    np.testing.assert_allclose(fit(sensor, points, rule=rule).rotation, reference.as_matrix(), atol=1e-12)
+
+
+def test_mirrored_points_never_give_a_mirrored_rotation() -> None:
+    points = cloud(4)
+    for axis in np.eye(3):
+        assert np.linalg.det(fit(points * (1 - 2 * axis), points, rule="inverse").rotation) == pytest.approx(1.0)
+
+
+def test_weights_count_like_repetitions() -> None:
+    points, random = cloud(6, 10), np.random.default_rng(0)
+    sensor = points + random.normal(scale=0.01, size=points.shape)
+    weights = random.integers(0, 4, 10).astype(float)
+    repeated = np.repeat(np.arange(10), weights.astype(int))
+    once = fit(sensor[repeated], points[repeated], rule="inverse")
+    np.testing.assert_allclose(fit(sensor, points, rule="inverse", weights=weights).matrix, once.matrix, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("points", "why"),
+    [
+        (cloud(0, 2), "at least 3"),
+        (np.ones((5, 3)), "coincide"),
+        (np.outer(np.arange(5.0), [1, 2, 3]), "one line"),
+        (np.outer(np.arange(5.0), [1, 2, 3]) + 1e-8 * cloud(0, 5), "double precision"),
+        (1e12 + cloud(0, 5), "double precision"),
+        (np.full((4, 3), np.nan), "finite"),
+    ],
+)
+def test_points_that_determine_nothing_are_refused(points, why) -> None:
+    with pytest.raises(Degenerate, match=why):
+        fit(points, points, rule="inverse")
+    with pytest.raises(Degenerate, match=why):
+        fit(points, cloud(0, len(points)), rule="inverse")

@@ -1,0 +1,42 @@
+"""The grid of the seed's section 2.3."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.viewpoints import grid, viewing_volume_m
+
+
+def test_the_grid_has_27_viewpoints_with_names_of_their_own() -> None:
+    names = [viewpoint.name for viewpoint in grid()]
+    assert len(set(names)) == 27
+    assert "R40-phi70-theta80" in names
+
+
+@pytest.mark.parametrize("viewpoint", grid(), ids=lambda v: v.name)
+def test_a_viewpoint_lies_where_its_polar_angles_say(viewpoint) -> None:
+    x, y, z = viewpoint.midpoint_m
+    assert np.hypot(np.hypot(x, y), z) == pytest.approx(viewpoint.radius_cm / 100)
+    assert np.degrees(np.arccos(z * 100 / viewpoint.radius_cm)) == pytest.approx(viewpoint.phi_deg)
+    assert np.degrees(np.arctan2(x, y)) == pytest.approx(viewpoint.theta_deg)
+
+
+def test_small_theta_is_the_viewers_right_and_small_phi_is_up() -> None:
+    by_name = {viewpoint.name: viewpoint.midpoint_m for viewpoint in grid()}
+    assert by_name["R50-phi90-theta80"][1] > 0 > by_name["R50-phi90-theta100"][1]
+    assert by_name["R50-phi70-theta90"][2] > by_name["R50-phi90-theta90"][2]
+
+
+@pytest.mark.parametrize("viewpoint", grid()[::5], ids=lambda v: v.name)
+def test_the_eyes_are_level_apart_by_the_ipd_and_equally_far(viewpoint) -> None:
+    left, right = viewpoint.eyes_m(0.064)
+    assert np.linalg.norm(left - right) == pytest.approx(0.064)
+    np.testing.assert_allclose((left + right) / 2, viewpoint.midpoint_m, atol=1e-15)
+    assert left[2] == pytest.approx(right[2])
+    assert left[1] < right[1]
+    assert np.linalg.norm(left) == pytest.approx(np.linalg.norm(right))
+
+
+def test_the_viewing_volume_lies_before_every_panel() -> None:
+    assert viewing_volume_m()[:, 0].min() > 0.06
