@@ -15,8 +15,8 @@ from runtime.eyes.eye_depth import FACE_DEPTH_M, depth_at, point_from_pixel
 from runtime.eyes.faces import Face, FaceFinder, HaarFaces, YunetFaces
 from runtime.records import F64, U8, EyePoints, Intrinsics, SensorFrame
 
-FULL_WIDTH_PX = 480  # the whole picture is searched at this width
-SMALLEST_FACE_PX = 24  # in it: 2 m away in a picture of 70 degrees
+FULL_WIDTH_PX = 640  # the whole picture is searched at this width
+SMALLEST_FACE_PX = 32  # in it: 2 m away in a picture of 70 degrees
 WINDOW_FACE_PX = 110  # in a window, the last face is brought to this width; networks go wrong on huge ones
 WINDOW_SCALE = 2.0  # width of the window, in widths of the face
 FULL_EVERY = 30  # frames between looks at the whole picture while a viewer is followed

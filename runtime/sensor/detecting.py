@@ -1,0 +1,49 @@
+"""A sensor that delivers images, together with what finds eyes in them, as one driver that delivers eyes.
+
+The search then happens in the sensor's thread, not in the loop's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from runtime.records import EyePoints, SensorFrame
+from runtime.sensor.base import Capabilities, SensorDriver
+
+FindEyes = Callable[[SensorFrame], EyePoints | None]
+
+
+class DetectingDriver(SensorDriver):
+    """Adds eye points to the frames of a driver that has none, and hands those of others through."""
+
+    def __init__(self, driver: SensorDriver, make_find: Callable[[], FindEyes], *, keep_images: bool = False) -> None:
+        """make_find: builds the finder when the driver is opened, if it is needed at all."""
+        self._driver, self._make_find, self._keep_images = driver, make_find, keep_images
+        self._find: FindEyes | None = None
+        self.name, self.capabilities = driver.name, driver.capabilities
+        self.serial = driver.serial
+
+    def open(self) -> None:
+        self._driver.serial = self.serial
+        self._driver.open()
+        self.serial, has = self._driver.serial, self._driver.capabilities
+        if has.eye_points:
+            self.capabilities, self._find = has, None
+            return
+        try:
+            self._find = self._make_find()
+        except BaseException:
+            self._driver.close()
+            raise
+        self.capabilities = Capabilities(has.colour, has.depth, has.infrared, eye_points=True)
+
+    def read_newest(self, timeout_s: float) -> SensorFrame:
+        frame = self._driver.read_newest(timeout_s)
+        self.overtaken, self.missed = self._driver.overtaken, self._driver.missed
+        if self._find is not None:
+            frame = replace(frame, eyes=self._find(frame))
+        return frame if self._keep_images else replace(frame, colour=None, depth_mm=None)
+
+    def close(self) -> None:
+        self._driver.close()
