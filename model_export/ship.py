@@ -3,7 +3,7 @@ import hashlib, json, sys
 from pathlib import Path
 import torch, onnx
 from model_export.network import SpectralSolver
-STEPS={"fast":[("chain",1.0)],"balanced":[("chain",1.0),("sweep",.35),("sweep",.35)],"best":[("chain",1.0),("sweep",.35),("chain",1.0),("sweep",.35),("sweep",.35),("sweep",.35),("sweep",.35)]}
+STEPS={"fast":[("chain",1.0)],"balanced":[("chain",1.0),("front",.9),("rear",.9)],"best":[("chain",1.0),("front",.9),("rear",.9),("chain",1.0)]+[("front",.9),("rear",.9)]*4}
 def main():
     for name,steps in STEPS.items():
         torch.manual_seed(0)

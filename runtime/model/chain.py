@@ -38,6 +38,26 @@ class ChainFrame:
         return self.cells * 2 * self.cell_px
 
 
+    def plane_from_frame(self, eye_m: F64, *, x_m: float) -> F64:
+        """3x3: (y, z, 1) on a parallel plane hit by an eye's rays through this raster's pixels."""
+        t = (x_m - self.x_m) / (eye_m[0] - self.x_m)
+        across = np.array([[1 - t, 0.0, eye_m[1] * t], [0.0, 1 - t, eye_m[2] * t], [0.0, 0.0, 1.0]])
+        return across @ self.plane_from_raster
+
+    def frame_from_plane(self, *, x_m: float) -> F64:
+        """3x3: this raster's pixels from (y, z, 1) on a parallel plane, in line as seen from between the eyes."""
+        t = (x_m - self.x_m) / (self.middle_m[0] - self.x_m)
+        back = np.array(
+            [[1.0, 0.0, -self.middle_m[1] * t], [0.0, 1.0, -self.middle_m[2] * t], [0.0, 0.0, 1.0 - t]]
+        ) / (1 - t)
+        p = self.plane_from_raster
+        determinant = p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]
+        linear = np.array([[p[1, 1], -p[0, 1]], [-p[1, 0], p[0, 0]]]) / determinant
+        inverse = np.eye(3)
+        inverse[:2, :2], inverse[:2, 2] = linear, -linear @ p[:2, 2]
+        return inverse @ back
+
+
 def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int) -> ChainFrame:
     """The raster for two eyes (2, 3), left and right, frame `stack`.
 

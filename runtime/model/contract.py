@@ -18,7 +18,9 @@ VERSION = 1
 class Step(Section):
     """One unrolled correction step of a `chain` model."""
 
-    kind: Literal["chain", "sweep"] = Field(description="the network along the eyes' line, or a local correction")
+    kind: Literal["chain", "front", "rear"] = Field(
+        description="the network along the eyes' line, or a local correction of one outer panel"
+    )
     size: Annotated[float, Field(gt=0, le=2)] = Field(1.0, description="learned step size")
 
 

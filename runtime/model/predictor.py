@@ -89,7 +89,7 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
             raise InputError(path, "contract.panels", "needs evenly spaced panels; use the model sart")
         from runtime.model.unrolled import UnrolledPredictor
 
-        return UnrolledPredictor(session, stack, tolerance_mm=settings.tolerance_mm)
+        return UnrolledPredictor(session, stack, tolerance_mm=settings.tolerance_mm, threads=settings.threads)
     from runtime.model.network import NetworkPredictor
 
     return NetworkPredictor(session, stack, source=path)

@@ -1,7 +1,8 @@
 """The unrolled solver: a network along the eyes' line, local corrections, and the centre panel in closed form.
 
-Phases are fixed-point (sixteenths of an 8-bit code); outer panels are kept as the 8 bits that will be shown, so
-that every correction sees what the eyes will see.
+Phases are fixed-point (sixteenths of an 8-bit code). Outer panels are kept rounded to what 8 bits can show, so
+that every correction answers to what the eyes will really see. One correction changes one panel, rear and front in
+turn: twice as much for the time as both at once.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from numpy.typing import NDArray
 from runtime.errors import ModelFailure
 from runtime.model.chain import ChainFrame, chain_frame, chain_modes
 from runtime.model.predictor import Prediction, Predictor
-from runtime.model.resample import resample, target_from_source
+from runtime.model.resample import buffer, resample, target_from_source
+from runtime.model.rows import RowPool
 from runtime.model.session import ModelSession
 from runtime.model.transfer import FULL, SUBCODE, phase_codes
 from runtime.optics.stack import PanelStack, PlaneRaster
@@ -25,135 +27,172 @@ from runtime.records import F64, U8
 
 I16 = NDArray[np.int16]
 NS_PER_MS = 1e6
-OUTER = (0, 2)  # rear, front
-START = 128  # of every panel: the middle of its range
+REAR, CENTRE, FRONT = 0, 1, 2
+START = FULL // 2  # of every outer panel: the middle of its range
 
 
 class UnrolledPredictor(Predictor):
     """Models of `input_frame` chain: three evenly spaced panels, any pose."""
 
-    def __init__(self, session: ModelSession, stack: PanelStack, *, tolerance_mm: float) -> None:
+    def __init__(self, session: ModelSession, stack: PanelStack, *, tolerance_mm: float, threads: int = 2) -> None:
         self.session, self.stack = session, stack
         self.name, self.provider = session.contract.name, session.provider
         self.parameters = session.contract.parameters
         self.tolerance_mm = tolerance_mm
-        self._layers = np.full((3, stack.height_px, stack.width_px, 4), 255, np.uint8)
+        self._rows = RowPool(threads)
+        h, w = stack.height_px, stack.width_px
+        self._layers = np.full((3, h, w, 4), 255, np.uint8)
+        self._outer = {REAR: buffer(h, w), FRONT: buffer(h, w)}
+        self._seen = {(n, side): buffer(h, w) for n in (REAR, FRONT) for side in (0, 1)}
+        self._residual = (buffer(h, w), buffer(h, w))
+        self._back = (buffer(h, w), buffer(h, w))
+        self._centre: I16 = np.empty((h, w, 3), np.int16)
+        self._chain_buffers: dict[tuple[int, int], Any] = {}
 
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
-        return (self.stack.panel(1),)
+        return (self.stack.panel(CENTRE),)
 
     def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64) -> Prediction:
-        clock = _Stopwatch()
+        watch = _Stopwatch()
         contract = self.session.contract
         try:
             frame = chain_frame(eyes_m, self.stack, cell_px=contract.cell_px, reduction=contract.reduction)
         except ValueError as error:
             raise ModelFailure(str(error)) from None
-        wanted = [self._phases(image[0]) for image in images]
-        shape = wanted[0].shape
-        outer = {n: np.full(shape, START, np.uint8) for n in OUTER}
-        centre, residuals = close_centre(wanted, [np.full(shape, 2 * START, np.int16)] * 2)
-        clock.lap("prepare")
+        table = phase_codes(contract.branch)
+        pictures = [image[0] for image in images]
+        wanted = [cv2.LUT(cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB), table) for picture in pictures]
+        first = True
         for step in contract.steps:
             if step.kind == "chain":
-                self._chain(outer, residuals, frame, eyes_m, clock, step.size)
+                needs = self._first_needs(pictures, table) if first else self._later_needs()
+                self._chain(needs, frame, eyes_m, watch, size=step.size, first=first)
+                changed: tuple[int, ...] = (REAR, FRONT)
             else:
-                self._sweep(outer, residuals, eyes_m, step.size)
-            seen = [self._outer_sum(outer, eye_m) for eye_m in eyes_m]
-            centre, residuals = close_centre(wanted, seen)
-            clock.lap("finish")
-        for n, layer in ((0, outer[0]), (1, centre), (2, outer[2])):
-            cv2.cvtColor(layer, cv2.COLOR_RGB2RGBA, dst=self._layers[n])
-        clock.lap("finish")
-        return Prediction(self._layers, clock.stage_ms)
+                changed = (FRONT if step.kind == "front" else REAR,)
+                self._correct(changed[0], eyes_m, size=step.size)
+            first = False
+            for n in changed:
+                for side, eye_m in enumerate(eyes_m):
+                    self._between(self._outer[n], eye_m, of=n, on=CENTRE, out=self._seen[n, side])
+            self._close_centre(wanted)
+        for n, codes in ((REAR, self._outer[REAR]), (CENTRE, self._centre), (FRONT, self._outer[FRONT])):
+            cv2.cvtColor(cv2.convertScaleAbs(codes, alpha=1 / SUBCODE), cv2.COLOR_RGB2RGBA, dst=self._layers[n])
+        watch.lap("finish")
+        return Prediction(self._layers, watch.stage_ms)
 
-    def _phases(self, image: U8) -> I16:
-        return cv2.LUT(cv2.cvtColor(image, cv2.COLOR_RGBA2RGB), phase_codes(self.session.contract.branch))
+    def close(self) -> None:
+        self._rows.close()
 
-    def _outer_sum(self, outer: dict[int, U8], eye_m: F64) -> I16:
-        """Rear plus front panel, as an eye sees them through the centre panel's pixels; 8-bit codes."""
-        seen = [self._from(eye_m, outer[n], target=n) for n in OUTER]
-        return cv2.add(seen[0], seen[1], dtype=cv2.CV_16S)
-
-    def _from(self, eye_m: F64, image: U8, *, target: int) -> U8:
-        """Panel `target`'s picture on the centre panel's pixels."""
-        return self._between(eye_m, image, of=target, on=1)
-
-    def _between(self, eye_m: F64, image: NDArray[Any], *, of: int, on: int) -> NDArray[Any]:
+    def _between(self, image: I16, eye_m: F64, *, of: int, on: int, out: I16) -> I16:
+        """Panel `of`'s pixels on panel `on`'s raster, as an eye sees them in line."""
         matrix = target_from_source(eye_m, source=self.stack.panel(on), target=self.stack.panel(of))
-        return resample(image, image_from_result=matrix, width_px=self.stack.width_px, height_px=self.stack.height_px)
+        return resample(image, image_from_result=matrix, out=out)
 
-    def _sweep(self, outer: dict[int, U8], residuals: Sequence[I16], eyes_m: F64, size: float) -> None:
-        """A symmetric correction of the outer panels from both eyes' residuals."""
-        for n in OUTER:
-            back = [self._between(eye_m, r, of=1, on=n) for eye_m, r in zip(eyes_m, residuals, strict=True)]
-            total = cv2.addWeighted(back[0], size / SUBCODE, back[1], size / SUBCODE, 0)
-            outer[n] = cv2.add(outer[n], total, dtype=cv2.CV_8U)
+    def _close_centre(self, wanted: Sequence[I16]) -> None:
+        """The best centre panel for the outer ones, per pixel and in closed form; and what each eye still lacks."""
+        rear, front = ([self._seen[n, side] for side in (0, 1)] for n in (REAR, FRONT))
+        residual, centre = self._residual, self._centre
+
+        def work(rows: slice) -> None:
+            left = wanted[0][rows] - rear[0][rows]
+            left -= front[0][rows]
+            right = wanted[1][rows] - rear[1][rows]
+            right -= front[1][rows]
+            best = left + right
+            best += SUBCODE
+            best >>= 5
+            best <<= 4
+            np.clip(best, 0, FULL, out=best)
+            centre[rows] = best
+            np.subtract(left, best, out=residual[0][rows])
+            np.subtract(right, best, out=residual[1][rows])
+
+        self._rows.each(self.stack.height_px, work)
+
+    def _correct(self, panel: int, eyes_m: F64, *, size: float) -> None:
+        """Change one outer panel by what both eyes lack along the rays through each of its pixels."""
+        back = self._back
+        for side, eye_m in enumerate(eyes_m):
+            self._between(self._residual[side], eye_m, of=CENTRE, on=panel, out=back[side])
+        outer = self._outer[panel]
+        gain = round(size * 256)
+
+        def work(rows: slice) -> None:
+            change = (back[0][rows].astype(np.int32) + back[1][rows]) * gain
+            change >>= 8
+            codes = outer[rows] + change.astype(np.int16)
+            _settle(codes, outer[rows])
+
+        self._rows.each(self.stack.height_px, work)
+
+    def _first_needs(self, pictures: Sequence[U8], table: NDArray[np.int16]) -> list[I16]:
+        """What each eye lacks while the outer panels are even, at the network's coarser raster."""
+        size = self._reduced_size()
+        left, right = (
+            cv2.LUT(cv2.cvtColor(cv2.resize(p, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGBA2RGB), table)
+            for p in pictures
+        )
+        half = (np.asarray(right, np.int16) - np.asarray(left, np.int16)) >> 1
+        return [-half, half]
+
+    def _later_needs(self) -> list[I16]:
+        size = self._reduced_size()
+        return [np.asarray(cv2.resize(r, size, interpolation=cv2.INTER_AREA), np.int16) for r in self._residual]
+
+    def _reduced_size(self) -> tuple[int, int]:
+        reduction = self.session.contract.reduction
+        return self.stack.width_px // reduction, self.stack.height_px // reduction
 
     def _chain(
-        self,
-        outer: dict[int, U8],
-        residuals: Sequence[I16],
-        frame: ChainFrame,
-        eyes_m: F64,
-        clock: _Stopwatch,
-        size: float,
+        self, needs: Sequence[I16], frame: ChainFrame, eyes_m: F64, watch: _Stopwatch, *, size: float, first: bool
     ) -> None:
         """The network's correction: what the outer panels must carry for the eyes to differ as they should."""
-        reduction = self.session.contract.reduction
-        half_size = (self.stack.width_px // reduction, self.stack.height_px // reduction)
-        reduced_from_full = np.diag([1 / reduction, 1 / reduction, 1.0])
-        seen = []
-        for eye_m, residual in zip(eyes_m, residuals, strict=True):
-            reduced = cv2.resize(residual, half_size, interpolation=cv2.INTER_AREA)
-            t = (self.stack.x_m[1] - frame.x_m) / (eye_m[0] - frame.x_m)
-            across = np.array([[1 - t, 0.0, eye_m[1] * t], [0.0, 1 - t, eye_m[2] * t], [0.0, 0.0, 1.0]])
-            matrix = reduced_from_full @ self.stack.panel(1).raster_from_plane() @ across @ frame.plane_from_raster
-            seen.append(resample(reduced, image_from_result=matrix, width_px=frame.width_px, height_px=frame.rows))
+        width, height = self._reduced_size()
+        reduced_from_full = np.diag([width / self.stack.width_px, height / self.stack.height_px, 1.0])
+        reduced_from_plane = reduced_from_full @ self.stack.panel(CENTRE).raster_from_plane()
+        key = (frame.rows, frame.width_px)
+        if key not in self._chain_buffers:
+            self._chain_buffers = {key: (buffer(*key), buffer(*key))}
+        seen = self._chain_buffers[key]
+        for side, eye_m in enumerate(eyes_m):
+            matrix = reduced_from_plane @ frame.plane_from_frame(eye_m, x_m=self.stack.x_m[CENTRE])
+            resample(needs[side], image_from_result=matrix, out=seen[side])
         difference = np.subtract(seen[1], seen[0], dtype=np.float32)
         difference *= 1 / FULL
-        modes_out, spectrum, modes_in = chain_modes(frame.cells)
-        clock.lap("prepare")
+        watch.lap("prepare")
         answer = self.session.run(
             difference.reshape(frame.rows, frame.cells, -1),
-            modes_out,
-            spectrum,
-            modes_in,
+            *chain_modes(frame.cells),
             np.array([self.tolerance_mm], np.float32),
             output_shape=(frame.rows, frame.cells + 1, 2 * frame.cell_px * 3),
         )
-        clock.lap("inference")
-        wave = np.rint(answer.reshape(frame.rows, -1, 3) * (FULL * size)).astype(np.int16)
-        for n, sign in ((0, -1.0), (2, 1.0)):
+        if not np.isfinite(answer.sum()):
+            raise ModelFailure("the network answered with numbers that are not finite")
+        watch.lap("inference")
+        wave = answer.reshape(frame.rows, -1, 3)
+        for n, sign in ((REAR, -1.0), (FRONT, 1.0)):
             panel = self.stack.panel(n)
-            t = (panel.x_m - frame.x_m) / (frame.middle_m[0] - frame.x_m)
-            back = np.array(
-                [
-                    [1 / (1 - t), 0.0, -frame.middle_m[1] * t / (1 - t)],
-                    [0.0, 1 / (1 - t), -frame.middle_m[2] * t / (1 - t)],
-                    [0.0, 0.0, 1.0],
-                ]
-            )
-            matrix = np.linalg.inv(frame.plane_from_raster) @ back @ panel.plane_from_raster()
+            matrix = frame.frame_from_plane(x_m=panel.x_m) @ panel.plane_from_raster()
             matrix[0, 2] += frame.cell_px  # the answer begins one parallax before the first column
-            wide = resample(
-                wave, image_from_result=matrix, width_px=self.stack.width_px, height_px=self.stack.height_px
-            )
-            codes = cv2.addWeighted(wide, sign / SUBCODE, wide, 0.0, 0.0)
-            outer[n] = cv2.add(outer[n], codes, dtype=cv2.CV_8U)
+            codes = cv2.addWeighted(wave, sign * FULL * size, wave, 0.0, START if first else 0.0, dtype=cv2.CV_16S)
+            target = self._outer[n] if first else self._back[0]
+            resample(codes, image_from_result=matrix, out=target, cubic=True)
+            self._take(self._outer[n], None if first else target)
+
+    def _take(self, outer: I16, change: I16 | None) -> None:
+        def work(rows: slice) -> None:
+            codes = outer[rows] if change is None else outer[rows] + change[rows]
+            _settle(codes, outer[rows])
+
+        self._rows.each(self.stack.height_px, work)
 
 
-def close_centre(wanted: Sequence[I16], outer_sums: Sequence[I16]) -> tuple[U8, list[I16]]:
-    """The best centre panel for given outer panels, per pixel and in closed form, and what each eye still lacks.
-
-    wanted: each eye's phase sum; outer_sums: rear plus front panel in 8-bit codes. Returns the centre panel's
-    8-bit codes and each eye's residual; phases and residuals in sixteenths of a code.
-    """
-    needs = [w - (o << 4) for w, o in zip(wanted, outer_sums, strict=True)]
-    mean = (needs[0] + needs[1] + SUBCODE) >> 5
-    centre = np.clip(mean, 0, 255).astype(np.uint8)
-    shown = centre.astype(np.int16) << 4
-    return centre, [need - shown for need in needs]
+def _settle(codes: I16, out: I16) -> None:
+    """Round to what 8 bits can show, and keep within the panel's range."""
+    np.add(codes, SUBCODE // 2, out=out)
+    np.bitwise_and(out, -SUBCODE, out=out)
+    np.clip(out, 0, FULL, out=out)
 
 
 class _Stopwatch:
