@@ -64,7 +64,7 @@ class FragileDriver(SensorDriver):
             raise self._plan.fault
         time.sleep(0.01)
         self._sequence += 1
-        eyes_m = self._plan.eyes_m + [0.0, 0.002 * np.sin(self._sequence / 10), 0.0]
+        eyes_m = self._plan.eyes_m + np.array([0.0, 0.002 * np.sin(self._sequence / 10), 0.0])
         capture_ns = self._clock.now_ns() + self._plan.clock_jump_ns
         return SensorFrame(self._sequence, capture_ns, EyePoints(eyes_m, np.ones(2)))
 
