@@ -10,8 +10,10 @@ from numpy.typing import ArrayLike
 
 from runtime.optics.malus import intensity_from_phase
 from runtime.optics.quality import Quality, psnr_db, quality
-from runtime.optics.retina import Mask, panel_positions, ray_mask, sample_bilinear, seen_by
+from runtime.optics.retina import Mask, sample_bilinear, seen_by
+from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack
+from runtime.optics.views import image_from_stack
 from runtime.records import F32, U8
 from runtime.report.pairs import OffView, StillPair
 
@@ -62,15 +64,19 @@ def seen_rays(
     eye_m: ArrayLike, layers: U8, stack: PanelStack, *, width_px: int, height_px: int, fov_deg: float, step: int
 ) -> tuple[F32, Mask]:
     """`seen_by` for some of an image's rays: every `step`-th column and row, from the first."""
-    total: F32 | None = None
-    mask = ray_mask(eye_m, stack, width_px=width_px, height_px=height_px, fov_deg=fov_deg)[::step, ::step]
+    u, v = np.arange(0, width_px, step) + 0.5, (np.arange(0, height_px, step) + 0.5)[:, None]
+    projection = image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
+    # A ray's direction is the inverse of the projection's left part times (u, v, 1); it must go towards the panels.
+    toward = np.linalg.inv(projection[:, :3])[0]
+    mask: Mask = toward[0] * u + toward[1] * v + toward[2] < 0
+    total = np.zeros((*mask.shape, 3), np.float32)
     for index in range(stack.count):
-        u, v = panel_positions(eye_m, stack, index=index, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
-        u, v = u[::step, ::step], v[::step, ::step]
-        sampled = sample_bilinear(layers[index][..., :3], u=u, v=v)
-        total = sampled if total is None else total + sampled
-        mask = mask & (u > 0.5) & (u < stack.width_px - 0.5) & (v > 0.5) & (v < stack.height_px - 0.5)
-    assert total is not None
+        h = panel_from_image(projection, stack.panel(index))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            weight = h[2, 0] * u + h[2, 1] * v + h[2, 2]
+            x, y = (((row[0] * u + row[1] * v + row[2]) / weight).astype(np.float32) for row in h[:2])
+        total += sample_bilinear(layers[index][..., :3], u=x, v=y)
+        mask &= (x > 0.5) & (x < stack.width_px - 0.5) & (y > 0.5) & (y < stack.height_px - 0.5)
     return intensity_from_phase(total * np.float32(1 / 255)), mask
 
 

@@ -21,6 +21,7 @@ from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_camera, raster_from_stack, stack_from_eye
 from runtime.records import F32, F64, U8
+from runtime.report.eyesight import as_intensity
 from runtime.report.pairs import Painter, eyes_at
 
 WIDTH_PX, HEIGHT_PX, FOV_DEG = 720, 300, 18.0
@@ -146,7 +147,7 @@ def focal_stack(
             shown.append(image)
             masks.append(mask)
             drawn = painter.draw(eye, matrix, width_px=WIDTH_PX, height_px=HEIGHT_PX)
-            true.append(drawn[..., :3].astype(np.float32) / np.float32(255))
+            true.append(as_intensity(drawn))
         seen, wanted, mask = average(shown), average(true), np.logical_and.reduce(masks)
         error = float(np.square(seen[mask] - wanted[mask], dtype=np.float64).mean())
         slices.append(
@@ -163,8 +164,8 @@ def focal_stack(
         progress(index + 1, len(PLANES_M))
     matrix = projection(eye, np.zeros(2), focus_m=DISTANCE_M)
     image, mask = through_layers(matrix, layers, stack)
-    drawn = painter.draw(eye, matrix, width_px=WIDTH_PX, height_px=HEIGHT_PX)[..., :3].astype(np.float32) / 255
-    pinhole_db = psnr_db(float(np.square(image[mask] - drawn[mask], dtype=np.float64).mean()))
+    sharp = as_intensity(painter.draw(eye, matrix, width_px=WIDTH_PX, height_px=HEIGHT_PX))
+    pinhole_db = psnr_db(float(np.square(image[mask] - sharp[mask], dtype=np.float64).mean()))
     away = [float(np.linalg.norm(np.array([x, 0.0, 0.0]) - eye)) for x in PLANES_M]
     cards = tuple(
         Accommodation(

@@ -51,8 +51,8 @@ def focal_section(stack: FocalStack) -> Section:
         f"Three cards, 5 cm behind, in and 4.5 cm before the middle panel, seen from {DISTANCE_M:g} m by a pupil of "
         f"{1000 * PUPIL_M:g} mm. The layers ({stack.model}) are solved for two pinhole eyes only; what the rest of the "
         f"pupil sees nobody asked for. Exactly at the pinhole: {stack.pinhole_db:.1f} dB.",
-        "On a flat panel every card is sharpest in the panel's plane, wherever it seems to stand: how far the solid tops "
-        "below lie from that plane, towards the dashed ones, is what the stack gains.",
+        "On a flat panel every card is sharpest in the panel's plane, wherever it seems to stand: how far the solid "
+        "tops below lie from that plane, towards the dashed ones, is what the stack gains.",
     ]
     return Section("Focal parallax", text, [slice_picture(stack), contrast_plot(stack)], [slices, conflict])
 

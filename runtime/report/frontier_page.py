@@ -17,8 +17,8 @@ def frontier_section(results: Sequence[MethodResult], *, pairs: str, title: str,
     front = {id(result) for result in pareto(results)}
     text = [
         f"Every method on {pairs}, in one run. The error is what the eyes see of the displayed layers: clipped, 8 "
-        "bits. The time is that of the whole prediction, from two decoded pictures to three 8-bit layers, warps included. "
-        "Each method runs in a process of its own; its memory is that process's peak.",
+        "bits. The time is that of the whole prediction, from two decoded pictures to three 8-bit layers, warps "
+        "included. Each method runs in a process of its own; its memory is that process's peak.",
     ]
     figures = [frontier_plot(results, name=f"frontier-{name}")]
     if any(result.psnr_db_off_eye for result in results):

@@ -88,10 +88,8 @@ def latency_section(runs: Sequence[Run], *, scale: float = 0.5) -> Section:
         marks = np.percentile(run.latency_ms, [50, 95, 99]) if run.latency_ms.size else [np.nan] * 3
         left_out = "; ".join(str(item["what"]) for item in s.get("plan", []))
         psnr = s.get("psnr_db")
-        rows.append(
-            [run.name, *(f"{m:.0f}" for m in marks), f"{s['fps']:.1f}", str(s["inferences"]), str(s["dropped"])]
-            + ["" if psnr is None else f"{psnr:.2f}", left_out]
-        )
+        row = [run.name, *(f"{m:.0f}" for m in marks), f"{s['fps']:.1f}", str(s["inferences"]), str(s["dropped"])]
+        rows.append([*row, "" if psnr is None else f"{psnr:.2f}", left_out])
     text = [
         f"The daemon on its built-in recording and scene, in real time, offscreen, panels at {scale:g} of their "
         "resolution. The latency runs from the sample's capture to the light of the frame that was made from it; "

@@ -64,9 +64,9 @@ def _map(axes: Any, table: Any) -> Any:
 
 def gap_section(curves: Sequence[Curve]) -> Section:
     """Why panels must not stand too close."""
-    figure = _curves(
-        curves, "gap-between-panels", "gap between neighbouring panels, mm", "displayed PSNR, dB", log=True
-    )
+    labels = ("gap between neighbouring panels, mm", "displayed PSNR, dB")
+    caption = "The viewer stays equally far from the front panel."
+    figure = _curves(curves, "gap-between-panels", labels, caption, log=True)
     text = [
         "The outer panels carry the difference between the eyes by their parallax, which grows with the gap: the "
         "smaller the gap, the stiffer the problem, and the less of the difference fits between black and white.",

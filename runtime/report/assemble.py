@@ -1,0 +1,191 @@
+"""The whole report: what is measured, in which order, and the page and record that come of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from runtime.config import StackGeometry
+from runtime.errors import FatalError
+from runtime.report import focal, horizon, latency, sweeps
+from runtime.report.focal_page import focal_section
+from runtime.report.frontier import MethodResult, check_models, measure
+from runtime.report.frontier_page import frontier_section
+from runtime.report.machine import describe
+from runtime.report.methods import Method, shipped_and_references
+from runtime.report.page import Page, Section, Tile
+from runtime.report.pairs import StillPair, eyes_at, procedural_pairs, read_pairs
+from runtime.report.simulate import Simulation
+from runtime.report.sweep_page import gap_section, knob_section, resolution_section, tolerance_section, volume_section
+
+MODELS = ("fast", "balanced", "best")
+OFFSETS_MM = tuple(range(-8, 9, 2))
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A page, and the same as a record."""
+
+    page: Page
+    record: dict[str, Any]
+
+
+def whole_report(
+    *,
+    pairs: Path | None,
+    with_focal: bool,
+    models: Sequence[str],
+    quick: bool,
+    command: str,
+    progress: Progress = lambda name: None,
+) -> Report:
+    """Measure everything. `quick`: quarter-size panels and fewer references, for a first look.
+
+    Raises InputError for case files and models with mistakes, before anything is measured.
+    """
+    cases = read_pairs(pairs) if pairs is not None else []
+    check_models(models)
+    stack = StackGeometry().stack()
+    small = replace(stack, width_px=480, height_px=270)
+    if quick:
+        stack = replace(stack, width_px=960, height_px=540)
+    methods = shipped_and_references(models=models, quick=quick)
+    record: dict[str, Any] = {"machine": describe(seed=0), "command": command}
+    sections: list[Section] = []
+
+    def tell(name: str) -> Callable[[int, int], None]:
+        return lambda done, of: progress(f"{name} {done}/{of}")
+
+    found: list[MethodResult] = []
+    for name, own in _by_size(cases).items():
+        results = measure(methods, own, progress=tell(f"frontier, case files {name}"))
+        found += results
+        title = f"Error against run time: {len(own)} case file{'s' if len(own) > 1 else ''}, {name}"
+        sections.append(
+            frontier_section(results, pairs=", ".join(p.name for p in own), title=title, name=f"cases-{name}")
+        )
+    progress("drawing pairs")
+    own_pairs = procedural_pairs(stack)
+    results = measure(methods, own_pairs, progress=tell("frontier, built-in scenes"))
+    text = "; ".join(pair.name for pair in own_pairs)
+    title = "Error against run time: built-in scenes"
+    sections.append(frontier_section(results, pairs=text, title=title, name="scenes"))
+    record["methods"] = [r.record() for r in (found or results)]
+    if found:
+        record["methods_on_built_in_scenes"] = [r.record() for r in results]
+
+    sections += _sweeps(record, stack=stack, small=small, progress=progress)
+    progress("the daemon, plan on and off")
+    scale = 0.25 if quick else 0.5
+    runs = latency.plan_on_and_off(frames=60 if quick else 150, scale=scale)
+    sections.insert(len(sections) - 1, latency.latency_section(runs, scale=scale))
+    record["runs"] = [{"name": run.name, "latency_ms": run.latency_ms, "summary": run.summary} for run in runs]
+    if with_focal:
+        stacks = []
+        full = StackGeometry().stack()
+        with focal.cards_painter(full) as painter:
+            stacks.append(focal.focal_stack(painter, full, model="best", progress=tell("focal stack")))
+        sections += [focal_section(one) for one in stacks]
+        record["focal"] = [_focal_record(one) for one in stacks]
+    return Report(_page(sections, found or results, methods, record, command), record)
+
+
+def _by_size(cases: Sequence[StillPair]) -> dict[str, list[StillPair]]:
+    groups: dict[str, list[StillPair]] = {}
+    for pair in cases:
+        groups.setdefault(f"{pair.stack.width_px}x{pair.stack.height_px}", []).append(pair)
+    return groups
+
+
+def _sweeps(record: dict[str, Any], *, stack: Any, small: Any, progress: Progress) -> list[Section]:
+    distance_m = 0.6
+    with Simulation("demo", small, model="balanced") as simulation:
+        progress("viewing volume")
+        volume = sweeps.viewing_volume(simulation)
+        progress("tolerance to tracking errors")
+        tolerance = sweeps.tolerance_map(simulation, eyes_at(distance_m=distance_m), OFFSETS_MM)
+    progress("tracker horizon")
+    horizons = horizon.all_motions()
+    progress("tolerance knob")
+    knob = sweeps.over_tolerance("demo", small, MODELS, distance_m=distance_m)
+    progress("panel gap")
+    gaps = sweeps.over_gaps("demo", small, MODELS, distance_m=distance_m - 0.06)
+    progress("resolution")
+    sizes = sweeps.over_resolutions("demo", stack, MODELS, distance_m=distance_m)
+    record["viewing_volume"] = {
+        "angles_deg": volume.angles_deg,
+        "distances_m": volume.distances_m,
+        "psnr_db": volume.psnr_db,
+    }
+    record["tolerance"] = {"offsets_mm": tolerance.offsets_mm, "psnr_db": tolerance.psnr_db}
+    record["horizon"] = [
+        {
+            "motion": h.motion,
+            "horizons_ms": horizon.HORIZONS_MS,
+            "tracked_mm": h.tracked_mm,
+            "untracked_mm": h.untracked_mm,
+        }
+        for h in horizons
+    ]
+    record["knob"] = [{"model": c.name, "exact_db": c.x, "off_2mm_db": c.y} for c in knob]
+    record["gaps"] = [{"model": c.name, "gap_mm": c.x, "psnr_db": c.y} for c in gaps]
+    record["resolutions"] = [
+        {"model": s.model, "width_px": s.width_px, "height_px": s.height_px, "ms": s.ms, "psnr_db": s.psnr_db}
+        for s in sizes
+    ]
+    return [
+        knob_section(knob),
+        volume_section(volume, model="balanced", scene="demo"),
+        tolerance_section(tolerance, model="balanced", distance_m=distance_m),
+        horizon.horizon_section(horizons, tolerance),
+        gap_section(gaps),
+        resolution_section(sizes),
+    ]
+
+
+def _focal_record(stack: focal.FocalStack) -> dict[str, Any]:
+    return {
+        "model": stack.model,
+        "pinhole_db": stack.pinhole_db,
+        "slices": [
+            {"plane_m": s.plane_m, "psnr_db": s.psnr_db, "contrast": s.contrast_shown, "contrast_true": s.contrast_true}
+            for s in stack.slices
+        ],
+        "cards": [
+            {"distance_m": c.card_m, "sharpest_m": c.sharpest_shown_m, "sharpest_true_m": c.sharpest_true_m}
+            for c in stack.cards
+        ],
+    }
+
+
+def _page(
+    sections: list[Section],
+    results: Sequence[MethodResult],
+    methods: Sequence[Method],
+    record: dict[str, Any],
+    command: str,
+) -> Page:
+    by_name = {result.name: result for result in results}
+    balanced = by_name.get("balanced")
+    if balanced is None:
+        raise FatalError(f"none of {', '.join(m.name for m in methods)} is the default model")
+    best = max((r for r in results if r.kind == "network"), key=lambda r: r.psnr_db)
+    references = [r for r in results if r.kind == "iterative"]
+    as_good = [r for r in references if r.psnr_db >= balanced.psnr_db]
+    tiles = [
+        Tile(f"{balanced.psnr_db:.1f} dB", "balanced, displayed"),
+        Tile(f"{best.psnr_db:.1f} dB", f"{best.name}, displayed"),
+        Tile(f"{balanced.memory_mib:.0f} MiB", "balanced, peak"),
+    ]
+    lead = f"The default model shows {balanced.psnr_db:.1f} dB"
+    if as_good:
+        quickest = min(as_good, key=lambda r: r.ms_p50)
+        ratio = quickest.ms_p50 / balanced.ms_p50
+        tiles.insert(0, Tile(f"{ratio:.1f} ×", f"balanced is faster than {quickest.name}"))
+        lead += f"; the first iterative method that is as good, {quickest.name}, takes {ratio:.1f} times as long."
+    else:
+        lead += ", which none of the iterative references reaches."
+    return Page("Error against run time", lead, sections, record["machine"], command, tiles)

@@ -1,0 +1,200 @@
+"""The frontier's regression file: a quick frontier and the stages' times, beside a yardstick of the machine's speed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from runtime.config import ModelSettings, StackGeometry, read_table
+from runtime.errors import InputError
+from runtime.optics.stack import PanelStack
+from runtime.optics.views import raster_from_stack
+from runtime.records import F64
+from runtime.report.frontier import measure
+from runtime.report.machine import describe
+from runtime.report.methods import Method
+from runtime.report.pairs import FOV_DEG, Painter, eyes_at
+
+VERSION = 1
+MODELS = ("fast", "balanced", "best")
+SIZES = ((960, 540), (1920, 1080))
+RUNS = 15
+WORSE_DB = 0.1  # more than rounding and the order of threads can change
+SLOWER = 0.15  # at least; more where the runs themselves scatter more
+MORE_MEMORY = 0.15
+SCATTERS = 3.0  # of the medians' own scatter before a difference counts
+
+
+def yardstick_ms() -> float:
+    """A fixed piece of work of the same kinds (warp, table, product of matrices): median of nine."""
+    import cv2
+
+    picture = np.random.default_rng(0).integers(0, 256, (1080, 1920, 4), dtype=np.uint8)
+    left = np.random.default_rng(1).random((1080, 240), dtype=np.float32)
+    right = np.random.default_rng(2).random((240, 1920), dtype=np.float32)
+    matrix = np.array([[1.01, 0.0, 3.3], [0.0, 1.01, 1.7]])
+    table = np.arange(256, dtype=np.uint8)[::-1].copy()
+    times = []
+    for _ in range(9):
+        start = time.perf_counter()
+        cv2.LUT(cv2.warpAffine(picture, matrix, (1920, 1080)), table)
+        _ = left @ right
+        times.append((time.perf_counter() - start) * 1e3)
+    return float(np.median(times))
+
+
+def scatter(values: Sequence[float]) -> float:
+    """How far a median of these may be off, relative: 1.4826·MAD·1.25/sqrt(n)."""
+    middle = float(np.median(values))
+    deviation = float(np.median(np.abs(np.asarray(values) - middle)))
+    return 1.4826 * 1.2533 * deviation / middle / len(values) ** 0.5
+
+
+def stage_times(model: str, stack: PanelStack, eyes_m: F64) -> dict[str, Any]:
+    """Medians of what a frame costs, stage by stage, drawn and predicted as the daemon does."""
+    from runtime.model.predictor import load_predictor
+
+    predictor = load_predictor(model, stack, ModelSettings())
+    stages: dict[str, list[float]] = {}
+    totals: list[float] = []
+    with Painter("demo", stack) as painter:
+        for run in range(RUNS + 2):
+            start = time.perf_counter()
+            rasters = predictor.rasters(eyes_m)
+            images = [
+                [
+                    painter.draw(eye, raster_from_stack(eye, r), width_px=r.width_px, height_px=r.height_px)
+                    for r in rasters
+                ]
+                for eye in eyes_m
+            ]
+            drawn = time.perf_counter()
+            prediction = predictor.predict(images, eyes_m)
+            done = time.perf_counter()
+            if run < 2:
+                continue
+            totals.append((done - start) * 1e3)
+            stages.setdefault("render", []).append((drawn - start) * 1e3)
+            for name, value in prediction.stage_ms.items():
+                stages.setdefault(name, []).append(value)
+    predictor.close()
+    return {
+        "name": model,
+        "width_px": stack.width_px,
+        "height_px": stack.height_px,
+        "stage_ms": {name: float(np.median(values)) for name, values in stages.items()},
+        "total_ms": float(np.median(totals)),
+        "total_scatter": scatter(totals),
+    }
+
+
+def run(
+    *, sizes: Sequence[tuple[int, int]] = SIZES, progress: Callable[[str], None] = lambda text: None
+) -> dict[str, Any]:
+    """The regression file's content. Takes about a minute."""
+    before = yardstick_ms()
+    stages, methods = [], []
+    eyes = eyes_at(distance_m=0.6, height_m=0.05)
+    for width, height in sizes:
+        stack = replace(StackGeometry().stack(), width_px=width, height_px=height)
+        with Painter("demo", stack) as painter:
+            pair = painter.pair("demo", eyes, stack, fov_deg=FOV_DEG, off_mm=(2,))
+        for model in MODELS:
+            progress(f"{model} {width}x{height}")
+            stages.append(stage_times(model, stack, eyes))
+            result = measure([Method(model, "network", model)], [pair])[0]
+            methods.append({key: value for key, value in result.record().items() if key != "pairs"})
+    return {
+        "version": VERSION,
+        "machine": describe(seed=0),
+        "yardstick_ms": (before + yardstick_ms()) / 2,
+        "methods": methods,
+        "stages": stages,
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One thing that differs between two files beyond noise."""
+
+    what: str
+    worse: bool
+    text: str
+
+
+def compare(old: dict[str, Any], new: dict[str, Any]) -> list[Change]:
+    """What got slower, faster, worse or better. Times are compared as multiples of each file's own yardstick."""
+    changes: list[Change] = []
+    machine = new["yardstick_ms"] / old["yardstick_ms"]
+    for before, after in _matched(old["stages"], new["stages"], changes):
+        ratio = after["total_ms"] / before["total_ms"] / machine
+        noise = max(SLOWER, SCATTERS * float(np.hypot(before["total_scatter"], after["total_scatter"])))
+        if ratio > 1 + noise or ratio < 1 / (1 + noise):
+            text = f"{ratio:.2f} times the time of a frame (noise {noise:.0%})"
+            changes.append(Change(_name(after), ratio > 1, text))
+    for before, after in _matched(old["methods"], new["methods"], changes):
+        for key, label in (("psnr_db", "at the eyes"), ("worst_eye_psnr_db", "at the worse eye")):
+            gain = after[key] - before[key]
+            if abs(gain) > WORSE_DB:
+                changes.append(Change(_name(after), gain < 0, f"{gain:+.2f} dB {label}"))
+        gain = after["psnr_db_off_eye"].get("2mm", 0.0) - before["psnr_db_off_eye"].get("2mm", 0.0)
+        if abs(gain) > WORSE_DB:
+            changes.append(Change(_name(after), gain < 0, f"{gain:+.2f} dB 2 mm off the eyes"))
+        ratio = after["memory_mib"] / before["memory_mib"]
+        if ratio > 1 + MORE_MEMORY or ratio < 1 / (1 + MORE_MEMORY):
+            changes.append(Change(_name(after), ratio > 1, f"{ratio:.2f} times the memory"))
+    return changes
+
+
+def _matched(
+    old: Sequence[dict[str, Any]], new: Sequence[dict[str, Any]], changes: list[Change]
+) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    after = {_name(entry): entry for entry in new}
+    pairs = []
+    for entry in old:
+        if _name(entry) in after:
+            pairs.append((entry, after[_name(entry)]))
+        elif not any(change.what == _name(entry) for change in changes):
+            changes.append(Change(_name(entry), True, "is missing from the new file"))
+    return pairs
+
+
+def _name(entry: dict[str, Any]) -> str:
+    return f"{entry['name']} {entry['width_px']}x{entry['height_px']}"
+
+
+NUMBERS = {
+    "stages": ("total_ms", "total_scatter", "width_px", "height_px"),
+    "methods": ("psnr_db", "worst_eye_psnr_db", "memory_mib", "width_px", "height_px"),
+}
+
+
+def read(path: Path) -> dict[str, Any]:
+    """A regression file. Raises InputError, naming file and field, for anything else."""
+    table = read_table(path)
+    if table.get("version") != VERSION:
+        raise InputError(path, "version", f"must be {VERSION}: made by `phasestack bench`")
+    if not _is_positive(table.get("yardstick_ms")):
+        raise InputError(path, "yardstick_ms", "must be a positive number")
+    for name, keys in NUMBERS.items():
+        entries = table.get(name)
+        if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+            raise InputError(path, name, "must be a list of tables")
+        for index, entry in enumerate(entries):
+            for key in keys:
+                if not isinstance(entry.get(key), int | float):
+                    raise InputError(path, f"{name}[{index}].{key}", "must be a number")
+            if not isinstance(entry.get("name"), str):
+                raise InputError(path, f"{name}[{index}].name", "must be a name")
+            if name == "methods" and not isinstance(entry.get("psnr_db_off_eye"), dict):
+                raise InputError(path, f"{name}[{index}].psnr_db_off_eye", "must be a table")
+    return table
+
+
+def _is_positive(value: Any) -> bool:
+    return isinstance(value, int | float) and value > 0
