@@ -31,7 +31,7 @@ def bench(
     from runtime.report.progress import status_line
 
     with status_line("bench") as tell:
-        record = benchmark.run(progress=tell)
+        record = benchmark.measured(progress=tell)
     if out is not None:
         write_json(out, record)
     if as_json:

@@ -41,11 +41,12 @@ def report(
         print(to_json(done.record))
         return
     console = Console(highlight=False)
-    console.print(done.page.lead)
+    console.print(done.page.lead, soft_wrap=True)
     for result in sorted(done.record["methods"], key=lambda r: r["ms_p50"]):
         size = f"{result['width_px']}x{result['height_px']}"
         console.print(
             f"{result['name']:18}{size:>11}{result['ms_p50']:10.1f} ms{result['psnr_db']:8.2f} dB"
-            f"{result['worst_eye_psnr_db']:8.2f} dB worst eye{result['memory_mib']:7.0f} MiB"
+            f"{result['worst_eye_psnr_db']:8.2f} dB worst eye{result['memory_mib']:7.0f} MiB",
+            soft_wrap=True,
         )
     console.print(f"see {out / 'index.html'}")

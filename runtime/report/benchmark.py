@@ -93,7 +93,7 @@ def stage_times(model: str, stack: PanelStack, eyes_m: F64) -> dict[str, Any]:
     }
 
 
-def run(
+def measured(
     *, sizes: Sequence[tuple[int, int]] = SIZES, progress: Callable[[str], None] = lambda text: None
 ) -> dict[str, Any]:
     """The regression file's content. Takes about a minute."""

@@ -32,6 +32,8 @@ def spare_digits(case: Case) -> float:
     """Decimal digits between the error and its tolerance; negative where it fails."""
     if not math.isfinite(case.forward_error):
         return math.nan
+    if case.forward_error == 0.0:
+        return math.inf
     return math.log10(max(case.tolerance, 1e-18) / max(case.forward_error, 1e-18))
 
 
@@ -56,7 +58,7 @@ def heat_map(cases: Sequence[Case]) -> Figure:
         for y, (_, own) in enumerate(rows):
             for x, case in enumerate(own):
                 spare = spare_digits(case)
-                face = "#d7dce6" if math.isnan(spare) else map_(norm(max(spare, 0)))
+                face = "#d7dce6" if math.isnan(spare) else map_(norm(min(max(spare, 0), 19)))
                 if not case.passed:
                     face = "#c0322b"
                 axes.add_patch(Rectangle((x, y), 0.9, 0.86, facecolor=face, linewidth=0))
@@ -107,9 +109,9 @@ def condition_plot(cases: Sequence[Case]) -> Figure:
 
 def stiffness_plot(cases: Sequence[Case]) -> Figure:
     """What each method leaves of the stiffest wave, over the condition of the two-eye operator."""
+    own = [c for c in cases if c.stage == "solve" and c.measure == "of the difference"]
     with drawing(9.6, 4.2) as figure:
         axes = figure.add_subplot()
-        own = [c for c in cases if c.stage == "solve" and c.measure == "of the difference"]
         for name in dict.fromkeys(case.name.partition(",")[0] for case in own):
             points = sorted((c.condition, c.forward_error) for c in own if c.name.partition(",")[0] == name)
             axes.plot(*zip(*points, strict=True), marker="o", markersize=4, label=name)
@@ -163,7 +165,7 @@ def stability_page(cases: Sequence[Case], *, machine: dict[str, str], seconds: f
             "digits or a closed form. The tolerance is stated before the case runs: a small multiple of the rounding "
             "of the input times the condition of the problem, or what is written beside it.",
         ],
-        [heat_map(cases), condition_plot(cases), stiffness_plot(cases)],
+        [heat_map(cases), condition_plot(cases), *([stiffness_plot(cases)] if "solve" in stages else [])],
         [] if not failed else [Table(headings, [row(c) for c in failed], "What fails", ["bad"] * len(failed))],
     )
     sections = [summary]
