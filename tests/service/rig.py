@@ -110,15 +110,16 @@ class Rig:
 class BreakablePanels:
     """Any panels, which are lost while `lost` says so."""
 
-    def __init__(self, panels: Any) -> None:
-        self._panels, self.lost, self.name = panels, "", panels.name
+    def __init__(self, panels: Any, *, keep: bool = True) -> None:
+        self._panels, self.lost, self.name, self._keep = panels, "", panels.name, keep
         self.shown: list[LayerFrame] = []
 
-    def present(self, frame: LayerFrame) -> PresentReport:
+    def present(self, frame: LayerFrame, *, unchanged: bool = False) -> PresentReport:
         if self.lost:
             raise PanelLost(self.lost)
-        self.shown.append(LayerFrame(frame.number, frame.layers.copy()))
-        return self._panels.present(frame)
+        if self._keep:
+            self.shown.append(LayerFrame(frame.number, frame.layers.copy()))
+        return self._panels.present(frame, unchanged=unchanged)
 
     def close(self) -> None:
         self._panels.close()

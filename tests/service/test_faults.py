@@ -87,7 +87,7 @@ def test_a_model_that_answers_nan_is_a_model_that_failed(rig):
     session = rig.loop.pipeline.predictor.session
     run = session.run
     session.run = lambda *inputs, output_shape: np.full(output_shape, np.nan, np.float32)
-    account = rig.turn_until("degraded: model")
+    account = rig.turn_until("degraded: model", within_s=2.0)
     assert account.presented
     assert np.array_equal(rig.loop.layers, before)
     session.run = run
