@@ -1,8 +1,8 @@
 """Resampling between rasters on parallel planes, as one eye sees them: a scale and a shift.
 
 OpenCV's `resize` is two to four times as fast as its `warpAffine`, and finer (1/2048 against 1/32 pixel), but
-knows no shift. So the result is begun at a pixel whose place in the source is a whole number, to 1/64 pixel; what
-lies beside it is warped. Rasters that are also sheared (a tilted head) are warped altogether.
+knows no shift. So the result is begun at a pixel whose place in the source is nearly a whole number; what lies
+beside it is warped. Rasters that are also sheared (a tilted head) are warped altogether.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from runtime.records import F64
 
 MARGIN = 4  # pixels to spare, right and below, in buffers that are resampled into
 SEARCH = 96  # pixels among which a whole place in the source is looked for
-PHASE_TOLERANCE = 1 / 64
+GOOD_PHASE = 1 / 24  # of a pixel: the search ends here; so small a shift leaves an error below -55 dB
+WORST_PHASE = 1 / 12  # where nothing better is found
 
 Image = NDArray[Any]
 
@@ -36,60 +37,73 @@ def buffer(height_px: int, width_px: int, dtype: Any = np.int16) -> Image:
     return np.zeros((height_px + MARGIN, width_px + MARGIN, 3), dtype)[:height_px, :width_px]
 
 
-def resample(image: Image, *, image_from_result: F64, out: Image, cubic: bool = False) -> Image:
-    """Bilinear (or bicubic) samples of an (h, w, C) image at the positions of a raster, into `out`; edges repeated.
+def resample(image: Image, *, image_from_result: F64, out: Image, outside: int = 0, cubic: bool = False) -> Image:
+    """Bilinear (or bicubic) samples of an (h, w, C) image at the positions of a raster, into `out`.
 
-    image_from_result: 3x3 affine, pixel centres at half-integers. `out` comes from `buffer`.
+    image_from_result: 3x3 affine, pixel centres at half-integers. `out` comes from `buffer`. Beside the image the
+    result is `outside` (axis-aligned rasters) or its repeated edge (sheared ones): no ray through there crosses
+    every panel, so that nobody sees it.
     """
     flags = cv2.INTER_CUBIC if cubic else cv2.INTER_LINEAR
     if image_from_result[0, 1] == 0.0 and image_from_result[1, 0] == 0.0:
         across = _whole_place(image_from_result[0, 0], image_from_result[0, 2], image.shape[1], out.shape[1])
         down = _whole_place(image_from_result[1, 1], image_from_result[1, 2], image.shape[0], out.shape[0])
         if across is not None and down is not None:
-            return _resized(image, image_from_result, out, across, down, flags)
+            return _resized(image, image_from_result, out, across, down, flags, outside)
     return _warped(image, image_from_result, out, 0, 0, *out.shape[1::-1])
 
 
-def _whole_place(scale: float, shift: float, source_px: int, result_px: int) -> tuple[int, int, int] | None:
-    """(first result pixel, its source pixel, how many source pixels) or None where there is none."""
+def _whole_place(scale: float, shift: float, source_px: int, result_px: int) -> tuple[int, int, int, int] | None:
+    """(first result pixel inside the source, first to resize, its source pixel, how many) or None: warp instead."""
     if scale <= 0.0:
         return None
     first = max(0, int(np.ceil(-shift / scale - 1e-9)))
     places = (first + np.arange(SEARCH)) * scale + shift
     errors = np.abs(places - np.rint(places))
-    best = int(np.argmax(errors < PHASE_TOLERANCE / 2))
-    if errors[best] >= PHASE_TOLERANCE / 2:
+    best = int(np.argmax(errors < GOOD_PHASE))
+    if errors[best] >= GOOD_PHASE:
         best = int(np.argmin(errors))
-        if errors[best] > PHASE_TOLERANCE:
+        if errors[best] > WORST_PHASE:
             return None
     start, source = first + best, int(np.rint(places[best]))
     count = min(source_px - source, int(np.ceil((result_px - start) * scale)) + 1)
     if count < 8 or result_px - start < 8:
         return None
-    return start, source, count
+    return first, start, source, count
 
 
 def _resized(
-    image: Image, matrix: F64, out: Image, across: tuple[int, int, int], down: tuple[int, int, int], flags: int
+    image: Image,
+    matrix: F64,
+    out: Image,
+    across: tuple[int, int, int, int],
+    down: tuple[int, int, int, int],
+    flags: int,
+    outside: int,
 ) -> Image:
-    (u0, su, columns), (v0, sv, rows) = across, down
+    (first_u, u0, su, columns), (first_v, v0, sv, rows) = across, down
     fx, fy = 1.0 / matrix[0, 0], 1.0 / matrix[1, 1]
-    width, height = round(columns * fx), round(rows * fy)
     parent = out.base
     assert isinstance(parent, np.ndarray)
-    # Never more than the margin: `count` above ends at most one source pixel past the result.
-    if u0 + width > parent.shape[1] or v0 + height > parent.shape[0]:
-        columns, rows = columns - 1, rows - 1
-        width, height = round(columns * fx), round(rows * fy)
+    width, height = round(columns * fx), round(rows * fy)
+    # The counts end at most one source pixel past the result: more than the margin only when magnified.
+    while u0 + width > parent.shape[1]:
+        columns -= 1
+        width = round(columns * fx)
+    while v0 + height > parent.shape[0]:
+        rows -= 1
+        height = round(rows * fy)
     target = parent[v0 : v0 + height, u0 : u0 + width]
-    done = cv2.resize(image[sv : sv + rows, su : su + columns], None, dst=target, fx=fx, fy=fy, interpolation=flags)
-    if done is not target and not np.shares_memory(done, target):
-        target[...] = done[: target.shape[0], : target.shape[1]]
+    cv2.resize(image[sv : sv + rows, su : su + columns], None, dst=target, fx=fx, fy=fy, interpolation=flags)
     h, w = out.shape[:2]
     right, below = min(w, u0 + width), min(h, v0 + height)
-    for x0, y0, x1, y1 in ((0, 0, w, v0), (0, below, w, h), (0, v0, u0, below), (right, v0, w, below)):
+    for x0, y0, x1, y1 in ((first_u, first_v, right, v0), (first_u, v0, u0, below)):
         if x1 > x0 and y1 > y0:
             _warped(image, matrix, out, x0, y0, x1, y1)
+    out[:first_v] = outside
+    out[below:] = outside
+    out[first_v:below, :first_u] = outside
+    out[first_v:below, right:] = outside
     return out
 
 

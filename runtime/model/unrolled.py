@@ -46,7 +46,7 @@ class UnrolledPredictor(Predictor):
         self._seen = {(n, side): buffer(h, w) for n in (REAR, FRONT) for side in (0, 1)}
         self._residual = (buffer(h, w), buffer(h, w))
         self._back = (buffer(h, w), buffer(h, w))
-        self._centre: I16 = np.empty((h, w, 3), np.int16)
+        self._centre: U8 = np.empty((h, w, 3), np.uint8)
         self._chain_buffers: dict[tuple[int, int], Any] = {}
 
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
@@ -64,6 +64,8 @@ class UnrolledPredictor(Predictor):
         wanted = [cv2.LUT(cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB), table) for picture in pictures]
         first = True
         for step in contract.steps:
+            if not first:
+                self._lacks(wanted)
             if step.kind == "chain":
                 needs = self._first_needs(pictures, table) if first else self._later_needs()
                 self._chain(needs, frame, eyes_m, watch, size=step.size, first=first)
@@ -75,9 +77,11 @@ class UnrolledPredictor(Predictor):
             for n in changed:
                 for side, eye_m in enumerate(eyes_m):
                     self._between(self._outer[n], eye_m, of=n, on=CENTRE, out=self._seen[n, side])
-            self._close_centre(wanted)
-        for n, codes in ((REAR, self._outer[REAR]), (CENTRE, self._centre), (FRONT, self._outer[FRONT])):
-            cv2.cvtColor(cv2.convertScaleAbs(codes, alpha=1 / SUBCODE), cv2.COLOR_RGB2RGBA, dst=self._layers[n])
+        self._close_centre(wanted)
+        cv2.cvtColor(self._centre, cv2.COLOR_RGB2RGBA, dst=self._layers[CENTRE])
+        for n in (REAR, FRONT):
+            codes = cv2.convertScaleAbs(self._outer[n], alpha=1 / SUBCODE)
+            cv2.cvtColor(codes, cv2.COLOR_RGB2RGBA, dst=self._layers[n])
         watch.lap("finish")
         return Prediction(self._layers, watch.stage_ms)
 
@@ -87,28 +91,43 @@ class UnrolledPredictor(Predictor):
     def _between(self, image: I16, eye_m: F64, *, of: int, on: int, out: I16) -> I16:
         """Panel `of`'s pixels on panel `on`'s raster, as an eye sees them in line."""
         matrix = target_from_source(eye_m, source=self.stack.panel(on), target=self.stack.panel(of))
-        return resample(image, image_from_result=matrix, out=out)
+        return resample(image, image_from_result=matrix, out=out, outside=0 if of == CENTRE else START)
 
-    def _close_centre(self, wanted: Sequence[I16]) -> None:
-        """The best centre panel for the outer ones, per pixel and in closed form; and what each eye still lacks."""
-        rear, front = ([self._seen[n, side] for side in (0, 1)] for n in (REAR, FRONT))
-        residual, centre = self._residual, self._centre
+    def _lacks(self, wanted: Sequence[I16]) -> None:
+        """What each eye still lacks when the centre panel is the best one for the outer panels."""
+        rear, front, residual = self._seen_of(REAR), self._seen_of(FRONT), self._residual
 
         def work(rows: slice) -> None:
-            left = wanted[0][rows] - rear[0][rows]
-            left -= front[0][rows]
-            right = wanted[1][rows] - rear[1][rows]
-            right -= front[1][rows]
+            left, right = residual[0][rows], residual[1][rows]
+            np.subtract(wanted[0][rows], rear[0][rows], out=left)
+            np.subtract(left, front[0][rows], out=left)
+            np.subtract(wanted[1][rows], rear[1][rows], out=right)
+            np.subtract(right, front[1][rows], out=right)
             best = left + right
-            best += SUBCODE
-            best >>= 5
-            best <<= 4
+            np.right_shift(best, 1, out=best)
             np.clip(best, 0, FULL, out=best)
-            centre[rows] = best
-            np.subtract(left, best, out=residual[0][rows])
-            np.subtract(right, best, out=residual[1][rows])
+            np.subtract(left, best, out=left)
+            np.subtract(right, best, out=right)
 
         self._rows.each(self.stack.height_px, work)
+
+    def _close_centre(self, wanted: Sequence[I16]) -> None:
+        """The best centre panel for the outer ones, per pixel and in closed form, in 8-bit codes."""
+        rear, front, centre = self._seen_of(REAR), self._seen_of(FRONT), self._centre
+
+        def work(rows: slice) -> None:
+            best = wanted[0][rows] + wanted[1][rows]
+            for seen in (*rear, *front):
+                np.subtract(best, seen[rows], out=best)
+            np.add(best, SUBCODE, out=best)
+            np.right_shift(best, 5, out=best)
+            np.clip(best, 0, 255, out=best)
+            centre[rows] = best
+
+        self._rows.each(self.stack.height_px, work)
+
+    def _seen_of(self, panel: int) -> tuple[I16, I16]:
+        return self._seen[panel, 0], self._seen[panel, 1]
 
     def _correct(self, panel: int, eyes_m: F64, *, size: float) -> None:
         """Change one outer panel by what both eyes lack along the rays through each of its pixels."""
@@ -116,13 +135,14 @@ class UnrolledPredictor(Predictor):
         for side, eye_m in enumerate(eyes_m):
             self._between(self._residual[side], eye_m, of=CENTRE, on=panel, out=back[side])
         outer = self._outer[panel]
-        gain = round(size * 256)
+        eighths = np.int16(round(size * 8))
 
         def work(rows: slice) -> None:
-            change = (back[0][rows].astype(np.int32) + back[1][rows]) * gain
-            change >>= 8
-            codes = outer[rows] + change.astype(np.int16)
-            _settle(codes, outer[rows])
+            change = back[0][rows] + back[1][rows]
+            np.right_shift(change, 3, out=change)
+            np.multiply(change, eighths, out=change)
+            np.add(change, outer[rows], out=change)
+            _settle(change, outer[rows])
 
         self._rows.each(self.stack.height_px, work)
 
@@ -177,7 +197,7 @@ class UnrolledPredictor(Predictor):
             matrix[0, 2] += frame.cell_px  # the answer begins one parallax before the first column
             codes = cv2.addWeighted(wave, sign * FULL * size, wave, 0.0, START if first else 0.0, dtype=cv2.CV_16S)
             target = self._outer[n] if first else self._back[0]
-            resample(codes, image_from_result=matrix, out=target, cubic=True)
+            resample(codes, image_from_result=matrix, out=target, outside=START if first else 0, cubic=True)
             self._take(self._outer[n], None if first else target)
 
     def _take(self, outer: I16, change: I16 | None) -> None:
