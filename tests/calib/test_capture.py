@@ -1,0 +1,212 @@
+"""From samples to pairs: a median over half a second, on disk when it is accepted, from a person or a recording."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from calib.capture import EyeWindow, midpoint, true_pair
+from calib.commands import app
+from calib.keys import Key
+from calib.pairs import PairsFile, read_pairs
+from calib.viewpoints import grid
+from calib.walk import Walk, accept
+from runtime.clock import NS_PER_S
+from runtime.errors import InputError
+from runtime.eyes.demo_geometry import demo_stack_from_sensor
+from runtime.records import EyePoints, SensorFrame
+from runtime.sensor.recording import recording_to
+from runtime.sensor.recording_format import RecordingHeader
+
+STEP_NS = NS_PER_S // 30
+run = CliRunner()
+
+
+def eyes_at(stack_m: np.ndarray, *, noise_m: float = 0.0, random: np.random.Generator | None = None) -> EyePoints:
+    """Two eyes about a midpoint in `stack`, as the demo's camera measures them."""
+    both = stack_m + np.array([[0.0, -0.03, 0.0], [0.0, 0.03, 0.0]])
+    sensor_from_stack = np.linalg.inv(demo_stack_from_sensor())
+    sensor = both @ sensor_from_stack[:3, :3].T + sensor_from_stack[:3, 3]
+    return EyePoints(sensor + (random.normal(scale=noise_m, size=(2, 3)) if random else 0.0), np.array([0.9, 0.9]))
+
+
+def test_the_median_over_the_window_ignores_a_wild_sample() -> None:
+    window = EyeWindow(0.5)
+    place = np.array([0.5, 0.0, 0.1])
+    for number in range(15):
+        window.add(number * STEP_NS, eyes_at(place + (5.0 if number == 7 else 0.0)))
+    measured = window.measure()
+    assert measured is not None
+    np.testing.assert_allclose(measured.midpoint_m, eyes_at(place).eyes_m.mean(0), atol=1e-12)
+    assert measured.samples == 15
+
+
+def test_only_the_last_half_second_counts() -> None:
+    window = EyeWindow(0.5)
+    for number in range(60):
+        window.add(number * STEP_NS, eyes_at(np.array([0.5, 0.001 * number, 0.1])))
+    assert 15 <= window.measure().samples <= 16
+
+
+def test_the_spread_tells_how_still_the_eyes_were() -> None:
+    random = np.random.default_rng(0)
+    window = EyeWindow(10.0)
+    for number in range(300):
+        window.add(number * STEP_NS, eyes_at(np.array([0.5, 0.0, 0.1]), noise_m=0.003, random=random))
+    # Each axis of a midpoint has 1/sqrt(2) of an eye's noise.
+    assert window.measure().spread_m == pytest.approx(0.003 / np.sqrt(2) * np.sqrt(3), rel=0.15)
+
+
+def test_filled_in_and_uncertain_eyes_are_not_used() -> None:
+    sure = eyes_at(np.zeros(3))
+    assert midpoint(sure) is not None
+    assert midpoint(None) is None
+    assert midpoint(EyePoints(sure.eyes_m, sure.confidence, completed="left")) is None
+    assert midpoint(EyePoints(sure.eyes_m, np.array([0.9, 0.1]))) is None
+    assert midpoint(EyePoints(sure.eyes_m * np.nan, sure.confidence)) is None
+
+
+def test_too_few_samples_give_no_pair() -> None:
+    window = EyeWindow(0.5)
+    for number in range(4):
+        window.add(number * STEP_NS, eyes_at(np.array([0.5, 0.0, 0.1])))
+    assert accept(window.measure(), grid()[0], max_spread_m=0.01) == "the sensor sees no pair of eyes"
+
+
+def test_a_moving_head_with_known_truth_gives_an_exact_pair() -> None:
+    times = np.arange(15) / 30
+    true = np.array([0.5, 0.0, 0.1]) + np.outer(times, [0.2, -0.3, 0.1])
+    sensor = np.array([eyes_at(place).eyes_m.mean(0) for place in true])
+    sensor[4] += 0.5
+    pair = true_pair(times, sensor, true)
+    assert pair.measured.samples == 14
+    np.testing.assert_allclose(pair.measured.midpoint_m, eyes_at(pair.true_m).eyes_m.mean(0), atol=1e-12)
+
+
+def walk(path: Path, said: list[str], **options) -> Walk:
+    request = {"again": False, "window_s": 0.5, "max_spread_m": 0.01} | options
+    return Walk(PairsFile(path), grid()[:3], say=said.append, **request)
+
+
+def stand(at: Walk, place: np.ndarray, *, start_ns: int = 0) -> None:
+    for number in range(15):
+        at.see(start_ns + number * STEP_NS, eyes_at(place), serial="A1")
+
+
+def test_enter_takes_a_viewpoint_and_goes_to_the_next(tmp_path: Path) -> None:
+    said: list[str] = []
+    person = walk(tmp_path / "pairs.csv", said)
+    person.begin()
+    for number, viewpoint in enumerate(grid()[:3]):
+        stand(person, viewpoint.midpoint_m, start_ns=number * NS_PER_S)
+        person.press(Key.ACCEPT)
+    assert person.finished
+    pairs = read_pairs(tmp_path / "pairs.csv")
+    np.testing.assert_allclose(pairs.stack_m, [v.midpoint_m for v in grid()[:3]], atol=1e-8)
+    np.testing.assert_allclose(pairs.sensor_m, [eyes_at(v.midpoint_m).eyes_m.mean(0) for v in grid()[:3]], atol=1e-8)
+    assert pairs.sensor_serial == "A1"
+
+
+def test_what_was_seen_at_one_viewpoint_is_not_used_for_the_next(tmp_path: Path) -> None:
+    said: list[str] = []
+    person = walk(tmp_path / "pairs.csv", said)
+    stand(person, grid()[0].midpoint_m)
+    person.press(Key.ACCEPT)
+    person.press(Key.ACCEPT)
+    assert len(read_pairs(tmp_path / "pairs.csv")) == 1
+    assert "not taken: the sensor sees no pair of eyes" in said[-1]
+
+
+def test_restless_eyes_are_not_taken(tmp_path: Path) -> None:
+    said: list[str] = []
+    person = walk(tmp_path / "pairs.csv", said)
+    for number in range(15):
+        person.see(number * STEP_NS, eyes_at(np.array([0.5, 0.01 * number, 0.1])), serial="")
+    person.press(Key.ACCEPT)
+    assert "hold still" in said[-1]
+    assert not (tmp_path / "pairs.csv").exists()
+
+
+def test_it_resumes_where_it_stopped(tmp_path: Path) -> None:
+    said: list[str] = []
+    first = walk(tmp_path / "pairs.csv", said)
+    stand(first, grid()[0].midpoint_m)
+    first.press(Key.ACCEPT)
+    first.press(Key.QUIT)
+    assert first.finished
+    assert first.summary()["skipped"] == [v.name for v in grid()[1:3]]
+    second = walk(tmp_path / "pairs.csv", said)
+    second.begin()
+    assert said[-1].startswith(grid()[1].name)
+    third = walk(tmp_path / "pairs.csv", said, again=True)
+    third.begin()
+    assert said[-1].startswith(grid()[0].name)
+
+
+def test_next_and_previous_do_not_run_off_the_ends(tmp_path: Path) -> None:
+    said: list[str] = []
+    person = walk(tmp_path / "pairs.csv", said)
+    person.begin()
+    for key, name in [(Key.PREVIOUS, 0), (Key.NEXT, 1), (Key.NEXT, 2), (Key.NEXT, 2), (Key.PREVIOUS, 1)]:
+        person.press(key)
+        assert said[-1].startswith(grid()[name].name)
+    assert not person.finished
+
+
+def recording(path: Path, places: list[np.ndarray], *, true: bool) -> Path:
+    """A second at each place."""
+    with recording_to(path, RecordingHeader(driver="openni2", serial="A1", eye_points=True)) as writer:
+        for number in range(30 * len(places)):
+            place = places[number // 30]
+            truth = place + np.array([[0.0, -0.03, 0.0], [0.0, 0.03, 0.0]]) if true else None
+            writer.write(SensorFrame(number + 1, number * STEP_NS, eyes=eyes_at(place), true_eyes_m=truth))
+    return path
+
+
+def capture(*options: str) -> dict:
+    result = run.invoke(app, ["capture", "--json", *options])
+    if result.exception is not None:
+        raise result.exception
+    return json.loads(result.stdout)
+
+
+def test_a_recording_with_marks_gives_its_pairs(tmp_path: Path) -> None:
+    chosen = grid()[::9]
+    path = recording(tmp_path / "r.mcap", [v.midpoint_m for v in chosen], true=False)
+    marks = tmp_path / "marks.csv"
+    marks.write_text("seconds,viewpoint\n" + "".join(f"{n + 0.9},{v.name}\n" for n, v in enumerate(chosen)))
+    told = capture("--replay", str(path), "--marks", str(marks), "--out", str(tmp_path / "p.csv"))
+    assert told["pairs"] == 3
+    pairs = read_pairs(tmp_path / "p.csv")
+    np.testing.assert_allclose(pairs.sensor_m, [eyes_at(v.midpoint_m).eyes_m.mean(0) for v in chosen], atol=1e-6)
+
+
+def test_a_recording_without_marks_or_truth_is_refused(tmp_path: Path) -> None:
+    path = recording(tmp_path / "r.mcap", [grid()[0].midpoint_m], true=False)
+    with pytest.raises(InputError, match="--marks"):
+        capture("--replay", str(path), "--out", str(tmp_path / "p.csv"))
+    assert not (tmp_path / "p.csv").exists()
+
+
+@pytest.mark.parametrize(
+    "text", ["", "a,b\n1,2\n", "seconds,viewpoint\nx,R40-phi70-theta80\n", "seconds,viewpoint\n1,R1\n"]
+)
+def test_wrong_marks_are_refused(tmp_path: Path, text: str) -> None:
+    path = recording(tmp_path / "r.mcap", [grid()[0].midpoint_m], true=False)
+    (tmp_path / "m.csv").write_text(text)
+    with pytest.raises(InputError, match=r"m\.csv"):
+        capture("--replay", str(path), "--marks", str(tmp_path / "m.csv"), "--out", str(tmp_path / "p.csv"))
+
+
+def test_the_demo_recording_calibrates_itself(tmp_path: Path) -> None:
+    """From end to end: its own truth gives back the geometry that it was made with, to the millimetre."""
+    told = capture("--replay", "demo", "--out", str(tmp_path / "p.csv"))
+    assert told["pairs"] >= 8
+    result = run.invoke(app, ["solve", "--pairs", str(tmp_path / "p.csv"), "--out", str(tmp_path / "c.toml"), "--json"])
+    matrix = np.array(json.loads(result.stdout)["stack_from_sensor"])
+    eye = np.array([0.0, 0.0, 0.6, 1.0])
+    assert np.linalg.norm((matrix - demo_stack_from_sensor()) @ eye) < 0.002

@@ -1,0 +1,116 @@
+"""Pairs from people's files: read, or refused with the row and the column; captured ones are safe at once."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.pairs import COLUMNS, CapturedPair, PairsFile, read_pairs
+from runtime.errors import InputError
+
+HEADER = ",".join(COLUMNS)
+
+
+def file(folder: Path, text: str, name: str = "pairs.csv") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def captured(viewpoint: str, x: float = 0.1) -> CapturedPair:
+    return CapturedPair((x, 0.2, 0.3), (0.4, 0.5, 0.6), viewpoint, 1.5, 15, "2026-01-01T00:00:00+00:00", "A1")
+
+
+def test_csv_columns_may_come_in_any_order_with_others_between(tmp_path: Path) -> None:
+    text = "note,stack_z,stack_y,stack_x,sensor_z,sensor_y,sensor_x\nhello,6,5,4,3,2,1\n"
+    pairs = read_pairs(file(tmp_path, text))
+    np.testing.assert_array_equal(pairs.sensor_m, [[1, 2, 3]])
+    np.testing.assert_array_equal(pairs.stack_m, [[4, 5, 6]])
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_json_gives_the_same_as_csv(tmp_path: Path, wrapped: bool) -> None:
+    rows = [dict(zip(COLUMNS, values, strict=True)) for values in ([1, 2, 3, 4, 5, 6], [2, 3, 4, 5, 6, 7])]
+    from_json = read_pairs(file(tmp_path, json.dumps({"pairs": rows} if wrapped else rows), "p.json"))
+    from_csv = read_pairs(file(tmp_path, HEADER + "\n1,2,3,4,5,6\n2,3,4,5,6,7\n"))
+    np.testing.assert_array_equal(from_json.sensor_m, from_csv.sensor_m)
+    np.testing.assert_array_equal(from_json.stack_m, from_csv.stack_m)
+
+
+def test_a_spreadsheets_byte_order_mark_and_blanks_do_no_harm(tmp_path: Path) -> None:
+    pairs = read_pairs(file(tmp_path, "\ufeff" + HEADER.replace(",", ", ") + "\n1, 2, 3, 4, 5, 6\n"))
+    assert len(pairs) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "wanted"),
+    [
+        ("p.csv", "", "sensor_x: column is missing"),
+        ("p.csv", "a,b\n1,2\n", "sensor_x: column is missing"),
+        ("p.csv", HEADER + "\n1,2,3,4,5\n", "line 2, stack_z: is missing"),
+        ("p.csv", HEADER + "\n1,2,3,4,5,6\n1,nan,3,4,5,6\n", "line 3, sensor_y: is not finite"),
+        ("p.csv", HEADER + "\n1,2,3,4,5,1e999\n", "line 2, stack_z: is not finite"),
+        ("p.csv", HEADER + "\n1,2,three,4,5,6\n", "line 2, sensor_z: is not a number: three"),
+        ("p.json", "{", "malformed"),
+        ("p.json", "3", "must be a list"),
+        ("p.json", "[1]", "pair 1: must be an object"),
+        ("p.json", '[{"sensor_x": 1}]', "pair 1, sensor_y: is missing"),
+        ("p.json", json.dumps([dict.fromkeys(COLUMNS, True)]), "pair 1, sensor_x: is not a number"),
+    ],
+)
+def test_a_wrong_file_is_refused_with_its_place(tmp_path: Path, name: str, text: str, wanted: str) -> None:
+    path = file(tmp_path, text, name)
+    with pytest.raises(InputError, match=wanted) as caught:
+        read_pairs(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        read_pairs(tmp_path / "none.csv")
+
+
+def test_pairs_of_two_sensors_are_not_mixed(tmp_path: Path) -> None:
+    text = HEADER + ",sensor_serial\n1,2,3,4,5,6,A\n1,2,3,4,5,6,B\n"
+    with pytest.raises(InputError, match="different sensors: A, B"):
+        read_pairs(file(tmp_path, text))
+
+
+def test_an_accepted_pair_is_on_disk_when_accept_returns(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "pairs.csv"
+    taking = PairsFile(path)
+    for number in range(3):
+        taking.accept(captured(f"v{number}", x=number))
+        assert len(read_pairs(path)) == number + 1
+    assert read_pairs(path).sensor_serial == "A1"
+
+
+def test_it_resumes_and_replaces_a_viewpoint_that_is_taken_again(tmp_path: Path) -> None:
+    path = tmp_path / "pairs.csv"
+    PairsFile(path).accept(captured("v0", x=1.0))
+    resumed = PairsFile(path)
+    assert resumed.viewpoints == {"v0"}
+    resumed.accept(captured("v1", x=2.0))
+    resumed.accept(captured("v0", x=3.0))
+    assert sorted(read_pairs(path).sensor_m[:, 0]) == [2.0, 3.0]
+
+
+def test_a_crash_while_writing_leaves_the_pairs_that_were_there(tmp_path: Path, monkeypatch) -> None:
+    path = tmp_path / "pairs.csv"
+    taking = PairsFile(path)
+    taking.accept(captured("v0"))
+    monkeypatch.setattr(Path, "replace", lambda *_: (_ for _ in ()).throw(OSError("power lost")))
+    with pytest.raises(OSError, match="power lost"):
+        taking.accept(captured("v1"))
+    assert len(read_pairs(path)) == 1
+    assert [found.name for found in tmp_path.iterdir()] == ["pairs.csv"]
+
+
+def test_a_file_of_something_else_is_not_overwritten(tmp_path: Path) -> None:
+    path = file(tmp_path, "my,precious\n1,2\n")
+    with pytest.raises(InputError):
+        PairsFile(path)
+    assert path.read_text() == "my,precious\n1,2\n"

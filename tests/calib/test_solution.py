@@ -1,0 +1,96 @@
+"""What a solution says of its own error is what repeated noise shows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.solution import METHODS, design_covariance, solve, solve_default
+from calib.viewpoints import viewing_volume_m
+from runtime.eyes.demo_geometry import demo_stack_from_sensor
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_recovers_exact_pairs(measured, known_m, method) -> None:
+    found = solve(measured(), known_m, method=method)
+    np.testing.assert_allclose(found.similarity.matrix, demo_stack_from_sensor(), atol=1e-12)
+    assert found.max_m < 1e-12
+    assert found.used.all()
+
+
+@pytest.mark.parametrize("method", ["inverse", "fixed-scale"])
+def test_the_predicted_error_at_the_eye_is_the_real_one(measured, known_m, method) -> None:
+    """200 noise samples: the RMS over samples against the covariance's promise, at every point of the volume."""
+    volume = viewing_volume_m()
+    seen = measured(volume)
+    squares, promised = np.zeros(len(volume)), np.zeros(len(volume))
+    for seed in range(200):
+        found = solve(measured(sigma_m=0.003, seed=seed), known_m, method=method)
+        squares += ((found.similarity.points(seen) - volume) ** 2).sum(-1) / 200
+        promised += found.eye_error_m(volume) ** 2 / 200
+    ratio = np.sqrt(squares / promised)
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.06)
+    assert 0.8 < ratio.min() <= ratio.max() < 1.2
+
+
+def test_the_noise_is_what_was_put_in(measured, known_m) -> None:
+    told = [solve(measured(sigma_m=0.005, seed=s), known_m, method="inverse").noise_m for s in range(50)]
+    assert np.mean(told) == pytest.approx(0.005, rel=0.03)
+
+
+def test_leaving_one_out_is_what_solving_without_it_gives(measured, known_m) -> None:
+    sensor = measured(sigma_m=0.003)
+    quick = solve(sensor, known_m, method="inverse").leave_one_out_m
+    for index in range(27):
+        rest = np.delete(np.arange(27), index)
+        alone = solve(sensor[rest], known_m[rest], method="inverse").similarity
+        slow = alone.points(sensor[index : index + 1])[0] - known_m[index]
+        assert np.linalg.norm(quick[index] - slow) < 0.05 * np.linalg.norm(slow) + 2e-5
+
+
+def test_three_pairs_leave_no_pair_to_leave_out(measured, known_m) -> None:
+    three = [0, 8, 22]
+    found = solve(measured(sigma_m=0.001)[three], known_m[three], method="inverse")
+    assert found.leave_one_out_rms_m > found.rms_m or np.isinf(found.leave_one_out_rms_m)
+
+
+def test_a_fixed_scale_has_no_uncertainty_of_scale(measured, known_m) -> None:
+    found = solve(measured(sigma_m=0.003), known_m, method="fixed-scale")
+    assert found.scale_sigma == 0.0
+    assert solve(measured(sigma_m=0.003), known_m, method="inverse").scale_sigma > 0.0
+
+
+def test_a_thin_design_has_a_large_condition(known_m) -> None:
+    thin = (known_m - known_m.mean(0)) * [1.0, 0.01, 0.01] + known_m.mean(0)
+    _, _, wide_condition = design_covariance(known_m, fixed_scale=False)
+    _, _, thin_condition = design_covariance(thin, fixed_scale=False)
+    assert wide_condition < 2 < 30 < thin_condition
+
+
+def test_a_line_leaves_the_turn_about_it_free() -> None:
+    line = np.outer(np.linspace(0, 1, 9), [1.0, 2.0, 3.0])
+    _, covariance, condition = design_covariance(line, fixed_scale=False)
+    assert np.isinf(condition)
+    assert np.isinf(covariance).any()
+
+
+def test_by_default_the_scale_is_one_where_the_data_agree(measured, known_m) -> None:
+    found = solve_default(measured(sigma_m=0.003), known_m)
+    assert found.method == "fixed-scale"
+    assert found.similarity.scale == 1.0
+    assert "cannot be told from 1" in found.reason
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.1, 8.125])
+def test_by_default_another_scale_is_found_where_the_data_tell_it(measured, known_m, scale) -> None:
+    found = solve_default(measured(sigma_m=0.0, scale=scale), known_m)
+    assert found.method == "inverse"
+    assert found.similarity.scale == pytest.approx(scale)
+
+
+def test_by_default_wrong_pairs_are_left_out(measured, known_m) -> None:
+    sensor = measured(sigma_m=0.003)
+    sensor[4] += 0.3
+    found = solve_default(sensor, known_m)
+    assert found.method == "robust"
+    assert np.flatnonzero(~found.used).tolist() == [4]
