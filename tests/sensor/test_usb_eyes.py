@@ -1,0 +1,158 @@
+"""The driver of streaming eye trackers, against a backend that plays one, faults included."""
+
+import errno
+import time
+
+import numpy as np
+import pytest
+
+from runtime.clock import MonotonicClock
+from runtime.config import SensorSettings
+from runtime.errors import SensorLost, SensorTimeout
+from runtime.sensor.eye_packets import encode
+from runtime.sensor.usb_devices import UDEV_RULE
+from runtime.sensor.usb_eyes import UsbEyesDriver
+from runtime.sensor.worker import SensorWorker
+from tests.sensor.fake_usb import FakeDevice, FakeUsb, Ticking, packet
+
+SETTINGS = SensorSettings(driver="usb-eyes", source="", timeout_s=0.1, reopen_backoff_s=0.05)
+
+
+def opened(device: FakeDevice) -> UsbEyesDriver:
+    driver = UsbEyesDriver(SETTINGS, MonotonicClock(), backend=FakeUsb(device))
+    driver.open()
+    return driver
+
+
+def until(condition, seconds=5.0):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(0.002)
+    return False
+
+
+def test_eyes_arrive_in_metres_with_their_serial():
+    driver = opened(FakeDevice(transfers=[encode(packet(4, x_m=0.1))]))
+    frame = driver.read_newest(0.1)
+    np.testing.assert_allclose(frame.eyes.eyes_m, [[0.131, 0, 0.6], [0.069, 0, 0.6]], atol=1e-6)
+    assert frame.sequence == 4 and driver.serial == "A1"
+
+
+def test_the_newest_packet_wins_and_the_others_are_counted():
+    driver = opened(FakeDevice(transfers=[b"".join(encode(packet(k)) for k in (1, 2)), encode(packet(3))]))
+    assert driver.read_newest(0.1).sequence == 3 and driver.overtaken == 2
+
+
+def test_no_face_is_a_sample_too():
+    assert opened(FakeDevice(transfers=[encode(packet(1, face=False))])).read_newest(0.1).eyes is None
+
+
+def test_short_and_corrupt_packets_are_passed_over():
+    good, bad = encode(packet(2)), bytearray(encode(packet(1)))
+    bad[30] ^= 4
+    driver = opened(FakeDevice(transfers=[bytes(bad), encode(packet(1))[:20], good[:9], good[9:]]))
+    assert driver.read_newest(0.2).sequence == 2
+
+
+def test_gaps_in_the_devices_count_are_losses():
+    driver = opened(FakeDevice(transfers=[encode(packet(1)) + encode(packet(9))]))
+    driver.read_newest(0.1)
+    assert driver.missed == 7
+
+
+def test_silence_is_a_time_out_and_then_a_reset():
+    device = FakeDevice()
+    driver = opened(device)
+    with pytest.raises(SensorTimeout):
+        driver.read_newest(0.05)
+    with pytest.raises(SensorLost, match="reset"):
+        driver.read_newest(0.05)
+    assert device.resets == 1
+
+
+def test_a_stalled_endpoint_is_cleared():
+    device = FakeDevice(transfers=[errno.EPIPE, encode(packet(1))])
+    assert opened(device).read_newest(0.2).sequence == 1
+    assert device.halts_cleared == 1
+
+
+def test_an_endpoint_that_stalls_again_and_again_is_reset():
+    device = FakeDevice(transfers=[errno.EPIPE] * 3)
+    with pytest.raises(SensorLost, match="stalled"):
+        opened(device).read_newest(0.2)
+    assert device.resets == 1
+
+
+def test_unplugging_is_lost_and_closing_afterwards_is_quiet():
+    device = FakeDevice(transfers=[encode(packet(1))])
+    bus = FakeUsb(device)
+    driver = UsbEyesDriver(SETTINGS, MonotonicClock(), backend=bus)
+    driver.open()
+    bus.devices.clear()
+    with pytest.raises(SensorLost):
+        driver.read_newest(0.1)
+    driver.close()
+    driver.close()
+
+
+def test_a_failed_open_leaves_nothing_open():
+    device = FakeDevice(readable=False)
+    driver = UsbEyesDriver(SETTINGS, MonotonicClock(), backend=FakeUsb(device))
+    with pytest.raises(SensorLost, match=UDEV_RULE):
+        driver.open()
+    with pytest.raises(SensorLost, match="not open"):
+        driver.read_newest(0.01)
+
+
+def watched(bus: FakeUsb) -> SensorWorker:
+    clock = MonotonicClock()
+    worker = SensorWorker(lambda: UsbEyesDriver(SETTINGS, clock, backend=bus), SETTINGS, clock)
+    worker.start()
+    return worker
+
+
+@pytest.mark.parametrize("away_s", [1.0, pytest.param(60.0, marks=pytest.mark.slow)])
+def test_a_camera_unplugged_in_mid_stream_is_back_within_a_second_of_its_return(away_s):
+    device = FakeDevice(stream=Ticking())
+    bus = FakeUsb(device, FakeDevice(serial="ANOTHER", ids=(0x8086, 0x0B07), address=9))
+    worker = watched(bus)
+    assert until(lambda: worker.newest() is not None)
+    bus.devices.remove(device)
+    assert until(lambda: worker.state == "lost")
+    # Meanwhile another tracker is plugged in: it is not taken for the one that left.
+    bus.devices.append(FakeDevice(serial="B2", address=7, stream=Ticking()))
+    time.sleep(away_s)
+    while worker.newest() is not None:
+        pass
+    assert worker.state == "lost"
+    bus.devices.append(FakeDevice(serial="A1", address=8, stream=Ticking()))
+    returned = time.monotonic()
+    assert until(lambda: worker.newest() is not None)
+    assert time.monotonic() - returned < 1.0
+    assert worker.serial == "A1"
+    worker.stop()
+
+
+def test_after_ten_seconds_worth_of_garbage_a_reset_brings_the_device_back():
+    random = np.random.default_rng(0)
+    device = FakeDevice(stream=lambda: random.bytes(4000) if not device.resets else ticking())
+    ticking = Ticking()
+    worker = watched(FakeUsb(device))
+    assert until(lambda: device.resets > 0)
+    assert until(lambda: worker.state == "running")
+    worker.stop()
+
+
+def test_a_stream_that_stalls_without_an_error_is_reset_and_comes_back():
+    state = {"stalled": False}
+    ticking = Ticking()
+    device = FakeDevice(stream=lambda: b"" if state["stalled"] else ticking())
+    device.on_reset = lambda: state.update(stalled=False)
+    worker = watched(FakeUsb(device))
+    assert until(lambda: worker.newest() is not None)
+    state["stalled"] = True
+    assert until(lambda: device.resets == 1)
+    assert until(lambda: worker.newest() is not None and worker.state == "running")
+    worker.stop()
