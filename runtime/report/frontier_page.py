@@ -53,7 +53,7 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
         axes.set(xlim=(low / 1.6, high * 1.6))
         axes.margins(y=0.12 if span else 0.5)
         axes.set_title("Error against run time: up and to the left is better")
-        axes.legend(loc="lower right")
+        axes.legend(loc="best")
         axes.xaxis.set_major_formatter("{x:g}")
     text = "The line is the Pareto front: methods that no other beats in both time and error."
     return Figure(name, png(figure), text)

@@ -67,6 +67,11 @@ def psnr_at(tolerance: Tolerance, error_mm: float) -> float:
     return float(np.interp(error_mm, rings, means))
 
 
+def _price(tolerance: Tolerance, error_mm: float) -> str:
+    beyond = error_mm > max(tolerance.offsets_mm)
+    return ("below " if beyond else "") + f"{psnr_at(tolerance, error_mm):.1f}"
+
+
 def horizon_section(horizons: Sequence[Horizon], tolerance: Tolerance) -> Section:
     """Error over the horizon, and its price."""
     with drawing(9.6, 3.6) as figure:
@@ -83,9 +88,9 @@ def horizon_section(horizons: Sequence[Horizon], tolerance: Tolerance) -> Sectio
     for horizon in horizons:
         half, most = horizon.tracked_mm[index]
         plain = horizon.untracked_mm[index]
-        prices = [psnr_at(tolerance, float(error)) for error in (half, plain[0])]
+        prices = [_price(tolerance, float(error)) for error in (half, plain[0])]
         rows.append([horizon.motion, f"{half:.1f}", f"{most:.1f}", f"{plain[0]:.1f}", f"{plain[1]:.1f}"])
-        rows[-1] += [f"{prices[0]:.1f}", f"{prices[1]:.1f}"]
+        rows[-1] += prices
     headings = ["motion", "p50 mm", "p95 mm", "untracked p50", "untracked p95", "PSNR at p50, dB", "untracked, dB"]
     text = [
         "Between the camera's exposure and the light that leaves the panels lie 60 to 90 ms. The line is the median "

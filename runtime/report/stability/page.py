@@ -165,7 +165,11 @@ def stability_page(cases: Sequence[Case], *, machine: dict[str, str], seconds: f
             "digits or a closed form. The tolerance is stated before the case runs: a small multiple of the rounding "
             "of the input times the condition of the problem, or what is written beside it.",
         ],
-        [heat_map(cases), condition_plot(cases), *([stiffness_plot(cases)] if "solve" in stages else [])],
+        [
+            heat_map(cases),
+            *([condition_plot(cases)] if set(stages) - {"solve"} else []),
+            *([stiffness_plot(cases)] if "solve" in stages else []),
+        ],
         [] if not failed else [Table(headings, [row(c) for c in failed], "What fails", ["bad"] * len(failed))],
     )
     sections = [summary]

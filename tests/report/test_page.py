@@ -1,0 +1,157 @@
+"""Pages: self-contained, escaped, and really there when a browser opens them."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from runtime.report import frontier_page, sweep_page
+from runtime.report.frontier import MethodResult
+from runtime.report.horizon import Horizon, horizon_section, psnr_at
+from runtime.report.latency import Run, latency_section
+from runtime.report.machine import describe
+from runtime.report.page import Figure, Page, Section, Table, Tile
+from runtime.report.stability.page import stability_page
+from runtime.report.stability.trial import Answer, Trial, settle
+from runtime.report.sweeps import Curve, Size, Tolerance, Volume
+
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+FLAGS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--hide-scrollbars",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+)  # fmt: skip
+
+
+def method(name: str, kind: str, ms: float, psnr: float) -> MethodResult:
+    off = {"2mm": psnr - 6, "4mm": psnr - 9, "6mm": psnr - 11}
+    return MethodResult(name, kind, "fp32", 960, 540, ms, ms * 1.3, 9, 200.0, 81, psnr, 0.97, psnr - 1, off)  # type: ignore[arg-type]
+
+
+def report_page() -> Page:
+    """The report's sections on made-up measurements: what is looked at here is the page."""
+    methods = [
+        method("fast", "network", 20, 36),
+        method("balanced", "network", 40, 41),
+        method("SART-10", "iterative", 900, 40),
+    ]
+    wave = np.add.outer(np.linspace(0, 5, 9), np.linspace(25, 30, 9))
+    holed = wave.copy()
+    holed[0, :3] = np.nan
+    tolerance = Tolerance(tuple(range(-8, 9, 2)), wave)
+    percentiles = np.linspace([2.0, 5.0], [9.0, 30.0], 7)
+    runs = [
+        Run(
+            name,
+            np.random.default_rng(1).normal(70, 8, 60),
+            {"stage_ms": {"render": {"p50": 9.0}, "finish": {"p50": 7.0}}, "fps": 30.0, "inferences": 50, "dropped": 0,
+             "psnr_db": 38.5, "plan": [{"what": "inference"}]},
+        )
+        for name in ("plan on", "plan off")
+    ]  # fmt: skip
+    sections = [
+        frontier_page.frontier_section(methods, pairs="a pair", title="Frontier", name="test"),
+        sweep_page.volume_section(Volume(range(9), range(9), holed), model="balanced", scene="demo"),
+        sweep_page.tolerance_section(tolerance, model="balanced", distance_m=0.6),
+        sweep_page.knob_section([Curve("balanced", [40, 41, 42], [30, 29, 27])]),
+        sweep_page.gap_section([Curve("balanced", [5, 30, 60], [30, 35, 36])]),
+        sweep_page.resolution_section([Size("balanced", 480, 270, 9.0, 30.0), Size("balanced", 960, 540, 30.0, 35.0)]),
+        horizon_section([Horizon(name, percentiles, 2 * percentiles) for name in ("still", "walk")], tolerance),
+        latency_section(runs),
+    ]
+    return Page("Error against run time", "A lead.", sections, describe(seed=0), "phasestack report", [Tile("1", "x")])
+
+
+def small_stability_page() -> Page:
+    cases = [
+        settle(Trial("solve", f"CG-30, gap {n}", lambda n=n: Answer(n / 10, 1.0, 10.0**n), measure="of the difference"))
+        for n in range(1, 6)
+    ]
+    return stability_page(cases, machine=describe(), seconds=1.0, command="phasestack stability")
+
+
+def browse(tmp_path: Path, *arguments: str) -> str:
+    assert BROWSER is not None
+    profile = f"--user-data-dir={tmp_path / 'profile'}"
+    command = [BROWSER, *FLAGS, profile, "--virtual-time-budget=5000", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine")
+@pytest.mark.parametrize("make", [report_page, small_stability_page])
+def test_a_browser_decodes_every_plot_of_the_page(make, tmp_path: Path) -> None:
+    page = make()
+    path = tmp_path / "index.html"
+    path.write_text(page.html())
+    dom = browse(tmp_path, "--dump-dom", path.as_uri())
+    decoded = re.search(r'<html[^>]*data-decoded="(\d+)"', dom)
+    assert decoded is not None, "the page's script did not run"
+    assert int(decoded[1]) == len(page.figures()) > 0
+    for section in page.sections:
+        assert section.title in dom
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine")
+def test_the_plots_can_be_seen_on_a_screenshot(tmp_path: Path) -> None:
+    """One flat red picture on the page must show up as that much red."""
+    red = np.zeros((200, 300, 3), np.uint8)
+    red[..., 2] = 255
+    figure = Figure("red", cv2.imencode(".png", red)[1].tobytes(), "red")
+    page = Page("title", "lead", [Section("section", figures=[figure])], {}, "command")
+    (tmp_path / "index.html").write_text(page.html())
+    shot = tmp_path / "shot.png"
+    browse(tmp_path, "--window-size=1000,900", f"--screenshot={shot}", (tmp_path / "index.html").as_uri())
+    image = cv2.imread(str(shot)).astype(int)
+    reddish = (image[..., 2] > 200) & (image[..., 1] < 60) & (image[..., 0] < 60)
+    assert reddish.sum() == pytest.approx(200 * 300, rel=0.02)
+
+
+def test_the_page_needs_nothing_from_elsewhere() -> None:
+    html = report_page().html()
+    assert not re.search(r"""(src|href)=["'](?!data:image/png|#)""", html)
+    assert "http:" not in html and "https:" not in html and "@import" not in html
+
+
+def test_the_page_states_machine_versions_seed_date_and_command() -> None:
+    html = report_page().html()
+    for value in (*describe(seed=0).keys(), "phasestack report", describe()["processor"]):
+        assert value in html
+
+
+def test_texts_are_escaped() -> None:
+    section = Section("<b>title</b>", ["a < b & c"], tables=[Table(["<i>"], [["<script>"]])])
+    html = Page("<x>", "<y>", [section], {"<k>": "<v>"}, "a && b").html()
+    for raw in ("<b>title", "<i>", "<x>", "<y>", "<k>", "<v>", "<script>\n</td>"):
+        assert raw not in html
+    assert "&lt;script&gt;" in html
+
+
+def test_columns_of_numbers_are_set_flush_right() -> None:
+    table = Table(["name", "value", "note"], [["a", "1.5", ""], ["b", "-2", ""], ["c", "∞", ""]])
+    assert table.numeric() == [False, True, False]
+
+
+def test_the_same_data_give_the_same_picture() -> None:
+    first, second = (report_page().sections[3].figures[0].png for _ in range(2))
+    assert first == second
+
+
+def test_a_times_table_shows_ratios_beside_milliseconds() -> None:
+    table = report_page().sections[0].tables[0]
+    column = list(table.headings).index("× fastest")
+    assert [row[column] for row in table.rows] == ["1.0", "2.0", "45.0"]
+    assert list(table.styles) == ["good", "good", ""]
+
+
+def test_the_price_of_an_error_is_read_off_the_tolerance_map() -> None:
+    offsets = tuple(range(-8, 9, 2))
+    distance = np.hypot(*np.meshgrid(np.array(offsets), np.array(offsets)))
+    tolerance = Tolerance(offsets, 40 - 2 * distance)
+    assert psnr_at(tolerance, 0.0) == 40.0
+    assert psnr_at(tolerance, 3.0) == pytest.approx(34.0, abs=0.5)
+    assert psnr_at(tolerance, 100.0) == psnr_at(tolerance, 8.0)
