@@ -42,9 +42,7 @@ def scaled_stack(settings: Settings, scale: float) -> PanelStack:
     )
 
 
-def build_pipeline(
-    settings: Settings, stack: PanelStack, context: Any, on_fault: Callable[[str], None]
-) -> Pipeline:
+def build_pipeline(settings: Settings, stack: PanelStack, context: Any, on_fault: Callable[[str], None]) -> Pipeline:
     """Content and model. Raises FatalError; leaves nothing open then."""
     from runtime.content.registry import open_content
     from runtime.model.predictor import load_predictor

@@ -19,7 +19,17 @@ from runtime.inputs import Input
 from runtime.panels.base import PanelSink
 from runtime.pipeline import Pipeline
 from runtime.quality_probe import Look, QualityProbe
-from runtime.records import F64, U8, EyePoints, EyesEstimate, FrameAccount, LayerFrame, PresentReport, SensorFrame, State
+from runtime.records import (
+    F64,
+    U8,
+    EyePoints,
+    EyesEstimate,
+    FrameAccount,
+    LayerFrame,
+    PresentReport,
+    SensorFrame,
+    State,
+)
 from runtime.stages import StageTimes
 from runtime.states import Conditions, Part, StateMachine
 from runtime.stats import RunStats

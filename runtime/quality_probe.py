@@ -40,6 +40,6 @@ class QualityProbe:
             view = retina_view(eye, side, width_px=width, height_px=height, fov_deg=self._fov_deg)
             wanted.append(content.render(view, time_ns=time_ns)[..., :3].copy())
             seen.append(seen_by(eye, layers, self._stack, fov_deg=self._fov_deg))
-        targets = [picture.astype(np.float32) / 255 for picture in wanted]
+        targets = [picture.astype(np.float32) / np.float32(255) for picture in wanted]
         measured = quality([r.image for r in seen], targets, [r.mask for r in seen])
         return Look((seen[0], seen[1]), (wanted[0], wanted[1]), measured)

@@ -17,7 +17,7 @@ def config(
 
     Example: phasestack config > phasestack.toml
     """
-    from runtime.config import Settings, load_settings
+    from runtime.config import load_settings
 
     settings = load_settings(check)
     if check is not None:

@@ -181,7 +181,9 @@ def run_daemon(
         signals = cleanup.enter_context(Signals())
         notifier = Notifier(clock)
         cleanup.callback(notifier.close)
-        server = None if max_speed else open_status_server(settings.service, clock=clock, supervised=notifier.supervised)
+        server = (
+            None if max_speed else open_status_server(settings.service, clock=clock, supervised=notifier.supervised)
+        )
         if server is not None:
             cleanup.callback(server.close)
         metrics = None
@@ -191,9 +193,7 @@ def run_daemon(
             metrics = Metrics()
             metrics.serve(settings.service.metrics_port)
             cleanup.callback(metrics.close)
-        daemon = Daemon(
-            config, overrides, settings, signals=signals, notifier=notifier, server=server, metrics=metrics
-        )
+        daemon = Daemon(config, overrides, settings, signals=signals, notifier=notifier, server=server, metrics=metrics)
         summary = drive(
             settings,
             RunOptions(max_speed=max_speed, measure=out is not None, scale=scale),

@@ -33,9 +33,7 @@ def run(
     from runtime.commands.daemon import run_daemon
     from runtime.config import Overrides
 
-    overrides = Overrides(
-        replay=replay, headless=headless, scene=scene, model=model, budget_ms=budget_ms
-    )
+    overrides = Overrides(replay=replay, headless=headless, scene=scene, model=model, budget_ms=budget_ms)
     summary = run_daemon(config, overrides, frames=frames, max_speed=max_speed, out=out, scale=scale, quiet=as_json)
     if as_json:
         typer.echo(json.dumps(summary))

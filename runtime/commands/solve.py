@@ -8,11 +8,15 @@ from typing import Annotated
 
 import typer
 
+Point = tuple[float, float, float]
+
 
 def solve(
     left: Annotated[Path, typer.Option(help="picture for the left eye")],
     right: Annotated[Path, typer.Option(help="picture for the right eye")],
-    left_eye: Annotated[tuple[float, float, float], typer.Option(help="left eye, metres, stack frame", metavar="X Y Z")],
+    left_eye: Annotated[
+        tuple[float, float, float], typer.Option(help="left eye, metres, stack frame", metavar="X Y Z")
+    ],
     right_eye: Annotated[tuple[float, float, float], typer.Option(help="right eye, metres", metavar="X Y Z")],
     panels: Annotated[Path, typer.Option(help="TOML or JSON: width_m, height_m, x_m")],
     out: Annotated[Path, typer.Option(help="folder for the layers")],

@@ -75,7 +75,7 @@ def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stac
         if not all(math.isfinite(value) for value in eye):
             raise InputError("solve", option, "must be three finite numbers")
         if eye[0] <= max(stack.x_m):
-            raise InputError("solve", option, f"x = {eye[0]:g} m is not in front of the panels (x > {max(stack.x_m):g})")
+            raise InputError("solve", option, f"x = {eye[0]:g} m : not in front of the panels (x > {max(stack.x_m):g})")
     separation_m = math.dist(left_eye, right_eye)
     if separation_m < SEPARATION_MIN_M:
         raise InputError("solve", "--right-eye", f"is {separation_m * 1e3:g} mm from the left one; 5 mm is the least")
@@ -112,7 +112,7 @@ def _write(
         retina = seen_by(eye_m, layers, stack, fov_deg=fov_deg)
         write_png(folder / f"seen-{name}.png", (np.clip(retina.image, 0, 1) * 255 + 0.5).astype(np.uint8))
         write_png(folder / f"wanted-{name}.png", np.asarray(wanted, np.uint8))
-        targets.append(np.asarray(wanted, np.float32) / 255)
+        targets.append(np.asarray(wanted, np.float32) / np.float32(255))
         retinas.append(retina)
     try:
         measured = quality([r.image for r in retinas], targets, [r.mask for r in retinas])

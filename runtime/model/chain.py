@@ -37,7 +37,6 @@ class ChainFrame:
     def width_px(self) -> int:
         return self.cells * 2 * self.cell_px
 
-
     def plane_from_frame(self, eye_m: F64, *, x_m: float) -> F64:
         """3x3: (y, z, 1) on a parallel plane hit by an eye's rays through this raster's pixels."""
         t = (x_m - self.x_m) / (eye_m[0] - self.x_m)
@@ -47,9 +46,9 @@ class ChainFrame:
     def frame_from_plane(self, *, x_m: float) -> F64:
         """3x3: this raster's pixels from (y, z, 1) on a parallel plane, in line as seen from between the eyes."""
         t = (x_m - self.x_m) / (self.middle_m[0] - self.x_m)
-        back = np.array(
-            [[1.0, 0.0, -self.middle_m[1] * t], [0.0, 1.0, -self.middle_m[2] * t], [0.0, 0.0, 1.0 - t]]
-        ) / (1 - t)
+        back = np.array([[1.0, 0.0, -self.middle_m[1] * t], [0.0, 1.0, -self.middle_m[2] * t], [0.0, 0.0, 1.0 - t]]) / (
+            1 - t
+        )
         p = self.plane_from_raster
         determinant = p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]
         linear = np.array([[p[1, 1], -p[0, 1]], [-p[1, 0], p[0, 0]]]) / determinant

@@ -71,5 +71,5 @@ def parse_contract(metadata: dict[str, str], *, source: str | Path) -> Contract:
     if not isinstance(table, dict):
         raise InputError(source, METADATA_KEY, "must be one JSON object")
     if table.get("version") != VERSION:
-        raise InputError(source, f"{METADATA_KEY}.version", f"is {table.get('version')!r}, this runtime knows {VERSION}")
+        raise InputError(source, f"{METADATA_KEY}.version", f"{table.get('version')!r} is unknown, not {VERSION}")
     return validated(Contract, table, source=source)

@@ -83,7 +83,7 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
 
     session = ModelSession(path, provider=settings.provider, threads=settings.threads)
     if session.contract.panels != stack.count:
-        raise InputError(path, "contract.panels", f"made for {session.contract.panels} panels, the stack has {stack.count}")
+        raise InputError(path, "contract.panels", f"{session.contract.panels}, but the stack has {stack.count}")
     if session.contract.input_frame == "chain":
         if not stack.is_evenly_spaced:
             raise InputError(path, "contract.panels", "needs evenly spaced panels; use the model sart")

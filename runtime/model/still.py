@@ -19,22 +19,25 @@ def solve_still(left: U8, right: U8, *, eyes_m: F64, fov_deg: float, predictor: 
 
     start = cv2.getTickCount()
     rasters = predictor.rasters(eyes_m)
-    images = []
+    images: list[list[U8]] = []
     for picture, eye_m in zip((left, right), eyes_m, strict=True):
         height, width = picture.shape[:2]
         rgba = picture if picture.shape[2] == 4 else cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA)
         projection = image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg)
-        warped = []
+        warped: list[U8] = []
         for raster in rasters:
             # OpenCV puts pixel centres at integers.
             matrix = _shifted(-0.5) @ image_from_raster(projection, raster) @ _shifted(0.5)
             warped.append(
-                cv2.warpPerspective(
-                    rgba,
-                    matrix,
-                    (raster.width_px, raster.height_px),
-                    flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-                    borderMode=cv2.BORDER_REPLICATE,
+                np.asarray(
+                    cv2.warpPerspective(
+                        rgba,
+                        matrix,
+                        (raster.width_px, raster.height_px),
+                        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                        borderMode=cv2.BORDER_REPLICATE,
+                    ),
+                    np.uint8,
                 )
             )
         images.append(warped)

@@ -8,7 +8,6 @@ turn: twice as much for the time as both at once.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from time import perf_counter_ns
 from typing import Any
 
 import cv2
@@ -21,12 +20,12 @@ from runtime.model.predictor import Prediction, Predictor
 from runtime.model.resample import buffer, resample, target_from_source
 from runtime.model.rows import RowPool
 from runtime.model.session import ModelSession
+from runtime.model.timing import Stopwatch
 from runtime.model.transfer import FULL, SUBCODE, phase_codes
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
 
 I16 = NDArray[np.int16]
-NS_PER_MS = 1e6
 REAR, CENTRE, FRONT = 0, 1, 2
 START = FULL // 2  # of every outer panel: the middle of its range
 
@@ -53,7 +52,7 @@ class UnrolledPredictor(Predictor):
         return (self.stack.panel(CENTRE),)
 
     def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64) -> Prediction:
-        watch = _Stopwatch()
+        watch = Stopwatch()
         contract = self.session.contract
         try:
             frame = chain_frame(eyes_m, self.stack, cell_px=contract.cell_px, reduction=contract.reduction)
@@ -93,7 +92,7 @@ class UnrolledPredictor(Predictor):
         matrix = target_from_source(eye_m, source=self.stack.panel(on), target=self.stack.panel(of))
         return resample(image, image_from_result=matrix, out=out, outside=0 if of == CENTRE else START)
 
-    def _lacks(self, wanted: Sequence[I16]) -> None:
+    def _lacks(self, wanted: Sequence[Any]) -> None:
         """What each eye still lacks when the centre panel is the best one for the outer panels."""
         rear, front, residual = self._seen_of(REAR), self._seen_of(FRONT), self._residual
 
@@ -111,7 +110,7 @@ class UnrolledPredictor(Predictor):
 
         self._rows.each(self.stack.height_px, work)
 
-    def _close_centre(self, wanted: Sequence[I16]) -> None:
+    def _close_centre(self, wanted: Sequence[Any]) -> None:
         """The best centre panel for the outer ones, per pixel and in closed form, in 8-bit codes."""
         rear, front, centre = self._seen_of(REAR), self._seen_of(FRONT), self._centre
 
@@ -165,7 +164,7 @@ class UnrolledPredictor(Predictor):
         return self.stack.width_px // reduction, self.stack.height_px // reduction
 
     def _chain(
-        self, needs: Sequence[I16], frame: ChainFrame, eyes_m: F64, watch: _Stopwatch, *, size: float, first: bool
+        self, needs: Sequence[I16], frame: ChainFrame, eyes_m: F64, watch: Stopwatch, *, size: float, first: bool
     ) -> None:
         """The network's correction: what the outer panels must carry for the eyes to differ as they should."""
         width, height = self._reduced_size()
@@ -213,16 +212,3 @@ def _settle(codes: I16, out: I16) -> None:
     np.add(codes, SUBCODE // 2, out=out)
     np.bitwise_and(out, -SUBCODE, out=out)
     np.clip(out, 0, FULL, out=out)
-
-
-class _Stopwatch:
-    """Adds the time since the last lap to a named stage."""
-
-    def __init__(self) -> None:
-        self.stage_ms = {"prepare": 0.0, "inference": 0.0, "finish": 0.0}
-        self._last_ns = perf_counter_ns()
-
-    def lap(self, stage: str) -> None:
-        now_ns = perf_counter_ns()
-        self.stage_ms[stage] += (now_ns - self._last_ns) / NS_PER_MS
-        self._last_ns = now_ns

@@ -1,0 +1,92 @@
+"""Whole-picture networks: eye pictures on panel rasters in, panel values out (the published U-Net, and its like)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from runtime.errors import InputError, ModelFailure
+from runtime.model.predictor import Prediction, Predictor
+from runtime.model.resample import buffer, resample, target_from_source
+from runtime.model.session import ModelSession
+from runtime.model.timing import Stopwatch
+from runtime.optics.malus import phase_from_intensity
+from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.records import F32, F64, U8
+
+
+class NetworkPredictor(Predictor):
+    """Models of `input_frame` panel (one picture per eye and panel) or centre (one per eye), layout NCHW.
+
+    Channels are panel-major, then eye, then RGB. Where the model answers with the outer panels alone, the centre
+    is closed here, as the weighted mean of what each eye lacks.
+    """
+
+    def __init__(self, session: ModelSession, stack: PanelStack, *, source: Path) -> None:
+        """Raises InputError where the model's fixed size is not the panels'."""
+        contract = session.contract
+        self.session, self.stack = session, stack
+        self.name, self.provider, self.parameters = contract.name, session.provider, contract.parameters
+        for given, wanted, name in (
+            (contract.width_px, stack.width_px, "width_px"),
+            (contract.height_px, stack.height_px, "height_px"),
+        ):
+            if given and given != wanted:
+                raise InputError(source, f"contract.{name}", f"made for {given}, the panels have {wanted}")
+        if contract.layout != "NCHW":
+            raise InputError(source, "contract.layout", f"{contract.layout} does not fit {contract.input_frame}")
+        self._panels = range(stack.count) if contract.input_frame == "panel" else (stack.count // 2,)
+        self._order = (0, 1) if contract.eye_order == "left-right" else (1, 0)
+        channels = len(self._panels) * 2 * 3
+        self._input = np.empty((1, channels, stack.height_px, stack.width_px), np.float32)
+        self._layers = np.full((stack.count, stack.height_px, stack.width_px, 4), 255, np.uint8)
+        table = np.arange(256, dtype=np.float32) / np.float32(255)
+        self._table = table if contract.input_value == "intensity" else phase_from_intensity(table, contract.branch)
+
+    def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
+        return tuple(self.stack.panel(n) for n in self._panels)
+
+    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64) -> Prediction:
+        watch = Stopwatch()
+        channel = 0
+        for raster in range(len(self._panels)):
+            for side in self._order:
+                picture = images[side][raster]
+                for c in range(3):
+                    self._input[0, channel] = cv2.LUT(np.ascontiguousarray(picture[..., c]), self._table)
+                    channel += 1
+        watch.lap("prepare")
+        answered = self.stack.count if self.session.contract.output == "panels" else self.stack.count - 1
+        shape = (1, answered * 3, self.stack.height_px, self.stack.width_px)
+        answer = self.session.run(self._input, output_shape=shape)
+        if not np.isfinite(answer.sum()):
+            raise ModelFailure("the network answered with numbers that are not finite")
+        watch.lap("inference")
+        values = np.clip(answer[0].reshape(answered, 3, *shape[2:]), 0, 1)
+        outer = [n for n in range(self.stack.count) if answered == self.stack.count or n != self.stack.count // 2]
+        for n, panel in zip(outer, values, strict=True):
+            self._layers[n, ..., :3] = np.rint(panel.transpose(1, 2, 0) * 255)
+        if answered < self.stack.count:
+            self._close(images, eyes_m, outer)
+        watch.lap("finish")
+        return Prediction(self._layers, watch.stage_ms)
+
+    def _close(self, images: Sequence[Sequence[U8]], eyes_m: F64, outer: Sequence[int]) -> None:
+        """The best centre panel for the outer ones: the mean of what the eyes lack (equal slopes assumed)."""
+        centre = self.stack.count // 2
+        raster = list(self._panels).index(centre)
+        branch = self.session.contract.branch
+        table = phase_from_intensity(np.arange(256, dtype=np.float32) / np.float32(255), branch)
+        needs: list[F32] = []
+        seen = buffer(self.stack.height_px, self.stack.width_px, np.float32)
+        for side, eye_m in enumerate(eyes_m):
+            need = cv2.LUT(np.ascontiguousarray(images[side][raster][..., :3]), table)
+            for n in outer:
+                matrix = target_from_source(eye_m, source=self.stack.panel(centre), target=self.stack.panel(n))
+                panel = self._layers[n, ..., :3].astype(np.float32) / 255
+                need = need - resample(panel, image_from_result=matrix, out=seen)
+            needs.append(np.asarray(need, np.float32))
+        self._layers[centre, ..., :3] = np.rint(np.clip((needs[0] + needs[1]) / 2, 0, 1) * 255)
