@@ -58,7 +58,9 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
         clock,
     )
     limits = RecordingLimits(min(seconds or s.record_max_s, s.record_max_s), round(s.record_max_mib * (1 << 20)))
-    count, first_ns, last_ns, stopped = 0, 0, 0, "the time is up"
+    in_time = seconds is not None and seconds <= s.record_max_s
+    time_is_up = "the time is up" if in_time else "the limit sensor.record_max_s is reached"
+    count, first_ns, last_ns = 0, 0, 0
     with ExitStack() as cleanup:
         cleanup.callback(worker.stop)
         worker.start()
@@ -70,15 +72,14 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
             deadline_ns = frame.capture_ns + round((seconds or s.record_max_s) * 1e9)
             while True:
                 if not writer.write(frame if images else replace(frame, colour=None, depth_mm=None)):
-                    is_longest = seconds is None or seconds > s.record_max_s
-                    too_long = frame.capture_ns - first_ns > limits.max_s * 1e9
-                    stopped = "the time is up" if too_long and not is_longest else "a limit is reached"
+                    is_long = frame.capture_ns - first_ns > limits.max_s * 1e9
+                    stopped = time_is_up if is_long else "the limit sensor.record_max_mib is reached"
                     break
                 count, last_ns = writer.count, frame.capture_ns
                 tell(count, (last_ns - first_ns) / 1e9)
                 following = _next(worker, deadline_ns)
                 if following is None:
-                    stopped = worker.reason if worker.state == "ended" else stopped
+                    stopped = worker.reason if worker.state in ("ended", "failed") else time_is_up
                     break
                 frame = following
         except KeyboardInterrupt:

@@ -1,0 +1,83 @@
+"""`phasestack record` writes what the sensor saw: eyes always, pictures only on request."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from runtime.commands.record import record, record_to
+from runtime.config import Settings, validated
+from runtime.errors import FatalError
+from runtime.sensor.recording import Recording
+
+app = typer.Typer()
+app.command()(record)
+
+RUN = "import typer; from runtime.commands.record import record; typer.run(record)"
+
+
+def settings(**sensor) -> Settings:
+    return validated(Settings, {"sensor": sensor}, source="test")
+
+
+def test_a_recording_of_the_demo_has_its_samples(tmp_path):
+    out = tmp_path / "new" / "a.mcap"
+    answer = CliRunner().invoke(app, ["--out", str(out), "--seconds", "1", "--json"])
+    summary = json.loads(answer.stdout)
+    frames = list(Recording(out).samples())
+    assert answer.exit_code == 0 and summary["samples"] == len(frames) and 25 <= len(frames) <= 31
+    assert summary["seconds"] <= 1.0 and summary["stopped"] == "the time is up"
+    assert frames[0].eyes is not None and frames[0].true_eyes_m is not None
+
+
+def test_a_source_that_ends_ends_the_recording(tmp_path):
+    summary = record_to(tmp_path / "a.mcap", settings(start_s=9.6), images=False, seconds=30, quiet=True)
+    assert "no more samples" in summary["stopped"] and summary["samples"] >= 10
+
+
+def test_a_limit_in_the_settings_is_kept_and_told(tmp_path):
+    summary = record_to(tmp_path / "a.mcap", settings(record_max_s=0.3), images=False, seconds=None, quiet=True)
+    assert "record_max_s" in summary["stopped"] and summary["seconds"] <= 0.3
+
+
+def test_ctrl_c_ends_it_properly(tmp_path):
+    out = tmp_path / "a.mcap"
+    process = subprocess.Popen([sys.executable, "-c", RUN, "--out", str(out)], stderr=subprocess.DEVNULL)
+    end = time.monotonic() + 20
+    while not out.exists() and time.monotonic() < end:
+        time.sleep(0.05)
+    time.sleep(0.3)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(20) == 0
+    assert Recording(out).is_whole
+
+
+def test_a_sensor_that_gives_nothing_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr("runtime.commands.record.FIRST_SAMPLE_S", 0.3)
+    with pytest.raises(FatalError, match="usb-eyes"):
+        record_to(tmp_path / "a.mcap", settings(driver="usb-eyes"), images=False, seconds=1, quiet=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_pictures_are_kept_only_with_images(tmp_path):
+    from tests.eyes.scene import IPD_M, camera, scene
+    from tests.sensor.oni_file import write_oni
+
+    view = camera(640, 480, 60.0)
+    colour, depth, _ = scene(np.array([0.0, 0.0, 0.6]), intrinsics=view)
+    fov = (np.radians(60.0), 2 * np.arctan(240 / view.fy_px))
+    write_oni(tmp_path / "v.oni", np.repeat(depth[None], 12, 0), np.repeat(colour[None], 12, 0), fov_rad=fov)
+    source = settings(driver="openni2", source=str(tmp_path / "v.oni"), loop=True)
+    for images in (False, True):
+        record_to(tmp_path / "a.mcap", source, images=images, seconds=0.8, quiet=True)
+        frames = list(Recording(tmp_path / "a.mcap").samples())
+        assert all((f.depth_mm is not None) == images for f in frames)
+        assert any(f.colour is not None for f in frames) == images
+        found = [np.linalg.norm(np.diff(f.eyes.eyes_m, axis=0)) for f in frames if f.eyes is not None]
+        assert np.median(found) == pytest.approx(IPD_M, abs=0.004)

@@ -1,0 +1,232 @@
+"""A recording comes back as it was, loses at most a chunk to a crash, and stays within its limits."""
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import tracemalloc
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from runtime.errors import InputError
+from runtime.records import EyePoints, Intrinsics, SensorFrame
+from runtime.sensor.demo_recording import demo_recording_bytes, samples
+from runtime.sensor.recording import Recording, RecordingLimits, RecordingWriter, recording_to
+from runtime.sensor.recording_format import RecordingHeader, eyes_message, frame_from_eyes_message
+
+EYES_ONLY = RecordingHeader(driver="test", serial="S1")
+WITH_IMAGES = RecordingHeader(driver="test", colour=True, depth=True)
+CAMERA = Intrinsics(64, 48, 60.0, 61.0, 32.5, 23.5)
+
+
+def sample(k: int, **parts) -> SensorFrame:
+    eyes = EyePoints(np.array([[0.03, 0.0, 0.6 + k * 1e-4], [-0.03, 0.0, 0.6]]), np.array([0.9, 0.5]))
+    return SensorFrame(k, 10**9 + k * 33_333_333, eyes, **parts)
+
+
+def write(path, frames, header=EYES_ONLY, limits=None):
+    with recording_to(path, header, limits=limits) as writer:
+        return [writer.write(frame) for frame in frames]
+
+
+finite = st.floats(-10, 10)
+
+
+@given(
+    values=st.lists(st.one_of(finite, st.just(float("nan"))), min_size=6, max_size=6),
+    sequence=st.integers(0, 2**40),
+    capture_ns=st.integers(0, 2**62),
+    completed=st.sampled_from(["", "left", "right"]),
+    truth=st.booleans(),
+    face=st.booleans(),
+)
+def test_a_sample_comes_back_to_a_tenth_of_a_micrometre(values, sequence, capture_ns, completed, truth, face):
+    points = np.array(values).reshape(2, 3)
+    eyes = EyePoints(points, np.array([0.25, 1.0]), completed) if face else None
+    frame = SensorFrame(sequence, capture_ns, eyes, true_eyes_m=np.nan_to_num(points) if truth else None)
+    back = frame_from_eyes_message(eyes_message(frame))
+    assert (back.sequence, back.capture_ns, back.eyes is None) == (sequence, capture_ns, not face)
+    if face:
+        np.testing.assert_allclose(back.eyes.eyes_m, points, atol=6e-8)
+        assert back.eyes.completed == completed
+    assert (back.true_eyes_m is not None) == truth
+
+
+def test_a_file_tells_its_sensor_and_all_its_samples(tmp_path):
+    path = tmp_path / "new" / "a.mcap"
+    assert all(write(path, [sample(k) for k in range(100)]))
+    recording = Recording(path)
+    assert recording.header == EYES_ONLY and recording.is_whole
+    assert [f.sequence for f in recording.samples()] == list(range(100))
+    assert [f.sequence for f in recording.samples()] == list(range(100))  # as often as one likes
+
+
+def test_other_tools_open_it(tmp_path):
+    from mcap.reader import make_reader
+
+    write(tmp_path / "a.mcap", [sample(k) for k in range(50)])
+    with (tmp_path / "a.mcap").open("rb") as file:
+        found = [(s.name, s.encoding, c.topic, json.loads(m.data)) for s, c, m in make_reader(file).iter_messages()]
+    assert len(found) == 50
+    assert found[0][:3] == ("phasestack.EyeSample", "jsonschema", "/eyes")
+    assert found[3][3]["sequence"] == 3
+
+
+def test_images_are_recorded_only_with_a_header_that_says_so(tmp_path):
+    random = np.random.default_rng(0)
+    depth = random.integers(0, 65535, (48, 64), dtype=np.uint16)
+    colour = np.full((48, 64, 3), (200, 100, 50), np.uint8)
+    frame = sample(1, colour=colour, depth_mm=depth, intrinsics=CAMERA)
+    write(tmp_path / "images.mcap", [frame, frame], WITH_IMAGES)
+    write(tmp_path / "eyes.mcap", [frame, frame])
+    for back in Recording(tmp_path / "images.mcap").samples():
+        np.testing.assert_array_equal(back.depth_mm, depth)
+        np.testing.assert_allclose(back.colour, colour, atol=3)
+        assert back.intrinsics == CAMERA
+    for back in Recording(tmp_path / "eyes.mcap").samples():
+        assert back.colour is None and back.depth_mm is None and back.intrinsics is None
+    assert b"/colour" not in (tmp_path / "eyes.mcap").read_bytes()
+
+
+def test_images_do_not_pile_up_in_memory(tmp_path):
+    depth = np.zeros((480, 640), np.uint16)
+    write(tmp_path / "a.mcap", [sample(k, depth_mm=depth) for k in range(60)], WITH_IMAGES)
+    tracemalloc.start()
+    count = sum(1 for _ in Recording(tmp_path / "a.mcap").samples())
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert count == 60 and peak < 15 * depth.nbytes
+
+
+def test_a_truncated_file_opens_up_to_its_last_whole_chunk_and_says_so(tmp_path, caplog):
+    whole, path = demo_recording_bytes(), tmp_path / "cut.mcap"
+    expected = list(samples())
+    counts = []
+    for size in range(3000, len(whole), 4801):
+        path.write_bytes(whole[:size])
+        caplog.clear()
+        try:
+            recording = Recording(path)
+        except InputError as error:
+            assert "cut.mcap" in str(error) and size < 6000
+            continue
+        found = list(recording.samples())
+        assert [f.sequence for f in found] == [f.sequence for f in expected[: len(found)]]
+        assert not recording.is_whole and "cut off" in caplog.text
+        counts.append(len(found))
+        bytes_a_sample = len(whole) / len(expected)
+        assert len(found) > size / bytes_a_sample - 2 * 4096 / bytes_a_sample - 20
+    assert counts == sorted(counts) and counts[-1] > 280
+
+
+@settings(max_examples=25, deadline=None)
+@given(place=st.floats(0, 1, exclude_max=True), bits=st.integers(1, 255))
+def test_a_damaged_byte_loses_no_sample_before_it_and_never_invents_one(tmp_path_factory, place, bits):
+    data = bytearray(demo_recording_bytes())
+    data[int(place * len(data))] ^= bits
+    path = tmp_path_factory.mktemp("damaged") / "a.mcap"
+    path.write_bytes(bytes(data))
+    try:
+        found = list(Recording(path).samples())
+    except InputError as error:
+        assert str(path) in str(error)
+        return
+    expected = [eyes_message(f) for f in samples()]
+    assert [eyes_message(f) for f in found] == expected[: len(found)]
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\x89MCAP0\r\n", b"not a recording", b"\x89MCAP0\r\n" * 2, b"\0" * 5000], ids=range(5)
+)
+def test_what_is_no_recording_is_refused_by_name(tmp_path, content):
+    path = tmp_path / "bad.mcap"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="bad"):
+        Recording(path)
+
+
+def test_a_missing_file_and_a_folder_are_refused_by_name(tmp_path):
+    for path in (tmp_path / "none.mcap", tmp_path):
+        with pytest.raises(InputError, match=path.name):
+            Recording(path)
+
+
+def test_a_recording_of_another_program_or_version_is_refused(tmp_path):
+    from mcap.writer import Writer
+
+    path = tmp_path / "other.mcap"
+    for name, metadata in (("else", {}), ("phasestack.recording", {"schema_version": "99"})):
+        with path.open("wb") as file:
+            writer = Writer(file)
+            writer.start()
+            writer.add_metadata(name, metadata)
+            writer.finish()
+        with pytest.raises(InputError, match="other"):
+            Recording(path)
+
+
+def test_it_ends_before_it_is_too_long(tmp_path):
+    done = write(tmp_path / "a.mcap", [sample(k) for k in range(100)], limits=RecordingLimits(max_s=1.0))
+    assert done.count(True) == 31 and not done[-1]  # 0 to 30/30 s
+    assert len(list(Recording(tmp_path / "a.mcap").samples())) == 31
+
+
+@pytest.mark.parametrize("limit", [30_000, 200_000])
+def test_its_file_is_never_larger_than_allowed(tmp_path, limit):
+    random = np.random.default_rng(0)
+    depth = random.integers(0, 65535, (48, 64), dtype=np.uint16)
+    frames = [sample(k, depth_mm=depth) for k in range(1500)]
+    for header in (EYES_ONLY, WITH_IMAGES):
+        write(tmp_path / "a.mcap", frames, header, RecordingLimits(max_bytes=limit))
+        assert 0.4 * limit < (tmp_path / "a.mcap").stat().st_size <= limit
+        assert Recording(tmp_path / "a.mcap").is_whole
+
+
+def test_without_a_sample_an_older_file_stays_and_nothing_new_is_left(tmp_path):
+    (tmp_path / "a.mcap").write_bytes(b"older")
+    write(tmp_path / "a.mcap", [])
+    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("a.mcap", b"older")]
+
+
+def test_a_killed_recorder_leaves_all_but_its_last_chunk(tmp_path):
+    path = tmp_path / "a.mcap"
+    code = f"""
+import pathlib, time
+from tests.sensor.test_recording import EYES_ONLY, sample
+from runtime.sensor.recording import recording_to
+with recording_to(pathlib.Path({str(path)!r}), EYES_ONLY) as writer:
+    for k in range(200):
+        writer.write(sample(k))
+    print("written", flush=True)
+    time.sleep(60)
+"""
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, env=os.environ)
+    assert process.stdout.readline() == b"written\n"
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    recording = Recording(path)
+    count = len(list(recording.samples()))
+    assert not recording.is_whole and 170 <= count <= 200
+
+
+def test_a_writer_takes_no_longer_for_a_long_recording():
+    file = io.BytesIO()
+    writer = RecordingWriter(file, EYES_ONLY, limits=RecordingLimits(max_s=1e6))
+
+    def batch(start):
+        begin = time.process_time()
+        for k in range(start, start + 1500):
+            writer.write(sample(k))
+        return time.process_time() - begin
+
+    first = batch(0)
+    for k in range(1, 6):
+        last = batch(1500 * k)
+    assert last < 4 * first

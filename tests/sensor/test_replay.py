@@ -1,0 +1,104 @@
+"""A replayed recording is a sensor: at its own pace, or sample after sample."""
+
+from itertools import pairwise
+
+import pytest
+
+from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
+from runtime.errors import EndOfRecording, InputError, SensorLost, SensorTimeout
+from runtime.sensor.replay import ReplayDriver
+
+PERIOD_NS = NS_PER_S / 30
+
+
+def opened(clock, **options):
+    driver = ReplayDriver("demo", clock, **options)
+    driver.open()
+    return driver
+
+
+def everything(driver, most=10_000):
+    frames = []
+    try:
+        while len(frames) < most:
+            frames.append(driver.next_sample())
+    except EndOfRecording:
+        pass
+    return frames
+
+
+def test_every_sample_is_delivered_once_in_order_and_without_waiting():
+    clock = SimulatedClock(777)
+    driver = opened(clock, latency_ms=15.0)
+    frames = everything(driver)
+    assert [f.sequence for f in frames] == list(range(1, 301))
+    assert frames[0].capture_ns == 777 and clock.now_ns() == 777
+    assert driver.available_ns(frames[5]) == frames[5].capture_ns + 15_000_000
+
+
+def test_two_replays_are_the_same():
+    first, second = (everything(opened(SimulatedClock(5))) for _ in range(2))
+    assert [(f.sequence, f.capture_ns) for f in first] == [(f.sequence, f.capture_ns) for f in second]
+    assert all((a.eyes is None) == (b.eyes is None) for a, b in zip(first, second))
+
+
+def test_recorded_timing_is_kept_on_the_runs_clock():
+    clock = SimulatedClock(NS_PER_S)
+    driver = opened(clock, latency_ms=20.0)
+    for k in range(20):
+        frame = driver.read_newest(0.5)
+        assert frame.capture_ns == pytest.approx(NS_PER_S + k * PERIOD_NS, abs=2)
+        assert clock.now_ns() == frame.capture_ns + 20_000_000
+
+
+def test_who_comes_late_gets_the_newest_and_the_others_are_counted():
+    clock = SimulatedClock()
+    driver = opened(clock)
+    driver.read_newest(1.0)
+    clock.advance_ns(round(10.5 * PERIOD_NS))
+    assert driver.read_newest(1.0).sequence == 11 and driver.overtaken == 9
+
+
+def test_waiting_ends_with_the_time_out():
+    clock = SimulatedClock()
+    driver = opened(clock, latency_ms=500.0)
+    with pytest.raises(SensorTimeout):
+        driver.read_newest(0.1)
+    assert clock.now_ns() == NS_PER_S // 10
+
+
+def test_it_starts_at_a_time():
+    frames = everything(opened(SimulatedClock(9), start_s=9.5))
+    assert [f.sequence for f in frames] == list(range(286, 301)) and frames[0].capture_ns == 9
+
+
+def test_a_start_after_the_end_is_refused():
+    with pytest.raises(InputError, match="start"):
+        opened(SimulatedClock(), start_s=11.0)
+
+
+def test_a_loop_goes_on_evenly_and_counts_on():
+    frames = everything(opened(SimulatedClock(), loop=True, start_s=9.0), most=100)
+    assert [f.sequence for f in frames] == list(range(271, 371))
+    steps = {b.capture_ns - a.capture_ns for a, b in pairwise(frames)}
+    assert max(steps) - min(steps) <= 1
+
+
+def test_it_can_be_opened_again_and_closed_twice():
+    driver = opened(SimulatedClock())
+    everything(driver)
+    with pytest.raises(EndOfRecording):
+        driver.read_newest(0.1)
+    driver.open()
+    assert driver.next_sample().sequence == 1
+    driver.close()
+    driver.close()
+    with pytest.raises(SensorLost):
+        driver.next_sample()
+
+
+def test_it_tells_its_sensor(tmp_path):
+    driver = opened(MonotonicClock())
+    assert driver.serial == "demo" and driver.capabilities.eye_points and not driver.capabilities.colour
+    with pytest.raises(InputError, match="none"):
+        ReplayDriver(str(tmp_path / "none.mcap"), MonotonicClock()).open()

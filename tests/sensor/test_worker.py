@@ -1,0 +1,201 @@
+"""The sensor's thread: the newest wins, what is lost comes back, and what hangs is left behind."""
+
+import statistics
+import threading
+import time
+
+import pytest
+
+from runtime.clock import MonotonicClock
+from runtime.config import SensorSettings
+from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout
+from runtime.records import SensorFrame
+from runtime.sensor.base import Capabilities, SensorDriver
+from runtime.sensor.worker import SensorWorker
+
+SETTINGS = SensorSettings(timeout_s=0.05, reopen_backoff_s=0.02, reopen_backoff_max_s=0.1, open_timeout_s=0.2)
+FRAME_S = 1 / 60
+
+
+class Scripted(SensorDriver):
+    """A driver whose `read_newest` asks the test what to do."""
+
+    name = "scripted"
+    capabilities = Capabilities(eye_points=True)
+
+    def __init__(self, act, log, *, on_open=None):
+        self._act, self._log, self._on_open = act, log, on_open
+        self._count = 0
+
+    def open(self):
+        self._log.append(f"open {self.serial}".strip())
+        if self._on_open:
+            self._on_open()
+        self.serial = self.serial or "S7"
+
+    def read_newest(self, timeout_s):
+        self._count += 1
+        self._act()
+        return SensorFrame(self._count, self._count)
+
+    def close(self):
+        self._log.append("close")
+
+
+def until(condition, seconds=5.0):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(0.002)
+    return False
+
+
+@pytest.fixture
+def started():
+    workers = []
+
+    def start(act, *, on_open=None, settings=SETTINGS):
+        log = []
+        worker = SensorWorker(lambda: Scripted(act, log, on_open=on_open), settings, MonotonicClock())
+        worker.start()
+        workers.append(worker)
+        return worker, log
+
+    yield start
+    for worker in workers:
+        worker.stop()
+
+
+def raiser(error):
+    def act():
+        time.sleep(0.002)
+        raise error
+
+    return act
+
+
+def test_the_newest_sample_wins_and_those_it_overtook_are_counted(started):
+    worker, _ = started(lambda: time.sleep(0.002))
+    assert until(lambda: worker.stale_inputs >= 5)
+    frame = worker.newest()
+    assert frame.sequence >= 6 and worker.state == "running" and worker.serial == "S7"
+
+
+def test_a_sample_is_handed_out_once(started):
+    gate = threading.Semaphore(1)
+    worker, _ = started(lambda: gate.acquire(timeout=0.04) or (_ for _ in ()).throw(SensorTimeout("none")))
+    assert until(lambda: worker.newest() is not None)
+    assert worker.newest() is None
+
+
+def test_a_lost_device_is_closed_and_reopened_by_its_serial(started):
+    lose = [False]
+
+    def act():
+        time.sleep(0.002)
+        if lose[0]:
+            lose[0] = False
+            raise SensorLost("unplugged")
+
+    worker, log = started(act)
+    assert until(lambda: worker.newest() is not None)
+    lose[0] = True
+    assert until(lambda: len(log) >= 3 and worker.state == "running")
+    assert log[:3] == ["open", "close", "open S7"]
+    assert until(lambda: worker.newest() is not None)
+
+
+def test_attempts_to_reopen_back_off_and_go_on(started):
+    worker, log = started(lambda: None, on_open=raiser(SensorLost("not there")))
+    time.sleep(0.6)
+    attempts = log.count("open")
+    # 0.02 + 0.04 + 0.08 + 0.1 ... : ten at most, and no fewer than half of that on a busy machine.
+    assert 4 <= attempts <= 10 and worker.state == "lost" and worker.reason == "not there"
+
+
+def test_a_stream_that_stalls_without_an_error_is_reopened(started):
+    worker, log = started(raiser(SensorTimeout("nothing")))
+    assert until(lambda: log.count("open") >= 1 and worker.state == "stalled")
+    assert until(lambda: log.count("open S7") >= 2)
+
+
+def test_an_unexpected_error_of_an_sdk_is_a_lost_sensor(started, caplog):
+    worker, log = started(raiser(ZeroDivisionError("inside the SDK")))
+    assert until(lambda: log.count("close") >= 2)
+    assert "ZeroDivisionError" in worker.reason
+
+
+def test_a_fatal_error_is_not_tried_again(started):
+    worker, log = started(lambda: None, on_open=raiser(FatalError("no such driver")))
+    assert until(lambda: worker.state == "failed")
+    time.sleep(0.1)
+    assert log == ["open", "close"] and str(worker.error) == "no such driver"
+
+
+def test_the_end_of_a_recording_is_told_and_its_last_sample_is_not_lost(started):
+    calls = []
+
+    def act():
+        calls.append(1)
+        if len(calls) > 1:
+            raise EndOfRecording("over")
+
+    worker, _ = started(act)
+    assert until(lambda: worker.state == "ended")
+    assert worker.newest().sequence == 1
+
+
+@pytest.mark.parametrize("where", ["open", "read"])
+def test_an_sdk_that_hangs_is_left_behind_and_never_blocks_the_loop(started, where, monkeypatch):
+    monkeypatch.setattr("runtime.sensor.worker.HANG_MARGIN_S", 0.1)
+    hung, release = [], threading.Event()
+
+    def hang_once():
+        time.sleep(0.002)
+        if not hung:
+            hung.append(threading.current_thread())
+            release.wait(20)
+
+    worker, log = started(hang_once if where == "read" else lambda: time.sleep(0.002),
+                          on_open=hang_once if where == "open" else None)  # fmt: skip
+    taken, seen, end = [], False, time.monotonic() + 5
+    while not seen and time.monotonic() < end:
+        begin = time.perf_counter()
+        seen = worker.newest() is not None and bool(hung)
+        state = worker.state
+        taken.append(time.perf_counter() - begin)
+        time.sleep(0.002)
+    assert seen and state == "running" and worker.reopened == 1
+    # The driver hangs for 20 s; no call waited for it, whatever else this machine was busy with.
+    assert max(taken) < 0.5 and statistics.median(taken) < FRAME_S / 4
+    assert hung[0].is_alive()
+    # What the abandoned thread still says does not count, and it closes its driver on its way out.
+    closed = log.count("close")
+    release.set()
+    assert until(lambda: not hung[0].is_alive())
+    assert log.count("close") == closed + 1 and worker.state == "running"
+
+
+def test_stopping_takes_no_longer_than_its_time_out_even_when_an_sdk_hangs(started):
+    release = threading.Event()
+    worker, _ = started(lambda: release.wait(20))
+    time.sleep(0.05)
+    begin = time.monotonic()
+    worker.stop(timeout_s=0.1)
+    assert time.monotonic() - begin < 1.0 and worker.state == "stopped"
+    release.set()
+
+
+def test_a_device_that_always_hangs_does_not_fill_memory_with_threads(started, monkeypatch):
+    monkeypatch.setattr("runtime.sensor.worker.HANG_MARGIN_S", 0.0)
+    monkeypatch.setattr("runtime.sensor.worker.ABANDONED_MAX", 3)
+    release = threading.Event()
+    quick = SETTINGS.model_copy(update={"open_timeout_s": 0.02, "timeout_s": 0.01})
+    worker, _ = started(lambda: None, on_open=lambda: release.wait(20), settings=quick)
+    before = threading.active_count()
+    for _ in range(100):
+        worker.newest()
+        time.sleep(0.01)
+    assert worker.state == "hung" and threading.active_count() <= before + 4
+    release.set()
