@@ -1,0 +1,47 @@
+"""Keys from a terminal's bytes."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calib.keys import Key, TerminalKeys, parse
+
+
+@pytest.mark.parametrize(
+    ("data", "keys"),
+    [
+        (b"\n", [Key.ACCEPT]),
+        (b"np q", [Key.NEXT, Key.PREVIOUS, Key.ACCEPT, Key.QUIT]),
+        (b"\x1b[C\x1b[D\x1b[A\x1b[B", [Key.RIGHT, Key.LEFT, Key.UP, Key.DOWN]),
+        (b"xyz", []),
+        (b"\x1b[Zn", [Key.NEXT]),
+    ],
+)
+def test_bytes_mean_keys(data: bytes, keys: list[Key]) -> None:
+    assert parse(data) == (keys, b"")
+
+
+@given(st.lists(st.sampled_from([b"\x1b[A", b"n", b"\n", b"\x1b[D", b"f"])), st.lists(st.integers(1, 4)))
+def test_an_arrow_may_arrive_in_pieces(sent: list[bytes], cuts: list[int]) -> None:
+    data, rest, found = b"".join(sent), b"", []
+    for cut in [*cuts, len(data) + 1]:
+        keys, rest = parse(rest + data[:cut])
+        data, found = data[cut:], found + keys
+    assert found == parse(b"".join(sent))[0]
+    assert rest == b""
+
+
+def test_a_closed_input_quits_and_an_idle_one_says_nothing() -> None:
+    reading, writing = os.pipe()
+    keys = TerminalKeys(reading)
+    assert keys.poll() is None
+    os.write(writing, b"nf")
+    assert [keys.poll(), keys.poll(), keys.poll()] == [Key.NEXT, Key.FINER, None]
+    os.close(writing)
+    assert keys.poll() is Key.QUIT
+    keys.close()
+    os.close(reading)

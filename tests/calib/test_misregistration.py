@@ -1,0 +1,96 @@
+"""A displaced panel costs what it must, and the registration gives it back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.misregistration import corrected, displayed_quality, seen_through, shifted
+from calib.registration import true_from_ideal
+from runtime.config import PanelSettings
+from runtime.optics.retina import seen_by
+
+EYES = np.array([[0.6, -0.03, 0.0], [0.6, 0.03, 0.0]])
+VIEW = {"fov_deg": 40.0, "width_px": 480, "height_px": 270}
+
+
+def smooth_layers(seed: int = 0) -> np.ndarray:
+    import cv2
+
+    random = np.random.default_rng(seed)
+    noise = random.normal(size=(3, 270, 480, 4)).astype(np.float32)
+    layers = np.stack([cv2.GaussianBlur(layer, (0, 0), 3) for layer in noise])
+    layers = np.clip(128 + 60 * layers / layers.std(), 0, 255).astype(np.uint8)
+    layers[..., 3] = 255
+    return layers
+
+
+def test_panels_in_their_places_look_as_the_retina_says(small_stack) -> None:
+    layers = smooth_layers()
+    straight = seen_through(EYES[0], layers, small_stack, [np.eye(3)] * 3, **VIEW)
+    plain = seen_by(EYES[0], layers, small_stack, **VIEW)
+    np.testing.assert_array_equal(straight.image, plain.image)
+    np.testing.assert_array_equal(straight.mask, plain.mask)
+
+
+def test_a_displaced_panel_looks_as_its_shifted_picture(small_stack) -> None:
+    """Pixel (u, v) of a panel displaced by (3, -2) lies where (u - 3, v + 2) belongs."""
+    layers = smooth_layers()
+    displaced = seen_through(EYES[0], layers, small_stack, shifted(small_stack, index=2, shift_px=(3, -2)), **VIEW)
+    moved = layers.copy()
+    moved[2] = np.roll(layers[2], (2, -3), axis=(0, 1))
+    plain = seen_by(EYES[0], moved, small_stack, **VIEW)
+    inner = plain.mask & displaced.mask
+    inner[:12], inner[-12:], inner[:, :12], inner[:, -12:] = False, False, False, False
+    np.testing.assert_allclose(displaced.image[inner], plain.image[inner], atol=2e-3)
+
+
+def test_half_a_pixel_costs_and_more_costs_more(small_stack) -> None:
+    layers = smooth_layers()
+    wanted = [(seen_by(eye, layers, small_stack, **VIEW).image * 255).astype(np.uint8) for eye in EYES]
+    cost = [
+        displayed_quality(
+            layers, wanted, EYES, small_stack, shifted(small_stack, index=2, shift_px=(shift, 0.0)), fov_deg=40.0
+        ).psnr_db
+        for shift in (0.0, 0.5, 1.0, 2.0)
+    ]
+    assert cost[0] > cost[1] + 3 > cost[2] + 6
+    assert cost[2] > cost[3] + 3
+
+
+def test_the_correction_gives_the_picture_back(small_stack) -> None:
+    layers = smooth_layers()
+    wanted = [(seen_by(eye, layers, small_stack, **VIEW).image * 255).astype(np.uint8) for eye in EYES]
+    truth = [
+        true_from_ideal(np.random.default_rng(n).normal(scale=1.5, size=(4, 2)), width_px=480, height_px=270)
+        for n in range(3)
+    ]
+    spoiled = displayed_quality(layers, wanted, EYES, small_stack, truth, fov_deg=40.0).psnr_db
+    mended = displayed_quality(corrected(layers, truth), wanted, EYES, small_stack, truth, fov_deg=40.0).psnr_db
+    assert mended > spoiled + 10
+
+
+def test_the_correction_is_what_the_presentation_shader_does() -> None:
+    """One homography, through OpenCV here and through the panels' own shader there."""
+    from runtime.clock import SimulatedClock
+    from runtime.gl import offscreen_context
+    from runtime.panels.offscreen import OffscreenPanels
+    from runtime.records import LayerFrame
+
+    layers = smooth_layers()
+    matrix = true_from_ideal(np.array([[2.0, 1], [-1, 3], [1, -2], [0, 2]]), width_px=480, height_px=270)
+    panels = (PanelSettings(), PanelSettings(homography=tuple(map(tuple, matrix.tolist()))), PanelSettings())
+    sink = OffscreenPanels(offscreen_context(), clock=SimulatedClock(), width_px=480, height_px=270, panels=panels)
+    sink.present(LayerFrame(1, layers))
+    shown = sink.read_back()[1]
+    sink.close()
+    ours = corrected(layers, [np.eye(3), matrix, np.eye(3)])[1]
+    inner = (slice(6, -6), slice(6, -6), slice(0, 3))
+    assert np.abs(shown[inner].astype(int) - ours[inner].astype(int)).max() <= 3
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_only_the_panel_that_was_asked_for_is_displaced(small_stack, index) -> None:
+    matrices = shifted(small_stack, index=index, shift_px=(1.5, 0.5))
+    for number, matrix in enumerate(matrices):
+        assert np.array_equal(matrix, np.eye(3)) == (number != index)

@@ -1,0 +1,115 @@
+"""The page: complete, self-contained, and made even of a calibration that holds only its matrix."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from calib.commands import app
+from runtime.artifacts import read_image
+from runtime.errors import InputError
+
+run = CliRunner()
+PUBLISHED = """stack_from_sensor = [
+    [0.699976, 2.09768, 7.81822, -1.90611], [8.09414, -0.276962, -0.650369, 0.166057],
+    [0.0985957, 7.8446, -2.11359, 3.31142], [0, 0, 0, 1]]
+"""
+
+
+def report(*options: str) -> dict:
+    result = run.invoke(app, ["report", "--json", *options])
+    if result.exception is not None:
+        raise result.exception
+    return json.loads(result.stdout)
+
+
+@pytest.fixture
+def calibration(tmp_path, measured, known_m, write_pairs) -> Path:
+    sensor = measured(sigma_m=0.003)
+    sensor[5] += 0.3
+    path = tmp_path / "c.toml"
+    result = run.invoke(app, ["solve", "--pairs", str(write_pairs(sensor, known_m)), "--out", str(path), "--json"])
+    assert result.exit_code == 0
+    return path
+
+
+def test_the_page_holds_numbers_and_pictures_and_needs_nothing_else(tmp_path, calibration) -> None:
+    out = tmp_path / "deep" / "report"
+    told = report(str(calibration), "--out", str(out))
+    assert told["points"] == 27
+    assert told["rejected"] == 1
+    page = (out / "index.html").read_text()
+    assert page.count("data:image/png;base64,") == 3
+    assert not re.search(r"(src|href)=\"(?!data:)", page)
+    for text in ("residual, RMS", "robust", "condition", "expected error at the eye", "line 7", "rejected"):
+        assert text in page
+    for name in ("residuals.png", "geometry.png", "eye-error.png"):
+        assert read_image(out / name).std() > 5
+
+
+def test_its_numbers_are_those_of_the_solution(tmp_path, calibration, measured, known_m) -> None:
+    told = report(str(calibration), "--out", str(tmp_path / "r"))
+    assert 2 < told["rms_mm"] < 8
+    assert told["axis_rms_mm"] == pytest.approx(told["axis_rms_mm"])
+    assert np.hypot.reduce(told["axis_rms_mm"]) == pytest.approx(told["rms_mm"])
+    assert told["eye_error_mm"] < told["eye_error_p95_mm"] < 10
+
+
+def test_the_published_prototype_is_reported_without_its_points(tmp_path) -> None:
+    path = tmp_path / "published.toml"
+    path.write_text(PUBLISHED)
+    told = report(str(path), "--out", str(tmp_path / "r"))
+    assert told["scale"] == pytest.approx(8.125, abs=1e-3)
+    assert told["similarity_defect"] < 2e-6
+    assert told["eye_error_mm"] is None
+    page = (tmp_path / "r" / "index.html").read_text()
+    assert "far from 1" in page
+    assert "--pairs" in page
+
+
+def test_the_points_can_be_given(tmp_path, measured, known_m, write_pairs) -> None:
+    path = tmp_path / "plain.toml"
+    from runtime.eyes.demo_geometry import demo_stack_from_sensor
+
+    path.write_text(f"stack_from_sensor = {demo_stack_from_sensor().tolist()}\n")
+    pairs = write_pairs(measured(sigma_m=0.002), known_m)
+    told = report(str(path), "--out", str(tmp_path / "r"), "--pairs", str(pairs))
+    assert told["rms_mm"] == pytest.approx(0.002e3 * np.sqrt(3), rel=0.2)
+
+
+def test_what_a_file_says_is_not_taken_for_markup(tmp_path) -> None:
+    path = tmp_path / "c.toml"
+    path.write_text(PUBLISHED + 'method = "<script>alert(1)</script>"\n')
+    report(str(path), "--out", str(tmp_path / "r"))
+    assert "<script>" not in (tmp_path / "r" / "index.html").read_text()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        "sensor_m = [[1, 2]]\nstack_m = [[1, 2]]",
+        "sensor_m = [[1, 2, 3]]",
+        "sensor_m = 3\nstack_m = 4",
+        "sensor_m = [[1, 2, 3]]\nstack_m = [[1, 2, 3]]\nused = [false]",
+        "sensor_m = [[1, 2, nan]]\nstack_m = [[1, 2, 3]]",
+    ],
+)
+def test_spoiled_points_are_refused_and_nothing_is_written(tmp_path, data) -> None:
+    path = tmp_path / "c.toml"
+    path.write_text(PUBLISHED + "[data]\n" + data + "\n")
+    with pytest.raises(InputError, match="data"):
+        report(str(path), "--out", str(tmp_path / "r"))
+    assert not (tmp_path / "r").exists()
+
+
+def test_the_methods_table_is_written_with_its_plots(tmp_path) -> None:
+    result = run.invoke(app, ["methods", "--out", str(tmp_path / "m"), "--seeds", "5", "--pairs-max", "100", "--json"])
+    assert result.exit_code == 0, result.output
+    told = json.loads((tmp_path / "m" / "methods.json").read_text())
+    assert [case["sigma_m"] for case in told["cases"]["clean"]] == [0.0, 0.001, 0.003, 0.01, 0.03]
+    assert (tmp_path / "m" / "index.html").read_text().count("data:image/png;base64,") == 4
