@@ -1,0 +1,55 @@
+# Two commands do all the set-up: `make demo` (what the runtime needs, no torch) and `make test` (everything).
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO_ARGS ?=
+PYTEST_ARGS ?=
+export PIP_DISABLE_PIP_VERSION_CHECK = 1
+
+.PHONY: demo test test-slow lint types bench soak install uninstall system clean
+
+demo: $(VENV)/.runtime
+	$(BIN)/phasestack demo $(DEMO_ARGS)
+
+test: $(VENV)/.test lint types
+	$(BIN)/python -m pytest -m "not slow" $(PYTEST_ARGS)
+
+test-slow: $(VENV)/.test
+	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
+
+lint: $(VENV)/.test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/.test
+	$(BIN)/mypy
+
+bench: $(VENV)/.test
+	$(BIN)/phasestack bench --out out/bench.json
+
+soak: $(VENV)/.test
+	$(BIN)/python -m tests.soak
+
+install uninstall: $(VENV)/.runtime
+	sh systemd/$@.sh
+
+# Debian's packages: OpenGL without a screen, the USB and OpenNI2 libraries. Only root can install them.
+system:
+	@sh systemd/packages.sh
+
+$(VENV)/.created:
+	$(PYTHON) -m venv $(VENV)
+	@touch $@
+
+$(VENV)/.runtime: $(VENV)/.created requirements/runtime.lock pyproject.toml | system
+	$(BIN)/python -m pip install --quiet -r requirements/runtime.lock
+	$(BIN)/python -m pip install --quiet --no-deps --editable .
+	@touch $@
+
+$(VENV)/.test: $(VENV)/.runtime requirements/test.lock
+	@sh systemd/packages.sh test
+	$(BIN)/python -m pip install --quiet -r requirements/test.lock
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build dist out *.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -1,0 +1,22 @@
+#!/bin/sh
+# Debian's packages for the runtime, and with `test` for the test suite. Root: installed. Others: asked for, in one line.
+set -u
+runtime="libegl1 libgl1-mesa-dri libgles2 libgl1 libusb-1.0-0 libopenni2-0"
+testing="xvfb xserver-xorg-core xserver-xorg-video-dummy x11-xserver-utils x11-apps imagemagick chromium systemd udev"
+wanted=$runtime
+[ "${1:-}" = test ] && wanted="$runtime $testing"
+command -v dpkg-query >/dev/null || { echo "Not Debian: see to it that these libraries are there: $wanted"; exit 0; }
+missing=""
+for name in $wanted; do
+  dpkg-query -W -f='${Status}' "$name" 2>/dev/null | grep -q "install ok installed" || missing="$missing $name"
+done
+[ -z "$missing" ] && exit 0
+if [ "$(id -u)" != 0 ]; then
+  echo "Please have root run: apt-get install$missing"
+  exit 0
+fi
+echo "Installing Debian's packages:$missing"
+export DEBIAN_FRONTEND=noninteractive
+# shellcheck disable=SC2086
+{ apt-get update -qq && apt-get install -y -qq --no-install-recommends $missing; } >/dev/null \
+  || echo "They could not be installed; please run: apt-get install$missing"
