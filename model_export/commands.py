@@ -1,0 +1,124 @@
+"""`phasestack train`, `export` and `validate`: names and options; torch is imported when they run."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from runtime.errors import MissingPart
+
+
+class Precision(StrEnum):
+    """Number format of the exported weights and products."""
+
+    FP32 = "fp32"
+    FP16 = "fp16"
+    INT8 = "int8"
+
+
+def require(*modules: str) -> None:
+    """Raises MissingPart, naming what to install, where a module of the `export` extra is not there."""
+    for module in modules:
+        if importlib.util.find_spec(module) is None:
+            raise MissingPart(f"{module} is needed here and is not installed: pip install phasestack[export]")
+
+
+def train(
+    out: Annotated[Path, typer.Option(help="folder for checkpoint.pth, recipe.json, validation.csv and .png")],
+    recipe: Annotated[str, typer.Option(help="fast, balanced, best or a recipe file (JSON)")] = "balanced",
+    data: Annotated[
+        list[Path] | None, typer.Option(help="folder of pairs named as the official data set; may be repeated")
+    ] = None,
+    scene: Annotated[str, typer.Option(help="preset that the folders' coordinates belong to")] = "lego_bulldozer",
+    iterations: Annotated[int | None, typer.Option(min=1, help="steps of the optimiser; the recipe's own")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="of data and weights; the recipe's own")] = None,
+    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1 ..; auto: a GPU where there is one")] = "auto",
+    threads: Annotated[int, typer.Option(min=1, help="torch's threads on the CPU")] = 2,
+    resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="the result as one object on stdout")] = False,
+) -> None:
+    """Train a model on endless procedural pairs (and on folders of your own).
+
+    Example: phasestack train --recipe balanced --out out/balanced
+
+    Several processes: torchrun --nproc-per-node 2 -m runtime.cli train --recipe best --out out/best
+    """
+    require("torch")
+    from model_export.train import TrainRequest, run_training
+
+    request = TrainRequest(out, recipe, tuple(data or ()), scene, iterations, seed, device, threads, resume)
+    result = run_training(request)
+    if result is None:  # another process of the same training tells
+        return
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        typer.echo(
+            f"{result['name']}: {result['iterations']} steps in {result['seconds']:.0f} s; held-out pairs "
+            f"{result['start_db']:.2f} -> {result['held_out_db']:.2f} dB; {out / 'checkpoint.pth'}"
+        )
+
+
+def export(
+    arch: Annotated[str, typer.Option(help="fast, balanced, best or eyereal")],
+    out: Annotated[Path, typer.Option(help="the ONNX file")],
+    checkpoint: Annotated[
+        Path | None, typer.Option(help="weights: of `phasestack train`, or a published one for eyereal")
+    ] = None,
+    random_init: Annotated[int | None, typer.Option(min=0, help="untrained weights of this seed")] = None,
+    width: Annotated[int, typer.Option(help="panels' width in pixels")] = 1920,
+    height: Annotated[int, typer.Option(help="panels' height in pixels")] = 1080,
+    base_width: Annotated[int, typer.Option(help="eyereal: channels of its first block, 32 or 16")] = 32,
+    precision: Annotated[Precision, typer.Option(help="number format")] = Precision.FP32,
+    opset: Annotated[int, typer.Option(help="ONNX operator set, 17 to 20")] = 17,
+    dynamic: Annotated[bool, typer.Option("--dynamic", help="any picture size, not only --width x --height")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="the checks as one object on stdout")] = False,
+) -> None:
+    """Write a model as ONNX with its contract, after checking it against torch; one that fails isn't written.
+
+    Without --checkpoint or --random-init, fast, balanced and best are made from the recipes that ship.
+
+    Example: phasestack export --arch eyereal --checkpoint published.pth --out eyereal.onnx
+    """
+    require("torch", "onnx")
+    from model_export.export import ExportRequest, export_model
+
+    request = ExportRequest(
+        arch=arch,
+        out=out,
+        checkpoint=checkpoint,
+        random_init=random_init,
+        width_px=width,
+        height_px=height,
+        base_width=base_width,
+        precision=precision.value,
+        opset=opset,
+        dynamic=dynamic,
+    )
+    report = export_model(request)
+    typer.echo(report.json() if as_json else report.table())
+    if not report.passed:
+        typer.echo(f"{out}: not written: a check failed", err=True)
+        raise typer.Exit(1)
+
+
+def validate(
+    file: Annotated[Path, typer.Argument(help="the ONNX file")],
+    as_json: Annotated[bool, typer.Option("--json", help="the checks as one object on stdout")] = False,
+) -> None:
+    """Check a model: contract, names, shapes, values against torch, drift on stress inputs. Exit 1: one failed.
+
+    Example: phasestack validate runtime/model/data/balanced.onnx
+    """
+    require("torch", "onnx")
+    from model_export.validate import validate_file
+
+    report = validate_file(file)
+    typer.echo(report.json() if as_json else report.table())
+    if not report.passed:
+        raise typer.Exit(1)
