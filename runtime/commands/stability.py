@@ -28,13 +28,14 @@ def stability(
     from rich.console import Console
 
     from runtime.artifacts import OutputFolder, to_json, write_json, write_text
+    from runtime.commands.solving import checked_eyes
     from runtime.report.machine import describe
     from runtime.report.progress import progress_bar
     from runtime.report.stability import suite
     from runtime.report.stability.page import stability_page, stages_of
 
     started = time.perf_counter()
-    trials = list(suite.every_trial(_fit(), methods={}, full=full, extra=[]))
+    trials = list(suite.every_trial(_fit(), checked_eyes, full=full))
     with progress_bar("stability") as tell:
         cases = suite.run(trials, progress=tell)
     seconds = time.perf_counter() - started

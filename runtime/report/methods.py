@@ -43,6 +43,7 @@ def opened(method: Method, pair: StillPair, *, threads: int) -> Opened:
     if method.source == "mean":
         return Opened(_mean, 0, "fp32")
     from runtime.config import ModelSettings
+    from runtime.model.predictor import Predictor, load_predictor
     from runtime.model.still import solve_still
 
     settings = ModelSettings(threads=threads)
@@ -51,11 +52,9 @@ def opened(method: Method, pair: StillPair, *, threads: int) -> Opened:
     if method.source == "sart":
         from runtime.model.sart import SartPredictor
 
-        predictor = SartPredictor(pair.stack, iterations=method.iterations)
+        predictor: Predictor = SartPredictor(pair.stack, iterations=method.iterations)
         precision = "fp32"
     else:
-        from runtime.model.predictor import load_predictor
-
         predictor = load_predictor(method.source, pair.stack, settings)
         session = getattr(predictor, "session", None)
         precision = session.contract.precision if session is not None else "fp32"

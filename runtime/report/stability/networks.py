@@ -1,0 +1,191 @@
+"""The shipped networks on pictures, poses and sizes that break solvers: what comes out is a picture, or a refusal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
+
+import numpy as np
+
+from runtime.config import ModelSettings
+from runtime.model.chain import chain_modes
+from runtime.model.predictor import Predictor, load_predictor
+from runtime.model.still import solve_still
+from runtime.optics.stack import PanelStack
+from runtime.records import F32, F64, U8
+from runtime.report.baselines import as_codes, mean_of_targets
+from runtime.report.eyesight import as_intensity, seen_rays
+from runtime.report.pairs import eyes_at
+from runtime.report.stability.solve import Method, Problem
+from runtime.report.stability.trial import EPS32, Answer, Trial, refusal
+
+STAGE = "network"
+STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
+FOV_DEG = 40.0
+MODELS = ("fast", "balanced", "best")
+
+
+Check = Callable[[tuple[float, ...], tuple[float, ...], PanelStack], object]  # left and right eye; raises
+
+
+@lru_cache(maxsize=4)
+def ready(model: str, stack: PanelStack) -> Predictor:
+    """A model's predictor, kept: most cases are about the same panels."""
+    return load_predictor(model, stack, ModelSettings(threads=1))
+
+
+def predicted(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack = STACK) -> U8:
+    """Layers, copied out of the predictor."""
+    done = solve_still(images[0], images[1], eyes_m=eyes_m, fov_deg=FOV_DEG, predictor=ready(model, stack))
+    return np.array(done.layers[..., :3])
+
+
+def squared_error(layers: U8, images: Sequence[U8], eyes_m: F64, stack: PanelStack) -> float:
+    """Mean squared displayed error over both eyes. Raises ValueError where no ray counts."""
+    total, count = 0.0, 0
+    for eye, image in zip(eyes_m, images, strict=True):
+        size = {"width_px": image.shape[1], "height_px": image.shape[0]}
+        seen, mask = seen_rays(eye, layers, stack, **size, fov_deg=FOV_DEG, step=1)
+        difference = (seen - as_intensity(image))[mask]
+        total, count = total + float(np.square(difference, dtype=np.float64).sum()), count + difference.size
+    if not count:
+        raise ValueError("no ray crosses every panel")
+    return total / count
+
+
+def pictures(kind: str, stack: PanelStack = STACK) -> list[U8]:
+    """Two pictures that solvers dislike."""
+    height, width = stack.height_px, stack.width_px
+    left = np.zeros((height, width, 3), np.uint8)
+    right = left.copy()
+    if kind == "all white":
+        left[:], right[:] = 255, 255
+    elif kind == "checkerboard of single pixels":
+        left[::2, ::2], left[1::2, 1::2] = 255, 255
+        right = left.copy()
+    elif kind == "lines one pixel wide":
+        left[:, ::9], right[:, 4::9] = 255, 255
+    elif kind == "black for one eye, white for the other":
+        right[:] = 255
+    elif kind == "noise, another for each eye":
+        rng = np.random.default_rng(4)
+        left, right = (rng.integers(0, 256, left.shape, dtype=np.uint8) for _ in range(2))
+    elif kind == "a step with a disparity of a third of the width":
+        left[:, : width // 3], right[:, : 2 * width // 3] = 200, 200
+    elif kind == "codes 0 and 1 in turn":
+        left[:, ::2], right[:, 1::2] = 1, 1
+    return [left, right]
+
+
+KINDS = (
+    "all black", "all white", "checkerboard of single pixels", "lines one pixel wide",
+    "black for one eye, white for the other", "noise, another for each eye",
+    "a step with a disparity of a third of the width", "codes 0 and 1 in turn",
+)  # fmt: skip
+
+
+def stressed(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack = STACK) -> Answer:
+    """RMS displayed error against that of the mean of the warped targets, which solves nothing."""
+    layers = predicted(model, images, eyes_m, stack)
+    wanted = [as_intensity(image) for image in images]
+    plain = as_codes(mean_of_targets(eyes_m, wanted, stack, fov_deg=FOV_DEG))
+    ours, theirs = (math.sqrt(squared_error(found, images, eyes_m, stack)) for found in (layers, plain))
+    # One grey step of three panels is 1/85 of the range: a perfect picture may still be off by that.
+    return Answer(ours, 1.1 * theirs + 1 / 85, note=f"the mean of the targets is off by {theirs:.2g}")
+
+
+def repeatable(model: str) -> Answer:
+    """The same picture twice, with another in between: no state may be left behind."""
+    eyes = eyes_at(distance_m=0.6)
+    noise, flat = pictures("noise, another for each eye"), pictures("all white")
+    found = [predicted(model, images, eyes) for images in (noise, flat, noise)]
+    return Answer(float(np.abs(found[0].astype(int) - found[2]).max()), 0.0)
+
+
+def modes(cells: int) -> Answer:
+    """The chains' singular vectors in closed form, float32, put together again."""
+    v, s, u_transposed = (part.astype(np.float64) for part in chain_modes(cells))
+    chain = np.zeros((cells, cells + 1))
+    np.fill_diagonal(chain, -2.0)
+    np.fill_diagonal(chain[:, 1:], 2.0)
+    error = float(np.abs((v * s) @ u_transposed - chain.T).max() / 4)
+    error = min(error, float(np.abs((v * s) @ u_transposed + chain.T).max() / 4))
+    return Answer(error, 8 * EPS32 * math.sqrt(cells), float(s.max() / s.min()))
+
+
+def smooth(stack: PanelStack) -> list[U8]:
+    """An ordinary picture and its like, a little aside."""
+    y, x = np.mgrid[0 : stack.height_px, 0 : stack.width_px]
+    wave = 128 + 90 * np.sin(x / stack.width_px * 19) * np.cos(y / stack.height_px * 11)
+    left = np.repeat(wave[..., None], 3, axis=2).astype(np.uint8)
+    return [left, np.roll(left, 1, axis=1)]
+
+
+def solver(model: str) -> Method:
+    """A model as a method of the solve stage, on 8-bit pictures."""
+
+    def solve(problem: Problem) -> F32:
+        images = [np.rint(image * 255).astype(np.uint8) for image in problem.wanted]
+        predictor = ready(model, problem.stack)
+        done = solve_still(*images, eyes_m=problem.eyes_m, fov_deg=problem.fov_deg, predictor=predictor)
+        return as_intensity(done.layers)
+
+    return solve
+
+
+def trials(check: Check, *, full: bool = False) -> Iterator[Trial]:
+    """Every case of the networks; `full` tries every size of network on every pose, and 4K panels.
+
+    `check` is what eyes must pass before a network sees them.
+    """
+    eyes = eyes_at(distance_m=0.6)
+    for model in MODELS:
+        for kind in KINDS:
+            yield Trial(STAGE, f"{model}: {kind}", partial(stressed, model, pictures(kind), eyes), measure="intensity")
+        yield Trial(STAGE, f"{model}: the same picture twice", partial(repeatable, model), measure="grey levels")
+    for model in MODELS if full else ("balanced",):
+        yield from _poses(model, full=full)
+    for name, left, right in (
+        ("eyes at one place", (0.6, 0.0, 0.0), (0.6, 0.0, 0.0)),
+        ("eyes 4.9 mm apart", (0.6, 0.0, 0.0), (0.6, 0.0049, 0.0)),
+        ("an eye behind the panels", (-0.6, -0.03, 0.0), (0.6, 0.03, 0.0)),
+        ("an eye between the panels", (0.6, -0.03, 0.0), (0.03, 0.03, 0.0)),
+        ("an eye in the front panel's plane", (0.06, -0.03, 0.0), (0.06, 0.03, 0.0)),
+        ("an eye at NaN", (0.6, -0.03, 0.0), (math.nan, 0.03, 0.0)),
+        ("an eye infinitely far", (0.6, -0.03, 0.0), (math.inf, 0.03, 0.0)),
+    ):
+        yield refusal(STAGE, f"before the network: {name}", partial(check, left, right, STACK))
+    aside = eyes_at(distance_m=3.0, angle_deg=85.0)
+    yield refusal(
+        STAGE, "85 degrees aside: no ray crosses all panels", partial(stressed, "balanced", smooth(STACK), aside)
+    )
+    one_place = np.repeat(eyes[:1], 2, axis=0)
+    yield refusal(STAGE, "balanced: eyes at one place", partial(predicted, "balanced", smooth(STACK), one_place))
+    for cells in (8, 112, 1024):
+        yield Trial(STAGE, f"singular vectors of {cells} chain cells, float32", partial(modes, cells))
+
+
+def _poses(model: str, *, full: bool) -> Iterator[Trial]:
+    for name, eyes in (
+        ("70 degrees aside", eyes_at(distance_m=0.8, angle_deg=70.0)),
+        ("75 degrees aside", eyes_at(distance_m=2.0, angle_deg=75.0)),
+        ("0.1 m away", eyes_at(distance_m=0.1)),
+        ("4 m away", eyes_at(distance_m=4.0)),
+        ("eyes 5 mm apart", eyes_at(distance_m=0.6, ipd_m=0.005)),
+        ("eyes 0.1 mm apart", eyes_at(distance_m=0.6, ipd_m=1e-4)),
+        ("eyes 30 cm apart", eyes_at(distance_m=0.6, ipd_m=0.3)),
+        ("head tilted by 45 degrees", np.array([[0.6, -0.022, -0.022], [0.6, 0.022, 0.022]])),
+        ("head turned by 60 degrees", np.array([[0.627, -0.016, 0.0], [0.573, 0.016, 0.0]])),
+        ("left and right exchanged", eyes_at(distance_m=0.6)[::-1].copy()),
+    ):
+        yield Trial(STAGE, f"{model}: {name}", partial(stressed, model, smooth(STACK), eyes), measure="intensity")
+    for gap_m in (1e-4, 1e-3, 0.5):
+        stack = replace(STACK, x_m=(-gap_m, 0.0, gap_m))
+        run = partial(stressed, model, smooth(stack), eyes_at(distance_m=0.6 + gap_m), stack)
+        yield Trial(STAGE, f"{model}: panels {gap_m:g} m apart", run, measure="intensity")
+    for width, height in ((16, 16), (17, 31), (333, 77), *(((3840, 2160),) if full else ())):
+        stack = replace(STACK, width_px=width, height_px=height)
+        run = partial(stressed, model, smooth(stack), eyes_at(distance_m=0.6), stack)
+        yield Trial(STAGE, f"{model}: panels of {width}x{height}", run, measure="intensity")
