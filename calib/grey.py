@@ -30,6 +30,7 @@ CHANNELS = ("red", "green", "blue")
 LEAST_LEVELS = 4
 HIGHEST_DEGREE = 6
 LUT_ROWS = 256
+EXACT = 1e-14  # mean square, of the range, below which a fit cannot be bettered
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,13 +106,15 @@ def fit_grey_curve(grey: F64, luminance: F64) -> GreyCurve:
             score = _information(cost, count=len(grey), parameters=parameters)
             if best is None or score < best[0] - 1e-9:
                 best = (score, curve)
+            if cost < EXACT * len(grey):
+                break
     assert best is not None
     return replace(best[1], dark=low + best[1].dark * (high - low), span=best[1].span * (high - low))
 
 
 def _information(cost: float, *, count: int, parameters: int) -> float:
     """Akaike's criterion, corrected for few samples; perfect fits differ by their parameters alone."""
-    variance = max(cost / count, 1e-14)
+    variance = max(cost / count, EXACT)
     return count * math.log(variance) + 2 * parameters * count / max(count - parameters - 1, 1)
 
 
@@ -126,7 +129,10 @@ def _fit(grey: F64, values: F64, degree: int, *, of_intensity: bool) -> tuple[Gr
 
     start = np.concatenate([[0.0, 0.0, 0.0], np.zeros(degree - 1)])
     fits = [
-        least_squares(residuals, np.concatenate([[math.log(gamma)], start[1:]]), max_nfev=2000) for gamma in (1.0, 2.2)
+        least_squares(
+            residuals, np.concatenate([[math.log(gamma)], start[1:]]), method="lm", ftol=1e-10, xtol=1e-10, max_nfev=600
+        )
+        for gamma in (1.0, 2.2)
     ]
     fit = min(fits, key=lambda found: found.cost)
     curve = curve_of(fit.x)

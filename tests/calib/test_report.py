@@ -108,7 +108,7 @@ def test_spoiled_points_are_refused_and_nothing_is_written(tmp_path, data) -> No
 
 
 def test_the_methods_table_is_written_with_its_plots(tmp_path) -> None:
-    result = run.invoke(app, ["methods", "--out", str(tmp_path / "m"), "--seeds", "5", "--pairs-max", "100", "--json"])
+    result = run.invoke(app, ["methods", "--out", str(tmp_path / "m"), "--seeds", "2", "--pairs-max", "100", "--json"])
     assert result.exit_code == 0, result.output
     told = json.loads((tmp_path / "m" / "methods.json").read_text())
     assert [case["sigma_m"] for case in told["cases"]["clean"]] == [0.0, 0.001, 0.003, 0.01, 0.03]
