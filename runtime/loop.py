@@ -157,9 +157,9 @@ class Loop:
         stages = StageTimes(self.clock, self.settings.loop.simulated_stage_ms)
         self.source.wait(rate_hz=self.settings.loop.rate_hz)
         stages.lap("wait")
-        start_ns = self.clock.now_ns()
         self._supervisor.obey(self)
         frame = self.source.receive()
+        start_ns = self.clock.now_ns()
         stages.lap("sensor")
         if frame is not None:
             self._track(frame)
@@ -246,11 +246,11 @@ class Loop:
     def _account(
         self, account: FrameAccount, stages: StageTimes, *, start_ns: int, report: PresentReport | None
     ) -> None:
-        cost_ns = self.clock.now_ns() - start_ns
-        if report is not None and account.inference == "ran":
-            self._turn_cost_ns += round(EXPECTED_WEIGHT * (cost_ns - self._turn_cost_ns))
         if report is not None:
             self.stats.missed_vblanks += report.missed_vblanks
+            if account.inference == "ran":
+                cost_ns = report.present_ns - start_ns
+                self._turn_cost_ns += round(EXPECTED_WEIGHT * (cost_ns - self._turn_cost_ns))
         self.last = account
         if self._on_account is not None:
             self._on_account(account)

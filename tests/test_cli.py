@@ -1,0 +1,184 @@
+"""The command line: what a user gets wrong is answered in one line with exit 2, and nothing is left behind."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from runtime.artifacts import write_png
+
+PANELS = {"width_m": 0.5184, "height_m": 0.2916, "x_m": [-0.06, 0.0, 0.06]}
+
+
+def phasestack(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "runtime.cli", *map(str, arguments)], capture_output=True, text=True, timeout=120
+    )
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> Path:
+    """A folder with a small stereo pair and its panels."""
+    rng = np.random.default_rng(1)
+    for name in ("left", "right"):
+        coarse = rng.integers(0, 255, (12, 20, 3)).astype(np.uint8)
+        write_png(tmp_path / f"{name}.png", coarse.repeat(9, 0).repeat(9, 1)[:108, :176].copy())
+    (tmp_path / "panels.json").write_text(json.dumps(PANELS))
+    return tmp_path
+
+
+def solve_arguments(folder: Path, **changes: object) -> list[str]:
+    values: dict[str, object] = {
+        "--left": folder / "left.png",
+        "--right": folder / "right.png",
+        "--left-eye": (0.6, -0.03, 0.0),
+        "--right-eye": (0.6, 0.03, 0.0),
+        "--fov": 40,
+        "--panels": folder / "panels.json",
+        "--out": folder / "out",
+    }
+    values.update({f"--{name.replace('_', '-')}": value for name, value in changes.items()})
+    arguments = ["solve"]
+    for name, value in values.items():
+        arguments += [name, *map(str, value)] if isinstance(value, tuple) else [name, str(value)]
+    return arguments
+
+
+def test_solve_leaves_layers_and_what_the_eyes_see(pair: Path) -> None:
+    result = phasestack(*solve_arguments(pair), "--json")
+    assert result.returncode == 0, result.stderr
+    solved = json.loads(result.stdout)
+    assert solved == json.loads((pair / "out" / "solve.json").read_text())
+    names = {path.name for path in (pair / "out").iterdir()}
+    assert names >= {"layer-0.png", "layer-1.png", "layer-2.png", "seen-left.png", "seen-right.png", "solve.json"}
+    assert solved["psnr_db"] > 15
+    assert solved["total_ms"] >= solved["inference_ms"] > 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"left": "missing.png"}, "missing.png"),
+        ({"panels": "missing.json"}, "missing.json"),
+        ({"left_eye": (0.05, -0.03, 0.0)}, "--left-eye"),
+        ({"left_eye": (-0.5, -0.03, 0.0)}, "--left-eye"),
+        ({"left_eye": ("nan", 0, 0)}, "--left-eye"),
+        ({"right_eye": (0.6, -0.03, 0.0)}, "--right-eye"),
+        ({"left_eye": (0.061, 40.0, 0.0), "right_eye": (0.061, 40.06, 0.0)}, "--left-eye"),
+        ({"fov": 180}, "--fov"),
+        ({"model": "quick"}, "quick"),
+        ({"model": "panels.onnx"}, "panels.onnx"),
+    ],
+)
+def test_what_cannot_be_solved_is_one_line_and_exit_2(pair: Path, changes: dict[str, object], named: str) -> None:
+    (pair / "panels.onnx").write_bytes(b"this is no model")
+    paths = {"left", "panels", "model"}
+    located = {k: (pair / str(v) if k in paths and "." in str(v) else v) for k, v in changes.items()}
+    result = phasestack(*solve_arguments(pair, **located))
+    assert result.returncode == 2
+    assert named in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert "Traceback" not in result.stderr
+    assert not (pair / "out").exists()
+
+
+def test_pictures_of_different_sizes_are_refused(pair: Path) -> None:
+    write_png(pair / "right.png", np.zeros((50, 60, 3), np.uint8))
+    result = phasestack(*solve_arguments(pair))
+    assert (result.returncode, "right.png" in result.stderr, "size" in result.stderr) == (2, True, True)
+
+
+@pytest.mark.parametrize(
+    ("table", "field"),
+    [
+        ({**PANELS, "x_m": [0.06, 0.0, -0.06]}, "x_m"),
+        ({**PANELS, "width_m": "wide"}, "width_m"),
+        ({**PANELS, "depth_m": 1}, "depth_m"),
+        ({"width_m": 0.5, "height_m": 0.3}, "x_m"),
+    ],
+)
+def test_panels_that_make_no_stack_are_refused_by_field(pair: Path, table: dict[str, object], field: str) -> None:
+    (pair / "panels.json").write_text(json.dumps(table))
+    result = phasestack(*solve_arguments(pair))
+    assert result.returncode == 2
+    assert "panels.json" in result.stderr
+    assert field in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("[loop]\nrate_hz = 'fast'\n", "loop.rate_hz"),
+        ("[loop]\nrate = 60\n", "loop.rate"),
+        ("[lop]\n", "lop"),
+        ("[loop\n", "malformed"),
+        ("[model]\nname = 'quick'\n", "quick"),
+        ("[calibration]\nfile = 'missing.toml'\n", "missing.toml"),
+    ],
+)
+def test_a_wrong_configuration_is_refused_by_file_and_field(tmp_path: Path, text: str, named: str) -> None:
+    config = tmp_path / "phasestack.toml"
+    config.write_text(text)
+    run = (
+        "run",
+        "--config",
+        config,
+        "--replay",
+        "demo",
+        "--headless",
+        "--max-speed",
+        "--frames",
+        "1",
+        "--scale",
+        "0.1",
+    )
+    result = phasestack(*run, "--out", tmp_path / "out")
+    assert result.returncode == 2
+    assert named in result.stderr
+    assert "Traceback" not in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"no recording at all", None])
+def test_a_recording_that_is_none_is_refused(tmp_path: Path, content: bytes | None) -> None:
+    recording = tmp_path / "eyes.mcap"
+    if content is not None:
+        recording.write_bytes(content)
+    out = tmp_path / "out"
+    result = phasestack("run", "--replay", recording, "--headless", "--max-speed", "--scale", "0.1", "--out", out)
+    assert result.returncode == 2
+    assert "eyes.mcap" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert not out.exists()
+
+
+def test_config_prints_a_valid_configuration_of_defaults(tmp_path: Path) -> None:
+    printed = phasestack("config")
+    assert printed.returncode == 0
+    file = tmp_path / "defaults.toml"
+    file.write_text(printed.stdout)
+    assert phasestack("config", "--check", file).returncode == 0
+    from runtime.config import Settings, load_settings
+
+    assert load_settings(file) == Settings()
+
+
+@pytest.mark.parametrize("command", [[], ["demo"], ["run"], ["solve"], ["config"], ["status"], ["ctl"], ["calibrate"]])
+def test_every_command_has_help(command: list[str]) -> None:
+    result = phasestack(*command, "--help")
+    assert result.returncode == 0
+    assert "Usage" in result.stdout
+
+
+def test_starting_the_command_line_imports_nothing_heavy() -> None:
+    code = (
+        "import sys, runtime.cli\n"
+        "heavy = {'torch', 'cv2', 'onnxruntime', 'scipy', 'numpy', 'matplotlib', 'pydantic', 'moderngl', 'glfw'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
