@@ -17,6 +17,7 @@ from runtime.config import ServiceSettings
 PRIORITY = {logging.DEBUG: "<7>", logging.INFO: "<6>", logging.WARNING: "<4>", logging.ERROR: "<3>"}
 ROOTS = ("phasestack", "runtime")  # named for what they tell, or after their module
 BURST = 5
+REMEMBERED = 1000
 QUIET_NS = 30 * NS_PER_S
 
 
@@ -75,6 +76,8 @@ class RateLimit(logging.Filter):
     def filter(self, record: logging.LogRecord) -> bool:
         key = (record.name, str(record.msg))
         now_ns = self._clock.now_ns()
+        if len(self._seen) > REMEMBERED:  # messages that are never twice the same must not pile up
+            self._seen.clear()
         start_ns, passed, suppressed = self._seen.get(key, (now_ns, 0, 0))
         if now_ns - start_ns >= QUIET_NS:
             start_ns, passed = now_ns, 0

@@ -68,6 +68,7 @@ class Display:
         """Raises PanelLost (no X server, or none that lets us in: it may come), MissingPart (no X11 library)."""
         self.faults: list[str] = []
         self._windows: list[Window] = []
+        self._closed = self.dead = False  # dead: the X server has gone, nothing more can be asked of it
         try:
             if glfw.platform_supported(glfw.PLATFORM_X11):
                 glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
@@ -80,36 +81,45 @@ class Display:
             xlib.survive_errors()
             self._guard = xlib.survive_server(_address(glfw.get_x11_display()), self._server_died)
             glfw.set_monitor_callback(self._monitor_changed)
-            _hints()
-            self.root = self.window(width_px=16, height_px=16, title="phasestack", monitor=None, visible=False)
-        except glfw.GLFWError as error:
-            glfw.terminate()
-            raise PanelLost(f"no OpenGL on the X server: {_text(error)}") from None
         except BaseException:
             glfw.terminate()
             raise
+
+    @property
+    def root(self) -> Window:
+        """The hidden window, made when it is first asked for: looking for monitors needs no OpenGL.
+
+        Raises PanelLost where the X server offers none.
+        """
+        if not self._windows:
+            _hints()
+            glfw.window_hint(glfw.VISIBLE, False)
+            try:
+                self._adopt(glfw.create_window(16, 16, "phasestack", None, None))
+            except glfw.GLFWError as error:
+                raise PanelLost(f"no OpenGL on the X server: {_text(error)}") from None
+        return self._windows[0]
 
     def monitors(self) -> tuple[Monitor, ...]:
         """The active monitors, from left to right."""
         return in_order([monitor for monitor, _ in self._pairs()])
 
-    def window(
-        self, *, width_px: int, height_px: int, title: str, monitor: Monitor | None, visible: bool = True
-    ) -> Window:
-        """A borderless window: fullscreen on a monitor, or hidden. Its context is current afterwards."""
-        handles = {found.connector: handle for found, handle in self._pairs()} if monitor else {}
-        if monitor and monitor.connector not in handles:
+    def fullscreen_window(self, monitor: Monitor, *, title: str) -> Window:
+        """A borderless window over a whole monitor. Its context is current afterwards. Raises PanelLost."""
+        share = self.root.handle
+        handles = {found.connector: handle for found, handle in self._pairs()}
+        if monitor.connector not in handles:
             raise PanelLost(f"{monitor.connector} has gone")
-        glfw.window_hint(glfw.VISIBLE, visible)
-        share = self._windows[0].handle if self._windows else None
-        handle = glfw.create_window(width_px, height_px, title, handles[monitor.connector] if monitor else None, share)
+        glfw.window_hint(glfw.VISIBLE, True)
+        handle = glfw.create_window(monitor.width_px, monitor.height_px, title, handles[monitor.connector], share)
         return self._adopt(handle)
 
     def spanning_window(self, *, x_px: int, y_px: int, width_px: int, height_px: int, title: str) -> Window:
         """One borderless window over a part of the X screen, whatever monitors are there."""
+        share = self.root.handle
         glfw.window_hint(glfw.VISIBLE, False)
         glfw.window_hint(glfw.DECORATED, False)
-        handle = glfw.create_window(width_px, height_px, title, None, self._windows[0].handle)
+        handle = glfw.create_window(width_px, height_px, title, None, share)
         glfw.window_hint(glfw.DECORATED, True)
         glfw.set_window_pos(handle, x_px, y_px)
         glfw.show_window(handle)
@@ -123,12 +133,15 @@ class Display:
 
     def close(self) -> None:
         """Close every window and the connection. May be called twice."""
-        windows, self._windows = self._windows, []
-        for window in windows:
+        if self._closed:
+            return
+        self._closed = True
+        for window in self._windows:
             window.context.release()
-        if windows:
+        if self._windows:
             glfw.make_context_current(None)
-            glfw.terminate()
+        self._windows = []
+        glfw.terminate()
 
     def _adopt(self, handle: Any) -> Window:
         glfw.make_context_current(handle)
@@ -174,7 +187,13 @@ class Display:
         name = glfw.get_monitor_name(handle).decode()
         self.faults.append(f"{name} was {'connected' if what == glfw.CONNECTED else 'disconnected'}")
 
+    @property
+    def has_windows(self) -> bool:
+        """True once anything was made that needs OpenGL."""
+        return bool(self._windows)
+
     def _server_died(self) -> None:
+        self.dead = True
         self.faults.append("the X server died")
 
 

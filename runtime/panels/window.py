@@ -22,7 +22,8 @@ from runtime.records import LayerFrame, PresentReport
 
 log = logging.getLogger("phasestack.panels")
 
-RETRY_NS = NS_PER_S // 2
+RETRY_NS = NS_PER_S // 2  # between attempts to open what was lost
+LOOK_NS = 5 * NS_PER_S  # between looks at monitors that X has not said anything about
 
 
 @dataclass
@@ -52,7 +53,8 @@ class WindowPanels(PanelSink):
     what it can't know is how far the monitors' own blanks lie apart (`kind = "span"` has one swap).
 
     Where a monitor, a window, the context or the X server is lost, everything is closed, `present` raises
-    PanelLost, and every half second a later `present` tries to build it anew.
+    PanelLost, and a later `present` builds it anew: half a second later, or as soon as X says that a missing
+    monitor is there.
     Uses GLFW, so: one thread, the main one. The `content` context is current again after every call.
     """
 
@@ -87,16 +89,16 @@ class WindowPanels(PanelSink):
 
         Raises PanelLost; ValueError for layers of another shape.
         """
-        if self._display is None and self._clock.now_ns() < self._retry_ns:
+        if not self._surfaces and not self._may_try():
             raise PanelLost(self._lost)
         try:
-            if self._display is None:
+            if not self._surfaces:
                 self._open()
                 log.info("panels are back: %s", ", ".join(str(monitor) for monitor in self.monitors))
             return self._present(frame, unchanged)
         except (PanelLost, glfw.GLFWError, moderngl.Error) as error:
             self._lost = str(error)
-            self._drop()
+            self._retreat()
             raise PanelLost(self._lost) from error
         finally:
             self._give_back()
@@ -160,8 +162,19 @@ class WindowPanels(PanelSink):
             return 0
         return max(0, round((swapped_ns - before_ns) * refresh_hz / NS_PER_S) - 1)
 
+    def _may_try(self) -> bool:
+        """Whether it is time to look for the panels again: now and then, or at once where a monitor came or went."""
+        display = self._display
+        if display is not None and display.poll():
+            if display.dead:
+                self._drop()
+                return False
+            display.faults.clear()
+            return True
+        return self._clock.now_ns() >= self._retry_ns
+
     def _open(self) -> None:
-        self._display = display = Display()
+        self._display = display = self._display or Display()
         self.monitors = bind(self._panels, display.monitors())
         if not self._any_shape:
             for number, (panel, monitor) in enumerate(zip(self._panels, self.monitors, strict=True)):
@@ -182,9 +195,7 @@ class WindowPanels(PanelSink):
     def _windows(self, display: Display) -> list[Surface]:
         surfaces = []
         for index, monitor in enumerate(self.monitors):
-            window = display.window(
-                width_px=monitor.width_px, height_px=monitor.height_px, title=f"panel {index}", monitor=monitor
-            )
+            window = display.fullscreen_window(monitor, title=f"panel {index}")
             viewport = (0, 0, monitor.width_px, monitor.height_px)
             surfaces.append(Surface(window, (self._spot(window, index, viewport),)))
         return surfaces
@@ -211,6 +222,13 @@ class WindowPanels(PanelSink):
             layer_height_px=self._stack.height_px,
         )
         return Spot(index, viewport, Painter(window.context, mounting))
+
+    def _retreat(self) -> None:
+        """After a failure: keep a connection that only looks for monitors, close anything more."""
+        if self._display is None or self._display.has_windows or self._display.dead:
+            self._drop()
+        else:
+            self._retry_ns = self._clock.now_ns() + LOOK_NS
 
     def _drop(self) -> None:
         display, self._display = self._display, None

@@ -65,12 +65,14 @@ class Notifier:
             self._send("WATCHDOG=1")
 
     def reloading(self) -> None:
-        """The configuration is being read again; `reloaded` ends it."""
-        self._send(f"RELOADING=1\nMONOTONIC_USEC={self._clock.now_ns() // NS_PER_US}")
+        """The configuration is being read again; `reloaded` ends it. Silent before the first READY."""
+        if self._ready:
+            self._send(f"RELOADING=1\nMONOTONIC_USEC={self._clock.now_ns() // NS_PER_US}")
 
     def reloaded(self) -> None:
         """Reading the configuration is over, whether it was taken or refused."""
-        self._send("READY=1")
+        if self._ready:
+            self._send("READY=1")
 
     def stopping(self, reason: str) -> None:
         """The daemon is going down on purpose."""

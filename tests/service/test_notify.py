@@ -101,12 +101,20 @@ def test_a_watchdog_that_is_not_ours_is_not_fed(supervisor, environment):
 
 def test_reloading_and_stopping_are_announced(supervisor):
     notifier = Notifier(SimulatedClock(5_000_000), {})
+    notifier.ready()
     notifier.reloading()
     notifier.reloaded()
     notifier.stopping("SIGTERM")
-    assert supervisor.heard() == [
+    assert supervisor.heard()[1:] == [
         "RELOADING=1\nMONOTONIC_USEC=5000", "READY=1", "STOPPING=1\nSTATUS=stopping: SIGTERM",
     ]  # fmt: skip
+
+
+def test_a_reload_before_the_first_frame_does_not_make_it_ready(supervisor):
+    notifier = Notifier(SimulatedClock(), {})
+    notifier.reloading()
+    notifier.reloaded()
+    assert supervisor.heard() == []
 
 
 def test_a_supervisor_that_does_not_listen_blocks_nobody(supervisor):
