@@ -7,11 +7,18 @@ import sys
 import typer
 
 from calib.commands import app as calibrate_app
+from model_export.commands import export, train, validate
+from runtime.commands.bench import app as bench_app
 from runtime.commands.config import config
 from runtime.commands.ctl import app as ctl_app
 from runtime.commands.demo import demo
+from runtime.commands.doctor import doctor
+from runtime.commands.identify import identify
+from runtime.commands.record import record
+from runtime.commands.report import report
 from runtime.commands.run import run
 from runtime.commands.solve import solve
+from runtime.commands.stability import stability
 from runtime.commands.status import status
 from runtime.errors import PhasestackError
 
@@ -23,10 +30,17 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (demo, run, solve, status, config):
+for command in (demo, run, solve, record):
+    app.command()(command)
+app.add_typer(calibrate_app, name="calibrate")
+for command in (train, export, validate, report, stability):
+    app.command()(command)
+app.add_typer(bench_app, name="bench")
+for command in (doctor, status):
     app.command()(command)
 app.add_typer(ctl_app, name="ctl")
-app.add_typer(calibrate_app, name="calibrate")
+for command in (identify, config):
+    app.command()(command)
 
 
 def main() -> None:
