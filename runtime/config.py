@@ -102,7 +102,7 @@ class TrackerSettings(Section):
     confidence_min: NonNegative = Field(0.3, description="less certain samples (a blink) are not used")
     loss_s: NonNegative = Field(0.2, description="without any sample for this long the eyes are held, not predicted")
     decay_s: Positive = Field(0.06, description="time constant with which a lost head comes to rest")
-    revive_s: Positive = Field(0.1, description="time in which a found head's jump is smoothed")
+    revive_s: Positive = Field(0.06, description="time in which the picture slides to eyes that were lost and found")
 
 
 class CalibrationSettings(Section):

@@ -93,35 +93,26 @@ def surprise(models: tuple[Model, ...], measured: Sequence[float], *, variance: 
 def corrected(models: tuple[Model, ...], measured: Sequence[float], *, variance: float) -> tuple[Model, ...]:
     """With a measurement taken in; variance of one of its axes, m²."""
     x, y, z = measured
-    result, logs = [], []
+    logs = []
     for m in models:
         total = m.var_position + variance
-        dx, dy, dz = x - m.x, y - m.y, z - m.z
-        k, kv, kept = m.var_position / total, m.covariance / total, variance / total
-        # The forms that rounding can't turn negative: a·R/(a+R), and c - b²/(a+R) with a floor.
-        a = max(m.var_position * kept, VARIANCE_FLOOR)
-        c = max(m.var_velocity - m.covariance * kv, VARIANCE_FLOOR)
-        limit = math.sqrt(a * c)
-        b = min(max(m.covariance * kept, -limit), limit)
-        result.append(
-            Model(
-                m.x + k * dx,
-                m.y + k * dy,
-                m.z + k * dz,
-                m.u + kv * dx,
-                m.v + kv * dy,
-                m.w + kv * dz,
-                a,
-                b,
-                c,
-                m.weight,
-            )
-        )
-        logs.append(-0.5 * ((dx * dx + dy * dy + dz * dz) / total + 3 * math.log(total)))
+        logs.append(-0.5 * (((x - m.x) ** 2 + (y - m.y) ** 2 + (z - m.z) ** 2) / total + 3 * math.log(total)))
     best = max(logs)
-    weights = [m.weight * math.exp(value - best) + WEIGHT_FLOOR for m, value in zip(result, logs)]
+    weights = [m.weight * math.exp(value - best) + WEIGHT_FLOOR for m, value in zip(models, logs)]
     whole = sum(weights)
-    return tuple(m._replace(weight=weight / whole) for m, weight in zip(result, weights))
+    result = []
+    for (px, py, pz, u, v, w, a, b, c, _), weight in zip(models, weights):
+        total = a + variance
+        dx, dy, dz = x - px, y - py, z - pz
+        k, kv, kept = a / total, b / total, variance / total
+        # The forms that rounding can't turn negative: a·R/(a+R), and c - b²/(a+R) with a floor.
+        a = max(a * kept, VARIANCE_FLOOR)
+        c = max(c - b * kv, VARIANCE_FLOOR)
+        limit = math.sqrt(a * c)
+        b = min(max(b * kept, -limit), limit)
+        place = px + k * dx, py + k * dy, pz + k * dz
+        result.append(Model(*place, u + kv * dx, v + kv * dy, w + kv * dz, a, b, c, weight / whole))
+    return tuple(result)
 
 
 def combined(models: tuple[Model, ...]) -> tuple[Vector, Vector]:

@@ -111,7 +111,7 @@ def observe(
     dropout_s: float = 0.2,
     seed: int = 1,
 ) -> list[Observation]:
-    """What a sensor delivers of a motion. Outliers put one eye or both 4 to 20 cm off."""
+    """What a sensor delivers of a motion. Outliers put one eye or both 4 to 20 cm off; no dropouts where 0 s."""
     random = np.random.default_rng([seed, *motion.encode(), round(rate_hz)])
     times_s = np.arange(round(seconds * rate_hz)) / rate_hz
     eyes = true_eyes(motion, times_s) + random.normal(0.0, noise_m, (len(times_s), 2, 3))
@@ -122,8 +122,8 @@ def observe(
     for eye in (0, 1):
         hit = wrong & ((which == eye) | (which == 2))
         eyes[hit, eye] += offset[hit]
-    gap_phase = times_s % dropout_every_s
-    missing = (times_s > 1.0) & (gap_phase >= dropout_every_s - dropout_s) if dropout_every_s else times_s < 0
+    every_s = dropout_every_s or np.inf
+    missing = (times_s > 1.0) & (np.mod(times_s, every_s) >= every_s - dropout_s)
     confidence = np.ones(2)
     return [
         Observation(round(t * NS_PER_S), None if gone else EyePoints(pair, confidence))

@@ -16,6 +16,7 @@ from runtime.records import F64, EyePoints, EyesEstimate, EyesLabel
 
 HISTORY = 256  # filtered samples kept: four seconds at 60 Hz
 CHI2_GATE = 21.1  # of three axes: one honest sample in 10 000 is refused
+KEEP_S = 0.4  # after a longer gap nothing of a head's motion is left
 CLOCK_RESET_NS = NS_PER_S  # a capture this far in the past is a clock that was set back, not a late sample
 FIRST_SPEED = 0.3  # m/s, of a head that was just found
 COMPLETED_NOISE = 2.0  # an eye that was filled in is this much less certain
@@ -28,21 +29,24 @@ class _Sample(NamedTuple):
     capture_ns: int
     middle: tuple[imm.Model, ...]  # between the eyes, frame `stack`
     half: tuple[imm.Model, ...]  # from the middle to the right eye
-    place: F64  # (4, 3) what follows from both: middle, its velocity, half, its velocity
-    jump_m: F64  # (2, 3) what a revival hides, as it stood at `jump_ns`
+    jump_m: F64  # (2, 3) from here back to what was shown last, at `jump_ns`; fades from then on
     jump_ns: int
 
 
 class Tracker:
-    """One viewer's eyes. `update` takes samples as they come; `at` answers for any instant."""
+    """One viewer's eyes. `update` takes samples as they come; `at` answers for any instant.
+
+    Eyes that return after a loss take over from where `at` last said that they were, and fade to where they are.
+    """
 
     def __init__(self, settings: TrackerSettings | None = None) -> None:
         self.settings = settings or TrackerSettings()
         self._variance = self.settings.noise_m**2 / 2  # of the middle, and of half the line between the eyes
         self._history: deque[_Sample] = deque(maxlen=HISTORY)
-        self._refused: tuple[int, F64] | None = None
+        self._refused: tuple[int, imm.Vector] | None = None
         self._lost_ns: int | None = None
         self._newest_ns = -1
+        self._asked_ns = 0  # the latest instant that `at` answered for: what was shown last
         self.outliers = 0
 
     def update(self, points: EyePoints | None, *, capture_ns: int) -> None:
@@ -59,12 +63,13 @@ class Tracker:
         if points is None:
             self._lost_ns = capture_ns if self._lost_ns is None else self._lost_ns
             return
-        if not float(points.confidence.min()) >= self.settings.confidence_min:
+        if not min(points.confidence.tolist()) >= self.settings.confidence_min:
             return
-        half = (points.eyes_m[1] - points.eyes_m[0]) / 2
-        middle = points.eyes_m[0] + half
-        ipd_m = 2 * math.sqrt(half @ half)
-        if not (math.isfinite(middle.sum()) and self.settings.ipd_min_m <= ipd_m <= self.settings.ipd_max_m):
+        (lx, ly, lz), (rx, ry, rz) = points.eyes_m.tolist()
+        half = (rx - lx) / 2, (ry - ly) / 2, (rz - lz) / 2
+        middle = lx + half[0], ly + half[1], lz + half[2]
+        ipd_m = 2 * math.hypot(*half)
+        if not (math.isfinite(sum(middle)) and self.settings.ipd_min_m <= ipd_m <= self.settings.ipd_max_m):
             self.outliers += 1
             return
         self._take(middle, half, capture_ns=capture_ns, completed=bool(points.completed))
@@ -73,53 +78,48 @@ class Tracker:
         """As if nothing had ever been seen."""
         self._history.clear()
         self._refused = self._lost_ns = None
-        self._newest_ns = -1
+        self._newest_ns, self._asked_ns = -1, 0
 
-    def _take(self, middle: F64, half: F64, *, capture_ns: int, completed: bool) -> None:
+    def _take(self, middle: imm.Vector, half: imm.Vector, *, capture_ns: int, completed: bool) -> None:
+        s = self.settings
         variance = self._variance * (COMPLETED_NOISE**2 if completed else 1.0)
         last = self._history[-1] if self._history else None
         age_s = (capture_ns - last.capture_ns) / NS_PER_S if last else math.inf
-        if last is not None and age_s <= self.settings.horizon_max_s:
-            s, place, turn = self.settings, middle.tolist(), half.tolist()
+        jump_m, jump_ns = (last.jump_m, last.jump_ns) if last else (NO_JUMP, 0)
+        is_held = self._lost_ns is not None or age_s > s.loss_s
+        found = side = None
+        if last is not None and age_s <= KEEP_S:
             now = imm.predicted(last.middle, age_s, acceleration=s.acceleration, stay_s=s.stay_s)
-            side = imm.predicted(last.half, age_s, acceleration=(s.turn_acceleration,), stay_s=s.stay_s)
+            turned = imm.predicted(last.half, age_s, acceleration=(s.turn_acceleration,), stay_s=s.stay_s)
             if (
-                imm.surprise(now, place, variance=variance) <= CHI2_GATE
-                and imm.surprise(side, turn, variance=variance) <= CHI2_GATE
+                imm.surprise(now, middle, variance=variance) <= CHI2_GATE
+                and imm.surprise(turned, half, variance=variance) <= CHI2_GATE
             ):
-                self._keep(
-                    capture_ns,
-                    imm.corrected(now, place, variance=variance),
-                    imm.corrected(side, turn, variance=variance),
-                    last.jump_m,
-                    last.jump_ns,
-                )
-                return
-            if not self._is_confirmed(middle, capture_ns):
+                found = imm.corrected(now, middle, variance=variance)
+                side = imm.corrected(turned, half, variance=variance)
+            elif not is_held and not self._is_confirmed(middle, capture_ns):
                 self._refused = capture_ns, middle
                 self.outliers += 1
                 return
-        before = self.at(capture_ns).eyes_m
-        jump = NO_JUMP if before is None else before - np.array([middle - half, middle + half])
-        count = len(self.settings.acceleration)
-        found = imm.started(middle.tolist(), count=count, variance=variance, speed=FIRST_SPEED)
-        side = imm.started(half.tolist(), count=1, variance=variance, speed=FIRST_SPEED / 3)
-        self._keep(capture_ns, found, side, jump, capture_ns)
+        is_new = found is None or side is None
+        if found is None or side is None:
+            found = imm.started(middle, count=len(s.acceleration), variance=variance, speed=FIRST_SPEED)
+            side = imm.started(half, count=1, variance=variance, speed=FIRST_SPEED / 3)
+        if is_held or is_new:
+            jump_ns = max(self._asked_ns, capture_ns)
+            before = self.at(jump_ns).eyes_m
+            ahead_s = min((jump_ns - capture_ns) / NS_PER_S, s.horizon_max_s)
+            jump_m = NO_JUMP if before is None else before - _eyes(found, side, ahead_s)
+        self._history.append(_Sample(capture_ns, found, side, jump_m, jump_ns))
+        self._refused = self._lost_ns = None
 
-    def _is_confirmed(self, middle: F64, capture_ns: int) -> bool:
+    def _is_confirmed(self, middle: imm.Vector, capture_ns: int) -> bool:
         """True where the sample before was refused for being in the same other place."""
         if self._refused is None:
             return False
         then_ns, then = self._refused
         reach_m = 4 * self.settings.noise_m + self.settings.speed_max * (capture_ns - then_ns) / NS_PER_S
-        return float(np.linalg.norm(middle - then)) <= reach_m
-
-    def _keep(
-        self, capture_ns: int, middle: tuple[imm.Model, ...], half: tuple[imm.Model, ...], jump_m: F64, jump_ns: int
-    ) -> None:
-        place = np.array([*imm.combined(middle), *imm.combined(half)])
-        self._history.append(_Sample(capture_ns, middle, half, place, jump_m, jump_ns))
-        self._refused = self._lost_ns = None
+        return math.dist(middle, then) <= reach_m
 
     def at(self, time_ns: int) -> EyesEstimate:
         """Where the eyes are at an instant of the samples' clock.
@@ -137,6 +137,7 @@ class Tracker:
         age_s = age_ns / NS_PER_S
         if age_s > self.settings.hold_s:
             return EyesEstimate(time_ns, newest.capture_ns, None, "none", age_ns)
+        self._asked_ns = max(self._asked_ns, time_ns)
         label: EyesLabel = "predicted"
         ahead_s = min(age_s, self.settings.horizon_max_s)
         if self._lost_ns is not None:
@@ -159,10 +160,15 @@ class Tracker:
         return EyesEstimate(time_ns, after.capture_ns, eyes, "interpolated", time_ns - after.capture_ns)
 
     def _eyes(self, sample: _Sample, ahead_s: float, time_ns: int) -> F64:
-        middle, half = sample.place[0::2] + sample.place[1::2] * ahead_s
-        eyes = np.array([middle - half, middle + half])
-        since_s = (time_ns - sample.jump_ns) / NS_PER_S
-        if sample.jump_m is not NO_JUMP and 0.0 <= since_s < self.settings.revive_s:
-            fraction = since_s / self.settings.revive_s
+        eyes = _eyes(sample.middle, sample.half, ahead_s)
+        if sample.jump_m is not NO_JUMP:
+            fraction = min(max((time_ns - sample.jump_ns) / NS_PER_S / self.settings.revive_s, 0.0), 1.0)
             eyes += sample.jump_m * (1 - fraction * fraction * (3 - 2 * fraction))
         return eyes
+
+
+def _eyes(middle: tuple[imm.Model, ...], half: tuple[imm.Model, ...], ahead_s: float) -> F64:
+    """(2, 3) left and right eye, so many seconds after the filters' instant."""
+    place, velocity = np.array([*zip(imm.combined(middle), imm.combined(half), strict=True)])
+    centre, side = place + velocity * ahead_s
+    return np.array([centre - side, centre + side])

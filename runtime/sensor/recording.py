@@ -118,16 +118,17 @@ def recording_to(
     with file:
         writer = _Appearing(file, header, limits=limits, part=part, path=path)
         try:
-            yield writer
+            try:
+                yield writer
+            finally:
+                if writer.count:
+                    writer.finish()
+                else:
+                    part.unlink(missing_ok=True)
         except OSError as error:
-            if error.filename is None and error.errno is not None:
+            if error.filename is None and error.errno is not None:  # ours: writing to an open file, a full disk
                 raise InputError(path, "", f"cannot be written ({error.strerror})") from None
             raise
-        finally:
-            if writer.count:
-                writer.finish()
-            else:
-                part.unlink(missing_ok=True)
 
 
 class _Appearing(RecordingWriter):

@@ -216,6 +216,19 @@ with recording_to(pathlib.Path({str(path)!r}), EYES_ONLY) as writer:
     assert not recording.is_whole and 170 <= count <= 200
 
 
+def test_a_full_disk_is_told_by_name_and_what_is_there_can_be_read(tmp_path):
+    path = tmp_path / "a.mcap"
+    code = f"""
+import pathlib, resource
+from tests.sensor.test_recording import sample, write
+resource.setrlimit(resource.RLIMIT_FSIZE, (30000, 30000))
+write(pathlib.Path({str(path)!r}), [sample(k) for k in range(1000)])
+"""
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert answer.returncode != 0 and "InputError" in answer.stderr.splitlines()[-1] and str(path) in answer.stderr
+    assert len(list(Recording(path).samples())) > 50
+
+
 def test_a_writer_takes_no_longer_for_a_long_recording():
     file = io.BytesIO()
     writer = RecordingWriter(file, EYES_ONLY, limits=RecordingLimits(max_s=1e6))

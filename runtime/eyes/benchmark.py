@@ -1,0 +1,299 @@
+"""How well the tracker predicts: error against horizon for recorded kinds of motion, and jitter against lag."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from runtime.clock import NS_PER_MS, NS_PER_S
+from runtime.config import TrackerSettings
+from runtime.eyes.motions import MOTIONS, Observation, observe, true_eyes
+from runtime.eyes.one_euro import OneEuro
+from runtime.eyes.tracker import Tracker
+from runtime.records import F64, EyePoints
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+HORIZONS_MS = (0, 15, 30, 45, 60, 75, 90, 105, 120)
+SETTLED_S = 1.5  # the start of a run, in which no filter knows the velocity yet, is left out
+SHIPPED, NONE, EURO, BEST = "shipped", "no filter, no prediction", "One Euro", "tuned offline"
+
+
+class Predictor(Protocol):
+    """What is compared."""
+
+    def update(self, points: EyePoints | None, *, capture_ns: int) -> None: ...
+
+    def eyes_at(self, time_ns: int) -> F64 | None:
+        """(2, 3) or None before the first sample."""
+
+
+class Shipped:
+    """The product's tracker, or one with other settings."""
+
+    def __init__(self, settings: TrackerSettings | None = None) -> None:
+        self._tracker = Tracker(settings)
+        self.update = self._tracker.update
+
+    def eyes_at(self, time_ns: int) -> F64 | None:
+        return self._tracker.at(time_ns).eyes_m
+
+
+class Newest:
+    """No filter and no prediction: what the published prototype does."""
+
+    def __init__(self) -> None:
+        self._eyes: F64 | None = None
+
+    def update(self, points: EyePoints | None, *, capture_ns: int) -> None:
+        self._eyes = points.eyes_m if points is not None else self._eyes
+
+    def eyes_at(self, time_ns: int) -> F64 | None:
+        return self._eyes
+
+
+class Euro:
+    """One Euro alone, behind the tracker's plausibility check; `predict`: goes on at its filtered speed."""
+
+    def __init__(self, *, min_cutoff_hz: float = 2.0, beta: float = 12.0, predict: bool = False) -> None:
+        self._filter = OneEuro(min_cutoff_hz=min_cutoff_hz, beta=beta)
+        self._predict, self._last_ns = predict, 0
+
+    def update(self, points: EyePoints | None, *, capture_ns: int) -> None:
+        if points is None:
+            return
+        ipd_m = float(np.linalg.norm(points.eyes_m[0] - points.eyes_m[1]))
+        if 0.05 <= ipd_m <= 0.075:
+            dt_s = (capture_ns - self._last_ns) / NS_PER_S
+            self._filter.update(points.eyes_m.ravel(), dt_s=max(dt_s, 1e-3))
+            self._last_ns = capture_ns
+
+    def eyes_at(self, time_ns: int) -> F64 | None:
+        if self._filter.position is None:
+            return None
+        ahead_s = min((time_ns - self._last_ns) / NS_PER_S, 0.12) if self._predict else 0.0
+        return (self._filter.position + self._filter.velocity * ahead_s).reshape(2, 3)
+
+
+def candidates() -> Iterable[tuple[str, Callable[[], Predictor]]]:
+    """What offline tuning may choose from, a motion at a time: plain Kalman filters, and One Euro with prediction."""
+    for q in (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0):
+        for turn in (1e-5, 1e-4, 1e-3):
+            settings = TrackerSettings(acceleration=(q,), turn_acceleration=turn)
+            yield f"Kalman q = {q:g}, {turn:g}", partial(Shipped, settings)
+    for cutoff_hz in (0.5, 1.0, 2.0, 4.0):
+        for beta in (3.0, 10.0, 30.0):
+            yield (
+                f"One Euro {cutoff_hz:g} Hz, beta {beta:g}, predicting",
+                partial(Euro, min_cutoff_hz=cutoff_hz, beta=beta, predict=True),
+            )
+
+
+def errors_mm(
+    make: Callable[[], Predictor], observed: Sequence[Observation], motion: str, horizons_ms: Sequence[float]
+) -> dict[float, F64]:
+    """Distance of the worse eye from the truth, each sample's instant plus each horizon, dropouts included.
+
+    Each horizon is a run of its own: a display has one.
+    """
+    result = {}
+    for horizon in horizons_ms:
+        predictor, answers, times_s = make(), [], []
+        ahead_ns = round(horizon * NS_PER_MS)
+        for sample in observed:
+            predictor.update(sample.points, capture_ns=sample.capture_ns)
+            eyes = predictor.eyes_at(sample.capture_ns + ahead_ns)
+            if sample.capture_ns >= SETTLED_S * NS_PER_S:
+                times_s.append((sample.capture_ns + ahead_ns) / NS_PER_S)
+                answers.append(np.full((2, 3), np.nan) if eyes is None else eyes)
+        truth = true_eyes(motion, np.array(times_s))
+        result[horizon] = np.linalg.norm(np.array(answers) - truth, axis=2).max(axis=1) * 1000
+    return result
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One method at one horizon."""
+
+    motion: str
+    rate_hz: int
+    method: str
+    horizon_ms: float
+    p50_mm: float
+    p95_mm: float
+    note: str = ""
+
+
+def _rows(motion: str, rate_hz: int, method: str, errors: dict[float, F64], note: str = "") -> list[Row]:
+    return [
+        Row(motion, rate_hz, method, h, float(np.nanpercentile(e, 50)), float(np.nanpercentile(e, 95)), note)
+        for h, e in errors.items()
+    ]
+
+
+def benchmark(
+    *,
+    seconds: float = 30.0,
+    rates_hz: Sequence[int] = (30, 60),
+    motions: Sequence[str] = ("lean", "nod", "walk", "stop-and-go"),
+    tune: bool = True,
+    tune_at_ms: float = 60.0,
+) -> list[Row]:
+    """Prediction error by motion, rate, method and horizon: noise 3 mm, 5 % outliers, dropouts of 0.2 s.
+
+    "tuned offline" is the candidate with the least p95 at `tune_at_ms` of this very run, which no tracker
+    can know beforehand.
+    """
+    rows: list[Row] = []
+    for motion in motions:
+        for rate_hz in rates_hz:
+            observed = observe(motion, seconds=seconds, rate_hz=rate_hz)
+
+            def measure(
+                make: Callable[[], Predictor],
+                horizons: Sequence[float] = HORIZONS_MS,
+                observed: list[Observation] = observed,
+                motion: str = motion,
+            ) -> dict[float, F64]:
+                return errors_mm(make, observed, motion, horizons)
+
+            rows += _rows(motion, rate_hz, SHIPPED, measure(Shipped))
+            rows += _rows(motion, rate_hz, NONE, measure(Newest))
+            rows += _rows(motion, rate_hz, EURO, measure(Euro))
+            if tune:
+                scores = [
+                    (float(np.nanpercentile(measure(make, [tune_at_ms])[tune_at_ms], 95)), name, make)
+                    for name, make in candidates()
+                ]
+                _, name, make = min(scores, key=lambda score: score[0])
+                rows += _rows(motion, rate_hz, BEST, measure(make), name)
+    return rows
+
+
+@dataclass(frozen=True, slots=True)
+class Trade:
+    """One setting: how much a still head shakes, and how far behind a moving one the eyes are."""
+
+    method: str
+    jitter_mm: float  # root mean square of a still head's steps from sample to sample
+    lag_ms: float  # by which the answer for the sample's own instant trails a head at 0.3 m/s
+
+
+def jitter_and_lag(*, rate_hz: int = 60, seconds: float = 16.0) -> list[Trade]:
+    """The trade-off of Kalman and One Euro filters over their settings, with the shipped tracker's point."""
+    still = observe("still", seconds=seconds, rate_hz=rate_hz, outliers=0.0, dropout_every_s=0.0)
+    lean = observe("lean", seconds=seconds, rate_hz=rate_hz, outliers=0.0, dropout_every_s=0.0)
+    times_s = np.array([o.capture_ns for o in lean]) / NS_PER_S
+    truth = true_eyes("lean", times_s)[:, :, 1].mean(1)
+    speed = np.gradient(truth, times_s)
+
+    def answers(predictor: Predictor, observed: list[Observation]) -> F64:
+        given = []
+        for sample in observed:
+            predictor.update(sample.points, capture_ns=sample.capture_ns)
+            eyes = predictor.eyes_at(sample.capture_ns)
+            given.append(np.full(3, np.nan) if eyes is None else eyes.mean(0))
+        return np.array(given)
+
+    def trade(method: str, make: Callable[[], Predictor]) -> Trade:
+        from_s = round(SETTLED_S * rate_hz)
+        steps = np.diff(answers(make(), still)[from_s:], axis=0)
+        behind = (truth - answers(make(), lean)[:, 1])[from_s:]
+        # Least squares of error = lag x speed: the noise averages out.
+        lag_s = float(behind @ speed[from_s:] / (speed[from_s:] @ speed[from_s:]))
+        return Trade(method, float(np.sqrt((steps**2).sum(1).mean()) * 1000), lag_s * 1000)
+
+    rows = [trade(SHIPPED, Shipped)]
+    for q in (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0):
+        settings = TrackerSettings(acceleration=(q,))
+        rows.append(trade("Kalman", partial(Shipped, settings)))
+    rows += [
+        trade("One Euro", partial(Euro, min_cutoff_hz=cutoff, beta=10.0))
+        for cutoff in (0.3, 0.6, 1.2, 2.5, 5.0, 10.0, 20.0)
+    ]
+    return rows
+
+
+def update_cost_us(*, samples: int = 2000) -> float:
+    """Median time of one update of the tracker, in microseconds on this machine, now."""
+    import time
+
+    observed = observe("walk", seconds=samples / 60, rate_hz=60)
+    tracker, times = Tracker(), []
+    for sample in observed:
+        begin = time.perf_counter_ns()
+        tracker.update(sample.points, capture_ns=sample.capture_ns)
+        times.append(time.perf_counter_ns() - begin)
+    return float(np.median(times)) / 1000
+
+
+def benchmark_table(rows: Sequence[Row]) -> list[dict[str, object]]:
+    """The rows as plain objects, for JSON."""
+    return [asdict(row) for row in rows]
+
+
+STYLES = {SHIPPED: ("C0", "-", 2.4), BEST: ("k", ":", 1.6), EURO: ("C1", "--", 1.4), NONE: ("C3", "-.", 1.4)}
+
+
+def plot_benchmark(rows: Sequence[Row], trades: Sequence[Trade], path: Path | None = None) -> Figure:
+    """p95 error against horizon, a panel a motion, and jitter against lag; written as PNG where a path is given."""
+    from matplotlib.figure import Figure
+
+    motions = [m for m in MOTIONS if any(row.motion == m for row in rows)]
+    rate_hz = min(row.rate_hz for row in rows)
+    columns = (len(motions) + 2) // 2
+    figure = Figure(figsize=(4.6 * columns, 7.6), layout="constrained")
+    axes = figure.subplots(2, columns, squeeze=False).ravel()
+    for axis, motion in zip(axes, motions):
+        tops = []
+        for method, (colour, dashes, width) in STYLES.items():
+            line = [r for r in rows if (r.motion, r.rate_hz, r.method) == (motion, rate_hz, method)]
+            axis.plot(
+                [r.horizon_ms for r in line],
+                [r.p95_mm for r in line],
+                dashes,
+                color=colour,
+                linewidth=width,
+                label=method,
+            )
+            tops += [r.p95_mm for r in line if method == SHIPPED]
+        axis.set(title=motion, xlabel="ahead of the newest sample, ms", ylabel="mm", xlim=(0, max(HORIZONS_MS)))
+        axis.set_ylim(0, 2.2 * max(tops))
+        axis.grid(alpha=0.3)
+    trade = axes[len(motions)]
+    for method, colour in (("Kalman", "k"), ("One Euro", "C1")):
+        curve = sorted((t.lag_ms, t.jitter_mm) for t in trades if t.method == method)
+        trade.plot(*zip(*curve), "o-", color=colour, markersize=4, label=f"{method}, by its setting")
+    shipped = next(t for t in trades if t.method == SHIPPED)
+    trade.plot(shipped.lag_ms, shipped.jitter_mm, "*", color="C0", markersize=16, label=SHIPPED)
+    trade.set(title="still head's jitter, moving head's lag", xlabel="lag, ms", ylabel="step to step, mm rms")
+    trade.set_ylim(bottom=0)
+    trade.legend(fontsize=9)
+    trade.grid(alpha=0.3)
+    for spare in axes[len(motions) + 1 :]:
+        spare.axis("off")
+        spare.legend(*axes[0].get_legend_handles_labels(), loc="upper left", title="curves over the horizon")
+        note = "Lines that leave a panel at its top\nare worse than the panel shows."
+        spare.text(0.02, 0.35, note, transform=spare.transAxes)
+    figure.suptitle(
+        f"Error of the predicted eyes (worse eye, 95th percentile): {rate_hz} Hz, 3 mm noise, 5 % outliers, dropouts"
+    )
+    if path is not None:
+        from runtime.artifacts import write_bytes
+
+        write_bytes(path, _png(figure))
+    return figure
+
+
+def _png(figure: Figure) -> bytes:
+    import io
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()
