@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ from runtime.records import U8
 from runtime.report.eyesight import Seen, judged
 from runtime.report.methods import Kind, Method, opened
 from runtime.report.pairs import StillPair
+from runtime.report.worker import apart
 
 ENOUGH_S = 2.0  # of timed runs on one pair; slow methods run once
 MOST_RUNS = 25
@@ -113,17 +112,14 @@ def measure(
     threads: int = 2,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[MethodResult]:
-    """Every method on every pair. Pairs of one call share a resolution.
-
-    A method that can't serve these panels is left out of the result. Raises InputError where none can.
-    """
+    """Every method on every pair. Pairs of one call share a resolution. Raises FatalError where a method fails."""
     results: list[MethodResult] = []
-    context = multiprocessing.get_context("spawn")
     for index, method in enumerate(methods):
-        timed: list[tuple[StillPair, Timed]] = []
-        with ProcessPoolExecutor(max_workers=1, mp_context=context) as pool:
-            timed += [(pair, pool.submit(run_method, method, pair, threads).result()) for pair in pairs]
-        results.append(_together(method, [(p, t, judged(p, t.layers)) for p, t in timed]))
+        runs = []
+        for pair in pairs:
+            timed = apart(run_method, method, replace(pair, off=()), threads)
+            runs.append((pair, timed, judged(pair, timed.layers)))
+        results.append(_together(method, runs))
         progress(index + 1, len(methods))
     return results
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.errors import InputError
+from runtime.errors import FatalError, InputError
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
@@ -17,6 +17,7 @@ from runtime.report.eyesight import as_intensity, judged, seen_rays
 from runtime.report.frontier import MethodResult, check_models, measure, pareto
 from runtime.report.methods import Method, shipped_and_references
 from runtime.report.pairs import Painter, StillPair, eyes_at
+from runtime.report.worker import apart
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
 
@@ -105,3 +106,24 @@ def test_a_model_that_is_not_there_is_refused_before_anything_is_measured(tmp_pa
 def test_off_eye_means_are_finite(pair: StillPair) -> None:
     seen = judged(pair, np.zeros((3, 108, 192, 3), np.uint8))
     assert all(math.isfinite(value) for value in seen.off_db.values())
+
+
+def echo(value: int) -> int:
+    print("noise on stdout")
+    return value
+
+
+def refuse() -> None:
+    raise InputError("file", "field", "is wrong")
+
+
+def die() -> None:
+    raise SystemExit(3)
+
+
+def test_a_measurement_in_a_process_of_its_own_answers_refuses_or_is_told_to_have_died() -> None:
+    assert apart(echo, 7) == 7
+    with pytest.raises(FatalError, match="file: field: is wrong"):
+        apart(refuse)
+    with pytest.raises(FatalError, match="die: the measuring process ended with 3"):
+        apart(die)
