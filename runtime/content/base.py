@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+from runtime.content.camera import PixelBox
 from runtime.records import F64, U8
 
 
@@ -46,6 +47,10 @@ class ContentSource(ABC):
         side, and the other side's call leaves it alone. `time_ns` is the run's clock, for content that moves.
         Raises ContentFailure: the last picture stays.
         """
+
+    def extent(self, view: View, *, time_ns: int) -> PixelBox | None:
+        """A box of the view's pixels beside which only the background shows, told without drawing; None: not known."""
+        return None
 
     def revision(self, *, time_ns: int) -> int:
         """A number that changes when what `render` draws for the same view may have changed; 0 for ever if static."""

@@ -12,6 +12,7 @@ from runtime.content.camera import PixelBox
 from runtime.records import U8
 
 SIDES = 2
+SIZES_KEPT = 8
 
 
 @dataclass(slots=True)
@@ -63,16 +64,21 @@ class Canvas:
 
     def close(self) -> None:
         """Release every framebuffer. May be called twice."""
-        for target in self._targets.values():
-            for framebuffer in {id(f): f for f in (target.smooth, target.plain)}.values():
-                for attachment in (*framebuffer.color_attachments, framebuffer.depth_attachment):
-                    attachment.release()
-                framebuffer.release()
-        self._targets.clear()
+        while self._targets:
+            self._forget_oldest()
+
+    def _forget_oldest(self) -> None:
+        target = self._targets.pop(next(iter(self._targets)))
+        for framebuffer in {id(f): f for f in (target.smooth, target.plain)}.values():
+            for attachment in (*framebuffer.color_attachments, framebuffer.depth_attachment):
+                attachment.release()
+            framebuffer.release()
 
     def _target(self, width_px: int, height_px: int) -> _Target:
         size = (width_px, height_px)
         if size not in self._targets:
+            if len(self._targets) >= SIZES_KEPT:
+                self._forget_oldest()
             plain = self._framebuffer(size, 0)
             other = self._samples > 1 or self._deep
             smooth = self._framebuffer(size, self._samples, "f2" if self._deep else "f1") if other else plain

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.camera import PixelBox
 from runtime.content.shapes import Shape
 from runtime.content.triangles import Part, TrianglePainter
 from runtime.errors import InputError, MissingPart
@@ -166,6 +167,9 @@ class MeshSource(ContentSource):
 
     def render(self, view: View, *, time_ns: int) -> U8:
         return self._painter.paint(view, self._placed)
+
+    def extent(self, view: View, *, time_ns: int) -> PixelBox:
+        return self._painter.extent(view, self._placed)
 
     def close(self) -> None:
         self._painter.close()

@@ -9,6 +9,7 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.content import shapes, textures
 from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.camera import PixelBox
 from runtime.content.scenes import Scene, Thing, scene
 from runtime.content.triangles import Part, TrianglePainter
 from runtime.optics.stack import PanelStack
@@ -58,12 +59,19 @@ class ProceduralSource(ContentSource):
 
     def render(self, view: View, *, time_ns: int) -> U8:
         """The scene through the view's projection; the same bytes for the same view and time."""
-        if not self._scene.moving:
-            return self._painter.paint(view, self._still)
-        return self._painter.paint(view, [self._placed(thing, time_ns / NS_PER_S) for thing in self._scene.things])
+        return self._painter.paint(view, self._places(time_ns))
+
+    def extent(self, view: View, *, time_ns: int) -> PixelBox:
+        return self._painter.extent(view, self._places(time_ns))
 
     def close(self) -> None:
         self._painter.close()
+
+    def _places(self, time_ns: int) -> list[F64]:
+        """4x4 stack_from_thing of every thing."""
+        if not self._scene.moving:
+            return self._still
+        return [self._placed(thing, time_ns / NS_PER_S) for thing in self._scene.things]
 
     def _placed(self, thing: Thing, time_s: float) -> F64:
         """4x4 stack_from_thing at a time."""

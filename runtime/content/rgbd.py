@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.camera import PixelBox
 from runtime.content.images import rgba_from_rgb
 from runtime.content.pictures import screen
 from runtime.content.shapes import Shape
@@ -82,6 +83,9 @@ class RgbdSource(ContentSource):
 
     def render(self, view: View, *, time_ns: int) -> U8:
         return self._painter.paint(view, [np.eye(4)])
+
+    def extent(self, view: View, *, time_ns: int) -> PixelBox:
+        return self._painter.extent(view, [np.eye(4)])
 
     def close(self) -> None:
         self._painter.close()

@@ -86,7 +86,7 @@ def _demo(turns_per_s: float = 0.0) -> tuple[Thing, ...]:
 
 
 def _sparse() -> tuple[Thing, ...]:
-    return (Thing(shapes.torus(0.032, 0.0115), "stripes", (0.02, 0.03, 0.0), rotation=_turned(-32, -18)),)
+    return (Thing(shapes.torus(0.021, 0.0075), "stripes", (0.02, 0.03, 0.0), rotation=_turned(-32, -18)),)
 
 
 def _texture() -> tuple[Thing, ...]:

@@ -20,6 +20,7 @@ from runtime.content.shapes import Shape
 from runtime.records import F32, F64, U8
 
 MOST_OUTLINED = 200_000  # triangles of a part; beyond, finding its outline costs more than drawing it
+MOST_PROJECTED = 5000  # vertices of a part that are projected to tell where it lies; beyond, its box is
 OUTLINE_BYTES = 6 * (5 + 8) * 4  # two triangles an edge: clip coordinates and coverage, then the attributes
 OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
 
@@ -144,6 +145,18 @@ class TrianglePainter:
         """(8n, 3) corners in the stack frame of the boxes that hold the parts."""
         placed = zip(self._parts, stack_from_parts, strict=True)
         return np.concatenate([item.corners_m @ matrix[:3, :3].T + matrix[:3, 3] for item, matrix in placed])
+
+    def extent(self, view: View, stack_from_parts: Sequence[F64]) -> camera.PixelBox:
+        """A box of the view's pixels that holds all that `paint` would draw."""
+        size = {"width_px": view.width_px, "height_px": view.height_px}
+        boxes = []
+        for item, matrix in zip(self._parts, stack_from_parts, strict=True):
+            vertices = item.part.shape.positions_m
+            points = item.corners_m if len(vertices) > MOST_PROJECTED else vertices.astype(np.float64)
+            placed = points @ matrix[:3, :3].T + matrix[:3, 3]
+            if camera.depth_bounds(view.pixels_from_stack, placed) is not None:
+                boxes.append(camera.covered_box(view.pixels_from_stack, placed, align_px=1, **size))
+        return camera.union(boxes)
 
     def paint(self, view: View, stack_from_parts: Sequence[F64]) -> U8:
         """The parts at their places (4x4 each, a similarity), over the background."""

@@ -1,0 +1,104 @@
+"""Where two eyes' pictures differ: the only place that needs a network. Pure functions of arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from runtime.content.camera import PixelBox
+from runtime.optics.stack import PanelStack
+from runtime.records import F64, U8
+
+TOLERANCE_CODES = 2  # eyes that differ by no more agree: a tenth of what 8 bits cost at 40 dB
+COARSE_STEP = 16  # of the look that decides whether a closer one is worth its time
+WHOLE_ABOVE = 0.6  # of the panel: a larger window is not worth cutting out
+MOST_SLACK = 1.3  # of a kept window's area over the one that would do
+STEPS = 16  # windows are whole sixteenths of the panel, so that a few sizes serve all
+# Measured with the shipped models: along the line of the eyes the outer panels are driven for some twelve
+# parallaxes beside a difference, and a window must hold each panel's part of what the eyes see through another.
+CHAIN_STEPS = 12.0
+PANEL_CROSSINGS = 2.0
+ROOM_PX = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A rectangle of every panel that is solved by itself."""
+
+    box: PixelBox  # panel pixels
+    stack: PanelStack  # the same panels, cut to the box and moved to its centre
+    shift_m: F64  # (3,) of the stack frame: where the box's centre is (0, y, z)
+
+
+def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> PixelBox:
+    """The smallest box of pixels in which two (h, w, 4) RGBA pictures differ; empty where they agree everywhere.
+
+    A picture that differs nearly everywhere is told by a coarse look, which costs a hundredth of the close one.
+    """
+    height, width = left.shape[:2]
+    coarse = _box(left[::COARSE_STEP, ::COARSE_STEP], right[::COARSE_STEP, ::COARSE_STEP], tolerance)
+    if coarse.width_px * coarse.height_px * COARSE_STEP**2 > WHOLE_ABOVE * width * height:
+        return PixelBox(0, 0, width, height)
+    return _box(left, right, tolerance)
+
+
+def _box(left: U8, right: U8, tolerance: int) -> PixelBox:
+    difference = cv2.absdiff(np.ascontiguousarray(left), np.ascontiguousarray(right))
+    agree = cv2.inRange(difference, (0, 0, 0, 0), (tolerance, tolerance, tolerance, 255))
+    u, v, width, height = cv2.boundingRect(cv2.bitwise_not(agree))
+    return PixelBox(u, v, u + width, v + height)
+
+
+def room_px(eyes_m: F64, stack: PanelStack) -> tuple[float, float]:
+    """How far beside a difference the panels take part in it: columns and rows on each side, in pixels.
+
+    eyes_m: (2, 3) left, right; frame `stack`.
+    """
+    middle = stack.x_m[stack.count // 2]
+    gaps_m = np.array(stack.x_m) - middle
+    per_metre = np.array([stack.width_px / stack.width_m, stack.height_px / stack.height_m])
+    stray_px = eyes_m[:, None, 1:] * (gaps_m[None, :, None] / (eyes_m[:, None, :1] - middle)) * per_metre
+    parallax = np.abs(stray_px).max(axis=(0, 1))
+    separation = np.abs(stray_px[0] - stray_px[1]).max(axis=0)
+    columns, rows = PANEL_CROSSINGS * parallax + CHAIN_STEPS * separation + ROOM_PX
+    return float(columns), float(rows)
+
+
+def window_of(box: PixelBox, eyes_m: F64, stack: PanelStack) -> Window | None:
+    """The window that a difference is solved in: grown by the parallax, rounded up to whole sixteenths of the panel.
+
+    None where it would be most of the panel: then the whole is as fast.
+    """
+    columns, rows = room_px(eyes_m, stack)
+    spans: list[tuple[int, int]] = []
+    for start, end, room, whole in (
+        (box.u0, box.u1, columns, stack.width_px),
+        (box.v0, box.v1, rows, stack.height_px),
+    ):
+        low, high = start - room, end + room
+        step = whole / STEPS
+        size = min(int(np.ceil(np.ceil((high - low) / step) * step / 8) * 8), whole)
+        first = int(np.clip(np.floor((low + high - size) / 2), 0, whole - size))
+        spans.append((first, first + size))
+    (u0, u1), (v0, v1) = spans
+    if (u1 - u0) * (v1 - v0) > WHOLE_ABOVE * stack.width_px * stack.height_px:
+        return None
+    return cut_out(PixelBox(u0, v0, u1, v1), stack)
+
+
+def cut_out(box: PixelBox, stack: PanelStack) -> Window:
+    """The panels behind a box of pixels, as a stack of their own."""
+    pitch_u, pitch_v = stack.width_m / stack.width_px, stack.height_m / stack.height_px
+    cut = PanelStack(pitch_u * box.width_px, pitch_v * box.height_px, stack.x_m, box.width_px, box.height_px)
+    y_m = ((box.u0 + box.u1) / 2 - stack.width_px / 2) * pitch_u
+    z_m = (stack.height_px / 2 - (box.v0 + box.v1) / 2) * pitch_v
+    return Window(box, cut, np.array([0.0, y_m, z_m]))
+
+
+def still_fits(window: Window, wanted: Window) -> bool:
+    """True where a window in use holds a new one and isn't much larger: nothing need be allocated again."""
+    held, new = window.box, wanted.box
+    inside = held.u0 <= new.u0 and held.v0 <= new.v0 and held.u1 >= new.u1 and held.v1 >= new.v1
+    return inside and held.width_px * held.height_px <= MOST_SLACK * new.width_px * new.height_px

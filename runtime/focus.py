@@ -1,0 +1,165 @@
+"""A model that runs only where the two eyes' pictures differ; the rest is filled in, in closed form.
+
+Panels that are cut to a window and moved to its centre are a smaller stack, seen by eyes moved the same way: any
+model for evenly spaced panels serves it. Where the eyes agree, the outer panels stand at the middle of their
+range, from which the solver starts, and the centre panel carries the picture: there is no seam.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from time import perf_counter_ns
+
+import cv2
+import numpy as np
+
+from runtime.content.active import Window, differing_box, still_fits, window_of
+from runtime.content.base import ContentSource, View
+from runtime.content.camera import PixelBox, union
+from runtime.model.predictor import Prediction, Predictor
+from runtime.model.transfer import SUBCODE, phase_codes
+from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.views import raster_from_stack
+from runtime.records import F64, U8
+
+START = 128  # the outer panels' code where both eyes agree
+SIZES_KEPT = 6
+
+
+class FocusedPredictor(Predictor):
+    """Wraps a model that draws on the centre panel's pixels and starts with even outer panels.
+
+    Call `aim` before `rasters` where the content may know where it lies: then only the window is drawn, too.
+    Without it, the pictures themselves tell where they differ.
+    """
+
+    def __init__(self, whole: Predictor, make: Callable[[PanelStack], Predictor]) -> None:
+        """whole: the model for all of the panels; make: the same model for smaller ones of the same pitch."""
+        self.whole, self._make = whole, make
+        self.name, self.provider, self.parameters = whole.name, whole.provider, whole.parameters
+        self.stack = whole.stack
+        self._parts: dict[tuple[int, int], Predictor] = {}
+        self._layers = np.full((self.stack.count, self.stack.height_px, self.stack.width_px, 4), 255, np.uint8)
+        self._layers[..., :3] = START
+        self._solved: PixelBox | None = None  # where the outer panels are not even
+        self._aimed: Window | None = None
+        self._wanted_background: tuple[int, ...] = (255, 255, 255)
+        self._background: tuple[int, ...] | None = None  # that fills the centre panel beside the aimed window
+        self.window: Window | None = None  # of the last frame
+        self.active_fraction = 1.0  # of the panel's pixels that went through the model
+
+    def aim(self, content: ContentSource, eyes_m: F64, *, time_ns: int) -> None:
+        """Ask the content where it lies, so that only that is drawn and solved."""
+        self._aimed = None
+        if content.info.background is None:
+            return
+        raster = self._middle()
+        boxes = []
+        for side, eye_m in enumerate(eyes_m):
+            view = View(eye_m, side, raster_from_stack(eye_m, raster), raster.width_px, raster.height_px)
+            box = content.extent(view, time_ns=time_ns)
+            if box is None:
+                return
+            boxes.append(box)
+        box = union(boxes)
+        if not box.width_px:
+            return
+        wanted = window_of(box, eyes_m, self.stack)
+        if wanted is not None and self.window is not None and still_fits(self.window, wanted):
+            wanted = self.window
+        self._aimed = wanted
+        self._wanted_background = tuple(round(value * 255) for value in content.info.background)
+
+    def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
+        """The whole centre panel, or the aimed window of it."""
+        if self._aimed is None:
+            return self.whole.rasters(eyes_m)
+        box, whole = self._aimed.box, self._middle()
+        return (
+            replace(
+                whole,
+                left_m=whole.left_m + box.u0 * whole.pitch_u_m,
+                top_m=whole.top_m - box.v0 * whole.pitch_v_m,
+                width_px=box.width_px,
+                height_px=box.height_px,
+            ),
+        )
+
+    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64) -> Prediction:
+        begin_ns = perf_counter_ns()
+        left, right = images[0][0], images[1][0]
+        aimed, self._aimed = self._aimed, None
+        if aimed is not None:
+            self._even_out(but=aimed.box)
+            self._paint_background(self._wanted_background)
+            window, cut = aimed, [[left], [right]]
+        else:
+            box = differing_box(left, right)
+            differs = box.width_px > 0 and box.height_px > 0
+            found = window_of(box, eyes_m, self.stack) if differs else None
+            if found is None and differs:
+                self.window, self.active_fraction = None, 1.0
+                return self.whole.predict(images, eyes_m)
+            if found is not None and self.window is not None and still_fits(self.window, found):
+                found = self.window
+            self._even_out(but=found.box if found else None)
+            self._background = None
+            cv2.LUT(left, _centre_codes(self.stack.count), dst=self._layers[self.stack.count // 2])
+            if found is None:
+                self.window, self.active_fraction = None, 0.0
+                filled_ms = (perf_counter_ns() - begin_ns) / 1e6
+                return Prediction(self._layers, {"prepare": filled_ms, "inference": 0.0, "finish": 0.0})
+            window = found
+            area = window.box
+            cut = [[np.ascontiguousarray(image[area.v0 : area.v1, area.u0 : area.u1])] for image in (left, right)]
+        filled_ms = (perf_counter_ns() - begin_ns) / 1e6
+        return self._solve(window, cut, eyes_m, filled_ms)
+
+    def close(self) -> None:
+        for part in (self.whole, *self._parts.values()):
+            part.close()
+        self._parts = {}
+
+    def _solve(self, window: Window, cut: Sequence[Sequence[U8]], eyes_m: F64, filled_ms: float) -> Prediction:
+        area = window.box
+        solved = self._part(window.stack).predict(cut, eyes_m - window.shift_m)
+        self._layers[:, area.v0 : area.v1, area.u0 : area.u1] = solved.layers
+        self._solved, self.window = area, window
+        self.active_fraction = area.width_px * area.height_px / (self.stack.width_px * self.stack.height_px)
+        stage_ms = dict(solved.stage_ms)
+        stage_ms["prepare"] = stage_ms.get("prepare", 0.0) + filled_ms
+        return Prediction(self._layers, stage_ms)
+
+    def _middle(self) -> PlaneRaster:
+        return self.stack.panel(self.stack.count // 2)
+
+    def _even_out(self, *, but: PixelBox | None) -> None:
+        """Bring the outer panels back to the middle of their range where the last frame drove them."""
+        if self._solved is None or self._solved == but:
+            return
+        area = self._solved
+        for layer in self._layers:
+            layer[area.v0 : area.v1, area.u0 : area.u1] = (START, START, START, 255)
+        self._solved, self._background = None, None
+
+    def _paint_background(self, colour: tuple[int, ...]) -> None:
+        """The centre panel as if both eyes saw nothing but the background; once, as long as nothing changes."""
+        if self._background != colour:
+            codes = _centre_codes(self.stack.count)[list(colour)]
+            self._layers[self.stack.count // 2] = (*codes.tolist(), 255)
+            self._background = colour
+
+    def _part(self, stack: PanelStack) -> Predictor:
+        size = (stack.width_px, stack.height_px)
+        if size not in self._parts:
+            while len(self._parts) >= SIZES_KEPT:
+                self._parts.pop(next(iter(self._parts))).close()
+            self._parts[size] = self._make(stack)
+        return self._parts[size]
+
+
+def _centre_codes(panels: int) -> U8:
+    """(256,) the centre panel's code for each code of the picture, the others standing at START."""
+    phases = phase_codes(2).reshape(256, -1)[:, 0].astype(np.int32)
+    return np.clip((phases - (panels - 1) * START * SUBCODE + SUBCODE // 2) // SUBCODE, 0, 255).astype(np.uint8)
