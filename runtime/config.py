@@ -219,6 +219,15 @@ class PlanSettings(Section):
     """What may be left out; each saving can be switched off."""
 
     enabled: bool = Field(True, description="switches every saving at once")
+    reuse: bool = Field(True, description="present again while neither content nor eyes moved")
+    focus: bool = Field(True, description="run the network only where the two eyes' pictures differ")
+    one_eye: bool = Field(True, description="solve for one eye alone while the other can't see the display")
+    dead_band_mm: NonNegative = Field(
+        0.0, description="eye motion that counts as none; 0: from the tracker's noise, at most model.tolerance_mm"
+    )
+    range_deg: Annotated[float, Field(gt=0, le=90)] = Field(
+        80.0, description="an eye farther off the display's axis than this can't see it"
+    )
 
 
 class ServiceSettings(Section):
