@@ -16,6 +16,7 @@ from runtime.records import F64, EyePoints, EyesEstimate, EyesLabel
 
 HISTORY = 256  # filtered samples kept: four seconds at 60 Hz
 CHI2_GATE = 21.1  # of three axes: one honest sample in 10 000 is refused
+FARTHEST_M = 100.0  # no sensor sees a face from there; larger numbers overflow when squared
 KEEP_S = 0.4  # after a longer gap nothing of a head's motion is left
 CLOCK_RESET_NS = NS_PER_S  # a capture this far in the past is a clock that was set back, not a late sample
 FIRST_SPEED = 0.3  # m/s, of a head that was just found
@@ -69,7 +70,8 @@ class Tracker:
         half = (rx - lx) / 2, (ry - ly) / 2, (rz - lz) / 2
         middle = lx + half[0], ly + half[1], lz + half[2]
         ipd_m = 2 * math.hypot(*half)
-        if not (math.isfinite(sum(middle)) and self.settings.ipd_min_m <= ipd_m <= self.settings.ipd_max_m):
+        is_person = self.settings.ipd_min_m <= ipd_m <= self.settings.ipd_max_m
+        if not (is_person and math.hypot(*middle) <= FARTHEST_M):  # NaN is refused as well
             self.outliers += 1
             return
         self._take(middle, half, capture_ns=capture_ns, completed=bool(points.completed))
