@@ -22,7 +22,7 @@ class Method:
 
     name: str
     kind: Kind
-    source: str  # `cg`, `mean`, `sart`, or what `load_predictor` takes
+    source: str  # `cg`, `filter`, `mean`, `sart`, or what `load_predictor` takes
     iterations: int = 0
     tolerance_mm: float | None = None  # of the networks; None: the default
 
@@ -42,6 +42,8 @@ def opened(method: Method, pair: StillPair, *, threads: int) -> Opened:
         return Opened(lambda p: _conjugate_gradients(p, method.iterations), 0, "fp32")
     if method.source == "mean":
         return Opened(_mean, 0, "fp32")
+    if method.source == "filter":
+        return Opened(lambda p: _filter(p, method.iterations), 0, "fp32")
     from runtime.config import ModelSettings
     from runtime.model.predictor import Predictor, load_predictor
     from runtime.model.still import solve_still
@@ -85,11 +87,19 @@ def _mean(pair: StillPair) -> U8:
     return as_codes(mean_of_targets(pair.eyes_m, _wanted(pair), pair.stack, fov_deg=pair.fov_deg))
 
 
+def _filter(pair: StillPair, steps: int) -> U8:
+    from runtime.report.baselines import as_codes
+    from runtime.report.filters import filtered_layers
+
+    return as_codes(filtered_layers(pair.eyes_m, _wanted(pair), pair.stack, fov_deg=pair.fov_deg, steps=steps))
+
+
 def shipped_and_references(*, models: Sequence[str] = (), quick: bool = False) -> list[Method]:
     """Our sizes, further ONNX files, and the reference methods; `quick` leaves out the slowest."""
     methods = [Method(name, "network", name) for name in ("fast", "balanced", "best")]
     methods += [Method(Path(name).stem, "network", name) for name in models]
     methods += [Method(f"SART-{n}", "iterative", "sart", n) for n in ((1, 3, 10) if quick else (1, 3, 10, 30))]
     methods += [Method(f"CG-{n}", "iterative", "cg", n) for n in ((3, 10) if quick else (3, 10, 30))]
+    methods += [Method(f"filter-{n}", "closed form", "filter", n) for n in (1, 3)]
     methods.append(Method("mean of targets", "closed form", "mean"))
     return methods
