@@ -91,13 +91,13 @@ class TrackerSettings(Section):
     ipd_max_m: Positive = Field(0.075, description="larger eye separations are implausible for a person")
     noise_m: Positive = Field(0.003, description="the sensor's noise on an eye, standard deviation of an axis")
     acceleration: tuple[Positive, ...] = Field(
-        (0.002, 0.03, 0.5),
+        (0.01, 0.1, 0.5),
         min_length=1,
         max_length=4,
         description="how freely a calm, a moving and a hasty head start and stop: noise density, m²/s³, ascending",
     )
-    stay_s: Positive = Field(0.5, description="how long a head keeps being calm, moving or hasty, on average")
-    turn_acceleration: Positive = Field(0.0005, description="the same of half the line between the eyes, m²/s³")
+    stay_s: Positive = Field(1.0, description="how long a head keeps being calm, moving or hasty, on average")
+    turn_acceleration: Positive = Field(0.0003, description="the same of half the line between the eyes, m²/s³")
     speed_max: Positive = Field(2.0, description="faster heads, in m/s, are outliers until a second sample confirms")
     confidence_min: NonNegative = Field(0.3, description="less certain samples (a blink) are not used")
     loss_s: NonNegative = Field(0.2, description="without any sample for this long the eyes are held, not predicted")

@@ -142,8 +142,10 @@ def benchmark(
     seconds: float = 30.0,
     rates_hz: Sequence[int] = (30, 60),
     motions: Sequence[str] = ("lean", "nod", "walk", "stop-and-go"),
+    horizons_ms: Sequence[float] = HORIZONS_MS,
     tune: bool = True,
     tune_at_ms: float = 60.0,
+    seed: int = 1,
 ) -> list[Row]:
     """Prediction error by motion, rate, method and horizon: noise 3 mm, 5 % outliers, dropouts of 0.2 s.
 
@@ -153,11 +155,11 @@ def benchmark(
     rows: list[Row] = []
     for motion in motions:
         for rate_hz in rates_hz:
-            observed = observe(motion, seconds=seconds, rate_hz=rate_hz)
+            observed = observe(motion, seconds=seconds, rate_hz=rate_hz, seed=seed)
 
             def measure(
                 make: Callable[[], Predictor],
-                horizons: Sequence[float] = HORIZONS_MS,
+                horizons: Sequence[float] = horizons_ms,
                 observed: list[Observation] = observed,
                 motion: str = motion,
             ) -> dict[float, F64]:
