@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from calib.capture import EyeWindow, midpoint, true_pair
-from calib.keys import Key, TerminalKeys
+from calib.keys import Key, TerminalKeys, first_of
 from calib.pairs import CapturedPair, PairsFile
 from calib.viewpoints import IPD_M, Viewpoint, grid
 from calib.walk import Walk, accept, captured
@@ -24,7 +24,8 @@ from runtime.records import F64, EyePoints, SensorFrame
 from runtime.sensor.base import SensorDriver, SteppedDriver
 
 POLL_NS = 20 * NS_PER_MS
-CHART_MODEL = "sart"
+SHOW_AGAIN_NS = 100 * NS_PER_MS
+CHART_MODEL = "best"
 Find = Callable[[SensorFrame], EyePoints | None]
 
 
@@ -173,24 +174,33 @@ def capture_live(
     worker = SensorWorker(lambda: open_sensor(settings.sensor, clock), settings.sensor, clock)
     chart = _chart_display(settings, stack) if show else None
     keys = TerminalKeys()
+    poll = keys.poll if chart is None else first_of(keys.poll, chart.keys.poll)
     worker.start()
     try:
         walk = Walk(file, viewpoints, again=again, window_s=window_s, max_spread_m=max_spread_m, say=_say, chart=chart)
+        told = ""
         while worker.capabilities is None:
             if worker.error is not None:
                 raise worker.error
-            if keys.poll() is Key.QUIT:
+            if worker.reason and worker.reason != told:
+                told = worker.reason
+                _say(f"waiting for the sensor: {told} (q: stop)")
+            if poll() is Key.QUIT:
                 return walk.summary()
             clock.sleep_until_ns(clock.now_ns() + POLL_NS)
         find = _finder_of(worker, settings)
         walk.begin()
+        shown_ns = clock.now_ns()
         while not walk.finished:
             if worker.error is not None:
                 raise worker.error
             frame = worker.newest()
             if frame is not None:
                 walk.see(frame.capture_ns, find(frame), serial=worker.serial)
-            walk.press(keys.poll())
+            if chart is not None and clock.now_ns() - shown_ns > SHOW_AGAIN_NS:
+                chart.again()
+                shown_ns = clock.now_ns()
+            walk.press(poll())
             clock.sleep_until_ns(clock.now_ns() + POLL_NS)
         return walk.summary()
     finally:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from calib.charts import FOV_DEG, Kind, alone, eye_chart, line_picture
-from calib.keys import Key, TerminalKeys
+from calib.keys import Key, TerminalKeys, WindowKeys, first_of
 from calib.viewpoints import Viewpoint
 from runtime.artifacts import OutputFolder, write_json, write_png
 from runtime.clock import NS_PER_MS, MonotonicClock
@@ -159,6 +159,8 @@ class ChartDisplay:
         self._drawer = drawer
         self._sink = open_panels(settings.output, drawer.stack, MonotonicClock(), offscreen_context())
         self._number = 0
+        self._shown: Chart | None = None
+        self.keys = WindowKeys(self._sink)
         self._kept = lru_cache(maxsize=2)(lambda viewpoint: list(drawer.charts(viewpoint)))
 
     def charts(self, viewpoint: Viewpoint) -> list[Chart]:
@@ -172,7 +174,13 @@ class ChartDisplay:
     def present(self, chart: Chart) -> None:
         """A chart on all panels. Raises PanelLost."""
         self._number += 1
+        self._shown = chart
         self._sink.present(LayerFrame(self._number, chart.layers))
+
+    def again(self) -> None:
+        """The same chart once more: it takes in the windows' events and keeps them alive. Raises PanelLost."""
+        if self._shown is not None:
+            self.present(self._shown)
 
     def close(self) -> None:
         """Close the panels and the model. May be called twice."""
@@ -192,7 +200,10 @@ def show_charts(settings: Settings, viewpoints: Sequence[Viewpoint], drawer: Dra
         display = ChartDisplay(settings, drawer)
         try:
             walk = steps(
-                display, viewpoints, keys.poll, wait=lambda: clock.sleep_until_ns(clock.now_ns() + SHOW_AGAIN_NS)
+                display,
+                viewpoints,
+                first_of(keys.poll, display.keys.poll),
+                wait=lambda: clock.sleep_until_ns(clock.now_ns() + SHOW_AGAIN_NS),
             )
             for chart in walk:
                 name = f"{chart.viewpoint.name} {chart.label}".rstrip()

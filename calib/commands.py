@@ -30,7 +30,7 @@ def charts(
     show: Annotated[bool, typer.Option("--show", help="show them on the panels, one after the other")] = False,
     viewpoint: Annotated[list[str] | None, typer.Option(help="only this one, as R40-phi70-theta80; repeatable")] = None,
     ipd_mm: Annotated[float, typer.Option(help="the observer's eye separation, mm")] = 60.0,
-    model: Annotated[str, typer.Option(help="solver of the solved charts: sart or balanced")] = "sart",
+    model: Annotated[str, typer.Option(help="model that solves the charts, or sart")] = "best",
     panels: Annotated[Path | None, typer.Option(help="panel geometry, TOML or JSON; else the configuration's")] = None,
     config: ConfigOption = None,
     as_json: JsonOption = False,

@@ -1,11 +1,13 @@
-"""Keys that a person presses in the terminal: one at a time, without waiting."""
+"""Keys that a person presses, in the terminal or on a panel's window: one at a time, without waiting."""
 
 from __future__ import annotations
 
 import os
 import select
 import sys
+from collections.abc import Callable
 from enum import Enum, auto
+from typing import Any
 
 
 class Key(Enum):
@@ -85,3 +87,61 @@ class TerminalKeys:
 
             termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._mode)
             self._mode = None
+
+
+class WindowKeys:
+    """Keys pressed while a panel's window has the keyboard, as they come with the windows' own events.
+
+    The windows' events are taken in when a frame is presented; windows that were rebuilt are found again.
+    """
+
+    def __init__(self, sink: Any) -> None:
+        """sink: the panels; those without windows have no keys."""
+        self._sink = sink
+        self._watched: list[Any] = []
+        self._pending: list[Key] = []
+
+    def poll(self) -> Key | None:
+        """The next key, or None. Never waits. Call it after a frame was presented, on the windows' thread."""
+        self._watch()
+        return self._pending.pop(0) if self._pending else None
+
+    def _watch(self) -> None:
+        # The panels keep their windows to themselves; nothing but their keyboard is wanted of them.
+        handles = [surface.window.handle for surface in getattr(self._sink, "_surfaces", ())]
+        if handles == self._watched:
+            return
+        from runtime.panels.display import glfw
+
+        meanings = {
+            glfw.KEY_RIGHT: Key.RIGHT,
+            glfw.KEY_LEFT: Key.LEFT,
+            glfw.KEY_UP: Key.UP,
+            glfw.KEY_DOWN: Key.DOWN,
+            glfw.KEY_ENTER: Key.ACCEPT,
+            glfw.KEY_KP_ENTER: Key.ACCEPT,
+            glfw.KEY_SPACE: Key.ACCEPT,
+            glfw.KEY_N: Key.NEXT,
+            glfw.KEY_P: Key.PREVIOUS,
+            glfw.KEY_F: Key.FINER,
+            glfw.KEY_C: Key.COARSER,
+            glfw.KEY_Q: Key.QUIT,
+            glfw.KEY_ESCAPE: Key.QUIT,
+        }
+
+        def pressed(_window: Any, key: int, _code: int, action: int, _modifiers: int) -> None:
+            if action != glfw.RELEASE and key in meanings:
+                self._pending.append(meanings[key])
+
+        for handle in handles:
+            glfw.set_key_callback(handle, pressed)
+        self._watched = handles
+
+
+def first_of(*sources: Callable[[], Key | None]) -> Callable[[], Key | None]:
+    """One source of keys from several: whichever has one."""
+
+    def poll() -> Key | None:
+        return next((key for source in sources if (key := source()) is not None), None)
+
+    return poll

@@ -123,7 +123,7 @@ def grey(
 @app.command()
 def cost(
     out: Annotated[Path, typer.Option(help="folder for cost.json, cost.png, index.html")],
-    model: Annotated[str, typer.Option(help="model whose layers are displaced")] = "sart",
+    model: Annotated[str, typer.Option(help="model whose layers are displaced")] = "best",
     left: Annotated[Path | None, typer.Option(help="the left eye's picture; without: the configured scene")] = None,
     right: Annotated[Path | None, typer.Option(help="the right eye's picture")] = None,
     left_eye: EyeOption = (0.6, -0.03, 0.0),
@@ -156,7 +156,7 @@ def simulate(
     viewpoint_error_mm: Annotated[float, typer.Option(help="how far off the mark the eye is, standard deviation")] = (
         0.0
     ),
-    model: Annotated[str, typer.Option(help="model whose layers are judged; empty: geometry only")] = "sart",
+    model: Annotated[str, typer.Option(help="model whose layers are judged; empty: geometry only")] = "best",
     panels: PanelsOption = None,
     config: ConfigOption = None,
     as_json: JsonOption = False,

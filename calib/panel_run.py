@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.keys import Key, TerminalKeys
+from calib.keys import Key, TerminalKeys, WindowKeys, first_of
 from calib.page import Picture, page
 from calib.panel_figures import registration_figure
 from calib.registration import Setting, StackRegistration, parts, register
@@ -82,7 +82,7 @@ def nudge_verniers(
             found = nudge(
                 Nudging(asked, done),
                 stack,
-                poll=keys.poll,
+                poll=first_of(keys.poll, WindowKeys(sink).poll),
                 present=present,
                 wait=lambda: clock.sleep_until_ns(clock.now_ns() + POLL_NS),
                 keep=lambda settings: write_settings(out, settings),
