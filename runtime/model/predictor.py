@@ -36,6 +36,10 @@ class Predictor(ABC):
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         """The rasters that each eye's picture must be drawn on, for eyes (2, 3), frame `stack`."""
 
+    def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
+        """Rows and columns of each raster that `predict` will look at: all of them, where it doesn't know better."""
+        return tuple((slice(0, raster.height_px), slice(0, raster.width_px)) for raster in self.rasters(eyes_m))
+
     @abstractmethod
     def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64) -> Prediction:
         """Layers for `images[eye][raster]`, (h, w, 4) RGBA, left eye first, drawn on `rasters(eyes_m)`.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from runtime.model.predictor import Prediction, Predictor
+from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack
 from runtime.records import F64, U8
 
@@ -18,29 +19,18 @@ def solve_still(left: U8, right: U8, *, eyes_m: F64, fov_deg: float, predictor: 
     import cv2
 
     start = cv2.getTickCount()
-    rasters = predictor.rasters(eyes_m)
+    rasters, windows = predictor.rasters(eyes_m), predictor.windows(eyes_m)
     images: list[list[U8]] = []
     for picture, eye_m in zip((left, right), eyes_m, strict=True):
         height, width = picture.shape[:2]
-        rgba = picture if picture.shape[2] == 4 else cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA)
+        rgba = np.asarray(picture if picture.shape[2] == 4 else cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA), np.uint8)
         projection = image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg)
-        warped: list[U8] = []
-        for raster in rasters:
-            # OpenCV puts pixel centres at integers.
-            matrix = _shifted(-0.5) @ image_from_raster(projection, raster) @ _shifted(0.5)
-            warped.append(
-                np.asarray(
-                    cv2.warpPerspective(
-                        rgba,
-                        matrix,
-                        (raster.width_px, raster.height_px),
-                        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-                        borderMode=cv2.BORDER_REPLICATE,
-                    ),
-                    np.uint8,
-                )
-            )
-        images.append(warped)
+        images.append(
+            [
+                _warped(rgba, image_from_raster(projection, raster), raster, rows=rows, columns=columns)
+                for raster, (rows, columns) in zip(rasters, windows, strict=True)
+            ]
+        )
     warps_ms = (cv2.getTickCount() - start) / cv2.getTickFrequency() * 1e3
     prediction = predictor.predict(images, eyes_m)
     stage_ms = dict(prediction.stage_ms)
@@ -48,5 +38,22 @@ def solve_still(left: U8, right: U8, *, eyes_m: F64, fov_deg: float, predictor: 
     return Prediction(prediction.layers, stage_ms)
 
 
-def _shifted(by: float) -> F64:
-    return np.array([[1.0, 0.0, by], [0.0, 1.0, by], [0.0, 0.0, 1.0]])
+def _warped(rgba: U8, image_from_raster: F64, raster: PlaneRaster, *, rows: slice, columns: slice) -> U8:
+    """A picture on a raster; only the given rows and columns are drawn."""
+    import cv2
+
+    out = np.zeros((raster.height_px, raster.width_px, 4), np.uint8)
+    # OpenCV puts pixel centres at integers.
+    matrix = _shifted(-0.5, -0.5) @ image_from_raster @ _shifted(columns.start + 0.5, rows.start + 0.5)
+    out[rows, columns] = cv2.warpPerspective(
+        rgba,
+        matrix,
+        (columns.stop - columns.start, rows.stop - rows.start),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return out
+
+
+def _shifted(right: float, down: float) -> F64:
+    return np.array([[1.0, 0.0, right], [0.0, 1.0, down], [0.0, 0.0, 1.0]])

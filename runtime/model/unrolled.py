@@ -22,11 +22,14 @@ from runtime.model.rows import RowPool
 from runtime.model.session import ModelSession
 from runtime.model.timing import Stopwatch
 from runtime.model.transfer import FULL, SUBCODE, phase_codes
+from runtime.model.visible import Box, visible_boxes
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
 
 I16 = NDArray[np.int16]
 REAR, CENTRE, FRONT = 0, 1, 2
+BUFFERS = ("rear", "front", *(f"seen-{n}-{side}" for n in (0, 2) for side in (0, 1)), "residual-0", "residual-1",
+           "back-0", "back-1")  # fmt: skip
 START = FULL // 2  # of every outer panel: the middle of its range
 
 
@@ -39,17 +42,16 @@ class UnrolledPredictor(Predictor):
         self.parameters = session.contract.parameters
         self.tolerance_mm = tolerance_mm
         self._rows = RowPool(threads)
-        h, w = stack.height_px, stack.width_px
-        self._layers = np.full((3, h, w, 4), 255, np.uint8)
-        self._outer = {REAR: buffer(h, w), FRONT: buffer(h, w)}
-        self._seen = {(n, side): buffer(h, w) for n in (REAR, FRONT) for side in (0, 1)}
-        self._residual = (buffer(h, w), buffer(h, w))
-        self._back = (buffer(h, w), buffer(h, w))
-        self._centre: U8 = np.empty((h, w, 3), np.uint8)
+        self._boxes: tuple[Box, ...] = ()
+        self._whole = {name: buffer(stack.height_px, stack.width_px) for name in BUFFERS}
+        self._layers = np.full((3, stack.height_px, stack.width_px, 4), 255, np.uint8)
         self._chain_buffers: dict[tuple[int, int], Any] = {}
 
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         return (self.stack.panel(CENTRE),)
+
+    def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
+        return (visible_boxes(eyes_m, self.stack)[CENTRE].slices,)
 
     def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64) -> Prediction:
         watch = Stopwatch()
@@ -58,8 +60,9 @@ class UnrolledPredictor(Predictor):
             frame = chain_frame(eyes_m, self.stack, cell_px=contract.cell_px, reduction=contract.reduction)
         except ValueError as error:
             raise ModelFailure(str(error)) from None
+        self._look_through(visible_boxes(eyes_m, self.stack))
         table = phase_codes(contract.branch)
-        pictures = [image[0] for image in images]
+        pictures = [image[0][self._boxes[CENTRE].slices] for image in images]
         wanted = [cv2.LUT(cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB), table) for picture in pictures]
         first = True
         for step in contract.steps:
@@ -77,19 +80,39 @@ class UnrolledPredictor(Predictor):
                 for side, eye_m in enumerate(eyes_m):
                     self._between(self._outer[n], eye_m, of=n, on=CENTRE, out=self._seen[n, side])
         self._close_centre(wanted)
-        cv2.cvtColor(self._centre, cv2.COLOR_RGB2RGBA, dst=self._layers[CENTRE])
+        self._put(CENTRE, self._centre)
         for n in (REAR, FRONT):
-            codes = cv2.convertScaleAbs(self._outer[n], alpha=1 / SUBCODE)
-            cv2.cvtColor(codes, cv2.COLOR_RGB2RGBA, dst=self._layers[n])
+            self._put(n, cv2.convertScaleAbs(self._outer[n], alpha=1 / SUBCODE))
         watch.lap("finish")
         return Prediction(self._layers, watch.stage_ms)
 
     def close(self) -> None:
         self._rows.close()
 
+    def _look_through(self, boxes: tuple[Box, ...]) -> None:
+        """Cut every raster and buffer to what the eyes look through; panels are even beside it."""
+        if boxes == self._boxes:
+            return
+        self._boxes = boxes
+        self._rasters = tuple(box.cut(self.stack.panel(n)) for n, box in enumerate(boxes))
+        self._layers[..., :3] = START // SUBCODE
+
+        def view(name: str, box: Box) -> I16:
+            return _view(self._whole[name], box.height_px, box.width_px)
+
+        centre = boxes[CENTRE]
+        self._outer = {REAR: view("rear", boxes[REAR]), FRONT: view("front", boxes[FRONT])}
+        self._seen = {(n, side): view(f"seen-{n}-{side}", centre) for n in (REAR, FRONT) for side in (0, 1)}
+        self._residual = (view("residual-0", centre), view("residual-1", centre))
+        self._centre: U8 = np.empty((centre.height_px, centre.width_px, 3), np.uint8)
+        self._back = {n: (view("back-0", boxes[n]), view("back-1", boxes[n])) for n in (REAR, FRONT)}
+
+    def _put(self, panel: int, codes: Any) -> None:
+        self._layers[panel][self._boxes[panel].slices] = cv2.cvtColor(codes, cv2.COLOR_RGB2RGBA)
+
     def _between(self, image: I16, eye_m: F64, *, of: int, on: int, out: I16) -> I16:
         """Panel `of`'s pixels on panel `on`'s raster, as an eye sees them in line."""
-        matrix = target_from_source(eye_m, source=self.stack.panel(on), target=self.stack.panel(of))
+        matrix = target_from_source(eye_m, source=self._rasters[on], target=self._rasters[of])
         return resample(image, image_from_result=matrix, out=out, outside=0 if of == CENTRE else START)
 
     def _lacks(self, wanted: Sequence[Any]) -> None:
@@ -108,7 +131,7 @@ class UnrolledPredictor(Predictor):
             np.subtract(left, best, out=left)
             np.subtract(right, best, out=right)
 
-        self._rows.each(self.stack.height_px, work)
+        self._rows.each(self._boxes[CENTRE].height_px, work)
 
     def _close_centre(self, wanted: Sequence[Any]) -> None:
         """The best centre panel for the outer ones, per pixel and in closed form, in 8-bit codes."""
@@ -123,14 +146,14 @@ class UnrolledPredictor(Predictor):
             np.clip(best, 0, 255, out=best)
             centre[rows] = best
 
-        self._rows.each(self.stack.height_px, work)
+        self._rows.each(self._boxes[CENTRE].height_px, work)
 
     def _seen_of(self, panel: int) -> tuple[I16, I16]:
         return self._seen[panel, 0], self._seen[panel, 1]
 
     def _correct(self, panel: int, eyes_m: F64, *, size: float) -> None:
         """Change one outer panel by what both eyes lack along the rays through each of its pixels."""
-        back = self._back
+        back = self._back[panel]
         for side, eye_m in enumerate(eyes_m):
             self._between(self._residual[side], eye_m, of=CENTRE, on=panel, out=back[side])
         outer = self._outer[panel]
@@ -143,7 +166,7 @@ class UnrolledPredictor(Predictor):
             np.add(change, outer[rows], out=change)
             _settle(change, outer[rows])
 
-        self._rows.each(self.stack.height_px, work)
+        self._rows.each(self._boxes[panel].height_px, work)
 
     def _first_needs(self, pictures: Sequence[U8], table: NDArray[np.int16]) -> list[I16]:
         """What each eye lacks while the outer panels are even, at the network's coarser raster."""
@@ -160,16 +183,17 @@ class UnrolledPredictor(Predictor):
         return [np.asarray(cv2.resize(r, size, interpolation=cv2.INTER_AREA), np.int16) for r in self._residual]
 
     def _reduced_size(self) -> tuple[int, int]:
-        reduction = self.session.contract.reduction
-        return self.stack.width_px // reduction, self.stack.height_px // reduction
+        reduction, box = self.session.contract.reduction, self._boxes[CENTRE]
+        return max(1, box.width_px // reduction), max(1, box.height_px // reduction)
 
     def _chain(
         self, needs: Sequence[I16], frame: ChainFrame, eyes_m: F64, watch: Stopwatch, *, size: float, first: bool
     ) -> None:
         """The network's correction: what the outer panels must carry for the eyes to differ as they should."""
         width, height = self._reduced_size()
-        reduced_from_full = np.diag([width / self.stack.width_px, height / self.stack.height_px, 1.0])
-        reduced_from_plane = reduced_from_full @ self.stack.panel(CENTRE).raster_from_plane()
+        centre = self._rasters[CENTRE]
+        reduced_from_full = np.diag([width / centre.width_px, height / centre.height_px, 1.0])
+        reduced_from_plane = reduced_from_full @ centre.raster_from_plane()
         key = (frame.rows, frame.width_px)
         if key not in self._chain_buffers:
             self._chain_buffers = {key: (buffer(*key), buffer(*key))}
@@ -191,20 +215,29 @@ class UnrolledPredictor(Predictor):
         watch.lap("inference")
         wave = answer.reshape(frame.rows, -1, 3)
         for n, sign in ((REAR, -1.0), (FRONT, 1.0)):
-            panel = self.stack.panel(n)
+            panel = self._rasters[n]
             matrix = frame.frame_from_plane(x_m=panel.x_m) @ panel.plane_from_raster()
             matrix[0, 2] += frame.cell_px  # the answer begins one parallax before the first column
             codes = cv2.addWeighted(wave, sign * FULL * size, wave, 0.0, START if first else 0.0, dtype=cv2.CV_16S)
-            target = self._outer[n] if first else self._back[0]
+            target = self._outer[n] if first else self._back[n][0]
             resample(codes, image_from_result=matrix, out=target, outside=START if first else 0, cubic=True)
-            self._take(self._outer[n], None if first else target)
+            self._take(n, None if first else target)
 
-    def _take(self, outer: I16, change: I16 | None) -> None:
+    def _take(self, panel: int, change: I16 | None) -> None:
+        outer = self._outer[panel]
+
         def work(rows: slice) -> None:
             codes = outer[rows] if change is None else outer[rows] + change[rows]
             _settle(codes, outer[rows])
 
-        self._rows.each(self.stack.height_px, work)
+        self._rows.each(self._boxes[panel].height_px, work)
+
+
+def _view(whole: I16, height_px: int, width_px: int) -> I16:
+    """The first rows and columns of a `buffer`, with margins of its own."""
+    parent = whole.base
+    assert isinstance(parent, np.ndarray)
+    return parent[:height_px, :width_px]
 
 
 def _settle(codes: I16, out: I16) -> None:
