@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -185,18 +185,3 @@ def procedural_pairs(stack: PanelStack) -> list[StillPair]:
         with Painter(scene, stack) as painter:
             pairs.append(painter.pair(name, eyes_at(**place), stack))
     return pairs
-
-
-def reduced(pair: StillPair, factor: float) -> StillPair:
-    """The same pair on panels and pictures of another resolution."""
-    import cv2
-
-    width, height = round(pair.stack.width_px * factor), round(pair.stack.height_px * factor)
-
-    def smaller(image: U8) -> U8:
-        return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-    left, right = (smaller(image) for image in pair.images)
-    stack = replace(pair.stack, width_px=width, height_px=height)
-    off = tuple(replace(view, image=smaller(view.image)) for view in pair.off)
-    return replace(pair, stack=stack, images=(left, right), off=off)

@@ -13,7 +13,7 @@ from runtime.artifacts import write_png
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
-from runtime.report.pairs import Painter, beside, eyes_at, read_pairs, reduced
+from runtime.report.pairs import Painter, beside, eyes_at, read_pairs
 
 EYES = [[0.7, -0.03, 0.1], [0.7, 0.03, 0.1]]
 
@@ -112,11 +112,3 @@ def test_a_built_in_pair_has_new_views_beside_its_eyes() -> None:
         return float(np.mean([np.abs(image.astype(float) - pair.images[0]).mean() for image in images[:4]]))
 
     assert 0 < change(near) < change(far)
-
-
-def test_a_reduced_pair_keeps_its_geometry(tmp_path: Path) -> None:
-    (pair,) = read_pairs(case_folder(tmp_path))
-    half = reduced(pair, 0.5)
-    assert (half.stack.width_px, half.stack.height_px) == (16, 9)
-    assert half.images[0].shape == half.off[0].image.shape == (9, 16, 3)
-    assert half.stack.x_m == pair.stack.x_m
