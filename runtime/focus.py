@@ -14,7 +14,7 @@ from time import perf_counter_ns
 import cv2
 import numpy as np
 
-from runtime.content.active import Window, differing_box, still_fits, window_of
+from runtime.content.active import Window, differing_box, still_fits, whole_rays, window_of
 from runtime.content.base import ContentSource, View
 from runtime.content.camera import PixelBox, union
 from runtime.model.predictor import Prediction, Predictor
@@ -124,7 +124,12 @@ class FocusedPredictor(Predictor):
     def _solve(self, window: Window, cut: Sequence[Sequence[U8]], eyes_m: F64, filled_ms: float) -> Prediction:
         area = window.box
         solved = self._part(window.stack).predict(cut, eyes_m - window.shift_m)
-        self._layers[:, area.v0 : area.v1, area.u0 : area.u1] = solved.layers
+        centre = self.stack.count // 2
+        for index, (layer, part) in enumerate(zip(self._layers, solved.layers, strict=True)):
+            # Near the window's edge the centre panel can't know what rays meet that leave the window.
+            kept = whole_rays(window, eyes_m, self.stack) if index == centre else area
+            rows, columns = slice(kept.v0 - area.v0, kept.v1 - area.v0), slice(kept.u0 - area.u0, kept.u1 - area.u0)
+            layer[kept.v0 : kept.v1, kept.u0 : kept.u1] = part[rows, columns]
         self._solved, self.window = area, window
         self.active_fraction = area.width_px * area.height_px / (self.stack.width_px * self.stack.height_px)
         stage_ms = dict(solved.stage_ms)
@@ -145,10 +150,14 @@ class FocusedPredictor(Predictor):
 
     def _paint_background(self, colour: tuple[int, ...]) -> None:
         """The centre panel as if both eyes saw nothing but the background; once, as long as nothing changes."""
+        codes = (*_centre_codes(self.stack.count)[list(colour)].tolist(), 255)
+        layer = self._layers[self.stack.count // 2]
         if self._background != colour:
-            codes = _centre_codes(self.stack.count)[list(colour)]
-            self._layers[self.stack.count // 2] = (*codes.tolist(), 255)
+            layer[:] = codes
             self._background = colour
+        elif self._solved is not None:
+            area = self._solved
+            layer[area.v0 : area.v1, area.u0 : area.u1] = codes
 
     def _part(self, stack: PanelStack) -> Predictor:
         size = (stack.width_px, stack.height_px)

@@ -16,11 +16,12 @@ COARSE_STEP = 16  # of the look that decides whether a closer one is worth its t
 WHOLE_ABOVE = 0.6  # of the panel: a larger window is not worth cutting out
 MOST_SLACK = 1.3  # of a kept window's area over the one that would do
 STEPS = 16  # windows are whole sixteenths of the panel, so that a few sizes serve all
-# Measured with the shipped models: along the line of the eyes the outer panels are driven for some twelve
+# Measured with the shipped models: along the line of the eyes the outer panels are driven for some fourteen
 # parallaxes beside a difference, and a window must hold each panel's part of what the eyes see through another.
-CHAIN_STEPS = 12.0
+CHAIN_STEPS = 14.0
 PANEL_CROSSINGS = 2.0
 ROOM_PX = 16
+EDGE_PX = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,19 +52,44 @@ def _box(left: U8, right: U8, tolerance: int) -> PixelBox:
     return PixelBox(u, v, u + width, v + height)
 
 
-def room_px(eyes_m: F64, stack: PanelStack) -> tuple[float, float]:
-    """How far beside a difference the panels take part in it: columns and rows on each side, in pixels.
+def stray_px(eyes_m: F64, stack: PanelStack) -> F64:
+    """(2, N, 2) how far rays through a centre-panel pixel stray on each panel: columns right and rows down.
 
-    eyes_m: (2, 3) left, right; frame `stack`.
+    To first order, as at the window's centre. eyes_m: (2, 3) left, right; frame `stack`.
     """
     middle = stack.x_m[stack.count // 2]
     gaps_m = np.array(stack.x_m) - middle
-    per_metre = np.array([stack.width_px / stack.width_m, stack.height_px / stack.height_m])
-    stray_px = eyes_m[:, None, 1:] * (gaps_m[None, :, None] / (eyes_m[:, None, :1] - middle)) * per_metre
-    parallax = np.abs(stray_px).max(axis=(0, 1))
-    separation = np.abs(stray_px[0] - stray_px[1]).max(axis=0)
+    per_metre = np.array([stack.width_px / stack.width_m, -stack.height_px / stack.height_m])
+    stray: F64 = eyes_m[:, None, 1:] * (gaps_m[None, :, None] / (eyes_m[:, None, :1] - middle)) * per_metre
+    return stray
+
+
+def room_px(eyes_m: F64, stack: PanelStack) -> tuple[float, float]:
+    """How far beside a difference the panels take part in it: columns and rows on each side, in pixels."""
+    stray = stray_px(eyes_m, stack)
+    parallax = np.abs(stray).max(axis=(0, 1))
+    separation = np.abs(stray[0] - stray[1]).max(axis=0)
     columns, rows = PANEL_CROSSINGS * parallax + CHAIN_STEPS * separation + ROOM_PX
     return float(columns), float(rows)
+
+
+def whole_rays(window: Window, eyes_m: F64, stack: PanelStack) -> PixelBox:
+    """The part of a window in which no eye's ray leaves it on another panel; up to the panels' own edges.
+
+    eyes_m: (2, 3), frame `stack`, not moved to the window.
+    """
+    box = window.box
+    inset = np.ceil(np.abs(stray_px(eyes_m - window.shift_m, stack)).max(axis=(0, 1)) + EDGE_PX)
+    # A scale about the middle adds what the first order leaves out.
+    gap_m = max(abs(x_m - stack.x_m[stack.count // 2]) for x_m in stack.x_m)
+    inset += np.ceil(np.array([box.width_px, box.height_px]) / 2 * gap_m / (eyes_m[:, 0].min() - gap_m))
+    columns, rows = (int(value) for value in inset)
+    return PixelBox(
+        box.u0 + columns if box.u0 > 0 else 0,
+        box.v0 + rows if box.v0 > 0 else 0,
+        box.u1 - columns if box.u1 < stack.width_px else stack.width_px,
+        box.v1 - rows if box.v1 < stack.height_px else stack.height_px,
+    )
 
 
 def window_of(box: PixelBox, eyes_m: F64, stack: PanelStack) -> Window | None:

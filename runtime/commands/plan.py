@@ -1,0 +1,55 @@
+"""`phasestack plan`: what this scene leaves out, and why."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+
+def plan(
+    config: Annotated[Path | None, typer.Option(help="TOML file; see `phasestack config`")] = None,
+    scene: Annotated[str | None, typer.Option(help="a preset's name, a built-in scene, a file or folder")] = None,
+    model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
+    scale: Annotated[float, typer.Option(min=0.05, max=2.0, help="panel resolution, times the configured one")] = 1.0,
+    budget_ms: Annotated[float | None, typer.Option(min=0, help="time for a frame; picks model and size")] = None,
+    eyes: Annotated[
+        tuple[float, float, float] | None, typer.Option(help="x y z between the eyes, metres, frame `stack`")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
+) -> None:
+    """What this scene leaves out, why, what each saving saves and what it costs, measured here.
+
+    Example: phasestack plan --scene sparse
+
+    Example: phasestack plan --scene lego_bulldozer --budget-ms 40 --json
+    """
+    from runtime.planning import plan_for
+
+    result = plan_for(config, scene=scene, model=model, scale=scale, budget_ms=budget_ms, middle_m=eyes, quiet=as_json)
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        _print(result)
+
+
+def _print(result: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    console.print(f"scene {result['scene']}, model {result['model']}, {result['width_px']} x {result['height_px']}")
+    table = Table("left out", "why", "saves ms", "costs dB")
+    for item in result["plan"]:
+        table.add_row(item["what"], item["why"], f"{item['saves_ms']:.1f}", f"{item['costs_db']:.2f}")
+    console.print(table)
+    console.print(f"one frame: {result['frame_ms']:.1f} ms with the plan, {result['frame_ms_without']:.1f} ms without")
+    console.print(f"displayed: {result['psnr_db']:.2f} dB with, {result['psnr_db_without']:.2f} dB without")
+    if result["levels"]:
+        levels = Table("model and resolution", "ms", "dB", "chosen")
+        for level in result["levels"]:
+            mark = "*" if level["label"] == result["level"] else ""
+            levels.add_row(level["label"], f"{level['ms']:.1f}", f"{level['psnr_db']:.2f}", mark)
+        console.print(levels)

@@ -1,0 +1,132 @@
+"""What a scene, its display and its viewer allow to be left out: decisions alone, from what was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from runtime.config import Settings
+from runtime.content.base import ContentInfo
+from runtime.optics.stack import PanelStack
+from runtime.records import F64, PlanItem
+
+OPTIONAL_PARTS = {
+    "torch": "training",
+    "openni": "the depth camera's SDK",
+    "usb": "USB sensors",
+    "trimesh": "meshes",
+    "plyfile": "splats",
+    "matplotlib": "reports",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Saving:
+    """What leaving something out came to, in one run, with and without."""
+
+    saves_ms: float = 0.0
+    costs_db: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """Times and errors on this machine, for this scene; zeros where nothing was measured."""
+
+    reuse: Saving = Saving()
+    focus: Saving = Saving()
+    one_eye: Saving = Saving()
+    active_fraction: float = 1.0  # of the panel's pixels that went through the network
+    level: str = ""  # model and resolution that the budget chose; empty: no budget
+    level_saving: Saving = Saving()
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What is left out, as switches for the pipeline and as words for people."""
+
+    reuse: bool
+    focus: bool
+    eyes: tuple[bool, bool]  # left, right: which are solved for
+    dead_band_m: float | None  # fixed; None: from the tracker's noise
+    most_band_m: float
+    items: tuple[PlanItem, ...] = field(default=())
+
+
+def eyes_in_range(eyes_m: F64, *, range_deg: float) -> tuple[bool, bool]:
+    """Which of two eyes (2, 3) can see the display: before it, and not farther off its axis than `range_deg`."""
+    off_axis = np.degrees(np.arctan2(np.linalg.norm(eyes_m[:, 1:], axis=1), eyes_m[:, 0]))
+    left, right = (off_axis <= range_deg).tolist()
+    return left, right
+
+
+def solved_eyes(eyes_m: F64, plan: Plan) -> F64:
+    """The eyes (2, 3) to draw and solve for: one that can't see gives way to the other, and costs nothing."""
+    if plan.eyes == (True, False):
+        return eyes_m[[0, 0]]
+    if plan.eyes == (False, True):
+        return eyes_m[[1, 1]]
+    return eyes_m
+
+
+def make_plan(
+    info: ContentInfo,
+    stack: PanelStack,
+    settings: Settings,
+    *,
+    eyes_m: F64 | None = None,
+    measured: Measured | None = None,
+    can_focus: bool = True,
+    loaded_modules: Collection[str] = (),
+) -> Plan:
+    """The plan for one scene and viewer. Make it again when either changes.
+
+    eyes_m: (2, 3) where they are known; can_focus: the model can be run on part of the panels; loaded_modules:
+    names in `sys.modules`.
+    """
+    chosen, numbers = settings.plan, measured or Measured()
+    on = chosen.enabled
+    reuse = on and chosen.reuse
+    focus = on and chosen.focus and can_focus
+    seeing = (True, True)
+    if on and chosen.one_eye and eyes_m is not None:
+        inside = eyes_in_range(eyes_m, range_deg=chosen.range_deg)
+        seeing = inside if any(inside) else (True, True)
+    most_m = settings.model.tolerance_mm / 1000
+    fixed_m = chosen.dead_band_mm / 1000 if chosen.dead_band_mm > 0 else None
+    items: list[PlanItem] = []
+    if reuse and not info.moving:
+        band = f"{chosen.dead_band_mm:g} mm" if fixed_m else f"the tracker's own noise, at most {most_m * 1000:g} mm"
+        why = f"the content stands still; as long as the eyes stay within {band} of those solved for"
+        items.append(_item("render and inference", why, numbers.reuse))
+    if focus:
+        items += _focus_items(info, numbers)
+    if seeing != (True, True):
+        side = "right" if seeing[0] else "left"
+        items.append(_item(f"the {side} eye", f"it is over {chosen.range_deg:g} degrees off the axis", numbers.one_eye))
+    items += [_item(part, f"`{info.name}` has none", Saving()) for part in (info.left_out if on else ())]
+    if settings.sensor.driver == "fixed":
+        items.append(_item("the sensor", "the eyes' position is given (sensor.driver = fixed)", Saving()))
+    absent = [name for name in OPTIONAL_PARTS if name not in loaded_modules]
+    if absent:
+        why = "not needed here, not imported: " + ", ".join(f"{name} ({OPTIONAL_PARTS[name]})" for name in absent)
+        items.append(_item("optional parts", why, Saving()))
+    if numbers.level:
+        why = f"the budget of {settings.model.budget_ms:g} ms: {numbers.level}"
+        items.append(_item("model or resolution", why, numbers.level_saving))
+    return Plan(reuse, focus, seeing, fixed_m, most_m, tuple(items))
+
+
+def _focus_items(info: ContentInfo, numbers: Measured) -> list[PlanItem]:
+    if info.flat_x_m is not None and numbers.active_fraction == 0.0:
+        why = "everything lies in the centre panel's plane: both eyes see the same"
+        return [_item("inference", why, numbers.focus)]
+    if numbers.active_fraction < 1.0:
+        why = f"the two eyes differ on {numbers.active_fraction:.0%} of the panel; the rest is filled in closed form"
+        return [_item("inference beside the active window", why, numbers.focus)]
+    return []
+
+
+def _item(what: str, why: str, saving: Saving) -> PlanItem:
+    return PlanItem(what, why, round(saving.saves_ms, 2), round(saving.costs_db, 3))
