@@ -83,8 +83,11 @@ def fused_psnr_db(layers: U8, viewpoint: Viewpoint, *, stack: PanelStack, ipd_m:
     return quality([r.image for r in seen], [wanted, wanted], [r.mask for r in seen]).psnr_db
 
 
-def make_charts(out: Path, viewpoints: Sequence[Viewpoint], drawer: Drawer) -> dict[str, Any]:
-    """Write PNGs, `charts.json` and a contact sheet. Raises InputError, MissingPart."""
+def make_charts(out: Path, viewpoints: Sequence[Viewpoint], drawer: Drawer, *, check: bool) -> dict[str, Any]:
+    """Write PNGs, `charts.json` and a contact sheet. Raises InputError, MissingPart.
+
+    check: also measure how well both eyes see the lines through each solved chart.
+    """
     stack, ipd_m = drawer.stack, drawer.ipd_m
     from rich.console import Console
     from rich.progress import track
@@ -103,7 +106,7 @@ def make_charts(out: Path, viewpoints: Sequence[Viewpoint], drawer: Drawer) -> d
                 for name, picture in _pictures(chart):
                     write_png(folder.staging / name, picture)
                     files.append(name)
-                if not chart.label:
+                if check and not chart.label:
                     entry["psnr_db"] = fused_psnr_db(chart.layers, viewpoint, stack=stack, ipd_m=ipd_m)
                 if chart.label in ("", f"layer-{stack.count - 1}-right"):
                     sheet.append(_thumbnail(chart.layers[-1], viewpoint.name))

@@ -29,6 +29,7 @@ def charts(
     ),
     show: Annotated[bool, typer.Option("--show", help="show them on the panels, one after the other")] = False,
     viewpoint: Annotated[list[str] | None, typer.Option(help="only this one, as R40-phi70-theta80; repeatable")] = None,
+    check: Annotated[bool, typer.Option("--check", help="measure how well each solved chart fuses, dB")] = False,
     ipd_mm: Annotated[float, typer.Option(help="the observer's eye separation, mm")] = 60.0,
     model: Annotated[str, typer.Option(help="model that solves the charts, or sart")] = "best",
     panels: Annotated[Path | None, typer.Option(help="panel geometry, TOML or JSON; else the configuration's")] = None,
@@ -52,7 +53,7 @@ def charts(
     drawer = Drawer(stack, kind=kind, ipd_m=ipd_mm / 1000, model=model, settings=settings.model)  # type: ignore[arg-type]
     try:
         if out is not None:
-            summary = make_charts(out, chosen, drawer)
+            summary = make_charts(out, chosen, drawer, check=check)
             _say(summary, as_json, f"{summary['files']} files for {len(chosen)} viewpoints in {out}")
         if show:
             show_charts(settings, chosen, drawer)

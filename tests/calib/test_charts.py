@@ -92,6 +92,32 @@ def test_the_command_writes_the_seeds_charts_of_every_panel_and_eye(tmp_path: Pa
     assert (out / "contact-sheet.png").exists()
 
 
+def test_a_solved_chart_shows_both_eyes_the_picture_from_its_viewpoint_alone(tmp_path: Path) -> None:
+    """Seen through the written files: the vertical lines stay clean at the viewpoint and grow ghosts 3 cm aside."""
+    viewpoint = grid()[13]
+    result = run.invoke(
+        app,
+        ["charts", "--out", str(tmp_path / "c"), "--panels", str(panels_file(tmp_path)), "--viewpoint", viewpoint.name,
+         "--model", "sart", "--check", "--json"],
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    layers = np.stack([read_image(tmp_path / "c" / f"chart-{viewpoint.name}-layer-{n}.png") for n in range(3)])
+    stack = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
+    wanted = line_picture(width_px=480, height_px=270).astype(np.float32) / 255
+
+    def seen_db(moved_m: float) -> float:
+        errors = []
+        for eye in viewpoint.eyes_m():
+            seen = seen_by(eye + np.array([0.0, moved_m, 0.0]), layers, stack, fov_deg=FOV_DEG)
+            errors.append(((seen.image - wanted)[seen.mask] ** 2).ravel())
+        return psnr_db(float(np.concatenate(errors).mean()))
+
+    assert told["psnr_db"] == pytest.approx([seen_db(0.0)], abs=0.01)
+    assert seen_db(0.0) > 16
+    assert seen_db(0.0) > 1.5 + max(seen_db(0.03), seen_db(-0.03))
+
+
 @pytest.mark.parametrize(
     "options",
     [
