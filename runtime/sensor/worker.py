@@ -186,6 +186,8 @@ class SensorWorker:
                     self._allow(attempt, s.open_timeout_s)
                     driver.close()
                     self._account(driver)
+            if attempt.abandoned.is_set():
+                return
             if attempt.received:
                 backoff_s = s.reopen_backoff_s
             wait_s, backoff_s = backoff_s, min(2 * backoff_s, s.reopen_backoff_max_s)
