@@ -98,7 +98,7 @@ def test_a_solved_chart_shows_both_eyes_the_picture_from_its_viewpoint_alone(tmp
     result = run.invoke(
         app,
         ["charts", "--out", str(tmp_path / "c"), "--panels", str(panels_file(tmp_path)), "--viewpoint", viewpoint.name,
-         "--model", "sart", "--check", "--json"],
+         "--check", "--json"],
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     told = json.loads(result.stdout)
