@@ -78,7 +78,7 @@ class Drawer:
 
 def fused_psnr_db(layers: U8, viewpoint: Viewpoint, *, stack: PanelStack, ipd_m: float) -> float:
     """How well both eyes see the line picture from the viewpoint (design 5.5)."""
-    wanted = line_picture(width_px=stack.width_px, height_px=stack.height_px).astype(np.float32) / 255
+    wanted = line_picture(width_px=stack.width_px, height_px=stack.height_px).astype(np.float32) / np.float32(255)
     seen = [seen_by(eye, layers, stack, fov_deg=FOV_DEG) for eye in viewpoint.eyes_m(ipd_m)]
     return quality([r.image for r in seen], [wanted, wanted], [r.mask for r in seen]).psnr_db
 

@@ -19,7 +19,8 @@ FOV_DEG = 40.0  # horizontal, of the eyes' images, as the published code has it
 
 def line_picture(*, width_px: int, height_px: int) -> U8:
     """(h, w, 3) what an eye should see: lines of 10 pixels at the thirds of width and height."""
-    u, v = np.arange(width_px) + 0.5, (np.arange(height_px) + 0.5)[:, None]
+    u: F64 = np.arange(width_px, dtype=np.float64) + 0.5
+    v: F64 = (np.arange(height_px, dtype=np.float64) + 0.5)[:, None]
     ink = np.maximum(_ink(u, width_px, 1.0), _ink(v, height_px, 1.0))
     return np.repeat(_white_less(ink)[..., None], 3, axis=2)
 

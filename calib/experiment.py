@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib.robust import fit_robust
-from calib.similarity import Similarity, fit, fit_batch
+from calib.similarity import ScaleRule, Similarity, fit, fit_batch
 from calib.solution import METHODS, design_covariance, scale_is_one
 from calib.viewpoints import grid, viewing_volume_m
 from runtime.records import F64
@@ -73,8 +73,13 @@ def _gross_errors(seeds: int, count: int, random: np.random.Generator) -> F64:
 
 
 def _all_fits(sensor_m: F64, stack_m: F64) -> dict[str, Similarity]:
-    rules = {"seed": "seed", "least-squares": "least-squares", "inverse": "inverse", "fixed-scale": 1.0}
-    fits = {name: fit_batch(sensor_m, stack_m, rule=rule) for name, rule in rules.items()}  # type: ignore[arg-type]
+    rules: dict[str, ScaleRule] = {
+        "seed": "seed",
+        "least-squares": "least-squares",
+        "inverse": "inverse",
+        "fixed-scale": 1.0,
+    }
+    fits = {name: fit_batch(sensor_m, stack_m, rule=rule) for name, rule in rules.items()}
     robust = [fit_robust(c, w) for c, w in zip(sensor_m, stack_m, strict=True)]
     fits["robust"] = _stacked([r.similarity for r in robust])
     rejects = np.array([not r.inlier.all() for r in robust])
@@ -121,7 +126,7 @@ def time_solvers(counts: Sequence[int], *, repeat: int = 15, sigma_m: float = 0.
     volume_m = viewing_volume_m()
     low, high = volume_m.min(axis=0), volume_m.max(axis=0)
     rotation = Rotation.random(rng=random).as_matrix()
-    solvers = {
+    solvers: dict[str, Callable[[F64, F64], Similarity]] = {
         "closed form": lambda c, w: fit(c, w, rule="inverse"),
         "robust": lambda c, w: fit_robust(c, w).similarity,
     }

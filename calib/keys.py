@@ -44,7 +44,7 @@ _MEANINGS = {
 
 def parse(data: bytes) -> tuple[list[Key], bytes]:
     """Keys in bytes from a terminal, and the rest: an escape sequence that is not complete yet."""
-    keys = []
+    keys: list[Key] = []
     while data:
         if data[:1] == b"\x1b" and len(data) < 3 and b"\x1b[".startswith(data[:2]):
             return keys, data

@@ -20,7 +20,7 @@ def compare_methods(out: Path, *, seeds: int, pairs_max: int) -> tuple[dict[str,
     from rich.console import Console
     from rich.progress import track
 
-    setups = {
+    setups: dict[str, tuple[str, dict[str, Any]]] = {
         "clean": ("Noise alone; both frames truly in metres", {}),
         "scale": (f"The sensor's metre is off: true scale {SENSOR_SCALE_OFF}", {"sensor_scale": SENSOR_SCALE_OFF}),
         "outliers": ("Every fifth pair grossly wrong (10 to 50 cm)", {"outliers": True}),

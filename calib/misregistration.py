@@ -71,7 +71,7 @@ def displayed_quality(
         seen_through(eye, layers, stack, true_from_ideal, fov_deg=fov_deg, width_px=width, height_px=height)
         for eye in eyes_m
     ]
-    targets = [picture[..., :3].astype(np.float32) / 255 for picture in wanted]
+    targets = [picture[..., :3].astype(np.float32) / np.float32(255) for picture in wanted]
     return quality([r.image for r in seen], targets, [r.mask for r in seen])
 
 

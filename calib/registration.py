@@ -9,10 +9,11 @@ What verniers cannot tell is where all panels are together: one panel is the ref
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from runtime.optics.rpu import image_from_panel_four_points
@@ -79,7 +80,11 @@ def through(matrix: F64, points_px: F64) -> F64:
     return moved[:, :2] / moved[:, 2:]
 
 
-def ideal_partner(points_px: F64, eye_m: Sequence[float], stack: PanelStack, *, reference: int, panel: int) -> F64:
+def _inverse(matrix: F64) -> F64:
+    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+
+
+def ideal_partner(points_px: F64, eye_m: ArrayLike, stack: PanelStack, *, reference: int, panel: int) -> F64:
     """(K, 2) ideal pixels of `panel` behind or before ideal pixels (K, 2) of `reference`, as one eye sees them."""
     scale, shift = relative_scale_shift(eye_m, from_x_m=stack.x_m[reference], to_x_m=stack.x_m[panel])
     source, target = stack.panel(reference), stack.panel(panel)
@@ -101,7 +106,7 @@ def register(settings: Sequence[Setting], stack: PanelStack, *, reference: int) 
         found = np.empty((len(settings), 2))
         for (eye, first, second), (index, first_px, second_px) in groups.items():
             place = np.array(eye) if eye_offset_m is None else np.array(eye) + eye_offset_m
-            ideal = through(np.linalg.inv(matrices[first]), first_px)
+            ideal = through(_inverse(matrices[first]), first_px)
             partner = ideal_partner(ideal, place, stack, reference=first, panel=second)
             found[index] = through(matrices[second], partner) - second_px
         return found.ravel()
@@ -157,7 +162,9 @@ def _matrices(parameters: F64, stack: PanelStack, moving: Sequence[int]) -> list
     return matrices
 
 
-def _viewpoint_covariance(settings: Sequence[Setting], parameters: F64, inverse: F64, residuals) -> F64:  # type: ignore[no-untyped-def]
+def _viewpoint_covariance(
+    settings: Sequence[Setting], parameters: F64, inverse: F64, residuals: Callable[[F64, F64], F64]
+) -> F64:
     """Covariance from each marked viewpoint's own error, shared by all that was set from it."""
     step_m = 1e-4
     covariance = np.zeros((len(parameters), len(parameters)))

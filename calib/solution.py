@@ -52,7 +52,7 @@ class Solution:
     @property
     def axis_rms_m(self) -> F64:
         """(3,) RMS along x, y, z of the used pairs."""
-        return np.sqrt((self.residual_m[self.used] ** 2).mean(0))
+        return np.asarray(np.sqrt((self.residual_m[self.used] ** 2).mean(0)), dtype=np.float64)
 
     @property
     def leave_one_out_rms_m(self) -> float:
@@ -68,7 +68,8 @@ class Solution:
         """(...) expected (RMS) error at points (..., 3) in `stack`, for the observed or another noise."""
         jacobian = position_jacobian(stack_m, pivot_m=self.pivot_m)
         covariance = self.unit_covariance * (self.noise_m if noise_m is None else noise_m) ** 2
-        return np.sqrt(np.trace(jacobian @ covariance @ np.swapaxes(jacobian, -1, -2), axis1=-2, axis2=-1))
+        spread: F64 = jacobian @ covariance @ np.swapaxes(jacobian, -1, -2)
+        return np.asarray(np.sqrt(np.trace(spread, axis1=-2, axis2=-1)), dtype=np.float64)
 
 
 def _rms(vectors: F64) -> float:
@@ -105,7 +106,7 @@ def leave_one_out(residual_m: F64, stack_m: F64, *, pivot_m: F64, unit_covarianc
     remaining = np.eye(3) - leverage
     alone = np.linalg.eigvalsh(remaining).min(-1) < 1e-9
     remaining[alone] = np.eye(3)
-    errors = np.linalg.solve(remaining, residual_m[..., None])[..., 0]
+    errors: F64 = np.asarray(np.linalg.solve(remaining, residual_m[..., None])[..., 0], dtype=np.float64)
     errors[alone] = np.inf
     return errors
 

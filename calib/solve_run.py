@@ -39,7 +39,7 @@ def solve_file(
     pairs = checked.pairs
     try:
         chosen = (
-            solve(pairs.sensor_m, pairs.stack_m, method=method, known_scale=known_scale, reason="asked for")  # type: ignore[arg-type]
+            solve(pairs.sensor_m, pairs.stack_m, method=method, known_scale=known_scale, reason="asked for")
             if method
             else solve_default(pairs.sensor_m, pairs.stack_m)
         )

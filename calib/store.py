@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from runtime.artifacts import write_bytes, write_text
 from runtime.errors import InputError
 from runtime.eyes.calibration import load_calibration
 from runtime.records import F64
+
+if TYPE_CHECKING:
+    from tomlkit.items import Array
 
 KEPT_VERSIONS = 20
 STORED_PAIRS = 500  # more are left in their own file
@@ -71,7 +75,7 @@ def calibration_text(solution: Solution, pairs: Pairs, *, origin: Origin, warnin
     return tomlkit.dumps(document)
 
 
-def _rows(matrix: F64):  # type: ignore[no-untyped-def]
+def _rows(matrix: F64) -> Array:
     import tomlkit
 
     rows = tomlkit.array()

@@ -112,9 +112,9 @@ def simulate(
     """
     found = []
     for s in asked:
-        ideal = through(np.linalg.inv(truth[s.reference]), np.array([s.reference_px]))
+        ideal = through(np.asarray(np.linalg.inv(truth[s.reference]), dtype=np.float64), np.array([s.reference_px]))
         place = np.array(s.eye_m) + viewpoint_error_m
-        partner = ideal_partner(ideal, place, stack, reference=s.reference, panel=s.panel)  # type: ignore[arg-type]
+        partner = ideal_partner(ideal, place, stack, reference=s.reference, panel=s.panel)
         met = through(truth[s.panel], partner)[0] + random.normal(scale=noise_px, size=2) * (noise_px > 0)
         found.append(replace(s, panel_px=(float(met[0]), float(met[1]))))
     return found
