@@ -99,8 +99,9 @@ def _default(fits: dict[str, Similarity], sensor_m: F64, stack_m: F64, rejects: 
     """What `solution.solve_default` takes, for a batch."""
     inverse = fits["inverse"]
     _, unit, _ = design_covariance(stack_m[0], fixed_scale=False)
-    squares = ((inverse.points(sensor_m) - stack_m) ** 2).sum((-1, -2)) / (3 * stack_m.shape[-2] - 7)
-    one = scale_is_one(inverse.scale, sigma=np.sqrt(unit[6, 6] * squares))
+    freedom = 3 * stack_m.shape[-2] - 7
+    squares = ((inverse.points(sensor_m) - stack_m) ** 2).sum((-1, -2)) / freedom
+    one = scale_is_one(inverse.scale, sigma=np.sqrt(unit[6, 6] * squares), freedom=freedom)
     names = np.where(rejects, "robust", np.where(one, "fixed-scale", "inverse"))
     return _stacked(
         [

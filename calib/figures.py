@@ -13,6 +13,7 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F64
 
 DPI = 110
+BARS = 200  # of more points each is a dot
 AXES = ("X", "Y", "Z")
 COLOURS = ("#c0392b", "#27803b", "#2260a8", "#c77d0a", "#6b3fa0", "#222222")
 
@@ -42,9 +43,13 @@ def residual_figure(residual_m: F64, used: Any, *, limit_m: float) -> bytes:
     for axis, (panel, name) in enumerate(zip(axes, AXES, strict=True)):
         values = residual_m[:, axis] * 1e3
         shown = np.clip(values, -2 * largest, 2 * largest)
-        panel.bar(numbers[used], shown[used], color=COLOURS[axis], width=0.7, label="used")
-        if (~used).any():
-            panel.bar(numbers[~used], shown[~used], color="#bbbbbb", width=0.7, label="rejected (may be cut off)")
+        for chosen, colour, label in ((used, COLOURS[axis], "used"), (~used, "#bbbbbb", "rejected (may be cut off)")):
+            if not chosen.any():
+                continue
+            if len(numbers) <= BARS:
+                panel.bar(numbers[chosen], shown[chosen], color=colour, width=0.7, label=label)
+            else:
+                panel.plot(numbers[chosen], shown[chosen], ".", color=colour, markersize=1.5, label=label)
         rms = float(np.sqrt((values[used] ** 2).mean()))
         panel.axhline(0, color="#222222", linewidth=0.8)
         panel.set_ylabel(f"{name} error (mm)")

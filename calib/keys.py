@@ -60,11 +60,11 @@ class TerminalKeys:
     """Keys from standard input; a terminal is put into character mode until `close`. The end of input quits."""
 
     def __init__(self, descriptor: int | None = None) -> None:
-        self._descriptor = sys.stdin.fileno() if descriptor is None else descriptor
+        self._descriptor = _standard_input() if descriptor is None else descriptor
         self._pending: list[Key] = []
         self._rest = b""
         self._mode = None
-        if os.isatty(self._descriptor):
+        if self._descriptor >= 0 and os.isatty(self._descriptor):
             import termios
             import tty
 
@@ -73,8 +73,7 @@ class TerminalKeys:
 
     def poll(self) -> Key | None:
         """The next key, or None. Never waits."""
-        ready, _, _ = select.select([self._descriptor], [], [], 0)
-        if ready:
+        if self._descriptor >= 0 and select.select([self._descriptor], [], [], 0)[0]:
             data = os.read(self._descriptor, 64)
             keys, self._rest = parse(self._rest + data)
             self._pending += keys if data else [Key.QUIT]
@@ -87,6 +86,14 @@ class TerminalKeys:
 
             termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._mode)
             self._mode = None
+
+
+def _standard_input() -> int:
+    """Its descriptor; -1 where there is none, as in a service."""
+    try:
+        return sys.stdin.fileno()
+    except (AttributeError, OSError, ValueError):
+        return -1
 
 
 class WindowKeys:

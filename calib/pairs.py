@@ -156,7 +156,17 @@ class PairsFile:
         return len(self._rows)
 
     def accept(self, pair: CapturedPair) -> None:
-        """Add a pair; one of the same viewpoint is replaced. On disk when this returns."""
+        """Add a pair; one of the same viewpoint is replaced. On disk when this returns.
+
+        Raises InputError for a pair of another sensor than those that are there.
+        """
+        others = {row["sensor_serial"] for row in self._rows} - {"", pair.sensor_serial}
+        if others and pair.sensor_serial:
+            raise InputError(
+                self.path,
+                "sensor_serial",
+                f"its pairs are of sensor {min(others)}, this one is of {pair.sensor_serial}",
+            )
         self._rows = [row for row in self._rows if not pair.viewpoint or row["viewpoint"] != pair.viewpoint]
         self._rows.append(pair.row())
         text = io.StringIO()

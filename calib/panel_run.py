@@ -14,7 +14,7 @@ from calib.page import Picture, page
 from calib.panel_figures import registration_figure
 from calib.registration import Setting, StackRegistration, parts, register
 from calib.store import save
-from calib.vernier import STEPS_PX, Nudging, chart, nominal, read_settings, write_settings
+from calib.vernier import STEPS_PX, Nudging, chart, nominal, read_settings, resumed, write_settings
 from runtime.artifacts import OutputFolder, write_bytes, write_json, write_png, write_text
 from runtime.clock import NS_PER_MS, MonotonicClock
 from runtime.config import Settings, load_settings
@@ -57,7 +57,7 @@ def nudge_verniers(
     from runtime.panels.registry import open_panels, panel_settings
 
     asked = asked_settings(stack, eye_m=eye_m, reference=reference)
-    done = read_settings(out, stack) if out.exists() else []
+    nudging = resumed(asked, read_settings(out, stack) if out.exists() else [])
     # Verniers measure the bare panels: a registration that is already configured would be measured away.
     bare = tuple(
         panel.model_copy(update={"homography": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))})
@@ -78,9 +78,11 @@ def nudge_verniers(
             number += 1
             sink.present(LayerFrame(number, layers))
 
+        if nudging.finished:
+            typer.echo(f"{out}: every vernier has its setting already", err=True)
         try:
             found = nudge(
-                Nudging(asked, done),
+                nudging,
                 stack,
                 poll=first_of(keys.poll, WindowKeys(sink).poll),
                 present=present,

@@ -21,6 +21,8 @@ from runtime.eyes.calibration import Calibration, load_calibration, similarity_d
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
 
+LISTED_POINTS = 200
+
 
 @dataclass(frozen=True, slots=True)
 class Points:
@@ -64,7 +66,8 @@ def write_report(file: Path, out: Path, *, pairs_path: Path | None, stack: Panel
     summary = _summary(calibration, points)
     tables = [("Numbers", _numbers(calibration, summary)), ("stack_from_sensor", _matrix(calibration))]
     if points is not None:
-        tables.append(("Points", _point_rows(points)))
+        heading = "Points" if len(points.pairs) <= LISTED_POINTS else f"The {LISTED_POINTS} worst points"
+        tables.append((heading, _point_rows(points)))
     with OutputFolder(out) as folder:
         for picture in pictures:
             write_bytes(folder.staging / picture.name, picture.png)
@@ -207,9 +210,10 @@ def _matrix(calibration: Calibration) -> list[list[str]]:
 
 def _point_rows(points: Points) -> list[list[str]]:
     rows = [["", "point", "X error, mm", "Y error, mm", "Z error, mm", "distance, mm", ""]]
-    for number, (name, error, used) in enumerate(
-        zip(points.pairs.names, points.residual_m * 1e3, points.used, strict=True), start=1
-    ):
+    worst_first = np.argsort(-np.linalg.norm(points.residual_m, axis=1))
+    for index in sorted(worst_first[:LISTED_POINTS].tolist()):
+        number, name = index + 1, points.pairs.names[index]
+        error, used = points.residual_m[index] * 1e3, bool(points.used[index])
         rows.append([str(number), name, *[f"{value:.2f}" for value in error], f"{np.linalg.norm(error):.2f}",
                      "" if used else "rejected"])  # fmt: skip
     return rows

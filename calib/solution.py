@@ -7,6 +7,7 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from calib.robust import fit_robust
 from calib.similarity import Similarity, fit
@@ -15,7 +16,7 @@ from runtime.records import F64
 
 Method = Literal["seed", "least-squares", "inverse", "robust", "fixed-scale"]
 METHODS: tuple[Method, ...] = get_args(Method)
-SCALE_SIGMAS = 3.0  # a scale that parts from 1 by less of its own standard deviations is taken as 1
+SCALE_DOUBT = 0.0027  # how often a scale of 1 may be taken for another: three standard deviations of many pairs
 EXACT_SCALE = 1e-9
 
 
@@ -138,10 +139,14 @@ def solve(sensor_m: F64, stack_m: F64, *, method: Method, known_scale: float = 1
     )
 
 
-def scale_is_one(scale: F64 | float, *, sigma: F64 | float) -> NDArray[np.bool_]:
-    """True where a fitted scale cannot be told from 1; `sigma`: the standard deviation of its logarithm."""
+def scale_is_one(scale: F64 | float, *, sigma: F64 | float, freedom: int) -> NDArray[np.bool_]:
+    """True where a fitted scale cannot be told from 1 (Student's test).
+
+    sigma: the estimated standard deviation of its logarithm; freedom: of that estimate.
+    """
+    limit = float(student.ppf(1 - SCALE_DOUBT / 2, freedom)) * np.asarray(sigma)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.abs(np.log(scale)) <= np.maximum(SCALE_SIGMAS * np.asarray(sigma), EXACT_SCALE)
+        return np.abs(np.log(scale)) <= np.maximum(limit, EXACT_SCALE)
 
 
 def solve_default(sensor_m: F64, stack_m: F64) -> Solution:
@@ -157,6 +162,6 @@ def solve_default(sensor_m: F64, stack_m: F64) -> Solution:
     inverse = solve(sensor_m, stack_m, method="inverse")
     scale = float(inverse.similarity.scale)
     text = f"the fitted scale, {scale:.5g} ± {inverse.scale_sigma * scale:.2g},"
-    if scale_is_one(scale, sigma=inverse.scale_sigma):
+    if scale_is_one(scale, sigma=inverse.scale_sigma, freedom=3 * len(sensor_m) - 7):
         return solve(sensor_m, stack_m, method="fixed-scale", reason=f"{text} cannot be told from 1")
     return replace(inverse, reason=f"{text} is not 1, and the noise is on the sensor's side")

@@ -112,12 +112,15 @@ def save(path: Path, text: str) -> Path | None:
 def roll_back(path: Path) -> Path:
     """Put the newest past version back, and take it from the history. Raises InputError where there is none.
 
-    The version that is left is checked first: a rollback never leaves a file that the runtime refuses.
+    It is checked first: a rollback never leaves a file that the runtime refuses. What it replaces is left as
+    `NAME.undone.toml`.
     """
     past = history(path)
     if not past:
         raise InputError(path, "--rollback", "there is no past version")
     newest = past[-1]
     load_calibration(newest)
+    if path.exists():
+        write_bytes(path.with_name(f"{path.stem}.undone{path.suffix}"), path.read_bytes())
     newest.replace(path)
     return newest

@@ -163,8 +163,11 @@ class Nudging:
     def _carry(self) -> None:
         """Begin the next vernier of the same panels with this one's correction: it is nearly right."""
         following = self.index + 1
-        if following < len(self.asked) and self.asked[following].panel == self.current.panel:
-            untouched = self.asked[following]
+        if following == len(self.asked):
+            return
+        untouched = self.asked[following]
+        taken = any(_where(s) == _where(untouched) for s in self.done)
+        if untouched.panel == self.current.panel and not taken:
             nominal_px = np.array(self._nominal(self.current))
             du, dv = np.array(self.current.panel_px) - nominal_px
             place = self._nominal(untouched)
@@ -181,6 +184,31 @@ class Nudging:
             self.finished = True
         else:
             self.index += 1
+
+
+def resumed(asked: Sequence[Setting], taken: Sequence[Setting]) -> Nudging:
+    """Go on where an earlier walk stopped: at the first vernier that is not taken, the others kept.
+
+    Files round: a setting belongs to the vernier of the same panels and eye less than half a pixel away.
+    """
+
+    def same(a: Setting, b: Setting) -> bool:
+        panels = (a.reference, a.panel) == (b.reference, b.panel)
+        near = np.allclose(a.reference_px, b.reference_px, rtol=0, atol=0.5)
+        return panels and near and np.allclose(a.eye_m, b.eye_m, rtol=0, atol=1e-6)
+
+    nudging = Nudging(list(asked), [])
+    open_numbers = set(range(len(asked)))
+    for setting in taken:
+        mine = next((number for number, vernier in enumerate(asked) if same(vernier, setting)), None)
+        if mine is not None:
+            open_numbers.discard(mine)
+            setting = replace(asked[mine], panel_px=setting.panel_px)
+            nudging.asked[mine] = setting
+        nudging.done.append(setting)
+    nudging.finished = not open_numbers
+    nudging.index = min(open_numbers, default=0)
+    return nudging
 
 
 def _where(setting: Setting) -> tuple[object, ...]:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -210,3 +214,30 @@ def test_the_demo_recording_calibrates_itself(tmp_path: Path) -> None:
     matrix = np.array(json.loads(result.stdout)["stack_from_sensor"])
     eye = np.array([0.0, 0.0, 0.6, 1.0])
     assert np.linalg.norm((matrix - demo_stack_from_sensor()) @ eye) < 0.002
+
+
+def test_a_person_at_the_terminal_takes_pairs_from_a_sensor(tmp_path: Path) -> None:
+    """The command itself in a process of its own: Enter, again and again, until the sensor has seen enough."""
+    viewpoint = grid()[3]
+    source = recording(tmp_path / "r.mcap", [viewpoint.midpoint_m] * 30, true=False)
+    (tmp_path / "config.toml").write_text(f'[sensor]\ndriver = "replay"\nsource = "{source}"\n')
+    out = tmp_path / "p.csv"
+    command = [sys.executable, "-m", "runtime.cli", "calibrate", "capture", "--out", str(out), "--json",
+               "--config", str(tmp_path / "config.toml"), "--viewpoint", viewpoint.name]  # fmt: skip
+    running = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    for _ in range(100):
+        if running.poll() is not None:
+            break
+        with contextlib.suppress(BrokenPipeError):
+            running.stdin.write("\n")
+            running.stdin.flush()
+        time.sleep(0.2)
+    told = json.loads(running.stdout.read())
+    with contextlib.suppress(BrokenPipeError):
+        running.stdin.close()
+    running.stdout.close()
+    assert running.wait(timeout=10) == 0
+    assert told["accepted"] == 1
+    pairs = read_pairs(out)
+    np.testing.assert_allclose(pairs.sensor_m, [eyes_at(viewpoint.midpoint_m).eyes_m.mean(0)], atol=1e-6)
+    assert pairs.sensor_serial == "A1"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,14 @@ def test_it_resumes_and_replaces_a_viewpoint_that_is_taken_again(tmp_path: Path)
     resumed.accept(captured("v1", x=2.0))
     resumed.accept(captured("v0", x=3.0))
     assert sorted(read_pairs(path).sensor_m[:, 0]) == [2.0, 3.0]
+
+
+def test_a_file_of_another_sensor_is_not_gone_on_with(tmp_path: Path) -> None:
+    path = tmp_path / "pairs.csv"
+    PairsFile(path).accept(captured("v0"))
+    with pytest.raises(InputError, match="sensor A1, this one is of B2"):
+        PairsFile(path).accept(replace(captured("v1"), sensor_serial="B2"))
+    assert len(read_pairs(path)) == 1
 
 
 def test_a_crash_while_writing_leaves_the_pairs_that_were_there(tmp_path: Path, monkeypatch) -> None:

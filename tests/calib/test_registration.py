@@ -113,6 +113,15 @@ def test_two_panels_are_enough_of_a_stack() -> None:
     assert error_over_panel_px(found.panels[0].true_from_ideal, truth[0], **SIZE).max() < 1e-6
 
 
+def test_four_settings_a_panel_fit_exactly_and_promise_no_more_than_a_hand_can() -> None:
+    truth = misaligned(STACK, reference=1, random=np.random.default_rng(1))
+    everything = settings_of(truth)
+    four = [[s for s in everything if s.panel == panel][number] for panel in (0, 2) for number in (0, 4, 10, 14)]
+    found = register(four, STACK, reference=1)
+    assert error_over_panel_px(found.panels[0].true_from_ideal, truth[0], **SIZE).max() < 1e-6
+    assert found.panels[0].setting_sigma_px > 0.1
+
+
 def test_too_few_settings_are_refused() -> None:
     three = [s for s in settings_of([np.eye(3)] * 3) if s.panel == 0][:3]
     with pytest.raises(ValueError, match="panel 0 has 3 settings"):

@@ -94,3 +94,11 @@ def test_by_default_wrong_pairs_are_left_out(measured, known_m) -> None:
     found = solve_default(sensor, known_m)
     assert found.method == "robust"
     assert np.flatnonzero(~found.used).tolist() == [4]
+
+
+def test_three_noisy_pairs_are_no_evidence_against_a_scale_of_one(measured, known_m) -> None:
+    """Two degrees of freedom: the noise itself is hardly known, and small by chance in every tenth sample."""
+    three = [0, 8, 22]
+    other = sum(solve_default(measured(sigma_m=0.003, seed=s)[three], known_m[three]).method != "fixed-scale"
+                for s in range(300))  # fmt: skip
+    assert other <= 6

@@ -193,8 +193,10 @@ def test_past_versions_are_kept_and_come_back(tmp_path, measured, known_m, write
         solve(write_pairs(measured(sigma_m=0.002, seed=seed), known_m), out)
         texts.append(out.read_text())
     for expected in (texts[1], texts[0]):
+        replaced = out.read_text()
         assert run.invoke(app, ["solve", "--out", str(out), "--rollback"]).exit_code == 0
         assert out.read_text() == expected
+        assert (tmp_path / "c.undone.toml").read_text() == replaced
     result = run.invoke(app, ["solve", "--out", str(out), "--rollback"])
     assert isinstance(result.exception, InputError)
     assert out.read_text() == texts[0]

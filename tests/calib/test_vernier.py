@@ -9,7 +9,7 @@ import pytest
 
 from calib.keys import Key
 from calib.panel_run import nudge
-from calib.vernier import ARM_PX, STEPS_PX, Nudging, chart, draw, nominal, read_settings, write_settings
+from calib.vernier import ARM_PX, STEPS_PX, Nudging, chart, draw, nominal, read_settings, resumed, write_settings
 from runtime.errors import InputError
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
@@ -119,6 +119,35 @@ def test_settings_survive_a_file(tmp_path: Path) -> None:
         assert (a.reference, a.panel) == (b.reference, b.panel)
         np.testing.assert_allclose([*a.eye_m, *a.reference_px, *a.panel_px], [*b.eye_m, *b.reference_px, *b.panel_px],
                                    rtol=1e-8)  # fmt: skip
+
+
+def test_it_resumes_at_the_first_vernier_that_is_open(tmp_path: Path) -> None:
+    """Through a file, which rounds: nothing is asked twice, nothing is kept twice."""
+    eye = (0.43, 1 / 3, -0.05)
+    asked = nominal(eye, STACK, reference=1)
+    first = Nudging(list(asked), [])
+    for key in (Key.RIGHT, Key.ACCEPT, Key.NEXT, Key.UP, Key.ACCEPT, Key.QUIT):
+        first.press(key)
+    write_settings(tmp_path / "v.csv", first.done)
+    second = resumed(asked, read_settings(tmp_path / "v.csv", STACK))
+    assert second.index == 1
+    assert not second.finished
+    second.press(Key.ACCEPT)
+    assert second.index == 2
+    assert second.current.panel_px == pytest.approx(first.done[1].panel_px, abs=1e-5), "a taken one is left as it is"
+    assert len(second.done) == 3
+    for _ in asked[2:]:
+        second.press(Key.ACCEPT)
+    assert second.finished
+    assert len(second.done) == len(asked)
+    assert resumed(asked, second.done).finished
+
+
+def test_settings_from_other_viewpoints_are_kept_beside(tmp_path: Path) -> None:
+    others = nominal((0.6, 0.1, 0.0), STACK, reference=1)
+    found = resumed(nominal(EYE, STACK, reference=1), others)
+    assert found.index == 0
+    assert found.done == others
 
 
 HEADER = "reference,panel,eye_x,eye_y,eye_z,reference_u,reference_v,panel_u,panel_v\n"
