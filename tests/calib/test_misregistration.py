@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from calib.misregistration import corrected, displayed_quality, seen_through, shifted
-from calib.registration import true_from_ideal
+from calib.registration import ideal_partner, register, through, true_from_ideal
+from calib.vernier import nominal, simulate
 from runtime.config import PanelSettings
 from runtime.optics.retina import seen_by
 
@@ -87,6 +88,26 @@ def test_the_correction_is_what_the_presentation_shader_does() -> None:
     ours = corrected(layers, [np.eye(3), matrix, np.eye(3)])[1]
     inner = (slice(6, -6), slice(6, -6), slice(0, 3))
     assert np.abs(shown[inner].astype(int) - ours[inner].astype(int)).max() <= 3
+
+
+def test_a_viewpoint_off_the_mark_does_no_harm_to_eyes_that_are_calibrated_afterwards(small_stack) -> None:
+    """Verniers set from 2 mm beside the mark shear the stack: whoever stands beside in proportion sees it straight."""
+    off_m, mark, eye = np.array([0.0, 0.002, -0.001]), np.array([0.5, 0.0, 0.0]), np.array([0.6, 0.03, 0.02])
+    asked = nominal(tuple(mark), small_stack, reference=1)
+    nothing = [np.eye(3)] * 3
+    random = np.random.default_rng(0)
+    taken = simulate(asked, small_stack, nothing, noise_px=0.0, viewpoint_error_m=off_m, random=random)
+    found = [panel.true_from_ideal for panel in register(taken, small_stack, reference=1).panels]
+    middle = np.array([[240.0, 135.0], [100.0, 60.0], [400.0, 200.0]])
+    for index in (0, 2):
+        meant = ideal_partner(middle, eye, small_stack, reference=1, panel=index)
+        errors = []
+        for place in (eye, eye + off_m * eye[0] / mark[0]):
+            looked_at = ideal_partner(middle, place, small_stack, reference=1, panel=index)
+            shown_there = through(np.linalg.inv(found[index]), looked_at)
+            errors.append(np.linalg.norm(shown_there - meant, axis=1).max())
+        assert errors[0] > 0.15, "at a quarter of the resolution that is half a pixel of the prototype's"
+        assert errors[1] < 0.01 * errors[0]
 
 
 @pytest.mark.parametrize("index", range(3))
