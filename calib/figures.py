@@ -96,7 +96,7 @@ def geometry_figure(
         panel.set_ylabel(label)
         panel.set_title(f"Seen {title}", fontsize=10)
         panel.grid(alpha=0.3)
-    axes[1].legend(loc="best", fontsize=8)
+    canvas.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
     return png(canvas)
 
 
