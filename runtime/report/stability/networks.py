@@ -11,7 +11,8 @@ import numpy as np
 
 from runtime.config import ModelSettings
 from runtime.model.chain import chain_modes
-from runtime.model.predictor import Predictor, load_predictor
+from runtime.model.predictor import Predictor, load_predictor, model_path
+from runtime.model.session import ModelSession
 from runtime.model.still import solve_still
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
@@ -104,6 +105,38 @@ def repeatable(model: str) -> Answer:
     return Answer(float(np.abs(found[0].astype(int) - found[2]).max()), 0.0)
 
 
+def threads(model: str) -> Answer:
+    """One thread against two: the order of sums may move a panel value by a grey level, no more."""
+    eyes, images = eyes_at(distance_m=0.6), pictures("noise, another for each eye")
+    predictor = load_predictor(model, STACK, ModelSettings(threads=2))
+    two = np.array(solve_still(images[0], images[1], eyes_m=eyes, fov_deg=FOV_DEG, predictor=predictor).layers)
+    predictor.close()
+    one = predicted(model, images, eyes)
+    return Answer(float(np.abs(one.astype(int) - two[..., :3]).max()), 1.0)
+
+
+def tiny_input(model: str, value: float) -> Answer:
+    """The network alone on a difference of subnormal size: the answer must be as good as none."""
+    path = model_path(model)
+    assert path is not None
+    session = ModelSession(path, threads=1)
+    cells, columns = 8, 2 * session.contract.cell_px * 3
+    difference = np.full((4, cells, columns), value, np.float32)
+    answer = session.run(
+        difference, *chain_modes(cells), np.array([1.0], np.float32), output_shape=(4, cells + 1, columns)
+    )
+    return Answer(float(np.abs(answer).max()), 1e-30)
+
+
+def poisoned(model: str, value: float) -> U8:
+    """A network whose tolerance input is not a number: what it answers isn't either."""
+    predictor = load_predictor(model, STACK, ModelSettings(threads=1))
+    predictor.__dict__["tolerance_mm"] = value
+    images = pictures("lines one pixel wide")
+    done = solve_still(images[0], images[1], eyes_m=eyes_at(distance_m=0.6), fov_deg=FOV_DEG, predictor=predictor)
+    return done.layers
+
+
 def modes(cells: int) -> Answer:
     """The chains' singular vectors in closed form, float32, put together again."""
     v, s, u_transposed = (part.astype(np.float64) for part in chain_modes(cells))
@@ -145,6 +178,9 @@ def trials(check: Check, *, full: bool = False) -> Iterator[Trial]:
         for kind in KINDS:
             yield Trial(STAGE, f"{model}: {kind}", partial(stressed, model, pictures(kind), eyes), measure="intensity")
         yield Trial(STAGE, f"{model}: the same picture twice", partial(repeatable, model), measure="grey levels")
+        yield Trial(STAGE, f"{model}: one thread and two", partial(threads, model), measure="grey levels")
+        yield Trial(STAGE, f"{model}: subnormal differences", partial(tiny_input, model, 1e-40), measure="phase")
+        yield refusal(STAGE, f"{model}: NaN in", partial(poisoned, model, math.nan))
     for model in MODELS if full else ("balanced",):
         yield from _poses(model, full=full)
     for name, left, right in (
