@@ -76,19 +76,13 @@ def compare(
 
 
 def _print(record: dict[str, Any], out: Path | None) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
     names = list(dict.fromkeys(name for entry in record["stages"] for name in entry["stage_ms"]))
-    table = Table("model", "panels", *names, "frame ms", "PSNR dB", "2 mm off", "MiB")
+    columns = [*names, "frame ms", "PSNR dB", "2 mm off", "MiB"]
+    print(f"{'':19}" + "".join(f"{column:>11}" for column in columns))
     for stages, method in zip(record["stages"], record["methods"], strict=True):
-        times = [f"{stages['stage_ms'].get(name, 0.0):.1f}" for name in names]
-        size = f"{stages['width_px']}x{stages['height_px']}"
-        off = method["psnr_db_off_eye"].get("2mm", float("nan"))
-        row = [stages["name"], size, *times, f"{stages['total_ms']:.1f}", f"{method['psnr_db']:.2f}", f"{off:.2f}"]
-        table.add_row(*row, f"{method['memory_mib']:.0f}")
-    console = Console(highlight=False)
-    console.print(table)
-    console.print(
-        f"yardstick of this machine: {record['yardstick_ms']:.1f} ms" + (f"; written to {out}" if out else "")
-    )
+        numbers = [stages["stage_ms"].get(name, 0.0) for name in names]
+        numbers += [stages["total_ms"], method["psnr_db"], method["psnr_db_off_eye"]["2mm"], method["memory_mib"]]
+        name = f"{stages['name']} {stages['width_px']}x{stages['height_px']}"
+        print(f"{name:19}" + "".join(f"{number:11.1f}" for number in numbers))
+    written = f"; written to {out}" if out else ""
+    print(f"yardstick of this machine: {record['yardstick_ms']:.1f} ms{written}")
