@@ -16,9 +16,9 @@ COARSE_STEP = 16  # of the look that decides whether a closer one is worth its t
 WHOLE_ABOVE = 0.6  # of the panel: a larger window is not worth cutting out
 MOST_SLACK = 1.3  # of a kept window's area over the one that would do
 STEPS = 16  # windows are whole sixteenths of the panel, so that a few sizes serve all
-# Measured with the shipped models: along the line of the eyes the outer panels are driven for some fourteen
+# Measured with the shipped models: along the line of the eyes the outer panels are driven for some sixteen
 # parallaxes beside a difference, and a window must hold each panel's part of what the eyes see through another.
-CHAIN_STEPS = 14.0
+CHAIN_STEPS = 16.0
 PANEL_CROSSINGS = 2.0
 ROOM_PX = 16
 EDGE_PX = 2
@@ -64,46 +64,62 @@ def stray_px(eyes_m: F64, stack: PanelStack) -> F64:
     return stray
 
 
-def room_px(eyes_m: F64, stack: PanelStack) -> tuple[float, float]:
-    """How far beside a difference the panels take part in it: columns and rows on each side, in pixels."""
-    stray = stray_px(eyes_m, stack)
-    parallax = np.abs(stray).max(axis=(0, 1))
-    separation = np.abs(stray[0] - stray[1]).max(axis=0)
-    columns, rows = PANEL_CROSSINGS * parallax + CHAIN_STEPS * separation + ROOM_PX
-    return float(columns), float(rows)
+def room_px(low: float, high: float, stray: F64, *, eyes_px: F64, weights: F64) -> tuple[float, float]:
+    """Along one axis: how far before and after a difference from `low` to `high` the panels take part in it.
+
+    Pixels from the centre of the panel. stray: (2, N) as `stray_px` has it; eyes_px: (2,) the eyes' places on
+    this axis; weights: (2, N) how far along its ray from the centre panel to the eye each panel lies.
+    """
+    before = (weights * (low - eyes_px[:, None])).max()
+    after = (weights * (eyes_px[:, None] - high)).max()
+    room = CHAIN_STEPS * float(np.abs(stray[0] - stray[1]).max()) + ROOM_PX
+    return PANEL_CROSSINGS * max(float(before), 0.0) + room, PANEL_CROSSINGS * max(float(after), 0.0) + room
 
 
 def whole_rays(window: Window, eyes_m: F64, stack: PanelStack) -> PixelBox:
     """The part of a window in which no eye's ray leaves it on another panel; up to the panels' own edges.
 
-    eyes_m: (2, 3), frame `stack`, not moved to the window.
+    A ray through p on the centre panel meets a panel of weight t at p(1 - t) + e·t. eyes_m: (2, 3), frame
+    `stack`, not moved to the window.
     """
-    box = window.box
-    inset = np.ceil(np.abs(stray_px(eyes_m - window.shift_m, stack)).max(axis=(0, 1)) + EDGE_PX)
-    # A scale about the middle adds what the first order leaves out.
-    gap_m = max(abs(x_m - stack.x_m[stack.count // 2]) for x_m in stack.x_m)
-    inset += np.ceil(np.array([box.width_px, box.height_px]) / 2 * gap_m / (eyes_m[:, 0].min() - gap_m))
-    columns, rows = (int(value) for value in inset)
-    return PixelBox(
-        box.u0 + columns if box.u0 > 0 else 0,
-        box.v0 + rows if box.v0 > 0 else 0,
-        box.u1 - columns if box.u1 < stack.width_px else stack.width_px,
-        box.v1 - rows if box.v1 < stack.height_px else stack.height_px,
-    )
+    box, weights = window.box, _weights(eyes_m, stack)
+    limits = []
+    for axis, (start, end, whole) in enumerate(((box.u0, box.u1, stack.width_px), (box.v0, box.v1, stack.height_px))):
+        along = _eyes_px(eyes_m, stack)[:, axis, None] * weights
+        low = ((start - whole / 2 - along) / (1 - weights)).max() + whole / 2 + EDGE_PX
+        high = ((end - whole / 2 - along) / (1 - weights)).min() + whole / 2 - EDGE_PX
+        first = max(int(np.ceil(low)), start) if start > 0 else 0
+        last = min(int(np.floor(high)), end) if end < whole else whole
+        limits.append((first, max(first, last)))
+    (u0, u1), (v0, v1) = limits
+    return PixelBox(u0, v0, u1, v1)
+
+
+def _weights(eyes_m: F64, stack: PanelStack) -> F64:
+    """(2, N): how far along its ray from the centre panel to an eye each panel lies; 1 is the eye."""
+    middle = stack.x_m[stack.count // 2]
+    weights: F64 = (np.array(stack.x_m) - middle)[None] / (eyes_m[:, :1] - middle)
+    return weights
+
+
+def _eyes_px(eyes_m: F64, stack: PanelStack) -> F64:
+    """(2, 2): the eyes' places in panel pixels from the panel's centre, columns and rows."""
+    places: F64 = eyes_m[:, 1:] * np.array([stack.width_px / stack.width_m, -stack.height_px / stack.height_m])
+    return places
 
 
 def window_of(box: PixelBox, eyes_m: F64, stack: PanelStack) -> Window | None:
-    """The window that a difference is solved in: grown by the parallax, rounded up to whole sixteenths of the panel.
+    """The window that a difference is solved in: grown by its room, rounded up to whole sixteenths of the panel.
 
     None where it would be most of the panel: then the whole is as fast.
     """
-    columns, rows = room_px(eyes_m, stack)
+    stray, weights, eyes_px = stray_px(eyes_m, stack), _weights(eyes_m, stack), _eyes_px(eyes_m, stack)
     spans: list[tuple[int, int]] = []
-    for start, end, room, whole in (
-        (box.u0, box.u1, columns, stack.width_px),
-        (box.v0, box.v1, rows, stack.height_px),
-    ):
-        low, high = start - room, end + room
+    for axis, (start, end, whole) in enumerate(((box.u0, box.u1, stack.width_px), (box.v0, box.v1, stack.height_px))):
+        before, after = room_px(
+            start - whole / 2, end - whole / 2, stray[..., axis], eyes_px=eyes_px[:, axis], weights=weights
+        )
+        low, high = max(start - before, 0.0), min(end + after, float(whole))
         step = whole / STEPS
         size = min(int(np.ceil(np.ceil((high - low) / step) * step / 8) * 8), whole)
         first = int(np.clip(np.floor((low + high - size) / 2), 0, whole - size))

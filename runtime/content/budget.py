@@ -68,7 +68,6 @@ class BudgetKeeper:
         """Tell a whole frame's time; True where the level has changed."""
         if self.budget_ms <= 0:
             return False
-        ratio = time_ms / self._expected[self.index]
         self._expected[self.index] += LEARNING * (time_ms - self._expected[self.index])
         self._recent.append(time_ms)
         slow = sum(taken > self.budget_ms for taken in self._recent)
@@ -76,7 +75,8 @@ class BudgetKeeper:
             return self._go(self.index + 1)
         better = self.index - 1
         # What slows this level slows the better one too.
-        likely = self.levels[better].expected_ms * max(ratio, self._expected[self.index] / self.level.expected_ms)
+        slowdown = max(time_ms, self._expected[self.index]) / self.level.expected_ms
+        likely = self.levels[better].expected_ms * slowdown
         self._calm = self._calm + 1 if better >= 0 and likely <= ROOM * self.budget_ms else 0
         if self._calm >= PATIENCE:
             return self._go(better)

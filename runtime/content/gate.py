@@ -9,9 +9,10 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.records import F64
 
-WINDOW_NS = NS_PER_S // 2  # over which noise is told from motion
+WINDOW_NS = NS_PER_S  # over which noise is told from motion
 FEWEST = 8  # estimates in it, before anything is said to be noise
 SIGMAS = 4.0  # a single estimate beyond so many is motion
+BAND_SIGMAS = 3.0  # of a single estimate's noise: the mean of a window stays well inside
 LEAST_BAND_M = 0.0002
 
 
@@ -28,7 +29,7 @@ def lateral_shift_m(eyes_m: F64, other_m: F64) -> float:
 class ReuseGate:
     """Says whether a frame that was solved for some eyes will do for the present ones.
 
-    It will while the mean of the last half second lies within the band of the solved eyes, and no single
+    It will while the mean of the last second lies within the band of the solved eyes, and no single
     estimate leaves it by more than noise can. The band is measured from the eyes that were solved, not from the
     last turn, so that slow drift can't accumulate.
     """
@@ -84,4 +85,4 @@ class ReuseGate:
         deviation = np.sqrt((rest**2).sum(axis=0) / max(len(eyes) - 2, 1)).reshape(2, 2)
         self.noise_m = float((np.linalg.norm(deviation, axis=1) * eyes[-1, :, 0]).max())
         if self._fixed_m is None:
-            self.band_m = float(np.clip(self.noise_m, LEAST_BAND_M, self._most_m))
+            self.band_m = float(np.clip(BAND_SIGMAS * self.noise_m, LEAST_BAND_M, self._most_m))
