@@ -74,7 +74,10 @@ class Soak:
 
 def soak(frames: int, *, warm: int, fault_every: int, report: bool = False) -> Soak:
     """Run it. `warm` turns come before the first look at memory."""
-    with tempfile.TemporaryDirectory() as folder, Rig(stack=SIZE, loop={"rate_hz": 10_000.0}, tracker={"hold_s": 1.0}) as rig:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Rig(stack=SIZE, loop={"rate_hz": 10_000.0}, tracker={"hold_s": 1.0}) as rig,
+    ):
         server = StatusServer(Path(folder) / "status.sock", group="root", clock=MonotonicClock())
         rig.loop._on_account = None  # the rig keeps every account: that alone would be a leak
         rig.loop.panels = panels = BreakablePanels(rig.loop.panels, keep=False)

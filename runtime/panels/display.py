@@ -61,14 +61,14 @@ class Window:
 class Display:
     """The connection to the X server, with a hidden root window whose objects all others share.
 
-    Nothing of it outlives `close`; a lost server is opened again with a new Display.
+    Nothing of it outlives `close`. The X server's death ends the process (xlib.take_over_errors says why).
     """
 
     def __init__(self) -> None:
         """Raises PanelLost (no X server, or none that lets us in: it may come), MissingPart (no X11 library)."""
         self.faults: list[str] = []
         self._windows: list[Window] = []
-        self._closed = self.dead = False  # dead: the X server has gone, nothing more can be asked of it
+        self._closed = False
         try:
             if glfw.platform_supported(glfw.PLATFORM_X11):
                 glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
@@ -78,9 +78,9 @@ class Display:
         try:
             if glfw.get_platform() != glfw.PLATFORM_X11:
                 raise MissingPart("GLFW without X11: only X11 can put a window on a chosen monitor")
-            xlib.survive_errors()
-            self._guard = xlib.survive_server(_address(glfw.get_x11_display()), self._server_died)
+            xlib.take_over_errors()
             glfw.set_monitor_callback(self._monitor_changed)
+            self._watch = xlib.ServerWatch(_address(glfw.get_x11_display()))
         except BaseException:
             glfw.terminate()
             raise
@@ -136,6 +136,7 @@ class Display:
         if self._closed:
             return
         self._closed = True
+        self._watch.stop()
         for window in self._windows:
             window.context.release()
         if self._windows:
@@ -191,10 +192,6 @@ class Display:
     def has_windows(self) -> bool:
         """True once anything was made that needs OpenGL."""
         return bool(self._windows)
-
-    def _server_died(self) -> None:
-        self.dead = True
-        self.faults.append("the X server died")
 
 
 def connected_monitors() -> tuple[Monitor, ...]:

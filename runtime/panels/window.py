@@ -52,9 +52,9 @@ class WindowPanels(PanelSink):
     turn would divide the rate by N. `skew_ms` is the time between the first and the last return from a swap;
     what it can't know is how far the monitors' own blanks lie apart (`kind = "span"` has one swap).
 
-    Where a monitor, a window, the context or the X server is lost, everything is closed, `present` raises
+    Where a monitor, a window or the context is lost, everything is closed, `present` raises
     PanelLost, and a later `present` builds it anew: half a second later, or as soon as X says that a missing
-    monitor is there.
+    monitor is there. The death of the X server ends the process with exit status 75, to be started again.
     Uses GLFW, so: one thread, the main one. The `content` context is current again after every call.
     """
 
@@ -166,9 +166,6 @@ class WindowPanels(PanelSink):
         """Whether it is time to look for the panels again: now and then, or at once where a monitor came or went."""
         display = self._display
         if display is not None and display.poll():
-            if display.dead:
-                self._drop()
-                return False
             display.faults.clear()
             return True
         return self._clock.now_ns() >= self._retry_ns
@@ -225,7 +222,7 @@ class WindowPanels(PanelSink):
 
     def _retreat(self) -> None:
         """After a failure: keep a connection that only looks for monitors, close anything more."""
-        if self._display is None or self._display.has_windows or self._display.dead:
+        if self._display is None or self._display.has_windows:
             self._drop()
         else:
             self._retry_ns = self._clock.now_ns() + LOOK_NS

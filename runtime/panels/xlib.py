@@ -1,4 +1,4 @@
-"""The little of Xlib and RandR that GLFW does not offer: EDIDs by connector, and surviving X's errors.
+"""The little of Xlib and RandR that GLFW does not offer: EDIDs by connector, and what happens on X's errors.
 
 Bound by ctypes to libraries that GLFW needs anyway. By default Xlib ends the process on any error.
 """
@@ -8,14 +8,16 @@ from __future__ import annotations
 import ctypes
 import functools
 import logging
-from collections.abc import Callable
+import os
+import select
+import threading
 from ctypes import POINTER, byref, c_char_p, c_int, c_long, c_ubyte, c_ulong, c_ushort, c_void_p
 
 log = logging.getLogger("phasestack.panels")
 
 ErrorHandler = ctypes.CFUNCTYPE(c_int, c_void_p, c_void_p)
 IOErrorHandler = ctypes.CFUNCTYPE(c_int, c_void_p)
-ExitHandler = ctypes.CFUNCTYPE(None, c_void_p, c_void_p)
+SERVER_DIED = 75  # sysexits.h: a temporary failure, try again
 
 
 class _Resources(ctypes.Structure):
@@ -49,6 +51,7 @@ def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
     x11.XDefaultRootWindow.restype, x11.XDefaultRootWindow.argtypes = c_ulong, [c_void_p]
     x11.XInternAtom.restype, x11.XInternAtom.argtypes = c_ulong, [c_void_p, c_char_p, c_int]
     x11.XFree.argtypes = [c_void_p]
+    x11.XSetIOErrorHandler.restype, x11.XSetIOErrorHandler.argtypes = c_void_p, [IOErrorHandler]
     x11.XSetErrorHandler.restype, x11.XSetErrorHandler.argtypes = c_void_p, [ErrorHandler]
     randr.XRRGetScreenResourcesCurrent.restype = POINTER(_Resources)
     randr.XRRGetScreenResourcesCurrent.argtypes = [c_void_p, c_ulong]
@@ -68,36 +71,58 @@ def _note_error(_display: int, _event: int) -> int:
     return 0
 
 
-def _note_io_error(_display: int) -> int:
-    log.warning("the connection to the X server broke")
-    return 0
+def _end(_display: int = 0) -> int:
+    log.critical("the X server died: ending with exit status %d, to be started again", SERVER_DIED)
+    for handler in (*logging.getLogger("phasestack").handlers, *logging.getLogger().handlers):
+        handler.flush()
+    os._exit(SERVER_DIED)
 
 
 # Xlib keeps their addresses for the life of the process.
 _ERROR_HANDLER = ErrorHandler(_note_error)
-_IO_ERROR_HANDLER = IOErrorHandler(_note_io_error)
+_IO_ERROR_HANDLER = IOErrorHandler(_end)
 
 
-def survive_errors() -> None:
-    """From now on a refused X request (a monitor that vanished meanwhile) is logged; it does not end the process."""
-    _libraries()[0].XSetErrorHandler(_ERROR_HANDLER)
+def take_over_errors() -> None:
+    """From now on a refused X request (a monitor that vanished meanwhile) is logged, and no more.
 
-
-def survive_server(display: int, lost: Callable[[], None]) -> object:
-    """Call `lost` when this display's server dies, in place of exit(). Keep the answer as long as the display.
-
-    Answers None where libX11 is older than 1.7 and can't: then the process ends, and its supervisor restarts it.
+    The server's death ends the process, at once and with a line of its own: nothing that Xlib, EGL and GLFW hold
+    can be used or even released afterwards (they hang or crash, as tried), and it may come in the middle of a call.
     """
     x11 = _libraries()[0]
-    if not hasattr(x11, "XSetIOErrorExitHandler"):
-        return None
-
-    x11.XSetIOErrorHandler.argtypes = [IOErrorHandler]
+    x11.XSetErrorHandler(_ERROR_HANDLER)
     x11.XSetIOErrorHandler(_IO_ERROR_HANDLER)
-    handler = ExitHandler(lambda _display, _data: lost())
-    x11.XSetIOErrorExitHandler.argtypes = [c_void_p, ExitHandler, c_void_p]
-    x11.XSetIOErrorExitHandler(display, handler, None)
-    return handler
+
+
+class ServerWatch:
+    """Notices the server's death while the main thread is in a call that would never return.
+
+    Mesa's software renderer spins for ever in a swap whose connection broke, and Xlib never hears of it.
+    """
+
+    def __init__(self, display: int) -> None:
+        """`display` is an open Display pointer; stop watching before it is closed."""
+        x11 = _libraries()[0]
+        x11.XConnectionNumber.argtypes = [c_void_p]
+        self._connection: int = x11.XConnectionNumber(display)
+        self._stop_reading, self._stop_writing = os.pipe()
+        self._thread = threading.Thread(target=self._watch, name="x-server", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """The connection is about to be closed on purpose."""
+        os.write(self._stop_writing, b".")
+        self._thread.join()
+        os.close(self._stop_reading)
+        os.close(self._stop_writing)
+
+    def _watch(self) -> None:
+        poll = select.poll()
+        poll.register(self._connection, 0)  # hanging up is always told; what comes in is not our business
+        poll.register(self._stop_reading, select.POLLIN)
+        for file, _ in poll.poll():
+            if file == self._connection:
+                _end()
 
 
 def edids() -> dict[str, bytes]:
@@ -106,7 +131,7 @@ def edids() -> dict[str, bytes]:
         x11, randr = _libraries()
     except OSError:
         return {}
-    survive_errors()
+    take_over_errors()
     display = x11.XOpenDisplay(None)
     if not display:
         return {}

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+import time
+
 import numpy as np
 import pytest
 
@@ -12,6 +17,7 @@ from runtime.optics.stack import PanelStack
 from runtime.panels import window
 from runtime.panels.display import glfw
 from runtime.panels.registry import open_panels
+from runtime.panels.xlib import SERVER_DIED
 from runtime.records import LayerFrame
 from tests.panels import xserver
 from tests.panels.edids import block
@@ -190,24 +196,46 @@ def test_content_can_draw_in_its_own_context_between_two_frames(context, opened)
     assert context.error == "GL_NO_ERROR"
 
 
-def test_the_x_server_dies_and_returns_and_the_process_lives(tmp_path, monkeypatch, context):
+PRESENTING = """
+import numpy as np
+from runtime.clock import MonotonicClock
+from runtime.config import OutputSettings, PanelSettings
+from runtime.gl import offscreen_context
+from runtime.panels.registry import open_panels
+from runtime.records import LayerFrame
+from tests.panels.test_windows import STACK
+
+panels = tuple(PanelSettings(connector=f"DUMMY{index}") for index in range(3))
+sink = open_panels(OutputSettings(kind="windows", panels=panels), STACK, MonotonicClock(), offscreen_context())
+layers = np.zeros((3, STACK.height_px, STACK.width_px, 4), np.uint8)
+for number in range(100_000):
+    sink.present(LayerFrame(number, layers))
+    if number == 10:
+        print("presenting", flush=True)
+"""
+
+
+@pytest.mark.parametrize("attempt", range(3))
+def test_the_death_of_the_x_server_ends_the_process_at_once_with_a_reason(tmp_path, attempt):
+    """In the middle of whatever call it happens to be: hence several attempts."""
     if absent := xserver.missing():
         pytest.skip(f"no virtual monitors without {absent}")
     server = xserver.XServer(tmp_path)
-    monkeypatch.setenv("DISPLAY", server.name)
-    sink = open_panels(OutputSettings(kind="windows", panels=BY_CONNECTOR), STACK, MonotonicClock(), context)
-    assert presents(sink, 0)
-    server.stop()
-    with pytest.raises(PanelLost, match="X server"):
-        sink.present(frame(1))
-    assert not eventually(lambda: presents(sink, 2), within_s=1.0)
-    server = xserver.XServer(tmp_path, display=server.number)
+    process = subprocess.Popen(
+        [sys.executable, "-c", PRESENTING], env={**os.environ, "DISPLAY": server.name},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
     try:
-        assert eventually(lambda: presents(sink, 3))
-        assert shows(server, 2, picture(3, 0))
-    finally:
-        sink.close()
+        assert process.stdout.readline() == "presenting\n"
+        time.sleep(0.03 * attempt)
         server.stop()
+        _, errors = process.communicate(timeout=20)
+    finally:
+        process.kill()
+        server.stop()
+    assert process.returncode == SERVER_DIED
+    assert "the X server died" in errors
+    assert "Traceback" not in errors
 
 
 def test_the_cursor_is_hidden_and_windows_stay_when_focus_goes(opened):

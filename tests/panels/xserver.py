@@ -152,7 +152,7 @@ class XServer:
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGKILL)
         self._process.wait(timeout=10)
-        self._output.close()
+        self._output.close()  # harmless when stopped twice
 
 
 def eventually(holds: Callable[[], bool], *, within_s: float = 10.0) -> bool:
