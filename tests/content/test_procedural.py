@@ -136,7 +136,7 @@ def test_alpha_is_zero_exactly_where_only_the_background_shows(context: Any, sta
     empty = picture[..., 3] == 0
     assert 0.9 < empty.mean() < 0.99
     assert (picture[empty][:, :3] == [255, 128, 0]).all()
-    assert (picture[..., 3] == 255).mean() > 0.02
+    assert (picture[..., 3] == 255).mean() > 0.01
 
 
 @pytest.mark.parametrize("name", SCENES)
