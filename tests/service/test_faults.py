@@ -83,7 +83,6 @@ def test_a_model_that_raises_keeps_the_last_picture(rig, fault):
     rig.turn_until(TRACKING)
 
 
-@pytest.mark.xfail(reason="ModelSession.run does not look at what it answers", strict=False)
 def test_a_model_that_answers_nan_is_a_model_that_failed(rig):
     rig.turns(2)
     before = rig.loop.layers.copy()
@@ -258,7 +257,6 @@ def test_a_disk_that_fills_up_while_recording_loses_nothing_that_was_written(dis
     assert read > 0.5 * written
 
 
-@pytest.mark.xfail(reason="recording_to finishes the file once more after the disk was full", strict=False)
 def test_a_disk_that_fills_up_while_recording_is_told_in_one_line(disk_filled):
     path, result = disk_filled
     assert "Traceback" not in result.stderr
