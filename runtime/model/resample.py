@@ -97,7 +97,9 @@ def _resized(
     cv2.resize(image[sv : sv + rows, su : su + columns], None, dst=target, fx=fx, fy=fy, interpolation=flags)
     h, w = out.shape[:2]
     right, below = min(w, u0 + width), min(h, v0 + height)
-    for x0, y0, x1, y1 in ((first_u, first_v, right, v0), (first_u, v0, u0, below)):
+    # What lies before the middle of the first source pixel was repeated from it: draw that again.
+    u1, v1 = u0 + _repeated(matrix[0, 0], su), v0 + _repeated(matrix[1, 1], sv)
+    for x0, y0, x1, y1 in ((first_u, first_v, right, v1), (first_u, v1, u1, below)):
         if x1 > x0 and y1 > y0:
             _warped(image, matrix, out, x0, y0, x1, y1)
     out[:first_v] = outside
@@ -105,6 +107,11 @@ def _resized(
     out[first_v:below, :first_u] = outside
     out[first_v:below, right:] = outside
     return out
+
+
+def _repeated(scale: float, source: int) -> int:
+    """Result pixels at the beginning of a resized part that needed the source pixel before it."""
+    return max(0, int(np.ceil(0.5 / scale - 0.5 - WORST_PHASE))) if source > 0 else 0
 
 
 def _warped(image: Image, matrix: F64, out: Image, x0: int, y0: int, x1: int, y1: int) -> Image:

@@ -87,7 +87,7 @@ def _box(low_m: F64, high_m: F64, stack: PanelStack) -> Box:
 
 def _span(low: float, high: float, size: int) -> tuple[int, int]:
     first, last = max(0, floor(low * size) - PAD_PX), min(size, ceil(high * size) + PAD_PX)
-    first, last = first // ALIGN_PX * ALIGN_PX, min(size // ALIGN_PX * ALIGN_PX, -(-last // ALIGN_PX) * ALIGN_PX)
+    first, last = first // ALIGN_PX * ALIGN_PX, min(size, -(-last // ALIGN_PX) * ALIGN_PX)
     least = min(LEAST_PX, size)
     if last - first < least:
         first = min(max(0, (first + last - least) // 2), size - least)

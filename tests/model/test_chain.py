@@ -1,0 +1,76 @@
+"""The common raster of the chains, and the closed-form modes of their operator."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runtime.model.chain import chain_frame, chain_modes
+from runtime.optics.stack import PanelStack
+from runtime.optics.views import relative_scale_shift
+from tests.model.scenes import STACK, eyes
+
+
+def chain_operator(cells: int) -> np.ndarray:
+    """A written out: rows of [.. -2 2 ..]."""
+    return 2 * (np.eye(cells, cells + 1, k=1) - np.eye(cells, cells + 1))
+
+
+@given(st.integers(1, 300))
+def test_modes_are_the_singular_value_decomposition_of_the_chain_operator(cells: int) -> None:
+    v, s, ut = (part.astype(np.float64) for part in chain_modes(cells))
+    assert np.allclose(ut.T @ np.diag(s) @ v.T, chain_operator(cells), atol=1e-4)
+    assert np.allclose(v.T @ v, np.eye(cells), atol=1e-4)
+    assert np.allclose(ut @ ut.T, np.eye(cells), atol=1e-4)
+
+
+@given(
+    distance_m=st.floats(0.25, 3.0),
+    side_m=st.floats(-0.5, 0.5),
+    up_m=st.floats(-0.3, 0.3),
+    separation_m=st.floats(0.015, 0.07),
+    roll_deg=st.floats(-30, 30),
+)
+def test_both_outer_panels_are_seen_one_cell_beside_the_middle_view(
+    distance_m: float, side_m: float, up_m: float, separation_m: float, roll_deg: float
+) -> None:
+    pair = eyes(distance_m, side_m, up_m, separation_m=separation_m, roll_deg=roll_deg)
+    frame = chain_frame(pair, STACK, cell_px=4, reduction=2)
+    raster_from_plane = np.linalg.inv(frame.plane_from_raster)
+    somewhere = frame.plane_from_raster @ np.array([frame.width_px / 3, frame.rows / 2, 1.0])
+    for x_m, sign in ((STACK.x_m[0], 1), (STACK.x_m[2], -1)):
+        on_panel = {}
+        for name, eye in (("left", pair[0]), ("right", pair[1]), ("middle", frame.middle_m)):
+            scale, shift = relative_scale_shift(eye, from_x_m=frame.x_m, to_x_m=x_m)
+            on_panel[name] = somewhere[:2] * scale + shift
+        scale, shift = relative_scale_shift(frame.middle_m, from_x_m=frame.x_m, to_x_m=x_m)
+        for name, direction in (("left", -1), ("right", 1)):
+            aligned = (on_panel[name] - shift) / scale
+            moved = raster_from_plane @ np.append(aligned, 1.0) - raster_from_plane @ somewhere
+            # Beyond the plane a ray from the right eye goes on to the left.
+            assert moved[0] == pytest.approx(-direction * sign * frame.cell_px, rel=1e-6)
+            assert moved[1] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_raster_covers_what_is_seen_of_all_panels() -> None:
+    frame = chain_frame(eyes(0.6), STACK, cell_px=4, reduction=2)
+    corners = frame.plane_from_raster @ np.array([[0, frame.width_px], [0, frame.rows], [1, 1]])
+    # The rear panel is the smallest as seen on the plane between.
+    scale, _ = relative_scale_shift(frame.middle_m, from_x_m=STACK.x_m[0], to_x_m=frame.x_m)
+    assert corners[0].min() <= -STACK.width_m / 2 * scale
+    assert corners[0].max() >= STACK.width_m / 2 * scale
+    assert corners[1].max() >= STACK.height_m / 2 * scale
+
+
+def test_eyes_above_each_other_have_no_row_to_solve_along() -> None:
+    upright = np.array([[0.6, 0.0, -0.03], [0.6, 0.0, 0.03]])
+    with pytest.raises(ValueError, match="vertical"):
+        chain_frame(upright, STACK, cell_px=4, reduction=2)
+
+
+def test_a_far_viewer_of_a_thin_stack_meets_the_limit_of_cells_not_of_memory() -> None:
+    thin = PanelStack(0.5184, 0.2916, (-0.0005, 0.0, 0.0005), 1920, 1080)
+    frame = chain_frame(eyes(10.0), thin, cell_px=4, reduction=2)
+    assert frame.cells <= 1024

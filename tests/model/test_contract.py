@@ -1,0 +1,78 @@
+"""A model file is refused in one clear line where its contract is missing, unknown or does not fit."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import onnx
+import pytest
+
+from runtime.config import ModelSettings
+from runtime.errors import InputError, MissingPart
+from runtime.model.contract import METADATA_KEY, parse_contract
+from runtime.model.predictor import SHIPPED, load_predictor, model_path
+from runtime.optics.stack import PanelStack
+from tests.model.scenes import STACK
+
+
+def contract_of(name: str) -> dict[str, object]:
+    model = onnx.load(str(model_path(name)))
+    return json.loads({entry.key: entry.value for entry in model.metadata_props}[METADATA_KEY])
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_models_keep_their_contract_and_are_small(name: str) -> None:
+    contract = parse_contract({METADATA_KEY: json.dumps(contract_of(name))}, source=name)
+    assert contract.name == name
+    path = model_path(name)
+    assert path is not None
+    assert path.stat().st_size < 4 * 2**20
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"version": 2}, "version"),
+        ({"input_frame": "eye"}, "input_frame"),
+        ({"surprise": 1}, "surprise"),
+        ({"panels": "three"}, "panels"),
+        ({"value_range": [0, "x"]}, "value_range"),
+    ],
+)
+def test_a_contract_that_does_not_fit_is_refused_by_field(change: dict[str, object], field: str) -> None:
+    with pytest.raises(InputError, match=field):
+        parse_contract({METADATA_KEY: json.dumps(contract_of("fast") | change)}, source="m.onnx")
+
+
+@pytest.mark.parametrize("text", [None, "{", "[1]"])
+def test_a_missing_or_malformed_contract_is_refused(text: str | None) -> None:
+    with pytest.raises(InputError, match=METADATA_KEY):
+        parse_contract({} if text is None else {METADATA_KEY: text}, source="m.onnx")
+
+
+def rewritten(tmp_path: Path, change: dict[str, object]) -> Path:
+    model = onnx.load(str(model_path("fast")))
+    for entry in model.metadata_props:
+        if entry.key == METADATA_KEY:
+            entry.value = json.dumps(contract_of("fast") | change)
+    path = tmp_path / "changed.onnx"
+    onnx.save(model, str(path))
+    return path
+
+
+def test_a_model_for_other_panels_is_refused(tmp_path: Path) -> None:
+    path = rewritten(tmp_path, {"panels": 4})
+    with pytest.raises(InputError, match="panels"):
+        load_predictor(str(path), STACK)
+
+
+def test_a_named_file_never_quietly_becomes_another_solver(tmp_path: Path) -> None:
+    uneven = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.03), 480, 270)
+    with pytest.raises(InputError, match="evenly"):
+        load_predictor(str(rewritten(tmp_path, {})), uneven)
+
+
+def test_a_provider_that_is_not_installed_names_its_package() -> None:
+    with pytest.raises(MissingPart, match="onnxruntime-gpu"):
+        load_predictor("fast", STACK, ModelSettings(provider="cuda"))

@@ -1,0 +1,119 @@
+"""Models end to end: what the eyes see, whatever the pose and the stack."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from runtime.config import ModelSettings
+from runtime.errors import ModelFailure
+from runtime.model.predictor import load_predictor
+from runtime.model.sart import SartPredictor
+from runtime.model.still import solve_still
+from runtime.model.visible import visible_boxes
+from runtime.optics.retina import panel_positions
+from runtime.optics.stack import PanelStack
+from tests.model.scenes import FOV_DEG, STACK, card_scene, displayed, eyes
+
+POSES = {
+    "in front": eyes(0.6),
+    "near": eyes(0.3),
+    "far": eyes(2.0),
+    "aside": eyes(0.5, 0.6),
+    "above": eyes(0.6, 0.1, 0.35),
+    "head tilted": eyes(0.6, 0.05, 0.1, roll_deg=20),
+    "head turned": np.array([[0.56, -0.028, 0.0], [0.59, 0.025, 0.0]]),
+    "narrow eyes": eyes(0.6, separation_m=0.015),
+}
+
+
+def solved(name: str, pair: np.ndarray, stack: PanelStack = STACK) -> np.ndarray:
+    size = {"width_px": stack.width_px, "height_px": stack.height_px}
+    pictures = [card_scene(eye, **size) for eye in pair]
+    predictor = load_predictor(name, stack, ModelSettings(threads=1))
+    try:
+        return solve_still(*pictures, eyes_m=pair, fov_deg=FOV_DEG, predictor=predictor).layers.copy()
+    finally:
+        predictor.close()
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_balanced_shows_both_eyes_what_three_sweeps_of_sart_do_or_better(pose: str) -> None:
+    pair = POSES[pose]
+    pictures = [card_scene(eye) for eye in pair]
+    reference = SartPredictor(STACK, iterations=3)
+    theirs = displayed(solve_still(*pictures, eyes_m=pair, fov_deg=FOV_DEG, predictor=reference).layers, pair, STACK)
+    ours = displayed(solved("balanced", pair), pair, STACK)
+    assert ours.psnr_db >= theirs.psnr_db - 0.3
+    assert abs(ours.eye_psnr_db[0] - ours.eye_psnr_db[1]) < 3.0
+
+
+@pytest.mark.parametrize("pose", ["in front", "aside", "head tilted"])
+def test_larger_models_show_more(pose: str) -> None:
+    fast, balanced, best = (displayed(solved(name, POSES[pose]), POSES[pose], STACK).psnr_db for name in
+                            ("fast", "balanced", "best"))  # fmt: skip
+    assert fast < balanced < best
+
+
+@pytest.mark.parametrize("gap_m", [0.005, 0.03, 0.15])
+def test_any_even_spacing_is_served(gap_m: float) -> None:
+    stack = PanelStack(0.5184, 0.2916, (-gap_m, 0.0, gap_m), 480, 270)
+    shown = displayed(solved("balanced", eyes(0.7), stack), eyes(0.7), stack)
+    assert shown.psnr_db > 20
+
+
+@pytest.mark.parametrize("x_m", [(-0.03, 0.03), (-0.08, 0.0, 0.03), (-0.09, -0.03, 0.03, 0.09)])
+def test_other_stacks_are_served_by_sart_and_the_name_says_so(x_m: tuple[float, ...]) -> None:
+    stack = PanelStack(0.5184, 0.2916, x_m, 240, 135)
+    predictor = load_predictor("balanced", stack)
+    assert predictor.name.startswith("sart (instead of balanced")
+    layers = solved("balanced", eyes(0.6), stack)
+    assert layers.shape == (len(x_m), 135, 240, 4)
+    assert displayed(layers, eyes(0.6), stack).psnr_db > 18
+
+
+def test_equal_pictures_on_the_centre_panel_leave_the_outer_panels_even() -> None:
+    predictor = load_predictor("balanced", STACK, ModelSettings(threads=1))
+    picture = np.full((270, 480, 4), 255, np.uint8)
+    picture[..., :3] = np.random.default_rng(0).integers(0, 255, (270, 480, 3))
+    layers = predictor.predict([[picture], [picture]], eyes(0.6)).layers
+    assert np.abs(layers[[0, 2], ..., :3].astype(int) - 128).max() <= 1
+
+
+def test_a_second_prediction_of_the_same_is_the_same() -> None:
+    assert (solved("balanced", POSES["aside"]) == solved("balanced", POSES["aside"])).all()
+
+
+def test_what_was_seen_before_does_not_leak_into_the_next_frame() -> None:
+    predictor = load_predictor("balanced", STACK, ModelSettings(threads=1))
+    first = [card_scene(eye) for eye in POSES["aside"]]
+    solve_still(*first, eyes_m=POSES["aside"], fov_deg=FOV_DEG, predictor=predictor)
+    pair = POSES["in front"]
+    again = solve_still(*(card_scene(eye) for eye in pair), eyes_m=pair, fov_deg=FOV_DEG, predictor=predictor)
+    assert (again.layers == solved("balanced", pair)).all()
+
+
+def test_eyes_above_each_other_are_a_model_failure_not_a_crash() -> None:
+    predictor = load_predictor("fast", STACK)
+    grey = np.full((270, 480, 4), 128, np.uint8)
+    with pytest.raises(ModelFailure):
+        predictor.predict([[grey], [grey]], np.array([[0.6, 0.0, -0.03], [0.6, 0.0, 0.03]]))
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_every_pixel_on_a_ray_through_all_panels_is_solved(pose: str) -> None:
+    pair = POSES[pose]
+    boxes = visible_boxes(pair, STACK)
+    for eye in pair:
+        positions = [
+            panel_positions(eye, STACK, index=n, width_px=480, height_px=270, fov_deg=70) for n in range(STACK.count)
+        ]
+        through = np.ones((270, 480), bool)
+        for u, v in positions:
+            through &= (u > 0.5) & (u < 479.5) & (v > 0.5) & (v < 269.5)
+        for box, (u, v) in zip(boxes, positions, strict=True):
+            if through.any():
+                assert box.u0 <= u[through].min() - 0.5
+                assert box.u1 >= u[through].max() + 0.5
+                assert box.v0 <= v[through].min() - 0.5
+                assert box.v1 >= v[through].max() + 0.5

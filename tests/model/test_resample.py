@@ -1,0 +1,53 @@
+"""Fast resampling against exact bilinear samples."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from runtime.model.resample import WORST_PHASE, buffer, resample
+from runtime.optics.retina import sample_bilinear
+
+HEIGHT, WIDTH = 96, 128
+
+
+def smooth(seed: int) -> np.ndarray:
+    """A picture of low frequencies, so that a shift by part of a pixel has a known effect."""
+    v, u = np.mgrid[0:HEIGHT, 0:WIDTH]
+    phase = np.random.default_rng(seed).uniform(0, 6.28, (2, 3))
+    waves = np.sin(u[..., None] / 7 + phase[0]) + np.sin(v[..., None] / 9 + phase[1])
+    return np.rint(1000 * waves).astype(np.int16)
+
+
+@settings(max_examples=60)
+@given(
+    scale=st.floats(0.5, 2.0),
+    shift_u=st.floats(-60, 60),
+    shift_v=st.floats(-60, 60),
+    shear=st.sampled_from([0.0, 0.0, 0.03, -0.2]),
+    seed=st.integers(0, 5),
+)
+def test_samples_are_where_the_matrix_says(
+    scale: float, shift_u: float, shift_v: float, shear: float, seed: int
+) -> None:
+    image = smooth(seed)
+    matrix = np.array([[scale, 0.0, shift_u], [shear, scale, shift_v], [0.0, 0.0, 1.0]])
+    out = buffer(HEIGHT, WIDTH)
+    result = resample(image, image_from_result=matrix, out=out)
+    v, u = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+    su, sv = scale * u + shift_u, shear * u + scale * v + shift_v
+    exact = sample_bilinear(image.astype(np.float32), u=su.astype(np.float32), v=sv.astype(np.float32))
+    inside = (su > 1) & (su < WIDTH - 1) & (sv > 1) & (sv < HEIGHT - 1)
+    # The steepest slope of the picture is 1000/7 + 1000/9 a pixel.
+    tolerance = (WORST_PHASE + 1 / 32) * 254 * 1.5 + 2
+    assert np.abs(result - exact)[inside].max(initial=0.0) <= tolerance
+
+
+def test_beside_the_image_stands_the_given_value() -> None:
+    out = buffer(HEIGHT, WIDTH)
+    matrix = np.array([[1.0, 0.0, -40.0], [0.0, 1.0, -30.0], [0.0, 0.0, 1.0]])
+    result = resample(smooth(0), image_from_result=matrix, out=out, outside=77)
+    assert (result[:30] == 77).all()
+    assert (result[:, :40] == 77).all()
+    assert (result[30:, 40:] == smooth(0)[: HEIGHT - 30, : WIDTH - 40]).all()
