@@ -1,0 +1,122 @@
+"""Checkpoints: read with weights only (no code of the file is run), written whole or not at all."""
+
+from __future__ import annotations
+
+import io
+import pickle
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from model_export.eyereal import EyeRealNet
+from model_export.network import SpectralSolver
+from model_export.recipe import Recipe
+from runtime.artifacts import write_bytes
+from runtime.config import validated
+from runtime.errors import InputError
+
+WIDTH_KEY = "subnets.in_conv.0.weight"
+FAMILIES = {"subnets.": "eyereal", "lambda_net.": "spectral"}
+
+
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """The table that a checkpoint holds; it has at least `model`, a table of tensors. Raises InputError."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(path, "", f"cannot be read ({error.strerror})") from None
+    try:
+        table = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError, OSError, TypeError) as error:
+        raise InputError(path, "", f"is no checkpoint of plain weights ({_first_line(error)})") from None
+    state = table.get("model") if isinstance(table, dict) else None
+    if not isinstance(state, Mapping) or not state or not all(isinstance(v, Tensor) for v in state.values()):
+        raise InputError(path, "model", 'missing: a checkpoint is {"model": state_dict}')
+    return table
+
+
+def load_eyereal(path: Path) -> EyeRealNet:
+    """The published network with a checkpoint's weights; its width is the checkpoint's. Raises InputError."""
+    state = load_checkpoint(path)["model"]
+    first = state.get(WIDTH_KEY)
+    if first is None or first.ndim != 4:
+        _refuse_family(state, path, wanted="eyereal")
+        raise InputError(path, WIDTH_KEY, "missing")
+    width = int(first.shape[0])
+    if not 1 <= width <= 256:
+        raise InputError(path, WIDTH_KEY, f"{width} channels are not a width of this network")
+    net = EyeRealNet(width)
+    fill(net, state, source=path, arch="eyereal")
+    return net.eval()
+
+
+def load_spectral(path: Path, *, name: str) -> tuple[SpectralSolver, Recipe]:
+    """A trained model and the recipe that it was trained by. Raises InputError, also where it is another model."""
+    table = load_checkpoint(path)
+    _refuse_family(table["model"], path, wanted="spectral")
+    if not isinstance(table.get("recipe"), dict):
+        raise InputError(path, "recipe", "missing: not a checkpoint of phasestack train")
+    recipe = validated(Recipe, table["recipe"], source=f"{path}: recipe")
+    if recipe.name != name:
+        raise InputError(path, "recipe.name", f"is a checkpoint of {recipe.name}, not of {name}")
+    net = SpectralSolver(recipe.hidden)
+    fill(net, table["model"], source=path, arch=name)
+    return net.eval(), recipe.model_copy(update={"weights": plain_weights(net)})
+
+
+def solver_of(recipe: Recipe, *, source: str) -> SpectralSolver:
+    """The network with a recipe's own weights, or the analytic start. Raises InputError."""
+    torch.manual_seed(recipe.training.seed)
+    net = SpectralSolver(recipe.hidden)
+    if recipe.weights is not None:
+        try:
+            state = {key: torch.tensor(value, dtype=torch.float32) for key, value in recipe.weights.items()}
+        except (TypeError, ValueError):
+            raise InputError(source, "weights", "must be tables of numbers") from None
+        fill(net, state, source=source, arch=recipe.name)
+    return net.eval()
+
+
+def plain_weights(net: nn.Module) -> dict[str, Any]:
+    """A state_dict as nested lists; float32 survives the way through JSON."""
+    return {key: value.detach().cpu().tolist() for key, value in net.state_dict().items()}
+
+
+def fill(net: nn.Module, state: Mapping[str, Tensor], *, source: str | Path, arch: str) -> None:
+    """Load weights, all of them and no others. Raises InputError, naming the first that is amiss."""
+    wanted = net.state_dict()
+    missing = [key for key in wanted if key not in state]
+    # Old checkpoints lack this counter, which plays no part in inference.
+    missing = [key for key in missing if not key.endswith("num_batches_tracked")]
+    surplus = [key for key in state if key not in wanted]
+    if missing or surplus:
+        problem = [f"{len(missing)} keys of {arch} are missing"] if missing else []
+        problem += [f"{len(surplus)} keys are not of {arch}"] if surplus else []
+        raise InputError(source, (missing or surplus)[0], "; ".join(problem))
+    for key, value in state.items():
+        if value.shape != wanted[key].shape:
+            shapes = f"{tuple(value.shape)}, but {arch} has {tuple(wanted[key].shape)}"
+            raise InputError(source, key, shapes)
+        if not torch.isfinite(value).all():
+            raise InputError(source, key, "holds numbers that are not finite")
+    net.load_state_dict({**wanted, **state})
+
+
+def save_checkpoint(path: Path, table: dict[str, Any]) -> None:
+    """Write a checkpoint atomically; everything in it survives a reading with weights only."""
+    buffer = io.BytesIO()
+    torch.save(table, buffer)
+    write_bytes(path, buffer.getvalue())
+
+
+def _refuse_family(state: Mapping[str, Tensor], path: Path, *, wanted: str) -> None:
+    for prefix, family in FAMILIES.items():
+        if family != wanted and any(key.startswith(prefix) for key in state):
+            raise InputError(path, "model", f"is a checkpoint of {family}, not of {wanted}")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:120]

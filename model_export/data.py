@@ -1,0 +1,132 @@
+"""Endless procedural pairs: poses over the whole design range, scenes of planes, views beside the eyes drawn anew."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from model_export.scene import Scene, draw, random_scene
+from model_export.textures import Random
+from runtime.optics.stack import PanelStack
+from runtime.optics.views import stack_from_eye
+from runtime.records import F64, U8
+
+PITCH_WIDTH_M = 0.5184  # of the prototype's panels
+CENTRE = 1
+LEAST_COMMON = 0.4  # of the centre panel's width that both eyes must see through all panels
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """An eye's place beside (or at) the nominal one, and what it should see on the centre panel's raster."""
+
+    side: int  # 0 left, 1 right
+    eye_m: F64  # (3,) frame `stack`
+    image: U8  # (h, w, 3)
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingPair:
+    """Two pictures, and the same scene from beside the eyes."""
+
+    stack: PanelStack
+    eyes_m: F64  # (2, 3) left, right; frame `stack`
+    images: tuple[U8, U8]  # (h, w, 3) on the centre panel's raster
+    tolerance_mm: float
+    off: tuple[Place, ...] = ()
+
+
+def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack:
+    """Three even panels: the prototype's, whole at a coarser raster or a piece of them, or of another size."""
+    width_m = PITCH_WIDTH_M * math.exp(random.uniform(math.log(0.25), math.log(1.6)))
+    gap_m = math.exp(random.uniform(math.log(0.005), math.log(0.5)))
+    if random.random() < 0.6:  # what people build
+        gap_m = random.uniform(0.01, 0.12)
+    return PanelStack(width_m, width_m * height_px / width_px, (-gap_m, 0.0, gap_m), width_px, height_px)
+
+
+def random_eyes(random: Random, stack: PanelStack) -> F64:
+    """(2, 3) eyes: 0.1 to 4 m from the centre, at least 0.1 m before the front; head rolled and turned."""
+    front_m = stack.x_m[-1]
+    distance_m = math.exp(random.uniform(math.log(0.1 + front_m), math.log(4.0)))
+    if random.random() < 0.5:
+        distance_m = random.uniform(0.35, 1.5) + front_m
+    angle = math.radians(70) * random.uniform(-1, 1) * random.random()
+    rise = math.radians(35) * random.uniform(-1, 1) * random.random()
+    middle = distance_m * np.array([math.cos(angle) * math.cos(rise), math.sin(angle) * math.cos(rise), math.sin(rise)])
+    middle[0] = max(middle[0], front_m + 0.1)
+    separation_m = random.uniform(0.055, 0.070) if random.random() < 0.85 else random.uniform(0.015, 0.055)
+    pose = stack_from_eye(middle)[:3, :3]
+    roll = math.radians(20) * random.uniform(-1, 1) * random.random()
+    turn = math.radians(30) * random.uniform(-1, 1) * random.random()
+    right = pose @ np.array([math.cos(roll) * math.cos(turn), math.sin(roll) * math.cos(turn), math.sin(turn)])
+    eyes = np.array([middle - right * separation_m / 2, middle + right * separation_m / 2])
+    eyes[:, 0] = np.maximum(eyes[:, 0], front_m + 0.09)
+    return eyes
+
+
+def is_served(eyes_m: F64, stack: PanelStack) -> bool:
+    """True where both eyes see enough of the display through all panels for a pair to teach something."""
+    for eye in eyes_m:
+        edges = []
+        for x_m in stack.x_m:
+            t = (x_m - stack.x_m[CENTRE]) / (eye[0] - stack.x_m[CENTRE])
+            for half, axis in ((stack.width_m / 2, 1), (stack.height_m / 2, 2)):
+                edges.append((axis, (-half - eye[axis] * t) / (1 - t), (half - eye[axis] * t) / (1 - t)))
+        for axis, size_m in ((1, stack.width_m), (2, stack.height_m)):
+            low = max(edge[1] for edge in edges if edge[0] == axis)
+            high = min(edge[2] for edge in edges if edge[0] == axis)
+            if high - low < LEAST_COMMON * size_m:
+                return False
+    return True
+
+
+def beside(random: Random, eye_m: F64, mm: float) -> F64:
+    """A place in a random direction across the gaze."""
+    pose = stack_from_eye(eye_m)
+    angle = random.uniform(0, 2 * math.pi)
+    return np.asarray(eye_m + mm / 1000 * (math.cos(angle) * pose[:3, 0] + math.sin(angle) * pose[:3, 1]))
+
+
+def views(
+    scene: Scene, eyes_m: F64, stack: PanelStack, *, tolerance_mm: float, random: Random, off_each: int = 1
+) -> TrainingPair:
+    """A scene from both eyes and, where there is a tolerance, from `off_each` places so far beside each."""
+    raster = stack.panel(CENTRE)
+    left, right = (draw(scene, eye, raster) for eye in eyes_m)
+    off = []
+    if tolerance_mm > 0:
+        for side in (0, 1):
+            for _ in range(off_each):
+                place = beside(random, eyes_m[side], tolerance_mm)
+                off.append(Place(side, place, draw(scene, place, raster)))
+    return TrainingPair(stack, eyes_m, (left, right), tolerance_mm, tuple(off))
+
+
+def random_pair(
+    random: Random, *, width_px: int, height_px: int, tolerance_mm: tuple[float, float] = (0.0, 4.0)
+) -> TrainingPair:
+    """One pair of the endless stream. A quarter of them has no tolerance at all: exact eyes."""
+    while True:
+        stack = random_stack(random, width_px=width_px, height_px=height_px)
+        eyes = random_eyes(random, stack)
+        if is_served(eyes, stack):
+            break
+    scene = random_scene(random, stack, eyes.mean(axis=0))
+    low, high = tolerance_mm
+    tolerance = low if random.random() < 0.25 else random.uniform(low, high)
+    return views(scene, eyes, stack, tolerance_mm=tolerance, random=random)
+
+
+def endless_pairs(
+    seed: int, *, first: int = 0, step: int = 1, width_px: int, height_px: int, tolerance_mm: tuple[float, float]
+) -> Iterator[TrainingPair]:
+    """Pairs number `first`, `first + step`, ..: each is made from (seed, number) alone, so any can be resumed at."""
+    number = first
+    while True:
+        random = np.random.default_rng([seed, number])
+        yield random_pair(random, width_px=width_px, height_px=height_px, tolerance_mm=tolerance_mm)
+        number += step

@@ -1,0 +1,80 @@
+"""The published network (EyeReal's U-Net), exactly, so that its checkpoints import by their own keys."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+OFFSET = 0.2  # the published code shows sigmoid(y) - 0.2, clipped at the panel
+INPUT, OUTPUT = "eyes", "panels"
+LEAST_PX = 32  # five halvings
+
+
+def _block(channels: int, middle: int, out: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(channels, middle, 3, padding=1, bias=False),
+        nn.BatchNorm2d(middle),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(middle, out, 3, padding=1, bias=False),
+        nn.BatchNorm2d(out),
+        nn.ReLU(inplace=True),
+    )
+
+
+class Up(nn.Module):
+    """Twice the size (aligned corners), padded to the skip's, beside it, and a block."""
+
+    def __init__(self, channels: int, out: int) -> None:
+        super().__init__()
+        self.conv = _block(channels, channels // 2, out)
+
+    def forward(self, deep: Tensor, skip: Tensor) -> Tensor:
+        """(n, a, h, w) and (n, b, H, W) -> (n, out, H, W)."""
+        up = functional.interpolate(deep, scale_factor=2, mode="bilinear", align_corners=True)
+        rows, columns = skip.shape[2] - up.shape[2], skip.shape[3] - up.shape[3]
+        up = functional.pad(up, [columns // 2, columns - columns // 2, rows // 2, rows - rows // 2])
+        return self.conv(torch.cat([skip, up], dim=1))
+
+
+class UNet(nn.Module):
+    """The published `subnets`: 17,303,721 parameters at width 32, 4,329,561 at width 16."""
+
+    def __init__(self, width: int = 32, channels: int = 18, out: int = 9) -> None:
+        super().__init__()
+        w = width
+        self.in_conv = _block(channels, w, w)
+        self.down1, self.down2, self.down3, self.down4, self.down5 = (
+            nn.Sequential(nn.MaxPool2d(2), _block(a, b, b))
+            for a, b in ((w, 2 * w), (2 * w, 4 * w), (4 * w, 8 * w), (8 * w, 16 * w), (16 * w, 16 * w))
+        )
+        self.up1, self.up2, self.up3, self.up4, self.up5 = (
+            Up(a, b) for a, b in ((32 * w, 8 * w), (16 * w, 4 * w), (8 * w, 2 * w), (4 * w, w), (2 * w, w))
+        )
+        self.out_conv = nn.Sequential(nn.Conv2d(w, out, 1))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(n, 18, h, w) intensities -> (n, 9, h, w), before the sigmoid."""
+        skips = [self.in_conv(x)]
+        for down in (self.down1, self.down2, self.down3, self.down4, self.down5):
+            skips.append(down(skips[-1]))
+        y = skips.pop()
+        for up in (self.up1, self.up2, self.up3, self.up4, self.up5):
+            y = up(y, skips.pop())
+        return self.out_conv(y)
+
+
+class EyeRealNet(nn.Module):
+    """Eyes' pictures on every panel's pixels to panel values.
+
+    Channels in: panel-major, then eye, then RGB, intensities in [0, 1]. Out: panel-major, then RGB; in
+    [-0.2, 0.8], as published: the panel clips what is negative.
+    """
+
+    def __init__(self, width: int = 32) -> None:
+        super().__init__()
+        self.subnets = UNet(width)
+
+    def forward(self, eyes: Tensor) -> Tensor:
+        """(1, 18, h, w) -> (1, 9, h, w)."""
+        return torch.sigmoid(self.subnets(eyes)) - OFFSET

@@ -1,0 +1,92 @@
+"""Recipes: how a model is made, and what its training found. One small JSON file each."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from runtime.config import Section, validated
+from runtime.errors import InputError
+from runtime.model.contract import Step, TrainedFor
+from runtime.model.predictor import SHIPPED
+
+RECIPES = Path(__file__).parent / "recipes"
+DESIGN_RANGE = TrainedFor(
+    distance_m=(0.1, 4.0), off_axis_deg=(0.0, 70.0), separation_m=(0.015, 0.07), spacing_m=(0.005, 0.5)
+)
+
+
+class Training(Section):
+    """What `phasestack train` does with a recipe."""
+
+    iterations: Annotated[int, Field(ge=1)] = 400
+    learning_rate: Annotated[float, Field(gt=0)] = 0.02
+    seed: Annotated[int, Field(ge=0)] = 1
+    width_px: Annotated[int, Field(ge=64)] = Field(480, description="raster of the training pairs")
+    height_px: Annotated[int, Field(ge=64)] = 270
+    tolerance_mm: tuple[float, float] = Field((0.0, 4.0), description="range of the tolerances that are drawn")
+    validate_every: Annotated[int, Field(ge=1)] = 50
+    validation_pairs: Annotated[int, Field(ge=1)] = 12
+    learn_steps: bool = Field(True, description="also the sizes of the correction steps")
+
+
+class Recipe(Section):
+    """A model of the spectral family: its unrolled steps, its training, and the weights that came of it."""
+
+    name: str
+    arch: Literal["spectral"] = "spectral"
+    hidden: Annotated[int, Field(ge=1, le=256)] = 16
+    cell_px: Annotated[int, Field(ge=1, le=64)] = 4
+    reduction: Literal[1, 2, 4] = 2
+    steps: Annotated[tuple[Step, ...], Field(min_length=1)]
+    training: Training = Training()
+    weights: dict[str, Any] | None = Field(None, description="state_dict as nested lists; none: the analytic start")
+
+    def canonical(self) -> bytes:
+        """The same bytes for the same recipe."""
+        return json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":")).encode()
+
+    def sha256(self) -> str:
+        """Of the recipe with its weights: what the contract carries."""
+        return hashlib.sha256(self.canonical()).hexdigest()
+
+    def text(self) -> str:
+        """As a file holds it."""
+        table = self.model_dump(mode="json", exclude_none=True)
+        weights = table.pop("weights", None)
+        text = json.dumps(table, indent=1)
+        if weights is None:
+            return text + "\n"
+        lines = ",\n".join(f'  "{key}": {json.dumps(value)}' for key, value in weights.items())
+        return f'{text[:-2]},\n "weights": {{\n{lines}\n }}\n}}\n'
+
+
+def recipe_path(name: str) -> Path:
+    """The file of a shipped recipe, or of a path. Raises InputError for neither."""
+    if name in SHIPPED:
+        return RECIPES / f"{name}.json"
+    path = Path(name)
+    if path.suffix != ".json":
+        raise InputError("recipe", "", f"{name!r} is neither {', '.join(SHIPPED)} nor a JSON file")
+    return path
+
+
+def read_recipe(name: str) -> Recipe:
+    """A recipe by name or file. Raises InputError."""
+    path = recipe_path(name)
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(path, "", f"cannot be read ({error.strerror})") from None
+    except ValueError as error:
+        raise InputError(path, "", f"malformed: {error}") from None
+    if not isinstance(table, dict):
+        raise InputError(path, "", "must be one JSON object")
+    recipe = validated(Recipe, table, source=path)
+    if recipe.steps[0].kind != "chain":
+        raise InputError(path, "steps", "must begin with a chain step")
+    return recipe

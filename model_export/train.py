@@ -1,0 +1,225 @@
+"""`phasestack train`: the network's weights and the sizes of its steps, by what the eyes see."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from model_export.checkpoint import fill, load_checkpoint, plain_weights, save_checkpoint, solver_of
+from model_export.curves import Point, write_curves
+from model_export.data import TrainingPair, endless_pairs
+from model_export.distributed import World, together
+from model_export.folders import folder_pairs, mixed
+from model_export.recipe import Recipe, Training, read_recipe
+from model_export.unroll import UnrolledSolver, displayed_mse
+from runtime.artifacts import write_text
+from runtime.config import validated
+from runtime.errors import InputError
+from runtime.report.progress import progress_bar
+
+HELD_OUT_SEED = 9_000_001  # of the validation pairs: no training seed reaches it
+PAIRS_A_STEP = 2
+FLOOR = 1e-6  # of the squared error in the loss: beyond 60 dB nothing is gained
+GRADIENT_MAX = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class TrainRequest:
+    """The command line of `train`."""
+
+    out: Path
+    recipe: str
+    data: tuple[Path, ...]
+    scene: str
+    iterations: int | None
+    seed: int | None
+    device: str
+    threads: int
+    resume: bool
+
+
+def run_training(request: TrainRequest) -> dict[str, Any] | None:
+    """Train, write checkpoint, recipe and curves; None in all but the first process. Raises InputError."""
+    recipe = _asked(read_recipe(request.recipe), request)
+    torch.set_num_threads(request.threads)
+    with together(request.device) as world:
+        device = world.device
+        model = UnrolledSolver(solver_of(recipe, source=request.recipe), recipe).to(device)
+        training = recipe.training
+        optimiser = torch.optim.Adam(_groups(model, training.learning_rate))
+        size = {"width_px": training.width_px, "height_px": training.height_px}
+        own = folder_pairs(request.data, scene=request.scene, **size)
+        held_out = held_out_pairs(training.validation_pairs, **size)
+        path = request.out / "checkpoint.pth"
+        first, points, before_s = _resumed(path, model, optimiser, recipe) if request.resume else (0, [], 0.0)
+        start = time.monotonic()
+        if not points:
+            points = [Point(0, math.nan, *validate(model, held_out))]
+        stream = mixed(_share(training, first, world), own)
+        losses: list[float] = []
+        with progress_bar(f"training {recipe.name}") as progress:
+            for iteration in range(first, training.iterations):
+                for group in optimiser.param_groups:
+                    group["lr"] = group["base"] * _annealed(iteration / training.iterations)
+                losses.append(_step(model, optimiser, stream, world))
+                done = iteration + 1
+                progress(done, training.iterations)
+                if done % training.validate_every == 0 or done == training.iterations:
+                    points.append(Point(done, float(np.mean(losses)), *validate(model, held_out)))
+                    losses = []
+                    if world.rank == 0:
+                        seconds = before_s + time.monotonic() - start
+                        _save(request.out, model, optimiser, recipe, done, points, seconds)
+        if world.rank != 0:
+            return None
+        seconds = before_s + time.monotonic() - start
+        last = points[-1]
+        return {
+            "name": recipe.name,
+            "iterations": last.iteration,
+            "seconds": round(seconds, 1),
+            "start_db": round(points[0].exact_db, 3),
+            "held_out_db": round(last.exact_db, 3),
+            "start_off_db": round(points[0].off_db, 3),
+            "held_out_off_db": round(last.off_db, 3),
+            "checkpoint": str(path),
+        }
+
+
+def pair_loss(model: UnrolledSolver, pair: TrainingPair) -> Tensor:
+    """Displayed error in dB over the eyes and, with equal weight, over the places `tolerance_mm` beside them."""
+    exact, off = displayed_mse(model(pair.images, pair.eyes_m, pair.stack, pair.tolerance_mm), pair)
+    return 10 * torch.log10((exact + off) / 2 + FLOOR)
+
+
+def held_out_pairs(count: int, *, width_px: int, height_px: int) -> list[TrainingPair]:
+    """Pairs that no training sees, the same every time."""
+    stream = endless_pairs(HELD_OUT_SEED, width_px=width_px, height_px=height_px, tolerance_mm=(0.0, 4.0))
+    return [pair for pair, _ in zip(stream, range(count), strict=False)]
+
+
+@torch.no_grad()
+def validate(model: UnrolledSolver, pairs: Sequence[TrainingPair]) -> tuple[float, float, float]:
+    """Mean dB at the eyes, mean dB beside them (of the pairs that have a tolerance), and mean loss."""
+    exact_db, off_db, losses = [], [], []
+    for pair in pairs:
+        exact, off = displayed_mse(model(pair.images, pair.eyes_m, pair.stack, pair.tolerance_mm), pair)
+        exact_db.append(-10 * math.log10(float(exact) + FLOOR))
+        if pair.off:
+            off_db.append(-10 * math.log10(float(off) + FLOOR))
+        losses.append(10 * math.log10((float(exact) + float(off)) / 2 + FLOOR))
+    return float(np.mean(exact_db)), float(np.mean(off_db)) if off_db else math.nan, float(np.mean(losses))
+
+
+def trained_recipe(model: UnrolledSolver, recipe: Recipe) -> Recipe:
+    """The recipe with what was found: weights, and sizes as the runtime applies them (eighths)."""
+    steps = [
+        step.model_copy(update={"size": round(min(max(round(float(size) * 8) / 8, 0.125), 2.0), 4)})
+        for step, size in zip(recipe.steps, model.sizes.detach(), strict=True)
+    ]
+    return recipe.model_copy(update={"steps": tuple(steps), "weights": plain_weights(model.net)})
+
+
+def _asked(recipe: Recipe, request: TrainRequest) -> Recipe:
+    changes = {
+        name: value for name, value in (("iterations", request.iterations), ("seed", request.seed)) if value is not None
+    }
+    return recipe.model_copy(update={"training": recipe.training.model_copy(update=changes)})
+
+
+def _groups(model: UnrolledSolver, rate: float) -> list[dict[str, Any]]:
+    groups = [{"params": list(model.net.parameters()), "lr": rate, "base": rate}]
+    if model.recipe.training.learn_steps:
+        groups.append({"params": [model.sizes], "lr": rate / 2, "base": rate / 2})
+    return groups
+
+
+def _annealed(done: float) -> float:
+    """Of the learning rate: a short warm-up, then half a cosine down to a twentieth."""
+    return min(1.0, 0.1 + done * 20) * (0.05 + 0.95 * (1 + math.cos(math.pi * done)) / 2)
+
+
+def _step(
+    model: UnrolledSolver, optimiser: torch.optim.Optimizer, stream: Iterator[TrainingPair], world: World
+) -> float:
+    """One step of the optimiser over all processes' pairs. A pair that nobody can see is passed over."""
+    optimiser.zero_grad()
+    total, used = 0.0, 0
+    for _ in range(PAIRS_A_STEP):
+        try:
+            loss = pair_loss(model, next(stream))
+        except ValueError:
+            continue
+        if bool(torch.isfinite(loss)):
+            (loss / PAIRS_A_STEP).backward()  # type: ignore[no-untyped-call]
+            total, used = total + float(loss.detach()), used + 1
+    world.average_gradients(model.parameters())
+    torch.nn.utils.clip_grad_norm_(model.parameters(), GRADIENT_MAX)
+    optimiser.step()
+    return total / used if used else math.nan
+
+
+def _share(training: Training, first: int, world: World) -> Iterator[TrainingPair]:
+    """This process's pairs from step `first` on: every `world.size`-th of the stream."""
+    return endless_pairs(
+        training.seed,
+        first=first * PAIRS_A_STEP * world.size + world.rank,
+        step=world.size,
+        width_px=training.width_px,
+        height_px=training.height_px,
+        tolerance_mm=training.tolerance_mm,
+    )
+
+
+def _save(
+    out: Path,
+    model: UnrolledSolver,
+    optimiser: torch.optim.Optimizer,
+    recipe: Recipe,
+    iteration: int,
+    points: Sequence[Point],
+    seconds: float,
+) -> None:
+    found = trained_recipe(model, recipe)
+    write_text(out / "recipe.json", found.text())
+    save_checkpoint(
+        out / "checkpoint.pth",
+        {
+            "model": {key: value.cpu() for key, value in model.net.state_dict().items()},
+            "recipe": found.model_copy(update={"weights": None}).model_dump(mode="json"),
+            "sizes": model.sizes.detach().cpu(),
+            "optimiser": optimiser.state_dict(),
+            "iteration": iteration,
+            "points": [list(point.row()) for point in points],
+            "seconds": seconds,
+        },
+    )
+    write_curves(out, points, name=recipe.name)
+
+
+def _resumed(
+    path: Path, model: UnrolledSolver, optimiser: torch.optim.Optimizer, recipe: Recipe
+) -> tuple[int, list[Point], float]:
+    """(iteration, curve, seconds) that a checkpoint had reached; fills model and optimiser. Raises InputError."""
+    table = load_checkpoint(path)
+    held = validated(Recipe, table.get("recipe") or {}, source=f"{path}: recipe")
+    if (held.name, [s.kind for s in held.steps]) != (recipe.name, [s.kind for s in recipe.steps]):
+        raise InputError(path, "recipe", f"was trained as {held.name}, which is not this recipe")
+    if held.training.seed != recipe.training.seed:
+        raise InputError(path, "recipe.training.seed", f"{held.training.seed}, but {recipe.training.seed} is asked for")
+    try:
+        fill(model.net, table["model"], source=path, arch=recipe.name)
+        model.sizes.data.copy_(table["sizes"])
+        optimiser.load_state_dict(table["optimiser"])
+        points = [Point(int(row[0]), *row[1:]) for row in table["points"]]
+        return int(table["iteration"]), points, float(table["seconds"])
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise InputError(path, "", f"is no checkpoint that a training can be resumed from ({error})") from None

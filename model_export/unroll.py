@@ -1,0 +1,189 @@
+"""A differentiable copy of the unrolled prediction (runtime.model.unrolled), and what eyes then see.
+
+The same steps in the same order, sampled exactly where the runtime resamples by OpenCV (1/32 pixel). Rounding to
+8 bits passes gradients straight through. Pictures are (1, C, h, w) tensors; phases are in units of one panel's range.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from model_export.data import TrainingPair
+from model_export.network import SpectralSolver
+from model_export.recipe import Recipe
+from runtime.model.chain import ChainFrame, chain_frame, chain_modes
+from runtime.model.resample import target_from_source
+from runtime.optics.malus import HALF_PI
+from runtime.optics.stack import PanelStack
+from runtime.records import F64, U8
+
+REAR, CENTRE, FRONT = 0, 1, 2
+START = 0.5
+LEVELS = 255.0
+
+
+def rounded(x: Tensor) -> Tensor:
+    """To 8-bit codes; the gradient passes as if nothing had happened."""
+    return x + (torch.round(x * LEVELS) / LEVELS - x).detach()
+
+
+def phases(picture: U8, device: torch.device) -> Tensor:
+    """(1, 3, h, w) phase sums on the second branch of an 8-bit picture (h, w, 3)."""
+    intensity = torch.from_numpy(np.ascontiguousarray(picture)).to(device).float().permute(2, 0, 1)[None] / LEVELS
+    return 2 - torch.asin(torch.sqrt(intensity)) / HALF_PI
+
+
+def sample(
+    image: Tensor,
+    image_from_result: F64,
+    size: tuple[int, int],
+    *,
+    mode: str = "bilinear",
+    outside: float | None = None,
+) -> Tensor:
+    """(1, C, h, w) exact samples at the places of a raster; beside the image its edge, or the value `outside`."""
+    height, width = size
+    m = torch.as_tensor(image_from_result, dtype=torch.float32, device=image.device)
+    u = torch.arange(width, device=image.device) + 0.5
+    v = (torch.arange(height, device=image.device) + 0.5)[:, None]
+    x = (m[0, 0] * u + m[0, 1] * v + m[0, 2]) * (2 / image.shape[3]) - 1
+    y = (m[1, 0] * u + m[1, 1] * v + m[1, 2]) * (2 / image.shape[2]) - 1
+    grid = torch.stack([x.expand(size), y.expand(size)], dim=-1)[None]
+    result = functional.grid_sample(image, grid, mode=mode, padding_mode="border", align_corners=False)
+    if outside is None:
+        return result
+    inside = (grid.abs() <= 1).all(dim=-1)[:, None]
+    return torch.where(inside, result, result.new_tensor(outside))
+
+
+class UnrolledSolver(nn.Module):
+    """The network and the sizes of the steps: all that is learned."""
+
+    def __init__(self, net: SpectralSolver, recipe: Recipe) -> None:
+        super().__init__()
+        self.net, self.recipe = net, recipe
+        self.kinds = [step.kind for step in recipe.steps]
+        self.sizes = nn.Parameter(torch.tensor([step.size for step in recipe.steps]))
+
+    def forward(self, images: Sequence[U8], eyes_m: F64, stack: PanelStack, tolerance_mm: float) -> Tensor:
+        """(3, 3, h, w) panel values, rear to front, as 8 bits show them. Raises ValueError for eyes it can't serve."""
+        recipe, device = self.recipe, self.sizes.device
+        frame = chain_frame(eyes_m, stack, cell_px=recipe.cell_px, reduction=recipe.reduction)
+        wanted = [phases(image, device) for image in images]
+        outer = {n: torch.full_like(wanted[0], START) for n in (REAR, FRONT)}
+        seen: dict[tuple[int, int], Tensor] = {}
+        tolerance = torch.tensor([tolerance_mm], dtype=torch.float32, device=device)
+        for index, kind in enumerate(self.kinds):
+            lacks = self._lacks(wanted, seen) if index else []
+            if kind == "chain":
+                needs = lacks or _first_needs(images, device, recipe.reduction)
+                coarse = [functional.avg_pool2d(need, recipe.reduction) for need in needs] if lacks else needs
+                change = self._chain(coarse, frame, eyes_m, stack, tolerance)
+                changed: tuple[int, ...] = (REAR, FRONT)
+            else:
+                n = FRONT if kind == "front" else REAR
+                change = {n: self._correction(lacks, n, eyes_m, stack)}
+                changed = (n,)
+            for n in changed:
+                outer[n] = rounded((outer[n] + self.sizes[index] * change[n]).clamp(0, 1))
+                for side, eye in enumerate(eyes_m):
+                    matrix = target_from_source(eye, source=stack.panel(CENTRE), target=stack.panel(n))
+                    seen[n, side] = sample(outer[n], matrix, outer[n].shape[2:], outside=START)
+        best = sum(wanted[side] - seen[REAR, side] - seen[FRONT, side] for side in (0, 1)) / 2
+        return torch.cat([outer[REAR], rounded(best.clamp(0, 1)), outer[FRONT]])
+
+    @staticmethod
+    def _lacks(wanted: Sequence[Tensor], seen: dict[tuple[int, int], Tensor]) -> list[Tensor]:
+        left, right = (wanted[side] - seen[REAR, side] - seen[FRONT, side] for side in (0, 1))
+        best = ((left + right) / 2).clamp(0, 1)
+        return [left - best, right - best]
+
+    @staticmethod
+    def _correction(lacks: Sequence[Tensor], panel: int, eyes_m: F64, stack: PanelStack) -> Tensor:
+        back = []
+        for lack, eye in zip(lacks, eyes_m, strict=True):
+            matrix = target_from_source(eye, source=stack.panel(panel), target=stack.panel(CENTRE))
+            back.append(sample(lack, matrix, lack.shape[2:], outside=0.0))
+        return back[0] + back[1]
+
+    def _chain(
+        self, needs: Sequence[Tensor], frame: ChainFrame, eyes_m: F64, stack: PanelStack, tolerance: Tensor
+    ) -> dict[int, Tensor]:
+        """The network's change of both outer panels."""
+        height, width = needs[0].shape[2:]
+        reduced = np.diag([width / stack.width_px, height / stack.height_px, 1.0])
+        reduced_from_plane = reduced @ stack.panel(CENTRE).raster_from_plane()
+        size = (frame.rows, frame.width_px)
+        left, right = (
+            sample(need, reduced_from_plane @ frame.plane_from_frame(eye, x_m=stack.x_m[CENTRE]), size, outside=0.0)
+            for need, eye in zip(needs, eyes_m, strict=True)
+        )
+        columns = (right - left)[0].permute(1, 2, 0).reshape(frame.rows, frame.cells, -1)
+        modes = (torch.from_numpy(part).to(columns.device) for part in chain_modes(frame.cells))
+        answer = self.net(columns, *modes, tolerance)
+        wave = answer.reshape(frame.rows, -1, 3).permute(2, 0, 1)[None]
+        change = {}
+        for n, sign in ((REAR, -1.0), (FRONT, 1.0)):
+            panel = stack.panel(n)
+            matrix = frame.frame_from_plane(x_m=panel.x_m) @ panel.plane_from_raster()
+            matrix[0, 2] += frame.cell_px
+            straight = matrix[0, 1] == 0.0 and matrix[1, 0] == 0.0
+            mode = "bicubic" if straight else "bilinear"
+            change[n] = sign * sample(wave, matrix, (stack.height_px, stack.width_px), mode=mode, outside=0.0)
+        return change
+
+
+def _first_needs(images: Sequence[U8], device: torch.device, reduction: int) -> list[Tensor]:
+    """What each eye lacks while the outer panels are even: averaged as intensities, as the runtime does."""
+    coarse = []
+    for image in images:
+        intensity = torch.from_numpy(np.ascontiguousarray(image)).to(device).float().permute(2, 0, 1)[None] / LEVELS
+        coarse.append(2 - torch.asin(torch.sqrt(functional.avg_pool2d(intensity, reduction))) / HALF_PI)
+    half = (coarse[1] - coarse[0]) / 2
+    return [-half, half]
+
+
+def seen_error(layers: Tensor, image: U8, eye_m: F64, stack: PanelStack) -> tuple[Tensor, int]:
+    """Squared error of what an eye sees through the centre panel's pixels, summed, and how many values count.
+
+    Displayed: sin² of the summed panel values, over rays that cross every panel half a pixel inside its edge.
+    """
+    height, width = image.shape[:2]
+    total = layers[CENTRE][None]
+    u, v = np.arange(width) + 0.5, (np.arange(height) + 0.5)[:, None]
+    counts = (u > 1) & (u < width - 1) & (v > 1) & (v < height - 1)
+    for n in (REAR, FRONT):
+        matrix = target_from_source(eye_m, source=stack.panel(CENTRE), target=stack.panel(n))
+        total = total + sample(layers[n][None], matrix, (height, width))
+        x, y = matrix[0, 0] * u + matrix[0, 2], matrix[1, 1] * v + matrix[1, 2]
+        counts = counts & (x > 0.5) & (x < width - 0.5) & (y > 0.5) & (y < height - 0.5)
+    wanted = torch.from_numpy(np.ascontiguousarray(image)).to(total.device).float().permute(2, 0, 1)[None] / LEVELS
+    mask = torch.from_numpy(counts).to(total.device)
+    squared = (torch.sin(total * (math.pi / 2)) ** 2 - wanted).square() * mask
+    return squared.sum(), int(counts.sum()) * 3
+
+
+def displayed_mse(layers: Tensor, pair: TrainingPair) -> tuple[Tensor, Tensor]:
+    """Mean squared error at the eyes, and beside them (equal to the first where the pair has no such views).
+
+    Raises ValueError where no ray of an eye crosses every panel.
+    """
+    exact = [seen_error(layers, image, eye, pair.stack) for image, eye in zip(pair.images, pair.eyes_m, strict=True)]
+    off = [seen_error(layers, place.image, place.eye_m, pair.stack) for place in pair.off]
+    return _mean(exact), _mean(off or exact)
+
+
+def _mean(parts: Sequence[tuple[Tensor, int]]) -> Tensor:
+    count = sum(n for _, n in parts)
+    if count == 0:
+        raise ValueError("no ray crosses every panel")
+    total = parts[0][0]
+    for value, _ in parts[1:]:
+        total = total + value
+    return total / count
