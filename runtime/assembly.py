@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from runtime.loop import Loop, Supervisor
     from runtime.optics.stack import PanelStack
     from runtime.pipeline import Pipeline
+    from runtime.sensor.base import SensorDriver
 
 log = logging.getLogger("phasestack.assembly")
 
@@ -44,17 +45,23 @@ def scaled_stack(settings: Settings, scale: float) -> PanelStack:
 
 def build_pipeline(settings: Settings, stack: PanelStack, context: Any, on_fault: Callable[[str], None]) -> Pipeline:
     """Content and model. Raises FatalError; leaves nothing open then."""
-    from runtime.content.registry import open_content
-    from runtime.model.predictor import load_predictor
-    from runtime.pipeline import Pipeline
+    import sys
 
-    predictor = load_predictor(settings.model.name, stack, settings.model)
+    from runtime.content.plan import make_plan
+    from runtime.content.registry import open_content
+    from runtime.focus import FocusedPredictor
+    from runtime.pipeline import Pipeline
+    from runtime.planning import planned_predictor
+
+    predictor = planned_predictor(settings, stack)
     try:
         content = open_content(settings.content, stack, context)
     except BaseException:
         predictor.close()
         raise
-    return Pipeline(stack, content=content, predictor=predictor, on_fault=on_fault)
+    can_focus = isinstance(predictor, FocusedPredictor)
+    plan = make_plan(content.info, stack, settings, can_focus=can_focus, loaded_modules=sys.modules)
+    return Pipeline(stack, content=content, predictor=predictor, plan=plan, on_fault=on_fault)
 
 
 def build_loop(
@@ -74,7 +81,9 @@ def build_loop(
     import numpy as np
 
     from runtime.eyes.calibration import load_calibration
+    from runtime.eyes.detect import EyeFinder
     from runtime.eyes.tracker import Tracker
+    from runtime.finding import FindingDriver
     from runtime.gl import offscreen_context
     from runtime.inputs import Input, LiveInput, SteppedInput
     from runtime.loop import Loop
@@ -85,8 +94,15 @@ def build_loop(
     clock: Clock = SimulatedClock() if options.max_speed else MonotonicClock()
     stack = scaled_stack(settings, options.scale)
     calibration = load_calibration(Path(settings.calibration.file) if settings.calibration.file else None)
-    driver = open_sensor(settings.sensor, clock, latency_ms=settings.loop.sensor_latency_ms)
+
+    def make_driver() -> SensorDriver:
+        driver = open_sensor(settings.sensor, clock, latency_ms=settings.loop.sensor_latency_ms)
+        return FindingDriver(driver, lambda: EyeFinder(settings.detector))
+
+    driver = make_driver()
     source: Input
+    for warning in calibration.warnings:
+        log.warning("%s", warning)
     if options.max_speed:
         source = SteppedInput(driver, clock)
         cleanup.callback(source.close)
@@ -99,15 +115,12 @@ def build_loop(
     cleanup.callback(lambda: faults["loop"].pipeline.close() if faults else pipeline.close())
     pipeline.predictor.warm_up(np.array(WARM_EYES_M))
     if not options.max_speed:
-        source = LiveInput(
-            lambda: open_sensor(settings.sensor, clock, latency_ms=settings.loop.sensor_latency_ms),
-            settings.sensor,
-            clock,
-        )
+        source = LiveInput(make_driver, settings.sensor, clock)
         cleanup.callback(source.close)
     loop = Loop(
         settings,
         clock=clock,
+        context=context,
         source=source,
         calibration=calibration,
         tracker=Tracker(settings.tracker),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 
 import typer
 
@@ -14,6 +15,7 @@ from runtime.commands.ctl import app as ctl_app
 from runtime.commands.demo import demo
 from runtime.commands.doctor import doctor
 from runtime.commands.identify import identify
+from runtime.commands.plan import plan
 from runtime.commands.record import record
 from runtime.commands.report import report
 from runtime.commands.run import run
@@ -30,17 +32,30 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (demo, run, solve, record):
-    app.command()(command)
-app.add_typer(calibrate_app, name="calibrate")
-for command in (train, export, validate, report, stability):
-    app.command()(command)
-app.add_typer(bench_app, name="bench")
-for command in (doctor, status):
-    app.command()(command)
-app.add_typer(ctl_app, name="ctl")
-for command in (identify, config):
-    app.command()(command)
+COMMANDS: tuple[Callable[..., None] | tuple[str, typer.Typer], ...] = (
+    demo,
+    run,
+    solve,
+    record,
+    ("calibrate", calibrate_app),
+    plan,
+    train,
+    export,
+    validate,
+    report,
+    stability,
+    ("bench", bench_app),
+    doctor,
+    status,
+    ("ctl", ctl_app),
+    identify,
+    config,
+)
+for command in COMMANDS:
+    if isinstance(command, tuple):
+        app.add_typer(command[1], name=command[0])
+    else:
+        app.command()(command)
 
 
 def main() -> None:

@@ -14,6 +14,7 @@ from runtime.clock import NS_PER_MS, NS_PER_S, Clock
 from runtime.config import Settings
 from runtime.errors import EndOfRecording, PanelLost
 from runtime.eyes.calibration import Calibration
+from runtime.eyes.calibration_drift import SeparationWatch
 from runtime.eyes.tracker import Tracker
 from runtime.inputs import Input
 from runtime.panels.base import PanelSink
@@ -104,15 +105,16 @@ class Loop:
         tracker: Tracker,
         pipeline: Pipeline,
         panels: PanelSink,
-        find_eyes: Callable[[SensorFrame], EyePoints | None] | None = None,
         supervisor: Supervisor | None = None,
         probe: QualityProbe | None = None,
         on_account: Callable[[FrameAccount], None] | None = None,
         in_stack_frame: bool = False,
+        context: Any = None,
     ) -> None:
+        """context: the GL context of this thread, for content that is loaded while it runs."""
+        self.context = context
         self.settings, self.clock, self.source = settings, clock, source
         self.calibration, self.tracker, self.pipeline, self.panels = calibration, tracker, pipeline, panels
-        self._find_eyes = find_eyes
         self._supervisor = supervisor or Unsupervised()
         self._probe, self._on_account = probe, on_account
         self._in_stack_frame = in_stack_frame
@@ -123,9 +125,13 @@ class Loop:
         self.layers: Any = None
         self.look: Look | None = None
         self.last: FrameAccount | None = None
+        self.missing: dict[str, str] = {}  # parts that don't work at present, and why
         self.present_missing = ""
         self._flatness = Flatness()
         self._turn_cost_ns = self._first_cost_ns()
+        self._watch = SeparationWatch(
+            known_ipd_m=settings.calibration.ipd_m, tolerance=settings.calibration.ipd_tolerance
+        )
         self._presented = False
         self._quality = QualityMeans()
         self._truth: list[tuple[int, F64]] = []  # the two newest samples' true eyes, with their capture times
@@ -169,6 +175,7 @@ class Loop:
         inference, missing, report = self._show(eyes, stages)
         if self.source.fault():
             missing["sensor"] = self.source.fault()
+        self.missing = missing
         state = self._judge(eyes, missing)
         account = FrameAccount(
             frame=self.stats.frames,
@@ -190,10 +197,10 @@ class Loop:
     def _track(self, frame: SensorFrame) -> None:
         """Map a sample into `stack` and hand it to the tracker."""
         points = frame.eyes
-        if points is None and self._find_eyes is not None:
-            points = self._find_eyes(frame)
         if points is not None and not self._in_stack_frame:
             points = self.calibration.apply(points)
+            if drift := self._watch.update(points):
+                log.warning("%s", drift)
         self.tracker.update(points, capture_ns=frame.capture_ns)
         if frame.true_eyes_m is not None:
             self._truth = [*self._truth[-1:], (frame.capture_ns, frame.true_eyes_m)]
@@ -223,11 +230,12 @@ class Loop:
             flatness = self._flatness.toward(wanted, blend_s=self.settings.tracker.blend_s, now_ns=now_ns)
             drawn = self.pipeline.draw(eyes.eyes_m, flatness=flatness, time_ns=now_ns, stages=stages)
             self.layers, inference, missing = drawn.layers, drawn.inference, drawn.missing
+            unchanged = drawn.unchanged
         else:
-            inference, missing = "reused", {}
+            inference, missing, unchanged = "reused", {}, True
         report: PresentReport | None = None
         try:
-            report = self.panels.present(LayerFrame(self.stats.frames, self.layers))
+            report = self.panels.present(LayerFrame(self.stats.frames, self.layers), unchanged=unchanged)
             self._presented = True
         except PanelLost as error:
             missing["panel"] = str(error)
@@ -249,7 +257,9 @@ class Loop:
         if report is not None:
             self.stats.missed_vblanks += report.missed_vblanks
             if account.inference == "ran":
-                cost_ns = report.present_ns - start_ns
+                # One turn of a machine that was suspended must not make the loop look past every eye for good.
+                longest_ns = round(self.settings.tracker.horizon_max_s * NS_PER_S)
+                cost_ns = min(report.present_ns - start_ns, longest_ns)
                 self._turn_cost_ns += round(EXPECTED_WEIGHT * (cost_ns - self._turn_cost_ns))
         self.last = account
         if self._on_account is not None:
@@ -282,6 +292,20 @@ class Loop:
                 self._pending = (account.predicted_for_ns, time_ns, self.layers.copy())
         except ValueError as error:
             log.info("quality: not measured here (%s)", error)
+
+    def _plan_items(self) -> list[dict[str, Any]]:
+        """What was left out; a saving or a cost that this run did not measure is null."""
+        plan = self.pipeline.plan
+        items = [] if plan is None else plan.items
+        return [
+            {
+                "what": item.what,
+                "why": item.why,
+                "saves_ms": item.saves_ms or None,
+                "costs_db": item.costs_db if item.saves_ms else None,
+            }
+            for item in items
+        ]
 
     def _measure_pending(self) -> None:
         """Quality at the true eyes at the moment of the light, once the recording has told where they were."""
@@ -318,7 +342,7 @@ class Loop:
             "quality_frames": len(self._quality.psnr_db),
             "model": predictor.name,
             "provider": predictor.provider,
-            "plan": [],
+            "plan": self._plan_items(),
             "states": self.machine.seconds(now_ns=self.clock.now_ns()),
         }
 

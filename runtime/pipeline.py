@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 
 from runtime.content.base import ContentSource, View
+from runtime.content.gate import ReuseGate
+from runtime.content.plan import Plan, solved_eyes
 from runtime.errors import ContentFailure, ModelFailure
+from runtime.focus import FocusedPredictor
 from runtime.model.flat import flat_layers
 from runtime.model.predictor import Predictor
 from runtime.optics.stack import PanelStack, PlaneRaster
@@ -45,6 +48,7 @@ class Drawn:
     layers: U8
     inference: Inference
     missing: dict[str, str] = field(default_factory=dict)  # parts that failed: content, model
+    unchanged: bool = False  # the same layers as the turn before
 
 
 class Pipeline:
@@ -56,15 +60,22 @@ class Pipeline:
         *,
         content: ContentSource,
         predictor: Predictor,
+        plan: Plan | None = None,
         on_fault: Callable[[str], None] = lambda part: None,
     ) -> None:
-        self.stack, self.content, self.predictor = stack, content, predictor
+        """plan: what is left out; None: nothing is."""
+        self.stack, self.content, self.predictor, self.plan = stack, content, predictor, plan
+        self._gate: ReuseGate | None = None
+        if plan is not None and plan.reuse and plan.most_band_m > 0:
+            self._gate = ReuseGate(most_m=plan.most_band_m, band_m=plan.dead_band_m)
+        self._shown: tuple[int, float] | None = None  # which array was answered last, and how flat
         self._on_fault = on_fault
         self._solved: U8 | None = None  # the last layers for two eyes
         self._solved_for: tuple[Any, ...] | None = None
         self._flat: U8 | None = None
         self._flat_for: tuple[Any, ...] | None = None
         self._middle_m = np.array(FLAT_EYE_M)
+        self._redrawn = False
         self._blend = np.empty((stack.count, stack.height_px, stack.width_px, 4), np.uint8)
         self.missing: dict[str, str] = {}
 
@@ -80,18 +91,33 @@ class Pipeline:
             inference = self._solve(eyes_m, time_ns=time_ns, stages=stages)
         if flatness > 0.0 or self._solved is None:
             self._draw_flat(time_ns=time_ns, stages=stages)
-        layers = self._blended(flatness if self._solved is not None else 1.0)
-        return Drawn(layers, inference, dict(self.missing))
+        flatness = flatness if self._solved is not None else 1.0
+        layers = self._blended(flatness)
+        shown = (id(layers), flatness)
+        unchanged = shown == self._shown and inference != "ran" and not self._redrawn
+        self._shown, self._redrawn = shown, False
+        return Drawn(layers, inference, dict(self.missing), unchanged)
 
     def forget(self) -> None:
         """Drop what was drawn: the content, the model or the settings have changed."""
         self._solved_for = self._flat_for = None
+        if self._gate is not None:
+            self._gate.forget()
 
     def _solve(self, eyes_m: F64, *, time_ns: int, stages: StageTimes) -> Inference:
-        key = (eyes_m.tobytes(), self.content.revision(time_ns=time_ns))
-        if self._solved is not None and key == self._solved_for:
+        if self.plan is not None:
+            eyes_m = solved_eyes(eyes_m, self.plan)
+        revision = self.content.revision(time_ns=time_ns)
+        still = self._gate is not None and self._gate.may_reuse(eyes_m, time_ns=time_ns)
+        solved_for = self._solved_for if self._solved is not None else None
+        if solved_for is not None and revision == solved_for[1] and (still or eyes_m.tobytes() == solved_for[0]):
             return "reused"
+        if self._gate is not None:
+            eyes_m = self._gate.best_guess(eyes_m)
+        key = (eyes_m.tobytes(), revision)
         try:
+            if isinstance(self.predictor, FocusedPredictor):
+                self.predictor.aim(self.content, eyes_m, time_ns=time_ns)
             images = self._render(eyes_m, time_ns=time_ns)
         except Exception as error:
             self._failed("content", error, expected=ContentFailure)
@@ -106,6 +132,8 @@ class Pipeline:
             return "reused" if self._solved is not None else "skipped"
         stages.laps(prediction.stage_ms, rest="finish")
         self._solved, self._solved_for = prediction.layers, key
+        if self._gate is not None:
+            self._gate.solved(eyes_m)
         self._middle_m = eyes_m.mean(axis=0)
         return "ran"
 
@@ -130,6 +158,7 @@ class Pipeline:
             view = View(middle, 0, raster_from_stack(middle, raster), raster.width_px, raster.height_px)
             self._flat = flat_layers(self.content.render(view, time_ns=time_ns), self.stack)
             self._flat_for = key
+            self._redrawn = True
         except Exception as error:
             self._failed("content", error, expected=ContentFailure)
             if self._flat is None:

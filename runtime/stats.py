@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -43,6 +45,7 @@ class RunStats:
         self.frames = self.presented = self.dropped = self.inferences = 0
         self.missed_vblanks = 0
         self.faults: dict[str, int] = {}
+        self._times_s: deque[float] = deque(maxlen=60)
         self._stages = {stage: Ring() for stage in STAGES}
         self._overhead, self._skew, self._latency = Ring(), Ring(), Ring()
 
@@ -50,6 +53,8 @@ class RunStats:
         """One turn; `turn_ms` is its whole duration on the machine's clock, evaluation left out."""
         self.frames += 1
         self.presented += account.presented
+        if account.presented:
+            self._times_s.append(perf_counter())
         self.dropped += not account.presented
         self.inferences += account.inference == "ran"
         for stage, ring in self._stages.items():
@@ -61,6 +66,12 @@ class RunStats:
             self._skew.add(account.skew_ms)
             if account.capture_ns:
                 self._latency.add((account.present_ns - account.capture_ns) / 1e6)
+
+    def recent_fps(self) -> float:
+        """Presented frames a second over the last turns."""
+        if len(self._times_s) < 2:
+            return 0.0
+        return (len(self._times_s) - 1) / max(self._times_s[-1] - self._times_s[0], 1e-9)
 
     def fault(self, part: str) -> None:
         """A fault that the run lives on with."""

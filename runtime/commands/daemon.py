@@ -44,6 +44,7 @@ class Daemon:
         self._config, self._overrides, self._settings = config, overrides, settings
         self._signals, self._notifier, self._server, self._metrics = signals, notifier, server, metrics
         self._faults_told: dict[str, int] = {}
+        self._missed_told = 0
 
     def stop_reason(self) -> str:
         return f"{self._signals.stop} received" if self._signals.stop else ""
@@ -69,6 +70,9 @@ class Daemon:
             self._server.publish(lambda: snapshot(loop, account))
         if self._metrics is not None:
             self._metrics.frame(account)
+            self._metrics.missed_vblanks(loop.stats.missed_vblanks - self._missed_told)
+            self._missed_told = loop.stats.missed_vblanks
+            self._metrics.fps(loop.stats.recent_fps())
             for part, count in loop.stats.faults.items():
                 for _ in range(count - self._faults_told.get(part, 0)):
                     self._metrics.fault(part)
@@ -123,7 +127,7 @@ class Daemon:
 
                 from runtime.assembly import WARM_EYES_M
 
-                pipeline = build_pipeline(settings, loop.pipeline.stack, self.context, loop.fault)
+                pipeline = build_pipeline(settings, loop.pipeline.stack, loop.context, loop.fault)
                 pipeline.predictor.warm_up(np.array(WARM_EYES_M))
                 previous, loop.pipeline = loop.pipeline, pipeline
                 previous.close()
@@ -135,13 +139,6 @@ class Daemon:
         loop.settings = self._settings = settings
         return ""
 
-    @property
-    def context(self) -> Any:
-        """The GL context of the loop's thread."""
-        import moderngl
-
-        return moderngl.get_context()
-
 
 def snapshot(loop: Loop, account: FrameAccount) -> dict[str, Any]:
     """What `status` answers."""
@@ -150,6 +147,7 @@ def snapshot(loop: Loop, account: FrameAccount) -> dict[str, Any]:
     return {
         "state": machine.name,
         "reason": machine.reason,
+        "missing": loop.missing,
         "scene": loop.settings.content.scene,
         "model": loop.pipeline.predictor.name,
         "provider": loop.pipeline.predictor.provider,

@@ -51,7 +51,7 @@ def load_gaussians(path: Path, *, progress: Callable[[str], None] = lambda _: No
     try:
         from plyfile import PlyData
     except ImportError:
-        raise MissingPart("splats need plyfile: pip install plyfile") from None
+        raise MissingPart("splats need plyfile: pip install phasestack[splats]") from None
     progress(f"reading {path.name}")
     try:
         table = PlyData.read(path)["vertex"].data
