@@ -5,24 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.config import TrackerSettings
-from runtime.eyes.motions import MOTIONS, Observation, observe, true_eyes
+from runtime.eyes.motions import Observation, observe, true_eyes
 from runtime.eyes.one_euro import OneEuro
 from runtime.eyes.tracker import Tracker
 from runtime.records import F64, EyePoints
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 HORIZONS_MS = (0, 15, 30, 45, 60, 75, 90, 105, 120)
 SETTLED_S = 1.5  # the start of a run, in which no filter knows the velocity yet, is left out
 SHIPPED, NONE, EURO, BEST = "shipped", "no filter, no prediction", "One Euro", "tuned offline"
+UNPREDICTED = "shipped filter, no prediction"
 
 
 class Predictor(Protocol):
@@ -43,6 +40,20 @@ class Shipped:
 
     def eyes_at(self, time_ns: int) -> F64 | None:
         return self._tracker.at(time_ns).eyes_m
+
+
+class Unpredicted:
+    """The product's tracker, asked for the newest sample's instant whatever the horizon."""
+
+    def __init__(self) -> None:
+        self._tracker, self._newest_ns = Tracker(), 0
+
+    def update(self, points: EyePoints | None, *, capture_ns: int) -> None:
+        self._tracker.update(points, capture_ns=capture_ns)
+        self._newest_ns = capture_ns
+
+    def eyes_at(self, time_ns: int) -> F64 | None:
+        return self._tracker.at(self._newest_ns).eyes_m
 
 
 class Newest:
@@ -166,6 +177,7 @@ def benchmark(
                 return errors_mm(make, observed, motion, horizons)
 
             rows += _rows(motion, rate_hz, SHIPPED, measure(Shipped))
+            rows += _rows(motion, rate_hz, UNPREDICTED, measure(Unpredicted))
             rows += _rows(motion, rate_hz, NONE, measure(Newest))
             rows += _rows(motion, rate_hz, EURO, measure(Euro))
             if tune:
@@ -238,64 +250,3 @@ def update_cost_us(*, samples: int = 2000) -> float:
 def benchmark_table(rows: Sequence[Row]) -> list[dict[str, object]]:
     """The rows as plain objects, for JSON."""
     return [asdict(row) for row in rows]
-
-
-STYLES = {SHIPPED: ("C0", "-", 2.4), BEST: ("k", ":", 1.6), EURO: ("C1", "--", 1.4), NONE: ("C3", "-.", 1.4)}
-
-
-def plot_benchmark(rows: Sequence[Row], trades: Sequence[Trade], path: Path | None = None) -> Figure:
-    """p95 error against horizon, a panel a motion, and jitter against lag; written as PNG where a path is given."""
-    from matplotlib.figure import Figure
-
-    motions = [m for m in MOTIONS if any(row.motion == m for row in rows)]
-    rate_hz = min(row.rate_hz for row in rows)
-    columns = (len(motions) + 2) // 2
-    figure = Figure(figsize=(4.6 * columns, 7.6), layout="constrained")
-    axes = figure.subplots(2, columns, squeeze=False).ravel()
-    for axis, motion in zip(axes, motions):
-        tops = []
-        for method, (colour, dashes, width) in STYLES.items():
-            line = [r for r in rows if (r.motion, r.rate_hz, r.method) == (motion, rate_hz, method)]
-            axis.plot(
-                [r.horizon_ms for r in line],
-                [r.p95_mm for r in line],
-                dashes,
-                color=colour,
-                linewidth=width,
-                label=method,
-            )
-            tops += [r.p95_mm for r in line if method == SHIPPED]
-        axis.set(title=motion, xlabel="ahead of the newest sample, ms", ylabel="mm", xlim=(0, max(HORIZONS_MS)))
-        axis.set_ylim(0, 2.2 * max(tops))
-        axis.grid(alpha=0.3)
-    trade = axes[len(motions)]
-    for method, colour in (("Kalman", "k"), ("One Euro", "C1")):
-        curve = sorted((t.lag_ms, t.jitter_mm) for t in trades if t.method == method)
-        trade.plot(*zip(*curve), "o-", color=colour, markersize=4, label=f"{method}, by its setting")
-    shipped = next(t for t in trades if t.method == SHIPPED)
-    trade.plot(shipped.lag_ms, shipped.jitter_mm, "*", color="C0", markersize=16, label=SHIPPED)
-    trade.set(title="still head's jitter, moving head's lag", xlabel="lag, ms", ylabel="step to step, mm rms")
-    trade.set_ylim(bottom=0)
-    trade.legend(fontsize=9)
-    trade.grid(alpha=0.3)
-    for spare in axes[len(motions) + 1 :]:
-        spare.axis("off")
-        spare.legend(*axes[0].get_legend_handles_labels(), loc="upper left", title="curves over the horizon")
-        note = "Lines that leave a panel at its top\nare worse than the panel shows."
-        spare.text(0.02, 0.35, note, transform=spare.transAxes)
-    figure.suptitle(
-        f"Error of the predicted eyes (worse eye, 95th percentile): {rate_hz} Hz, 3 mm noise, 5 % outliers, dropouts"
-    )
-    if path is not None:
-        from runtime.artifacts import write_bytes
-
-        write_bytes(path, _png(figure))
-    return figure
-
-
-def _png(figure: Figure) -> bytes:
-    import io
-
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()

@@ -7,7 +7,6 @@ import numpy as np
 from runtime.records import F64, U16, Intrinsics
 
 M_PER_MM = 1e-3
-WINDOW = 0.16  # half a window, in separations of the eyes
 GROW = (1.0, 1.8, 3.0)  # windows that are tried until one holds enough measurements
 ENOUGH = 0.2  # share of a window that must be measured
 FACE_DEPTH_M = 0.12  # what belongs to one face is within this of its median
@@ -45,10 +44,3 @@ def point_from_pixel(pixel: F64, depth_m: float, intrinsics: Intrinsics) -> F64:
     i = intrinsics
     x, y = (pixel[0] - i.cx_px) / i.fx_px, (pixel[1] - i.cy_px) / i.fy_px
     return np.array([x * depth_m, y * depth_m, depth_m])
-
-
-def pixel_from_point(point_m: F64, intrinsics: Intrinsics) -> F64:
-    """(2,) continuous pixel of a point before the camera."""
-    i = intrinsics
-    x, y, z = point_m
-    return np.array([x / z * i.fx_px + i.cx_px, y / z * i.fy_px + i.cy_px])

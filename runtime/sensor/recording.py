@@ -115,9 +115,9 @@ def recording_to(
         file = part.open("wb")
     except OSError as error:
         raise InputError(path, "", f"cannot be written ({error.strerror})") from None
-    with file:
-        writer = _Appearing(file, header, limits=limits, part=part, path=path)
-        try:
+    try:
+        with file:
+            writer = _Appearing(file, header, limits=limits, part=part, path=path)
             try:
                 yield writer
             finally:
@@ -125,10 +125,10 @@ def recording_to(
                     writer.finish()
                 else:
                     part.unlink(missing_ok=True)
-        except OSError as error:
-            if error.filename is None and error.errno is not None:  # ours: writing to an open file, a full disk
-                raise InputError(path, "", f"cannot be written ({error.strerror})") from None
-            raise
+    except OSError as error:
+        if error.filename is None and error.errno is not None:  # of writing to an open file: a full disk
+            raise InputError(path, "", f"cannot be written ({error.strerror})") from None
+        raise
 
 
 class _Appearing(RecordingWriter):

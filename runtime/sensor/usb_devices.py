@@ -56,6 +56,7 @@ def _sysfs_serial(device: Any) -> str:
 
 def _described(device: Any, known: KnownDevice) -> UsbDevice:
     import usb.core
+    import usb.util
 
     serial, accessible = "", True
     try:
@@ -63,6 +64,8 @@ def _described(device: Any, known: KnownDevice) -> UsbDevice:
     except (usb.core.USBError, NotImplementedError, ValueError):
         # pyusb says ValueError ("no langid") where strings may not be read.
         serial, accessible = _sysfs_serial(device), False
+    finally:
+        usb.util.dispose_resources(device)  # reading the serial opened it; whoever uses it opens it again
     return UsbDevice(known, device.bus or 0, device.address or 0, serial, device.speed or 0, accessible, device)
 
 

@@ -49,7 +49,7 @@ class SensorWorker:
     def __init__(self, make_driver: Callable[[], SensorDriver], settings: SensorSettings, clock: Clock) -> None:
         """make_driver: an unopened driver, a fresh one at each call."""
         self._make, self._settings, self._clock = make_driver, settings, clock
-        self._lock = threading.Lock()
+        self._lock, self._watching = threading.Lock(), threading.Lock()
         self._frame: SensorFrame | None = None
         self._attempt: _Attempt | None = None
         self._hung: list[_Attempt] = []
@@ -120,7 +120,14 @@ class SensorWorker:
 
     def _watch(self) -> None:
         """Leave a thread behind that is in one call for too long, and begin another."""
-        attempt = self._attempt
+        if not self._watching.acquire(blocking=False):
+            return  # another thread is at it
+        try:
+            self._leave_behind(self._attempt)
+        finally:
+            self._watching.release()
+
+    def _leave_behind(self, attempt: _Attempt | None) -> None:
         if attempt is None or self._clock.now_ns() <= attempt.deadline_ns:
             return
         if attempt.thread is None or not attempt.thread.is_alive():
