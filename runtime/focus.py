@@ -91,8 +91,6 @@ class FocusedPredictor(Predictor):
         left, right = images[0][0], images[1][0]
         aimed, self._aimed = self._aimed, None
         if aimed is not None:
-            self._even_out(but=aimed.box)
-            self._paint_background(self._wanted_background)
             window, cut = aimed, [[left], [right]]
         else:
             box = differing_box(left, right)
@@ -103,27 +101,39 @@ class FocusedPredictor(Predictor):
                 return self.whole.predict(images, eyes_m)
             if found is not None and self.window is not None and still_fits(self.window, found):
                 found = self.window
-            self._even_out(but=found.box if found else None)
-            self._background = None
-            cv2.LUT(left, _centre_codes(self.stack.count), dst=self._layers[self.stack.count // 2])
             if found is None:
+                self._fill_with(left, but=None)
                 self.window, self.active_fraction = None, 0.0
                 filled_ms = (perf_counter_ns() - begin_ns) / 1e6
                 return Prediction(self._layers, {"prepare": filled_ms, "inference": 0.0, "finish": 0.0})
             window = found
             area = window.box
             cut = [[np.ascontiguousarray(image[area.v0 : area.v1, area.u0 : area.u1])] for image in (left, right)]
-        filled_ms = (perf_counter_ns() - begin_ns) / 1e6
-        return self._solve(window, cut, eyes_m, filled_ms)
+        found_ms = (perf_counter_ns() - begin_ns) / 1e6
+        # Solved before anything is painted: where the model fails, the last good layers stay as they were.
+        solved = self._part(window.stack).predict(cut, eyes_m - window.shift_m)
+        begin_ns = perf_counter_ns()
+        if aimed is not None:
+            self._even_out(but=window.box)
+            self._paint_background(self._wanted_background)
+        else:
+            self._fill_with(left, but=window.box)
+        return self._place(window, solved, eyes_m, found_ms + (perf_counter_ns() - begin_ns) / 1e6)
 
     def close(self) -> None:
         for part in (self.whole, *self._parts.values()):
             part.close()
         self._parts = {}
 
-    def _solve(self, window: Window, cut: Sequence[Sequence[U8]], eyes_m: F64, filled_ms: float) -> Prediction:
+    def _fill_with(self, picture: U8, *, but: PixelBox | None) -> None:
+        """The picture on the centre panel, as both eyes see it where they agree."""
+        self._even_out(but=but)
+        self._background = None
+        cv2.LUT(picture, _centre_codes(self.stack.count), dst=self._layers[self.stack.count // 2])
+
+    def _place(self, window: Window, solved: Prediction, eyes_m: F64, filled_ms: float) -> Prediction:
+        """The window's layers among the rest."""
         area = window.box
-        solved = self._part(window.stack).predict(cut, eyes_m - window.shift_m)
         centre = self.stack.count // 2
         for index, (layer, part) in enumerate(zip(self._layers, solved.layers, strict=True)):
             # Near the window's edge the centre panel can't know what rays meet that leave the window.

@@ -23,7 +23,6 @@ from runtime.quality_probe import Look, QualityProbe
 from runtime.records import (
     F64,
     U8,
-    EyePoints,
     EyesEstimate,
     FrameAccount,
     LayerFrame,

@@ -43,6 +43,7 @@ class UnrolledPredictor(Predictor):
         self.tolerance_mm = tolerance_mm
         self._rows = RowPool(threads)
         self._boxes: tuple[Box, ...] = ()
+        self._drawn: tuple[Box, ...] = ()  # where the layers hold more than even panels
         self._whole = {name: buffer(stack.height_px, stack.width_px) for name in BUFFERS}
         self._layers = np.full((3, stack.height_px, stack.width_px, 4), 255, np.uint8)
         self._chain_buffers: dict[tuple[int, int], Any] = {}
@@ -80,6 +81,9 @@ class UnrolledPredictor(Predictor):
                 for side, eye_m in enumerate(eyes_m):
                     self._between(self._outer[n], eye_m, of=n, on=CENTRE, out=self._seen[n, side])
         self._close_centre(wanted)
+        if self._drawn != self._boxes:
+            self._layers[..., :3] = START // SUBCODE
+            self._drawn = self._boxes
         self._put(CENTRE, self._centre)
         for n in (REAR, FRONT):
             self._put(n, cv2.convertScaleAbs(self._outer[n], alpha=1 / SUBCODE))
@@ -95,7 +99,6 @@ class UnrolledPredictor(Predictor):
             return
         self._boxes = boxes
         self._rasters = tuple(box.cut(self.stack.panel(n)) for n, box in enumerate(boxes))
-        self._layers[..., :3] = START // SUBCODE
 
         def view(name: str, box: Box) -> I16:
             return _view(self._whole[name], box.height_px, box.width_px)
