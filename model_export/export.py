@@ -1,0 +1,160 @@
+"""`phasestack export`: weights to a checked ONNX file."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from model_export.checkpoint import load_eyereal, load_spectral, solver_of
+from model_export.eyereal import LEAST_PX, EyeRealNet
+from model_export.network import SpectralSolver
+from model_export.onnx_files import eyereal_bytes, half_precision, quantised, spectral_bytes, with_contract
+from model_export.recipe import DESIGN_RANGE, Recipe, read_recipe
+from model_export.stress import eyereal_feeds, ordinary_pictures
+from model_export.validate import OPSETS, Report, check_model
+from runtime.artifacts import write_bytes
+from runtime.errors import InputError
+from runtime.model.contract import Contract
+from runtime.model.predictor import SHIPPED
+
+CALIBRATION_PAIRS = 8
+CALIBRATION_SIZE = (270, 480)
+
+
+@dataclass(frozen=True, slots=True)
+class ExportRequest:
+    """The command line of `export`."""
+
+    arch: str
+    out: Path
+    checkpoint: Path | None = None
+    random_init: int | None = None
+    width_px: int = 1920
+    height_px: int = 1080
+    base_width: int = 32
+    precision: str = "fp32"
+    opset: int = OPSETS[0]
+    dynamic: bool = False
+
+
+def export_model(request: ExportRequest) -> Report:
+    """Make, check, and write where every check passed. Raises InputError."""
+    _check_request(request)
+    data, module = eyereal_model(request) if request.arch == "eyereal" else spectral_model(request)
+    report = check_model(data, source=str(request.out), reference=module)
+    if report.passed:
+        write_bytes(request.out, data)
+    return report
+
+
+def spectral_model(request: ExportRequest) -> tuple[bytes, nn.Module]:
+    """One of the shipped family: its recipe's weights, a checkpoint's, or untrained ones."""
+    if request.precision == "int8":
+        raise InputError(
+            "export",
+            "--precision",
+            f"int8 is for eyereal: {request.arch} has no convolutions, and 8 bits ruin its modes",
+        )
+    recipe = read_recipe(request.arch)
+    if request.checkpoint is not None:
+        net, recipe = load_spectral(request.checkpoint, name=request.arch)
+    elif request.random_init is not None:
+        training = recipe.training.model_copy(update={"seed": request.random_init})
+        recipe = recipe.model_copy(update={"weights": None, "training": training})
+        net = solver_of(recipe, source=request.arch)
+    else:
+        net = solver_of(recipe, source=request.arch)
+    return spectral_file(net, recipe, precision=request.precision, opset=request.opset), net
+
+
+def spectral_file(net: SpectralSolver, recipe: Recipe, *, precision: str = "fp32", opset: int = OPSETS[0]) -> bytes:
+    """The ONNX file of a recipe's network, with its contract."""
+    data = spectral_bytes(net, cell_px=recipe.cell_px, opset=opset)
+    if precision == "fp16":
+        data = half_precision(data)
+    contract = Contract(
+        version=1,
+        arch="spectral",
+        name=recipe.name,
+        panels=3,
+        eyes=2,
+        input_frame="chain",
+        input_value="phase",
+        layout="RNC",
+        eye_order="left-right",
+        output="outer",
+        branch=2,
+        value_range=(0.0, 1.0),
+        trained_for=DESIGN_RANGE,
+        recipe_sha256=recipe.sha256(),
+        precision=precision,
+        parameters=_parameters(net),
+        cell_px=recipe.cell_px,
+        reduction=recipe.reduction,
+        steps=recipe.steps,
+    )
+    return with_contract(data, contract)
+
+
+def eyereal_model(request: ExportRequest) -> tuple[bytes, nn.Module]:
+    """The published network with a checkpoint's weights, or untrained ones."""
+    if request.checkpoint is not None:
+        net = load_eyereal(request.checkpoint)
+        origin = hashlib.sha256(request.checkpoint.read_bytes())
+    else:
+        torch.manual_seed(request.random_init or 0)
+        net = EyeRealNet(request.base_width).eval()
+        origin = hashlib.sha256(f"eyereal {request.base_width} random {request.random_init}".encode())
+    size = {"width_px": request.width_px, "height_px": request.height_px}
+    whole = request.dynamic or request.precision == "int8"
+    data = eyereal_bytes(net, **size, dynamic=whole, opset=request.opset)
+    if request.precision == "fp16":
+        data = half_precision(data)
+    elif request.precision == "int8":
+        samples = [eyereal_feeds(ordinary_pictures(*CALIBRATION_SIZE, number=k)) for k in range(CALIBRATION_PAIRS)]
+        data = quantised(data, samples, size=None if request.dynamic else (request.height_px, request.width_px))
+    contract = Contract(
+        version=1,
+        arch="eyereal",
+        name="eyereal",
+        panels=3,
+        eyes=2,
+        input_frame="panel",
+        input_value="intensity",
+        layout="NCHW",
+        eye_order="left-right",
+        output="panels",
+        branch=1,
+        value_range=(-0.2, 0.8),
+        trained_for=DESIGN_RANGE,
+        recipe_sha256=origin.hexdigest(),
+        width_px=0 if request.dynamic else request.width_px,
+        height_px=0 if request.dynamic else request.height_px,
+        precision=request.precision,
+        parameters=_parameters(net),
+    )
+    return with_contract(data, contract), net
+
+
+def _parameters(net: nn.Module) -> int:
+    return sum(parameter.numel() for parameter in net.parameters())
+
+
+def _check_request(request: ExportRequest) -> None:
+    if request.arch not in (*SHIPPED, "eyereal"):
+        raise InputError("export", "--arch", f"{request.arch!r} is neither {', '.join(SHIPPED)} nor eyereal")
+    if request.checkpoint is not None and request.random_init is not None:
+        raise InputError("export", "--random-init", "and --checkpoint exclude one another")
+    if request.arch == "eyereal" and request.checkpoint is None and request.random_init is None:
+        raise InputError("export", "--checkpoint", "or --random-init is needed: eyereal's weights aren't shipped")
+    for option, value in (("--width", request.width_px), ("--height", request.height_px)):
+        if value < LEAST_PX or value > 8192 or value % 2:
+            raise InputError("export", option, f"{value} must be an even number from {LEAST_PX} to 8192")
+    if not 1 <= request.base_width <= 256:
+        raise InputError("export", "--base-width", f"{request.base_width} must be from 1 to 256")
+    if request.opset not in OPSETS:
+        raise InputError("export", "--opset", f"{request.opset}: there are {OPSETS[0]} to {OPSETS[-1]}")

@@ -1,0 +1,133 @@
+"""torch modules to ONNX bytes, at a precision, with the contract in them."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import tempfile
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from torch import nn
+
+from model_export import eyereal, network
+from runtime.model.contract import METADATA_KEY, Contract
+
+CELL_AXES = {
+    "difference": {0: "rows", 1: "cells", 2: "columns"},
+    "modes_out": {0: "cells_and_one", 1: "cells"},
+    "spectrum": {0: "cells"},
+    "modes_in": {0: "cells", 1: "cells"},
+    network.OUTPUT: {0: "rows", 1: "cells_and_one", 2: "columns"},
+}
+PICTURE_AXES = {name: {2: "height", 3: "width"} for name in (eyereal.INPUT, eyereal.OUTPUT)}
+Feeds = dict[str, np.ndarray]
+
+
+def spectral_bytes(net: nn.Module, *, cell_px: int, opset: int) -> bytes:
+    """The solver along the eyes' line: rows, cells and columns are whatever a pose asks for."""
+    n, rows = 8, 6
+    example = (torch.zeros(rows, n, 6 * cell_px), torch.zeros(n + 1, n), torch.ones(n), torch.zeros(n, n))
+    return _exported(net, (*example, torch.ones(1)), network.INPUTS, network.OUTPUT, CELL_AXES, opset)
+
+
+def eyereal_bytes(net: nn.Module, *, width_px: int, height_px: int, dynamic: bool, opset: int) -> bytes:
+    """The published network, of one picture size or of any."""
+    example = torch.zeros(1, 18, *((64, 96) if dynamic else (height_px, width_px)))
+    axes = PICTURE_AXES if dynamic else {}
+    return _exported(net, (example,), (eyereal.INPUT,), eyereal.OUTPUT, axes, opset)
+
+
+def with_contract(data: bytes, contract: Contract) -> bytes:
+    """The same model with the metadata entry that the runtime asks for."""
+    model = onnx.load_from_string(data)
+    del model.metadata_props[:]
+    onnx.helper.set_model_props(model, {METADATA_KEY: contract.model_dump_json()})
+    return bytes(model.SerializeToString(deterministic=True))
+
+
+def half_precision(data: bytes) -> bytes:
+    """Weights and products in 16 bits; inputs and outputs stay 32."""
+    from onnxruntime.transformers.float16 import convert_float_to_float16
+    from onnxruntime.transformers.onnx_model import OnnxModel
+
+    converted = OnnxModel(convert_float_to_float16(onnx.load_from_string(data), keep_io_types=True))
+    converted.topological_sort()  # the conversion puts its casts of the inputs last
+    return bytes(converted.model.SerializeToString())
+
+
+def quantised(data: bytes, samples: Sequence[Feeds], *, size: tuple[int, int] | None) -> bytes:
+    """Static 8-bit convolutions (QDQ, a scale per channel), calibrated on samples.
+
+    size: (height, width) to fix a model of any size to, afterwards; None: leave it.
+    """
+    from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+    from onnxruntime.tools.onnx_model_utils import make_dim_param_fixed
+
+    class Reader(CalibrationDataReader):  # type: ignore[misc]
+        def __init__(self) -> None:
+            self._rest = iter(samples)
+
+        def get_next(self) -> Any:
+            return next(self._rest, None)
+
+    with tempfile.TemporaryDirectory() as folder, _quiet():
+        plain, small = Path(folder) / "plain.onnx", Path(folder) / "int8.onnx"
+        plain.write_bytes(data)
+        quantize_static(
+            plain,
+            small,
+            Reader(),
+            quant_format=QuantFormat.QDQ,
+            per_channel=True,
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+            op_types_to_quantize=["Conv"],
+        )
+        model = onnx.load(small)
+    if size is not None:
+        make_dim_param_fixed(model.graph, "height", size[0])
+        make_dim_param_fixed(model.graph, "width", size[1])
+    return bytes(model.SerializeToString())
+
+
+def _exported(
+    net: nn.Module,
+    example: tuple[Any, ...],
+    inputs: Sequence[str],
+    output: str,
+    axes: dict[str, dict[int, str]],
+    opset: int,
+) -> bytes:
+    buffer = io.BytesIO()
+    with _quiet(), torch.no_grad():
+        torch.onnx.export(
+            net.eval(),
+            example,
+            buffer,
+            opset_version=opset,
+            input_names=list(inputs),
+            output_names=[output],
+            dynamic_axes=axes,
+            dynamo=False,
+        )
+    return buffer.getvalue()
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """The exporters advise developers of models, not users of this command."""
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(level)

@@ -1,0 +1,73 @@
+"""Inputs that a model is checked on: an ordinary pair, and pictures that break what is fragile."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from model_export.data import endless_pairs
+from model_export.onnx_files import Feeds
+from runtime.model.chain import chain_modes
+from runtime.optics.malus import phase_from_intensity
+from runtime.records import F32
+
+ORDINARY = "ordinary pair"
+
+
+def stress_pictures(height: int, width: int) -> dict[str, tuple[F32, F32]]:
+    """Left and right pictures (h, w, 3), intensities in [0, 1], by name."""
+    v, u = np.mgrid[0:height, 0:width]
+
+    def grey(values: np.ndarray) -> F32:
+        return np.repeat(values[..., None], 3, axis=2).astype(np.float32)
+
+    black, white = grey(np.zeros((height, width))), grey(np.ones((height, width)))
+    checker, lines = grey((u // 8 + v // 8) % 2), grey(u % 2)
+    bars = grey((u // max(1, width // 6)) % 2)
+    random = np.random.default_rng(11)
+    left, right = (random.random((height, width, 3), dtype=np.float32) for _ in range(2))
+    return {
+        "all black": (black, black),
+        "all white": (white, white),
+        "checkerboard": (checker, 1 - checker),
+        "one-pixel lines": (lines, np.roll(lines, 1, axis=1)),
+        "extreme disparity": (bars, np.roll(bars, width // 3, axis=1)),
+        "one eye black": (black, white),
+        "noise": (left, right),
+    }
+
+
+def ordinary_pictures(height: int, width: int, *, number: int = 0) -> tuple[F32, F32]:
+    """A procedural pair of that size."""
+    pair = next(endless_pairs(77, first=number, width_px=width, height_px=height, tolerance_mm=(0.0, 0.0)))
+    left, right = (image.astype(np.float32) / np.float32(255) for image in pair.images)
+    return left, right
+
+
+def spectral_cases(cell_px: int) -> dict[str, Feeds]:
+    """Inputs of the solver along the eyes' line: short and long chains, exact and tolerant."""
+    cases = {}
+    for cells, tolerance in ((16, 0.0), (112, 1.0), (400, 4.0)):
+        size = (64, cells * 2 * cell_px)
+        for name, pictures in {ORDINARY: ordinary_pictures(*size), **stress_pictures(*size)}.items():
+            left, right = (phase_from_intensity(picture) for picture in pictures)
+            modes_out, spectrum, modes_in = chain_modes(cells)
+            cases[f"{name}, {cells} cells"] = {
+                "difference": np.ascontiguousarray((right - left).reshape(64, cells, -1), np.float32),
+                "modes_out": modes_out,
+                "spectrum": spectrum,
+                "modes_in": modes_in,
+                "tolerance_mm": np.array([tolerance], np.float32),
+            }
+    return cases
+
+
+def eyereal_cases(height: int, width: int) -> dict[str, Feeds]:
+    """Inputs of the published network: every panel gets the same pictures."""
+    cases = {ORDINARY: ordinary_pictures(height, width), **stress_pictures(height, width)}
+    return {name: eyereal_feeds(pictures) for name, pictures in cases.items()}
+
+
+def eyereal_feeds(pictures: tuple[F32, F32]) -> Feeds:
+    """(1, 18, h, w): panel-major, then eye, then RGB."""
+    eyes = np.concatenate([picture.transpose(2, 0, 1) for picture in pictures])
+    return {"eyes": np.ascontiguousarray(np.tile(eyes, (3, 1, 1))[None], np.float32)}
