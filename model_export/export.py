@@ -95,6 +95,8 @@ def spectral_file(net: SpectralSolver, recipe: Recipe, *, precision: str = "fp32
         parameters=_parameters(net),
         cell_px=recipe.cell_px,
         reduction=recipe.reduction,
+        emphasis=recipe.emphasis,
+        interpolation=recipe.interpolation,
         steps=recipe.steps,
     )
     return with_contract(data, contract)

@@ -42,6 +42,11 @@ class Recipe(Section):
     hidden: Annotated[int, Field(ge=1, le=256)] = 16
     cell_px: Annotated[int, Field(ge=1, le=64)] = 4
     reduction: Literal[1, 2, 4] = 2
+    emphasis: Annotated[float, Field(ge=0, le=0.5)] = Field(
+        0.0,
+        description="strength of the sharpening that undoes the blur of interpolation, on the way in and in the eye",
+    )
+    interpolation: Literal["linear", "cubic"] = Field("linear", description="how still pictures are warped")
     steps: Annotated[tuple[Step, ...], Field(min_length=1)]
     training: Training = Training()
     weights: dict[str, Any] | None = Field(None, description="state_dict as nested lists; none: the analytic start")

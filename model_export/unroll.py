@@ -17,8 +17,9 @@ from torch.nn import functional
 from model_export.data import TrainingPair
 from model_export.network import SpectralSolver
 from model_export.recipe import Recipe
-from runtime.model.chain import ChainFrame, chain_frame, chain_modes
+from runtime.model.chain import ChainFrame, chain_frame, chain_modes, relative_tolerance_mm
 from runtime.model.resample import target_from_source
+from runtime.model.transfer import emphasised
 from runtime.optics.malus import HALF_PI
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
@@ -75,10 +76,10 @@ class UnrolledSolver(nn.Module):
         """(3, 3, h, w) panel values, rear to front, as 8 bits show them. Raises ValueError for eyes it can't serve."""
         recipe, device = self.recipe, self.sizes.device
         frame = chain_frame(eyes_m, stack, cell_px=recipe.cell_px, reduction=recipe.reduction)
-        wanted = [phases(image, device) for image in images]
+        wanted = [phases(emphasised(image, recipe.emphasis), device) for image in images]
         outer = {n: torch.full_like(wanted[0], START) for n in (REAR, FRONT)}
         seen: dict[tuple[int, int], Tensor] = {}
-        tolerance = torch.tensor([tolerance_mm], dtype=torch.float32, device=device)
+        tolerance = torch.tensor([relative_tolerance_mm(tolerance_mm, eyes_m)], dtype=torch.float32, device=device)
         for index, kind in enumerate(self.kinds):
             lacks = self._lacks(wanted, seen) if index else []
             if kind == "chain":

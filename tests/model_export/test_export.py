@@ -1,0 +1,166 @@
+"""Export and validation: what is written passes its checks and runs in the runtime; what fails isn't written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+onnx = pytest.importorskip("onnx")
+from onnx import numpy_helper  # noqa: E402
+from typer.testing import CliRunner  # noqa: E402
+
+from model_export.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
+from model_export.export import ExportRequest, export_model  # noqa: E402
+from model_export.eyereal import EyeRealNet  # noqa: E402
+from model_export.network import SpectralSolver  # noqa: E402
+from model_export.recipe import read_recipe  # noqa: E402
+from model_export.ship import shipped_bytes  # noqa: E402
+from model_export.validate import check_model, validate_file  # noqa: E402
+from runtime.cli import app  # noqa: E402
+from runtime.errors import InputError  # noqa: E402
+from runtime.model.predictor import SHIPPED, load_predictor, model_path  # noqa: E402
+from runtime.model.still import solve_still  # noqa: E402
+from runtime.optics.stack import PanelStack  # noqa: E402
+
+STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
+EYES = np.array([[0.7, -0.0315, 0.0], [0.7, 0.0315, 0.0]])
+
+
+def layers_of(path: Path) -> np.ndarray:
+    picture = np.random.default_rng(5).integers(0, 256, (108, 192, 3), dtype=np.uint8)
+    predictor = load_predictor(str(path), STACK)
+    return solve_still(picture, picture, eyes_m=EYES, fov_deg=40.0, predictor=predictor).layers.copy()
+
+
+def narrow_eyereal(tmp_path: Path, **options: object) -> ExportRequest:
+    """The published network, narrow, with weights and statistics that aren't trivial."""
+    torch.manual_seed(1)
+    net = EyeRealNet(4)
+    with torch.no_grad():
+        net.train()(torch.rand(2, 18, 64, 96))
+        net.subnets.out_conv[0].weight *= 4
+    path = tmp_path / "published.pth"
+    save_checkpoint(path, {"model": net.state_dict()})
+    size = {"width_px": 192, "height_px": 108}
+    return ExportRequest("eyereal", tmp_path / "eyereal.onnx", checkpoint=path, **{**size, **options})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_models_are_remade_from_their_recipes_to_the_byte(name: str) -> None:
+    path = model_path(name)
+    assert path is not None
+    shipped, made = path.read_bytes(), shipped_bytes(name)
+    # Another version of torch may arrange the file differently; the numbers must not move.
+    if onnx.load_from_string(shipped).producer_version == onnx.load_from_string(made).producer_version:
+        assert made == shipped
+    weights = [[numpy_helper.to_array(i) for i in onnx.load_from_string(d).graph.initializer] for d in (shipped, made)]
+    assert all(np.array_equal(a, b) for a, b in zip(*weights, strict=True))
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_models_pass_validation(name: str) -> None:
+    path = model_path(name)
+    assert path is not None
+    assert validate_file(path).passed
+
+
+@pytest.mark.parametrize("opset", [17, 18, 19, 20])
+def test_every_opset_on_offer_runs(tmp_path: Path, opset: int) -> None:
+    out = tmp_path / "fast.onnx"
+    assert export_model(ExportRequest("fast", out, opset=opset)).passed
+    assert onnx.load(out).opset_import[0].version == opset
+    assert np.array_equal(layers_of(out), layers_of(Path(str(model_path("fast")))))
+
+
+@pytest.mark.parametrize("precision", ["fp32", "fp16", "int8"])
+@pytest.mark.parametrize("dynamic", [False, True])
+def test_the_published_network_is_exported_at_every_precision_and_served(
+    tmp_path: Path, precision: str, dynamic: bool
+) -> None:
+    request = narrow_eyereal(tmp_path, precision=precision, dynamic=dynamic)
+    report = export_model(request)
+    assert report.passed, report.table()
+    again = validate_file(request.out)
+    assert again.passed, again.table()
+    assert layers_of(request.out)[..., :3].std() > 0
+
+
+def test_half_precision_of_ours_stays_within_two_codes(tmp_path: Path) -> None:
+    out = tmp_path / "half.onnx"
+    assert export_model(ExportRequest("balanced", out, precision="fp16")).passed
+    difference = layers_of(out).astype(int) - layers_of(Path(str(model_path("balanced"))))
+    assert np.abs(difference).mean() < 2
+
+
+def test_a_file_whose_weights_were_changed_differs_from_the_torch_it_came_from(tmp_path: Path) -> None:
+    request = narrow_eyereal(tmp_path)
+    export_model(request)
+    model = onnx.load(request.out)
+    kernel = model.graph.initializer[0]
+    kernel.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(kernel) * 3 + 1, kernel.name))
+    assert request.checkpoint is not None
+    net = EyeRealNet(4)
+    net.load_state_dict(load_checkpoint(request.checkpoint)["model"])
+    assert not check_model(model.SerializeToString(), source="changed", reference=net.eval()).passed
+
+
+def test_an_export_that_fails_its_checks_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("model_export.validate.LIMITS", {"fp16": 0.0})
+    out = tmp_path / "half.onnx"
+    arguments = ["export", "--arch", "balanced", "--precision", "fp16", "--out", str(out)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 1
+    assert "FAILED" in result.output and not out.exists()
+
+
+def test_a_model_that_answers_nan_fails(tmp_path: Path) -> None:
+    net = SpectralSolver()
+    torch.nn.init.constant_(net.lambda_net[2].bias, float("nan"))
+    from model_export.export import spectral_file
+
+    data = spectral_file(net, read_recipe("fast"))
+    assert any(c.found == "not finite" and not c.passed for c in check_model(data, source="nan").checks)
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        ({"opset": 12}, "--opset"),
+        ({"width_px": 191}, "--width"),
+        ({"height_px": 8}, "--height"),
+        ({"arch": "huge"}, "--arch"),
+        ({"arch": "eyereal"}, "--checkpoint"),
+        ({"precision": "int8"}, "--precision"),
+        ({"random_init": 1, "checkpoint": Path("x.pth")}, "--random-init"),
+        ({"checkpoint": Path("absent.pth")}, "cannot be read"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused_in_one_line(tmp_path: Path, options: dict[str, object], field: str) -> None:
+    out = tmp_path / "new" / "model.onnx"
+    with pytest.raises(InputError, match=field):
+        export_model(ExportRequest(**{"arch": "fast", "out": out, **options}))  # type: ignore[arg-type]
+    assert not out.parent.exists()
+
+
+def test_validate_refuses_what_is_not_ours(tmp_path: Path) -> None:
+    path = tmp_path / "other.onnx"
+    path.write_bytes(b"nonsense")
+    with pytest.raises(InputError, match="is no ONNX model"):
+        validate_file(path)
+    model = onnx.load_from_string(shipped_bytes("fast"))
+    del model.metadata_props[:]
+    path.write_bytes(model.SerializeToString())
+    with pytest.raises(InputError, match="carries no contract"):
+        validate_file(path)
+
+
+def test_validate_prints_a_table_or_one_json_object() -> None:
+    path = str(model_path("fast"))
+    table = CliRunner().invoke(app, ["validate", path])
+    assert table.exit_code == 0 and "checks passed" in table.output
+    found = json.loads(CliRunner().invoke(app, ["validate", path, "--json"]).stdout)
+    assert found["passed"] and all(check["passed"] for check in found["checks"])

@@ -1,0 +1,186 @@
+"""Training: exact geometry of the data, a copy that agrees with the runtime, determinism and resuming."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+import model_export.train as training  # noqa: E402
+from model_export.checkpoint import load_spectral, solver_of  # noqa: E402
+from model_export.data import TrainingPair, endless_pairs  # noqa: E402
+from model_export.recipe import Recipe, read_recipe  # noqa: E402
+from model_export.scene import Plane, draw  # noqa: E402
+from model_export.train import TrainRequest, held_out_pairs, pair_loss, run_training  # noqa: E402
+from model_export.unroll import UnrolledSolver, displayed_mse, seen_error  # noqa: E402
+from runtime.config import ModelSettings  # noqa: E402
+from runtime.errors import InputError  # noqa: E402
+from runtime.model.predictor import load_predictor  # noqa: E402
+from runtime.optics.stack import PanelStack  # noqa: E402
+from runtime.optics.views import raster_from_stack  # noqa: E402
+
+STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
+EYES = np.array([[0.7, -0.0315, 0.02], [0.7, 0.0315, 0.02]])
+SMALL = {"width_px": 160, "height_px": 96}
+
+
+def first_pairs(count: int, *, seed: int = 1, **size: int) -> list[TrainingPair]:
+    stream = endless_pairs(seed, tolerance_mm=(0.0, 4.0), **(size or SMALL))
+    return [pair for pair, _ in zip(stream, range(count), strict=False)]
+
+
+# A texture is drawn twice as fine as the raster and averaged: its edges are true to about a tenth of a pixel.
+def test_a_plane_is_drawn_where_the_projection_puts_it() -> None:
+    white = np.full((40, 40, 4), 255, np.uint8)
+    centre = np.array([-0.1, 0.05, -0.03])
+    plane = Plane(white, centre - [0, 0.01, -0.01], np.array([0, 0.02, 0.0]), np.array([0, 0, -0.02]))
+    for eye in EYES:
+        picture = draw((plane,), eye, STACK.panel(1)).mean(axis=2)
+        v_px, u_px = np.mgrid[0:270, 0:480] + 0.5
+        u, v, w = raster_from_stack(eye, STACK.panel(1)) @ [*centre, 1.0]
+        assert (u_px * picture).sum() / picture.sum() == pytest.approx(u / w, abs=0.12)
+        assert (v_px * picture).sum() / picture.sum() == pytest.approx(v / w, abs=0.12)
+
+
+def test_the_nearer_plane_hides_the_farther_whatever_their_order() -> None:
+    def plane(x_m: float, grey: int) -> Plane:
+        texture = np.dstack([np.full((8, 8, 3), grey, np.uint8), np.full((8, 8), 255, np.uint8)])
+        corner = np.array([x_m, -1.0, 1.0])
+        return Plane(texture, corner, np.array([0, 2.0, 0]), np.array([0, 0, -2.0]))
+
+    near, far = plane(0.1, 200), plane(-0.2, 50)
+    for scene in ((near, far), (far, near)):
+        assert draw(scene, EYES[0], STACK.panel(1))[135, 240].tolist() == [200, 200, 200]
+
+
+def test_pairs_depend_on_seed_and_number_alone() -> None:
+    whole = first_pairs(4)
+    rest = endless_pairs(1, first=2, tolerance_mm=(0.0, 4.0), **SMALL)
+    again = next(rest)
+    assert np.array_equal(again.images[1], whole[2].images[1]) and np.array_equal(again.eyes_m, whole[2].eyes_m)
+    assert not np.array_equal(first_pairs(1, seed=2)[0].images[0], whole[0].images[0])
+
+
+def test_poses_stay_within_the_design_range() -> None:
+    for pair in first_pairs(60, width_px=64, height_px=64):
+        eyes, middle = pair.eyes_m, pair.eyes_m.mean(axis=0)
+        assert 0.01 < np.linalg.norm(eyes[1] - eyes[0]) < 0.0701
+        assert eyes[1, 1] > eyes[0, 1]
+        assert eyes[:, 0].min() > pair.stack.x_m[2] + 0.08
+        assert np.linalg.norm(middle) < 4.2
+        assert 0.005 <= pair.stack.x_m[2] <= 0.5
+        assert len(pair.off) == (2 if pair.tolerance_mm > 0 else 0)
+
+
+@pytest.mark.parametrize("name", ["fast", "balanced"])
+def test_the_copy_sees_what_the_runtime_sees(name: str) -> None:
+    recipe = read_recipe(name)
+    copy = UnrolledSolver(solver_of(recipe, source=name), recipe)
+    pair = first_pairs(1)[0]
+    eyes = EYES.copy()
+    white = np.random.default_rng(2).integers(40, 200, (27, 48, 3)).astype(np.uint8)
+    left = white.repeat(10, axis=0).repeat(10, axis=1)
+    pair = TrainingPair(STACK, eyes, (left, np.roll(left, 2, axis=1)), 1.0)
+    predictor = load_predictor(name, STACK, ModelSettings(tolerance_mm=1.0))
+    alpha = np.full((270, 480, 1), 255, np.uint8)
+    layers = predictor.predict([[np.concatenate([p, alpha], axis=2)] for p in pair.images], eyes).layers[..., :3]
+    shown = torch.from_numpy(layers.copy()).permute(0, 3, 1, 2).float() / 255
+    with torch.no_grad():
+        ours, theirs = (
+            -10 * np.log10(float(displayed_mse(x, pair)[0])) for x in (copy(pair.images, eyes, STACK, 1.0), shown)
+        )
+    assert ours == pytest.approx(theirs, abs=1.0)
+
+
+def test_what_is_learned_gets_gradients_and_steps_down_the_loss() -> None:
+    recipe = read_recipe("balanced").model_copy(update={"weights": None})
+    model = UnrolledSolver(solver_of(recipe, source="test"), recipe)
+    pair = first_pairs(1, seed=4)[0]
+    loss = pair_loss(model, pair)
+    loss.backward()
+    assert model.sizes.grad is not None and (model.sizes.grad != 0).all()
+    gradient = torch.cat([p.grad.reshape(-1) for p in model.parameters() if p.grad is not None])
+    assert torch.isfinite(gradient).all() and gradient.norm() > 0
+    with torch.no_grad():
+        for p in model.parameters():
+            p -= 0.02 * p.grad / gradient.norm()
+        assert pair_loss(model, pair) < loss
+
+
+def test_even_layers_show_the_intensity_of_malus_law() -> None:
+    grey = np.full((270, 480, 3), 128, np.uint8)
+    value = (2 - 2 / np.pi * np.arcsin(np.sqrt(128 / 255))) / 3
+    error, count = seen_error(torch.full((3, 3, 270, 480), float(value)), grey, EYES[0], STACK)
+    assert count > 100_000
+    assert float(error) / count < 1e-9
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> Path:
+    """A recipe that trains in seconds."""
+    table = json.loads(read_recipe("fast").text())
+    table.pop("weights", None)
+    table["training"] |= SMALL | {"iterations": 4, "validate_every": 2, "validation_pairs": 2}
+    path = tmp_path / "tiny.json"
+    path.write_text(json.dumps(table))
+    return path
+
+
+def trained(
+    out: Path, recipe: Path, *, iterations: int | None = None, resume: bool = False, data: tuple[Path, ...] = ()
+) -> Recipe:
+    run_training(TrainRequest(out, str(recipe), data, "lego_bulldozer", iterations, None, "cpu", 1, resume))
+    return Recipe.model_validate_json((out / "recipe.json").read_text())
+
+
+def test_training_is_the_same_twice_and_leaves_its_files(tmp_path: Path, tiny: Path) -> None:
+    first, second = (trained(tmp_path / name, tiny) for name in ("a", "b"))
+    assert first.weights == second.weights
+    _, recipe = load_spectral(tmp_path / "a" / "checkpoint.pth", name="fast")
+    assert recipe.steps == first.steps and recipe.weights == first.weights
+    rows = (tmp_path / "a" / "validation.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in rows] == ["iteration", "0", "2", "4"]
+    assert (tmp_path / "a" / "validation.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_training_that_was_cut_off_and_resumed_ends_as_if_nothing_had_happened(
+    tmp_path: Path, tiny: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = trained(tmp_path / "whole", tiny)
+    with monkeypatch.context() as patch:
+
+        def save_and_stop(*arguments: object) -> None:
+            save(*arguments)
+            raise KeyboardInterrupt
+
+        save = training._save
+        patch.setattr(training, "_save", save_and_stop)
+        with pytest.raises(KeyboardInterrupt):
+            trained(tmp_path / "cut", tiny)
+    assert torch.load(tmp_path / "cut" / "checkpoint.pth", weights_only=True)["iteration"] == 2
+    assert trained(tmp_path / "cut", tiny, resume=True).weights == whole.weights
+    curves = [(tmp_path / name / "validation.csv").read_text() for name in ("whole", "cut")]
+    assert curves[0] == curves[1]
+
+
+def test_resuming_something_else_is_refused(tmp_path: Path, tiny: Path) -> None:
+    trained(tmp_path / "a", tiny, iterations=1)
+    with pytest.raises(InputError, match="was trained as fast"):
+        run_training(TrainRequest(tmp_path / "a", "balanced", (), "", None, None, "cpu", 1, True))
+
+
+def test_half_a_pair_is_refused_before_anything_is_written(tmp_path: Path, tiny: Path) -> None:
+    folder = tmp_path / "data"
+    folder.mkdir()
+    (folder / "pair0_x6.486_y-0.263_z2.004_1.jpg").write_bytes(b"x")
+    with pytest.raises(InputError, match="pair0"):
+        trained(tmp_path / "out", tiny, data=(folder,))
+    assert not (tmp_path / "out").exists()
+
+
+def test_held_out_pairs_are_the_same_every_time() -> None:
+    a, b = (held_out_pairs(1, **SMALL)[0] for _ in range(2))
+    assert np.array_equal(a.images[0], b.images[0])
