@@ -13,6 +13,13 @@ import typer
 from runtime.errors import MissingPart
 
 
+class EyeOrder(StrEnum):
+    """Which eye's picture an `eyereal` checkpoint takes first."""
+
+    LEFT_RIGHT = "left-right"
+    RIGHT_LEFT = "right-left"
+
+
 class Precision(StrEnum):
     """Number format of the exported weights and products."""
 
@@ -74,6 +81,7 @@ def export(
     width: Annotated[int, typer.Option(help="panels' width in pixels")] = 1920,
     height: Annotated[int, typer.Option(help="panels' height in pixels")] = 1080,
     base_width: Annotated[int, typer.Option(help="eyereal: channels of its first block, 32 or 16")] = 32,
+    eye_order: Annotated[EyeOrder, typer.Option(help="eyereal: the eye that its data had first")] = EyeOrder.LEFT_RIGHT,
     precision: Annotated[Precision, typer.Option(help="number format")] = Precision.FP32,
     opset: Annotated[int, typer.Option(help="ONNX operator set, 17 to 20")] = 17,
     dynamic: Annotated[bool, typer.Option("--dynamic", help="any picture size, not only --width x --height")] = False,
@@ -96,6 +104,7 @@ def export(
         width_px=width,
         height_px=height,
         base_width=base_width,
+        eye_order=eye_order.value,
         precision=precision.value,
         opset=opset,
         dynamic=dynamic,

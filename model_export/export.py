@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import nn
@@ -36,6 +37,7 @@ class ExportRequest:
     width_px: int = 1920
     height_px: int = 1080
     base_width: int = 32
+    eye_order: Literal["left-right", "right-left"] = "left-right"
     precision: str = "fp32"
     opset: int = OPSETS[0]
     dynamic: bool = False
@@ -128,7 +130,7 @@ def eyereal_model(request: ExportRequest) -> tuple[bytes, nn.Module]:
         input_frame="panel",
         input_value="intensity",
         layout="NCHW",
-        eye_order="left-right",
+        eye_order=request.eye_order,
         output="panels",
         branch=1,
         value_range=(-0.2, 0.8),

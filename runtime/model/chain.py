@@ -20,6 +20,8 @@ from runtime.records import F32, F64
 CELLS_STEP = 8  # chains' lengths are rounded up to this, so that a moving viewer meets few shapes
 ROWS_STEP = 64
 CELLS_MAX = 1024
+ORDINARY_SEPARATION_M = 0.062
+RELATIVE_TOLERANCE_MAX_MM = 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +116,15 @@ def _panel_extent(middle: F64, stack: PanelStack, *, plane_m: float) -> tuple[fl
     t = (stack.x_m[1] - plane_m) / (middle[0] - plane_m)
     half_m = stack.height_m / 2
     return (-half_m - middle[2] * t) / (1 - t), (half_m - middle[2] * t) / (1 - t)
+
+
+def relative_tolerance_mm(tolerance_mm: float, eyes_m: F64) -> float:
+    """A tolerance as it weighs on an ordinary viewer: beside eyes half as far apart, a millimetre counts twice.
+
+    An eye that is off by d sees the difference between the eyes change by d over their separation.
+    """
+    separation_m = float(np.linalg.norm(eyes_m[1] - eyes_m[0]))
+    return min(RELATIVE_TOLERANCE_MAX_MM, tolerance_mm * ORDINARY_SEPARATION_M / max(separation_m, 1e-6))
 
 
 @lru_cache(maxsize=8)

@@ -56,6 +56,11 @@ class Contract(Section):
     parameters: int = 0
     cell_px: int = Field(4, description="chain: parallax of the outer panels in columns of the network's raster")
     reduction: Literal[1, 2, 4] = Field(2, description="chain: the network's raster is so much coarser than a panel")
+    emphasis: Annotated[float, Field(ge=0, le=0.5)] = Field(
+        0.0,
+        description="strength of the sharpening that undoes the blur of interpolation, on the way in and in the eye",
+    )
+    interpolation: Literal["linear", "cubic"] = Field("linear", description="how still pictures are warped")
     steps: tuple[Step, ...] = ()
 
 

@@ -36,6 +36,11 @@ class Predictor(ABC):
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         """The rasters that each eye's picture must be drawn on, for eyes (2, 3), frame `stack`."""
 
+    @property
+    def interpolation(self) -> str:
+        """How still pictures are to be warped for it: `linear` or `cubic`."""
+        return "linear"
+
     def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
         """Rows and columns of each raster that `predict` will look at: all of them, where it doesn't know better."""
         return tuple((slice(0, raster.height_px), slice(0, raster.width_px)) for raster in self.rasters(eyes_m))

@@ -27,7 +27,14 @@ def solve_still(left: U8, right: U8, *, eyes_m: F64, fov_deg: float, predictor: 
         projection = image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg)
         images.append(
             [
-                _warped(rgba, image_from_raster(projection, raster), raster, rows=rows, columns=columns)
+                _warped(
+                    rgba,
+                    image_from_raster(projection, raster),
+                    raster,
+                    rows=rows,
+                    columns=columns,
+                    cubic=predictor.interpolation == "cubic",
+                )
                 for raster, (rows, columns) in zip(rasters, windows, strict=True)
             ]
         )
@@ -38,7 +45,7 @@ def solve_still(left: U8, right: U8, *, eyes_m: F64, fov_deg: float, predictor: 
     return Prediction(prediction.layers, stage_ms)
 
 
-def _warped(rgba: U8, image_from_raster: F64, raster: PlaneRaster, *, rows: slice, columns: slice) -> U8:
+def _warped(rgba: U8, image_from_raster: F64, raster: PlaneRaster, *, rows: slice, columns: slice, cubic: bool) -> U8:
     """A picture on a raster; only the given rows and columns are drawn."""
     import cv2
 
@@ -49,7 +56,7 @@ def _warped(rgba: U8, image_from_raster: F64, raster: PlaneRaster, *, rows: slic
         rgba,
         matrix,
         (columns.stop - columns.start, rows.stop - rows.start),
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        flags=(cv2.INTER_CUBIC if cubic else cv2.INTER_LINEAR) | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,
     )
     return out

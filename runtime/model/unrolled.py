@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.errors import ModelFailure
-from runtime.model.chain import ChainFrame, chain_frame, chain_modes
+from runtime.model.chain import ChainFrame, chain_frame, chain_modes, relative_tolerance_mm
+from runtime.model.contract import Step
 from runtime.model.predictor import Prediction, Predictor
 from runtime.model.resample import buffer, resample, target_from_source
 from runtime.model.rows import RowPool
 from runtime.model.session import ModelSession
 from runtime.model.timing import Stopwatch
-from runtime.model.transfer import FULL, SUBCODE, phase_codes
+from runtime.model.transfer import FULL, SUBCODE, emphasised, phase_codes
 from runtime.model.visible import Box, visible_boxes
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
@@ -51,6 +52,10 @@ class UnrolledPredictor(Predictor):
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         return (self.stack.panel(CENTRE),)
 
+    @property
+    def interpolation(self) -> str:
+        return self.session.contract.interpolation
+
     def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
         return (visible_boxes(eyes_m, self.stack)[CENTRE].slices,)
 
@@ -63,19 +68,21 @@ class UnrolledPredictor(Predictor):
             raise ModelFailure(str(error)) from None
         self._look_through(visible_boxes(eyes_m, self.stack))
         table = phase_codes(contract.branch)
-        pictures = [image[0][self._boxes[CENTRE].slices] for image in images]
+        pictures = [emphasised(image[0][self._boxes[CENTRE].slices], contract.emphasis) for image in images]
         wanted = [cv2.LUT(cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB), table) for picture in pictures]
         first = True
-        for step in contract.steps:
+        last = {n: _last_change(contract.steps, n) for n in (REAR, FRONT)}
+        for index, step in enumerate(contract.steps):
+            shown = {n: index == last[n] for n in (REAR, FRONT)}
             if not first:
                 self._lacks(wanted)
             if step.kind == "chain":
                 needs = self._first_needs(pictures, table) if first else self._later_needs()
-                self._chain(needs, frame, eyes_m, watch, size=step.size, first=first)
+                self._chain(needs, frame, eyes_m, watch, size=step.size, first=first, shown=shown)
                 changed: tuple[int, ...] = (REAR, FRONT)
             else:
                 changed = (FRONT if step.kind == "front" else REAR,)
-                self._correct(changed[0], eyes_m, size=step.size)
+                self._correct(changed[0], eyes_m, size=step.size, shown=shown[changed[0]])
             first = False
             for n in changed:
                 for side, eye_m in enumerate(eyes_m):
@@ -154,7 +161,7 @@ class UnrolledPredictor(Predictor):
     def _seen_of(self, panel: int) -> tuple[I16, I16]:
         return self._seen[panel, 0], self._seen[panel, 1]
 
-    def _correct(self, panel: int, eyes_m: F64, *, size: float) -> None:
+    def _correct(self, panel: int, eyes_m: F64, *, size: float, shown: bool) -> None:
         """Change one outer panel by what both eyes lack along the rays through each of its pixels."""
         back = self._back[panel]
         for side, eye_m in enumerate(eyes_m):
@@ -167,7 +174,7 @@ class UnrolledPredictor(Predictor):
             np.right_shift(change, 3, out=change)
             np.multiply(change, eighths, out=change)
             np.add(change, outer[rows], out=change)
-            _settle(change, outer[rows])
+            _settle(change, outer[rows], shown=shown)
 
         self._rows.each(self._boxes[panel].height_px, work)
 
@@ -190,7 +197,15 @@ class UnrolledPredictor(Predictor):
         return max(1, box.width_px // reduction), max(1, box.height_px // reduction)
 
     def _chain(
-        self, needs: Sequence[I16], frame: ChainFrame, eyes_m: F64, watch: Stopwatch, *, size: float, first: bool
+        self,
+        needs: Sequence[I16],
+        frame: ChainFrame,
+        eyes_m: F64,
+        watch: Stopwatch,
+        *,
+        size: float,
+        first: bool,
+        shown: dict[int, bool],
     ) -> None:
         """The network's correction: what the outer panels must carry for the eyes to differ as they should."""
         width, height = self._reduced_size()
@@ -210,7 +225,7 @@ class UnrolledPredictor(Predictor):
         answer = self.session.run(
             difference.reshape(frame.rows, frame.cells, -1),
             *chain_modes(frame.cells),
-            np.array([self.tolerance_mm], np.float32),
+            np.array([relative_tolerance_mm(self.tolerance_mm, eyes_m)], np.float32),
             output_shape=(frame.rows, frame.cells + 1, 2 * frame.cell_px * 3),
         )
         if not np.isfinite(answer.sum()):
@@ -224,14 +239,14 @@ class UnrolledPredictor(Predictor):
             codes = cv2.addWeighted(wave, sign * FULL * size, wave, 0.0, START if first else 0.0, dtype=cv2.CV_16S)
             target = self._outer[n] if first else self._back[n][0]
             resample(codes, image_from_result=matrix, out=target, outside=START if first else 0, cubic=True)
-            self._take(n, None if first else target)
+            self._take(n, None if first else target, shown=shown[n])
 
-    def _take(self, panel: int, change: I16 | None) -> None:
+    def _take(self, panel: int, change: I16 | None, *, shown: bool) -> None:
         outer = self._outer[panel]
 
         def work(rows: slice) -> None:
             codes = outer[rows] if change is None else outer[rows] + change[rows]
-            _settle(codes, outer[rows])
+            _settle(codes, outer[rows], shown=shown)
 
         self._rows.each(self._boxes[panel].height_px, work)
 
@@ -243,8 +258,18 @@ def _view(whole: I16, height_px: int, width_px: int) -> I16:
     return parent[:height_px, :width_px]
 
 
-def _settle(codes: I16, out: I16) -> None:
-    """Round to what 8 bits can show, and keep within the panel's range."""
-    np.add(codes, SUBCODE // 2, out=out)
-    np.bitwise_and(out, -SUBCODE, out=out)
-    np.clip(out, 0, FULL, out=out)
+def _settle(codes: I16, out: I16, *, shown: bool) -> None:
+    """Keep within the panel's range; what will be shown is rounded to what 8 bits can show.
+
+    Rounded any earlier, corrections of less than half a code would be lost.
+    """
+    if shown:
+        np.add(codes, SUBCODE // 2, out=codes)
+        np.bitwise_and(codes, -SUBCODE, out=codes)
+    np.clip(codes, 0, FULL, out=out)
+
+
+def _last_change(steps: Sequence[Step], panel: int) -> int:
+    """The last step that changes an outer panel."""
+    kinds = {"chain", "front" if panel == FRONT else "rear"}
+    return max(index for index, step in enumerate(steps) if step.kind in kinds)
