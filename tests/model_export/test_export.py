@@ -89,6 +89,20 @@ def test_the_published_network_is_exported_at_every_precision_and_served(
     assert layers_of(request.out)[..., :3].std() > 0
 
 
+def test_the_eye_that_the_data_had_first_gets_the_first_channels(tmp_path: Path) -> None:
+    pictures = np.random.default_rng(9).integers(0, 256, (2, 108, 192, 3), dtype=np.uint8)
+    layers = {}
+    for order in ("left-right", "right-left"):
+        request = narrow_eyereal(tmp_path, eye_order=order)
+        export_model(request)
+        predictor = load_predictor(str(request.out), STACK)
+        rgba = [[np.dstack([p, p[..., :1]])] * 3 for p in pictures]
+        layers[order] = predictor.predict(rgba, EYES).layers.copy()
+        layers[f"{order} swapped"] = predictor.predict(rgba[::-1], EYES).layers.copy()
+    assert np.array_equal(layers["left-right"], layers["right-left swapped"])
+    assert not np.array_equal(layers["left-right"], layers["right-left"])
+
+
 def test_half_precision_of_ours_stays_within_two_codes(tmp_path: Path) -> None:
     out = tmp_path / "half.onnx"
     assert export_model(ExportRequest("balanced", out, precision="fp16")).passed
