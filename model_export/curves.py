@@ -45,7 +45,12 @@ def _picture(points: Sequence[Point], name: str) -> bytes:
     axes = figure.add_subplot()
     steps = [point.iteration for point in points]
     axes.plot(steps, [point.exact_db for point in points], "o-", label="at the eyes")
-    axes.plot(steps, [point.off_db for point in points], "s-", label="as far off as each pair's tolerance (0 to 4 mm)")
+    axes.plot(
+        steps,
+        [point.off_db for point in points],
+        "s-",
+        label="beside them, by each pair's tolerance (other pairs: those with one)",
+    )
     axes.plot(steps, [-point.loss_db for point in points], "^--", label="both together (minus the loss)")
     axes.set(xlabel="steps of the optimiser", ylabel="displayed PSNR, dB (higher is better)")
     axes.set_title(f"Training {name}: mean over held-out procedural pairs")
