@@ -83,11 +83,11 @@ def build_loop(
     from runtime.eyes.calibration import load_calibration
     from runtime.eyes.detect import EyeFinder
     from runtime.eyes.tracker import Tracker
-    from runtime.finding import FindingDriver
     from runtime.gl import offscreen_context
     from runtime.inputs import Input, LiveInput, SteppedInput
     from runtime.loop import Loop
     from runtime.quality_probe import QualityProbe
+    from runtime.sensor.detecting import DetectingDriver
     from runtime.sensor.registry import open_sensor
 
     cv2.setNumThreads(settings.model.threads or -1)
@@ -97,7 +97,7 @@ def build_loop(
 
     def make_driver() -> SensorDriver:
         driver = open_sensor(settings.sensor, clock, latency_ms=settings.loop.sensor_latency_ms)
-        return FindingDriver(driver, lambda: EyeFinder(settings.detector))
+        return DetectingDriver(driver, lambda: EyeFinder(settings.detector).find)
 
     driver = make_driver()
     source: Input

@@ -201,10 +201,10 @@ class LoopSettings(Section):
         default_factory=lambda: {
             "sensor": 0.1,
             "track": 0.1,
-            "render": 12.0,
+            "render": 8.0,
             "prepare": 4.0,
-            "inference": 12.0,
-            "finish": 6.0,
+            "inference": 3.0,
+            "finish": 8.0,
             "present": 2.0,
             "wait": 0.0,
         },

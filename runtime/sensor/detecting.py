@@ -8,13 +8,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+from runtime.errors import InputError
 from runtime.records import EyePoints, SensorFrame
-from runtime.sensor.base import Capabilities, SensorDriver
+from runtime.sensor.base import Capabilities, SensorDriver, SteppedDriver
 
 FindEyes = Callable[[SensorFrame], EyePoints | None]
 
 
-class DetectingDriver(SensorDriver):
+class DetectingDriver(SteppedDriver):
     """Adds eye points to the frames of a driver that has none, and hands those of others through."""
 
     def __init__(self, driver: SensorDriver, make_find: Callable[[], FindEyes], *, keep_images: bool = False) -> None:
@@ -41,6 +42,20 @@ class DetectingDriver(SensorDriver):
     def read_newest(self, timeout_s: float) -> SensorFrame:
         frame = self._driver.read_newest(timeout_s)
         self.overtaken, self.missed = self._driver.overtaken, self._driver.missed
+        return self._with_eyes(frame)
+
+    def next_sample(self) -> SensorFrame:
+        return self._with_eyes(self._stepped().next_sample())
+
+    def available_ns(self, frame: SensorFrame) -> int:
+        return self._stepped().available_ns(frame)
+
+    def _stepped(self) -> SteppedDriver:
+        if not isinstance(self._driver, SteppedDriver):
+            raise InputError("run", "--max-speed", f"needs a recording, not the sensor {self.name}")
+        return self._driver
+
+    def _with_eyes(self, frame: SensorFrame) -> SensorFrame:
         if self._find is not None:
             frame = replace(frame, eyes=self._find(frame))
         return frame if self._keep_images else replace(frame, colour=None, depth_mm=None)
