@@ -29,7 +29,7 @@ class World:
         flat = torch.cat([(torch.zeros_like(p) if p.grad is None else p.grad).reshape(-1) for p in held])
         distributed.all_reduce(flat)
         flat /= self.size
-        for p, part in zip(held, flat.split([p.numel() for p in held]), strict=True):
+        for p, part in zip(held, flat.split([p.numel() for p in held]), strict=True):  # type: ignore[no-untyped-call]
             p.grad = part.view_as(p).clone()
 
 

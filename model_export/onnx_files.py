@@ -110,7 +110,7 @@ def _exported(
         torch.onnx.export(
             net.eval(),
             example,
-            buffer,
+            buffer,  # type: ignore[arg-type]
             opset_version=opset,
             input_names=list(inputs),
             output_names=[output],

@@ -40,6 +40,11 @@ def phases(picture: U8, device: torch.device) -> Tensor:
     return 2 - torch.asin(torch.sqrt(intensity)) / HALF_PI
 
 
+def _size(image: Tensor) -> tuple[int, int]:
+    """(h, w) of (1, C, h, w)."""
+    return int(image.shape[2]), int(image.shape[3])
+
+
 def sample(
     image: Tensor,
     image_from_result: F64,
@@ -95,8 +100,9 @@ class UnrolledSolver(nn.Module):
                 outer[n] = rounded((outer[n] + self.sizes[index] * change[n]).clamp(0, 1))
                 for side, eye in enumerate(eyes_m):
                     matrix = target_from_source(eye, source=stack.panel(CENTRE), target=stack.panel(n))
-                    seen[n, side] = sample(outer[n], matrix, outer[n].shape[2:], outside=START)
-        best = sum(wanted[side] - seen[REAR, side] - seen[FRONT, side] for side in (0, 1)) / 2
+                    seen[n, side] = sample(outer[n], matrix, _size(outer[n]), outside=START)
+        left, right = (wanted[side] - seen[REAR, side] - seen[FRONT, side] for side in (0, 1))
+        best = (left + right) / 2
         return torch.cat([outer[REAR], rounded(best.clamp(0, 1)), outer[FRONT]])
 
     @staticmethod
@@ -110,7 +116,7 @@ class UnrolledSolver(nn.Module):
         back = []
         for lack, eye in zip(lacks, eyes_m, strict=True):
             matrix = target_from_source(eye, source=stack.panel(panel), target=stack.panel(CENTRE))
-            back.append(sample(lack, matrix, lack.shape[2:], outside=0.0))
+            back.append(sample(lack, matrix, _size(lack), outside=0.0))
         return back[0] + back[1]
 
     def _chain(
