@@ -29,6 +29,7 @@ def test_every_pinned_dependency_is_listed():
         "hypothesis",
         "mpmath",
         "mypy",
+        "plyfile",
         "psutil",
         "pytest",
         "ruff",
