@@ -18,7 +18,7 @@ from runtime.content.active import Window, differing_box, still_fits, whole_rays
 from runtime.content.base import ContentSource, View
 from runtime.content.camera import PixelBox, union
 from runtime.model.predictor import Prediction, Predictor
-from runtime.model.transfer import SUBCODE, phase_codes
+from runtime.model.transfer import SUBCODE, emphasised, phase_codes
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import raster_from_stack
 from runtime.records import F64, U8
@@ -129,7 +129,8 @@ class FocusedPredictor(Predictor):
         """The picture on the centre panel, as both eyes see it where they agree."""
         self._even_out(but=but)
         self._background = None
-        cv2.LUT(picture, _centre_codes(self.stack.count), dst=self._layers[self.stack.count // 2])
+        sharp = emphasised(picture, self.whole.emphasis)
+        cv2.LUT(sharp, _centre_codes(self.stack.count), dst=self._layers[self.stack.count // 2])
 
     def _place(self, window: Window, solved: Prediction, eyes_m: F64, filled_ms: float) -> Prediction:
         """The window's layers among the rest."""

@@ -124,7 +124,9 @@ def relative_tolerance_mm(tolerance_mm: float, eyes_m: F64) -> float:
     An eye that is off by d sees the difference between the eyes change by d over their separation.
     """
     separation_m = float(np.linalg.norm(eyes_m[1] - eyes_m[0]))
-    return min(RELATIVE_TOLERANCE_MAX_MM, tolerance_mm * ORDINARY_SEPARATION_M / max(separation_m, 1e-6))
+    # numpy's minimum, unlike min, hands a NaN on to be refused.
+    relative = tolerance_mm * ORDINARY_SEPARATION_M / np.maximum(separation_m, 1e-6)
+    return float(np.minimum(RELATIVE_TOLERANCE_MAX_MM, relative))
 
 
 @lru_cache(maxsize=8)

@@ -41,6 +41,11 @@ class Predictor(ABC):
         """How still pictures are to be warped for it: `linear` or `cubic`."""
         return "linear"
 
+    @property
+    def emphasis(self) -> float:
+        """How strongly it sharpens pictures against the blur of interpolation (`transfer.emphasised`)."""
+        return 0.0
+
     def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
         """Rows and columns of each raster that `predict` will look at: all of them, where it doesn't know better."""
         return tuple((slice(0, raster.height_px), slice(0, raster.width_px)) for raster in self.rasters(eyes_m))

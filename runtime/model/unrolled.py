@@ -56,6 +56,10 @@ class UnrolledPredictor(Predictor):
     def interpolation(self) -> str:
         return self.session.contract.interpolation
 
+    @property
+    def emphasis(self) -> float:
+        return self.session.contract.emphasis
+
     def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
         return (visible_boxes(eyes_m, self.stack)[CENTRE].slices,)
 
