@@ -24,6 +24,10 @@ log = logging.getLogger("phasestack.daemon")
 
 PANEL_RETRY_S = 1.0
 START_EXTENSION_S = 10.0
+BUDGET_NOT_HELD = (
+    "a budget is kept with the settings, but the loop does not choose by it yet: `phasestack plan --budget-ms` "
+    "measures which model and size would hold it; set model.name"
+)
 NEEDS_RESTART = ("stack", "sensor", "output", "service")
 
 
@@ -102,6 +106,7 @@ class Daemon:
                 content = self._settings.content.model_copy(update={"scene": command.value})
                 return self._replace(loop, self._settings.model_copy(update={"content": content}))
             case "budget":
+                log.warning("%s", BUDGET_NOT_HELD)
                 model = self._settings.model.model_copy(update={"budget_ms": command.value})
                 return self._replace(loop, self._settings.model_copy(update={"model": model}))
         return ""
@@ -174,6 +179,8 @@ def run_daemon(
     logs.configure(settings.service)
     if settings.model.budget_ms and max_speed:
         raise InputError("run", "--budget-ms", "measures real time: it can't be combined with --max-speed")
+    if settings.model.budget_ms:
+        log.warning("%s", BUDGET_NOT_HELD)
     clock = MonotonicClock()
     with ExitStack() as cleanup:
         signals = cleanup.enter_context(Signals())
