@@ -37,7 +37,6 @@ from runtime.stats import RunStats
 log = logging.getLogger("phasestack.loop")
 
 EXPECTED_WEIGHT = 0.1  # of the newest turn in the running mean of turn lengths
-MOVED_M = 1e-6
 
 
 class Supervisor(Protocol):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from runtime.content.base import View
 from runtime.optics.quality import Quality, quality
 from runtime.optics.retina import sample_bilinear, seen_by
 from runtime.optics.stack import PanelStack, PlaneRaster
@@ -56,4 +55,4 @@ def displayed(layers: U8, pair: F64, stack: PanelStack, *, seed: int = 0) -> Qua
     return quality([r.image for r in retinas], wanted, [r.mask for r in retinas])
 
 
-__all__ = ["FOV_DEG", "STACK", "View", "card_scene", "displayed", "eyes"]
+__all__ = ["FOV_DEG", "STACK", "card_scene", "displayed", "eyes"]
