@@ -7,18 +7,17 @@ from typing import Annotated, Any
 
 import typer
 
+from calib.options import ConfigOption, JsonOption, PanelsOption, settings_and_stack, tell
 from calib.panel_commands import app as panels_app
 from runtime.errors import InputError
 
 app = typer.Typer(
     no_args_is_help=True,
     help="Find where the depth camera stands before the stack, and where the panels really are.\n\n"
-    "Example: phasestack calibrate charts --out charts, then capture, solve and report.",
+    "The order is `charts`, `capture`, `solve`, `report`; but first the panels themselves: `panels`.\n\n"
+    "Example: phasestack calibrate charts --out charts",
 )
 app.add_typer(panels_app, name="panels")
-
-ConfigOption = Annotated[Path | None, typer.Option(help="configuration TOML; without it the defaults hold")]
-JsonOption = Annotated[bool, typer.Option("--json", help="one JSON object on stdout")]
 
 
 @app.command()
@@ -32,7 +31,7 @@ def charts(
     check: Annotated[bool, typer.Option("--check", help="measure how well each solved chart fuses, dB")] = False,
     ipd_mm: Annotated[float, typer.Option(help="the observer's eye separation, mm")] = 60.0,
     model: Annotated[str, typer.Option(help="model that solves the charts, or sart")] = "best",
-    panels: Annotated[Path | None, typer.Option(help="panel geometry, TOML or JSON; else the configuration's")] = None,
+    panels: PanelsOption = None,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -48,13 +47,13 @@ def charts(
         raise InputError("calibrate charts", "--kind", f"must be solved or seed, not {kind}")
     if not 5.0 <= ipd_mm <= 100.0:
         raise InputError("calibrate charts", "--ipd-mm", "must lie between 5 and 100")
-    settings, stack = _settings_and_stack(config, panels)
+    settings, stack = settings_and_stack(config, panels)
     chosen = _viewpoints("calibrate charts", viewpoint)
     drawer = Drawer(stack, kind=kind, ipd_m=ipd_mm / 1000, model=model, settings=settings.model)  # type: ignore[arg-type]
     try:
         if out is not None:
             summary = make_charts(out, chosen, drawer, check=check)
-            _say(summary, as_json, f"{summary['files']} files for {len(chosen)} viewpoints in {out}")
+            tell(summary, as_json, f"{summary['files']} files for {len(chosen)} viewpoints in {out}")
         if show:
             show_charts(settings, chosen, drawer)
     finally:
@@ -81,7 +80,7 @@ def capture(
     Live: at each chart move until the lines fuse, then press Enter (n: next, p: previous, q: stop). A recording
     needs --marks, unless it knows its true eyes, as the demo does.
 
-    Example: phasestack calibrate capture --config /etc/phasestack/config.toml --out pairs.csv
+    Example: phasestack calibrate capture --config /etc/phasestack/phasestack.toml --out pairs.csv
     """
     from calib.capture_run import capture_live, capture_recording
 
@@ -91,14 +90,14 @@ def capture(
         raise InputError("calibrate capture", "--max-spread-mm", "must be above 0")
     if marks is not None and replay is None:
         raise InputError("calibrate capture", "--marks", "needs --replay")
-    settings, stack = _settings_and_stack(config, None)
+    settings, stack = settings_and_stack(config)
     limits = {"window_s": window_s, "max_spread_m": max_spread_mm / 1000}
     if replay is not None:
         summary = capture_recording(out, settings, source=replay, marks=marks, **limits)
     else:
         chosen = _viewpoints("calibrate capture", viewpoint)
         summary = capture_live(out, settings, chosen, stack=stack, show=show, again=again, **limits)
-    _say(summary, as_json, f"{summary['pairs']} pairs in {out} ({summary['accepted']} new)")
+    tell(summary, as_json, f"{summary['pairs']} pairs in {out} ({summary['accepted']} new)")
 
 
 @app.command()
@@ -124,7 +123,7 @@ def solve(
         from calib.store import roll_back
 
         restored = roll_back(out)
-        _say({"file": str(out), "restored": str(restored)}, as_json, f"{out} is {restored.name} again")
+        tell({"file": str(out), "restored": str(restored)}, as_json, f"{out} is {restored.name} again")
         return
     if pairs is None:
         raise InputError("calibrate solve", "--pairs", "is missing")
@@ -134,11 +133,11 @@ def solve(
     for name, value in zip(("--sensor-unit", "--stack-unit", "--scale"), units.values(), strict=True):
         if not 0.0 < value < float("inf"):
             raise InputError("calibrate solve", name, "must be a positive number")
-    settings, _ = _settings_and_stack(config, None)
+    settings, _ = settings_and_stack(config)
     summary, text = solve_file(pairs, out, method=method, settings=settings, serial=serial, **units)
     for warning in summary["warnings"]:
         typer.echo(f"warning: {warning}", err=True)
-    _say(summary, as_json, text)
+    tell(summary, as_json, text)
 
 
 @app.command()
@@ -155,9 +154,9 @@ def report(
     """
     from calib.report import write_report
 
-    _, stack = _settings_and_stack(config, None)
+    _, stack = settings_and_stack(config)
     summary = write_report(file, out, pairs_path=pairs, stack=stack)
-    _say(summary, as_json, f"{out / 'index.html'}")
+    tell(summary, as_json, f"{out / 'index.html'}")
 
 
 @app.command()
@@ -174,17 +173,7 @@ def methods(
     from calib.methods_run import compare_methods
 
     summary, text = compare_methods(out, seeds=seeds, pairs_max=pairs_max)
-    _say(summary, as_json, text)
-
-
-def _settings_and_stack(config: Path | None, panels: Path | None) -> tuple[Any, Any]:
-    from runtime.config import load_settings, load_stack
-
-    settings = load_settings(config)
-    geometry = settings.stack
-    if panels is None:
-        return settings, geometry.stack()
-    return settings, load_stack(panels, width_px=geometry.width_px, height_px=geometry.height_px)
+    tell(summary, as_json, text)
 
 
 def _viewpoints(command: str, names: list[str] | None) -> tuple[Any, ...]:
@@ -197,12 +186,3 @@ def _viewpoints(command: str, names: list[str] | None) -> tuple[Any, ...]:
         if name not in known:
             raise InputError(command, "--viewpoint", f"unknown: {name}; known: R40-phi70-theta80 .. R60-phi90-theta100")
     return tuple(known[name] for name in dict.fromkeys(names))
-
-
-def _say(summary: dict[str, Any], as_json: bool, text: str) -> None:
-    if not as_json:
-        typer.echo(text)
-        return
-    from runtime.artifacts import to_json
-
-    typer.echo(to_json(summary))

@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calib.options import ConfigOption, JsonOption, PanelsOption, settings_and_stack, tell
 from runtime.errors import InputError
+
+if TYPE_CHECKING:
+    from runtime.optics.stack import PanelStack
 
 app = typer.Typer(
     no_args_is_help=True,
     help="Register the panels with each other and measure their grey curves.\n\n"
-    "Example: phasestack calibrate panels vernier --config config.toml --eye 0.5 0 0 --out vernier.csv, "
-    "then phasestack calibrate panels fit --vernier vernier.csv --config config.toml --write --out registration",
+    "First the verniers, then what follows from them.\n\n"
+    "Example: phasestack calibrate panels vernier --config phasestack.toml --eye 0.5 0 0 --out vernier.csv\n\n"
+    "Example: phasestack calibrate panels fit --config phasestack.toml --vernier vernier.csv --write --out panels",
 )
 
-ConfigOption = Annotated[Path | None, typer.Option(help="configuration TOML; without it the defaults hold")]
-PanelsOption = Annotated[Path | None, typer.Option(help="panel geometry, TOML or JSON; else the configuration's")]
+Point = tuple[float, float, float]
 EyeOption = Annotated[
-    tuple[float, float, float], typer.Option(help="the marked viewpoint: one eye, X Y Z in metres before the stack")
+    Point, typer.Option(help="the marked viewpoint of one eye, X Y Z in metres before the stack", metavar="X Y Z")
 ]
 ReferenceOption = Annotated[int, typer.Option(help="the panel that the others are registered to; -1: the middle one")]
-JsonOption = Annotated[bool, typer.Option("--json", help="one JSON object on stdout")]
-EYE = (0.5, 0.0, 0.0)
+EYE: Point = (0.5, 0.0, 0.0)
+LEFT_EYE: Point = (0.6, -0.03, 0.0)
+RIGHT_EYE: Point = (0.6, 0.03, 0.0)
 
 
 @app.command()
@@ -42,9 +46,9 @@ def charts(
     """
     from calib.panel_run import write_vernier_charts
 
-    _, stack = _settings_and_stack(config, panels)
+    _, stack = settings_and_stack(config, panels)
     summary = write_vernier_charts(out, stack, eye_m=_eye(eye, stack), reference=_reference(reference, stack))
-    _say(summary, as_json, f"{len(summary['files'])} files in {out}")
+    tell(summary, as_json, f"{len(summary['files'])} files in {out}")
 
 
 @app.command()
@@ -61,13 +65,13 @@ def vernier(
     Look with one eye, the other shut, from the marked viewpoint. f and c: finer and coarser steps; n, p: next and
     previous; q: stop. Every setting is on disk at once.
 
-    Example: phasestack calibrate panels vernier --config config.toml --eye 0.5 0 0 --out vernier.csv
+    Example: phasestack calibrate panels vernier --config phasestack.toml --eye 0.5 0 0 --out vernier.csv
     """
     from calib.panel_run import nudge_verniers
 
-    settings, stack = _settings_and_stack(config, panels)
+    settings, stack = settings_and_stack(config, panels)
     summary = nudge_verniers(out, settings, stack, eye_m=_eye(eye, stack), reference=_reference(reference, stack))
-    _say(summary, as_json, f"{summary['settings']} of {summary['asked']} settings in {out}")
+    tell(summary, as_json, f"{summary['settings']} of {summary['asked']} settings in {out}")
 
 
 @app.command()
@@ -82,17 +86,17 @@ def fit(
 ) -> None:
     """Find a homography per panel from the settings, with its uncertainty.
 
-    Example: phasestack calibrate panels fit --vernier vernier.csv --config config.toml --write --out registration
+    Example: phasestack calibrate panels fit --vernier vernier.csv --config phasestack.toml --write --out registration
     """
     from calib.panel_run import fit_registration
 
     if write and config is None:
         raise InputError("calibrate panels fit", "--write", "needs --config")
-    settings, stack = _settings_and_stack(config, panels)
+    settings, stack = settings_and_stack(config, panels)
     summary, text = fit_registration(
         vernier, out, settings, stack, reference=_reference(reference, stack), config=config if write else None
     )
-    _say(summary, as_json, text)
+    tell(summary, as_json, text)
 
 
 @app.command()
@@ -113,11 +117,11 @@ def grey(
 
     if (series is None) == (not typed):
         raise InputError("calibrate panels grey", "--series", "or --typed is needed, one of them")
-    settings, stack = _settings_and_stack(config, None)
+    settings, stack = settings_and_stack(config)
     if not -1 <= panel < stack.count:
         raise InputError("calibrate panels grey", "--panel", f"must be -1 to {stack.count - 1}")
     summary, text = fit_lut(out, series, settings=settings, stack=stack, levels=levels, panel=panel)
-    _say(summary, as_json, text)
+    tell(summary, as_json, text)
 
 
 @app.command()
@@ -126,8 +130,8 @@ def cost(
     model: Annotated[str, typer.Option(help="model whose layers are displaced")] = "best",
     left: Annotated[Path | None, typer.Option(help="the left eye's picture; without: the configured scene")] = None,
     right: Annotated[Path | None, typer.Option(help="the right eye's picture")] = None,
-    left_eye: EyeOption = (0.6, -0.03, 0.0),
-    right_eye: EyeOption = (0.6, 0.03, 0.0),
+    left_eye: Annotated[Point, typer.Option(help="the left eye, metres before the stack", metavar="X Y Z")] = LEFT_EYE,
+    right_eye: Annotated[Point, typer.Option(help="the right eye, metres", metavar="X Y Z")] = RIGHT_EYE,
     panels: PanelsOption = None,
     config: ConfigOption = None,
     as_json: JsonOption = False,
@@ -140,11 +144,11 @@ def cost(
 
     if (left is None) != (right is None):
         raise InputError("calibrate panels cost", "--left", "and --right go together")
-    settings, stack = _settings_and_stack(config, panels)
-    eyes = (_eye(left_eye, stack), _eye(right_eye, stack))
+    settings, stack = settings_and_stack(config, panels)
+    eyes = (_eye(left_eye, stack, "--left-eye"), _eye(right_eye, stack, "--right-eye"))
     pictures = None if left is None or right is None else (left, right)
     summary, text = measure_cost(out, settings, stack, eyes_m=eyes, pictures=pictures, model=model)
-    _say(summary, as_json, text)
+    tell(summary, as_json, text)
 
 
 @app.command()
@@ -169,7 +173,7 @@ def simulate(
 
     if noise_px < 0 or viewpoint_error_mm < 0:
         raise InputError("calibrate panels simulate", "--noise-px", "and --viewpoint-error-mm must not be negative")
-    settings, stack = _settings_and_stack(config, panels)
+    settings, stack = settings_and_stack(config, panels)
     summary, text = simulate_registration(
         out,
         settings,
@@ -180,35 +184,16 @@ def simulate(
         viewpoint_error_m=viewpoint_error_mm / 1000,
         model=model,
     )
-    _say(summary, as_json, text)
+    tell(summary, as_json, text)
 
 
-def _settings_and_stack(config: Path | None, panels: Path | None) -> tuple[Any, Any]:
-    from runtime.config import load_settings, load_stack
-
-    settings = load_settings(config)
-    geometry = settings.stack
-    if panels is None:
-        return settings, geometry.stack()
-    return settings, load_stack(panels, width_px=geometry.width_px, height_px=geometry.height_px)
-
-
-def _eye(eye: tuple[float, float, float], stack: Any) -> tuple[float, float, float]:
+def _eye(eye: Point, stack: PanelStack, option: str = "--eye") -> Point:
     if not all(abs(value) < 100 for value in eye) or eye[0] <= max(stack.x_m):
-        raise InputError("calibrate panels", "--eye", "must be in front of every panel, in metres")
+        raise InputError("calibrate panels", option, "must be in front of every panel, in metres")
     return eye
 
 
-def _reference(reference: int, stack: Any) -> int:
+def _reference(reference: int, stack: PanelStack) -> int:
     if not -1 <= reference < stack.count:
         raise InputError("calibrate panels", "--reference", f"must be -1 to {stack.count - 1}")
-    return int(stack.count // 2 if reference == -1 else reference)
-
-
-def _say(summary: dict[str, Any], as_json: bool, text: str) -> None:
-    if not as_json:
-        typer.echo(text)
-        return
-    from runtime.artifacts import to_json
-
-    typer.echo(json.dumps(json.loads(to_json(summary))))
+    return stack.count // 2 if reference == -1 else reference
