@@ -71,6 +71,14 @@ class FocusedPredictor(Predictor):
         self._aimed = wanted
         self._wanted_background = tuple(round(value * 255) for value in content.info.background)
 
+    @property
+    def interpolation(self) -> str:
+        return self.whole.interpolation
+
+    @property
+    def emphasis(self) -> float:
+        return self.whole.emphasis
+
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         """The whole centre panel, or the aimed window of it."""
         if self._aimed is None:
