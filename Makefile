@@ -6,7 +6,7 @@ DEMO_ARGS ?=
 PYTEST_ARGS ?=
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test test-slow lint types bench soak install uninstall system clean
+.PHONY: demo test test-slow lint types bench soak install uninstall system docs gallery clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/phasestack demo $(DEMO_ARGS)
@@ -32,6 +32,13 @@ soak: $(VENV)/.test
 
 install uninstall: $(VENV)/.runtime
 	sh systemd/$@.sh
+
+# The commands' pages from their helps; the gallery's pictures from the commands (minutes).
+docs: $(VENV)/.runtime
+	$(BIN)/python docs/make_pages.py
+
+gallery: $(VENV)/.test
+	$(BIN)/python docs/make_gallery.py
 
 # Debian's packages: OpenGL without a screen, the USB and OpenNI2 libraries. Only root can install them.
 system:

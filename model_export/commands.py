@@ -42,8 +42,8 @@ def train(
         list[Path] | None, typer.Option(help="folder of pairs named as the official data set; may be repeated")
     ] = None,
     scene: Annotated[str, typer.Option(help="preset that the folders' coordinates belong to")] = "lego_bulldozer",
-    iterations: Annotated[int | None, typer.Option(min=1, help="steps of the optimiser; the recipe's own")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="of data and weights; the recipe's own")] = None,
+    iterations: Annotated[int | None, typer.Option(min=1, help="steps of the optimiser; without: the recipe's")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="of data and weights; without: the recipe's")] = None,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1 ..; auto: a GPU where there is one")] = "auto",
     threads: Annotated[int, typer.Option(min=1, help="torch's threads on the CPU")] = 2,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
@@ -53,7 +53,9 @@ def train(
 
     Example: phasestack train --recipe balanced --out out/balanced
 
-    Several processes: torchrun --nproc-per-node 2 -m runtime.cli train --recipe best --out out/best
+    Several processes that train one model together are started by torchrun.
+
+    Example: torchrun --nproc-per-node 2 -m runtime.cli train --recipe best --out out/best
     """
     require("torch")
     from model_export.train import TrainRequest, run_training
@@ -90,6 +92,7 @@ def export(
     """Write a model as ONNX with its contract, after checking it against torch; one that fails isn't written.
 
     Without --checkpoint or --random-init, fast, balanced and best are made from the recipes that ship.
+    Exits with 1 where a check fails.
 
     Example: phasestack export --arch eyereal --checkpoint published.pth --out eyereal.onnx
     """
@@ -120,7 +123,9 @@ def validate(
     file: Annotated[Path, typer.Argument(help="the ONNX file")],
     as_json: Annotated[bool, typer.Option("--json", help="the checks as one object on stdout")] = False,
 ) -> None:
-    """Check a model: contract, names, shapes, values against torch, drift on stress inputs. Exit 1: one failed.
+    """Check a model: contract, names, shapes, values against torch, drift on stress inputs.
+
+    Exits with 1 where a check fails.
 
     Example: phasestack validate runtime/model/data/balanced.onnx
     """

@@ -26,7 +26,8 @@ from runtime.errors import PhasestackError
 
 app = typer.Typer(
     name="phasestack",
-    help="Realtime runtime of a glasses-free 3D display made of stacked LCD panels.",
+    help="Realtime runtime of a glasses-free 3D display made of stacked LCD panels.\n\n"
+    "Example: phasestack demo --out out/demo",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

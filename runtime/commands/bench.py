@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-app = typer.Typer(
-    help="Measure what a frame costs, or compare two measurements. Example: phasestack bench --out new.json"
-)
+if TYPE_CHECKING:
+    from runtime.report.pairs import StillPair
+
+SHIPPED = ("fast", "balanced", "best")
+ROBUST_SIZE = {"width_px": 480, "height_px": 270}
+app = typer.Typer()
 
 
 @app.callback(invoke_without_command=True)
@@ -18,7 +22,9 @@ def bench(
     out: Annotated[Path | None, typer.Option(help="write the regression file here (JSON)")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """Milliseconds a stage and the frontier of the shipped models, at 960x540 and 1920x1080.
+    """Measure what a frame costs, or compare two measurements.
+
+    It measures milliseconds a stage and the frontier of the shipped models, at 960x540 and 1920x1080.
 
     Example: phasestack bench --out bench.json
 
@@ -46,7 +52,7 @@ def compare(
     new: Annotated[Path, typer.Argument(help="the later one")],
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
-    """Name what got slower or worse beyond noise. Exits with 1 where anything did.
+    """Name what got slower or worse beyond noise. Exits with 1 where anything is named.
 
     Example: phasestack bench compare old.json new.json
     """
@@ -73,6 +79,96 @@ def compare(
         )
     if worse:
         raise typer.Exit(1)
+
+
+@app.command()
+def robust(
+    pairs: Annotated[int, typer.Option(min=1, help="how many random pairs")] = 500,
+    model: Annotated[
+        list[str] | None, typer.Option(help="shipped name or ONNX file; may be repeated (all shipped ones)")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="of the pairs")] = 0,
+    first: Annotated[int, typer.Option(min=0, help="number of the first pair: with --pairs 1, one of them alone")] = 0,
+    cache: Annotated[Path | None, typer.Option(help="folder where pairs are kept (the user's cache)")] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for robust.json and robust.png")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
+) -> None:
+    """Random pairs of the whole design range against SART-30, at 480x270. Exits with 1 where a model fails.
+
+    A model fails where it shows less than 28 dB of a pair of which SART-30 shows 32 or more, or where it is refused
+    or answers with no number. Minutes the first time; pairs and what SART-30 shows of them are kept.
+
+    Example: phasestack bench robust --model balanced --out robust
+    """
+    from dataclasses import asdict
+
+    from rich.console import Console
+
+    from runtime.artifacts import OutputFolder, to_json, write_json
+    from runtime.report import robust as check
+    from runtime.report.frontier import check_models
+    from runtime.report.machine import describe
+    from runtime.report.progress import progress_bar
+    from runtime.report.robust_plot import robust_plot
+
+    names = list(dict.fromkeys(model or SHIPPED))
+    check_models([name for name in names if name not in SHIPPED])
+    with progress_bar("robust") as tell:
+        found = check.outcomes(
+            _random_pairs(seed),
+            range(first, first + pairs),
+            models=names,
+            cache=cache or _pairs_cache(seed),
+            progress=tell,
+        )
+    verdicts = [check.verdict(found, name) for name in names]
+    record = {
+        "machine": describe(seed=seed),
+        "reference": check.REFERENCE.name,
+        "bar": {"poor_db": check.POOR_DB, "reached_db": check.REACHED_DB},
+        "models": [asdict(one) for one in verdicts],
+        "pairs": [outcome.record() for outcome in found],
+    }
+    if out is not None:
+        figure = robust_plot(found)
+        with OutputFolder(out) as folder:
+            write_json(folder.staging / "robust.json", record)
+            (folder.staging / f"{figure.name}.png").write_bytes(figure.png)
+    failed = sum(len(one.failing) for one in verdicts)
+    if as_json:
+        print(to_json(record))
+    else:
+        console = Console(highlight=False)
+        for one in verdicts:
+            text = f"median {one.median_db:.1f}, 5th percentile {one.p5_db:.1f}, least {one.least_db:.1f} dB; above"
+            text += f" {check.REFERENCE.name} on {one.beats_reference:.0%}; {len(one.failing)} fail"
+            console.print(f"{Path(one.model).stem:12}{text}", style="red" if one.failing else None, soft_wrap=True)
+            for outcome in (outcome for outcome in found if outcome.number in one.failing):
+                shown = outcome.models[one.model]
+                said = (
+                    shown.problem or f"{shown.psnr_db:.1f} dB, {check.REFERENCE.name} {outcome.reference.psnr_db:.1f}"
+                )
+                console.print(f"  pair {outcome.number}: {said}", soft_wrap=True)
+        ends = f"all {len(found)} pairs pass" if not failed else f"{failed} failures in {len(found)} pairs"
+        console.print(ends + (f"; see {out / 'robust.png'}" if out else ""), soft_wrap=True)
+    if failed:
+        raise typer.Exit(1)
+
+
+def _random_pairs(seed: int) -> Callable[[int], StillPair]:
+    from model_export.stills import random_still
+
+    return lambda number: random_still(seed, number, **ROBUST_SIZE)
+
+
+def _pairs_cache(seed: int) -> Path:
+    """A folder of its own for each seed, and for each state of the code that draws and solves the pairs."""
+    from model_export import data, scene, stills, textures
+    from runtime.model import sart, still
+    from runtime.report.cache import digest, user_cache
+
+    modules = (data, scene, stills, textures, sart, still)
+    return user_cache("pairs") / digest([Path(str(module.__file__)) for module in modules], seed, ROBUST_SIZE)
 
 
 def _print(record: dict[str, Any], out: Path | None) -> None:

@@ -7,15 +7,27 @@ from typing import Annotated, Any
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, help="Tell the running daemon. Example: phasestack ctl scene lego_bulldozer")
+app = typer.Typer(
+    no_args_is_help=True,
+    help="Tell the running daemon what to do between two of its turns. Exits with 1 where no daemon answers.\n\n"
+    "Example: phasestack ctl scene lego_bulldozer",
+)
+
+ANSWERS_WITHIN_S = 70.0  # a scene or a model is loaded first: longer than the daemon itself waits for that
 
 Config = Annotated[Path | None, typer.Option(help="configuration of the daemon: says where its socket is")]
 Socket = Annotated[Path | None, typer.Option(help="the socket itself, whatever the configuration says")]
 
 
 @app.command()
-def scene(name: str, config: Config = None, socket: Socket = None) -> None:
+def scene(
+    name: Annotated[str, typer.Argument(help="what `content.scene` of the configuration takes")],
+    config: Config = None,
+    socket: Socket = None,
+) -> None:
     """Show another scene: a preset's name, `demo`, or a file on the daemon's machine.
+
+    The present scene goes on while it is loaded, and stays where it can't be: then this exits with 2 and one line.
 
     Example: phasestack ctl scene demo
     """
@@ -50,8 +62,12 @@ def flat(config: Config = None, socket: Socket = None) -> None:
 
 
 @app.command()
-def budget(milliseconds: float, config: Config = None, socket: Socket = None) -> None:
-    """Time for one frame, 0 for none: model and resolution are chosen to fit.
+def budget(
+    milliseconds: Annotated[float, typer.Argument(help="time for one frame; 0: none")],
+    config: Config = None,
+    socket: Socket = None,
+) -> None:
+    """Set the time for one frame: model and resolution are chosen to fit.
 
     Example: phasestack ctl budget 16
     """
@@ -74,9 +90,11 @@ def tell(request: dict[str, Any], config: Path | None, socket: Path | None) -> N
     from runtime.service.client import NotRunning, ask
 
     try:
-        answer = ask(sockets(config, socket), request)
+        answer = ask(sockets(config, socket), request, timeout_s=ANSWERS_WITHIN_S)
     except NotRunning as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(1) from None
     if not answer.get("ok"):
         raise InputError(f"ctl {request['command']}", "", str(answer.get("error", "refused")))
+    if answer.get("note"):
+        typer.echo(answer["note"], err=True)

@@ -19,7 +19,7 @@ def doctor(
 ) -> None:
     """Check sensor, permissions, OpenGL, monitors and their binding, model, calibration and the service.
 
-    Exits with 1 where a check fails; what is only unusual is a warning.
+    What is only unusual is a warning. Exits with 1 where a check fails.
 
     Example: phasestack doctor --config /etc/phasestack/phasestack.toml
     """

@@ -26,6 +26,8 @@ def identify(
     With panels in the configuration they are bound, turned, mirrored and registered as they will be when it runs.
     Without any, every monitor tells how to name it in the configuration.
 
+    Exits with 75 where the X server dies.
+
     Example: phasestack identify --config phasestack.toml --seconds 20
     """
     from runtime.config import load_settings

@@ -18,13 +18,15 @@ def run(
         bool, typer.Option("--max-speed", help="every recorded sample, simulated clock, no waiting: reproducible")
     ] = False,
     out: Annotated[Path | None, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = None,
-    scene: Annotated[str | None, typer.Option(help="a preset's name, or a file")] = None,
+    scene: Annotated[str | None, typer.Option(help="a built-in scene, a preset's name, a file or folder")] = None,
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
     scale: Annotated[float, typer.Option(min=0.05, max=2.0, help="panel resolution, times the configured one")] = 1.0,
     budget_ms: Annotated[float | None, typer.Option(min=0, help="time for a frame; picks model and size")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="the summary as one JSON object on stdout")] = False,
 ) -> None:
     """Run the display: eyes in, layers out, until SIGTERM. SIGHUP reads the configuration again.
+
+    Exits with 75 where the X server dies: start it again, and it waits for the server.
 
     Example: phasestack run --config /etc/phasestack/phasestack.toml
 

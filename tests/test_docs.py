@@ -1,0 +1,84 @@
+"""The pages of docs/: those of commands say what the commands' help says, and every link leads somewhere."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted([ROOT / "README.md", *DOCS.rglob("*.md")])
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+
+
+def script(name: str) -> Any:
+    """A script of docs/ as a module."""
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def anchors(page: Path) -> set[str]:
+    """What GitHub and its like make of a page's headings."""
+    titles = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def test_every_commands_page_says_what_its_help_says() -> None:
+    written = {path.name: path.read_text(encoding="utf-8") for path in (DOCS / "commands").glob("*.md")}
+    wanted = script("make_pages").pages()
+    stale = sorted(name for name in written.keys() | wanted.keys() if written.get(name) != wanted.get(name))
+    assert stale == [], "run `make docs`"
+
+
+def test_a_changed_help_makes_its_page_stale(monkeypatch: pytest.MonkeyPatch) -> None:
+    pages = script("make_pages")
+    before = pages.pages()
+    demo = next(info for info in pages.app.registered_commands if info.callback.__name__ == "demo")
+    monkeypatch.setattr(
+        demo.callback, "__doc__", "Another text. Exits with 7 on Sundays.\n\nExample: phasestack demo -7\n"
+    )
+    after = pages.pages()
+    assert [name for name in before if before[name] != after[name]] == ["README.md", "demo.md"]
+    assert "Another text." in after["demo.md"]
+    assert "    phasestack demo -7\n" in after["demo.md"]
+    assert "; 7 on Sundays." in after["demo.md"]
+    assert "| 7 | `demo`: on Sundays |" in after["README.md"]
+
+
+def test_every_command_and_sub_command_has_an_example_and_says_what_its_options_are() -> None:
+    pages = script("make_pages")
+    root = pages.typer.main.get_command(pages.app)
+    for path, command in pages.walk(root, ["phasestack"]):
+        name = " ".join(path)
+        assert f"Example: {name}" in command.help, name
+        silent = [parameter.name for parameter in command.params if not parameter.help]
+        assert silent == [], name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_leads_somewhere(page: Path) -> None:
+    for target in LINK.findall(page.read_text(encoding="utf-8")):
+        if re.match(r"https?:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        place = (page.parent / path).resolve() if path else page
+        assert place.exists(), f"{page.name}: {target}"
+        assert not anchor or anchor in anchors(place), f"{page.name}: {target}"
+
+
+def test_every_page_can_be_reached_from_the_readme() -> None:
+    reached, waiting = set(), [ROOT / "README.md"]
+    while waiting:
+        page = waiting.pop()
+        reached.add(page)
+        links = (link.partition("#")[0] for link in LINK.findall(page.read_text(encoding="utf-8")))
+        places = ((page.parent / link).resolve() for link in links if link.endswith(".md") and ":" not in link)
+        waiting += [place for place in places if place not in reached]
+    assert sorted(str(page.relative_to(ROOT)) for page in PAGES if page not in reached) == []
