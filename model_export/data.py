@@ -84,6 +84,15 @@ def is_served(eyes_m: F64, stack: PanelStack) -> bool:
     return True
 
 
+def random_place(random: Random, *, width_px: int, height_px: int) -> tuple[PanelStack, F64]:
+    """Panels, and eyes (2, 3) that see enough through them."""
+    while True:
+        stack = random_stack(random, width_px=width_px, height_px=height_px)
+        eyes = random_eyes(random, stack)
+        if is_served(eyes, stack):
+            return stack, eyes
+
+
 def beside(random: Random, eye_m: F64, mm: float) -> F64:
     """A place in a random direction across the gaze."""
     pose = stack_from_eye(eye_m)
@@ -110,11 +119,7 @@ def random_pair(
     random: Random, *, width_px: int, height_px: int, tolerance_mm: tuple[float, float] = (0.0, 4.0)
 ) -> TrainingPair:
     """One pair of the endless stream. A quarter of them has no tolerance at all: exact eyes."""
-    while True:
-        stack = random_stack(random, width_px=width_px, height_px=height_px)
-        eyes = random_eyes(random, stack)
-        if is_served(eyes, stack):
-            break
+    stack, eyes = random_place(random, width_px=width_px, height_px=height_px)
     scene = random_scene(random, stack, eyes.mean(axis=0))
     low, high = tolerance_mm
     tolerance = low if random.random() < 0.25 else random.uniform(low, high)

@@ -10,7 +10,7 @@ import numpy as np
 
 from model_export.textures import BACKDROPS, OBJECTS, Random, glint
 from runtime.optics.stack import PanelStack, PlaneRaster
-from runtime.optics.views import raster_from_stack
+from runtime.optics.views import image_from_stack, raster_from_stack
 from runtime.records import F32, F64, U8
 
 FINER = 2  # drawn so many times finer and averaged: edges and details are not jagged
@@ -34,15 +34,26 @@ def draw(scene: Scene, eye_m: F64, raster: PlaneRaster) -> U8:
     """(h, w, 3) what an eye sees of a scene through each pixel of a raster.
 
     The nearest plane wins, by its exact depth in every pixel; half-transparent edges let through what was drawn
-    before. All planes must lie before the eye.
+    before. What lies behind the eye is not seen.
     """
     width, height = raster.width_px * FINER, raster.height_px * FINER
     finer = PlaneRaster(
         raster.x_m, raster.left_m, raster.top_m, raster.pitch_u_m / FINER, raster.pitch_v_m / FINER, width, height
     )
-    projection = raster_from_stack(eye_m, finer)
+    return _drawn(scene, raster_from_stack(eye_m, finer), width, height)
+
+
+def view(scene: Scene, eye_m: F64, *, width_px: int, height_px: int, fov_deg: float) -> U8:
+    """(h, w, 3) the picture of an eye that looks at the stack's origin, of a horizontal field of view."""
+    width, height = width_px * FINER, height_px * FINER
+    projection = image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg)
+    return _drawn(scene, projection, width, height)
+
+
+def _drawn(scene: Scene, projection: F64, width: int, height: int) -> U8:
+    """A scene through a 3x4 projection (frame `stack` to pixels FINER times as fine as the result's)."""
     picture = np.zeros((height, width, 3), np.float32)
-    nearness = np.full((height, width), -np.inf, np.float32)
+    nearness = np.zeros((height, width), np.float32)  # 1 over the distance: what lies behind the eye has less
     for plane in scene:
         on_raster = projection @ np.vstack(
             [np.column_stack([plane.across_m, plane.down_m, plane.corner_m]), [0.0, 0.0, 1.0]]
@@ -50,7 +61,7 @@ def draw(scene: Scene, eye_m: F64, raster: PlaneRaster) -> U8:
         part = _part(on_raster, width, height)
         if part is not None:
             _draw_plane(plane.texture, on_raster, part, picture, nearness)
-    smaller = cv2.resize(picture, (raster.width_px, raster.height_px), interpolation=cv2.INTER_AREA)
+    smaller = cv2.resize(picture, (width // FINER, height // FINER), interpolation=cv2.INTER_AREA)
     return np.clip(np.rint(smaller), 0, 255).astype(np.uint8)
 
 
@@ -58,8 +69,10 @@ def _part(raster_from_plane: F64, width: int, height: int) -> tuple[slice, slice
     """(rows, columns) of a raster that a plane's unit square can cover; None: none, or it is seen from its edge."""
     corners = raster_from_plane @ np.array([[0, 1, 1, 0], [0, 0, 1, 1], [1, 1, 1, 1]], dtype=np.float64)
     area = np.linalg.det(raster_from_plane)
-    if not np.isfinite(area) or abs(area) < 1e-12 or (corners[2] <= 0).any():
+    if not np.isfinite(area) or abs(area) < 1e-12 or (corners[2] <= 0).all():
         return None
+    if (corners[2] <= 0).any():  # it reaches behind the eye: anywhere
+        return slice(0, height), slice(0, width)
     u, v = corners[:2] / corners[2]
     left, right = max(0, math.floor(u.min()) - 1), min(width, math.ceil(u.max()) + 1)
     top, bottom = max(0, math.floor(v.min()) - 1), min(height, math.ceil(v.max()) + 1)
@@ -77,7 +90,7 @@ def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], 
     drawn = cv2.warpPerspective(texture, shifted, (columns.stop - left, rows.stop - top), flags=cv2.INTER_LINEAR)
     inverse = np.linalg.inv(raster_from_plane)
     u, v = np.arange(left, columns.stop) + 0.5, np.arange(top, rows.stop)[:, None] + 0.5
-    # The third coordinate of a pixel taken back on to the plane is 1 over its distance along x.
+    # The third coordinate of a pixel taken back on to the plane is 1 over its distance along the projection's axis.
     near = (inverse[2, 0] * u + inverse[2, 1] * v + inverse[2, 2]).astype(np.float32)
     alpha = drawn[..., 3].astype(np.float32) * np.float32(1 / 255)
     alpha *= near >= nearness[part]
