@@ -98,8 +98,8 @@ class PlanItem:
 
     what: str
     why: str
-    saves_ms: float
-    costs_db: float
+    saves_ms: float | None  # None: not measured
+    costs_db: float | None
 
 
 @dataclass(frozen=True, slots=True)

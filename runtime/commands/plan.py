@@ -43,7 +43,7 @@ def _print(result: dict[str, Any]) -> None:
     console.print(f"scene {result['scene']}, model {result['model']}, {result['width_px']} x {result['height_px']}")
     table = Table("left out", "why", "saves ms", "costs dB")
     for item in result["plan"]:
-        table.add_row(item["what"], item["why"], f"{item['saves_ms']:.1f}", f"{item['costs_db']:.2f}")
+        table.add_row(item["what"], item["why"], _number(item["saves_ms"], 1), _number(item["costs_db"], 2))
     console.print(table)
     console.print(f"one frame: {result['frame_ms']:.1f} ms with the plan, {result['frame_ms_without']:.1f} ms without")
     console.print(f"displayed: {result['psnr_db']:.2f} dB with, {result['psnr_db_without']:.2f} dB without")
@@ -53,3 +53,8 @@ def _print(result: dict[str, Any]) -> None:
             mark = "*" if level["label"] == result["level"] else ""
             levels.add_row(level["label"], f"{level['ms']:.1f}", f"{level['psnr_db']:.2f}", mark)
         console.print(levels)
+
+
+def _number(value: float | None, digits: int) -> str:
+    """Empty where nothing was measured."""
+    return "" if value is None else f"{value:.{digits}f}"

@@ -21,18 +21,20 @@ OPTIONAL_PARTS = {
     "matplotlib": "reports",
 }
 
+RETURN_MARGIN_DEG = 3.0  # three standard deviations of an eye's direction: 3 mm of noise at 0.2 m
+
 
 @dataclass(frozen=True, slots=True)
 class Saving:
-    """What leaving something out came to, in one run, with and without."""
+    """What leaving something out came to, in one run, with and without; None: not measured."""
 
-    saves_ms: float = 0.0
-    costs_db: float = 0.0
+    saves_ms: float | None = None
+    costs_db: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Times and errors on this machine, for this scene; zeros where nothing was measured."""
+    """Times and errors on this machine, for this scene."""
 
     reuse: Saving = Saving()
     focus: Saving = Saving()
@@ -61,6 +63,17 @@ def eyes_in_range(eyes_m: F64, *, range_deg: float) -> tuple[bool, bool]:
     return left, right
 
 
+def seeing_eyes(eyes_m: F64, before: tuple[bool, bool], *, range_deg: float) -> tuple[bool, bool]:
+    """The same for a viewer who is watched: an eye that is out comes back only well within the range.
+
+    before: what this answered last. Without the margin an eye at the edge would flicker with the tracker's noise.
+    """
+    outer = eyes_in_range(eyes_m, range_deg=range_deg)
+    inner = eyes_in_range(eyes_m, range_deg=range_deg - RETURN_MARGIN_DEG)
+    left, right = (inner[eye] or (before[eye] and outer[eye]) for eye in (0, 1))
+    return left, right
+
+
 def solved_eyes(eyes_m: F64, plan: Plan) -> F64:
     """The eyes (2, 3) to draw and solve for: one that can't see gives way to the other, and costs nothing."""
     if plan.eyes == (True, False):
@@ -76,23 +89,25 @@ def make_plan(
     settings: Settings,
     *,
     eyes_m: F64 | None = None,
+    seeing: tuple[bool, bool] | None = None,
     measured: Measured | None = None,
     can_focus: bool = True,
     loaded_modules: Collection[str] = (),
 ) -> Plan:
     """The plan for one scene and viewer. Make it again when either changes.
 
-    eyes_m: (2, 3) where they are known; can_focus: the model can be run on part of the panels; loaded_modules:
+    eyes_m: (2, 3) where they are known; seeing: which of them can see the display, where a loop has watched them
+    (`seeing_eyes`); can_focus: the model can be run on part of the panels; loaded_modules:
     names in `sys.modules`.
     """
     chosen, numbers = settings.plan, measured or Measured()
     on = chosen.enabled
     reuse = on and chosen.reuse
     focus = on and chosen.focus and can_focus
-    seeing = (True, True)
-    if on and chosen.one_eye and eyes_m is not None:
-        inside = eyes_in_range(eyes_m, range_deg=chosen.range_deg)
-        seeing = inside if any(inside) else (True, True)
+    if seeing is None and eyes_m is not None:
+        seeing = eyes_in_range(eyes_m, range_deg=chosen.range_deg)
+    if seeing is None or not any(seeing) or not (on and chosen.one_eye):
+        seeing = (True, True)
     most_m = settings.model.tolerance_mm / 1000
     fixed_m = chosen.dead_band_mm / 1000 if chosen.dead_band_mm > 0 else None
     items: list[PlanItem] = []
@@ -129,4 +144,8 @@ def _focus_items(info: ContentInfo, numbers: Measured) -> list[PlanItem]:
 
 
 def _item(what: str, why: str, saving: Saving) -> PlanItem:
-    return PlanItem(what, why, round(saving.saves_ms, 2), round(saving.costs_db, 3))
+    return PlanItem(what, why, _rounded(saving.saves_ms, 2), _rounded(saving.costs_db, 3))
+
+
+def _rounded(number: float | None, digits: int) -> float | None:
+    return None if number is None else round(number, digits)

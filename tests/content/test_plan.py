@@ -7,7 +7,7 @@ import pytest
 
 from runtime.config import Settings
 from runtime.content.base import ContentInfo
-from runtime.content.plan import Measured, Plan, Saving, eyes_in_range, make_plan, solved_eyes
+from runtime.content.plan import Measured, Plan, Saving, eyes_in_range, make_plan, seeing_eyes, solved_eyes
 from runtime.optics.stack import PanelStack
 
 EYES = np.array([[0.6, -0.03, 0.05], [0.6, 0.03, 0.05]])
@@ -76,3 +76,27 @@ def test_the_dead_band_is_the_noise_s_unless_it_is_set(stack: PanelStack) -> Non
     assert planned(stack).dead_band_m is None
     assert planned(stack).most_band_m == pytest.approx(0.001)
     assert planned(stack, settings={"plan": {"dead_band_mm": 0.5}}).dead_band_m == pytest.approx(0.0005)
+
+
+def at_angle(degrees: float) -> np.ndarray:
+    """Eyes of which the right one is so far off the axis, at 0.5 m."""
+    angle = np.radians(degrees)
+    right = 0.5 * np.array([np.cos(angle), np.sin(angle), 0.0])
+    return np.array([[0.5, 0.0, 0.0], right])
+
+
+def test_an_eye_at_the_edge_of_the_range_does_not_flicker() -> None:
+    random = np.random.default_rng(1)
+    seeing, changes = (True, True), 0
+    for step in range(2000):
+        angle = 70.0 + 20.0 * step / 2000
+        now = seeing_eyes(at_angle(angle) + random.normal(0.0, 0.002, (2, 3)), seeing, range_deg=80)
+        changes += now != seeing
+        seeing = now
+    assert (seeing, changes) == ((True, False), 1)
+
+
+def test_an_eye_returns_only_well_within_the_range() -> None:
+    assert seeing_eyes(at_angle(79), (True, True), range_deg=80) == (True, True)
+    assert seeing_eyes(at_angle(79), (True, False), range_deg=80) == (True, False)
+    assert seeing_eyes(at_angle(76), (True, False), range_deg=80) == (True, True)
