@@ -45,12 +45,9 @@ def scaled_stack(settings: Settings, scale: float) -> PanelStack:
 
 def build_pipeline(settings: Settings, stack: PanelStack, context: Any, on_fault: Callable[[str], None]) -> Pipeline:
     """Content and model. Raises FatalError; leaves nothing open then."""
-    import sys
-
-    from runtime.content.plan import make_plan
     from runtime.content.registry import open_content
-    from runtime.focus import FocusedPredictor
     from runtime.pipeline import Pipeline
+    from runtime.planner import Planner
     from runtime.planning import planned_predictor
 
     predictor = planned_predictor(settings, stack)
@@ -59,9 +56,8 @@ def build_pipeline(settings: Settings, stack: PanelStack, context: Any, on_fault
     except BaseException:
         predictor.close()
         raise
-    can_focus = isinstance(predictor, FocusedPredictor)
-    plan = make_plan(content.info, stack, settings, can_focus=can_focus, loaded_modules=sys.modules)
-    return Pipeline(stack, content=content, predictor=predictor, plan=plan, on_fault=on_fault)
+    planner = Planner(settings, stack)
+    return Pipeline(stack, content=content, predictor=predictor, planner=planner, on_fault=on_fault)
 
 
 def build_loop(

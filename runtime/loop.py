@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from time import perf_counter
 from typing import Any, Protocol
 
@@ -291,19 +291,9 @@ class Loop:
         except ValueError as error:
             log.info("quality: not measured here (%s)", error)
 
-    def _plan_items(self) -> list[dict[str, Any]]:
-        """What was left out; a saving or a cost that this run did not measure is null."""
-        plan = self.pipeline.plan
-        items = [] if plan is None else plan.items
-        return [
-            {
-                "what": item.what,
-                "why": item.why,
-                "saves_ms": item.saves_ms or None,
-                "costs_db": item.costs_db if item.saves_ms else None,
-            }
-            for item in items
-        ]
+    def plan_items(self) -> list[dict[str, Any]]:
+        """What is left out at present; a saving or a cost that this run did not measure is None."""
+        return [asdict(item) for item in self.pipeline.plan_items()]
 
     def _measure_pending(self) -> None:
         """Quality at the true eyes at the moment of the light, once the recording has told where they were."""
@@ -340,7 +330,7 @@ class Loop:
             "quality_frames": len(self._quality.psnr_db),
             "model": predictor.name,
             "provider": predictor.provider,
-            "plan": self._plan_items(),
+            "plan": self.plan_items(),
             "states": self.machine.seconds(now_ns=self.clock.now_ns()),
         }
 

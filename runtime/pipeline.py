@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from runtime.content.base import ContentSource, View
 from runtime.content.gate import ReuseGate
-from runtime.content.plan import Plan, solved_eyes
+from runtime.content.plan import Measured, Plan, seeing_eyes, solved_eyes
 from runtime.errors import ContentFailure, ModelFailure
-from runtime.focus import FocusedPredictor
 from runtime.model.flat import flat_layers
 from runtime.model.predictor import Predictor
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack, raster_from_stack
-from runtime.records import F64, U8, Inference
+from runtime.planner import Planner, focused_part
+from runtime.records import F64, U8, Inference, PlanItem
 from runtime.stages import StageTimes
 
 log = logging.getLogger("phasestack.pipeline")
@@ -60,14 +60,15 @@ class Pipeline:
         *,
         content: ContentSource,
         predictor: Predictor,
-        plan: Plan | None = None,
+        planner: Planner | None = None,
         on_fault: Callable[[str], None] = lambda part: None,
     ) -> None:
-        """plan: what is left out; None: nothing is."""
-        self.stack, self.content, self.predictor, self.plan = stack, content, predictor, plan
+        """planner: says what is left out; None: nothing is."""
+        self.stack, self.content, self.predictor, self.planner = stack, content, predictor, planner
+        self.measured = Measured()  # what is known of the plan's times and errors
+        self.plan: Plan | None = None
         self._gate: ReuseGate | None = None
-        if plan is not None and plan.reuse and plan.most_band_m > 0:
-            self._gate = ReuseGate(most_m=plan.most_band_m, band_m=plan.dead_band_m)
+        self._seeing = (True, True)
         self._shown: tuple[int, float] | None = None  # which array was answered last, and how flat
         self._on_fault = on_fault
         self._solved: U8 | None = None  # the last layers for two eyes
@@ -78,6 +79,54 @@ class Pipeline:
         self._redrawn = False
         self._blend = np.empty((stack.count, stack.height_px, stack.width_px, 4), np.uint8)
         self.missing: dict[str, str] = {}
+        self._replan()
+
+    def show(self, content: ContentSource) -> None:
+        """Other content from now on; the last good layers stay until its first picture is solved."""
+        previous, self.content = self.content, content
+        previous.close()
+        self._replan()
+
+    def use(self, predictor: Predictor) -> Predictor:
+        """Another model from now on. Answers the one before it, which is the caller's to close."""
+        previous, self.predictor = self.predictor, predictor
+        self._replan()
+        return previous
+
+    def plan_with(self, planner: Planner | None) -> None:
+        """Other settings of what may be left out."""
+        self.planner = planner
+        self._replan()
+
+    def plan_items(self, measured: Measured | None = None) -> tuple[PlanItem, ...]:
+        """What is left out now, with what is known of its time and error."""
+        if self.planner is None:
+            return ()
+        part = focused_part(self.predictor)
+        numbers = replace(measured or self.measured, active_fraction=1.0 if part is None else part.active_fraction)
+        plan = self.planner.plan(self.content.info, self.predictor, seeing=self._seeing, measured=numbers)
+        return plan.items
+
+    def _replan(self) -> None:
+        """What may be left out has changed: the content, the model, the viewer or the settings have."""
+        plan = None
+        if self.planner is not None:
+            plan = self.planner.plan(self.content.info, self.predictor, seeing=self._seeing)
+        self.plan = plan
+        self._gate = None
+        if plan is not None and plan.reuse and plan.most_band_m > 0:
+            self._gate = ReuseGate(most_m=plan.most_band_m, band_m=plan.dead_band_m)
+        self.forget()
+
+    def _watch(self, eyes_m: F64) -> None:
+        """Make the plan again when an eye leaves the viewing range, or returns."""
+        if self.planner is None:
+            return
+        seeing = seeing_eyes(eyes_m, self._seeing, range_deg=self.planner.settings.plan.range_deg)
+        if seeing != self._seeing:
+            self._seeing = seeing
+            log.info("plan: %s", _who_sees(seeing))
+            self._replan()
 
     def draw(self, eyes_m: F64 | None, *, flatness: float, time_ns: int, stages: StageTimes) -> Drawn:
         """Layers for two eyes (2, 3), frame `stack`, blended with the flat picture.
@@ -105,6 +154,7 @@ class Pipeline:
             self._gate.forget()
 
     def _solve(self, eyes_m: F64, *, time_ns: int, stages: StageTimes) -> Inference:
+        self._watch(eyes_m)
         if self.plan is not None:
             eyes_m = solved_eyes(eyes_m, self.plan)
         revision = self.content.revision(time_ns=time_ns)
@@ -116,8 +166,6 @@ class Pipeline:
             eyes_m = self._gate.best_guess(eyes_m)
         key = (eyes_m.tobytes(), revision)
         try:
-            if isinstance(self.predictor, FocusedPredictor):
-                self.predictor.aim(self.content, eyes_m, time_ns=time_ns)
             images = self._render(eyes_m, time_ns=time_ns)
         except Exception as error:
             self._failed("content", error, expected=ContentFailure)
@@ -140,6 +188,9 @@ class Pipeline:
     def _render(self, eyes_m: F64, *, time_ns: int) -> list[list[U8]]:
         """images[side][raster]; copied only where a source's array would be drawn over by the next raster."""
         images: list[list[U8]] = [[], []]
+        part = focused_part(self.predictor)
+        if part is not None:
+            part.aim(self.content, eyes_m, time_ns=time_ns)
         rasters = self.predictor.rasters(eyes_m)
         for raster in rasters:
             for view in raster_views(eyes_m, raster):
@@ -192,3 +243,13 @@ class Pipeline:
         """Release content and model. May be called twice."""
         self.content.close()
         self.predictor.close()
+
+
+def _who_sees(seeing: tuple[bool, bool]) -> str:
+    """One line for the log."""
+    match seeing:
+        case (True, False):
+            return "the right eye can't see the display: solved for the left one alone"
+        case (False, True):
+            return "the left eye can't see the display: solved for the right one alone"
+    return "solved for both eyes"

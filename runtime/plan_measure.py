@@ -16,6 +16,7 @@ from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, raster_from_stack
+from runtime.planner import focused_part
 from runtime.records import F32, F64, U8
 
 REPEATS = 5
@@ -32,8 +33,9 @@ class Trial:
 
 def draw(content: ContentSource, predictor: Predictor, eyes_m: F64, *, time_ns: int, aim: bool = True) -> U8:
     """One frame's layers (N, h, w, 4), straight from content and model; the predictor's own array."""
-    if aim and isinstance(predictor, FocusedPredictor):
-        predictor.aim(content, eyes_m, time_ns=time_ns)
+    part = focused_part(predictor)
+    if aim and part is not None:
+        part.aim(content, eyes_m, time_ns=time_ns)
     images: list[list[U8]] = [[], []]
     rasters = predictor.rasters(eyes_m)
     for raster in rasters:

@@ -10,8 +10,6 @@ import cv2
 import numpy as np
 
 from runtime.config import Settings
-from runtime.content.base import ContentSource
-from runtime.focus import FocusedPredictor
 from runtime.model.predictor import Prediction, Predictor
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
@@ -26,13 +24,15 @@ class ReducedPredictor(Predictor):
         self.name, self.provider, self.parameters = small.name, small.provider, small.parameters
         self._layers = np.empty((stack.count, stack.height_px, stack.width_px, 4), np.uint8)
 
-    def aim(self, content: ContentSource, eyes_m: F64, *, time_ns: int) -> None:
-        """See `FocusedPredictor.aim`."""
-        if isinstance(self.small, FocusedPredictor):
-            self.small.aim(content, eyes_m, time_ns=time_ns)
-
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         return self.small.rasters(eyes_m)
+
+    @property
+    def interpolation(self) -> str:
+        return self.small.interpolation
+
+    def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
+        return self.small.windows(eyes_m)
 
     def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64) -> Prediction:
         solved = self.small.predict(images, eyes_m)

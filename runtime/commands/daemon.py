@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from runtime import logs
-from runtime.assembly import RunOptions, build_pipeline
+from runtime.assembly import RunOptions
+from runtime.changeover import Changeover
 from runtime.clock import MonotonicClock
 from runtime.commands.running import drive, print_summary
 from runtime.config import Overrides, Settings, load_settings
 from runtime.errors import InputError, PhasestackError
-from runtime.eyes.calibration import load_calibration
-from runtime.eyes.tracker import Tracker
 from runtime.loop import Loop
 from runtime.records import FrameAccount
 from runtime.service import Command, Notifier, Signals, StatusServer, open_status_server
@@ -28,7 +27,7 @@ BUDGET_NOT_HELD = (
     "a budget is kept with the settings, but the loop does not choose by it yet: `phasestack plan --budget-ms` "
     "measures which model and size would hold it; set model.name"
 )
-NEEDS_RESTART = ("stack", "sensor", "output", "service")
+NEEDS_RESTART = ("stack", "sensor", "detector", "output", "service")
 
 
 class Daemon:
@@ -49,6 +48,9 @@ class Daemon:
         self._signals, self._notifier, self._server, self._metrics = signals, notifier, server, metrics
         self._faults_told: dict[str, int] = {}
         self._missed_told = 0
+        self._change: Changeover | None = None
+        self._asked_by: Command | None = None  # for the change under way; None: a signal
+        self._refused = ""  # why the last change was refused, until one is taken
 
     def stop_reason(self) -> str:
         return f"{self._signals.stop} received" if self._signals.stop else ""
@@ -56,13 +58,16 @@ class Daemon:
     def obey(self, loop: Loop) -> None:
         if self._signals.take_reload():
             self._notifier.reloading()
-            if refused := self._reload(loop):
-                log.error("reload refused, the old configuration stays: %s", refused)
-            self._notifier.reloaded()
+            self._reload(loop, None)
         while self._server is not None and not self._server.commands.empty():
-            command = self._server.commands.get()
-            refused = self._carry_out(command, loop)
-            command.refuse(refused) if refused else command.done()
+            self._carry_out(self._server.commands.get(), loop)
+        if self._change is not None and self._change.poll(loop.context):
+            change, self._change = self._change, None
+            if not change.problem:
+                change.commit(loop)
+                self._settings = change.settings
+                log.info("changed: scene %s, model %s", loop.pipeline.content.info.name, loop.pipeline.predictor.name)
+            self._answer(self._asked_by, change.problem)
 
     def turn(self, loop: Loop, account: FrameAccount) -> None:
         machine = loop.machine
@@ -71,7 +76,7 @@ class Daemon:
         self._notifier.status(f"{machine.name} ({machine.reason})")
         self._notifier.turn(machine.state, machine.missing, presented=account.presented)
         if self._server is not None:
-            self._server.publish(lambda: snapshot(loop, account))
+            self._server.publish(lambda: snapshot(loop, account) | self._loading())
         if self._metrics is not None:
             self._metrics.frame(account)
             self._metrics.missed_vblanks(loop.stats.missed_vblanks - self._missed_told)
@@ -92,57 +97,75 @@ class Daemon:
         time.sleep(PANEL_RETRY_S)
         return not self._signals.stop
 
-    def _carry_out(self, command: Command, loop: Loop) -> str:
+    def _loading(self) -> dict[str, str]:
+        """What is being loaded, and why the last change was refused; for the status."""
+        change, told = self._change, {}
+        if change is not None:
+            told["loading"] = change.progress
+        if self._refused:
+            told["refused"] = self._refused
+        return told
+
+    def _carry_out(self, command: Command, loop: Loop) -> None:
         match command.name:
             case "pause":
                 loop.paused = True
+                command.done()
             case "resume":
                 loop.paused = loop.flat_wanted = False
+                command.done()
             case "flat":
                 loop.flat_wanted = True
+                command.done()
             case "reload":
-                return self._reload(loop)
+                self._reload(loop, command)
             case "scene":
                 content = self._settings.content.model_copy(update={"scene": command.value})
-                return self._replace(loop, self._settings.model_copy(update={"content": content}))
+                settings = self._settings.model_copy(update={"content": content})
+                self._begin(loop, settings, command, reload_content=True)
             case "budget":
-                log.warning("%s", BUDGET_NOT_HELD)
                 model = self._settings.model.model_copy(update={"budget_ms": command.value})
-                return self._replace(loop, self._settings.model_copy(update={"model": model}))
-        return ""
+                self._begin(loop, self._settings.model_copy(update={"model": model}), command)
 
-    def _reload(self, loop: Loop) -> str:
-        """Read the configuration again; answers why it was refused, or nothing."""
+    def _reload(self, loop: Loop, command: Command | None) -> None:
+        """Read the configuration again."""
         try:
             settings = self._overrides.applied(load_settings(self._config))
         except PhasestackError as error:
-            return str(error)
+            self._answer(command, str(error))
+            return
         changed = [name for name in NEEDS_RESTART if getattr(settings, name) != getattr(self._settings, name)]
         if changed:
-            return f"{self._config}: {changed[0]}: a change needs a restart of the service"
-        return self._replace(loop, settings)
+            self._answer(command, f"{self._config}: {changed[0]}: a change needs a restart of the service")
+        else:
+            self._begin(loop, settings, command)
 
-    def _replace(self, loop: Loop, settings: Settings) -> str:
-        """Swap what the settings change; the old parts stay where the new ones can't be built."""
-        old = self._settings
+    def _begin(self, loop: Loop, settings: Settings, command: Command | None, *, reload_content: bool = False) -> None:
+        """Load what the settings change; what was being loaded is overtaken."""
+        if self._change is not None:
+            self._change.abandon()
+            self._change = None
+            self._answer(self._asked_by, "overtaken by a newer change")
         try:
-            calibration = load_calibration(Path(settings.calibration.file) if settings.calibration.file else None)
-            if (settings.content, settings.model) != (old.content, old.model):
-                import numpy as np
-
-                from runtime.assembly import WARM_EYES_M
-
-                pipeline = build_pipeline(settings, loop.pipeline.stack, loop.context, loop.fault)
-                pipeline.predictor.warm_up(np.array(WARM_EYES_M))
-                previous, loop.pipeline = loop.pipeline, pipeline
-                previous.close()
+            change = Changeover(settings, self._settings, loop.pipeline.stack, reload_content=reload_content)
         except PhasestackError as error:
-            return str(error)
-        loop.calibration = calibration
-        if settings.tracker != old.tracker:
-            loop.tracker = Tracker(settings.tracker)
-        loop.settings = self._settings = settings
-        return ""
+            self._answer(command, str(error))
+            return
+        self._change, self._asked_by = change, command
+        if command is not None:
+            command.begin()
+
+    def _answer(self, command: Command | None, problem: str) -> None:
+        """What became of a change: to who asked for it, to the log and to the status."""
+        self._refused = problem
+        if problem:
+            log.error("refused, what was there stays: %s", problem)
+        if command is None:
+            self._notifier.reloaded()
+        elif problem:
+            command.refuse(problem)
+        else:
+            command.done()
 
 
 def snapshot(loop: Loop, account: FrameAccount) -> dict[str, Any]:
@@ -154,6 +177,7 @@ def snapshot(loop: Loop, account: FrameAccount) -> dict[str, Any]:
         "reason": machine.reason,
         "missing": loop.missing,
         "scene": loop.settings.content.scene,
+        "plan": loop.plan_items(),
         "model": loop.pipeline.predictor.name,
         "provider": loop.pipeline.predictor.provider,
         "panels": loop.panels.name,

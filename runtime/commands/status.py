@@ -61,7 +61,7 @@ def describe(answer: dict[str, Any]) -> Iterator[str]:
     frames = [f"{answer[name]} {name}" for name in ("frames", "presented", "dropped", "stale_inputs") if name in answer]
     if "fps" in answer:
         yield row("rate", f"{float(answer['fps']):.1f} frames/s", ", ".join(frames))
-    for name in ("scene", "model", "provider", "panels"):
+    for name in ("scene", "loading", "refused", "model", "provider", "panels"):
         if answer.get(name):
             yield row(name, str(answer[name]))
     if answer.get("eyes_m"):

@@ -69,6 +69,8 @@ class Canvas:
 
     def _forget_oldest(self) -> None:
         target = self._targets.pop(next(iter(self._targets)))
+        # moderngl binds the last framebuffer again on later calls: it must not be one that is no more.
+        self._context.detect_framebuffer(0).use()
         for framebuffer in {id(f): f for f in (target.smooth, target.plain)}.values():
             for attachment in (*framebuffer.color_attachments, framebuffer.depth_attachment):
                 attachment.release()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.camera import PixelBox
 from runtime.content.shapes import Shape
-from runtime.content.triangles import Part, TrianglePainter
+from runtime.content.triangles import Part, ReadyPart, TrianglePainter
 from runtime.errors import InputError, MissingPart
 from runtime.records import F64, U8
 
@@ -152,8 +153,10 @@ class MeshSource(ContentSource):
         context: Any,
         background: tuple[float, float, float] = (1.0, 1.0, 1.0),
         samples: int = 0,
+        parts: Sequence[ReadyPart] | None = None,
     ) -> None:
-        self._painter = TrianglePainter(data.parts, context=context, background=background, samples=samples)
+        """parts: those of `data`, where they were made ready on another thread."""
+        self._painter = TrianglePainter(parts or data.parts, context=context, background=background, samples=samples)
         self._placed = [stack_from_scene] * len(data.parts)
         corners = self._painter.corners_m(self._placed)
         used = {feature for part in data.parts for feature in part.features}

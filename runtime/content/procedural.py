@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,37 @@ from runtime.content import shapes, textures
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.camera import PixelBox
 from runtime.content.scenes import Scene, Thing, scene
-from runtime.content.triangles import Part, TrianglePainter
+from runtime.content.triangles import Part, ReadyPart, TrianglePainter, ready
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 
 MODELLED_HEIGHT_M = 0.2916  # the display for which the scenes' lengths are written
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReadyScene:
+    """A built-in scene with its shapes and pictures made, a part a thing."""
+
+    scene: Scene
+    parts: tuple[ReadyPart, ...]
+
+
+def ready_scene(built_in: str | Scene, *, samples: int = 0) -> ReadyScene:
+    """The slow half of opening a scene. Needs no GL: may run on any thread. samples: as `ProceduralSource` has it."""
+    chosen = scene(built_in) if isinstance(built_in, str) else built_in
+    pictures = {name: textures.texture(name) for name in {thing.texture for thing in chosen.things}}
+    parts = [
+        Part(
+            thing.shape,
+            picture=pictures[thing.texture],
+            colour=thing.colour,
+            lit=thing.lit,
+            grey=chosen.grey,
+            turning=chosen.moving and thing.turns_per_s != 0,
+        )
+        for thing in chosen.things
+    ]
+    return ReadyScene(chosen, tuple(ready(part, samples=samples) for part in parts))
 
 
 class ProceduralSource(ContentSource):
@@ -23,7 +50,7 @@ class ProceduralSource(ContentSource):
 
     def __init__(
         self,
-        built_in: str | Scene,
+        built_in: str | Scene | ReadyScene,
         *,
         stack: PanelStack,
         context: Any,
@@ -31,21 +58,10 @@ class ProceduralSource(ContentSource):
         samples: int = 0,
     ) -> None:
         """samples: per pixel, for outlines; 0: smooth outlines without (see `fringe`)."""
-        self._scene = scene(built_in) if isinstance(built_in, str) else built_in
+        made = built_in if isinstance(built_in, ReadyScene) else ready_scene(built_in, samples=samples)
+        self._scene = made.scene
         self._scale = stack.height_m / MODELLED_HEIGHT_M
-        pictures = {name: textures.texture(name) for name in {thing.texture for thing in self._scene.things}}
-        parts = [
-            Part(
-                thing.shape,
-                picture=pictures[thing.texture],
-                colour=thing.colour,
-                lit=thing.lit,
-                grey=self._scene.grey,
-                turning=self._scene.moving and thing.turns_per_s != 0,
-            )
-            for thing in self._scene.things
-        ]
-        self._painter = TrianglePainter(parts, context=context, background=background, samples=samples)
+        self._painter = TrianglePainter(made.parts, context=context, background=background, samples=samples)
         self._still = [self._placed(thing, 0.0) for thing in self._scene.things]
         corners = self._painter.corners_m(self._still)
         self.info = ContentInfo(

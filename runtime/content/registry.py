@@ -72,11 +72,13 @@ def _from_path(
 
 
 def _built_in(name: str, settings: ContentSettings, stack: PanelStack) -> Opener:
-    def make(context: Any) -> ContentSource:
-        from runtime.content.procedural import ProceduralSource
+    from runtime.content.procedural import ProceduralSource, ready_scene
 
+    made = ready_scene(name, samples=settings.samples)
+
+    def make(context: Any) -> ContentSource:
         return ProceduralSource(
-            name, stack=stack, context=context, background=settings.background, samples=settings.samples
+            made, stack=stack, context=context, background=settings.background, samples=settings.samples
         )
 
     return make
@@ -84,9 +86,10 @@ def _built_in(name: str, settings: ContentSettings, stack: PanelStack) -> Opener
 
 def _stand_in(name: str, settings: ContentSettings, stack: PanelStack) -> Opener:
     """The demo scene under the preset's name: the paper's scenes are not shipped."""
+    make_demo = _built_in("demo", settings, stack)
 
     def make(context: Any) -> ContentSource:
-        source = _built_in("demo", settings, stack)(context)
+        source = make_demo(context)
         source.info = replace(source.info, name=f"{name} (stand-in `demo`: content.file is empty)")
         return source
 
@@ -143,8 +146,10 @@ def _pictures(path: Path, settings: ContentSettings, stack: PanelStack) -> Opene
 def _mesh(path: Path, settings: ContentSettings, stack: PanelStack, chosen: Preset | None) -> Opener:
     from runtime.content.mesh import MeshSource, load_mesh
     from runtime.content.placing import stack_from_scene
+    from runtime.content.triangles import ready
 
     data = load_mesh(path)
+    parts = [ready(part, samples=settings.samples) for part in data.parts]
     matrix = stack_from_scene(
         data.low,
         data.high,
@@ -154,7 +159,12 @@ def _mesh(path: Path, settings: ContentSettings, stack: PanelStack, chosen: Pres
         scene_from_stack=chosen.scene_from_stack if chosen else None,
     )
     return lambda context: MeshSource(
-        data, stack_from_scene=matrix, context=context, background=settings.background, samples=settings.samples
+        data,
+        stack_from_scene=matrix,
+        context=context,
+        background=settings.background,
+        samples=settings.samples,
+        parts=parts,
     )
 
 

@@ -108,6 +108,36 @@ class Part:
         return tuple(name for name, wanted in switches.items() if wanted)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ReadyPart:
+    """A part with all that can be worked out without a GL context: the slow half of getting it on to the panels."""
+
+    part: Part
+    features: tuple[str, ...]
+    attributes: F32  # (v, 8) normal, texture coordinates, colour
+    packed: F32  # (v, 11) position and attributes
+    edges: Edges | None  # for ramps along the outline; None: it has none
+    corners_m: F64  # (8, 3) of the box that holds it; frame of the part
+
+
+def ready(part: Part, *, samples: int = 0) -> ReadyPart:
+    """Needs no GL: may run on any thread. samples: as `TrianglePainter` has it."""
+    mesh = part.shape
+    attributes = _attributes(part)
+    low, high = mesh.positions_m.min(0), mesh.positions_m.max(0)
+    if part.turning:
+        reach = float(np.linalg.norm(mesh.positions_m, axis=1).max())
+        low, high = np.full(3, -reach), np.full(3, reach)
+    return ReadyPart(
+        part=part,
+        features=part.features,
+        attributes=attributes,
+        packed=np.concatenate([mesh.positions_m, attributes], axis=1, dtype=np.float32),
+        edges=edges_of(mesh) if samples == 0 and len(mesh.triangles) <= MOST_OUTLINED else None,
+        corners_m=camera.box_corners(low, high),
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class _Uploaded:
     part: Part
@@ -127,7 +157,7 @@ class TrianglePainter:
 
     def __init__(
         self,
-        parts: Sequence[Part],
+        parts: Sequence[Part | ReadyPart],
         *,
         context: Any,
         background: tuple[float, float, float],
@@ -139,7 +169,9 @@ class TrianglePainter:
         self._with_ramps = samples == 0
         self._programs: dict[tuple[str, ...], Any] = {}
         self._textures: dict[int, Any] = {}
-        self._parts = [self._upload(part) for part in parts]
+        self._parts = [
+            self._upload(part if isinstance(part, ReadyPart) else ready(part, samples=samples)) for part in parts
+        ]
 
     def corners_m(self, stack_from_parts: Sequence[F64]) -> F64:
         """(8n, 3) corners in the stack frame of the boxes that hold the parts."""
@@ -192,26 +224,19 @@ class TrianglePainter:
             shared.release()
         self._parts, self._textures, self._programs = [], {}, {}
 
-    def _upload(self, part: Part) -> _Uploaded:
-        mesh, context = part.shape, self._context
-        surface_program, outline_program = self._program(part.features), self._program((*part.features, "OUTLINE"))
-        attributes = _attributes(part)
-        packed = np.concatenate([mesh.positions_m, attributes], axis=1, dtype=np.float32)
-        triangles = context.buffer(np.ascontiguousarray(mesh.triangles, np.int32).tobytes())
+    def _upload(self, prepared: ReadyPart) -> _Uploaded:
+        part, features, context = prepared.part, prepared.features, self._context
+        surface_program, outline_program = self._program(features), self._program((*features, "OUTLINE"))
+        triangles = context.buffer(np.ascontiguousarray(part.shape.triangles, np.int32))
         names = ("in_normal", "in_uv", "in_colour")
         surface = context.vertex_array(
             surface_program,
-            [_layout(surface_program, context.buffer(packed.tobytes()), ("in_position", *names), (3, 3, 2, 3))],
+            [_layout(surface_program, context.buffer(prepared.packed), ("in_position", *names), (3, 3, 2, 3))],
             index_buffer=triangles,
         )
-        outlined = self._with_ramps and len(mesh.triangles) <= MOST_OUTLINED
-        edges = edges_of(mesh) if outlined else None
+        edges = prepared.edges
         buffer = context.buffer(reserve=max(len(edges.faces) if edges else 0, 1) * OUTLINE_BYTES, dynamic=True)
         layout = _layout(outline_program, buffer, ("in_clip", "in_coverage", *names), (4, 1, 3, 2, 3))
-        low, high = mesh.positions_m.min(0), mesh.positions_m.max(0)
-        if part.turning:
-            reach = float(np.linalg.norm(mesh.positions_m, axis=1).max())
-            low, high = np.full(3, -reach), np.full(3, reach)
         return _Uploaded(
             part=part,
             surface=surface,
@@ -221,8 +246,8 @@ class TrianglePainter:
             texture=None if part.picture is None else self._texture(part.picture),
             surface_program=surface_program,
             outline_program=outline_program,
-            corners_m=camera.box_corners(low, high),
-            attributes=attributes,
+            corners_m=prepared.corners_m,
+            attributes=prepared.attributes,
         )
 
     def _program(self, features: tuple[str, ...]) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import queue
+import threading
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
@@ -14,7 +15,7 @@ BUDGET_MAX_MS = 10_000.0
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One wish of an operator. The loop carries it out between two turns, and answers exactly once.
+    """One wish of an operator. The loop carries it out between two turns, or begins to, and answers exactly once.
 
     `flat` with value True holds the 2D picture until `resume`; `pause` freezes the picture until `resume`.
     """
@@ -22,6 +23,16 @@ class Command:
     name: Name
     value: Any = None  # scene: str; budget: milliseconds, 0 for none; the others: None
     _answers: queue.SimpleQueue[str] = field(default_factory=queue.SimpleQueue)
+    _begun: threading.Event = field(default_factory=threading.Event)
+
+    def begin(self) -> None:
+        """It takes longer than a turn, and has begun."""
+        self._begun.set()
+
+    @property
+    def begun(self) -> bool:
+        """True where the loop is at it."""
+        return self._begun.is_set()
 
     def done(self) -> None:
         """It was carried out."""

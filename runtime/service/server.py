@@ -28,6 +28,7 @@ LINE_MAX_BYTES = 65536
 CLIENTS_MAX = 16
 CLIENT_IDLE_S = 5.0
 LOOP_ANSWERS_WITHIN_S = 5.0
+LOADED_WITHIN_S = 60.0  # what has begun is waited for so long
 
 
 class StatusServer:
@@ -88,6 +89,10 @@ class StatusServer:
         log.info("asked for: %s %s", command.name, "" if command.value is None else command.value)
         self.commands.put(command)
         refused = command.wait(LOOP_ANSWERS_WITHIN_S)
+        if refused is None and command.begun:
+            refused = command.wait(LOADED_WITHIN_S - LOOP_ANSWERS_WITHIN_S)
+            if refused is None:
+                return {"ok": True, "note": f"still loading after {LOADED_WITHIN_S:.0f} s: ask `phasestack status`"}
         if refused is None:
             return {"ok": False, "error": f"the loop did not answer within {LOOP_ANSWERS_WITHIN_S:.0f} s"}
         return {"ok": not refused} | ({"error": refused} if refused else {})

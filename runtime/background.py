@@ -1,0 +1,60 @@
+"""One piece of work on a thread of its own, asked about between two turns of the loop."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from runtime.errors import PhasestackError
+
+log = logging.getLogger("phasestack.background")
+
+T = TypeVar("T")
+
+
+class Job(Generic[T]):
+    """Begins at once. `done`, `result` and `problem` never wait; a job that is no longer wanted is `abandon`ed."""
+
+    def __init__(self, name: str, work: Callable[[], T], *, discard: Callable[[T], None] = lambda _: None) -> None:
+        """discard: what becomes of a result that nobody wants any more."""
+        self._name, self._work, self._discard = name, work, discard
+        self._lock = threading.Lock()
+        self._abandoned = False
+        self.done = False
+        self.result: T | None = None
+        self.problem = ""  # one line, where it failed
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def abandon(self) -> None:
+        """Its result is discarded, whether it is there already or comes later. May be called twice."""
+        with self._lock:
+            self._abandoned = True
+            result, self.result = self.result, None
+        if result is not None:
+            self._discard(result)
+
+    def take(self) -> T | None:
+        """The result, which is the caller's from now on; None where there is none (yet)."""
+        with self._lock:
+            result, self.result = self.result, None
+        return result
+
+    def _run(self) -> None:
+        result: T | None = None
+        try:
+            result = self._work()
+        except PhasestackError as error:
+            self.problem = str(error)
+        except Exception as error:  # whatever a library raises, the loop goes on with what it has
+            self.problem = f"{self._name}: {type(error).__name__}: {error}".splitlines()[0]
+            log.exception("%s: unexpected error", self._name)
+        with self._lock:
+            wanted = not self._abandoned
+            if wanted:
+                self.result = result
+            self.done = True
+        if not wanted and result is not None:
+            self._discard(result)
