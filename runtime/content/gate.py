@@ -50,18 +50,20 @@ class ReuseGate:
         self._measure_noise()
         if self._solved is None:
             return False
-        alone = lateral_shift_m(self._solved, eyes_m)
-        if alone > self.band_m + SIGMAS * min(self.noise_m, self._most_m / SIGMAS):
+        if not self._is_noise(lateral_shift_m(self._solved, eyes_m)):
             return False
         mean = np.mean([eyes for _, eyes in self._recent], axis=0)
         return lateral_shift_m(self._solved, mean) <= self.band_m
 
     def best_guess(self, eyes_m: F64) -> F64:
-        """The eyes to solve for: the recent mean while nothing but noise moves them, else the newest."""
+        """The eyes to solve for: the recent mean while nothing but noise moves them, else the newest.
+
+        An estimate that noise threw far off must not be solved for: the next ones would be as far from it again.
+        """
         if len(self._recent) < FEWEST:
             return eyes_m
         mean: F64 = np.mean([eyes for _, eyes in self._recent], axis=0)
-        return mean if lateral_shift_m(mean, eyes_m) <= self.band_m else eyes_m
+        return mean if self._is_noise(lateral_shift_m(mean, eyes_m)) else eyes_m
 
     def solved(self, eyes_m: F64) -> None:
         """The frame on the panels is now for these eyes."""
@@ -70,6 +72,10 @@ class ReuseGate:
     def forget(self) -> None:
         """Nothing solved is good any more: the content, the model or the settings changed."""
         self._solved = None
+
+    def _is_noise(self, shift_m: float) -> bool:
+        """True where a single estimate so far off the head's place says nothing of motion."""
+        return shift_m <= self.band_m + SIGMAS * min(self.noise_m, self._most_m / SIGMAS)
 
     def _measure_noise(self) -> None:
         """What remains of the recent slopes when a straight motion is taken out of them."""
