@@ -128,6 +128,10 @@ class FocusedPredictor(Predictor):
             self._fill_with(left, but=window.box)
         return self._place(window, solved, eyes_m, found_ms + (perf_counter_ns() - begin_ns) / 1e6)
 
+    def warm_up(self, eyes_m: F64) -> None:
+        self.whole.warm_up(eyes_m)
+        super().warm_up(eyes_m)
+
     def close(self) -> None:
         for part in (self.whole, *self._parts.values()):
             part.close()

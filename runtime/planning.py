@@ -28,12 +28,16 @@ LADDER = (("best", 1.0), ("balanced", 1.0), ("fast", 1.0), ("fast", 0.75), ("fas
 def focused(predictor: Predictor, settings: ModelSettings) -> FocusedPredictor | None:
     """The predictor made to run on windows, where its kind can; None for others (`sart`, whole-picture networks)."""
     from runtime.focus import FocusedPredictor
-    from runtime.model.predictor import load_predictor
     from runtime.model.unrolled import UnrolledPredictor
 
     if not isinstance(predictor, UnrolledPredictor):
         return None
-    return FocusedPredictor(predictor, lambda stack: load_predictor(settings.name, stack, settings))
+
+    def make(part: PanelStack) -> Predictor:
+        # One session serves every size: loading another for a new window would cost as much as solving it.
+        return UnrolledPredictor(predictor.session, part, tolerance_mm=predictor.tolerance_mm, threads=settings.threads)
+
+    return FocusedPredictor(predictor, make)
 
 
 def planned_predictor(settings: Settings, stack: PanelStack) -> Predictor:
