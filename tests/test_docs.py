@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,7 @@ def script(name: str) -> Any:
     spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
     return module
 
@@ -82,3 +86,34 @@ def test_every_page_can_be_reached_from_the_readme() -> None:
         places = ((page.parent / link).resolve() for link in links if link.endswith(".md") and ":" not in link)
         waiting += [place for place in places if place not in reached]
     assert sorted(str(page.relative_to(ROOT)) for page in PAGES if page not in reached) == []
+
+
+def test_the_gallery_shows_what_its_list_names_with_the_commands_that_made_it() -> None:
+    gallery = script("make_gallery")
+    made = json.loads(gallery.MADE.read_text(encoding="utf-8"))
+    assert gallery.PAGE.read_text(encoding="utf-8") == gallery.page(made), "run `make gallery`"
+    sizes = {path.name: path.stat().st_size for path in gallery.IMAGES.iterdir()}
+    assert sizes.keys() == {picture.file for picture in gallery.pictures().values()} | {gallery.MADE.name}
+    assert max(sizes.values()) <= gallery.LIMIT_BYTES
+    assert sum(sizes.values()) <= 2_500_000
+
+
+def test_the_gallerys_commands_are_commands_with_options_that_exist() -> None:
+    pages, gallery = script("make_pages"), script("make_gallery")
+    known = {tuple(path[1:]): command for path, command in pages.walk(pages.typer.main.get_command(pages.app), [""])}
+    for command in {command for picture in gallery.pictures().values() for command in picture.commands}:
+        words = command.split()
+        name = max((path for path in known if tuple(words[: len(path)]) == path), key=len)
+        options = {option for parameter in known[name].params for option in parameter.opts}
+        assert name and {word for word in words if word.startswith("--")} <= options, command
+
+
+def test_a_picture_that_cannot_be_made_leaves_the_gallery_as_it_was(tmp_path: Path) -> None:
+    gallery = script("make_gallery")
+    before = {path: path.read_bytes() for path in [gallery.PAGE, *gallery.IMAGES.iterdir()]}
+    call = [sys.executable, DOCS / "make_gallery.py", "--work", tmp_path / "w"]
+    (tmp_path / "w" / "verniers").mkdir(parents=True)  # as if the command had left nothing
+    result = subprocess.run([*call, "--keep", "verniers"], capture_output=True, text=True, timeout=60)
+    assert result.returncode != 0
+    assert "vernier-1-2-layer-1.png" in result.stderr
+    assert {path: path.read_bytes() for path in before} == before
