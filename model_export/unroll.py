@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -32,12 +33,6 @@ LEVELS = 255.0
 def rounded(x: Tensor) -> Tensor:
     """To 8-bit codes; the gradient passes as if nothing had happened."""
     return x + (torch.round(x * LEVELS) / LEVELS - x).detach()
-
-
-def phases(picture: U8, device: torch.device) -> Tensor:
-    """(1, 3, h, w) phase sums on the second branch of an 8-bit picture (h, w, 3)."""
-    intensity = torch.from_numpy(np.ascontiguousarray(picture)).to(device).float().permute(2, 0, 1)[None] / LEVELS
-    return 2 - torch.asin(torch.sqrt(intensity)) / HALF_PI
 
 
 def _size(image: Tensor) -> tuple[int, int]:
@@ -81,49 +76,30 @@ class UnrolledSolver(nn.Module):
         """(3, 3, h, w) panel values, rear to front, as 8 bits show them. Raises ValueError for eyes it can't serve."""
         recipe, device = self.recipe, self.sizes.device
         frame = chain_frame(eyes_m, stack, cell_px=recipe.cell_px, reduction=recipe.reduction)
-        wanted = [phases(emphasised(image, recipe.emphasis), device) for image in images]
-        outer = {n: torch.full_like(wanted[0], START) for n in (REAR, FRONT)}
-        seen: dict[tuple[int, int], Tensor] = {}
+        pictures = [emphasised(image, recipe.emphasis) for image in images]
         tolerance = torch.tensor([relative_tolerance_mm(tolerance_mm, eyes_m)], dtype=torch.float32, device=device)
-        for index, kind in enumerate(self.kinds):
-            lacks = self._lacks(wanted, seen) if index else []
-            if kind == "chain":
-                needs = lacks or _first_needs(images, device, recipe.reduction)
-                coarse = [functional.avg_pool2d(need, recipe.reduction) for need in needs] if lacks else needs
-                change = self._chain(coarse, frame, eyes_m, stack, tolerance)
-                changed: tuple[int, ...] = (REAR, FRONT)
+        level = _Level(pictures, eyes_m, stack, recipe.steps[0].reduction, device)
+        for index, step in enumerate(recipe.steps):
+            if step.reduction != level.reduction:
+                level = level.refined(pictures, step.reduction)
+            lacks = level.lacks() if index else []
+            if step.kind == "chain":
+                needs = lacks or _first_needs(pictures, recipe.reduction, device)
+                factor = recipe.reduction // level.reduction if lacks else 1
+                coarse = [functional.avg_pool2d(need, factor) for need in needs] if factor > 1 else needs
+                change = self._chain(coarse, frame, level, tolerance)
             else:
-                n = FRONT if kind == "front" else REAR
-                change = {n: self._correction(lacks, n, eyes_m, stack)}
-                changed = (n,)
-            for n in changed:
-                outer[n] = rounded((outer[n] + self.sizes[index] * change[n]).clamp(0, 1))
-                for side, eye in enumerate(eyes_m):
-                    matrix = target_from_source(eye, source=stack.panel(CENTRE), target=stack.panel(n))
-                    seen[n, side] = sample(outer[n], matrix, _size(outer[n]), outside=START)
-        left, right = (wanted[side] - seen[REAR, side] - seen[FRONT, side] for side in (0, 1))
-        best = (left + right) / 2
-        return torch.cat([outer[REAR], rounded(best.clamp(0, 1)), outer[FRONT]])
+                n = FRONT if step.kind == "front" else REAR
+                change = {n: level.correction(lacks, n)}
+            level.add({n: self.sizes[index] * value for n, value in change.items()})
+        if level.reduction > 1:
+            level = level.refined(pictures, 1)
+        return level.layers()
 
-    @staticmethod
-    def _lacks(wanted: Sequence[Tensor], seen: dict[tuple[int, int], Tensor]) -> list[Tensor]:
-        left, right = (wanted[side] - seen[REAR, side] - seen[FRONT, side] for side in (0, 1))
-        best = ((left + right) / 2).clamp(0, 1)
-        return [left - best, right - best]
-
-    @staticmethod
-    def _correction(lacks: Sequence[Tensor], panel: int, eyes_m: F64, stack: PanelStack) -> Tensor:
-        back = []
-        for lack, eye in zip(lacks, eyes_m, strict=True):
-            matrix = target_from_source(eye, source=stack.panel(panel), target=stack.panel(CENTRE))
-            back.append(sample(lack, matrix, _size(lack), outside=0.0))
-        return back[0] + back[1]
-
-    def _chain(
-        self, needs: Sequence[Tensor], frame: ChainFrame, eyes_m: F64, stack: PanelStack, tolerance: Tensor
-    ) -> dict[int, Tensor]:
+    def _chain(self, needs: Sequence[Tensor], frame: ChainFrame, level: _Level, tolerance: Tensor) -> dict[int, Tensor]:
         """The network's change of both outer panels."""
-        height, width = needs[0].shape[2:]
+        stack, eyes_m = level.stack, level.eyes_m
+        height, width = _size(needs[0])
         reduced = np.diag([width / stack.width_px, height / stack.height_px, 1.0])
         reduced_from_plane = reduced @ stack.panel(CENTRE).raster_from_plane()
         size = (frame.rows, frame.width_px)
@@ -146,13 +122,73 @@ class UnrolledSolver(nn.Module):
         return change
 
 
-def _first_needs(images: Sequence[U8], device: torch.device, reduction: int) -> list[Tensor]:
-    """What each eye lacks while the outer panels are even: averaged as intensities, as the runtime does."""
-    coarse = []
-    for image in images:
-        intensity = torch.from_numpy(np.ascontiguousarray(image)).to(device).float().permute(2, 0, 1)[None] / LEVELS
-        coarse.append(2 - torch.asin(torch.sqrt(functional.avg_pool2d(intensity, reduction))) / HALF_PI)
-    half = (coarse[1] - coarse[0]) / 2
+class _Level:
+    """The panels on a raster, whole or coarser (runtime.model.level)."""
+
+    def __init__(
+        self, pictures: Sequence[U8], eyes_m: F64, stack: PanelStack, reduction: int, device: torch.device
+    ) -> None:
+        self.reduction, self.eyes_m, self.whole = reduction, eyes_m, stack
+        self.stack = replace(
+            stack, width_px=max(1, stack.width_px // reduction), height_px=max(1, stack.height_px // reduction)
+        )
+        self.wanted = [_averaged(picture, reduction, device) for picture in pictures]
+        self.outer = {n: torch.full_like(self.wanted[0], START) for n in (REAR, FRONT)}
+        self.seen: dict[tuple[int, int], Tensor] = {}
+
+    def refined(self, pictures: Sequence[U8], reduction: int) -> _Level:
+        """The same outer panels on a finer raster."""
+        finer = _Level(pictures, self.eyes_m, self.whole, reduction, self.wanted[0].device)
+        size = _size(finer.wanted[0])
+        for n, coarse in self.outer.items():
+            enlarged = functional.interpolate(coarse, size=size, mode="bicubic", align_corners=False)
+            finer.outer[n] = rounded(enlarged.clamp(0, 1))
+        finer.look((REAR, FRONT))
+        return finer
+
+    def look(self, panels: Sequence[int]) -> None:
+        for n in panels:
+            for side, eye in enumerate(self.eyes_m):
+                matrix = target_from_source(eye, source=self.stack.panel(CENTRE), target=self.stack.panel(n))
+                self.seen[n, side] = sample(self.outer[n], matrix, _size(self.outer[n]), outside=START)
+
+    def lacks(self) -> list[Tensor]:
+        left, right = self._unclosed()
+        best = ((left + right) / 2).clamp(0, 1)
+        return [left - best, right - best]
+
+    def correction(self, lacks: Sequence[Tensor], panel: int) -> Tensor:
+        back = []
+        for lack, eye in zip(lacks, self.eyes_m, strict=True):
+            matrix = target_from_source(eye, source=self.stack.panel(panel), target=self.stack.panel(CENTRE))
+            back.append(sample(lack, matrix, _size(lack), outside=0.0))
+        return back[0] + back[1]
+
+    def add(self, change: dict[int, Tensor]) -> None:
+        for n, value in change.items():
+            self.outer[n] = rounded((self.outer[n] + value).clamp(0, 1))
+        self.look(tuple(change))
+
+    def layers(self) -> Tensor:
+        left, right = self._unclosed()
+        return torch.cat([self.outer[REAR], rounded(((left + right) / 2).clamp(0, 1)), self.outer[FRONT]])
+
+    def _unclosed(self) -> tuple[Tensor, Tensor]:
+        left, right = (self.wanted[side] - self.seen[REAR, side] - self.seen[FRONT, side] for side in (0, 1))
+        return left, right
+
+
+def _averaged(picture: U8, reduction: int, device: torch.device) -> Tensor:
+    """Phase sums of a picture at fewer pixels: averaged as intensities, as the runtime does."""
+    intensity = torch.from_numpy(np.ascontiguousarray(picture)).to(device).float().permute(2, 0, 1)[None] / LEVELS
+    coarse = functional.avg_pool2d(intensity, reduction) if reduction > 1 else intensity
+    return 2 - torch.asin(torch.sqrt(coarse)) / HALF_PI
+
+
+def _first_needs(pictures: Sequence[U8], reduction: int, device: torch.device) -> list[Tensor]:
+    """What each eye lacks while the outer panels are even."""
+    left, right = (_averaged(picture, reduction, device) for picture in pictures)
+    half = (right - left) / 2
     return [-half, half]
 
 

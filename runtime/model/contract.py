@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from runtime.config import Section, validated
 from runtime.errors import InputError
@@ -22,6 +23,19 @@ class Step(Section):
         description="the network along the eyes' line, or a local correction of one outer panel"
     )
     size: Annotated[float, Field(gt=0, le=2)] = Field(1.0, description="learned step size")
+    reduction: Literal[1, 2, 4] = Field(1, description="the step works on a raster so much coarser than a panel")
+
+
+def checked_steps(steps: tuple[Step, ...]) -> tuple[Step, ...]:
+    """Steps that can be carried out: a chain first, never back to a coarser raster. Raises ValueError."""
+    if steps and steps[0].kind != "chain":
+        raise ValueError("must begin with a chain step")
+    if any(after.reduction > before.reduction for before, after in pairwise(steps)):
+        raise ValueError("reduction must not grow from step to step")
+    return steps
+
+
+Steps = Annotated[tuple[Step, ...], AfterValidator(checked_steps)]
 
 
 class TrainedFor(Section):
@@ -61,7 +75,7 @@ class Contract(Section):
         description="strength of the sharpening that undoes the blur of interpolation, on the way in and in the eye",
     )
     interpolation: Literal["linear", "cubic"] = Field("linear", description="how still pictures are warped")
-    steps: tuple[Step, ...] = ()
+    steps: Steps = ()
 
 
 def parse_contract(metadata: dict[str, str], *, source: str | Path) -> Contract:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from runtime.config import ModelSettings
 from runtime.errors import InputError
+from runtime.model.allocator import keep_freed_memory
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
 
@@ -87,6 +88,7 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
     A stack that the network was not made for (not three evenly spaced panels) is served by `sart` where a
     shipped name was asked for; `Predictor.name` says so. Raises InputError, MissingPart.
     """
+    keep_freed_memory()
     settings = settings or ModelSettings()
     path = model_path(name)
     if path is None or (name in SHIPPED and not (stack.count == 3 and stack.is_evenly_spaced)):

@@ -5,22 +5,37 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-ROWS = 16
+import numpy as np
+from numpy.typing import NDArray
+
+ROWS = 32
+
+Work = Callable[[slice, NDArray[np.int16]], None]
 
 
 class RowPool:
-    """Calls a function on strips of rows, on a few threads (numpy releases the interpreter's lock)."""
+    """Calls a function on strips of rows, on a few threads (numpy releases the interpreter's lock).
 
-    def __init__(self, threads: int) -> None:
+    Every call gets a strip of its thread's own to work in: memory that is asked for anew costs more than the work.
+    """
+
+    def __init__(self, threads: int, *, width_px: int) -> None:
+        """width_px: of the widest image, three channels."""
         self._threads = max(1, threads)
         self._pool = ThreadPoolExecutor(self._threads, "rows") if self._threads > 1 else None
+        self._scratch = np.zeros((self._threads, ROWS * width_px * 3), np.int16)
 
-    def each(self, height: int, work: Callable[[slice], None]) -> None:
-        """`work` on every strip of `height` rows; strips don't overlap. What it raises is raised here."""
+    def each(self, height_px: int, width_px: int, work: Work) -> None:
+        """`work` on every strip of rows; strips don't overlap. What it raises is raised here.
+
+        It gets the rows, and a strip (rows, width_px, 3) with anything in it.
+        """
 
         def share(index: int) -> None:
-            for start in range(index * ROWS, height, self._threads * ROWS):
-                work(slice(start, min(start + ROWS, height)))
+            strip = self._scratch[index, : ROWS * width_px * 3].reshape(ROWS, width_px, 3)
+            for start in range(index * ROWS, height_px, self._threads * ROWS):
+                stop = min(start + ROWS, height_px)
+                work(slice(start, stop), strip[: stop - start])
 
         if self._pool is None:
             share(0)

@@ -1,0 +1,173 @@
+"""The three panels on one raster, whole or coarser: what corrections of the outer two read and write.
+
+Phases are fixed-point (sixteenths of an 8-bit code), so that OpenCV and numpy do the work on 16-bit integers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.model.resample import buffer, resample, target_from_source
+from runtime.model.rows import RowPool
+from runtime.model.transfer import FULL, SUBCODE
+from runtime.model.visible import Box
+from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.records import F64, U8
+
+I16 = NDArray[np.int16]
+REAR, CENTRE, FRONT = 0, 1, 2
+OUTER = (REAR, FRONT)
+EYES = (0, 1)
+START = FULL // 2  # of every outer panel: the middle of its range
+
+
+class Level:
+    """Buffers for one stack at `1 / reduction` of its columns and rows; state lives from frame to frame."""
+
+    def __init__(self, stack: PanelStack, *, reduction: int, rows: RowPool) -> None:
+        self.reduction = reduction
+        self._rows = rows
+        height, width = -(-stack.height_px // reduction), -(-stack.width_px // reduction)
+        names = [*(("outer", n, 0) for n in OUTER), *(("seen", n, side) for n in OUTER for side in EYES)]
+        names += [(name, CENTRE, side) for name in ("residual", "back") for side in EYES]
+        self._whole = {name: buffer(height, width) for name in names}
+        self.rasters: tuple[PlaneRaster, ...] = ()
+        self.wanted: list[I16] = []  # per eye, (h, w, 3) phase sums on the centre panel
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the centre panel's raster."""
+        return self.rasters[CENTRE].width_px, self.rasters[CENTRE].height_px
+
+    def look_through(self, boxes: Sequence[Box], stack: PanelStack) -> None:
+        """Cut every raster and buffer to what the eyes look through."""
+        self.rasters = tuple(_coarser(box.cut(stack.panel(n)), self.reduction) for n, box in enumerate(boxes))
+        self.outer = {n: self._view("outer", n, 0, on=n) for n in OUTER}
+        self.seen = {(n, side): self._view("seen", n, side, on=CENTRE) for n in OUTER for side in EYES}
+        self.residual = tuple(self._view("residual", CENTRE, side, on=CENTRE) for side in EYES)
+        self._back = {n: tuple(self._view("back", CENTRE, side, on=n) for side in EYES) for n in OUTER}
+
+    def look(self, panels: Sequence[int], eyes_m: F64) -> None:
+        """See outer panels anew through the centre panel's pixels."""
+        for n in panels:
+            for side, eye_m in enumerate(eyes_m):
+                self._between(self.outer[n], eye_m, of=n, on=CENTRE, out=self.seen[n, side])
+
+    def lacks(self) -> None:
+        """Find what each eye still lacks when the centre panel is the best one for the outer panels."""
+        seen, residual, wanted = self.seen, self.residual, self.wanted
+
+        def work(rows: slice, best: I16) -> None:
+            for side in EYES:
+                np.subtract(wanted[side][rows], seen[REAR, side][rows], out=residual[side][rows])
+                np.subtract(residual[side][rows], seen[FRONT, side][rows], out=residual[side][rows])
+            left, right = residual[0][rows], residual[1][rows]
+            np.add(left, right, out=best)
+            np.right_shift(best, 1, out=best)
+            np.clip(best, 0, FULL, out=best)
+            np.subtract(left, best, out=left)
+            np.subtract(right, best, out=right)
+
+        self._each(CENTRE, work)
+
+    def correct(self, panel: int, eyes_m: F64, *, size: float, shown: bool) -> None:
+        """Change one outer panel by what both eyes lack along the rays through each of its pixels."""
+        back, outer = self._back[panel], self.outer[panel]
+        for side, eye_m in enumerate(eyes_m):
+            self._between(self.residual[side], eye_m, of=CENTRE, on=panel, out=back[side])
+        eighths = np.int16(round(size * 8))
+
+        def work(rows: slice, change: I16) -> None:
+            np.add(back[0][rows], back[1][rows], out=change)
+            np.right_shift(change, 3, out=change)
+            np.multiply(change, eighths, out=change)
+            np.add(change, outer[rows], out=change)
+            _settle(change, outer[rows], shown=shown)
+
+        self._each(panel, work)
+
+    def drive(self, panel: int, wave: I16, wave_from_raster: F64, *, first: bool, shown: bool) -> None:
+        """Add a wave (h, w, 3), drawn on this raster, to an outer panel; the first one takes its place."""
+        outer = self.outer[panel]
+        target = outer if first else self._back[panel][0]
+        resample(wave, image_from_result=wave_from_raster, out=target, outside=START if first else 0, cubic=True)
+
+        def work(rows: slice, codes: I16) -> None:
+            if first:
+                codes = outer[rows]
+            else:
+                np.add(outer[rows], target[rows], out=codes)
+            _settle(codes, outer[rows], shown=shown)
+
+        self._each(panel, work)
+
+    def refine(self, coarser: Level, *, shown: bool) -> None:
+        """Take the outer panels over from a coarser raster of the same boxes."""
+        for n in OUTER:
+            outer = self.outer[n]
+            cv2.resize(coarser.outer[n], outer.shape[1::-1], dst=outer, interpolation=cv2.INTER_CUBIC)
+
+            def work(rows: slice, _: I16, outer: I16 = outer) -> None:
+                _settle(outer[rows], outer[rows], shown=shown)
+
+            self._each(n, work)
+
+    def close_centre(self, out: U8) -> None:
+        """The best centre panel for the outer ones, per pixel and in closed form, in 8-bit codes."""
+        seen, wanted = self.seen, self.wanted
+
+        def work(rows: slice, best: I16) -> None:
+            np.add(wanted[0][rows], wanted[1][rows], out=best)
+            for part in seen.values():
+                np.subtract(best, part[rows], out=best)
+            np.add(best, SUBCODE, out=best)
+            np.right_shift(best, 5, out=best)
+            np.clip(best, 0, 255, out=best)
+            out[rows] = best
+
+        self._each(CENTRE, work)
+
+    def _each(self, panel: int, work: object) -> None:
+        raster = self.rasters[panel]
+        self._rows.each(raster.height_px, raster.width_px, work)  # type: ignore[arg-type]
+
+    def _view(self, name: str, n: int, side: int, *, on: int) -> I16:
+        """The first rows and columns of a buffer, with margins of its own."""
+        parent = self._whole[name, n, side].base
+        assert isinstance(parent, np.ndarray)
+        return parent[: self.rasters[on].height_px, : self.rasters[on].width_px]
+
+    def _between(self, image: I16, eye_m: F64, *, of: int, on: int, out: I16) -> I16:
+        """Panel `of`'s pixels on panel `on`'s raster, as an eye sees them in line."""
+        matrix = target_from_source(eye_m, source=self.rasters[on], target=self.rasters[of])
+        return resample(image, image_from_result=matrix, out=out, outside=0 if of == CENTRE else START)
+
+
+def _coarser(raster: PlaneRaster, reduction: int) -> PlaneRaster:
+    """The same rectangle in fewer pixels."""
+    if reduction == 1:
+        return raster
+    width, height = max(1, raster.width_px // reduction), max(1, raster.height_px // reduction)
+    return replace(
+        raster,
+        pitch_u_m=raster.pitch_u_m * raster.width_px / width,
+        pitch_v_m=raster.pitch_v_m * raster.height_px / height,
+        width_px=width,
+        height_px=height,
+    )
+
+
+def _settle(codes: I16, out: I16, *, shown: bool) -> None:
+    """Keep within the panel's range; what will be shown is rounded to what 8 bits can show.
+
+    Rounded any earlier, corrections of less than half a code would be lost.
+    """
+    if shown:
+        np.add(codes, SUBCODE // 2, out=codes)
+        np.bitwise_and(codes, -SUBCODE, out=codes)
+    np.clip(codes, 0, FULL, out=out)
