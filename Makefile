@@ -30,8 +30,11 @@ bench: $(VENV)/.test
 soak: $(VENV)/.test
 	$(BIN)/python -m tests.soak
 
-install uninstall: $(VENV)/.runtime
-	sh systemd/$@.sh
+install: system
+	sh systemd/install.sh
+
+uninstall:
+	sh systemd/uninstall.sh
 
 # The commands' pages from their helps; the gallery's pictures from the commands (minutes).
 docs: $(VENV)/.runtime

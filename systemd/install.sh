@@ -21,7 +21,11 @@ put() { install -D -m "$1" "$here/$2" "$DESTDIR$3"; }
 if [ "${APP:-yes}" != no ]; then
   rm -rf "$DESTDIR$library.new"
   "$python" -m pip install --quiet --no-compile --target "$DESTDIR$library.new" -r "$source/requirements/runtime.lock"
-  "$python" -m pip install --quiet --no-compile --no-deps --target "$DESTDIR$library.new" "$source"
+  # From a copy: what an earlier build left beside the source would come along, modules that are gone included.
+  copy=$(mktemp -d)
+  trap 'rm -rf "$copy"' EXIT
+  (cd "$source" && cp -r pyproject.toml README.md runtime calib model_export "$copy")
+  "$python" -m pip install --quiet --no-compile --no-deps --target "$DESTDIR$library.new" "$copy"
   # The old program stays whole until the new one is.
   rm -rf "$DESTDIR$library"
   mv "$DESTDIR$library.new" "$DESTDIR$library"
@@ -46,6 +50,7 @@ if [ "${version:-0}" -ge 254 ]; then
   put 644 50-backoff.conf /usr/lib/systemd/system/phasestack.service.d/50-backoff.conf
 fi
 put 644 ../docs/operation.md /usr/share/doc/phasestack/operation.md
+put 644 ../docs/install.md /usr/share/doc/phasestack/install.md
 put 644 ../docs/hardware.md /usr/share/doc/phasestack/hardware.md
 put 644 ../THIRD_PARTY.md /usr/share/doc/phasestack/THIRD_PARTY.md
 # What the operator has written is never replaced.

@@ -12,6 +12,8 @@ from typing import Any
 
 import pytest
 
+from runtime.sensor.known_devices import KNOWN_DEVICES
+
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([ROOT / "README.md", *DOCS.rglob("*.md")])
@@ -98,14 +100,41 @@ def test_the_gallery_shows_what_its_list_names_with_the_commands_that_made_it() 
     assert sum(sizes.values()) <= 2_500_000
 
 
-def test_the_gallerys_commands_are_commands_with_options_that_exist() -> None:
-    pages, gallery = script("make_pages"), script("make_gallery")
+def shown_commands() -> list[tuple[str, str]]:
+    """Every call of phasestack in the pages' examples, comments and continued lines resolved: page and words."""
+    lines = re.compile(r"^    (?:sudo .*)?(phasestack .+)$", re.MULTILINE)
+    return [
+        (str(page.relative_to(ROOT)), re.split(r"\s+(?:#|&&)\s|\s{4,}", line)[0])
+        for page in PAGES
+        for line in lines.findall(page.read_text(encoding="utf-8").replace("\\\n", " "))
+    ]
+
+
+def test_every_command_that_a_page_shows_exists_with_its_options() -> None:
+    pages = script("make_pages")
     known = {tuple(path[1:]): command for path, command in pages.walk(pages.typer.main.get_command(pages.app), [""])}
-    for command in {command for picture in gallery.pictures().values() for command in picture.commands}:
-        words = command.split()
-        name = max((path for path in known if tuple(words[: len(path)]) == path), key=len)
-        options = {option for parameter in known[name].params for option in parameter.opts}
-        assert name and {word for word in words if word.startswith("--")} <= options, command
+    shown = shown_commands()
+    assert len(shown) > 60
+    for page, line in shown:
+        for part in line.split(", "):  # `phasestack record, doctor, status`
+            words = part.removeprefix("phasestack ").split()
+            name = max((path for path in known if tuple(words[: len(path)]) == path), key=len)
+            options = {option for parameter in known[name].params for option in parameter.opts} | {"--help"}
+            assert name, f"{page}: {line}"
+            asked = {word.strip("[];") for word in words if word.startswith(("--", "[--"))}
+            assert asked <= options, f"{page}: {line}: {asked - options}"
+
+
+def test_every_known_camera_with_a_driver_is_on_the_page_of_hardware() -> None:
+    page = (DOCS / "hardware.md").read_text(encoding="utf-8")
+    assert [device.name for device in KNOWN_DEVICES if device.driver and device.name not in page] == []
+
+
+def test_ci_runs_what_the_readme_tells_a_newcomer_to_run() -> None:
+    told = re.findall(r"^    (make \w+)", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert told == ["make demo", "make test"]
+    run = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    assert [command for command in told if not re.search(rf"^{command}\b", run, re.MULTILINE)] == []
 
 
 def test_a_picture_that_cannot_be_made_leaves_the_gallery_as_it_was(tmp_path: Path) -> None:
