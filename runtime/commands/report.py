@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from runtime.report.methods import Method
 
 
 def report(
@@ -14,9 +17,15 @@ def report(
     focal: Annotated[bool, typer.Option("--focal", help="focal stacks through the layers as well")] = False,
     model: Annotated[list[str] | None, typer.Option(help="a further ONNX file to compare; may be repeated")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="quarter-size panels, fewer references: a first look")] = False,
+    compare: Annotated[
+        bool, typer.Option("--compare/--no-compare", help="the published network and other precisions (needs torch)")
+    ] = True,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
     """Measure quality against run time, in one run on this machine, and write a page of it. Takes minutes.
+
+    The published network is compared with untrained weights (time and memory only) where torch is installed, and
+    with its own as `--model FILE.onnx`.
 
     Example: phasestack report --pairs my-pairs --out report
     """
@@ -28,9 +37,16 @@ def report(
 
     parts = ["phasestack report", *([f"--pairs {pairs.name}"] if pairs else []), *(["--focal"] if focal else [])]
     parts += [f"--model {Path(name).name}" for name in model or []] + (["--quick"] if quick else [])
+    parts += [] if compare else ["--no-compare"]
     with status_line("report") as tell:
         done = whole_report(
-            pairs=pairs, with_focal=focal, models=model or [], quick=quick, command=" ".join(parts), progress=tell
+            pairs=pairs,
+            with_focal=focal,
+            models=model or [],
+            quick=quick,
+            command=" ".join(parts),
+            variants=_variants if compare and not quick else lambda width_px, height_px: [],
+            progress=tell,
         )
     with OutputFolder(out) as folder:
         write_json(folder.staging / "report.json", done.record)
@@ -44,9 +60,41 @@ def report(
     console.print(done.page.lead, soft_wrap=True)
     for result in sorted(done.record["methods"], key=lambda r: r["ms_p50"]):
         size = f"{result['width_px']}x{result['height_px']}"
+        shown = f"{result['psnr_db']:8.2f} dB{result['worst_eye_psnr_db']:8.2f} dB worst eye"
         console.print(
-            f"{result['name']:18}{size:>11}{result['ms_p50']:10.1f} ms{result['psnr_db']:8.2f} dB"
-            f"{result['worst_eye_psnr_db']:8.2f} dB worst eye{result['memory_mib']:7.0f} MiB",
+            f"{result['name']:18}{size:>11}{result['ms_p50']:10.1f} ms"
+            f"{shown if result['trained'] else '  untrained: no picture':31}{result['memory_mib']:7.0f} MiB",
             soft_wrap=True,
         )
     console.print(f"see {out / 'index.html'}")
+
+
+def _variants(width_px: int, height_px: int) -> list[Method]:
+    """The published network and the shipped ones in fp16, made once and kept; none where torch isn't installed."""
+    import importlib.metadata
+    import importlib.util
+
+    if any(importlib.util.find_spec(name) is None for name in ("torch", "onnx")):
+        return []
+    import model_export
+    from model_export import yardstick
+    from runtime.report.cache import digest, user_cache
+    from runtime.report.methods import SHIPPED, Method
+    from runtime.report.worker import apart
+
+    code = Path(model_export.__file__).parent
+    sources = sorted(path for kind in ("*.py", "recipes/*") for path in code.glob(kind) if path.is_file())
+    versions = [importlib.metadata.version(name) for name in ("torch", "onnx", "onnxruntime")]
+    folder = user_cache("models") / digest(sources, versions)
+    found = []
+    for name, precision in yardstick.PUBLISHED:
+        path = folder / f"eyereal-{precision}-{width_px}x{height_px}.onnx"
+        if not path.is_file():
+            apart(yardstick.write_eyereal, path, precision=precision, width_px=width_px, height_px=height_px)
+        found.append(Method(name, "network", str(path), trained=False))
+    for name in SHIPPED:
+        path = folder / f"{name}-fp16.onnx"
+        if not path.is_file():
+            apart(yardstick.write_half, path, name=name)
+        found.append(Method(f"{name} fp16", "network", str(path)))
+    return found

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from runtime.config import StackGeometry
-from runtime.errors import FatalError
 from runtime.report import focal, horizon, latency, sweeps
 from runtime.report.focal_page import focal_section
 from runtime.report.frontier import MethodResult, check_models, measure
@@ -23,6 +22,7 @@ from runtime.report.sweep_page import gap_section, knob_section, resolution_sect
 MODELS = ("fast", "balanced", "best")
 OFFSETS_MM = tuple(range(-8, 9, 2))
 Progress = Callable[[str], None]
+Variants = Callable[[int, int], list[Method]]  # further methods for panels so wide and high
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +40,12 @@ def whole_report(
     models: Sequence[str],
     quick: bool,
     command: str,
+    variants: Variants = lambda width_px, height_px: [],
     progress: Progress = lambda name: None,
 ) -> Report:
     """Measure everything. `quick`: quarter-size panels and fewer references, for a first look.
+
+    variants: what else to compare on panels of a size, such as models made for it.
 
     Raises InputError for case files and models with mistakes, before anything is measured.
     """
@@ -52,7 +55,12 @@ def whole_report(
     small = replace(stack, width_px=480, height_px=270)
     if quick:
         stack = replace(stack, width_px=960, height_px=540)
-    methods = shipped_and_references(models=models, quick=quick)
+
+    def methods(pair: StillPair) -> list[Method]:
+        progress("models to compare with")
+        own = variants(pair.stack.width_px, pair.stack.height_px)
+        return shipped_and_references(models=models, variants=own, quick=quick)
+
     record: dict[str, Any] = {"machine": describe(seed=0), "command": command}
     sections: list[Section] = []
 
@@ -61,7 +69,7 @@ def whole_report(
 
     found: list[MethodResult] = []
     for name, own in _by_size(cases).items():
-        results = measure(methods, own, progress=tell(f"frontier, case files {name}"))
+        results = measure(methods(own[0]), own, progress=tell(f"frontier, case files {name}"))
         found += results
         title = f"Error against run time: {len(own)} case file{'s' if len(own) > 1 else ''}, {name}"
         sections.append(
@@ -69,7 +77,7 @@ def whole_report(
         )
     progress("drawing pairs")
     own_pairs = procedural_pairs(stack)
-    results = measure(methods, own_pairs, progress=tell("frontier, built-in scenes"))
+    results = measure(methods(own_pairs[0]), own_pairs, progress=tell("frontier, built-in scenes"))
     text = "; ".join(pair.name for pair in own_pairs)
     title = "Error against run time: built-in scenes"
     sections.append(frontier_section(results, pairs=text, title=title, name="scenes"))
@@ -90,7 +98,7 @@ def whole_report(
             stacks.append(focal.focal_stack(painter, full, model="best", progress=tell("focal stack")))
         sections += [focal_section(one) for one in stacks]
         record["focal"] = [_focal_record(one) for one in stacks]
-    return Report(_page(sections, found or results, methods, record, command), record)
+    return Report(_page(sections, found or results, record, command), record)
 
 
 def _by_size(cases: Sequence[StillPair]) -> dict[str, list[StillPair]]:
@@ -164,15 +172,12 @@ def _focal_record(stack: focal.FocalStack) -> dict[str, Any]:
 def _page(
     sections: list[Section],
     results: Sequence[MethodResult],
-    methods: Sequence[Method],
     record: dict[str, Any],
     command: str,
 ) -> Page:
     by_name = {result.name: result for result in results}
-    balanced = by_name.get("balanced")
-    if balanced is None:
-        raise FatalError(f"none of {', '.join(m.name for m in methods)} is the default model")
-    best = max((r for r in results if r.kind == "network"), key=lambda r: r.psnr_db)
+    balanced = by_name["balanced"]
+    best = max((r for r in results if r.kind == "network" and r.trained), key=lambda r: r.psnr_db)
     references = [r for r in results if r.kind == "iterative"]
     as_good = [r for r in references if r.psnr_db >= balanced.psnr_db]
     tiles = [
@@ -180,6 +185,9 @@ def _page(
         Tile(f"{best.psnr_db:.1f} dB", f"{best.name}, displayed"),
         Tile(f"{balanced.memory_mib:.0f} MiB", "balanced, peak"),
     ]
+    published = by_name.get("eyereal")
+    if published is not None:
+        tiles.insert(0, Tile(f"1/{published.ms_p50 / balanced.ms_p50:.0f}", "of eyereal's time, balanced"))
     lead = f"The default model shows {balanced.psnr_db:.1f} dB"
     if as_good:
         quickest = min(as_good, key=lambda r: r.ms_p50)

@@ -32,6 +32,7 @@ class Timed:
     memory_mib: float  # the process's peak
     parameters: int
     precision: str
+    multiply_adds: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +65,9 @@ class MethodResult:
     ssim: float
     worst_eye_psnr_db: float  # least of all eyes and pairs
     psnr_db_off_eye: dict[str, float]
+    multiply_adds: float  # of one prediction, mean over pairs
+    scale: float = 1.0  # of the panels' columns and rows that a network works at
+    trained: bool = True  # where not, the picture is nobody's: time, memory and sizes count, the error does not
     pairs: list[PairResult] = field(default_factory=list)
 
     def record(self) -> dict[str, Any]:
@@ -88,7 +92,8 @@ def run_method(method: Method, pair: StillPair, threads: int) -> Timed:
             start = time.perf_counter()
             layers = ready.solve(pair)
             run_ms.append((time.perf_counter() - start) * 1e3)
-    return Timed(np.array(layers[..., :3]), run_ms, _peak_mib(), ready.parameters, ready.precision)
+    layers, peak_mib = np.array(layers[..., :3]), _peak_mib()
+    return Timed(layers, run_ms, peak_mib, ready.parameters, ready.precision, ready.multiply_adds(pair))
 
 
 def _forget_peak() -> None:
@@ -112,11 +117,14 @@ def measure(
     threads: int = 2,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[MethodResult]:
-    """Every method on every pair. Pairs of one call share a resolution. Raises FatalError where a method fails."""
+    """Every method on every pair; one without training on the first alone. Pairs of one call share a resolution.
+
+    Raises FatalError where a method fails.
+    """
     results: list[MethodResult] = []
     for index, method in enumerate(methods):
         runs = []
-        for pair in pairs:
+        for pair in pairs if method.trained else pairs[:1]:
             timed = apart(run_method, method, replace(pair, off=()), threads)
             runs.append((pair, timed, judged(pair, timed.layers)))
         results.append(_together(method, runs))
@@ -157,14 +165,17 @@ def _together(method: Method, runs: Sequence[tuple[StillPair, Timed, Seen]]) -> 
             name: float(np.mean([r.psnr_db_off_eye[name] for r in pairs if name in r.psnr_db_off_eye]))
             for name in distances
         },
+        multiply_adds=float(np.mean([timed.multiply_adds for _, timed, _ in runs])),
+        scale=method.scale,
+        trained=method.trained,
         pairs=pairs,
     )
 
 
 def pareto(results: Sequence[MethodResult]) -> list[MethodResult]:
-    """Those that nothing else beats in both time and quality, fastest first."""
+    """Those that nothing else beats in both time and quality, fastest first; the untrained have no quality."""
     front: list[MethodResult] = []
-    for result in sorted(results, key=lambda r: (r.ms_p50, -r.psnr_db)):
+    for result in sorted((r for r in results if r.trained), key=lambda r: (r.ms_p50, -r.psnr_db)):
         if not front or result.psnr_db > front[-1].psnr_db:
             front.append(result)
     return front

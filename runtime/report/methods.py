@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from runtime.records import U8
 from runtime.report.pairs import StillPair
 
+if TYPE_CHECKING:
+    from runtime.model.predictor import Predictor
+
 Kind = Literal["network", "iterative", "closed form"]
+SHIPPED = ("fast", "balanced", "best")
 Solver = Callable[[StillPair], U8]  # layers (N, h, w, 3 or 4), the solver's own until its next call
 
 
@@ -25,6 +29,8 @@ class Method:
     source: str  # `cg`, `filter`, `mean`, `sart`, or what `load_predictor` takes
     iterations: int = 0
     tolerance_mm: float | None = None  # of the networks; None: the default
+    scale: float = 1.0  # a network works at this share of the panels' columns and rows; its layers are enlarged
+    trained: bool = True  # where not, time and memory are the network's, its picture is nobody's
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,37 +40,69 @@ class Opened:
     solve: Solver
     parameters: int
     precision: str
+    multiply_adds: Callable[[StillPair], int]  # of one prediction
 
 
 def opened(method: Method, pair: StillPair, *, threads: int) -> Opened:
     """A method ready for pairs on this pair's stack. Raises InputError, MissingPart."""
-    if method.source == "cg":
-        return Opened(lambda p: _conjugate_gradients(p, method.iterations), 0, "fp32")
-    if method.source == "mean":
-        return Opened(_mean, 0, "fp32")
-    if method.source == "filter":
-        return Opened(lambda p: _filter(p, method.iterations), 0, "fp32")
-    from runtime.config import ModelSettings
-    from runtime.model.predictor import Predictor, load_predictor
+    if method.source in ("cg", "mean", "filter"):
+        return _plain(method)
+    from runtime.model.predictor import model_path
     from runtime.model.still import solve_still
+    from runtime.report.operations import predictor_multiply_adds
 
-    settings = ModelSettings(threads=threads)
-    if method.tolerance_mm is not None:
-        settings = settings.model_copy(update={"tolerance_mm": method.tolerance_mm})
-    if method.source == "sart":
-        from runtime.model.sart import SartPredictor
-
-        predictor: Predictor = SartPredictor(pair.stack, iterations=method.iterations)
-        precision = "fp32"
-    else:
-        predictor = load_predictor(method.source, pair.stack, settings)
-        session = getattr(predictor, "session", None)
-        precision = session.contract.precision if session is not None else "fp32"
+    predictor = _predictor(method, pair, threads)
     return Opened(
         lambda p: solve_still(p.images[0], p.images[1], eyes_m=p.eyes_m, fov_deg=p.fov_deg, predictor=predictor).layers,
         predictor.parameters,
-        precision,
+        _precision(predictor),
+        lambda p: predictor_multiply_adds(predictor, p, path=model_path(method.source)),
     )
+
+
+def _plain(method: Method) -> Opened:
+    """The references that are plain linear algebra."""
+    from runtime.report import operations
+
+    n = method.iterations
+    if method.source == "cg":
+        return Opened(
+            lambda p: _conjugate_gradients(p, n),
+            0,
+            "fp32",
+            lambda p: operations.cg_multiply_adds(p.stack, rays=2 * p.images[0][..., 0].size, iterations=n),
+        )
+    if method.source == "mean":
+        return Opened(_mean, 0, "fp32", lambda p: operations.mean_multiply_adds(p.stack))
+    return Opened(lambda p: _filter(p, n), 0, "fp32", lambda p: operations.filter_multiply_adds(p.stack, steps=n))
+
+
+def _predictor(method: Method, pair: StillPair, threads: int) -> Predictor:
+    """Raises InputError, MissingPart."""
+    from runtime.config import ModelSettings
+    from runtime.model.predictor import load_predictor
+    from runtime.reduced import ReducedPredictor
+
+    if method.source == "sart":
+        from runtime.model.sart import SartPredictor
+
+        return SartPredictor(pair.stack, iterations=method.iterations)
+    settings = ModelSettings(threads=threads)
+    if method.tolerance_mm is not None:
+        settings = settings.model_copy(update={"tolerance_mm": method.tolerance_mm})
+    if method.scale == 1.0:
+        return load_predictor(method.source, pair.stack, settings)
+    small = replace(
+        pair.stack,
+        width_px=round(pair.stack.width_px * method.scale),
+        height_px=round(pair.stack.height_px * method.scale),
+    )
+    return ReducedPredictor(load_predictor(method.source, small, settings), pair.stack)
+
+
+def _precision(predictor: Predictor) -> str:
+    session = getattr(getattr(predictor, "small", predictor), "session", None)
+    return "fp32" if session is None else str(session.contract.precision)
 
 
 def _wanted(pair: StillPair) -> list[np.ndarray]:
@@ -94,10 +132,17 @@ def _filter(pair: StillPair, steps: int) -> U8:
     return as_codes(filtered_layers(pair.eyes_m, _wanted(pair), pair.stack, fov_deg=pair.fov_deg, steps=steps))
 
 
-def shipped_and_references(*, models: Sequence[str] = (), quick: bool = False) -> list[Method]:
-    """Our sizes, further ONNX files, and the reference methods; `quick` leaves out the slowest."""
-    methods = [Method(name, "network", name) for name in ("fast", "balanced", "best")]
+def shipped_and_references(
+    *, models: Sequence[str] = (), variants: Sequence[Method] = (), quick: bool = False
+) -> list[Method]:
+    """Our sizes, at half the panels' resolution too, further ONNX files, and the reference methods.
+
+    variants: what is made for the occasion, such as other precisions. `quick` leaves out the slowest.
+    """
+    methods = [Method(name, "network", name) for name in SHIPPED]
+    methods += [Method(f"{name} ×½", "network", name, scale=0.5) for name in SHIPPED]
     methods += [Method(Path(name).stem, "network", name) for name in models]
+    methods += variants
     methods += [Method(f"SART-{n}", "iterative", "sart", n) for n in ((1, 3, 10) if quick else (1, 3, 10, 30))]
     methods += [Method(f"CG-{n}", "iterative", "cg", n) for n in ((3, 10) if quick else (3, 10, 30))]
     methods += [Method(f"filter-{n}", "closed form", "filter", n) for n in (1, 3)]

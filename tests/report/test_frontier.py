@@ -70,7 +70,7 @@ def test_methods_are_measured_whole(pair: StillPair) -> None:
 
 
 def result(name: str, ms: float, psnr_db: float) -> MethodResult:
-    return MethodResult(name, "iterative", "fp32", 1, 1, ms, ms, 1, 1.0, 0, psnr_db, 1.0, psnr_db, {})
+    return MethodResult(name, "iterative", "fp32", 1, 1, ms, ms, 1, 1.0, 0, psnr_db, 1.0, psnr_db, {}, 1e9)
 
 
 @given(st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9)), min_size=1, max_size=12))
@@ -90,7 +90,7 @@ def test_the_pareto_front_is_what_nothing_beats(points: list[tuple[int, int]]) -
 
 def test_the_comparison_has_our_sizes_and_the_references() -> None:
     names = [m.name for m in shipped_and_references(models=["elsewhere/eyereal.onnx"])]
-    assert names[:4] == ["fast", "balanced", "best", "eyereal"]
+    assert names[:3] == ["fast", "balanced", "best"] and {"eyereal", "best ×½"} <= set(names)
     assert {"SART-1", "SART-3", "SART-10", "SART-30", "CG-10", "mean of targets"} <= set(names)
     assert len(set(names)) == len(names)
 

@@ -1,0 +1,199 @@
+"""Multiply-adds of one prediction: counted, not measured, so that they hold on any machine.
+
+One is a product added to a sum. Elementwise arithmetic (a sum, a product, a limit, a table, a root) counts as one per
+value written; moving and rounding count as none. A bilinear sample is four per channel, a bicubic one sixteen.
+Networks are counted from the shapes that onnxruntime meets when it runs their graph unoptimised; what surrounds
+them and the reference methods by the formulas below, per pixel.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from math import log2, prod
+from pathlib import Path
+
+import numpy as np
+
+from runtime.errors import InputError
+from runtime.model.chain import chain_frame, chain_modes
+from runtime.model.contract import Contract, Step
+from runtime.model.predictor import Predictor
+from runtime.model.visible import visible_boxes
+from runtime.optics.stack import PanelStack
+from runtime.records import F64
+from runtime.report.pairs import StillPair
+
+RGB, RGBA, EYES = 3, 4, 2
+LINEAR, CUBIC = 4, 16  # products per sample
+OUTER = (0, 2)  # panels that the chain models correct
+Shape = tuple[int, ...]
+
+COUNTED_ONCE = (
+    *("Abs", "Add", "Clip", "Cos", "Div", "Erf", "Exp", "HardSigmoid", "LeakyRelu", "Log", "Max", "Min", "Mul", "Neg"),
+    *("Pow", "Reciprocal", "Relu", "Sigmoid", "Sin", "Softplus", "Sqrt", "Sub", "Tanh"),
+)
+
+
+def node_multiply_adds(kind: str, inputs: Sequence[Shape], output: Shape) -> int:
+    """Of one ONNX node, by the shapes of its inputs and its first output."""
+    written = prod(output)
+    if kind == "Conv":  # weights (out, in / groups, *kernel)
+        return written * prod(inputs[1][1:])
+    if kind == "ConvTranspose":  # weights (in, out / groups, *kernel)
+        return prod(inputs[0]) * prod(inputs[1][1:])
+    if kind == "MatMul":
+        return written * inputs[0][-1]
+    if kind == "Gemm":
+        return written * (prod(inputs[0]) // output[0])
+    if kind == "Resize":
+        return written * LINEAR
+    if kind in ("MaxPool", "AveragePool", "GlobalAveragePool", "ReduceMean", "ReduceSum", "BatchNormalization"):
+        return prod(inputs[0])
+    return written if kind in COUNTED_ONCE else 0
+
+
+def graph_multiply_adds(path: Path, shapes: Sequence[Shape]) -> int:
+    """Of one run of an ONNX file on float32 inputs of these shapes, in its order. Raises InputError: no such run."""
+    import onnxruntime as ort
+
+    options = ort.SessionOptions()
+    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
+    options.add_session_config_entry("session.disable_prepacking", "1")  # packed weights have no shape
+    options.enable_profiling = True
+    options.log_severity_level = 3
+    with tempfile.TemporaryDirectory() as folder:
+        options.profile_file_prefix = str(Path(folder) / "run")
+        try:
+            session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+            names = [item.name for item in session.get_inputs()]
+            session.run(None, {name: np.zeros(shape, np.float32) for name, shape in zip(names, shapes, strict=True)})
+        except Exception as error:  # onnxruntime raises its own hierarchy of undocumented exceptions
+            raise InputError(path, "", f"does not run ({(str(error).splitlines() or [''])[0][:120]})") from None
+        events = json.loads(Path(session.end_profiling()).read_text(encoding="utf-8"))
+    nodes = [e["args"] for e in events if e.get("cat") == "Node" and e["name"].endswith("_kernel_time")]
+    return sum(
+        node_multiply_adds(node["op_name"], _shapes(node["input_type_shape"]), _shapes(node["output_type_shape"])[0])
+        for node in nodes
+        if node["output_type_shape"]
+    )
+
+
+def _shapes(entries: Sequence[Mapping[str, Sequence[int]]]) -> list[Shape]:
+    return [tuple(shape) for entry in entries for shape in entry.values()]
+
+
+def predictor_multiply_adds(predictor: Predictor, pair: StillPair, *, path: Path | None) -> int:
+    """Of a whole prediction from a pair's two pictures, warps included. path: the network's file, if it has one."""
+    from runtime.model.network import NetworkPredictor
+    from runtime.model.sart import SartPredictor
+    from runtime.model.unrolled import UnrolledPredictor
+    from runtime.reduced import ReducedPredictor
+
+    if isinstance(predictor, ReducedPredictor):
+        enlarged = LINEAR * RGBA * predictor.stack.count * _pixels(predictor.stack)
+        return predictor_multiply_adds(predictor.small, pair, path=path) + enlarged
+    windows = predictor.windows(pair.eyes_m)
+    drawn = sum((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in windows)
+    total = EYES * RGBA * drawn * (CUBIC if predictor.interpolation == "cubic" else LINEAR)
+    if isinstance(predictor, SartPredictor):
+        return total + sart_multiply_adds(predictor.stack, iterations=predictor.iterations)
+    if path is None:
+        raise ValueError("a network's file is needed to count it")
+    if isinstance(predictor, UnrolledPredictor):
+        return total + unrolled_multiply_adds(predictor.session.contract, predictor.stack, pair.eyes_m, path=path)
+    if isinstance(predictor, NetworkPredictor):
+        pixels = _pixels(predictor.stack)
+        shape = (
+            1,
+            len(predictor.rasters(pair.eyes_m)) * EYES * RGB,
+            predictor.stack.height_px,
+            predictor.stack.width_px,
+        )
+        tables = shape[1] * pixels
+        return total + tables + graph_multiply_adds(path, [shape]) + predictor.stack.count * RGB * pixels
+    raise ValueError(f"{type(predictor).__name__} can't be counted")
+
+
+def unrolled_multiply_adds(contract: Contract, stack: PanelStack, eyes_m: F64, *, path: Path) -> int:
+    """The networks of a chain model, its corrections and the closed centre, over what both eyes look through."""
+    boxes = visible_boxes(eyes_m, stack)
+
+    def values(panel: int, reduction: int) -> int:
+        box = boxes[panel]
+        return RGB * (box.width_px // reduction) * (box.height_px // reduction)
+
+    frame = chain_frame(eyes_m, stack, cell_px=contract.cell_px, reduction=contract.reduction)
+    chain = [(frame.rows, frame.cells, 2 * frame.cell_px * RGB), *(a.shape for a in chain_modes(frame.cells)), (1,)]
+    network = graph_multiply_adds(path, chain) if any(step.kind == "chain" for step in contract.steps) else 0
+    in_frame = RGB * frame.rows * frame.width_px
+    whole, sharpened = values(1, 1), 6 if contract.emphasis else 0  # a separable filter of three
+    total = EYES * whole * (sharpened + 1)  # and a table
+    level = contract.steps[0].reduction
+    for index, step in enumerate(contract.steps):
+        if step.reduction != level:
+            level = step.reduction
+            total += sum(CUBIC * values(n, level) + EYES * LINEAR * values(1, level) for n in OUTER)
+        if index:  # what each eye lacks when the centre is closed: two differences each, mean, limit, two differences
+            total += 8 * values(1, level)
+        total += _step(step, values, network=network, in_frame=in_frame, reduction=contract.reduction)
+    if level != 1:
+        total += sum(CUBIC * values(n, 1) + EYES * LINEAR * values(1, 1) for n in OUTER)
+    return total + 7 * whole  # the centre: two targets less four, and a limit
+
+
+def _step(step: Step, values: Callable[[int, int], int], *, network: int, in_frame: int, reduction: int) -> int:
+    """One correction, and the look at what it changed."""
+    seen = EYES * LINEAR * values(1, step.reduction)  # one outer panel through the centre's pixels
+    if step.kind == "chain":
+        wave = sum((CUBIC + 2) * values(n, step.reduction) for n in OUTER)
+        coarser = EYES * values(1, 1 if reduction == 1 else step.reduction)  # every value goes into one mean
+        return network + coarser + in_frame * (EYES * LINEAR + 2) + wave + seen * len(OUTER)
+    return (EYES * LINEAR + 4) * values(2 if step.kind == "front" else 0, step.reduction) + seen
+
+
+def sart_multiply_adds(stack: PanelStack, *, iterations: int) -> int:
+    """Each eye in turn samples every panel, and every panel that eye's lack: five per value each way, and a limit."""
+    values = RGB * _pixels(stack)
+    return EYES * values + iterations * EYES * stack.count * (LINEAR + 1 + LINEAR + 2) * values
+
+
+def cg_multiply_adds(stack: PanelStack, *, rays: int, iterations: int) -> int:
+    """Least squares by conjugate gradients: operator, its transpose and the check of the clipped iterate a turn.
+
+    rays: counted rays of both eyes together. The vectors' updates and squares are one per value each.
+    """
+    sampled = stack.count * LINEAR * rays * RGB
+    unknowns = stack.count * RGB * _pixels(stack)
+    start = 3 * sampled + RGB * rays + unknowns
+    return start + iterations * (3 * sampled + 4 * RGB * rays + 5 * unknowns)
+
+
+def mean_multiply_adds(stack: PanelStack) -> int:
+    """Each eye's phases sampled on to every panel and added; one table per picture; a share and a limit."""
+    values = RGB * _pixels(stack)
+    return EYES * values + stack.count * (EYES * (LINEAR + 1) + 2) * values
+
+
+def filter_multiply_adds(stack: PanelStack, *, steps: int) -> int:
+    """Fourier transforms at 2.5·n·log2(n) per real picture (margins left out), and per frequency the small solve.
+
+    A complex product is four. Per step: every panel seen by both eyes, five transforms, the solve, every panel
+    sampled from its answer.
+    """
+    pixels = _pixels(stack)
+    transforms = (EYES + stack.count) * RGB * round(2.5 * pixels * log2(pixels))
+    solve = (EYES * 8 + stack.count * EYES * 4) * RGB * pixels // 2  # half the frequencies: the pictures are real
+    samples = (EYES + 1) * stack.count * (LINEAR + 1) * RGB * pixels
+    return EYES * (LINEAR + 1) * RGB * pixels + steps * (transforms + solve + samples)
+
+
+def _pixels(stack: PanelStack) -> int:
+    return stack.width_px * stack.height_px
+
+
+def spoken(count: float) -> str:
+    """A count as billions, in a column's width: `0.43`, `12`, `5,310`."""
+    billions = count / 1e9
+    return f"{billions:.2g}" if billions < 10 else f"{billions:,.0f}"
