@@ -1,7 +1,7 @@
 # phasestack in a container: the demo by default, a display with the flags below.
 #
 #   docker build -t phasestack .
-#   docker run --rm phasestack                                      the demo: 30 s of the built-in recording, no screen
+#   docker run --rm phasestack                                      the demo: the built-in recording, no screen
 #   docker run --rm -v "$PWD/out:/out" phasestack demo --out /out   its pictures (make out/ writable for uid 990)
 #   docker run --rm phasestack doctor
 #
