@@ -83,8 +83,11 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
                 )
         axes.set_title("Error against run time: up and to the left is better")
         axes.xaxis.set_major_formatter("{x:g}")
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=4, fontsize=8.5)
-        label_points(figure, axes, [(r.ms_p50, r.psnr_db, r.name) for r in dots])
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=5, fontsize=8.5)
+        corners = [(x[0], y[0])]
+        for ms, psnr_db in zip([*x[1:], high], [*y[1:], y[-1]], strict=True):
+            corners += [(ms, corners[-1][1]), (ms, psnr_db)]
+        label_points(figure, axes, [(r.ms_p50, r.psnr_db, r.name) for r in dots], lines=corners)
     text = "The line is the Pareto front: methods that no other beats in both time and error."
     return Figure(name, png(figure), text)
 
@@ -99,7 +102,7 @@ def cost_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
     measures = (
         ("median time, ms", [r.ms_p50 for r in ordered]),
         ("peak memory, MiB", [r.memory_mib for r in ordered]),
-        ("multiply-adds, 1e9", [r.multiply_adds / 1e9 for r in ordered]),
+        ("multiply-adds, 10⁹", [r.multiply_adds / 1e9 for r in ordered]),
     )
     with drawing(9.6, 0.9 + 0.23 * len(ordered)) as figure:
         panels = figure.subplots(1, 3, sharey=True)

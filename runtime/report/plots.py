@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,7 @@ COLOURS = ("#2456c4", "#d9662b", "#1a8f6b", "#a23b8f", "#c9a227", "#5b6478", "#2
 INK = "#1d2433"
 # Where a name may stand beside its dot, in points right and up of it, the best first.
 LABEL_PLACES = tuple(
-    (right, up) for reach in (8, 16, 26, 38) for up in (0, 9, -9, reach, -reach) for right in (reach, -reach)
+    (right, up) for reach in (8, 16, 26, 38) for up in (7, -7, 0, reach, -reach) for right in (reach, -reach)
 )
 
 
@@ -56,23 +57,39 @@ def png(figure: Any) -> bytes:
     return buffer.getvalue()
 
 
-def label_points(figure: Any, axes: Any, points: Sequence[tuple[float, float, str]]) -> None:
+def label_points(
+    figure: Any,
+    axes: Any,
+    points: Sequence[tuple[float, float, str]],
+    *,
+    lines: Sequence[tuple[float, float]] = (),
+    colours: Sequence[str] = (),
+) -> None:
     """Name dots so that no name lies on another, on a dot or beyond the axes: each takes the first free place.
 
+    lines: corners of a line that names should keep off, if they can; colours: of the names, without: all alike.
     To be called when everything else is drawn. Where no place is free, the least crowded one is taken.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.patheffects import withStroke
     from matplotlib.transforms import Bbox
 
+    if not points:
+        return
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # type: ignore[no-untyped-call]
     renderer = canvas.get_renderer()  # type: ignore[no-untyped-call]
     dots = axes.transData.transform([(x, y) for x, y, _ in points])
     frame, point = axes.get_window_extent(renderer), figure.dpi / 72
-    taken: list[Any] = []
+    corners = axes.transData.transform(lines) if len(lines) else np.empty((0, 2))
+    steps = [np.linspace(a, b, 200) for a, b in pairwise(corners)]
+    kept_off = np.concatenate([np.empty((0, 2)), *steps])
+    halo = [withStroke(linewidth=2.5, foreground="white")]
+    taken = [text.get_window_extent(renderer) for text in axes.texts]
     for index in np.argsort(dots[:, 0]):
         x, y, text = points[index]
-        style = {"textcoords": "offset points", "va": "center", "fontsize": 8.5, "color": INK}
+        style: dict[str, Any] = {"textcoords": "offset points", "va": "center", "fontsize": 8.5, "path_effects": halo}
+        style["color"] = colours[index] if colours else INK
         label = axes.annotate(text, (x, y), xytext=(0, 0), ha="left", **style)
         size = label.get_window_extent(renderer)
         others = np.delete(dots, index, axis=0)
@@ -83,9 +100,10 @@ def label_points(figure: Any, axes: Any, points: Sequence[tuple[float, float, st
 
         def crowding(place: tuple[float, float], others: Any = others, box: Any = box) -> float:
             own = box(*place)
-            apart = np.maximum(np.maximum([own.x0, own.y0] - others, others - [own.x1, own.y1]), 0)
             inside = frame.x0 <= own.x0 and own.x1 <= frame.x1 and frame.y0 <= own.y0 and own.y1 <= frame.y1
-            return float((np.hypot(*apart.T) < 5 * point).sum() + sum(map(own.overlaps, taken)) + 3 * (not inside))
+            crossed = bool((_apart(own, kept_off) == 0).any())
+            dots_on_it = (_apart(own, others) < 5 * point).sum()
+            return float(dots_on_it + sum(map(own.overlaps, taken)) + 3 * (not inside) + 0.5 * crossed)
 
         place = min(LABEL_PLACES, key=crowding)
         taken.append(box(*place))
@@ -94,3 +112,8 @@ def label_points(figure: Any, axes: Any, points: Sequence[tuple[float, float, st
         if np.hypot(*place) > 14:
             line = {"arrowstyle": "-", "color": "#b8bfcc", "linewidth": 0.7, "shrinkA": 1, "shrinkB": 4}
             axes.annotate("", (x, y), xytext=place, textcoords="offset points", arrowprops=line)
+
+
+def _apart(box: Any, places: Any) -> Any:
+    """How far places (n, 2) are from a box; 0 within."""
+    return np.hypot(*np.maximum(np.maximum([box.x0, box.y0] - places, places - [box.x1, box.y1]), 0).T)

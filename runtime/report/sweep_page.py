@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from runtime.report.page import Figure, Section, Table
-from runtime.report.plots import COLOURS, drawing, png
+from runtime.report.plots import COLOURS, drawing, label_points, png
 from runtime.report.sweeps import Curve, Size, Tolerance, Volume
 
 
@@ -66,7 +66,7 @@ def gap_section(curves: Sequence[Curve]) -> Section:
     """Why panels must not stand too close."""
     labels = ("gap between neighbouring panels, mm", "displayed PSNR, dB")
     caption = "The viewer stays equally far from the front panel."
-    figure = _curves(curves, "gap-between-panels", labels, caption, log=True)
+    figure = _curves(curves, "gap-between-panels", labels, caption)
     text = [
         "The outer panels carry the difference between the eyes by their parallax, which grows with the gap: the "
         "smaller the gap, the stiffer the problem, and the less of the difference fits between black and white.",
@@ -74,26 +74,34 @@ def gap_section(curves: Sequence[Curve]) -> Section:
     return Section("Quality against panel gap", text, [figure])
 
 
-def knob_section(curves: Sequence[Curve]) -> Section:
-    """Exactness against tolerance."""
-    labels = ("PSNR exactly at the eyes, dB", "PSNR 2 mm beside them, dB")
-    figure = _curves(curves, "tolerance-knob", labels, "To the right: more exact. Up: more tolerant.", log=False)
+def knob_section(curves: Sequence[Curve], *, where: str) -> Section:
+    """Exactness against tolerance: a panel a model, all on the same axes."""
+    with drawing(9.6, 3.8) as figure:
+        panels = figure.subplots(1, len(curves), sharex=True, sharey=True, squeeze=False)[0]
+        for axes, curve, colour in zip(panels, curves, COLOURS, strict=False):
+            axes.plot(curve.x, curve.y, marker="o", markersize=4.5, color=colour)
+            axes.set(xlabel="PSNR exactly at the eyes, dB", title=curve.name)
+            axes.margins(0.12, 0.12)
+        panels[0].set_ylabel("PSNR 2 mm beside them, dB")
+        for axes, curve in zip(panels, curves, strict=True):
+            dots = [(x, y, mark) for x, y, mark in zip(curve.x, curve.y, curve.marks, strict=False)]
+            label_points(figure, axes, dots, lines=list(zip(curve.x, curve.y, strict=True)))
     text = [
-        "The setting model.tolerance_mm from 0 to 8 mm, a dot each: how strongly the outer panels are driven. "
+        f"The setting model.tolerance_mm from 0 to 8 mm on {where}: how strongly the outer panels are driven. "
         "What is perfect at one point and useless 2 mm beside it is worth nothing on a real display.",
     ]
-    return Section("Exactness against tolerance", text, [figure])
+    caption = "A dot a setting, its millimetres beside it. To the right: more exact. Up: more tolerant."
+    return Section("Exactness against tolerance", text, [Figure("tolerance-knob", png(figure), caption)])
 
 
-def _curves(curves: Sequence[Curve], name: str, labels: tuple[str, str], caption: str, *, log: bool) -> Figure:
+def _curves(curves: Sequence[Curve], name: str, labels: tuple[str, str], caption: str) -> Figure:
     with drawing(9.6, 4.0) as figure:
         axes = figure.add_subplot()
         for curve in curves:
             axes.plot(curve.x, curve.y, marker="o", markersize=4.5, label=curve.name)
-        if log:
-            axes.set_xscale("log")
-            axes.set_xticks(curves[0].x, [f"{x:g}" for x in curves[0].x], minor=False)
-            axes.minorticks_off()
+        axes.set_xscale("log")
+        axes.set_xticks(curves[0].x, [f"{x:g}" for x in curves[0].x], minor=False)
+        axes.minorticks_off()
         axes.set(xlabel=labels[0], ylabel=labels[1])
         axes.legend()
     return Figure(name, png(figure), caption)

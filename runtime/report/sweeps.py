@@ -75,6 +75,7 @@ class Curve:
     name: str
     x: Sequence[float]
     y: Sequence[float]
+    marks: Sequence[str] = ()  # what stands beside each dot
 
 
 def over_gaps(scene: str, stack: PanelStack, models: Sequence[str], *, distance_m: float) -> list[Curve]:
@@ -140,7 +141,7 @@ def over_tolerance(
     eyes = eyes_at(distance_m=distance_m)
     curves = []
     for model in models:
-        exact, beside_db = [], []
+        exact, beside_db, marks = [], [], []
         for tolerance_mm in (0.0, 0.5, 1.0, 2.0, 4.0, 8.0):
             settings = ModelSettings(tolerance_mm=tolerance_mm)
             with Simulation(scene, stack, model=model, settings=settings) as simulation:
@@ -148,7 +149,8 @@ def over_tolerance(
                 if layers is None:
                     continue
                 exact.append(simulation.pooled_db(eyes, layers))
+                marks.append(f"{tolerance_mm:g}")
                 places = [place for eye in eyes for place in beside(eye, off_mm)]
                 beside_db.append(float(np.mean([simulation.psnr_db(place, layers) for place in places])))
-        curves.append(Curve(model, exact, beside_db))
+        curves.append(Curve(model, exact, beside_db, marks))
     return curves

@@ -58,7 +58,7 @@ def report_page() -> Page:
         frontier_page.frontier_section(methods, pairs="a pair", title="Frontier", name="test"),
         sweep_page.volume_section(Volume(range(9), range(9), holed), model="balanced", scene="demo"),
         sweep_page.tolerance_section(tolerance, model="balanced", distance_m=0.6),
-        sweep_page.knob_section([Curve("balanced", [40, 41, 42], [30, 29, 27])]),
+        sweep_page.knob_section([Curve("balanced", [40, 41, 42], [30, 29, 27], ["4", "2", "0"])], where="a scene"),
         sweep_page.gap_section([Curve("balanced", [5, 30, 60], [30, 35, 36])]),
         sweep_page.resolution_section([Size("balanced", 480, 270, 9.0, 30.0), Size("balanced", 960, 540, 30.0, 35.0)]),
         horizon_section([Horizon(name, percentiles, 2 * percentiles) for name in ("still", "walk")], tolerance),
