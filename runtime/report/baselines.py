@@ -61,6 +61,21 @@ def bilinear_rows(u: F32, v: F32, *, width_px: int, height_px: int) -> Any:
 
 def eye_operator(eye_m: ArrayLike, stack: PanelStack, *, width_px: int, height_px: int, fov_deg: float) -> EyeOperator:
     """The operator of one eye's image of the given size. Raises ValueError where no ray crosses every panel."""
+    positions, mask = _crossings(eye_m, stack, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
+    if not mask.any():
+        raise ValueError("no ray of this eye crosses every panel")
+    size = {"width_px": stack.width_px, "height_px": stack.height_px}
+    return EyeOperator(tuple(bilinear_rows(u[mask], v[mask], **size) for u, v in positions), mask)
+
+
+def rays_that_count(eye_m: ArrayLike, stack: PanelStack, *, width_px: int, height_px: int, fov_deg: float) -> int:
+    """How many rows an eye's operator has: rays that cross every panel."""
+    return int(_crossings(eye_m, stack, width_px=width_px, height_px=height_px, fov_deg=fov_deg)[1].sum())
+
+
+def _crossings(
+    eye_m: ArrayLike, stack: PanelStack, *, width_px: int, height_px: int, fov_deg: float
+) -> tuple[list[tuple[F32, F32]], Mask]:
     mask = ray_mask(eye_m, stack, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
     positions = [
         panel_positions(eye_m, stack, index=index, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
@@ -68,10 +83,7 @@ def eye_operator(eye_m: ArrayLike, stack: PanelStack, *, width_px: int, height_p
     ]
     for u, v in positions:
         mask &= (u > 0.5) & (u < stack.width_px - 0.5) & (v > 0.5) & (v < stack.height_px - 0.5)
-    if not mask.any():
-        raise ValueError("no ray of this eye crosses every panel")
-    size = {"width_px": stack.width_px, "height_px": stack.height_px}
-    return EyeOperator(tuple(bilinear_rows(u[mask], v[mask], **size) for u, v in positions), mask)
+    return positions, mask
 
 
 def conjugate_gradients(

@@ -70,7 +70,7 @@ def _plain(method: Method) -> Opened:
             lambda p: _conjugate_gradients(p, n),
             0,
             "fp32",
-            lambda p: operations.cg_multiply_adds(p.stack, rays=2 * p.images[0][..., 0].size, iterations=n),
+            lambda p: operations.cg_multiply_adds(p.stack, rays=_rays(p), iterations=n),
         )
     if method.source == "mean":
         return Opened(_mean, 0, "fp32", lambda p: operations.mean_multiply_adds(p.stack))
@@ -107,6 +107,14 @@ def _precision(predictor: Predictor) -> str:
 
 def _wanted(pair: StillPair) -> list[np.ndarray]:
     return [image.astype(np.float32) / np.float32(255) for image in pair.images]
+
+
+def _rays(pair: StillPair) -> int:
+    from runtime.report.baselines import rays_that_count
+
+    height, width = pair.images[0].shape[:2]
+    size = {"width_px": width, "height_px": height, "fov_deg": pair.fov_deg}
+    return sum(rays_that_count(eye, pair.stack, **size) for eye in pair.eyes_m)
 
 
 def _conjugate_gradients(pair: StillPair, iterations: int) -> U8:
