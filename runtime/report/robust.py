@@ -18,6 +18,7 @@ import numpy as np
 from runtime.artifacts import write_bytes
 from runtime.errors import ModelFailure
 from runtime.optics.stack import PanelStack
+from runtime.records import F64
 from runtime.report.eyesight import judged
 from runtime.report.methods import Method, opened
 from runtime.report.pairs import StillPair
@@ -42,7 +43,9 @@ class Outcome:
     """One pair, and what each model shows of it."""
 
     number: int
-    pair: StillPair
+    stack: PanelStack
+    eyes_m: F64  # (2, 3) left, right; frame `stack`
+    fov_deg: float
     reference: Shown
     models: dict[str, Shown] = field(default_factory=dict)
 
@@ -53,16 +56,16 @@ class Outcome:
 
     def record(self) -> dict[str, Any]:
         """As robust.json has it."""
-        middle = self.pair.eyes_m.mean(axis=0)
+        middle = self.eyes_m.mean(axis=0)
         return {
             "number": self.number,
-            "panel_width_m": self.pair.stack.width_m,
-            "gap_m": float(np.diff(self.pair.stack.x_m)[0]),
+            "panel_width_m": self.stack.width_m,
+            "gap_m": float(np.diff(self.stack.x_m)[0]),
             "distance_m": float(np.linalg.norm(middle)),
             "off_axis_deg": float(np.degrees(np.arccos(middle[0] / np.linalg.norm(middle)))),
-            "ipd_m": float(np.linalg.norm(self.pair.eyes_m[1] - self.pair.eyes_m[0])),
-            "eyes_m": self.pair.eyes_m,
-            "fov_deg": self.pair.fov_deg,
+            "ipd_m": float(np.linalg.norm(self.eyes_m[1] - self.eyes_m[0])),
+            "eyes_m": self.eyes_m,
+            "fov_deg": self.fov_deg,
             "reference_db": self.reference.psnr_db,
             "psnr_db": {name: shown.psnr_db for name, shown in self.models.items()},
             "worst_eye_db": {name: shown.worst_eye_db for name, shown in self.models.items()},
@@ -102,11 +105,8 @@ def outcomes(
     found = []
     for done, number in enumerate(numbers):
         pair, reference = _kept(make, number, cache, threads)
-        found.append(
-            Outcome(
-                number, pair, reference, {name: _shown(Method(name, "network", name), pair, threads) for name in models}
-            )
-        )
+        shown = {name: _shown(Method(name, "network", name), pair, threads) for name in models}
+        found.append(Outcome(number, pair.stack, pair.eyes_m, pair.fov_deg, reference, shown))
         progress(done + 1, len(numbers))
     return found
 

@@ -85,7 +85,7 @@ def test_pairs_are_kept_and_a_cut_off_file_is_made_anew(tmp_path: Path) -> None:
     assert made == [0, 1]
     for a, b in zip(first, second, strict=True):
         assert a.models == b.models and a.reference == b.reference
-        assert np.array_equal(a.pair.images, b.pair.images) and a.pair.stack == b.pair.stack
+        assert np.array_equal(a.eyes_m, b.eyes_m) and a.stack == b.stack and a.fov_deg == b.fov_deg
     (tmp_path / "1.npz").write_bytes((tmp_path / "1.npz").read_bytes()[:-200])
     run()
     assert made == [0, 1, 1]
@@ -97,8 +97,9 @@ def test_pairs_are_kept_and_a_cut_off_file_is_made_anew(tmp_path: Path) -> None:
 )
 def test_the_bar(model_db: float, reference_db: float, fails: bool) -> None:
     stack = PanelStack(0.5, 0.3, (-0.1, 0.0, 0.1), 2, 2)
-    pair = StillPair("one", stack, np.ones((2, 3)), (np.zeros((2, 2, 3), np.uint8),) * 2, 40.0)
-    outcome = robust.Outcome(7, pair, robust.Shown(reference_db, 0), {"m": robust.Shown(model_db, 0)})
+    outcome = robust.Outcome(
+        7, stack, np.ones((2, 3)), 40.0, robust.Shown(reference_db, 0), {"m": robust.Shown(model_db, 0)}
+    )
     assert outcome.fails("m") is fails
     verdict = robust.verdict([outcome], "m")
     assert verdict.failing == ([7] if fails else [])
