@@ -8,14 +8,18 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
-from runtime.errors import InputError, MissingPart
+from runtime.content.ply import Table, read_vertices
+from runtime.errors import InputError
 from runtime.records import F32, F64
 
 LOW_PASS_PX2 = 0.3  # added to each splat's covariance: none falls between the pixels
 LEAST_ALPHA = 1 / 255
 MOST_ALPHA = 0.99
 LARGEST_RELATIVE_SCALE = 1000.0  # of a splat, in units of the scene's extent
+FARTHEST_RELATIVE = 1e6  # of a splat from the middle, in units of the median distance
+LARGEST_COEFFICIENT = 1e4  # of the harmonics: colours are blended as half floats, which end at 65504
 COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}  # f_rest properties: spherical harmonics a channel
 
 I64 = NDArray[np.int64]
@@ -48,17 +52,10 @@ def load_gaussians(path: Path, *, progress: Callable[[str], None] = lambda _: No
 
     Raises InputError: unreadable, a property missing, values that aren't finite, absurd scales.
     """
-    try:
-        from plyfile import PlyData
-    except ImportError:
-        raise MissingPart("splats need plyfile: pip install phasestack[splats]") from None
     progress(f"reading {path.name}")
-    try:
-        table = PlyData.read(path)["vertex"].data
-    except Exception as error:  # plyfile raises its own and struct's errors
-        raise InputError(path, "", f"cannot be read as PLY ({type(error).__name__}: {str(error)[:120]})") from None
+    table = read_vertices(path)
     names = set(table.dtype.names or ())
-    rest = sorted((name for name in names if name.startswith("f_rest_")), key=lambda name: int(name[7:]))
+    rest = [name for name in names if name.startswith("f_rest_")]
     needed = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
     needed += ["rot_0", "rot_1", "rot_2", "rot_3"]
     for name in needed:
@@ -66,15 +63,21 @@ def load_gaussians(path: Path, *, progress: Callable[[str], None] = lambda _: No
             raise InputError(path, name, "the property is missing: this is no 3D Gaussian splat file")
     if len(rest) not in COEFFICIENTS:
         raise InputError(path, "f_rest", f"{len(rest)} properties; 0, 9, 24 or 45 are needed")
+    for index in range(len(rest)):
+        if f"f_rest_{index}" not in names:
+            raise InputError(path, f"f_rest_{index}", "the property is missing")
     if not len(table):
         raise InputError(path, "vertex", "there are none")
 
     def columns(prefix: str, count: int) -> F32:
-        values = np.column_stack([table[f"{prefix}{index}"] for index in range(count)]).astype(np.float32)
-        return _finite(values, path, prefix.rstrip("_"))
+        return _numbers(table, [f"{prefix}{index}" for index in range(count)], path, prefix.rstrip("_"))
 
     progress(f"{len(table)} splats")
-    centres = _finite(np.column_stack([table["x"], table["y"], table["z"]]).astype(np.float32), path, "x, y, z")
+    centres = _numbers(table, ["x", "y", "z"], path, "x, y, z")
+    away = np.abs(centres.astype(np.float64) - np.median(centres, axis=0)).max(1)
+    stray = int((away > FARTHEST_RELATIVE * np.median(away)).sum()) if np.median(away) > 0 else 0
+    if stray:
+        raise InputError(path, "x, y, z", f"{stray} splats are over {FARTHEST_RELATIVE:g} times the scene's size away")
     log_scales = columns("scale_", 3)
     extent = float(np.ptp(np.percentile(centres, [1, 99], axis=0), axis=0).max()) or 1.0
     limit = np.log(LARGEST_RELATIVE_SCALE * extent)
@@ -86,19 +89,28 @@ def load_gaussians(path: Path, *, progress: Callable[[str], None] = lambda _: No
             )
     higher = columns("f_rest_", len(rest)).reshape(len(table), 3, -1).transpose(0, 2, 1) if rest else None
     first = columns("f_dc_", 3)[:, None]
-    opacity = _finite(np.asarray(table["opacity"], dtype=np.float32)[:, None], path, "opacity")[:, 0]
-    return Gaussians(
-        centres=centres,
-        covariances=covariances_of(np.exp(log_scales), columns("rot_", 4)),
-        opacities=(1 / (1 + np.exp(-opacity.astype(np.float64)))).astype(np.float32),
-        harmonics=first if higher is None else np.ascontiguousarray(np.concatenate([first, higher], axis=1)),
-    )
+    harmonics = first if higher is None else np.ascontiguousarray(np.concatenate([first, higher], axis=1))
+    glaring = int((np.abs(harmonics) > LARGEST_COEFFICIENT).any((1, 2)).sum())
+    if glaring:
+        raise InputError(path, "f_dc, f_rest", f"{glaring} splats have coefficients over {LARGEST_COEFFICIENT:g}")
+    rotations = columns("rot_", 4)
+    undirected = int((~rotations.any(1)).sum())
+    if undirected:
+        raise InputError(path, "rot", f"{undirected} of {len(table)} are no rotations: all four numbers are 0")
+    opacity = _numbers(table, ["opacity"], path, "opacity")[:, 0].astype(np.float64)
+    opacities = np.asarray(expit(opacity), dtype=np.float32)
+    if not (opacities > LEAST_ALPHA).any():
+        raise InputError(path, "opacity", "no splat can be seen")
+    return Gaussians(centres, covariances_of(np.exp(log_scales), rotations), opacities, harmonics)
 
 
-def _finite(values: F32, path: Path, name: str) -> F32:
+def _numbers(table: Table, names: list[str], path: Path, field: str) -> F32:
+    """(n, len(names)) finite float32 columns of a table. Raises InputError."""
+    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is told
+        values = np.column_stack([table[name] for name in names]).astype(np.float32)
     broken = int((~np.isfinite(values).all(1)).sum())
     if broken:
-        raise InputError(path, name, f"{broken} of {len(values)} are not finite")
+        raise InputError(path, field, f"{broken} of {len(values)} are not finite")
     return values
 
 

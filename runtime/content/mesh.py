@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import importlib.util
+import io
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
+from PIL import Image
 
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.camera import PixelBox
@@ -19,6 +23,7 @@ from runtime.records import F64, U8
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
 LARGEST_TEXTURE_PX = 4096
+LARGEST_COORDINATE = 1e15  # products of three still fit in float32's range
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,16 +38,14 @@ class MeshData:
 
 def load_mesh(path: Path) -> MeshData:
     """Read a file. Raises InputError: unreadable, no faces, NaN vertices, a texture missing."""
-    try:
-        import trimesh
-    except ImportError:
-        raise MissingPart("meshes need trimesh: pip install trimesh") from None
+    if importlib.util.find_spec("trimesh") is None:
+        raise MissingPart("meshes need trimesh: pip install trimesh")
     if not path.is_file():
         raise InputError(path, "", "is not there")
     _refuse_what_loaders_hide(path)
     try:
-        scene = trimesh.load_scene(path, process=False)
-        geometries: list[Any] = list(scene.dump())
+        with np.errstate(all="ignore"):  # coordinates beyond any scene overflow in the loader; they are told below
+            geometries: list[Any] = list(_scene(path).dump())
     except Exception as error:  # loaders raise whatever their parsers do
         raise InputError(path, "", f"cannot be read as a mesh ({type(error).__name__}: {str(error)[:120]})") from None
     meshes = [item for item in geometries if getattr(item, "faces", None) is not None and len(item.faces)]
@@ -50,8 +53,26 @@ def load_mesh(path: Path) -> MeshData:
         raise InputError(path, "faces", "there are none")
     pictures: dict[int, U8] = {}
     parts = tuple(_part(mesh, path, pictures) for mesh in meshes)
+    if not any(_has_area(part.shape) for part in parts):
+        raise InputError(path, "faces", "none has an area")
     corners = np.array([bound(part.shape.positions_m, axis=0) for part in parts for bound in (np.min, np.max)])
     return MeshData(path.stem, parts, corners.min(0).astype(np.float64), corners.max(0).astype(np.float64))
+
+
+def _scene(path: Path) -> Any:
+    import trimesh
+
+    if path.suffix.lower() != ".obj":
+        return trimesh.load_scene(path, process=False)
+    # Of an OBJ only names and comments can be other than ASCII, and exporters differ in how they write them.
+    text = path.read_text(encoding="utf-8", errors="replace")
+    resolver = trimesh.resolvers.FilePathResolver(str(path))
+    return trimesh.load_scene(io.StringIO(text), file_type="obj", resolver=resolver, process=False)
+
+
+def _has_area(shape: Shape) -> bool:
+    corner = shape.positions_m.astype(np.float64)[shape.triangles]
+    return bool(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).any())
 
 
 def _part(mesh: Any, path: Path, pictures: dict[int, U8]) -> Part:
@@ -59,6 +80,9 @@ def _part(mesh: Any, path: Path, pictures: dict[int, U8]) -> Part:
     if not np.isfinite(vertices).all():
         broken = int((~np.isfinite(vertices).all(1)).sum())
         raise InputError(path, "vertices", f"{broken} of {len(vertices)} are not finite")
+    huge = int((np.abs(vertices) > LARGEST_COORDINATE).any(1).sum())
+    if huge:
+        raise InputError(path, "vertices", f"{huge} of {len(vertices)} are beyond {LARGEST_COORDINATE:g}")
     faces = np.asarray(mesh.faces)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(path, "faces", "refer to vertices that are not there")
@@ -116,30 +140,77 @@ def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, tuple[
 
 
 def _refuse_what_loaders_hide(path: Path) -> None:
-    """The loader passes over a texture that isn't there, and over an OBJ's vertices that aren't numbers."""
-    wanted: list[str] = []
-    if path.suffix.lower() == ".gltf":
-        try:
-            table = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise InputError(path, "", f"malformed: {error}") from None
-        wanted = [str(image.get("uri", "")) for image in table.get("images", []) if isinstance(image, dict)]
-    elif path.suffix.lower() == ".obj":
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-        positions = [line for line in lines if line.startswith("v ")]
-        broken = sum("nan" in line.lower() or "inf" in line.lower() for line in positions)
-        if broken:
-            raise InputError(path, "vertices", f"{broken} of {len(positions)} are not finite")
-        for line in lines:
-            if line.startswith("mtllib "):
-                library = path.parent / line.split(maxsplit=1)[1].strip()
-                if not library.is_file():
-                    raise InputError(path, "mtllib", f"{library.name} is not there")
-                text = library.read_text(encoding="utf-8", errors="replace").splitlines()
-                wanted += [item.split()[-1] for item in text if item.strip().startswith("map_Kd")]
+    """The loader passes over textures that aren't there or aren't pictures, and over an OBJ's broken numbers."""
+    suffix = path.suffix.lower()
+    wanted = _of_gltf(path) if suffix == ".gltf" else _of_obj(path) if suffix == ".obj" else []
     for name in wanted:
-        if name and not name.startswith("data:") and not (path.parent / name).is_file():
+        picture = path.parent / name
+        if not picture.is_file():
             raise InputError(path, "texture", f"{name} is not there")
+        try:
+            with Image.open(picture) as image:
+                image.load()
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+            raise InputError(path, "texture", f"{name} is not an image that can be decoded") from None
+
+
+def _of_gltf(path: Path) -> list[str]:
+    """Names of the picture files; the buffers' are checked. Raises InputError."""
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(path, "", f"malformed: {error}") from None
+    if not isinstance(table, dict):
+        raise InputError(path, "", "malformed: a glTF file is a JSON object")
+    for index, buffer in enumerate(_objects(table, "buffers", path)):
+        name, wanted = _file_of(buffer), buffer.get("byteLength", 0)
+        held = path.parent / name
+        if name and not held.is_file():
+            raise InputError(path, f"buffers[{index}].uri", f"{name} is not there")
+        if name and isinstance(wanted, int) and held.stat().st_size < wanted:
+            raise InputError(
+                path, f"buffers[{index}].byteLength", f"{name} holds {held.stat().st_size} bytes, not {wanted}"
+            )
+    return [name for image in _objects(table, "images", path) if (name := _file_of(image))]
+
+
+def _objects(table: dict[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
+    items = table.get(key, [])
+    if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
+        raise InputError(path, key, "must be a list of objects")
+    return items
+
+
+def _file_of(item: dict[str, Any]) -> str:
+    """The file that a glTF object refers to; empty where its data are inside."""
+    uri = str(item.get("uri", ""))
+    return "" if uri.startswith("data:") else unquote(uri)
+
+
+def _of_obj(path: Path) -> list[str]:
+    """Names of the picture files of its materials. Raises InputError."""
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    positions = [line for line in lines if line.startswith("v ")]
+    broken = sum("nan" in line.lower() or "inf" in line.lower() for line in positions)
+    if broken:
+        raise InputError(path, "vertices", f"{broken} of {len(positions)} are not finite")
+    for line in lines:
+        # The loader takes a 0 for the last vertex; the format counts from 1, or from -1 backwards.
+        if line.startswith("f ") and any(corner.split("/")[0] == "0" for corner in line.split()[1:]):
+            raise InputError(path, "faces", "refer to vertex 0; the first is 1")
+    wanted = []
+    for line in lines:
+        if line.startswith("mtllib "):
+            library = path.parent / line.split(maxsplit=1)[1].strip()
+            if not library.is_file():
+                raise InputError(path, "mtllib", f"{library.name} is not there")
+            text = library.read_text(encoding="utf-8", errors="replace").splitlines()
+            wanted += [item.split(maxsplit=1)[1].strip() for item in map(str.strip, text) if _names_texture(item)]
+    return wanted
+
+
+def _names_texture(line: str) -> bool:
+    return line.lower().startswith("map_kd ") and len(line.split()) > 1
 
 
 class MeshSource(ContentSource):

@@ -17,7 +17,6 @@ OPTIONAL_PARTS = {
     "openni": "the depth camera's SDK",
     "usb": "USB sensors",
     "trimesh": "meshes",
-    "plyfile": "splats",
     "matplotlib": "reports",
 }
 
