@@ -68,14 +68,17 @@ def build_loop(
     supervisor: Supervisor | None = None,
     on_account: Callable[[FrameAccount], None] | None = None,
     wait_for_panels: Callable[[str], bool] | None = None,
+    on_start: Callable[[str], bool] = lambda _: True,
 ) -> Loop:
     """A loop ready for its first turn; whatever it holds is closed by `cleanup`.
 
-    wait_for_panels: asked when a panel is not there yet; True: try again. Raises FatalError, PanelLost.
+    wait_for_panels: asked when a panel is not there yet; True: try again. on_start: told what takes long before the
+    first turn; False: leave it. Raises FatalError, PanelLost.
     """
     import cv2
     import numpy as np
 
+    from runtime.budget_control import BudgetControl
     from runtime.eyes.calibration import load_calibration
     from runtime.eyes.detect import EyeFinder
     from runtime.eyes.tracker import Tracker
@@ -110,6 +113,9 @@ def build_loop(
     pipeline = build_pipeline(settings, stack, context, lambda part: faults["loop"].fault(part))
     cleanup.callback(lambda: faults["loop"].pipeline.close() if faults else pipeline.close())
     pipeline.predictor.warm_up(np.array(WARM_EYES_M))
+    budget = BudgetControl(settings, pipeline, simulated=options.max_speed)
+    cleanup.callback(budget.close)
+    budget.start(on_start)
     if not options.max_speed:
         source = LiveInput(make_driver, settings.sensor, clock)
         cleanup.callback(source.close)
@@ -117,6 +123,7 @@ def build_loop(
         settings,
         clock=clock,
         context=context,
+        budget=budget,
         source=source,
         calibration=calibration,
         tracker=Tracker(settings.tracker),

@@ -74,6 +74,7 @@ class Changeover:
         predictor = self._model.take() if self._model is not None else None
         if predictor is not None:
             loop.pipeline.use(predictor).close()
+        loop.budget.changed(settings, content=self._source is not None, model=predictor is not None)
 
     def abandon(self) -> None:
         """It is no longer wanted, or failed: nothing of it stays."""

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from runtime.budget_control import BudgetControl
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
 from runtime.config import Settings
 from runtime.errors import EndOfRecording, PanelLost
@@ -108,11 +109,13 @@ class Loop:
         on_account: Callable[[FrameAccount], None] | None = None,
         in_stack_frame: bool = False,
         context: Any = None,
+        budget: BudgetControl | None = None,
     ) -> None:
-        """context: the GL context of this thread, for content that is loaded while it runs."""
+        """context: the GL context of this thread, for content that is loaded while it runs; budget: a started one."""
         self.context = context
         self.settings, self.clock, self.source = settings, clock, source
         self.calibration, self.tracker, self.pipeline, self.panels = calibration, tracker, pipeline, panels
+        self.budget = budget or BudgetControl(settings, pipeline)
         self._supervisor = supervisor or Unsupervised()
         self._probe, self._on_account = probe, on_account
         self._in_stack_frame = in_stack_frame
@@ -138,7 +141,7 @@ class Loop:
         self._started_s = perf_counter()
 
     def _first_cost_ns(self) -> int:
-        stages = self.settings.loop.simulated_stage_ms
+        stages = self.budget.stage_ms
         return round(sum(cost for stage, cost in stages.items() if stage != "wait") * NS_PER_MS)
 
     def run(self, *, frames: int | None = None) -> str:
@@ -158,7 +161,7 @@ class Loop:
 
     def turn(self) -> FrameAccount:
         """One turn of the loop. Raises EndOfRecording, FatalError."""
-        stages = StageTimes(self.clock, self.settings.loop.simulated_stage_ms)
+        stages = StageTimes(self.clock, self.budget.stage_ms)
         self.source.wait(rate_hz=self.settings.loop.rate_hz)
         stages.lap("wait")
         self._supervisor.obey(self)
@@ -263,6 +266,7 @@ class Loop:
         if self._on_account is not None:
             self._on_account(account)
         self._supervisor.turn(self, account)
+        self.budget.turn(account)
         turn_ms = stages.turn_ms()
         self.stats.add(account, turn_ms=turn_ms)
         self._measure_pending()

@@ -41,6 +41,23 @@ def retina_view(eye_m: F64, side: int, *, width_px: int, height_px: int, fov_deg
     return View(eye_m, side, projection, width_px, height_px)
 
 
+def drawn_for(predictor: Predictor, content: ContentSource, eyes_m: F64, *, time_ns: int) -> list[list[U8]]:
+    """images[side][raster] that a model wants for eyes (2, 3), aimed where the content lies.
+
+    Copied only where a source's array would be drawn over by the next raster: else they are the source's own.
+    """
+    images: list[list[U8]] = [[], []]
+    part = focused_part(predictor)
+    if part is not None:
+        part.aim(content, eyes_m, time_ns=time_ns)
+    rasters = predictor.rasters(eyes_m)
+    for raster in rasters:
+        for view in raster_views(eyes_m, raster):
+            picture = content.render(view, time_ns=time_ns)
+            images[view.side].append(picture.copy() if len(rasters) > 1 else picture)
+    return images
+
+
 @dataclass(slots=True)
 class Drawn:
     """What one turn put together."""
@@ -166,7 +183,7 @@ class Pipeline:
             eyes_m = self._gate.best_guess(eyes_m)
         key = (eyes_m.tobytes(), revision)
         try:
-            images = self._render(eyes_m, time_ns=time_ns)
+            images = drawn_for(self.predictor, self.content, eyes_m, time_ns=time_ns)
         except Exception as error:
             self._failed("content", error, expected=ContentFailure)
             stages.lap("render")
@@ -184,19 +201,6 @@ class Pipeline:
             self._gate.solved(eyes_m)
         self._middle_m = eyes_m.mean(axis=0)
         return "ran"
-
-    def _render(self, eyes_m: F64, *, time_ns: int) -> list[list[U8]]:
-        """images[side][raster]; copied only where a source's array would be drawn over by the next raster."""
-        images: list[list[U8]] = [[], []]
-        part = focused_part(self.predictor)
-        if part is not None:
-            part.aim(self.content, eyes_m, time_ns=time_ns)
-        rasters = self.predictor.rasters(eyes_m)
-        for raster in rasters:
-            for view in raster_views(eyes_m, raster):
-                picture = self.content.render(view, time_ns=time_ns)
-                images[view.side].append(picture.copy() if len(rasters) > 1 else picture)
-        return images
 
     def _draw_flat(self, *, time_ns: int, stages: StageTimes) -> None:
         # The viewpoint of the flat picture stays where it was drawn first: without a viewer nothing should move.

@@ -14,8 +14,9 @@ from runtime.changeover import Changeover
 from runtime.clock import MonotonicClock
 from runtime.commands.running import drive, print_summary
 from runtime.config import Overrides, Settings, load_settings
-from runtime.errors import InputError, PhasestackError
+from runtime.errors import PhasestackError
 from runtime.loop import Loop
+from runtime.planner import Planner
 from runtime.records import FrameAccount
 from runtime.service import Command, Notifier, Signals, StatusServer, open_status_server
 
@@ -23,10 +24,6 @@ log = logging.getLogger("phasestack.daemon")
 
 PANEL_RETRY_S = 1.0
 START_EXTENSION_S = 10.0
-BUDGET_NOT_HELD = (
-    "a budget is kept with the settings, but the loop does not choose by it yet: `phasestack plan --budget-ms` "
-    "measures which model and size would hold it; set model.name"
-)
 NEEDS_RESTART = ("stack", "sensor", "detector", "output", "service")
 
 
@@ -97,6 +94,12 @@ class Daemon:
         time.sleep(PANEL_RETRY_S)
         return not self._signals.stop
 
+    def starting(self, doing: str) -> bool:
+        """Something before the first frame takes long: ask for more time. False: told to stop."""
+        self._notifier.extend_start(START_EXTENSION_S)
+        self._notifier.status(f"starting ({doing})")
+        return not self._signals.stop
+
     def _loading(self) -> dict[str, str]:
         """What is being loaded, and why the last change was refused; for the status."""
         change, told = self._change, {}
@@ -124,8 +127,16 @@ class Daemon:
                 settings = self._settings.model_copy(update={"content": content})
                 self._begin(loop, settings, command, reload_content=True)
             case "budget":
-                model = self._settings.model.model_copy(update={"budget_ms": command.value})
-                self._begin(loop, self._settings.model_copy(update={"model": model}), command)
+                self._set_budget(loop, command.value)
+                command.done()
+
+    def _set_budget(self, loop: Loop, budget_ms: float) -> None:
+        """In force at once; which level holds it is measured beside the loop, where it isn't known yet."""
+        self._settings = loop.settings = _with_budget(self._settings, budget_ms)
+        if self._change is not None:
+            self._change.settings = _with_budget(self._change.settings, budget_ms)
+        loop.pipeline.plan_with(Planner(loop.settings, loop.pipeline.stack))
+        loop.budget.changed(loop.settings, content=False, model=False)
 
     def _reload(self, loop: Loop, command: Command | None) -> None:
         """Read the configuration again."""
@@ -168,6 +179,10 @@ class Daemon:
             command.done()
 
 
+def _with_budget(settings: Settings, budget_ms: float) -> Settings:
+    return settings.model_copy(update={"model": settings.model.model_copy(update={"budget_ms": budget_ms})})
+
+
 def snapshot(loop: Loop, account: FrameAccount) -> dict[str, Any]:
     """What `status` answers."""
     machine, stats = loop.machine, loop.stats
@@ -180,6 +195,7 @@ def snapshot(loop: Loop, account: FrameAccount) -> dict[str, Any]:
         "plan": loop.plan_items(),
         "model": loop.pipeline.predictor.name,
         "provider": loop.pipeline.predictor.provider,
+        "budget": loop.budget.describe(),
         "panels": loop.panels.name,
         "eyes_m": account.eyes_m,
         "eyes_label": account.eyes_label,
@@ -201,10 +217,6 @@ def run_daemon(
     """The whole life of `phasestack run`; answers the summary. Raises FatalError."""
     settings = overrides.applied(load_settings(config))
     logs.configure(settings.service)
-    if settings.model.budget_ms and max_speed:
-        raise InputError("run", "--budget-ms", "measures real time: it can't be combined with --max-speed")
-    if settings.model.budget_ms:
-        log.warning("%s", BUDGET_NOT_HELD)
     clock = MonotonicClock()
     with ExitStack() as cleanup:
         signals = cleanup.enter_context(Signals())
@@ -233,6 +245,7 @@ def run_daemon(
             measured_times=not max_speed,
             supervisor=daemon,
             wait_for_panels=daemon.wait_for_panels,
+            on_start=daemon.starting,
         )
         notifier.stopping(summary["stopped"])
     log.info("stopped: %s", summary["stopped"])

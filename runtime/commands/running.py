@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,7 @@ def drive(
     measured_times: bool,
     supervisor: Supervisor | None = None,
     wait_for_panels: Any = None,
+    on_start: Callable[[str], bool] = lambda _: True,
 ) -> dict[str, Any]:
     """Run to the end and answer the summary. `total`: turns that the progress bar counts to, where it is known.
 
@@ -49,6 +51,7 @@ def drive(
             supervisor=supervisor,
             on_account=account,
             wait_for_panels=wait_for_panels,
+            on_start=on_start,
         )
         reason = loop.run(frames=frames)
         if loop.look is None or settings.loop.evaluate_every == 0:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-import numpy as np
-
 SLOW_FRAMES = 8  # of the last ten must be over the budget before something is given up
 LOOK_BACK = 10
 ROOM = 0.8  # a better level must be expected to take no more than this of the budget
@@ -64,6 +62,16 @@ class BudgetKeeper:
         """What the present level gives up against the best."""
         return self.levels[0].psnr_db - self.level.psnr_db
 
+    @property
+    def lightest(self) -> bool:
+        """Nothing more can be given up."""
+        return self.index + 1 == len(self.levels)
+
+    @property
+    def held(self) -> bool:
+        """The last frames keep to the budget, but for a few."""
+        return self.budget_ms <= 0 or sum(taken > self.budget_ms for taken in self._recent) < SLOW_FRAMES
+
     def frame_took(self, time_ms: float) -> bool:
         """Tell a whole frame's time; True where the level has changed."""
         if self.budget_ms <= 0:
@@ -87,8 +95,3 @@ class BudgetKeeper:
         self._recent.clear()
         self.switches += 1
         return True
-
-
-def expected_ms(times_ms: list[float]) -> float:
-    """One number for a few measured frames: their median."""
-    return float(np.median(times_ms))
