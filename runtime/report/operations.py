@@ -10,20 +10,28 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from math import log2, prod
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.errors import InputError
-from runtime.model.chain import chain_frame, chain_modes
+from runtime.model.chain import chain_frame
 from runtime.model.contract import Contract, Step
 from runtime.model.predictor import Predictor
 from runtime.model.visible import visible_boxes
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
 from runtime.report.pairs import StillPair
+
+if TYPE_CHECKING:
+    from runtime.model.network import NetworkPredictor
+    from runtime.model.session import ModelSession
+    from runtime.model.unrolled import UnrolledPredictor
 
 RGB, RGBA, EYES = 3, 4, 2
 LINEAR, CUBIC = 4, 16  # products per sample
@@ -85,7 +93,10 @@ def _shapes(entries: Sequence[Mapping[str, Sequence[int]]]) -> list[Shape]:
 
 
 def predictor_multiply_adds(predictor: Predictor, pair: StillPair, *, path: Path | None) -> int:
-    """Of a whole prediction from a pair's two pictures, warps included. path: the network's file, if it has one."""
+    """Of a whole prediction from a pair's two pictures, warps included. path: the network's file, if it has one.
+
+    Predicts once, to see on which shapes the network is run, and how often.
+    """
     from runtime.model.network import NetworkPredictor
     from runtime.model.sart import SartPredictor
     from runtime.model.unrolled import UnrolledPredictor
@@ -102,22 +113,47 @@ def predictor_multiply_adds(predictor: Predictor, pair: StillPair, *, path: Path
     if path is None:
         raise ValueError("a network's file is needed to count it")
     if isinstance(predictor, UnrolledPredictor):
-        return total + unrolled_multiply_adds(predictor.session.contract, predictor.stack, pair.eyes_m, path=path)
-    if isinstance(predictor, NetworkPredictor):
-        pixels = _pixels(predictor.stack)
-        shape = (
-            1,
-            len(predictor.rasters(pair.eyes_m)) * EYES * RGB,
-            predictor.stack.height_px,
-            predictor.stack.width_px,
-        )
-        tables = shape[1] * pixels
-        return total + tables + graph_multiply_adds(path, [shape]) + predictor.stack.count * RGB * pixels
-    raise ValueError(f"{type(predictor).__name__} can't be counted")
+        total += correction_multiply_adds(predictor.session.contract, predictor.stack, pair.eyes_m)
+    elif isinstance(predictor, NetworkPredictor):
+        values = (len(windows) * EYES + predictor.stack.count) * RGB  # a table in, a limit out
+        total += values * _pixels(predictor.stack)
+    else:
+        raise ValueError(f"{type(predictor).__name__} can't be counted")
+    runs = Counter(_network_runs(predictor, pair))
+    return total + sum(times * graph_multiply_adds(path, shapes) for shapes, times in runs.items())
 
 
-def unrolled_multiply_adds(contract: Contract, stack: PanelStack, eyes_m: F64, *, path: Path) -> int:
-    """The networks of a chain model, its corrections and the closed centre, over what both eyes look through."""
+class _Noting:
+    """A session that notes the shapes of its inputs, run by run."""
+
+    def __init__(self, session: ModelSession) -> None:
+        self._session = session
+        self.shapes: list[tuple[Shape, ...]] = []
+
+    def run(self, *inputs: NDArray[Any], output_shape: Shape) -> NDArray[np.float32]:
+        self.shapes.append(tuple(array.shape for array in inputs))
+        return self._session.run(*inputs, output_shape=output_shape)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._session, name)
+
+
+def _network_runs(predictor: UnrolledPredictor | NetworkPredictor, pair: StillPair) -> list[tuple[Shape, ...]]:
+    """The shapes of the network's inputs at each of its runs in one prediction."""
+    from runtime.model.still import solve_still
+
+    session = predictor.session
+    noting = _Noting(session)
+    predictor.session = noting  # type: ignore[assignment]
+    try:
+        solve_still(*pair.images, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, predictor=predictor)
+    finally:
+        predictor.session = session
+    return noting.shapes
+
+
+def correction_multiply_adds(contract: Contract, stack: PanelStack, eyes_m: F64) -> int:
+    """What a chain model does beside its network, over what both eyes look through."""
     boxes = visible_boxes(eyes_m, stack)
 
     def values(panel: int, reduction: int) -> int:
@@ -125,8 +161,6 @@ def unrolled_multiply_adds(contract: Contract, stack: PanelStack, eyes_m: F64, *
         return RGB * (box.width_px // reduction) * (box.height_px // reduction)
 
     frame = chain_frame(eyes_m, stack, cell_px=contract.cell_px, reduction=contract.reduction)
-    chain = [(frame.rows, frame.cells, 2 * frame.cell_px * RGB), *(a.shape for a in chain_modes(frame.cells)), (1,)]
-    network = graph_multiply_adds(path, chain) if any(step.kind == "chain" for step in contract.steps) else 0
     in_frame = RGB * frame.rows * frame.width_px
     whole, sharpened = values(1, 1), 6 if contract.emphasis else 0  # a separable filter of three
     total = EYES * whole * (sharpened + 1)  # and a table
@@ -137,19 +171,19 @@ def unrolled_multiply_adds(contract: Contract, stack: PanelStack, eyes_m: F64, *
             total += sum(CUBIC * values(n, level) + EYES * LINEAR * values(1, level) for n in OUTER)
         if index:  # what each eye lacks when the centre is closed: two differences each, mean, limit, two differences
             total += 8 * values(1, level)
-        total += _step(step, values, network=network, in_frame=in_frame, reduction=contract.reduction)
+        total += _step(step, values, in_frame=in_frame, reduction=contract.reduction)
     if level != 1:
         total += sum(CUBIC * values(n, 1) + EYES * LINEAR * values(1, 1) for n in OUTER)
     return total + 7 * whole  # the centre: two targets less four, and a limit
 
 
-def _step(step: Step, values: Callable[[int, int], int], *, network: int, in_frame: int, reduction: int) -> int:
-    """One correction, and the look at what it changed."""
+def _step(step: Step, values: Callable[[int, int], int], *, in_frame: int, reduction: int) -> int:
+    """One correction beside the network, and the look at what it changed."""
     seen = EYES * LINEAR * values(1, step.reduction)  # one outer panel through the centre's pixels
     if step.kind == "chain":
         wave = sum((CUBIC + 2) * values(n, step.reduction) for n in OUTER)
         coarser = EYES * values(1, 1 if reduction == 1 else step.reduction)  # every value goes into one mean
-        return network + coarser + in_frame * (EYES * LINEAR + 2) + wave + seen * len(OUTER)
+        return coarser + in_frame * (EYES * LINEAR + 2) + wave + seen * len(OUTER)
     return (EYES * LINEAR + 4) * values(2 if step.kind == "front" else 0, step.reduction) + seen
 
 

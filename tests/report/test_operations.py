@@ -76,26 +76,16 @@ def test_the_published_network_counts_as_its_own_layers_do(tmp_path: Path) -> No
     assert convolved < counted < 1.15 * convolved  # rectifiers, limits and enlargements are the rest
 
 
-@pytest.mark.parametrize("name", ["fast", "balanced", "best"])
-def test_the_networks_part_of_a_shipped_model_is_that_of_the_shapes_it_meets(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pair = still()
-    predictor = load_predictor(name, STACK, ModelSettings())
-    met: list[list[tuple[int, ...]]] = []
-    run = predictor.session.run  # type: ignore[attr-defined]
-    monkeypatch.setattr(
-        predictor.session,  # type: ignore[attr-defined]
-        "run",
-        lambda *inputs, **more: (met.append([array.shape for array in inputs]), run(*inputs, **more))[1],
-    )
-    grey = [np.full((r.height_px, r.width_px, 4), 128, np.uint8) for r in predictor.rasters(pair.eyes_m)]
-    predictor.predict([grey, grey], pair.eyes_m)
-    counted: list[list[tuple[int, ...]]] = []
+def test_a_model_counts_its_network_as_often_as_it_runs_and_is_left_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    predictor = load_predictor("best", STACK, ModelSettings())
+    session = predictor.session  # type: ignore[attr-defined]
+    counted = []
     monkeypatch.setattr(operations, "graph_multiply_adds", lambda path, shapes: counted.append(shapes) or 10**12)
-    total = operations.predictor_multiply_adds(predictor, pair, path=model_path(name))
-    assert met and all(shapes == counted[0] for shapes in met)
-    assert total // 10**12 == len(met)  # one run of the network for each time that it runs
+    total = operations.predictor_multiply_adds(predictor, still(), path=model_path("best"))
+    chains = sum(step.kind == "chain" for step in session.contract.steps)
+    assert chains > 0 and total // 10**12 % chains == 0 and total // 10**12 > 0
+    assert 0 < total % 10**12 < 10**9  # the corrections: nothing to do with the network
+    assert counted and predictor.session is session  # type: ignore[attr-defined]
 
 
 def test_more_work_is_more_multiply_adds() -> None:
