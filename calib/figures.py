@@ -35,6 +35,15 @@ def png(canvas: Any) -> bytes:
     return buffer.getvalue()
 
 
+def finish(axes: Any, *, x: str, y: str, title: str, which: str = "major") -> None:
+    """Name the axes of a plot of lines, and give it a grid and a legend."""
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.set_title(title, fontsize=10)
+    axes.grid(alpha=0.3, which=which)
+    axes.legend(fontsize=8)
+
+
 def residual_figure(residual_m: F64, used: Any, *, limit_m: float) -> bytes:
     """X, Y, Z error of every calibration point (the seed's figure S5), millimetres."""
     canvas, axes = figure(9, 6.5, nrows=3, sharex=True, sharey=True)
@@ -106,11 +115,8 @@ def eye_error_figure(distances_m: F64, straight_m: F64, aside_m: F64) -> bytes:
     axes.plot(distances_m, straight_m * 1e3, color="#2260a8", label="straight ahead")
     axes.plot(distances_m, aside_m * 1e3, color="#c0392b", linestyle="--", label="25° to the side")
     axes.set_ylim(bottom=0)
-    axes.set_xlabel("distance of the eyes (m)")
-    axes.set_ylabel("expected error (mm)")
-    axes.set_title("What the calibration's own uncertainty does at the eye", fontsize=10)
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+    title = "What the calibration's own uncertainty does at the eye"
+    finish(axes, x="distance of the eyes (m)", y="expected error (mm)", title=title)
     return png(canvas)
 
 
@@ -157,10 +163,7 @@ def timing_figure(timings: Sequence[Timing]) -> bytes:
                           textcoords="offset points")  # fmt: skip
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_xlabel("time of one solution (ms)")
-    axes.set_ylabel("mean error at the eye (mm)")
     axes.margins(x=0.12)
-    axes.set_title("Error against run time; numbers: pairs; noise 3 mm", fontsize=10)
-    axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize=8)
+    title = "Error against run time; numbers: pairs; noise 3 mm"
+    finish(axes, x="time of one solution (ms)", y="mean error at the eye (mm)", title=title, which="both")
     return png(canvas)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.figures import COLOURS, figure, png
+from calib.figures import COLOURS, figure, finish, png
 from calib.grey import CHANNELS, GreyCurve, Series
 from calib.registration import StackRegistration, through
 from runtime.optics.stack import PanelStack
@@ -83,9 +83,5 @@ def cost_figure(shifts_px: Sequence[float], psnr_db: Mapping[str, Sequence[float
     styles: Any = zip(psnr_db.items(), (*COLOURS[2:], *COLOURS[:2]), strict=False)
     for (name, values), colour in styles:
         axes.plot(shifts_px, values, "o-", color=colour, markersize=4, label=name)
-    axes.set_xlabel("displacement of the panel (px)")
-    axes.set_ylabel("displayed PSNR (dB)")
-    axes.set_title("What registration error costs", fontsize=10)
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+    finish(axes, x="displacement of the panel (px)", y="displayed PSNR (dB)", title="What registration error costs")
     return png(canvas)

@@ -17,7 +17,8 @@ from calib.vernier import nominal, read_settings
 from calib.viewpoints import grid
 from runtime.optics.stack import PanelStack
 from tests.panels import xserver
-from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, eventually
+from tests.panels.xserver import HEIGHT_PX, WIDTH_PX
+from tests.waiting import eventually
 
 pytestmark = pytest.mark.windows
 STACK = PanelStack(0.5, 0.28, (-0.06, 0.0, 0.06), WIDTH_PX, HEIGHT_PX)
@@ -36,9 +37,7 @@ RETURN, RIGHT, Q = 0xFF0D, 0xFF53, 0x71  # X key symbols
 
 @pytest.fixture(scope="module")
 def screen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[xserver.XServer]:
-    if absent := xserver.missing():
-        pytest.skip(f"no virtual monitors without {absent}")
-    server = xserver.XServer(tmp_path_factory.mktemp("xorg"))
+    server = xserver.start_or_skip(tmp_path_factory.mktemp("xorg"))
     yield server
     server.stop()
 

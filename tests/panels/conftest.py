@@ -20,8 +20,6 @@ def context() -> Iterator[moderngl.Context]:
 
 @pytest.fixture(scope="module")
 def screen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[xserver.XServer]:
-    if absent := xserver.missing():
-        pytest.skip(f"no virtual monitors without {absent}")
-    server = xserver.XServer(tmp_path_factory.mktemp("xorg"))
+    server = xserver.start_or_skip(tmp_path_factory.mktemp("xorg"))
     yield server
     server.stop()

@@ -16,7 +16,8 @@ from runtime.commands.identify import identify
 from runtime.errors import InputError
 from runtime.panels.card import BARS, identity_card
 from tests.panels.edids import block
-from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, eventually
+from tests.panels.xserver import HEIGHT_PX, WIDTH_PX
+from tests.waiting import eventually
 
 BOUND = f"""
 [stack]

@@ -21,7 +21,8 @@ from runtime.panels.xlib import SERVER_DIED
 from runtime.records import LayerFrame
 from tests.panels import xserver
 from tests.panels.edids import block
-from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, eventually
+from tests.panels.xserver import HEIGHT_PX, WIDTH_PX
+from tests.waiting import eventually
 
 pytestmark = pytest.mark.windows
 STACK = PanelStack(0.5, 0.28, (-0.06, 0.0, 0.06), WIDTH_PX, HEIGHT_PX)
@@ -218,9 +219,7 @@ for number in range(100_000):
 @pytest.mark.parametrize("attempt", range(3))
 def test_the_death_of_the_x_server_ends_the_process_at_once_with_a_reason(tmp_path, attempt):
     """In the middle of whatever call it happens to be: hence several attempts."""
-    if absent := xserver.missing():
-        pytest.skip(f"no virtual monitors without {absent}")
-    server = xserver.XServer(tmp_path)
+    server = xserver.start_or_skip(tmp_path)
     process = subprocess.Popen(
         [sys.executable, "-c", PRESENTING], env={**os.environ, "DISPLAY": server.name},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

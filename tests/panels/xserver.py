@@ -8,12 +8,11 @@ import select
 import shutil
 import signal
 import subprocess
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+import pytest
 
 WIDTH_PX, HEIGHT_PX = 320, 180
 MODE = f"{WIDTH_PX}x{HEIGHT_PX}p"
@@ -53,6 +52,13 @@ def missing() -> str:
     if not any(Path(folder, "dummy_drv.so").exists() for folder in ("/usr/lib/xorg/modules/drivers",)):
         absent.append("xserver-xorg-video-dummy")
     return ", ".join(absent)
+
+
+def start_or_skip(folder: Path) -> XServer:
+    """A server whose files lie in `folder`; skips the test that asks, saying why, where there can be none."""
+    if absent := missing():
+        pytest.skip(f"no virtual monitors without {absent}")
+    return XServer(folder)
 
 
 class XServer:
@@ -153,13 +159,3 @@ class XServer:
             self._process.send_signal(signal.SIGKILL)
         self._process.wait(timeout=10)
         self._output.close()  # harmless when stopped twice
-
-
-def eventually(holds: Callable[[], bool], *, within_s: float = 10.0) -> bool:
-    """True as soon as it holds; False if it doesn't in all that time."""
-    deadline = time.monotonic() + within_s
-    while not holds():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.02)
-    return True

@@ -14,6 +14,7 @@ from runtime.sensor.usb_devices import UDEV_RULE
 from runtime.sensor.usb_eyes import UsbEyesDriver
 from runtime.sensor.worker import SensorWorker
 from tests.sensor.fake_usb import FakeDevice, FakeUsb, Ticking, packet
+from tests.waiting import eventually
 
 SETTINGS = SensorSettings(driver="usb-eyes", source="", timeout_s=0.1, reopen_backoff_s=0.05)
 
@@ -22,15 +23,6 @@ def opened(device: FakeDevice) -> UsbEyesDriver:
     driver = UsbEyesDriver(SETTINGS, MonotonicClock(), backend=FakeUsb(device))
     driver.open()
     return driver
-
-
-def until(condition, seconds=5.0):
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if condition():
-            return True
-        time.sleep(0.002)
-    return False
 
 
 def test_eyes_arrive_in_metres_with_their_serial():
@@ -118,9 +110,9 @@ def test_a_camera_unplugged_in_mid_stream_is_back_within_a_second_of_its_return(
     device = FakeDevice(stream=Ticking())
     bus = FakeUsb(device, FakeDevice(serial="ANOTHER", ids=(0x8086, 0x0B07), address=9))
     worker = watched(bus)
-    assert until(lambda: worker.newest() is not None)
+    assert eventually(lambda: worker.newest() is not None)
     bus.devices.remove(device)
-    assert until(lambda: worker.state == "lost")
+    assert eventually(lambda: worker.state == "lost")
     # Meanwhile another tracker is plugged in: it is not taken for the one that left.
     bus.devices.append(FakeDevice(serial="B2", address=7, stream=Ticking()))
     time.sleep(away_s)
@@ -129,7 +121,7 @@ def test_a_camera_unplugged_in_mid_stream_is_back_within_a_second_of_its_return(
     assert worker.state == "lost"
     bus.devices.append(FakeDevice(serial="A1", address=8, stream=Ticking()))
     returned = time.monotonic()
-    assert until(lambda: worker.newest() is not None)
+    assert eventually(lambda: worker.newest() is not None)
     assert time.monotonic() - returned < 1.0
     assert worker.serial == "A1"
     worker.stop()
@@ -140,8 +132,8 @@ def test_after_ten_seconds_worth_of_garbage_a_reset_brings_the_device_back():
     device = FakeDevice(stream=lambda: random.bytes(4000) if not device.resets else ticking())
     ticking = Ticking()
     worker = watched(FakeUsb(device))
-    assert until(lambda: device.resets > 0)
-    assert until(lambda: worker.state == "running")
+    assert eventually(lambda: device.resets > 0)
+    assert eventually(lambda: worker.state == "running")
     worker.stop()
 
 
@@ -151,8 +143,8 @@ def test_a_stream_that_stalls_without_an_error_is_reset_and_comes_back():
     device = FakeDevice(stream=lambda: b"" if state["stalled"] else ticking())
     device.on_reset = lambda: state.update(stalled=False)
     worker = watched(FakeUsb(device))
-    assert until(lambda: worker.newest() is not None)
+    assert eventually(lambda: worker.newest() is not None)
     state["stalled"] = True
-    assert until(lambda: device.resets == 1)
-    assert until(lambda: worker.newest() is not None and worker.state == "running")
+    assert eventually(lambda: device.resets == 1)
+    assert eventually(lambda: worker.newest() is not None and worker.state == "running")
     worker.stop()

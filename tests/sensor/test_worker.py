@@ -12,6 +12,7 @@ from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, SensorDriver
 from runtime.sensor.worker import SensorWorker
+from tests.waiting import eventually
 
 SETTINGS = SensorSettings(timeout_s=0.05, reopen_backoff_s=0.02, reopen_backoff_max_s=0.1, open_timeout_s=0.2)
 FRAME_S = 1 / 60
@@ -42,15 +43,6 @@ class Scripted(SensorDriver):
         self._log.append("close")
 
 
-def until(condition, seconds=5.0):
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if condition():
-            return True
-        time.sleep(0.002)
-    return False
-
-
 @pytest.fixture
 def started():
     workers = []
@@ -77,7 +69,7 @@ def raiser(error):
 
 def test_the_newest_sample_wins_and_those_it_overtook_are_counted(started):
     worker, _ = started(lambda: time.sleep(0.002))
-    assert until(lambda: worker.stale_inputs >= 5)
+    assert eventually(lambda: worker.stale_inputs >= 5)
     frame = worker.newest()
     assert frame.sequence >= 6 and worker.state == "running" and worker.serial == "S7"
 
@@ -85,7 +77,7 @@ def test_the_newest_sample_wins_and_those_it_overtook_are_counted(started):
 def test_a_sample_is_handed_out_once(started):
     gate = threading.Semaphore(1)
     worker, _ = started(lambda: gate.acquire(timeout=0.04) or (_ for _ in ()).throw(SensorTimeout("none")))
-    assert until(lambda: worker.newest() is not None)
+    assert eventually(lambda: worker.newest() is not None)
     assert worker.newest() is None
 
 
@@ -99,11 +91,11 @@ def test_a_lost_device_is_closed_and_reopened_by_its_serial(started):
             raise SensorLost("unplugged")
 
     worker, log = started(act)
-    assert until(lambda: worker.newest() is not None)
+    assert eventually(lambda: worker.newest() is not None)
     lose[0] = True
-    assert until(lambda: len(log) >= 3 and worker.state == "running")
+    assert eventually(lambda: len(log) >= 3 and worker.state == "running")
     assert log[:3] == ["open", "close", "open S7"]
-    assert until(lambda: worker.newest() is not None)
+    assert eventually(lambda: worker.newest() is not None)
 
 
 def test_attempts_to_reopen_back_off_and_go_on(started):
@@ -116,19 +108,19 @@ def test_attempts_to_reopen_back_off_and_go_on(started):
 
 def test_a_stream_that_stalls_without_an_error_is_reopened(started):
     worker, log = started(raiser(SensorTimeout("nothing")))
-    assert until(lambda: log.count("open") >= 1 and worker.state == "stalled")
-    assert until(lambda: log.count("open S7") >= 2)
+    assert eventually(lambda: log.count("open") >= 1 and worker.state == "stalled")
+    assert eventually(lambda: log.count("open S7") >= 2)
 
 
 def test_an_unexpected_error_of_an_sdk_is_a_lost_sensor(started, caplog):
     worker, log = started(raiser(ZeroDivisionError("inside the SDK")))
-    assert until(lambda: log.count("close") >= 2)
+    assert eventually(lambda: log.count("close") >= 2)
     assert "ZeroDivisionError" in worker.reason
 
 
 def test_a_fatal_error_is_not_tried_again(started):
     worker, log = started(lambda: None, on_open=raiser(FatalError("no such driver")))
-    assert until(lambda: worker.state == "failed")
+    assert eventually(lambda: worker.state == "failed")
     time.sleep(0.1)
     assert log == ["open", "close"] and str(worker.error) == "no such driver"
 
@@ -142,7 +134,7 @@ def test_the_end_of_a_recording_is_told_and_its_last_sample_is_not_lost(started)
             raise EndOfRecording("over")
 
     worker, _ = started(act)
-    assert until(lambda: worker.state == "ended")
+    assert eventually(lambda: worker.state == "ended")
     assert worker.newest().sequence == 1
 
 
@@ -173,7 +165,7 @@ def test_an_sdk_that_hangs_is_left_behind_and_never_blocks_the_loop(started, whe
     # What the abandoned thread still says does not count, and it closes its driver on its way out.
     closed = log.count("close")
     release.set()
-    assert until(lambda: not hung[0].is_alive())
+    assert eventually(lambda: not hung[0].is_alive())
     assert log.count("close") == closed + 1 and worker.state == "running"
 
 

@@ -10,8 +10,9 @@ import pytest
 from runtime.panels.xlib import SERVER_DIED
 from runtime.service.client import ask
 from tests.panels import xserver
-from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, eventually
+from tests.panels.xserver import HEIGHT_PX, WIDTH_PX
 from tests.service.test_daemon import Daemon
+from tests.waiting import eventually
 
 pytestmark = pytest.mark.windows
 
@@ -41,9 +42,7 @@ connector = "DUMMY2"
 
 @pytest.fixture
 def x(tmp_path, monkeypatch):
-    if absent := xserver.missing():
-        pytest.skip(f"no virtual monitors without {absent}")
-    servers = [xserver.XServer(tmp_path)]
+    servers = [xserver.start_or_skip(tmp_path)]
     monkeypatch.setenv("DISPLAY", servers[0].name)
     yield servers
     servers[-1].stop()
