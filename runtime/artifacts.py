@@ -83,10 +83,12 @@ def read_image(path: Path) -> U8:
     import cv2
 
     try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
+        data = path.read_bytes()
     except OSError as error:
         raise InputError(path, "", f"cannot be read ({error.strerror})") from None
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    # libpng would write a line of its own to stderr about a file that is cut off.
+    cut_off = data.startswith(b"\x89PNG") and b"IEND" not in data
+    image = None if cut_off or not data else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise InputError(path, "", "is not an image that can be decoded")
     return np.ascontiguousarray(image[..., ::-1])

@@ -53,7 +53,12 @@ def read_folder(folder: Path, preset: Preset) -> tuple[Pair, ...]:
             raise InputError(
                 path, "name", f"its eye is behind the display (x = {eye[0]:.3f} m) with preset {preset.name}"
             )
-        found.setdefault(int(match[1]), {})[int(match[5])] = (path, eye)
+        halves = found.setdefault(int(match[1]), {})
+        if int(match[5]) in halves:
+            raise InputError(
+                path, f"pair{int(match[1])}", f"_{match[5]} is there twice, as {halves[int(match[5])][0].name} too"
+            )
+        halves[int(match[5])] = (path, eye)
     if not found:
         raise InputError(folder, "", "holds no pair0_x.._y.._z.._0.jpg")
     pairs = []

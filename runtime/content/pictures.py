@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from runtime.artifacts import read_image
 from runtime.clock import NS_PER_S
@@ -94,6 +96,8 @@ class PictureFolder(Frames):
     def __init__(self, paths: Sequence[Path], *, rate_hz: float) -> None:
         self._paths = list(paths)
         self._shape = read_image(self._paths[0]).shape
+        for path in self._paths[1:]:
+            _refuse_other_size(path, self._shape)
         self.count, self.rate_hz = len(self._paths), rate_hz
 
     def frame(self, index: int) -> U8:
@@ -106,12 +110,27 @@ class PictureFolder(Frames):
         return picture
 
 
+def _refuse_other_size(path: Path, shape: tuple[int, ...]) -> None:
+    """Reads the header alone: a long sequence opens quickly. Raises InputError."""
+    try:
+        with Image.open(path) as image:
+            width, height = image.size
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        raise InputError(path, "", "is not an image that can be decoded") from None
+    if (height, width) != shape[:2]:
+        raise InputError(
+            path, "size", f"{width} x {height} pixels; the folder's first picture has {shape[1]} x {shape[0]}"
+        )
+
+
 class Video(Frames):
     """A video file, read by OpenCV as it goes."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._capture = cv2.VideoCapture(str(path))
+        # FFmpeg writes its own lines to stderr; ours names the file.
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+        self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         if not self._capture.isOpened():
             raise InputError(path, "", "is not a video that can be decoded")
         self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -159,14 +178,19 @@ def open_frames(path: Path, settings: ContentSettings) -> Frames:
 
 
 def split(rgb: U8, layout: str, quilt: tuple[int, int] = (1, 1)) -> list[U8]:
-    """The views of one picture: [left, right], [one], or a quilt's from the leftmost camera to the rightmost."""
+    """The views of one picture: [left, right], [one], or a quilt's from the leftmost camera to the rightmost.
+
+    Raises ValueError for a picture that is smaller than one pixel a view.
+    """
     height, width = rgb.shape[:2]
+    columns, rows = {"side-by-side": (2, 1), "top-bottom": (1, 2), "quilt": quilt}.get(layout, (1, 1))
+    if not 0 < columns <= width or not 0 < rows <= height:
+        raise ValueError(f"{width} x {height} pixels cannot hold {columns} x {rows} views")
     if layout == "side-by-side":
         return [rgb[:, : width // 2], rgb[:, width - width // 2 :]]
     if layout == "top-bottom":
         return [rgb[: height // 2], rgb[height - height // 2 :]]
     if layout == "quilt":
-        columns, rows = quilt
         wide, high = width // columns, height // rows
         # The first view is at the bottom left, then rightwards, then upwards.
         return [
@@ -187,24 +211,25 @@ class ScreenPictures(ContentSource):
         layout: str,
         stack: PanelStack,
         settings: ContentSettings,
-        name: str,
+        path: Path,
         quilt: tuple[int, int],
     ) -> None:
+        """Raises InputError where the picture is too small for its layout."""
         self._frames, self._layout, self._quilt = frames, layout, quilt
         self._cone_rad = np.radians(settings.cone_deg)
         self._repeat = settings.at_end == "repeat"
         self._background = settings.background
-        views = split(frames.frame(0), layout, quilt)
-        height, width = views[0].shape[:2]
-        if not height or not width:
-            raise InputError(name, "layout", f"a picture of this size has no {layout} views")
+        try:
+            height, width = split(frames.frame(0), layout, quilt)[0].shape[:2]
+        except ValueError as error:
+            raise InputError(path, "quilt" if layout == "quilt" else "layout", str(error)) from None
         self._screen = screen(stack, width_px=width, height_px=height)
         self._shown: dict[int, WarpedPicture] = {}
         self._at = -1
         self._views: list[U8] = []
         moving = frames.count > 1
         self.info = ContentInfo(
-            name=name,
+            name=path.stem,
             moving=moving,
             grey=not moving and _is_grey(frames.frame(0)),
             depth_range_m=(0.0, 0.0) if layout == "mono" else None,

@@ -139,7 +139,7 @@ def _pictures(path: Path, settings: ContentSettings, stack: PanelStack) -> Opene
 
         return make
     quilt = quilt_size(path, settings) if layout == "quilt" else (1, 1)
-    source = ScreenPictures(frames, layout=layout, stack=stack, settings=settings, name=path.stem, quilt=quilt)
+    source = ScreenPictures(frames, layout=layout, stack=stack, settings=settings, path=path, quilt=quilt)
     return lambda context: source
 
 

@@ -77,6 +77,13 @@ def test_half_a_pair_is_named(tmp_path: Path, context: Any, stack: PanelStack) -
         read_folder(tmp_path, LEGO)
 
 
+def test_a_half_that_is_there_twice_is_named(tmp_path: Path) -> None:
+    for x, half in ((6.0, 0), (6.0, 1), (7.0, 1)):
+        (tmp_path / f"pair3_x{x}_y{half}_z2.0_{half}.jpg").write_bytes(b"")
+    with pytest.raises(InputError, match=r"pair3_x7.0_y1_z2.0_1.jpg: pair3: _1 is there twice"):
+        read_folder(tmp_path, LEGO)
+
+
 def test_a_folder_without_pairs_and_a_truncated_picture_are_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds no pair0"):
         read_folder(tmp_path, LEGO)

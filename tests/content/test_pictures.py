@@ -88,8 +88,10 @@ def test_a_folder_of_pictures_plays_and_repeats(tmp_path: Path, context: Any, st
     assert source.revision(time_ns=0) == source.revision(time_ns=99_000_000) != source.revision(time_ns=10**8)
 
 
-def make_video(path: Path, colours: list[tuple[int, int, int]], size: tuple[int, int] = (160, 96)) -> Path:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, size)
+def make_video(
+    path: Path, colours: list[tuple[int, int, int]], size: tuple[int, int] = (160, 96), codec: str = "MJPG"
+) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 10, size)
     for colour in colours:
         writer.write(np.full((size[1], size[0], 3), colour[::-1], np.uint8))
     writer.release()
@@ -123,6 +125,55 @@ def test_a_file_that_is_none_is_one_line(tmp_path: Path, context: Any, stack: Pa
     (tmp_path / name).write_bytes(b"nothing of the kind")
     with pytest.raises(InputError, match=rf"{name}: is not"):
         opened(tmp_path / name, context, stack)
+
+
+def test_a_folder_of_pictures_of_different_sizes_is_told_at_once(
+    tmp_path: Path, context: Any, stack: PanelStack
+) -> None:
+    write_png(tmp_path / "0.png", solid(RED))
+    write_png(tmp_path / "1.png", solid(RED, 80, 90))
+    with pytest.raises(InputError, match=r"1.png: size: 80 x 90 pixels; the folder's first picture has 160 x 90"):
+        opened(tmp_path, context, stack)
+    (tmp_path / "1.png").write_bytes(b"no picture")
+    with pytest.raises(InputError, match=r"1.png: is not an image"):
+        opened(tmp_path, context, stack)
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("a_sbs.png", "layout: 1 x 1 pixels cannot hold 2 x 1 views"),
+        ("a_tb.png", "layout: 1 x 1 pixels cannot hold 1 x 2 views"),
+        ("a_qs2x3.png", "quilt: 1 x 1 pixels cannot hold 2 x 3 views"),
+        ("a_qs999999999999x1.png", "quilt: 1 x 1 pixels cannot hold 999999999999 x 1 views"),
+        ("a_qs0x3.png", "quilt: columns and rows"),
+        ("a_rgbd.png", "layout: the picture is too small"),
+    ],
+)
+def test_a_picture_too_small_for_its_views_is_one_line(
+    tmp_path: Path, context: Any, stack: PanelStack, name: str, told: str
+) -> None:
+    write_png(tmp_path / name, solid(RED, 1, 1))
+    with pytest.raises(InputError) as refused:
+        opened(tmp_path / name, context, stack)
+    assert str(refused.value).startswith(f"{tmp_path / name}: {told}")
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.mp4", "a.avi"])
+def test_a_file_that_was_cut_off_is_one_line_and_the_decoders_are_silent(
+    tmp_path: Path, context: Any, stack: PanelStack, name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / name
+    if name.endswith((".mp4", ".avi")):
+        make_video(path, [RED] * 12, codec="mp4v" if name.endswith("4") else "MJPG")
+    else:
+        cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (90, 160, 3), np.uint8))
+    data = path.read_bytes()
+    path.write_bytes(data[: 300 if name.endswith((".jpg", ".avi")) else len(data) // 2])
+    capfd.readouterr()
+    with pytest.raises(InputError, match=rf"{name}: is not"):
+        opened(path, context, stack)
+    assert capfd.readouterr().err == ""
 
 
 def test_a_quilt_without_its_size_is_told(tmp_path: Path, context: Any, stack: PanelStack) -> None:
