@@ -221,6 +221,7 @@ class PlanSettings(Section):
     enabled: bool = Field(True, description="switches every saving at once")
     reuse: bool = Field(True, description="present again while neither content nor eyes moved")
     focus: bool = Field(True, description="run the network only where the two eyes' pictures differ")
+    one_channel: bool = Field(True, description="solve one channel instead of three while the pictures are grey")
     one_eye: bool = Field(True, description="solve for one eye alone while the other can't see the display")
     dead_band_mm: NonNegative = Field(
         0.0, description="eye motion that counts as none; 0: from the tracker's noise, at most model.tolerance_mm"

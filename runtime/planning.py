@@ -35,16 +35,25 @@ def focused(predictor: Predictor, settings: ModelSettings) -> FocusedPredictor |
 
     def make(part: PanelStack) -> Predictor:
         # One session serves every size: loading another for a new window would cost as much as solving it.
-        return UnrolledPredictor(predictor.session, part, tolerance_mm=predictor.tolerance_mm, threads=settings.threads)
+        return UnrolledPredictor(
+            predictor.session,
+            part,
+            tolerance_mm=predictor.tolerance_mm,
+            threads=settings.threads,
+            one_channel=predictor.one_channel,
+        )
 
     return FocusedPredictor(predictor, make)
 
 
 def planned_predictor(settings: Settings, stack: PanelStack) -> Predictor:
-    """The configured model, focused where the plan says so. Raises InputError, MissingPart."""
+    """The configured model with the savings that the plan allows. Raises InputError, MissingPart."""
     from runtime.model.predictor import load_predictor
+    from runtime.model.unrolled import UnrolledPredictor
 
     predictor = load_predictor(settings.model.name, stack, settings.model)
+    if isinstance(predictor, UnrolledPredictor):
+        predictor.one_channel = settings.plan.enabled and settings.plan.one_channel
     if settings.plan.enabled and settings.plan.focus:
         return focused(predictor, settings.model) or predictor
     return predictor

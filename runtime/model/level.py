@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.model.resample import buffer, resample, target_from_source
-from runtime.model.rows import RowPool
+from runtime.model.rows import RowPool, Work
 from runtime.model.transfer import FULL, SUBCODE
 from runtime.model.visible import Box
 from runtime.optics.stack import PanelStack, PlaneRaster
@@ -24,20 +24,25 @@ REAR, CENTRE, FRONT = 0, 1, 2
 OUTER = (REAR, FRONT)
 EYES = (0, 1)
 START = FULL // 2  # of every outer panel: the middle of its range
+EVEN = (START + SUBCODE // 2) // SUBCODE  # the same in 8-bit codes, rounded as what is shown is
 
 
 class Level:
-    """Buffers for one stack at `1 / reduction` of its columns and rows; state lives from frame to frame."""
+    """Buffers for one stack at `1 / reduction` of its columns and rows; state lives from frame to frame.
 
-    def __init__(self, stack: PanelStack, *, reduction: int, rows: RowPool) -> None:
+    Images are (h, w, 3), or (h, w) where there is one channel.
+    """
+
+    def __init__(self, stack: PanelStack, *, reduction: int, rows: RowPool, channels: int = 3) -> None:
         self.reduction = reduction
         self._rows = rows
+        self._tail = () if channels == 1 else (channels,)
         height, width = -(-stack.height_px // reduction), -(-stack.width_px // reduction)
         names = [*(("outer", n, 0) for n in OUTER), *(("seen", n, side) for n in OUTER for side in EYES)]
         names += [(name, CENTRE, side) for name in ("residual", "back") for side in EYES]
-        self._whole = {name: buffer(height, width) for name in names}
+        self._whole = {name: buffer(height, width, channels=channels) for name in names}
         self.rasters: tuple[PlaneRaster, ...] = ()
-        self.wanted: list[I16] = []  # per eye, (h, w, 3) phase sums on the centre panel
+        self.wanted: list[I16] = []  # per eye, phase sums on the centre panel
 
     @property
     def size(self) -> tuple[int, int]:
@@ -92,7 +97,7 @@ class Level:
         self._each(panel, work)
 
     def drive(self, panel: int, wave: I16, wave_from_raster: F64, *, first: bool, shown: bool) -> None:
-        """Add a wave (h, w, 3), drawn on this raster, to an outer panel; the first one takes its place."""
+        """Add a wave, drawn on a raster of its own, to an outer panel; the first one takes its place."""
         outer = self.outer[panel]
         target = outer if first else self._back[panel][0]
         resample(wave, image_from_result=wave_from_raster, out=target, outside=START if first else 0, cubic=True)
@@ -132,9 +137,9 @@ class Level:
 
         self._each(CENTRE, work)
 
-    def _each(self, panel: int, work: object) -> None:
+    def _each(self, panel: int, work: Work) -> None:
         raster = self.rasters[panel]
-        self._rows.each(raster.height_px, raster.width_px, work)  # type: ignore[arg-type]
+        self._rows.each((raster.height_px, raster.width_px, *self._tail), work)
 
     def _view(self, name: str, n: int, side: int, *, on: int) -> I16:
         """The first rows and columns of a buffer, with margins of its own."""

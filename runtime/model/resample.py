@@ -32,13 +32,17 @@ def target_from_source(eye_m: ArrayLike, *, source: PlaneRaster, target: PlaneRa
     return target.raster_from_plane() @ across @ source.plane_from_raster()
 
 
-def buffer(height_px: int, width_px: int, dtype: Any = np.int16) -> Image:
-    """An (height, width, 3) array that `resample` can write into: a view with margins."""
-    return np.zeros((height_px + MARGIN, width_px + MARGIN, 3), dtype)[:height_px, :width_px]
+def buffer(height_px: int, width_px: int, dtype: Any = np.int16, *, channels: int = 3) -> Image:
+    """An (height, width, 3) array, or (height, width) for one channel, that `resample` can write into.
+
+    It is a view with margins.
+    """
+    shape = (height_px + MARGIN, width_px + MARGIN)
+    return np.zeros(shape if channels == 1 else (*shape, channels), dtype)[:height_px, :width_px]
 
 
 def resample(image: Image, *, image_from_result: F64, out: Image, outside: int = 0, cubic: bool = False) -> Image:
-    """Bilinear (or bicubic) samples of an (h, w, C) image at the positions of a raster, into `out`.
+    """Bilinear (or bicubic) samples of an (h, w, C) or (h, w) image at the positions of a raster, into `out`.
 
     image_from_result: 3x3 affine, pixel centres at half-integers. `out` comes from `buffer`. Beside the image the
     result is `outside` (axis-aligned rasters) or its repeated edge (sheared ones): no ray through there crosses

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from math import prod
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,14 +26,17 @@ class RowPool:
         self._pool = ThreadPoolExecutor(self._threads, "rows") if self._threads > 1 else None
         self._scratch = np.zeros((self._threads, ROWS * width_px * 3), np.int16)
 
-    def each(self, height_px: int, width_px: int, work: Work) -> None:
-        """`work` on every strip of rows; strips don't overlap. What it raises is raised here.
+    def each(self, shape: tuple[int, ...], work: Work) -> None:
+        """`work` on every strip of rows of an image; strips don't overlap. What it raises is raised here.
 
-        It gets the rows, and a strip (rows, width_px, 3) with anything in it.
+        shape: (height, width, 3) or (height, width). `work` gets the rows, and a strip of that shape with anything
+        in it.
         """
+        height_px, row = shape[0], shape[1:]
+        numbers = ROWS * prod(row)
 
         def share(index: int) -> None:
-            strip = self._scratch[index, : ROWS * width_px * 3].reshape(ROWS, width_px, 3)
+            strip = self._scratch[index, :numbers].reshape(ROWS, *row)
             for start in range(index * ROWS, height_px, self._threads * ROWS):
                 stop = min(start + ROWS, height_px)
                 work(slice(start, stop), strip[: stop - start])

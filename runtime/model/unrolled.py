@@ -14,35 +14,49 @@ import cv2
 import numpy as np
 
 from runtime.errors import ModelFailure
+from runtime.model.bench import Bench
 from runtime.model.chain import ChainFrame, chain_frame, chain_modes, relative_tolerance_mm
+from runtime.model.channels import RGBA_FROM, is_grey, without_alpha
 from runtime.model.contract import Step
-from runtime.model.level import CENTRE, FRONT, I16, OUTER, REAR, START, Level
+from runtime.model.level import CENTRE, EVEN, FRONT, I16, OUTER, REAR, START, Level
 from runtime.model.predictor import Prediction, Predictor
-from runtime.model.resample import buffer, resample
+from runtime.model.resample import resample
 from runtime.model.rows import RowPool
 from runtime.model.session import ModelSession
 from runtime.model.timing import Stopwatch
 from runtime.model.transfer import FULL, SUBCODE, emphasised, phase_codes
 from runtime.model.visible import Box, visible_boxes
 from runtime.optics.stack import PanelStack, PlaneRaster
-from runtime.records import F64, U8
+from runtime.records import F32, F64, U8
 
 
 class UnrolledPredictor(Predictor):
-    """Models of `input_frame` chain: three evenly spaced panels, any pose."""
+    """Models of `input_frame` chain: three evenly spaced panels, any pose.
 
-    def __init__(self, session: ModelSession, stack: PanelStack, *, tolerance_mm: float, threads: int = 2) -> None:
+    Where `one_channel` is set, grey pictures are solved in one channel of three: a third of the work.
+    """
+
+    def __init__(
+        self,
+        session: ModelSession,
+        stack: PanelStack,
+        *,
+        tolerance_mm: float,
+        threads: int = 2,
+        one_channel: bool = False,
+    ) -> None:
+        """one_channel: whether pictures without colour are solved in a single channel."""
         self.session, self.stack = session, stack
         self.name, self.provider = session.contract.name, session.provider
         self.parameters = session.contract.parameters
         self.tolerance_mm = tolerance_mm
+        self.one_channel = one_channel
+        self.channels = 3  # that the last pictures were solved in
         self._rows = RowPool(threads, width_px=stack.width_px)
-        reductions = {1} | {step.reduction for step in session.contract.steps}
-        self._levels = {r: Level(stack, reduction=r, rows=self._rows) for r in reductions}
+        self._benches: dict[int, Bench] = {}
         self._boxes: tuple[Box, ...] = ()
         self._drawn: tuple[Box, ...] = ()  # where the layers hold more than even panels
         self._layers = np.full((3, stack.height_px, stack.width_px, 4), 255, np.uint8)
-        self._chain_buffers: dict[tuple[int, int], tuple[I16, I16]] = {}
 
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         return (self.stack.panel(CENTRE),)
@@ -65,16 +79,18 @@ class UnrolledPredictor(Predictor):
             frame = chain_frame(eyes_m, self.stack, cell_px=contract.cell_px, reduction=contract.reduction)
         except ValueError as error:
             raise ModelFailure(str(error)) from None
-        self._look_through(visible_boxes(eyes_m, self.stack))
-        cut = [cv2.cvtColor(image[0][self._boxes[CENTRE].slices], cv2.COLOR_RGBA2RGB) for image in images]
-        pictures = [emphasised(np.asarray(picture, np.uint8), contract.emphasis) for picture in cut]
-        for level in self._levels.values():
+        self._boxes = visible_boxes(eyes_m, self.stack)
+        cut = [image[0][self._boxes[CENTRE].slices] for image in images]
+        self.channels = 1 if self.one_channel and all(is_grey(picture) for picture in cut) else 3
+        bench = self._bench()
+        pictures = [emphasised(without_alpha(picture, self.channels), contract.emphasis) for picture in cut]
+        for level in bench.levels.values():
             level.wanted = [np.asarray(phases, np.int16) for phases in self._phases(pictures, level.size)]
         last = {n: _last_change(contract.steps, n) for n in OUTER}
-        level = self._levels[contract.steps[0].reduction]
+        level = bench.levels[contract.steps[0].reduction]
         for index, step in enumerate(contract.steps):
             if step.reduction != level.reduction:
-                coarser, level = level, self._levels[step.reduction]
+                coarser, level = level, bench.levels[step.reduction]
                 level.refine(coarser, shown=False)
                 level.look(OUTER, eyes_m)
             if index:
@@ -82,27 +98,28 @@ class UnrolledPredictor(Predictor):
             shown = {n: index == last[n] for n in OUTER}
             if step.kind == "chain":
                 needs = self._later_needs(level) if index else self._first_needs(pictures)
-                self._chain(needs, frame, eyes_m, watch, level=level, size=step.size, first=not index, shown=shown)
+                wave = self._wave(needs, frame, eyes_m, watch, bench=bench)
+                _drive(level, wave, frame, size=step.size, first=not index, shown=shown)
                 changed: tuple[int, ...] = OUTER
             else:
                 changed = (FRONT if step.kind == "front" else REAR,)
                 level.correct(changed[0], eyes_m, size=step.size, shown=shown[changed[0]])
             level.look(changed, eyes_m)
-        self._finish(level, eyes_m)
+        self._finish(level, eyes_m, bench)
         watch.lap("finish")
         return Prediction(self._layers, watch.stage_ms)
 
     def close(self) -> None:
         self._rows.close()
 
-    def _look_through(self, boxes: tuple[Box, ...]) -> None:
-        """Cut every raster and buffer to what the eyes look through; panels are even beside it."""
-        if boxes == self._boxes:
-            return
-        self._boxes = boxes
-        for level in self._levels.values():
-            level.look_through(boxes, self.stack)
-        self._shown = [np.empty((box.height_px, box.width_px, 3), np.uint8) for box in boxes]
+    def _bench(self) -> Bench:
+        """What the steps work on, cut to what the eyes look through; panels are even beside it."""
+        if self.channels not in self._benches:
+            reductions = {1} | {step.reduction for step in self.session.contract.steps}
+            self._benches[self.channels] = Bench(self.stack, reductions, rows=self._rows, channels=self.channels)
+        bench = self._benches[self.channels]
+        bench.look_through(self._boxes, self.stack)
+        return bench
 
     def _phases(self, pictures: Sequence[U8], size: tuple[int, int]) -> list[Any]:
         """Phase sums of two pictures at a size, averaged as codes."""
@@ -111,20 +128,20 @@ class UnrolledPredictor(Predictor):
         sized = pictures if same else [cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in pictures]
         return [cv2.LUT(picture, table) for picture in sized]
 
-    def _finish(self, level: Level, eyes_m: F64) -> None:
+    def _finish(self, level: Level, eyes_m: F64, bench: Bench) -> None:
         """Close the centre panel on every pixel, and bring the panels into their layers."""
-        whole = self._levels[1]
+        whole = bench.levels[1]
         if level is not whole:
             whole.refine(level, shown=True)
             whole.look(OUTER, eyes_m)
-        whole.close_centre(self._shown[CENTRE])
+        whole.close_centre(bench.shown[CENTRE])
         if self._drawn != self._boxes:
-            self._layers[..., :3] = START // SUBCODE
+            self._layers[..., :3] = EVEN
             self._drawn = self._boxes
         for n, box in enumerate(self._boxes):
             if n != CENTRE:
-                cv2.convertScaleAbs(whole.outer[n], dst=self._shown[n], alpha=1 / SUBCODE)
-            self._layers[n][box.slices] = cv2.cvtColor(self._shown[n], cv2.COLOR_RGB2RGBA)
+                cv2.convertScaleAbs(whole.outer[n], dst=bench.shown[n], alpha=1 / SUBCODE)
+            self._layers[n][box.slices] = cv2.cvtColor(bench.shown[n], RGBA_FROM[self.channels])
 
     def _first_needs(self, pictures: Sequence[U8]) -> list[I16]:
         """What each eye lacks while the outer panels are even, at the network's coarser raster."""
@@ -142,27 +159,16 @@ class UnrolledPredictor(Predictor):
         reduction, box = self.session.contract.reduction, self._boxes[CENTRE]
         return max(1, box.width_px // reduction), max(1, box.height_px // reduction)
 
-    def _chain(
-        self,
-        needs: Sequence[I16],
-        frame: ChainFrame,
-        eyes_m: F64,
-        watch: Stopwatch,
-        *,
-        level: Level,
-        size: float,
-        first: bool,
-        shown: dict[int, bool],
-    ) -> None:
-        """The network's correction: what the outer panels must carry for the eyes to differ as they should."""
+    def _wave(self, needs: Sequence[I16], frame: ChainFrame, eyes_m: F64, watch: Stopwatch, *, bench: Bench) -> F32:
+        """The network's answer: what the outer panels must carry for the eyes to differ as they should.
+
+        On the chain frame's raster, from one parallax before its first column.
+        """
         width, height = self._reduced_size()
         centre = self._boxes[CENTRE].cut(self.stack.panel(CENTRE))
         reduced_from_full = np.diag([width / centre.width_px, height / centre.height_px, 1.0])
         reduced_from_plane = reduced_from_full @ centre.raster_from_plane()
-        key = (frame.rows, frame.width_px)
-        if key not in self._chain_buffers:
-            self._chain_buffers = {key: (buffer(*key), buffer(*key))}
-        seen = self._chain_buffers[key]
+        seen = bench.chain_buffers(frame)
         for side, eye_m in enumerate(eyes_m):
             matrix = reduced_from_plane @ frame.plane_from_frame(eye_m, x_m=self.stack.x_m[CENTRE])
             resample(needs[side], image_from_result=matrix, out=seen[side])
@@ -173,18 +179,22 @@ class UnrolledPredictor(Predictor):
             difference.reshape(frame.rows, frame.cells, -1),
             *chain_modes(frame.cells),
             np.array([relative_tolerance_mm(self.tolerance_mm, eyes_m)], np.float32),
-            output_shape=(frame.rows, frame.cells + 1, 2 * frame.cell_px * 3),
+            output_shape=(frame.rows, frame.cells + 1, 2 * frame.cell_px * self.channels),
         )
         if not np.isfinite(answer.sum()):
             raise ModelFailure("the network answered with numbers that are not finite")
         watch.lap("inference")
-        wave = answer.reshape(frame.rows, -1, 3)
-        for n, sign in ((REAR, -1.0), (FRONT, 1.0)):
-            panel = level.rasters[n]
-            matrix = frame.frame_from_plane(x_m=panel.x_m) @ panel.plane_from_raster()
-            matrix[0, 2] += frame.cell_px  # the answer begins one parallax before the first column
-            codes = cv2.addWeighted(wave, sign * FULL * size, wave, 0.0, START if first else 0.0, dtype=cv2.CV_16S)
-            level.drive(n, np.asarray(codes, np.int16), matrix, first=first, shown=shown[n])
+        return answer.reshape(frame.rows, -1, *difference.shape[2:])
+
+
+def _drive(level: Level, wave: F32, frame: ChainFrame, *, size: float, first: bool, shown: dict[int, bool]) -> None:
+    """The wave on both outer panels, with opposite signs."""
+    for n, sign in ((REAR, -1.0), (FRONT, 1.0)):
+        panel = level.rasters[n]
+        matrix = frame.frame_from_plane(x_m=panel.x_m) @ panel.plane_from_raster()
+        matrix[0, 2] += frame.cell_px  # the answer begins one parallax before the first column
+        codes = cv2.addWeighted(wave, sign * FULL * size, wave, 0.0, START if first else 0.0, dtype=cv2.CV_16S)
+        level.drive(n, np.asarray(codes, np.int16), matrix, first=first, shown=shown[n])
 
 
 def _last_change(steps: Sequence[Step], panel: int) -> int:
