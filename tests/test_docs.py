@@ -79,6 +79,23 @@ def test_every_link_leads_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors(place), f"{page.name}: {target}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_file_and_module_that_a_page_names_is_there(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    files = re.findall(r"`((?:runtime|calib|model_export|tests|docs|systemd|examples|requirements)/[\w./{},*-]*)", text)
+    modules = re.findall(r"python -m ((?:runtime|calib|model_export|tests)[\w.]*)", text)
+    gone = [name for name in files if not any(list(ROOT.glob(one)) for one in alternatives(name.rstrip("/.")))]
+    gone += [name for name in modules if importlib.util.find_spec(name) is None]
+    assert gone == []
+
+
+def alternatives(name: str) -> list[str]:
+    """`a/{b,c}.json` as a/b.json and a/c.json."""
+    head, brace, rest = name.partition("{")
+    inner, _, tail = rest.partition("}")
+    return [head + one + tail for one in inner.split(",")] if brace else [name]
+
+
 def test_every_page_can_be_reached_from_the_readme() -> None:
     reached, waiting = set(), [ROOT / "README.md"]
     while waiting:
