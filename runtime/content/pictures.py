@@ -123,14 +123,22 @@ def _refuse_other_size(path: Path, shape: tuple[int, ...]) -> None:
         )
 
 
+def _opened(path: Path) -> cv2.VideoCapture:
+    """A video by FFmpeg alone, whose complaints and OpenCV's stay off stderr: our own line names the file."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.utils.logging.setLogLevel(0)
+    try:
+        return cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
 class Video(Frames):
     """A video file, read by OpenCV as it goes."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        # FFmpeg writes its own lines to stderr; ours names the file.
-        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-        self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        self._capture = _opened(path)
         if not self._capture.isOpened():
             raise InputError(path, "", "is not a video that can be decoded")
         self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
