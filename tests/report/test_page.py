@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,6 +18,7 @@ from runtime.report.horizon import Horizon, horizon_section, psnr_at
 from runtime.report.latency import Run, latency_section
 from runtime.report.machine import describe
 from runtime.report.page import Figure, Page, Section, Table, Tile
+from runtime.report.plots import drawing, label_points, png
 from runtime.report.stability.page import stability_page
 from runtime.report.stability.trial import Answer, Trial, settle
 from runtime.report.sweeps import Curve, Size, Tolerance, Volume
@@ -146,6 +148,35 @@ def test_a_times_table_shows_ratios_beside_milliseconds() -> None:
     column = list(table.headings).index("× fastest")
     assert [row[column] for row in table.rows] == ["1.0", "2.0", "45.0"]
     assert list(table.styles) == ["good", "good", ""]
+
+
+def test_an_untrained_network_has_a_time_and_no_error() -> None:
+    untrained = replace(method("eyereal", "network", 10, 99), trained=False)
+    results = [method("fast", "network", 20, 36), untrained, method("SART-10", "iterative", 900, 40)]
+    section = frontier_page.frontier_section(results, pairs="a pair", title="Frontier", name="test")
+    (table,) = section.tables
+    rows = {row[0]: dict(zip(table.headings, row, strict=True)) for row in table.rows}
+    assert rows["eyereal"]["p50 ms"] == "10.0" and rows["eyereal"]["10⁹ multiply-adds"] == "2"
+    assert rows["eyereal"]["PSNR dB"] == rows["eyereal"]["2mm off dB"] == ""
+    assert rows["fast"]["PSNR dB"] == "36.00"
+    assert dict(zip(rows, table.styles, strict=True)) == {"eyereal": "", "fast": "good", "SART-10": "good"}
+    assert any("untrained" in text for text in section.text)
+
+
+def test_names_of_dots_lie_neither_on_one_another_nor_beyond_the_axes() -> None:
+    points = [(1.0, 1.0, "first"), (1.01, 1.0, "second"), (1.0, 1.02, "third"), (2.0, 2.0, "at the edge")]
+    with drawing(5, 3) as figure:
+        axes = figure.add_subplot()
+        axes.scatter([x for x, _, _ in points], [y for _, y, _ in points])
+        axes.set(xlim=(0.9, 2.0), ylim=(0.9, 2.1))
+        label_points(figure, axes, points)
+        png(figure)
+        frame = axes.get_window_extent()
+        boxes = [text.get_window_extent() for text in axes.texts if text.get_text()]
+    assert len(boxes) == len(points)
+    for index, box in enumerate(boxes):
+        assert frame.x0 - 1 <= box.x0 and box.x1 <= frame.x1 + 1
+        assert not any(box.overlaps(other) for other in boxes[:index])
 
 
 def test_the_price_of_an_error_is_read_off_the_tolerance_map() -> None:

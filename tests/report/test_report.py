@@ -9,9 +9,15 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from runtime.commands.report import report
+from runtime.commands.report import _variants, report
 from runtime.errors import InputError
+from runtime.optics.stack import PanelStack
+from runtime.report.frontier import measure, pareto
+from runtime.report.methods import Method
+from runtime.report.pairs import Painter, eyes_at
 from tests.report.test_pairs import case_folder
+
+STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
 
 
 def command(*arguments: str):
@@ -33,6 +39,31 @@ def test_mistakes_are_told_before_anything_is_measured_and_nothing_is_written(tm
         assert isinstance(done.exception, InputError), done.output
         assert str(tmp_path) in str(done.exception)
         assert not (tmp_path / "out").exists()
+
+
+def test_without_torch_nothing_is_made_to_compare_with(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert _variants(64, 64) == []
+
+
+@pytest.mark.slow
+def test_what_is_made_to_compare_with_is_measured_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("torch")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    methods = _variants(STACK.width_px, STACK.height_px)
+    assert [m.name for m in methods] == ["eyereal", "eyereal int8", "fast fp16", "balanced fp16", "best fp16"]
+    files = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.onnx")}
+    assert _variants(STACK.width_px, STACK.height_px) == methods
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.onnx")} == files and len(files) == 5
+    with Painter("demo", STACK) as painter:
+        pairs = [painter.pair(name, eyes_at(distance_m=0.6), STACK, off_mm=()) for name in ("one", "two")]
+    shipped = Method("balanced", "network", "balanced")
+    results = {r.name: r for r in measure([*methods, shipped], pairs, threads=1)}
+    assert [results[m.name].precision for m in methods] == ["fp32", "int8", "fp16", "fp16", "fp16"]
+    assert len(results["eyereal"].pairs) == 1 and not results["eyereal"].trained
+    assert results["eyereal"].multiply_adds > 20 * results["balanced"].multiply_adds
+    assert results["balanced fp16"].psnr_db == pytest.approx(results["balanced"].psnr_db, abs=0.2)
+    assert {r.name for r in pareto(list(results.values()))}.isdisjoint({"eyereal", "eyereal int8"})
 
 
 @pytest.mark.slow
