@@ -83,17 +83,18 @@ def _variants(width_px: int, height_px: int) -> list[Method]:
     from runtime.report.worker import apart
 
     code = Path(model_export.__file__).parent
-    sources = sorted(path for kind in ("*.py", "recipes/*") for path in code.glob(kind) if path.is_file())
     versions = [importlib.metadata.version(name) for name in ("torch", "onnx", "onnxruntime")]
-    folder = user_cache("models") / digest(sources, versions)
+    published = [code / name for name in ("eyereal.py", "onnx_files.py", "yardstick.py")]
+    ours = sorted([*code.glob("*.py"), *code.glob("recipes/*.json")])
+    large, small = (user_cache("models") / digest(sources, versions) for sources in (published, ours))
     found = []
     for name, precision in yardstick.PUBLISHED:
-        path = folder / f"eyereal-{precision}-{width_px}x{height_px}.onnx"
+        path = large / f"eyereal-{precision}-{width_px}x{height_px}.onnx"
         if not path.is_file():
             apart(yardstick.write_eyereal, path, precision=precision, width_px=width_px, height_px=height_px)
         found.append(Method(name, "network", str(path), trained=False))
     for name in SHIPPED:
-        path = folder / f"{name}-fp16.onnx"
+        path = small / f"{name}-fp16.onnx"
         if not path.is_file():
             apart(yardstick.write_half, path, name=name)
         found.append(Method(f"{name} fp16", "network", str(path)))
