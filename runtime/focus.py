@@ -2,7 +2,8 @@
 
 Panels that are cut to a window and moved to its centre are a smaller stack, seen by eyes moved the same way: any
 model for evenly spaced panels serves it. Where the eyes agree, the outer panels stand at the middle of their
-range, from which the solver starts, and the centre panel carries the picture: there is no seam.
+range, from which the solver starts, and the centre panel carries the picture. What drives the outer panels fades out
+towards the window's edge (`model.fade`): there is no seam.
 """
 
 from __future__ import annotations
@@ -14,16 +15,19 @@ from time import perf_counter_ns
 import cv2
 import numpy as np
 
-from runtime.content.active import Window, differing_box, still_fits, whole_rays, window_of
+from runtime.content.active import Window, differing_box, still_fits, wave_px, whole_rays, window_of
 from runtime.content.base import ContentSource, View
 from runtime.content.camera import PixelBox, union
+from runtime.model.fade import Fade
+from runtime.model.level import EVEN
 from runtime.model.predictor import Prediction, Predictor
 from runtime.model.transfer import SUBCODE, emphasised, phase_codes
+from runtime.model.unrolled import UnrolledPredictor
+from runtime.model.visible import Box
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import raster_from_stack
 from runtime.records import F64, U8
 
-START = 128  # the outer panels' code where both eyes agree
 SIZES_KEPT = 6
 
 
@@ -34,20 +38,21 @@ class FocusedPredictor(Predictor):
     Without it, the pictures themselves tell where they differ.
     """
 
-    def __init__(self, whole: Predictor, make: Callable[[PanelStack], Predictor]) -> None:
+    def __init__(self, whole: UnrolledPredictor, make: Callable[[PanelStack], UnrolledPredictor]) -> None:
         """whole: the model for all of the panels; make: the same model for smaller ones of the same pitch."""
         self.whole, self._make = whole, make
         self.name, self.provider, self.parameters = whole.name, whole.provider, whole.parameters
         self.stack = whole.stack
-        self._parts: dict[tuple[int, int], Predictor] = {}
+        self._parts: dict[tuple[int, int], UnrolledPredictor] = {}
         self._layers = np.full((self.stack.count, self.stack.height_px, self.stack.width_px, 4), 255, np.uint8)
-        self._layers[..., :3] = START
+        self._layers[..., :3] = EVEN
         self._solved: PixelBox | None = None  # where the outer panels are not even
         self._aimed: Window | None = None
         self._wanted_background: tuple[int, ...] = (255, 255, 255)
         self._background: tuple[int, ...] | None = None  # that fills the centre panel beside the aimed window
         self.window: Window | None = None  # of the last frame
         self.active_fraction = 1.0  # of the panel's pixels that went through the model
+        self.channels = 3  # that it solved
 
     def aim(self, content: ContentSource, eyes_m: F64, *, time_ns: int) -> None:
         """Ask the content where it lies, so that only that is drawn and solved."""
@@ -72,12 +77,20 @@ class FocusedPredictor(Predictor):
         self._wanted_background = tuple(round(value * 255) for value in content.info.background)
 
     @property
+    def one_channel(self) -> bool:
+        """True where grey pictures are solved in one channel."""
+        return self.whole.one_channel
+
+    @property
     def interpolation(self) -> str:
         return self.whole.interpolation
 
     @property
     def emphasis(self) -> float:
         return self.whole.emphasis
+
+    def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
+        return super().windows(eyes_m) if self._aimed is not None else self.whole.windows(eyes_m)
 
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         """The whole centre panel, or the aimed window of it."""
@@ -106,7 +119,9 @@ class FocusedPredictor(Predictor):
             found = window_of(box, eyes_m, self.stack) if differs else None
             if found is None and differs:
                 self.window, self.active_fraction = None, 1.0
-                return self.whole.predict(images, eyes_m)
+                prediction = self.whole.predict(images, eyes_m)
+                self.channels = self.whole.channels
+                return prediction
             if found is not None and self.window is not None and still_fits(self.window, found):
                 found = self.window
             if found is None:
@@ -119,7 +134,10 @@ class FocusedPredictor(Predictor):
             cut = [[np.ascontiguousarray(image[area.v0 : area.v1, area.u0 : area.u1])] for image in (left, right)]
         found_ms = (perf_counter_ns() - begin_ns) / 1e6
         # Solved before anything is painted: where the model fails, the last good layers stay as they were.
-        solved = self._part(window.stack).predict(cut, eyes_m - window.shift_m)
+        part = self._part(window.stack)
+        part.fade = self._fade(window, eyes_m)
+        solved = part.predict(cut, eyes_m - window.shift_m)
+        self.channels = part.channels
         begin_ns = perf_counter_ns()
         if aimed is not None:
             self._even_out(but=window.box)
@@ -159,6 +177,18 @@ class FocusedPredictor(Predictor):
         stage_ms["prepare"] = stage_ms.get("prepare", 0.0) + filled_ms
         return Prediction(self._layers, stage_ms)
 
+    def _fade(self, window: Window, eyes_m: F64) -> Fade:
+        """How a window ends: gently, but where the panels themselves do."""
+        box, kept = window.box, whole_rays(window, eyes_m, self.stack)
+        return Fade(
+            Box(kept.u0 - box.u0, kept.v0 - box.v0, kept.u1 - box.u0, kept.v1 - box.v0),
+            over_px=wave_px(eyes_m, self.stack),
+            left=box.u0 > 0,
+            top=box.v0 > 0,
+            right=box.u1 < self.stack.width_px,
+            bottom=box.v1 < self.stack.height_px,
+        )
+
     def _middle(self) -> PlaneRaster:
         return self.stack.panel(self.stack.count // 2)
 
@@ -168,7 +198,7 @@ class FocusedPredictor(Predictor):
             return
         area = self._solved
         for layer in self._layers:
-            layer[area.v0 : area.v1, area.u0 : area.u1] = (START, START, START, 255)
+            layer[area.v0 : area.v1, area.u0 : area.u1] = (EVEN, EVEN, EVEN, 255)
         self._solved, self._background = None, None
 
     def _paint_background(self, colour: tuple[int, ...]) -> None:
@@ -182,7 +212,7 @@ class FocusedPredictor(Predictor):
             area = self._solved
             layer[area.v0 : area.v1, area.u0 : area.u1] = codes
 
-    def _part(self, stack: PanelStack) -> Predictor:
+    def _part(self, stack: PanelStack) -> UnrolledPredictor:
         size = (stack.width_px, stack.height_px)
         if size not in self._parts:
             while len(self._parts) >= SIZES_KEPT:
@@ -192,6 +222,6 @@ class FocusedPredictor(Predictor):
 
 
 def _centre_codes(panels: int) -> U8:
-    """(256,) the centre panel's code for each code of the picture, the others standing at START."""
+    """(256,) the centre panel's code for each code of the picture, the others standing at EVEN."""
     phases = phase_codes(2).reshape(256, -1)[:, 0].astype(np.int32)
-    return np.clip((phases - (panels - 1) * START * SUBCODE + SUBCODE // 2) // SUBCODE, 0, 255).astype(np.uint8)
+    return np.clip((phases - (panels - 1) * EVEN * SUBCODE + SUBCODE // 2) // SUBCODE, 0, 255).astype(np.uint8)

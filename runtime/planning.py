@@ -33,7 +33,7 @@ def focused(predictor: Predictor, settings: ModelSettings) -> FocusedPredictor |
     if not isinstance(predictor, UnrolledPredictor):
         return None
 
-    def make(part: PanelStack) -> Predictor:
+    def make(part: PanelStack) -> UnrolledPredictor:
         # One session serves every size: loading another for a new window would cost as much as solving it.
         return UnrolledPredictor(
             predictor.session,

@@ -18,6 +18,7 @@ from runtime.model.bench import Bench
 from runtime.model.chain import ChainFrame, chain_frame, chain_modes, relative_tolerance_mm
 from runtime.model.channels import RGBA_FROM, is_grey, without_alpha
 from runtime.model.contract import Step
+from runtime.model.fade import Fade
 from runtime.model.level import CENTRE, EVEN, FRONT, I16, OUTER, REAR, START, Level
 from runtime.model.predictor import Prediction, Predictor
 from runtime.model.resample import resample
@@ -51,6 +52,7 @@ class UnrolledPredictor(Predictor):
         self.parameters = session.contract.parameters
         self.tolerance_mm = tolerance_mm
         self.one_channel = one_channel
+        self.fade: Fade | None = None  # how this stack ends, where it is a part of larger panels
         self.channels = 3  # that the last pictures were solved in
         self._rows = RowPool(threads, width_px=stack.width_px)
         self._benches: dict[int, Bench] = {}
@@ -95,6 +97,8 @@ class UnrolledPredictor(Predictor):
                 level.look(OUTER, eyes_m)
             if index:
                 level.lacks()
+                if self.fade is not None:
+                    self.fade.soften(level, self._centre_from(level.rasters[CENTRE].plane_from_raster()))
             shown = {n: index == last[n] for n in OUTER}
             if step.kind == "chain":
                 needs = self._later_needs(level) if index else self._first_needs(pictures)
@@ -184,7 +188,23 @@ class UnrolledPredictor(Predictor):
         if not np.isfinite(answer.sum()):
             raise ModelFailure("the network answered with numbers that are not finite")
         watch.lap("inference")
-        return answer.reshape(frame.rows, -1, *difference.shape[2:])
+        wave = answer.reshape(frame.rows, -1, *difference.shape[2:])
+        if self.fade is not None:
+            self._fade_out(wave, frame)
+        return wave
+
+    def _fade_out(self, wave: F32, frame: ChainFrame) -> None:
+        """Let a wave end within this part of the panels."""
+        assert self.fade is not None
+        plane_from_wave = frame.plane_from_frame(frame.middle_m, x_m=self.stack.x_m[CENTRE])
+        plane_from_wave = plane_from_wave @ np.array([[1.0, 0.0, -frame.cell_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        rows, columns = wave.shape[:2]
+        weights = self.fade.wave_weights(self._centre_from(plane_from_wave), rows=rows, columns=columns)
+        np.multiply(wave, weights if wave.ndim == 3 else weights[..., 0], out=wave)
+
+    def _centre_from(self, plane_from_raster: F64) -> F64:
+        """3x3: the centre panel's pixels from a raster's on its plane."""
+        return self.stack.panel(CENTRE).raster_from_plane() @ plane_from_raster
 
 
 def _drive(level: Level, wave: F32, frame: ChainFrame, *, size: float, first: bool, shown: dict[int, bool]) -> None:

@@ -10,12 +10,16 @@ import numpy as np
 import pytest
 
 from runtime.config import Settings
+from runtime.content.base import View
 from runtime.content.plan import solved_eyes
 from runtime.content.procedural import ProceduralSource
+from runtime.content.scenes import Scene, scene
 from runtime.focus import FocusedPredictor
 from runtime.gl import offscreen_context
 from runtime.model.predictor import Predictor, load_predictor
+from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
+from runtime.optics.views import image_from_stack
 from runtime.plan_measure import displayed_psnr, draw
 from runtime.planning import focused
 from runtime.reduced import ladder_predictor
@@ -57,7 +61,7 @@ def test_a_sparse_object_looks_the_same_from_a_small_window(context: Any, whole:
     part = part_of(whole)
     without = psnr(draw(source, whole, EYES, time_ns=0), source)
     with_window = psnr(draw(source, part, EYES, time_ns=0, aim=aim), source)
-    assert part.active_fraction < 0.25
+    assert part.active_fraction < 0.2
     assert with_window > without - 0.1
 
 
@@ -91,16 +95,18 @@ def test_nothing_remains_of_an_earlier_window(context: Any, whole: Predictor) ->
             assert (layers[..., :3] == again[..., :3]).mean() > 0.9999
 
 
-def test_there_is_no_seam(context: Any, whole: Predictor) -> None:
-    """Along the window's edge the picture errs no more than the whole model's does there."""
-    from runtime.content.base import View
-    from runtime.optics.retina import seen_by
-    from runtime.optics.views import image_from_stack
-
+@pytest.mark.parametrize("name", ["fast", "balanced", "best"])
+def test_there_is_no_seam(context: Any, name: str) -> None:
+    """On mid-grey, where the eye is most sensitive, the background errs no more than the whole model's does."""
     source = ProceduralSource("sparse", stack=STACK, context=context, background=(0.5, 0.6, 0.7))
-    worst, mean = [], []
-    for predictor in (whole, part_of(whole)):
+    settings = SETTINGS.model.model_copy(update={"name": name})
+    entire = load_predictor(name, STACK, settings)
+    part = focused(entire, settings)
+    assert part is not None
+    worst, mean, quality = [], [], []
+    for predictor in (entire, part):
         layers = draw(source, predictor, EYES, time_ns=0).copy()
+        quality.append(psnr(layers, source))
         errors = []
         for side, eye in enumerate(EYES):
             projection = image_from_stack(eye, width_px=960, height_px=540, fov_deg=40)
@@ -111,8 +117,36 @@ def test_there_is_no_seam(context: Any, whole: Predictor) -> None:
         error = np.concatenate(errors)
         worst.append(error.max())
         mean.append(np.sqrt((error**2).mean()))
+    assert part.active_fraction < 0.25
     assert worst[1] < 1.1 * worst[0]
-    assert mean[1] < 1.7 * mean[0]
+    assert mean[1] < 1.2 * mean[0]
+    assert quality[1] > quality[0] - 0.1
+
+
+@pytest.mark.parametrize("turn", [[0.0, 0.0, 0.0], [0.0, 0.0, 0.02]], ids=["level", "tilted head"])
+@pytest.mark.parametrize("at", [(-0.06, 0.02), (0.19, -0.06)], ids=["inside", "at the panel's edge"])
+def test_a_window_costs_nothing_wherever_the_object_is(
+    context: Any, at: tuple[float, float], turn: list[float]
+) -> None:
+    thing = replace(scene("sparse").things[0], centre_m=(-0.02, *at))
+    source = ProceduralSource(Scene("other", (thing,)), stack=STACK, context=context, background=(0.3, 0.5, 0.4))
+    eyes = EYES + np.array([turn, np.zeros(3)])
+    entire = load_predictor("balanced", STACK, SETTINGS.model)
+    part = focused(entire, SETTINGS.model)
+    assert part is not None
+    with_window = psnr(draw(source, part, eyes, time_ns=0), source, eyes)
+    assert part.active_fraction < 0.5
+    assert with_window > psnr(draw(source, entire, eyes, time_ns=0), source, eyes) - 0.1
+
+
+def test_still_pictures_are_warped_as_the_model_asks() -> None:
+    settings = SETTINGS.model.model_copy(update={"name": "best"})
+    entire = load_predictor("best", STACK, settings)
+    part = focused(entire, settings)
+    assert part is not None
+    assert part.interpolation == entire.interpolation == "cubic"
+    assert part.emphasis == entire.emphasis
+    assert part.windows(EYES) == entire.windows(EYES)
 
 
 def test_one_eye_alone_costs_no_inference(context: Any, whole: Predictor) -> None:

@@ -1,0 +1,81 @@
+"""How a part of larger panels ends: what drives the outer panels fades out towards edges that aren't the panels' own.
+
+The wave along the line of the eyes reaches far beyond the difference that it makes. Cut off, it leaves its whole
+height as an error in the last parallax. Faded out over n parallaxes it leaves an nth of that in each: an nth of
+the energy altogether.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from runtime.model.level import I16, Level
+from runtime.model.visible import Box
+from runtime.records import F32, F64
+
+CORRECTED_SHARE = 1 / 6  # of the fade, in which corrections fade too: they mend the error of the wave's own
+
+
+@dataclass(frozen=True, slots=True)
+class Fade:
+    """In pixels of the part's centre panel."""
+
+    kept: Box  # beside which the outer panels stay even
+    over_px: tuple[float, float]  # right and down: how far the fade reaches inwards
+    left: bool = True  # the sides that fade: where the part ends within the panels
+    top: bool = True
+    right: bool = True
+    bottom: bool = True
+
+    def wave_weights(self, centre_from_raster: F64, *, rows: int, columns: int) -> F32:
+        """(rows or 1, columns, 1): 0 beside what is kept to 1 inside, on a raster; 3x3, affine."""
+        m = centre_from_raster
+        u = m[0, 0] * (np.arange(columns) + 0.5) + m[0, 2]
+        v = m[1, 1] * (np.arange(rows) + 0.5)[:, None] + m[1, 2]
+        if m[0, 1] or m[1, 0]:
+            u = u + m[0, 1] * (np.arange(rows) + 0.5)[:, None]
+            v = v + m[1, 0] * (np.arange(columns) + 0.5)
+        weights = np.ones((1, columns))
+        for inside, over_px in (*self._across(u, self.over_px[0]), *self._down(v, self.over_px[1])):
+            weights = weights * np.clip(inside / over_px, 0.0, 1.0)
+        return np.asarray(weights, np.float32)[..., None]
+
+    def soften(self, level: Level, centre_from_raster: F64) -> None:
+        """Take back, towards the edges, what the eyes lack: no correction must drive the panels beyond them."""
+        m = centre_from_raster
+        height, width = level.residual[0].shape[:2]
+        u = m[0, 0] * (np.arange(width) + 0.5) + m[0, 2]
+        v = m[1, 1] * (np.arange(height) + 0.5) + m[1, 2]
+        along, down = (over_px * CORRECTED_SHARE for over_px in self.over_px)
+        for image in level.residual:
+            for inside, over_px in self._across(u, along):
+                columns, weights = _ramp(inside, over_px)
+                _scale(image[:, columns], weights[None])
+            for inside, over_px in self._down(v, down):
+                rows, weights = _ramp(inside, over_px)
+                _scale(image[rows], weights[:, None])
+
+    def _across(self, u: F64, over_px: float) -> list[tuple[F64, float]]:
+        """How far inside the left and right edge columns are, and over how much the edge fades."""
+        sides = ((self.left, u - self.kept.u0), (self.right, self.kept.u1 - u))
+        return [(inside, over_px) for fades, inside in sides if fades and over_px > 0]
+
+    def _down(self, v: F64, over_px: float) -> list[tuple[F64, float]]:
+        """The same of rows."""
+        sides = ((self.top, v - self.kept.v0), (self.bottom, self.kept.v1 - v))
+        return [(inside, over_px) for fades, inside in sides if fades and over_px > 0]
+
+
+def _ramp(inside: F64, over_px: float) -> tuple[slice, F32]:
+    """The rows or columns that an edge weakens, and their weights."""
+    weights = np.clip(inside / over_px, 0.0, 1.0)
+    (faded,) = np.nonzero(weights < 1.0)
+    part = slice(int(faded[0]), int(faded[-1]) + 1) if faded.size else slice(0, 0)
+    return part, np.asarray(weights[part], np.float32)
+
+
+def _scale(image: I16, weights: F32) -> None:
+    """In place. weights: (1, columns) or (rows, 1)."""
+    np.multiply(image, weights if image.ndim == 2 else weights[..., None], out=image, casting="unsafe")
