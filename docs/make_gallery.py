@@ -77,7 +77,7 @@ def page(made: dict[str, str]) -> str:
 
 
 def run_commands(chosen: list[Picture], work: Path, *, keep: bool) -> None:
-    """Run what the pictures need, each command once. Raises CalledProcessError."""
+    """Run what the pictures need, each command once. Raises SystemExit where one cannot do it."""
     commands = dict.fromkeys(command for picture in chosen for command in picture.commands)
     for command in commands:
         words = shlex.split(command)
@@ -88,7 +88,10 @@ def run_commands(chosen: list[Picture], work: Path, *, keep: bool) -> None:
             shutil.rmtree(target)
         target.unlink(missing_ok=True)
         print(f"phasestack {command}", flush=True)
-        subprocess.run([sys.executable, "-m", "runtime.cli", *words], cwd=work, check=True, stdout=subprocess.DEVNULL)
+        done = subprocess.run([sys.executable, "-m", "runtime.cli", *words], cwd=work, stdout=subprocess.DEVNULL)
+        # 1: what the command checks has failed; its picture is there and shows it.
+        if done.returncode not in (0, 1):
+            raise SystemExit(f"phasestack {command}: exit {done.returncode}")
 
 
 def put_together(picture: Picture, work: Path) -> bytes:
