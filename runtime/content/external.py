@@ -53,6 +53,7 @@ class ExternalSource(ContentSource):
         self._pictures: list[WarpedPicture] = []
         self._projections: tuple[F64, F64] | None = None
         self._fresh_ns: int | None = None
+        self._looked_ns: int | None = None  # when the memory was last looked at
         self._left_view: View | None = None
         self.rejected = 0  # pictures that were torn, or nobody had asked for
         self.status = "waiting for a client"
@@ -68,7 +69,7 @@ class ExternalSource(ContentSource):
         return -(-whole // mmap.PAGESIZE) * mmap.PAGESIZE
 
     def revision(self, *, time_ns: int) -> int:
-        """Changes with each picture that arrives, and when the source goes flat."""
+        """Changes with each picture that arrives, and when the source goes flat. Looks for a new one."""
         self._serve()
         self._take(time_ns)
         return self._arrived * 2 + int(self._is_flat(time_ns))
@@ -80,7 +81,9 @@ class ExternalSource(ContentSource):
             self._left_view = view
         elif self._left_view is not None:
             self._ask(self._left_view, view, time_ns)
-        self._take(time_ns)
+        # Every picture of one frame comes of one handover: eyes that saw two would see depth that isn't there.
+        if time_ns != self._looked_ns:
+            self._take(time_ns)
         if self._projections is None:
             raise ContentFailure(f"external: {self.status}")
         side = 0 if self._is_flat(time_ns) else view.side
@@ -180,6 +183,7 @@ class ExternalSource(ContentSource):
 
     def _take(self, time_ns: int) -> None:
         """Copy the newest whole picture, if there is one that was asked for."""
+        self._looked_ns = time_ns
         if self._memory.closed:
             return
         slots = [self._numbers(slot) for slot in range(SLOTS)]

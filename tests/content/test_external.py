@@ -53,7 +53,8 @@ def client_of(source: ExternalSource, tmp_path: Path) -> ExternalClient:
 
 
 def turn(source: ExternalSource, small: PanelStack, time_ns: int = 0) -> list[np.ndarray]:
-    """One turn of the loop: both eyes."""
+    """One turn of the loop: what is new, then both eyes."""
+    source.revision(time_ns=time_ns)
     return [source.render(panel_view(EYES[side], small.panel(1), side=side), time_ns=time_ns).copy() for side in (0, 1)]
 
 
@@ -172,6 +173,79 @@ def test_noise_on_the_socket_and_in_the_memory_harms_nothing(
             left, right = turn(source, small)
             assert (left[..., 0] == 50).all()
             assert (right[..., 0] == 200).all()
+
+
+WRITER = """
+import sys
+import numpy as np
+from runtime.content.external_client import ExternalClient
+
+with ExternalClient(sys.argv[1]) as display:
+    pictures = [np.full((display.height_px, display.width_px, 4), grey, np.uint8) for grey in range(256)]
+    request = display.wait()
+    display._socket.setblocking(False)
+    count = 0
+    while True:
+        try:
+            request = display.wait()
+            if request is None:
+                break
+        except BlockingIOError:
+            pass
+        count += 1
+        display.send(request, pictures[count % 256], pictures[count % 256])
+"""
+
+
+def test_a_writer_that_never_stops_and_is_killed_again_and_again_leaves_no_torn_picture(tmp_path: Path) -> None:
+    """It overwrites its slots as fast as it can; each picture is of one grey, the same for both eyes."""
+    display = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 640, 360)
+    address = str(tmp_path / "content.sock")
+    source = ExternalSource(ContentSettings(scene="external", external=address), stack=display)
+    frames, levels = 0, set()
+    try:
+        for _ in range(3):
+            writer = subprocess.Popen([sys.executable, "-c", WRITER, address], cwd=ROOT)
+            arrived, deadline = source._arrived, time.monotonic() + 20
+            try:
+                while source._arrived < arrived + 15 and time.monotonic() < deadline:
+                    now = time.monotonic_ns()
+                    source.revision(time_ns=now)
+                    pictures = []
+                    for side, eye in enumerate(EYES):
+                        try:
+                            pictures.append(source.render(panel_view(eye, display.panel(1), side=side), time_ns=now))
+                        except ContentFailure:
+                            time.sleep(0.01)
+                    if len(pictures) == 2:
+                        frames += 1
+                        assert (pictures[0] == pictures[0][0, 0]).all()
+                        assert (pictures[1] == pictures[0][0, 0]).all()
+                        levels.add(int(pictures[0][0, 0, 0]))
+            finally:
+                writer.kill()
+                writer.wait()
+            assert source._arrived >= arrived + 15
+    finally:
+        source.close()
+    assert frames > 30
+    assert len(levels) > 10
+
+
+def test_a_picture_that_arrives_between_the_eyes_waits_for_the_next_frame(
+    source: ExternalSource, small: PanelStack, tmp_path: Path
+) -> None:
+    with client_of(source, tmp_path) as client:
+        request = ask(source, small, client)
+        client.send(request, solid(50), solid(60))
+        turn(source, small, 1)
+        source.revision(time_ns=2)
+        left = source.render(panel_view(EYES[0], small.panel(1), side=0), time_ns=2).copy()
+        client.send(request, solid(150), solid(160))
+        right = source.render(panel_view(EYES[1], small.panel(1), side=1), time_ns=2).copy()
+        assert (left[0, 0, 0], right[0, 0, 0]) == (50, 60)
+        left, right = turn(source, small, 3)
+        assert (left[0, 0, 0], right[0, 0, 0]) == (150, 160)
 
 
 def test_the_memory_can_t_be_shrunk_under_the_daemon(source: ExternalSource) -> None:
