@@ -38,6 +38,8 @@ def test_shipped_models_keep_their_contract_and_are_small(name: str) -> None:
         ({"surprise": 1}, "surprise"),
         ({"panels": "three"}, "panels"),
         ({"value_range": [0, "x"]}, "value_range"),
+        ({"steps": [{"kind": "front"}]}, "must begin with a chain step"),
+        ({"steps": [{"kind": "chain"}, {"kind": "rear", "reduction": 2}]}, "reduction must not grow"),
     ],
 )
 def test_a_contract_that_does_not_fit_is_refused_by_field(change: dict[str, object], field: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -79,20 +80,20 @@ def test_poses_stay_within_the_design_range() -> None:
 def test_the_copy_sees_what_the_runtime_sees(name: str) -> None:
     recipe = read_recipe(name)
     copy = UnrolledSolver(solver_of(recipe, source=name), recipe)
-    pair = first_pairs(1)[0]
-    eyes = EYES.copy()
-    white = np.random.default_rng(2).integers(40, 200, (27, 48, 3)).astype(np.uint8)
-    left = white.repeat(10, axis=0).repeat(10, axis=1)
-    pair = TrainingPair(STACK, eyes, (left, np.roll(left, 2, axis=1)), 1.0)
-    predictor = load_predictor(name, STACK, ModelSettings(tolerance_mm=1.0))
-    alpha = np.full((270, 480, 1), 255, np.uint8)
-    layers = predictor.predict([[np.concatenate([p, alpha], axis=2)] for p in pair.images], eyes).layers[..., :3]
-    shown = torch.from_numpy(layers.copy()).permute(0, 3, 1, 2).float() / 255
-    with torch.no_grad():
-        ours, theirs = (
-            -10 * np.log10(float(displayed_mse(x, pair)[0])) for x in (copy(pair.images, eyes, STACK, 1.0), shown)
-        )
-    assert ours == pytest.approx(theirs, abs=1.0)
+    apart = []
+    for pair in first_pairs(5, seed=1):
+        predictor = load_predictor(name, pair.stack, ModelSettings(tolerance_mm=pair.tolerance_mm, threads=1))
+        rgba = [[cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA)] for picture in pair.images]
+        layers = predictor.predict(rgba, pair.eyes_m).layers[..., :3]
+        predictor.close()
+        shown = torch.from_numpy(layers.copy()).permute(0, 3, 1, 2).float() / 255
+        with torch.no_grad():
+            copied = copy(pair.images, pair.eyes_m, pair.stack, pair.tolerance_mm)
+            ours, theirs = (-10 * np.log10(float(displayed_mse(x, pair)[0])) for x in (copied, shown))
+        apart.append(abs(ours - theirs))
+    # OpenCV samples tilted heads' rasters to 1/32 pixel, the copy exactly: 1.3 dB of 29 for one of these pairs.
+    assert np.median(apart) < 0.3
+    assert max(apart) < 1.5
 
 
 def test_what_is_learned_gets_gradients_and_steps_down_the_loss() -> None:
