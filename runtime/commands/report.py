@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -80,7 +81,6 @@ def _variants(width_px: int, height_px: int) -> list[Method]:
     from model_export import yardstick
     from runtime.report.cache import digest, user_cache
     from runtime.report.methods import SHIPPED, Method
-    from runtime.report.worker import apart
 
     code = Path(model_export.__file__).parent
     versions = [importlib.metadata.version(name) for name in ("torch", "onnx", "onnxruntime")]
@@ -90,12 +90,25 @@ def _variants(width_px: int, height_px: int) -> list[Method]:
     found = []
     for name, precision in yardstick.PUBLISHED:
         path = large / f"eyereal-{precision}-{width_px}x{height_px}.onnx"
-        if not path.is_file():
-            apart(yardstick.write_eyereal, path, precision=precision, width_px=width_px, height_px=height_px)
-        found.append(Method(name, "network", str(path), trained=False))
+        size = {"width_px": width_px, "height_px": height_px}
+        if _made(name, path, yardstick.write_eyereal, precision=precision, **size):
+            found.append(Method(name, "network", str(path), trained=False))
     for name in SHIPPED:
         path = small / f"{name}-fp16.onnx"
-        if not path.is_file():
-            apart(yardstick.write_half, path, name=name)
-        found.append(Method(f"{name} fp16", "network", str(path)))
+        if _made(f"{name} fp16", path, yardstick.write_half, name=name):
+            found.append(Method(f"{name} fp16", "network", str(path)))
     return found
+
+
+def _made(what: str, path: Path, make: Callable[..., None], **options: Any) -> bool:
+    """False, told on stderr, where it can't be made (too little memory, say): the rest of the report is worth making."""
+    from runtime.errors import FatalError
+    from runtime.report.worker import apart
+
+    try:
+        if not path.is_file():
+            apart(make, path, **options)
+    except FatalError as error:
+        typer.echo(f"phasestack: {what} is left out: {error}", err=True)
+        return False
+    return True

@@ -57,9 +57,13 @@ def whole_report(
     if quick:
         stack = replace(stack, width_px=960, height_px=540)
 
+    # Everything that can fail at the start is done at the start.
+    progress("models to compare with")
+    sizes = {(one.width_px, one.height_px) for one in (stack, *(pair.stack for pair in cases))}
+    further = {size: variants(*size) for size in sorted(sizes)}
+
     def methods(pair: StillPair) -> list[Method]:
-        progress("models to compare with")
-        own = variants(pair.stack.width_px, pair.stack.height_px)
+        own = further[pair.stack.width_px, pair.stack.height_px]
         return shipped_and_references(models=models, variants=own, quick=quick)
 
     record: dict[str, Any] = {"machine": describe(seed=0), "command": command}

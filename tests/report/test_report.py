@@ -10,7 +10,7 @@ import typer
 from typer.testing import CliRunner
 
 from runtime.commands.report import _variants, report
-from runtime.errors import InputError
+from runtime.errors import FatalError, InputError
 from runtime.optics.stack import PanelStack
 from runtime.report.frontier import measure, pareto
 from runtime.report.methods import Method
@@ -44,6 +44,23 @@ def test_mistakes_are_told_before_anything_is_measured_and_nothing_is_written(tm
 def test_without_torch_nothing_is_made_to_compare_with(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert _variants(64, 64) == []
+
+
+def test_what_cannot_be_made_to_compare_with_is_left_out_and_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("torch")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+    def apart(make: object, path: Path, **_: object) -> None:
+        if "eyereal" in path.name:
+            raise FatalError("the measuring process ended with -9")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"made")
+
+    monkeypatch.setattr("runtime.report.worker.apart", apart)
+    assert [m.name for m in _variants(64, 64)] == ["fast fp16", "balanced fp16", "best fp16"]
+    assert "eyereal int8 is left out: the measuring process ended with -9" in capsys.readouterr().err
 
 
 @pytest.mark.slow
