@@ -42,7 +42,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--socket", default="/run/phasestack/content.sock")
     arguments = parser.parse_args()
-    with ExternalClient(arguments.socket) as display:
+    try:
+        display = ExternalClient(arguments.socket)
+    except (OSError, ValueError) as error:
+        raise SystemExit(f"{arguments.socket}: {error}") from None
+    with display:
         while (request := display.wait()) is not None:
             angle = request.time_ns * 1e-9
             size = (display.width_px, display.height_px)

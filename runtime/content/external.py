@@ -54,7 +54,9 @@ class ExternalSource(ContentSource):
         self._projections: tuple[F64, F64] | None = None
         self._fresh_ns: int | None = None
         self._looked_ns: int | None = None  # when the memory was last looked at
-        self._left_view: View | None = None
+        self._left_view: View | None = None  # drawn last, and no right one since
+        self._wanted: tuple[View, View] | None = None  # which pictures the client is to draw
+        self._asked_this_frame = False
         self.rejected = 0  # pictures that were torn, or nobody had asked for
         self.status = "waiting for a client"
         self.info = ContentInfo(name="external", moving=True, background=settings.background)
@@ -69,18 +71,29 @@ class ExternalSource(ContentSource):
         return -(-whole // mmap.PAGESIZE) * mmap.PAGESIZE
 
     def revision(self, *, time_ns: int) -> int:
-        """Changes with each picture that arrives, and when the source goes flat. Looks for a new one."""
+        """Changes with each picture that arrives, and when the source goes flat. Looks for a new one.
+
+        Called once a frame, drawn or not: a client hears of every frame, or it would wait for us and we for it.
+        """
         self._serve()
         self._take(time_ns)
+        if not self._asked_this_frame and self._wanted is not None:
+            self._ask(*self._wanted, time_ns)
+        self._asked_this_frame = False
         return self._arrived * 2 + int(self._is_flat(time_ns))
 
     def render(self, view: View, *, time_ns: int) -> U8:
         """The newest whole picture for this eye. Raises ContentFailure until there has been one."""
         self._serve()
         if view.side == 0:
+            # The left one before had no right one after it: a flat picture, or a frame that failed half way.
+            if self._left_view is not None:
+                self._wanted = (view, view)
             self._left_view = view
         elif self._left_view is not None:
-            self._ask(self._left_view, view, time_ns)
+            self._wanted, self._left_view = (self._left_view, view), None
+        if self._left_view is None and self._wanted is not None:
+            self._ask(*self._wanted, time_ns)
         # Every picture of one frame comes of one handover: eyes that saw two would see depth that isn't there.
         if time_ns != self._looked_ns:
             self._take(time_ns)
@@ -175,6 +188,7 @@ class ExternalSource(ContentSource):
         }
         if not _send(self._client, json.dumps(line).encode() + b"\n"):
             self._drop("the client is gone")
+        self._asked_this_frame = True
 
     def _whole(self, view: View) -> F64:
         """The view's projection, scaled to the pictures' fixed size."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import socket
@@ -59,12 +60,10 @@ def turn(source: ExternalSource, small: PanelStack, time_ns: int = 0) -> list[np
 
 
 def ask(source: ExternalSource, small: PanelStack, client: ExternalClient, time_ns: int = 0) -> Request:
-    try:
-        turn(source, small, time_ns)
-    except ContentFailure:
-        # Nothing to show yet; the left eye's view was noted, the right one makes the request.
-        with pytest.raises(ContentFailure):
-            source.render(panel_view(EYES[1], small.panel(1), side=1), time_ns=time_ns)
+    """The loop turns as the daemon's does, which gives a frame up at the first eye that fails, until it asks."""
+    for _ in range(4):
+        with contextlib.suppress(ContentFailure):
+            turn(source, small, time_ns)
     request = client.wait()
     assert request is not None
     return request
@@ -79,7 +78,12 @@ def test_pictures_arrive_for_the_eyes_that_were_asked_for(
 ) -> None:
     with client_of(source, tmp_path) as client:
         assert (client.width_px, client.height_px) == (64, 36)
-        request = ask(source, small, client)
+        first = ask(source, small, client)
+        assert first.eyes_m == pytest.approx(np.array([EYES[0], EYES[0]]))  # nothing to show yet: a flat one
+        client.send(first, solid(10), solid(20))
+        turn(source, small, 1)
+        request = client.wait()
+        assert request is not None
         assert request.eyes_m == pytest.approx(np.array(EYES))
         assert request.pixels_from_stack[1] == pytest.approx(panel_view(EYES[1], small.panel(1)).pixels_from_stack)
         before = source.revision(time_ns=0)
@@ -232,6 +236,32 @@ def test_a_writer_that_never_stops_and_is_killed_again_and_again_leaves_no_torn_
     assert len(levels) > 10
 
 
+def test_a_picture_that_is_overwritten_while_it_is_copied_is_dropped(
+    source: ExternalSource, small: PanelStack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with client_of(source, tmp_path) as client:
+        request = ask(source, small, client)
+        client.send(request, solid(50), solid(60))
+        turn(source, small, 1)
+        client.send(request, solid(90), solid(91))
+        looks: list[int] = []
+        numbers = source._numbers
+
+        def overtaken(slot: int) -> tuple[int, int, int]:
+            looks.append(slot)
+            if len(looks) == 3:  # both slots were looked at, one was copied, now comes the second look
+                client.send(request, solid(100), solid(101))
+                client.send(request, solid(110), solid(111))
+            return numbers(slot)
+
+        monkeypatch.setattr(source, "_numbers", overtaken)
+        left, right = turn(source, small, 2)
+        assert (left[0, 0, 0], right[0, 0, 0]) == (50, 60)
+        assert source.rejected == 1
+        left, right = turn(source, small, 3)
+        assert (left[0, 0, 0], right[0, 0, 0]) == (110, 111)
+
+
 def test_a_picture_that_arrives_between_the_eyes_waits_for_the_next_frame(
     source: ExternalSource, small: PanelStack, tmp_path: Path
 ) -> None:
@@ -246,6 +276,37 @@ def test_a_picture_that_arrives_between_the_eyes_waits_for_the_next_frame(
         assert (left[0, 0, 0], right[0, 0, 0]) == (50, 60)
         left, right = turn(source, small, 3)
         assert (left[0, 0, 0], right[0, 0, 0]) == (150, 160)
+
+
+def test_a_client_hears_of_every_frame_even_where_nothing_is_drawn(
+    source: ExternalSource, small: PanelStack, tmp_path: Path
+) -> None:
+    """A still viewer's frames are not drawn anew: a client that comes then must not wait for ever."""
+    with client_of(source, tmp_path) as client:
+        client.send(ask(source, small, client), solid(50), solid(60))
+        turn(source, small, 1)
+        client.wait()
+    for time_ns in (2, 3):
+        source.revision(time_ns=time_ns)
+    with client_of(source, tmp_path) as client:
+        for time_ns in (4, 5):
+            source.revision(time_ns=time_ns)
+        request = client.wait()
+        assert request is not None
+        assert request.eyes_m == pytest.approx(np.array(EYES))
+
+
+def test_a_client_that_comes_while_only_the_flat_picture_is_drawn_is_asked_for_it(
+    source: ExternalSource, small: PanelStack, tmp_path: Path
+) -> None:
+    with client_of(source, tmp_path) as client:
+        for time_ns in range(3):
+            source.revision(time_ns=time_ns)
+            with pytest.raises(ContentFailure):
+                source.render(panel_view((0.6, 0.0, 0.0), small.panel(1)), time_ns=time_ns)
+        request = client.wait()
+        assert request is not None
+        assert request.eyes_m == pytest.approx(np.array([(0.6, 0.0, 0.0)] * 2))
 
 
 def test_the_memory_can_t_be_shrunk_under_the_daemon(source: ExternalSource) -> None:
@@ -289,11 +350,8 @@ def test_the_example_draws_for_a_running_daemon(source: ExternalSource, small: P
     pictures: list[np.ndarray] = []
     deadline = time.monotonic() + 20
     while len(pictures) < 30 and time.monotonic() < deadline and process.poll() is None:
-        try:
-            pictures.append(turn(source, small)[1])
-        except ContentFailure:
-            with pytest.raises(ContentFailure):
-                source.render(panel_view(EYES[1], small.panel(1), side=1), time_ns=0)
+        with contextlib.suppress(ContentFailure):
+            pictures.append(turn(source, small, time.monotonic_ns())[1])
         time.sleep(0.005)
     process.kill()
     process.wait()
