@@ -1,4 +1,4 @@
-"""The splat equations again, slowly and exactly: float64, one splat at a time, every pixel. Shares no code."""
+"""The splat equations again, slowly and exactly: float64, one splat at a time. Shares no code."""
 
 from __future__ import annotations
 
@@ -58,13 +58,20 @@ def render(
         flat = jacobian @ covariance @ jacobian.T + 0.3 * np.eye(2)
         direction = rotation.T @ ((place - eye) / np.linalg.norm(place - eye))
         colour = np.maximum(0.5 + harmonics(direction, len(coefficient)) @ coefficient, 0)
-        items.append((w, np.array([u, v]) / w, np.linalg.inv(flat), opacity, colour))
+        items.append((w, np.array([u, v]) / w, flat, opacity, colour))
     picture, transmittance = np.zeros((height, width, 3)), np.ones((height, width))
-    for _, centre, inverse, opacity, colour in sorted(items, key=lambda item: item[0]):
-        dx, dy = columns - centre[0], rows - centre[1]
+    for _, centre, flat, opacity, colour in sorted(items, key=lambda item: item[0]):
+        if opacity < 1 / 255:
+            continue
+        # Beyond this box the splat's alpha is below 1/255 everywhere: skipping it changes no pixel.
+        half = np.sqrt(2 * np.log(255 * opacity) * np.diag(flat)) + 1
+        low, high = np.clip([centre - half, centre + half + 1], 0, [width, height]).astype(int)
+        area = np.s_[low[1] : high[1], low[0] : high[0]]
+        dx, dy = columns[area] - centre[0], rows[area] - centre[1]
+        inverse = np.linalg.inv(flat)
         power = -0.5 * (inverse[0, 0] * dx**2 + 2 * inverse[0, 1] * dx * dy + inverse[1, 1] * dy**2)
         alpha = np.minimum(0.99, opacity * np.exp(power))
         alpha[alpha < 1 / 255] = 0
-        picture += (transmittance * alpha)[..., None] * colour
-        transmittance *= 1 - alpha
+        picture[area] += (transmittance[area] * alpha)[..., None] * colour
+        transmittance[area] *= 1 - alpha
     return picture + transmittance[..., None] * np.array(background)
