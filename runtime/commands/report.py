@@ -101,7 +101,7 @@ def _variants(width_px: int, height_px: int) -> list[Method]:
 
 
 def _made(what: str, path: Path, make: Callable[..., None], **options: Any) -> bool:
-    """False, told on stderr, where it can't be made (too little memory, say): the rest of the report is worth making."""
+    """False, told on stderr, where it cannot be made (too little memory, say): the report goes on without it."""
     from runtime.errors import FatalError
     from runtime.report.worker import apart
 
