@@ -52,7 +52,6 @@ class FocusedPredictor(Predictor):
         self._background: tuple[int, ...] | None = None  # that fills the centre panel beside the aimed window
         self.window: Window | None = None  # of the last frame
         self.active_fraction = 1.0  # of the panel's pixels that went through the model
-        self.channels = 3  # that it solved
 
     def aim(self, content: ContentSource, eyes_m: F64, *, time_ns: int) -> None:
         """Ask the content where it lies, so that only that is drawn and solved."""
@@ -125,10 +124,7 @@ class FocusedPredictor(Predictor):
             if found is not None and self.window is not None and still_fits(self.window, found):
                 found = self.window
             if found is None:
-                self._fill_with(left, but=None)
-                self.window, self.active_fraction = None, 0.0
-                filled_ms = (perf_counter_ns() - begin_ns) / 1e6
-                return Prediction(self._layers, {"prepare": filled_ms, "inference": 0.0, "finish": 0.0})
+                return self._filled(left, begin_ns)
             window = found
             area = window.box
             cut = [[np.ascontiguousarray(image[area.v0 : area.v1, area.u0 : area.u1])] for image in (left, right)]
@@ -154,6 +150,13 @@ class FocusedPredictor(Predictor):
         for part in (self.whole, *self._parts.values()):
             part.close()
         self._parts = {}
+
+    def _filled(self, picture: U8, begin_ns: int) -> Prediction:
+        """Layers of which the centre panel alone carries the picture, for both eyes."""
+        self._fill_with(picture, but=None)
+        self.window, self.active_fraction, self.channels = None, 0.0, 3
+        filled_ms = (perf_counter_ns() - begin_ns) / 1e6
+        return Prediction(self._layers, {"prepare": filled_ms, "inference": 0.0, "finish": 0.0})
 
     def _fill_with(self, picture: U8, *, but: PixelBox | None) -> None:
         """The picture on the centre panel, as both eyes see it where they agree."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from time import perf_counter_ns
 
@@ -10,13 +10,12 @@ import numpy as np
 
 from runtime.content.base import ContentSource, View
 from runtime.content.plan import Measured, Saving
-from runtime.focus import FocusedPredictor
 from runtime.model.predictor import Predictor
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, raster_from_stack
-from runtime.planner import focused_part
+from runtime.planner import focused_part, observed
 from runtime.records import F32, F64, U8
 
 REPEATS = 5
@@ -27,8 +26,13 @@ class Trial:
     """One way of making the layers."""
 
     layers: U8
-    frame_ms: float  # render and predict, median
+    times_ms: tuple[float, ...]  # render and predict, frame by frame
     psnr_db: float
+
+    @property
+    def frame_ms(self) -> float:
+        """Of the median frame."""
+        return float(np.median(self.times_ms))
 
 
 def draw(content: ContentSource, predictor: Predictor, eyes_m: F64, *, time_ns: int, aim: bool = True) -> U8:
@@ -62,51 +66,81 @@ def displayed_psnr(
     return quality(seen, wanted, masks).psnr_db
 
 
-def trial(
+def trials(
     content: ContentSource,
-    predictor: Predictor,
+    ways: Mapping[str, Predictor],
     eyes_m: F64,
     stack: PanelStack,
     *,
     fov_deg: float,
-    time_ns: int = 0,
+    step_ns: int = 0,
     repeats: int = REPEATS,
+) -> dict[str, Trial]:
+    """Time and displayed quality of several predictors on one scene, in turn: what slows one slows all.
+
+    The first frame of each is not timed. step_ns: between one repeat and the next, for content that moves.
+    """
+    times: dict[str, list[float]] = {name: [] for name in ways}
+    layers: dict[str, U8] = {}
+    for repeat in range(repeats + 1):
+        for name, predictor in ways.items():
+            begin_ns = perf_counter_ns()
+            drawn = draw(content, predictor, eyes_m, time_ns=repeat * step_ns)
+            if repeat:
+                times[name].append((perf_counter_ns() - begin_ns) / 1e6)
+            if repeat == repeats:
+                layers[name] = drawn.copy()
+    last_ns = repeats * step_ns
+    return {
+        name: Trial(
+            layers[name],
+            tuple(times[name]),
+            displayed_psnr(layers[name], content, eyes_m, stack, fov_deg=fov_deg, time_ns=last_ns),
+        )
+        for name in ways
+    }
+
+
+def trial(
+    content: ContentSource, predictor: Predictor, eyes_m: F64, stack: PanelStack, *, fov_deg: float, repeats: int
 ) -> Trial:
-    """Time and displayed quality of one predictor on one scene; the first frame is not timed."""
-    draw(content, predictor, eyes_m, time_ns=time_ns)
-    times = []
-    for _ in range(repeats):
-        begin_ns = perf_counter_ns()
-        layers = draw(content, predictor, eyes_m, time_ns=time_ns)
-        times.append((perf_counter_ns() - begin_ns) / 1e6)
-    kept = layers.copy()
-    psnr_db = displayed_psnr(kept, content, eyes_m, stack, fov_deg=fov_deg, time_ns=time_ns)
-    return Trial(kept, float(np.median(times)), psnr_db)
+    """Time and displayed quality of one predictor on one scene."""
+    return trials(content, {"": predictor}, eyes_m, stack, fov_deg=fov_deg, repeats=repeats)[""]
 
 
 def measure(
     content: ContentSource,
-    whole: Predictor,
-    focused: FocusedPredictor | None,
+    plain: Predictor,
+    planned: Predictor,
     eyes_m: F64,
     stack: PanelStack,
     *,
     fov_deg: float,
     band_m: float,
+    step_ns: int = 0,
     repeats: int = REPEATS,
-    progress: Callable[[str], None] = lambda _: None,
-) -> Measured:
-    """Each saving with and without, for eyes (2, 3). band_m: the widest dead band."""
-    progress("the whole panel")
-    plain = trial(content, whole, eyes_m, stack, fov_deg=fov_deg, repeats=repeats)
-    best, fraction, focus = plain, 1.0, Saving()
-    if focused is not None:
-        progress("the active window")
-        best = trial(content, focused, eyes_m, stack, fov_deg=fov_deg, repeats=repeats)
-        fraction = focused.active_fraction
-        focus = Saving(plain.frame_ms - best.frame_ms, plain.psnr_db - best.psnr_db)
-    progress("eyes within the dead band")
+) -> tuple[Measured, Trial, Trial]:
+    """Each saving with and without, for eyes (2, 3); and the trials without and with the plan.
+
+    plain: the model without savings; planned: the same with them; band_m: the widest dead band.
+    """
+    draw(content, planned, eyes_m, time_ns=0)
+    part = focused_part(planned)
+    ways: dict[str, Predictor] = {"plain": plain, "planned": planned}
+    if planned.channels == 1 and part is not None:
+        ways["one channel"] = part.whole
+    done = trials(content, ways, eyes_m, stack, fov_deg=fov_deg, step_ns=step_ns, repeats=repeats)
+    without, with_plan = done["plain"], done["planned"]
+    unfocused = done.get("one channel", with_plan if part is None else without)
     moved = eyes_m + np.array([0.0, band_m, 0.0])
-    off_db = displayed_psnr(best.layers, content, moved, stack, fov_deg=fov_deg, time_ns=0)
-    reuse = Saving(best.frame_ms, best.psnr_db - off_db)
-    return Measured(reuse=reuse, focus=focus, active_fraction=fraction)
+    off_db = displayed_psnr(with_plan.layers, content, moved, stack, fov_deg=fov_deg, time_ns=repeats * step_ns)
+    numbers = Measured(
+        reuse=Saving(with_plan.frame_ms, with_plan.psnr_db - off_db),
+        focus=_saving(unfocused, with_plan),
+        one_channel=_saving(without, unfocused),
+    )
+    return observed(numbers, planned), without, with_plan
+
+
+def _saving(without: Trial, with_it: Trial) -> Saving:
+    return Saving(without.frame_ms - with_it.frame_ms, without.psnr_db - with_it.psnr_db)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from runtime.config import Settings
 from runtime.content.base import ContentInfo
@@ -39,6 +39,14 @@ class Planner:
             can_focus=focused_part(predictor) is not None,
             loaded_modules=sys.modules,
         )
+
+
+def observed(measured: Measured, predictor: Predictor) -> Measured:
+    """The same with what the predictor left out of its last frame."""
+    part = focused_part(predictor)
+    if part is None:
+        return replace(measured, channels=predictor.channels)
+    return replace(measured, channels=part.channels, active_fraction=part.active_fraction)
 
 
 def focused_part(predictor: Predictor) -> FocusedPredictor | None:

@@ -73,11 +73,12 @@ def plan_for(
     import cv2
     import numpy as np
 
-    from runtime.content.plan import Measured, make_plan
+    from runtime.content.plan import make_plan
     from runtime.content.registry import open_content
     from runtime.gl import offscreen_context
     from runtime.model.predictor import load_predictor
-    from runtime.plan_measure import measure, trial
+    from runtime.plan_measure import measure
+    from runtime.planner import focused_part
 
     settings = _overridden(load_settings(config), scene=scene, model=model, budget_ms=budget_ms)
     cv2.setNumThreads(settings.model.threads or -1)
@@ -96,24 +97,14 @@ def plan_for(
         cleanup.callback(context.release)
         content = open_content(settings.content, stack, context)
         cleanup.callback(content.close)
-        whole = load_predictor(settings.model.name, stack, settings.model)
-        cleanup.callback(whole.close)
-        on = settings.plan.enabled and settings.plan.focus
-        part = focused(whole, settings.model) if on else None
-        fov_deg = settings.content.fov_deg
-        numbers = measure(
-            content,
-            whole,
-            part,
-            eyes_m,
-            stack,
-            fov_deg=fov_deg,
-            band_m=_band_m(settings),
-            progress=tell,
-        )
+        plain = load_predictor(settings.model.name, stack, settings.model)
+        cleanup.callback(plain.close)
+        predictor = planned_predictor(settings, stack)
+        cleanup.callback(predictor.close)
         tell("with and without the plan")
-        without = trial(content, whole, eyes_m, stack, fov_deg=fov_deg)
-        with_plan = trial(content, part, eyes_m, stack, fov_deg=fov_deg) if part else without
+        numbers, without, with_plan = measure(
+            content, plain, predictor, eyes_m, stack, fov_deg=settings.content.fov_deg, band_m=_band_m(settings)
+        )
         levels: list[Level] = []
         if settings.model.budget_ms > 0:
             levels, numbers, with_plan = _budget(settings, stack, content, eyes_m, numbers, with_plan, tell)
@@ -122,17 +113,18 @@ def plan_for(
             stack,
             settings,
             eyes_m=eyes_m,
-            measured=numbers or Measured(),
-            can_focus=part is not None,
+            measured=numbers,
+            can_focus=focused_part(predictor) is not None,
             loaded_modules=sys.modules,
         )
         return {
             "scene": content.info.name,
-            "model": whole.name,
+            "model": plain.name,
             "width_px": stack.width_px,
             "height_px": stack.height_px,
             "plan": [asdict(item) for item in planned.items],
             "active_fraction": round(numbers.active_fraction, 4),
+            "channels": numbers.channels,
             "frame_ms": round(with_plan.frame_ms, 2),
             "frame_ms_without": round(without.frame_ms, 2),
             "psnr_db": round(with_plan.psnr_db, 3),

@@ -37,7 +37,9 @@ class Measured:
 
     reuse: Saving = Saving()
     focus: Saving = Saving()
+    one_channel: Saving = Saving()
     one_eye: Saving = Saving()
+    channels: int = 3  # that the network solved
     active_fraction: float = 1.0  # of the panel's pixels that went through the network
     level: str = ""  # model and resolution that the budget chose; empty: no budget
     level_saving: Saving = Saving()
@@ -116,6 +118,9 @@ def make_plan(
         items.append(_item("render and inference", why, numbers.reuse))
     if focus:
         items += _focus_items(info, numbers)
+    if on and chosen.one_channel and numbers.channels == 1:
+        why = "the pictures are grey: one channel is solved for all three"
+        items.append(_item("two of three colour channels", why, numbers.one_channel))
     if seeing != (True, True):
         side = "right" if seeing[0] else "left"
         items.append(_item(f"the {side} eye", f"it is over {chosen.range_deg:g} degrees off the axis", numbers.one_eye))

@@ -32,6 +32,7 @@ class Predictor(ABC):
     provider: str
     parameters: int
     stack: PanelStack
+    channels: int = 3  # that the last pictures were solved in: one, where grey ones may be
 
     @abstractmethod
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:

@@ -53,7 +53,6 @@ class UnrolledPredictor(Predictor):
         self.tolerance_mm = tolerance_mm
         self.one_channel = one_channel
         self.fade: Fade | None = None  # how this stack ends, where it is a part of larger panels
-        self.channels = 3  # that the last pictures were solved in
         self._rows = RowPool(threads, width_px=stack.width_px)
         self._benches: dict[int, Bench] = {}
         self._boxes: tuple[Box, ...] = ()

@@ -100,3 +100,10 @@ def test_an_eye_returns_only_well_within_the_range() -> None:
     assert seeing_eyes(at_angle(79), (True, True), range_deg=80) == (True, True)
     assert seeing_eyes(at_angle(79), (True, False), range_deg=80) == (True, False)
     assert seeing_eyes(at_angle(76), (True, False), range_deg=80) == (True, True)
+
+
+def test_one_channel_is_said_where_it_was_enough(stack: PanelStack) -> None:
+    grey = Measured(channels=1, one_channel=Saving(20.0, 0.0))
+    (item,) = [item for item in planned(stack, measured=grey).items if "channels" in item.what]
+    assert (item.saves_ms, item.costs_db) == (20.0, 0.0)
+    assert "two of three colour channels" not in names(planned(stack, measured=Measured()))

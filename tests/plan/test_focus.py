@@ -21,7 +21,7 @@ from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 from runtime.plan_measure import displayed_psnr, draw
-from runtime.planning import focused
+from runtime.planning import focused, planned_predictor
 from runtime.reduced import ladder_predictor
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 960, 540)
@@ -170,6 +170,21 @@ def test_fewer_pixels_are_enlarged_to_the_panels(context: Any) -> None:
     layers = draw(source, half, EYES, time_ns=0)
     assert layers.shape == (3, 540, 960, 4)
     assert 20 < psnr(layers, source) < psnr(draw(source, full, EYES, time_ns=0), source)
+
+
+def test_grey_windows_are_solved_in_one_channel(context: Any) -> None:
+    source = ProceduralSource(
+        Scene("grey", scene("sparse").things, grey=True), stack=STACK, context=context, background=(0.5, 0.5, 0.5)
+    )
+    planned = planned_predictor(SETTINGS, STACK)
+    never = Settings.model_validate({"plan": {"one_channel": False}})
+    three = planned_predictor(never, STACK)
+    layers = draw(source, planned, EYES, time_ns=0).astype(np.int16)
+    assert planned.channels == 1
+    difference = np.abs(layers - draw(source, three, EYES, time_ns=0))
+    assert three.channels == 3
+    assert difference.max() <= 2
+    assert (difference > 0).mean() < 0.001
 
 
 def test_models_that_can_t_be_cut_are_left_whole() -> None:
