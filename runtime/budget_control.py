@@ -75,6 +75,8 @@ class BudgetControl:
     @property
     def stage_ms(self) -> dict[str, float]:
         """What each stage costs on a simulated clock at the present level."""
+        if self._shown == self._configured:
+            return self._settings.loop.simulated_stage_ms
         return simulated_stage_ms(self._shown, self._settings)
 
     def start(self, tell: Callable[[str], bool] = lambda _: True) -> None:
@@ -170,7 +172,7 @@ class BudgetControl:
         if keeper.frame_took(time_ms):
             log.info("budget: %s instead of %s (%s)", keeper.level.label, before.label, _why(before, keeper))
             self._told_missed = False
-        elif not keeper.held and keeper.lightest and not self._told_missed:
+        elif keeper.held is False and keeper.lightest and not self._told_missed:
             self._told_missed = True
             log.warning("budget: %g ms can't be held: the lightest level takes %.1f ms", self.budget_ms, time_ms)
 

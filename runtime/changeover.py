@@ -67,7 +67,7 @@ class Changeover:
         loop.calibration = self._calibration
         if settings.tracker != self._old.tracker:
             loop.tracker = Tracker(settings.tracker)
-        loop.settings = settings
+        loop.apply(settings)
         loop.pipeline.plan_with(Planner(settings, self._stack))
         if self._source is not None:
             loop.pipeline.show(self._source)
@@ -94,5 +94,6 @@ def ready_predictor(settings: Settings, stack: PanelStack) -> Predictor:
 
 def _model_part(settings: Settings) -> Any:
     """All that decides which predictor there is, but the budget."""
-    focus = settings.plan.enabled and settings.plan.focus
-    return settings.model.model_copy(update={"budget_ms": 0.0}), focus
+    plan = settings.plan
+    savings = plan.enabled and (plan.focus, plan.one_channel)
+    return settings.model.model_copy(update={"budget_ms": 0.0}), savings

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from time import perf_counter
 from typing import Any, Protocol
 
@@ -16,6 +16,7 @@ from runtime.config import Settings
 from runtime.errors import EndOfRecording, PanelLost
 from runtime.eyes.calibration import Calibration
 from runtime.eyes.calibration_drift import SeparationWatch
+from runtime.eyes.rest import RestWatch
 from runtime.eyes.tracker import Tracker
 from runtime.inputs import Input
 from runtime.panels.base import PanelSink
@@ -133,12 +134,19 @@ class Loop:
         self._watch = SeparationWatch(
             known_ipd_m=settings.calibration.ipd_m, tolerance=settings.calibration.ipd_tolerance
         )
+        self._rest = _rest_watch(settings)
+        self._served_m: F64 | None = None  # the eyes that were last found to be servable
         self._presented = False
         self._quality = QualityMeans()
         self._truth: list[tuple[int, F64]] = []  # the two newest samples' true eyes, with their capture times
         self._pending: tuple[int, int, U8] | None = None  # light and draw time of layers to be measured there
         self._serial_checked = False
         self._started_s = perf_counter()
+
+    def apply(self, settings: Settings) -> None:
+        """Other settings hold from now on."""
+        self.settings = settings
+        self._rest = _rest_watch(settings)
 
     def _first_cost_ns(self) -> int:
         stages = self.budget.stage_ms
@@ -171,7 +179,7 @@ class Loop:
         if frame is not None:
             self._track(frame)
         light_ns = start_ns + self._turn_cost_ns + round(self.settings.loop.scanout_ms * NS_PER_MS)
-        eyes = self._servable(self.tracker.at(light_ns))
+        eyes = self._servable(self._rested(self.tracker.at(light_ns)))
         stages.lap("track")
         inference, missing, report = self._show(eyes, stages)
         if self.source.fault():
@@ -203,6 +211,8 @@ class Loop:
             if drift := self._watch.update(points):
                 log.warning("%s", drift)
         self.tracker.update(points, capture_ns=frame.capture_ns)
+        if self._rest is not None and points is not None:
+            self._rest.update(points.eyes_m, capture_ns=frame.capture_ns)
         if frame.true_eyes_m is not None:
             self._truth = [*self._truth[-1:], (frame.capture_ns, frame.true_eyes_m)]
         if not self._serial_checked and self.source.serial:
@@ -212,14 +222,22 @@ class Loop:
 
     def _servable(self, eyes: EyesEstimate) -> EyesEstimate:
         """Eyes that see every panel from the front; others are dropped, counted and logged."""
-        if eyes.eyes_m is None:
+        if eyes.eyes_m is None or eyes.eyes_m is self._served_m:
             return eyes
         front_m = max(self.pipeline.stack.x_m)
         if np.isfinite(eyes.eyes_m).all() and bool((eyes.eyes_m[:, 0] > front_m + 0.01).all()):
+            self._served_m = eyes.eyes_m
             return eyes
         self.fault("eyes")
         log.warning("eyes: at %s, not in front of the panels: dropped", np.round(eyes.eyes_m, 3).tolist())
         return EyesEstimate(eyes.time_ns, eyes.capture_ns, None, "none", eyes.age_ns)
+
+    def _rested(self, eyes: EyesEstimate) -> EyesEstimate:
+        """Where the head rests, as long as it does: the same eyes turn after turn cost nothing, and don't jitter."""
+        place = self._rest.place if self._rest is not None else None
+        if place is None or eyes.eyes_m is None or eyes.label == "held":
+            return eyes
+        return replace(eyes, eyes_m=place)
 
     def _show(self, eyes: EyesEstimate, stages: StageTimes) -> tuple[Any, dict[str, str], PresentReport | None]:
         """Draw the frame and put it on the panels."""
@@ -229,7 +247,8 @@ class Loop:
             self._flatness.value = wanted
         if not self.paused or self.layers is None:
             flatness = self._flatness.toward(wanted, blend_s=self.settings.tracker.blend_s, now_ns=now_ns)
-            drawn = self.pipeline.draw(eyes.eyes_m, flatness=flatness, time_ns=now_ns, stages=stages)
+            resting = self._rest is not None and eyes.eyes_m is not None and eyes.eyes_m is self._rest.place
+            drawn = self.pipeline.draw(eyes.eyes_m, flatness=flatness, time_ns=now_ns, stages=stages, resting=resting)
             self.layers, inference, missing = drawn.layers, drawn.inference, drawn.missing
             unchanged = drawn.unchanged
         else:
@@ -337,6 +356,13 @@ class Loop:
             "plan": self.plan_items(),
             "states": self.machine.seconds(now_ns=self.clock.now_ns()),
         }
+
+
+def _rest_watch(settings: Settings) -> RestWatch | None:
+    """None where the plan may not present a frame again for eyes that are only nearly the same."""
+    plan = settings.plan
+    most_m = (plan.dead_band_mm or settings.model.tolerance_mm) / 1000
+    return RestWatch(most_m=most_m) if plan.enabled and plan.reuse and most_m > 0 else None
 
 
 def _mean(values: list[float]) -> float | None:

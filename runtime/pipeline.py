@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from runtime.model.flat import flat_layers
 from runtime.model.predictor import Predictor
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack, raster_from_stack
-from runtime.planner import Planner, focused_part
+from runtime.planner import Planner, focused_part, observed
 from runtime.records import F64, U8, Inference, PlanItem
 from runtime.stages import StageTimes
 
@@ -86,6 +86,7 @@ class Pipeline:
         self.plan: Plan | None = None
         self._gate: ReuseGate | None = None
         self._seeing = (True, True)
+        self._watched: F64 | None = None  # the eyes that `_seeing` was told from
         self._shown: tuple[int, float] | None = None  # which array was answered last, and how flat
         self._on_fault = on_fault
         self._solved: U8 | None = None  # the last layers for two eyes
@@ -119,8 +120,7 @@ class Pipeline:
         """What is left out now, with what is known of its time and error."""
         if self.planner is None:
             return ()
-        part = focused_part(self.predictor)
-        numbers = replace(measured or self.measured, active_fraction=1.0 if part is None else part.active_fraction)
+        numbers = observed(measured or self.measured, self.predictor)
         plan = self.planner.plan(self.content.info, self.predictor, seeing=self._seeing, measured=numbers)
         return plan.items
 
@@ -145,16 +145,19 @@ class Pipeline:
             log.info("plan: %s", _who_sees(seeing))
             self._replan()
 
-    def draw(self, eyes_m: F64 | None, *, flatness: float, time_ns: int, stages: StageTimes) -> Drawn:
+    def draw(
+        self, eyes_m: F64 | None, *, flatness: float, time_ns: int, stages: StageTimes, resting: bool = False
+    ) -> Drawn:
         """Layers for two eyes (2, 3), frame `stack`, blended with the flat picture.
 
-        flatness: 0 solved for the eyes, 1 flat. A part that fails is named in `missing` and its last good
+        flatness: 0 solved for the eyes, 1 flat. resting: the eyes are no estimate of this moment but where a still
+        head is; they are solved for as they are. A part that fails is named in `missing` and its last good
         answer is used.
         """
         inference: Inference = "skipped"
         self.missing = {}
         if flatness < 1.0 and eyes_m is not None:
-            inference = self._solve(eyes_m, time_ns=time_ns, stages=stages)
+            inference = self._solve(eyes_m, time_ns=time_ns, stages=stages, resting=resting)
         if flatness > 0.0 or self._solved is None:
             self._draw_flat(time_ns=time_ns, stages=stages)
         flatness = flatness if self._solved is not None else 1.0
@@ -170,17 +173,22 @@ class Pipeline:
         if self._gate is not None:
             self._gate.forget()
 
-    def _solve(self, eyes_m: F64, *, time_ns: int, stages: StageTimes) -> Inference:
-        self._watch(eyes_m)
+    def _solve(self, eyes_m: F64, *, time_ns: int, stages: StageTimes, resting: bool) -> Inference:
+        if eyes_m is not self._watched:
+            self._watched = eyes_m
+            self._watch(eyes_m)
         if self.plan is not None:
             eyes_m = solved_eyes(eyes_m, self.plan)
         revision = self.content.revision(time_ns=time_ns)
-        still = self._gate is not None and self._gate.may_reuse(eyes_m, time_ns=time_ns)
         solved_for = self._solved_for if self._solved is not None else None
-        if solved_for is not None and revision == solved_for[1] and (still or eyes_m.tobytes() == solved_for[0]):
+        if solved_for == (eyes_m.tobytes(), revision):
             return "reused"
-        if self._gate is not None:
-            eyes_m = self._gate.best_guess(eyes_m)
+        gate = self._gate if not resting else None
+        still = gate is not None and gate.may_reuse(eyes_m, time_ns=time_ns)
+        if still and solved_for is not None and revision == solved_for[1]:
+            return "reused"
+        if gate is not None:
+            eyes_m = gate.best_guess(eyes_m)
         key = (eyes_m.tobytes(), revision)
         try:
             images = drawn_for(self.predictor, self.content, eyes_m, time_ns=time_ns)

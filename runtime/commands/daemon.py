@@ -132,7 +132,8 @@ class Daemon:
 
     def _set_budget(self, loop: Loop, budget_ms: float) -> None:
         """In force at once; which level holds it is measured beside the loop, where it isn't known yet."""
-        self._settings = loop.settings = _with_budget(self._settings, budget_ms)
+        self._settings = _with_budget(self._settings, budget_ms)
+        loop.apply(self._settings)
         if self._change is not None:
             self._change.settings = _with_budget(self._change.settings, budget_ms)
         loop.pipeline.plan_with(Planner(loop.settings, loop.pipeline.stack))

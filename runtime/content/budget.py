@@ -68,9 +68,11 @@ class BudgetKeeper:
         return self.index + 1 == len(self.levels)
 
     @property
-    def held(self) -> bool:
-        """The last frames keep to the budget, but for a few."""
-        return self.budget_ms <= 0 or sum(taken > self.budget_ms for taken in self._recent) < SLOW_FRAMES
+    def held(self) -> bool | None:
+        """The last frames keep to the budget, but for a few; None before there are any at this level."""
+        if not self._recent:
+            return None
+        return sum(taken > self.budget_ms for taken in self._recent) < SLOW_FRAMES
 
     def frame_took(self, time_ms: float) -> bool:
         """Tell a whole frame's time; True where the level has changed."""

@@ -39,6 +39,8 @@ class Plan:
         self.hang = threading.Event()  # set: calls don't return
         self.released = threading.Event()  # set: hung calls return after all
         self.eyes_m = np.array([[0.7, -0.031, 0.0], [0.7, 0.031, 0.0]])
+        self.sway_m = 0.002
+        self.noise_m = 0.0  # standard deviation of each axis of each eye
         self.clock_jump_ns = 0
 
 
@@ -50,6 +52,7 @@ class FragileDriver(SensorDriver):
 
     def __init__(self, plan: Plan, clock: Any) -> None:
         self._plan, self._clock, self._sequence = plan, clock, 0
+        self._random = np.random.default_rng(1)
 
     def open(self) -> None:
         if self._plan.refuse is not None:
@@ -64,7 +67,8 @@ class FragileDriver(SensorDriver):
             raise self._plan.fault
         time.sleep(0.01)
         self._sequence += 1
-        eyes_m = self._plan.eyes_m + np.array([0.0, 0.002 * np.sin(self._sequence / 10), 0.0])
+        eyes_m = self._plan.eyes_m + np.array([0.0, self._plan.sway_m * np.sin(self._sequence / 10), 0.0])
+        eyes_m = eyes_m + self._random.normal(0.0, self._plan.noise_m, (2, 3))
         capture_ns = self._clock.now_ns() + self._plan.clock_jump_ns
         return SensorFrame(self._sequence, capture_ns, EyePoints(eyes_m, np.ones(2)))
 

@@ -204,11 +204,11 @@ def test_a_reload_with_another_model_is_warm_when_it_is_taken_over(served: Serve
 
 
 def test_the_plan_follows_the_viewer_and_the_content(served: Served) -> None:
-    served.rig.plan.eyes_m = np.array([[0.12, 0.37, 0.0], [0.075, 0.41, 0.0]])  # the right eye is off by 79.6 degrees
+    served.rig.plan.eyes_m = np.array([[0.135, 0.43, 0.0], [0.09, 0.47, 0.0]])  # the right eye is off by 79.2 degrees
     served.rig.turns(30)
     before = [item["what"] for item in served.loop.plan_items()]
     assert "the right eye" not in before
-    served.rig.plan.eyes_m = np.array([[0.12, 0.37, 0.0], [0.065, 0.41, 0.0]])  # 81 degrees
+    served.rig.plan.eyes_m = np.array([[0.123, 0.43, 0.0], [0.078, 0.47, 0.0]])  # 80.6 degrees
     deadline = time.monotonic() + 10.0
     while "the right eye" not in [item["what"] for item in served.loop.plan_items()]:
         served.loop.turn()
@@ -223,3 +223,17 @@ def test_the_plan_follows_the_viewer_and_the_content(served: Served) -> None:
     served.rig.turns(2)
     assert "render and inference" in before
     assert "render and inference" not in [item["what"] for item in served.status()["plan"]]
+
+
+def test_a_still_head_costs_no_inference_whatever_its_sensor_s_noise(served: Served) -> None:
+    served.rig.plan.sway_m, served.rig.plan.noise_m = 0.0, 0.0015
+    deadline = time.monotonic() + 10.0
+    while served.rig.turns(40)[-1].inference == "ran" or any(a.inference == "ran" for a in served.rig.accounts[-40:]):
+        assert time.monotonic() < deadline
+    accounts = served.rig.turns(200)
+    assert [account.inference for account in accounts] == ["reused"] * 200
+    assert all(account.presented for account in accounts)
+    assert len({account.eyes_m.tobytes() for account in accounts}) == 1
+    served.rig.plan.eyes_m = served.rig.plan.eyes_m + np.array([0.0, 0.02, 0.0])
+    while served.loop.turn().inference != "ran":
+        assert time.monotonic() < deadline

@@ -1,0 +1,136 @@
+"""Does the head stand still? Told from the sensor's own samples, whose noise a prediction would only enlarge.
+
+What the tracker predicts jitters by several times the sensor's noise, since the noise of the speed is multiplied by
+the horizon. A head at rest has no speed: the median of its samples is where it is, and the picture need not follow.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from runtime.clock import NS_PER_S
+from runtime.records import F64
+
+REST_NS = NS_PER_S  # a head that has stood for so long rests
+LOST_NS = NS_PER_S  # after a longer gap nothing is known
+DRIFT_NS = 3 * NS_PER_S  # drift is told from the median of so much
+EVERY = 8  # samples, noise and drift are looked at: neither changes quickly
+FEWEST = 8  # samples that anything is told from
+KEPT = 256
+GRACE_M = 0.0005  # of every test, for sensors without noise
+# In standard deviations of one sample; each is exceeded by white noise once in hours at 60 samples a second.
+SINGLE = 4.5  # two samples in a row, the same way off
+MEDIAN_OF_FIVE = 2.6
+HALVES = 4.5  # of the difference of two halves' means, over the root of their length
+MAD_TO_SIGMA = 1.4826 / 6**0.5  # median of absolute second differences of white noise to its standard deviation
+
+
+class RestWatch:
+    """Takes every sample as the sensor gave it, and says where the head rests. One thread uses it; no clock."""
+
+    def __init__(self, *, most_m: float) -> None:
+        """most_m: a resting head may have drifted so far, and by what noise leaves unsure, until it is renewed."""
+        self._most_m = most_m
+        self._times = np.zeros(2 * KEPT, np.int64)
+        self._eyes = np.zeros((2 * KEPT, 2, 3))
+        self._count = 0
+        self.place: F64 | None = None  # (2, 3) the resting eyes, the same array as long as they rest; None: they move
+        self.noise_m = 0.0  # standard deviation of one sample, laterally; the worse axis of the worse eye
+
+    def update(self, eyes_m: F64, *, capture_ns: int) -> None:
+        """One sample (2, 3), any frame whose x points from the display to the viewer (`stack`)."""
+        if not np.isfinite(eyes_m).all() or eyes_m[:, 0].min() <= 0:
+            return
+        if self._count and not 0 < capture_ns - self._times[self._count - 1] < LOST_NS:
+            self.forget()
+        self._append(eyes_m, capture_ns)
+        if self._count < FEWEST:
+            return
+        slow_checks = self._count % EVERY == 0 or self.place is None
+        if slow_checks:
+            self._measure_noise()
+        if self.place is None:
+            if self._stands():
+                self.place = self._median_since(capture_ns - REST_NS)
+        elif self._left(self.place):
+            # What lies before the motion says nothing of where it will end.
+            self._keep_last(2)
+            self.place = None
+        elif slow_checks and self._drifted(self.place):
+            self.place = self._median_since(capture_ns - DRIFT_NS)
+
+    def forget(self) -> None:
+        """The face was lost, or the clock jumped."""
+        self._count, self.place = 0, None
+
+    def _append(self, eyes_m: F64, capture_ns: int) -> None:
+        if self._count == len(self._times):
+            self._keep_last(KEPT)
+        self._times[self._count], self._eyes[self._count] = capture_ns, eyes_m
+        self._count += 1
+
+    def _keep_last(self, count: int) -> None:
+        first = self._count - count
+        self._times[:count] = self._times[first : self._count]
+        self._eyes[:count] = self._eyes[first : self._count]
+        self._count = count
+
+    def _since(self, time_ns: int) -> F64:
+        """(n, 2, 3) the samples from then on; more, where a slow machine has seen but a few since."""
+        first = min(int(np.searchsorted(self._times[: self._count], time_ns)), self._count - FEWEST)
+        return self._eyes[first : self._count]
+
+    def _median_since(self, time_ns: int) -> F64:
+        place: F64 = np.median(self._since(time_ns), axis=0)
+        return place
+
+    def _measure_noise(self) -> None:
+        """From second differences: an even motion does not count."""
+        recent = self._eyes[max(0, self._count - KEPT // 4) : self._count]
+        lateral = _lateral(recent, recent[-1])
+        second = np.abs(lateral[2:] - 2 * lateral[1:-1] + lateral[:-2])
+        self.noise_m = float(np.median(second, axis=0).max()) * MAD_TO_SIGMA
+
+    def _stands(self) -> bool:
+        """The two halves of the last second agree, and so does the newest moment."""
+        now_ns = int(self._times[self._count - 1])
+        if now_ns - self._times[0] < REST_NS:
+            return False
+        recent = self._since(now_ns - REST_NS)
+        half = len(recent) // 2
+        lateral = _lateral(recent, recent[-1])
+        before, after = np.median(lateral[:half], axis=0), np.median(lateral[half:], axis=0)
+        # A median is a quarter less sure than a mean.
+        unsure_m = HALVES * 1.25 * self.noise_m * (2 / half) ** 0.5
+        if np.abs(after - before).max() > unsure_m + GRACE_M:
+            return False
+        return not self._left(np.median(recent, axis=0))
+
+    def _left(self, place: F64) -> bool:
+        """The newest samples are further off than noise can be."""
+        lateral = _lateral(self._eyes[self._count - 5 : self._count], place)
+        if np.abs(np.sort(lateral, axis=0)[2]).max() > MEDIAN_OF_FIVE * self.noise_m + GRACE_M:
+            return True
+        last, newest = lateral[-2:]
+        reach = SINGLE * self.noise_m + GRACE_M
+        # Outliers lie anywhere: two in a row must be off the same way.
+        together = np.minimum(last, newest) > reach
+        opposite = np.maximum(last, newest) < -reach
+        return bool((together | opposite).any())
+
+    def _drifted(self, place: F64) -> bool:
+        now_ns = int(self._times[self._count - 1])
+        if now_ns - self._times[0] < DRIFT_NS:
+            return False
+        recent = self._since(now_ns - DRIFT_NS)
+        shift = _lateral(np.median(recent, axis=0)[None], place)
+        # The place itself is the median of a third as many.
+        unsure_m = 1.25 * self.noise_m * (4 / len(recent)) ** 0.5
+        return float(np.abs(shift).max()) > self._most_m + 2 * unsure_m
+
+
+def _lateral(eyes_m: F64, place: F64) -> F64:
+    """(n, 4) how far samples (n, 2, 3) lie from a place (2, 3) as the display shows it, metres at that distance."""
+    slopes = eyes_m[..., 1:] / eyes_m[..., :1] - place[:, 1:] / place[:, :1]
+    lateral: F64 = (slopes * place[:, :1]).reshape(len(eyes_m), 4)
+    return lateral

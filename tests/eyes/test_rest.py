@@ -1,0 +1,90 @@
+"""A head at rest is told from a moving one, whatever the sensor's noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from runtime.clock import NS_PER_S
+from runtime.eyes.rest import RestWatch
+
+EYES = np.array([[0.6, -0.031, 0.05], [0.6, 0.031, 0.05]])
+MOST_M = 0.001
+
+
+def watched(
+    seconds: float,
+    *,
+    noise_m: float,
+    aside_m: Callable[[float], float] = lambda _: 0.0,
+    rate_hz: float = 30.0,
+    seed: int = 0,
+    outliers: float = 0.0,
+) -> list[tuple[float, np.ndarray, np.ndarray | None]]:
+    """(time, true eyes, place) after each sample of a head that moves aside as it is told."""
+    random = np.random.default_rng(seed)
+    watch = RestWatch(most_m=MOST_M)
+    told = []
+    for number in range(int(seconds * rate_hz)):
+        time_s = number / rate_hz
+        true = EYES + np.array([0.0, aside_m(time_s), 0.0])
+        sample = true + random.normal(0.0, noise_m, (2, 3))
+        if random.random() < outliers:
+            sample = true + random.uniform(-0.3, 0.3, 3)
+        watch.update(sample, capture_ns=NS_PER_S + int(time_s * NS_PER_S))
+        told.append((time_s, true, watch.place))
+    return told
+
+
+@pytest.mark.parametrize("noise_mm", [0.0, 0.5, 1.0, 2.0, 3.0])
+@pytest.mark.parametrize(("rate_hz", "seed"), [(30, 0), (30, 1), (60, 2), (3, 3)])
+def test_a_still_head_is_found_at_rest_once_and_near_where_it_is(noise_mm: float, rate_hz: float, seed: int) -> None:
+    told = watched(60, noise_m=noise_mm / 1000, rate_hz=rate_hz, seed=seed)
+    rests_from_s = 1.1 if rate_hz > 8 else 3.0
+    places = [place for time_s, _, place in told if time_s > rests_from_s]
+    assert all(place is places[0] for place in places)
+    assert places[0] is not None
+    assert np.abs(places[0] - EYES)[:, 1:].max() <= 1e-12 + noise_mm / 1000  # of a single sample; a frame errs more
+
+
+def test_outliers_are_not_motion() -> None:
+    told = watched(60, noise_m=0.001, outliers=0.05)
+    assert np.mean([place is None for time_s, _, place in told if time_s > 2.0]) < 0.15
+
+
+@pytest.mark.parametrize("speed", [0.02, 0.1, 0.3])
+@pytest.mark.parametrize("noise_mm", [0.2, 1.0, 2.0])
+def test_a_head_that_sets_off_is_let_go_before_it_is_far(noise_mm: float, speed: float) -> None:
+    for seed in range(8):
+        told = watched(5, noise_m=noise_mm / 1000, aside_m=lambda s: speed * float(np.clip(s - 3, 0, 1)), seed=seed)
+        behind = [abs(place[0, 1] - true[0, 1]) for time_s, true, place in told if place is not None and 3 < time_s < 4]
+        # Two samples' way, and what noise hides of it.
+        assert max(behind, default=0.0) < 2.1 * speed / 30 + 0.0015 + 4.5 * noise_mm / 1000
+
+
+@pytest.mark.parametrize("noise_mm", [0.0, 1.0])
+def test_a_head_in_motion_never_rests(noise_mm: float) -> None:
+    told = watched(10, noise_m=noise_mm / 1000, aside_m=lambda s: 0.1 * float(np.sin(2 * s)))
+    assert np.mean([place is None for _, _, place in told]) > 0.9
+
+
+@pytest.mark.parametrize("noise_mm", [0.0, 1.0])
+def test_slow_drift_is_bounded(noise_mm: float) -> None:
+    told = watched(60, noise_m=noise_mm / 1000, aside_m=lambda s: 0.0005 * s)  # 3 cm in all
+    off = [abs(place[0, 1] - true[0, 1]) for _, true, place in told if place is not None]
+    assert max(off) < 2 * MOST_M + 3 * noise_mm / 1000
+
+
+def test_what_is_lost_or_nonsense_is_no_rest() -> None:
+    watch = RestWatch(most_m=MOST_M)
+    for number in range(60):
+        watch.update(EYES, capture_ns=number * NS_PER_S // 30)
+    assert watch.place is not None
+    watch.update(np.full((2, 3), np.nan), capture_ns=2 * NS_PER_S)
+    assert watch.place is not None
+    watch.update(EYES, capture_ns=10 * NS_PER_S)  # after a gap
+    assert watch.place is None
+    watch.update(EYES, capture_ns=NS_PER_S)  # a clock that was set back
+    assert watch.place is None
