@@ -15,7 +15,7 @@ from runtime.content.eyereal import Pair, read_folder
 from runtime.content.presets import preset
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
-from runtime.optics.views import image_from_raster, image_from_stack
+from runtime.optics.views import image_from_raster
 from runtime.records import F64, U8
 
 FOV_DEG = 40.0  # horizontal: what the published network takes its pictures to be
@@ -43,18 +43,21 @@ def _loaded(pair: Pair, stack: PanelStack) -> TrainingPair:
     pictures = [read_image(path) for path in pair.paths]
     if pictures[0].shape != pictures[1].shape:
         raise InputError(pair.paths[1], "size", f"differs from {pair.paths[0].name}")
-    left, right = (on_centre(p, eye, stack, fov_deg=FOV_DEG) for p, eye in zip(pictures, pair.eyes_m, strict=True))
+    left, right = (on_centre(picture, pair, side, stack, fov_deg=FOV_DEG) for side, picture in enumerate(pictures))
     return TrainingPair(stack, pair.eyes_m, (left, right), 0.0)
 
 
-def on_centre(picture: U8, eye_m: F64, stack: PanelStack, *, fov_deg: float) -> U8:
-    """(h, w, 3) what an eye whose picture this is sees through the centre panel's pixels; averaged where smaller."""
+def on_centre(picture: U8, pair: Pair, side: int, stack: PanelStack, *, fov_deg: float) -> U8:
+    """(h, w, 3) what an eye of a pair, whose picture this is, sees through the centre panel's pixels.
+
+    Averaged where they are fewer.
+    """
     height, width = picture.shape[:2]
     raster = stack.panel(CENTRE)
     factor = max(1, round(width / raster.width_px))
     smaller = cv2.resize(picture, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
     height, width = smaller.shape[:2]
-    projection = image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg)
+    projection = pair.image_from_stack(side, width_px=width, height_px=height, fov_deg=fov_deg)
     matrix = _shift(-0.5) @ image_from_raster(projection, raster) @ _shift(0.5)
     warped = cv2.warpPerspective(
         smaller,

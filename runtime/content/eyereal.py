@@ -27,6 +27,14 @@ class Pair:
     number: int
     paths: tuple[Path, Path]
     eyes_m: F64  # (2, 3) left, right; frame `stack`
+    looks_at_m: F64  # (3,) the scene's origin, at which both look; the display may stand before or behind it
+
+    def image_from_stack(self, side: int, *, width_px: int, height_px: int, fov_deg: float) -> F64:
+        """(3, 4) the projection of one of its pictures."""
+        around_origin = np.eye(4)
+        around_origin[:3, 3] = -self.looks_at_m
+        eye = self.eyes_m[side] - self.looks_at_m
+        return image_from_stack(eye, width_px=width_px, height_px=height_px, fov_deg=fov_deg) @ around_origin
 
 
 def is_data_set(folder: Path) -> bool:
@@ -37,8 +45,10 @@ def is_data_set(folder: Path) -> bool:
 def read_folder(folder: Path, preset: Preset) -> tuple[Pair, ...]:
     """Every pair, by number. Raises InputError: no pair, half a pair, coordinates that are no eye.
 
-    Names hold the eyes in the scene's digital units around the display; which one is left is told by geometry.
+    Names hold the eyes in the scene's digital units; which one is left is told by geometry. preset: in the published
+    code's reading, which drew the pictures.
     """
+    stack_from_scene: F64 = np.linalg.inv(preset.scene_from_stack).astype(np.float64)
     found: dict[int, dict[int, tuple[Path, F64]]] = {}
     for path in sorted(folder.iterdir()):
         match = NAME.match(path.name)
@@ -48,7 +58,7 @@ def read_folder(folder: Path, preset: Preset) -> tuple[Pair, ...]:
             digital = np.array([float(match[2]), float(match[3]), float(match[4])])
         except ValueError:
             raise InputError(path, "name", "its coordinates are not numbers") from None
-        eye = preset.eye_axes.T @ digital / preset.scale_per_m
+        eye = (stack_from_scene @ np.append(digital, 1.0))[:3]
         if eye[0] <= 0:
             raise InputError(
                 path, "name", f"its eye is behind the display (x = {eye[0]:.3f} m) with preset {preset.name}"
@@ -72,7 +82,7 @@ def read_folder(folder: Path, preset: Preset) -> tuple[Pair, ...]:
             raise InputError(first, f"pair{number}", "both eyes are at the same y: left can't be told from right")
         if first_eye[1] > second_eye[1]:
             first, second, first_eye, second_eye = second, first, second_eye, first_eye
-        pairs.append(Pair(number, (first, second), np.array([first_eye, second_eye])))
+        pairs.append(Pair(number, (first, second), np.array([first_eye, second_eye]), stack_from_scene[:3, 3]))
     return tuple(pairs)
 
 
@@ -104,14 +114,14 @@ class EyeRealSource(ContentSource):
     def _load(self, index: int) -> tuple[tuple[WarpedPicture, F64], tuple[WarpedPicture, F64]]:
         if index not in self._loaded:
             pair = self._pairs[index]
-            left, right = (self._opened(path, eye) for path, eye in zip(pair.paths, pair.eyes_m, strict=True))
+            left, right = self._opened(pair, 0), self._opened(pair, 1)
             while len(self._loaded) >= KEPT:
                 self._loaded.pop(next(iter(self._loaded)))
             self._loaded[index] = (left, right)
         return self._loaded[index]
 
-    def _opened(self, path: Path, eye_m: F64) -> tuple[WarpedPicture, F64]:
-        rgb = read_image(path)
+    def _opened(self, pair: Pair, side: int) -> tuple[WarpedPicture, F64]:
+        rgb = read_image(pair.paths[side])
         height, width = rgb.shape[:2]
-        projection = image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=self._fov_deg)
+        projection = pair.image_from_stack(side, width_px=width, height_px=height, fov_deg=self._fov_deg)
         return WarpedPicture(rgba_from_rgb(rgb), background=self._background), projection

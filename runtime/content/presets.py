@@ -35,7 +35,17 @@ class Published(Section):
     up: Axis = Field(description="the scene's axis that is up")
     left_index: Annotated[int, Field(ge=0, le=1)] | None = Field(None, description="the left eye's number in a pair")
     earlier_thickness_cm: Positive | None = Field(None, description="of an earlier state of the code")
-    shift_y: float = Field(0.0, description="of the panels along the scene's y, digital units")
+    shift: Triple = Field((0.0, 0.0, 0.0), description="of the panels along the scene's axes, digital units")
+    ground: float | None = Field(None, description="half a gap behind the middle panel, along `out`, digital units")
+    ground_coefficient: float | None = Field(None, description="the same in gaps, where the code has it so")
+
+    @property
+    def middle(self) -> float:
+        """Where that code puts the middle panel: half a gap beyond its ground, along `out`, digital units."""
+        gap = self.thickness_cm * self.scale_per_cm
+        if self.ground_coefficient is not None:
+            return gap * self.ground_coefficient + gap / 2
+        return (self.ground or 0.0) + gap / 2
 
 
 class SceneTable(Section):
@@ -67,7 +77,6 @@ class Preset:
     gap_m: float  # between neighbouring panels
     width_m: float | None  # of the panels; None: the reading says nothing
     scene_from_stack: F64  # 4x4 similarity: digital coordinates of a point in metres of the stack frame
-    eye_axes: F64  # 3x3 rotation: digital axes of the stack's axes, for data sets that name eyes in digital units
     left_index: int | None  # which of pair.._0 and pair.._1 is the left eye
 
     def panel_positions_m(self, panels: int = PANELS) -> tuple[float, ...]:
@@ -98,14 +107,13 @@ def preset(name: str, reading: Reading = "seed") -> Preset:
 
     `seed`: r_p2d, rotation and translation as printed; d_thick is the whole depth, so that three panels are
     d_thick/2 apart; light-field = R·scene/(100 r_p2d) + t, metres.
-    `published-code`: that code's scale; d_thick is the gap; the scene's own axes and the shift of its panels.
+    `published-code`: that code's scale; d_thick is the gap; the scene's own axes, and its panels' place in the scene.
     """
     file = preset_file()
     if name not in file.scene:
         raise InputError("content", "scene", f"no preset `{name}`; there are {', '.join(file.scene)}")
     table = file.scene[name]
     published = table.published
-    axes = axes_matrix(out=published.out, up=published.up)
     if reading == "seed":
         scale_per_m = table.scale_per_cm / CM
         rotation = rotation_matrix(table.rotation_deg, file.rotation_order)
@@ -115,10 +123,11 @@ def preset(name: str, reading: Reading = "seed") -> Preset:
         scene_from_stack = np.asarray(np.linalg.inv(stack_from_scene), dtype=np.float64)
         gap_m, width_m = table.thickness_cm * CM / (PANELS - 1), None
     else:
+        axes = axes_matrix(out=published.out, up=published.up)
         scale_per_m = published.scale_per_cm / CM
         scene_from_stack = np.eye(4)
         scene_from_stack[:3, :3] = axes * scale_per_m
-        scene_from_stack[1, 3] = published.shift_y
+        scene_from_stack[:3, 3] = np.array(published.shift) + axes[:, 0] * published.middle
         gap_m, width_m = published.thickness_cm * CM, published.width_cm * CM
     return Preset(
         name=name,
@@ -128,7 +137,6 @@ def preset(name: str, reading: Reading = "seed") -> Preset:
         gap_m=gap_m,
         width_m=width_m,
         scene_from_stack=scene_from_stack,
-        eye_axes=axes,
         left_index=published.left_index,
     )
 

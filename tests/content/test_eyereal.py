@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from runtime.artifacts import write_png
+from runtime.content.base import View
 from runtime.content.eyereal import EyeRealSource, is_data_set, read_folder
 from runtime.content.presets import preset
 from runtime.content.procedural import ProceduralSource
@@ -56,6 +57,36 @@ def test_at_its_own_eyes_a_pair_is_what_the_scene_was(tmp_path: Path, context: A
         right = np.abs(wanted - given)[inside][:, :3].mean()
         wrong = np.abs(np.roll(wanted, 4, axis=1) - given)[inside][:, :3].mean()
         assert right < 0.5 * wrong
+
+
+@pytest.mark.parametrize("name", ["orchids", "chair", "room_floor", "lego_entity"])
+def test_pictures_look_at_the_scene_s_origin_wherever_the_display_stands(
+    tmp_path: Path, context: Any, stack: PanelStack, name: str
+) -> None:
+    """Orchids' middle panel stands 0.7 m behind the scene's origin, chair's 4.5 cm before it."""
+    chosen = preset(name, "published-code")
+    origin = np.linalg.solve(chosen.scene_from_stack, [0.0, 0.0, 0.0, 1.0])[:3]
+    assert np.linalg.norm(origin) > 0.005
+    scene = ProceduralSource("demo", stack=stack, context=context)
+    for half, y in enumerate((-0.03, 0.03)):
+        eye = np.array([1.5, y, 0.2])
+        digital = (chosen.scene_from_stack @ np.append(eye, 1.0))[:3]
+        own = image_view(eye - origin, 480, 270)  # of an eye that looks at the origin of its coordinates
+        shifted = own.pixels_from_stack @ np.block([[np.eye(3), -origin[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+        picture = scene.render(View(eye, half, shifted, 480, 270), time_ns=0)
+        coordinates = "_".join(f"{axis}{value:.5f}" for axis, value in zip("xyz", digital, strict=True))
+        write_png(tmp_path / f"pair0_{coordinates}_{half}.png", picture)
+    (pair,) = read_folder(tmp_path, chosen)
+    assert pair.eyes_m == pytest.approx(np.array([[1.5, -0.03, 0.2], [1.5, 0.03, 0.2]]), abs=1e-3)
+    source = EyeRealSource((pair,), fov_deg=40, background=(1, 1, 1), name=name)
+    for side in (0, 1):
+        view = panel_view(pair.eyes_m[side], stack.panel(1), side=side)
+        wanted, given = scene.render(view, time_ns=0).astype(int), source.render(view, time_ns=0).astype(int)
+        inside = given[..., 3] == 255
+        assert inside.mean() > 0.5
+        right = np.abs(wanted - given)[inside][:, :3].mean()
+        wrong = np.abs(np.roll(wanted, 4, axis=1) - given)[inside][:, :3].mean()
+        assert right < 0.6 * wrong
 
 
 def test_the_nearest_pair_is_shown(tmp_path: Path, context: Any, stack: PanelStack) -> None:

@@ -39,6 +39,64 @@ def test_the_published_reading_gives_that_code_s_panels(name: str, stack: PanelS
     assert np.linalg.norm(corner) == pytest.approx(gap_cm * scale)
 
 
+# Of the published code's table: out axis, up axis; ground (digital units) or its coefficient; shift (digital units).
+PLACES = {
+    "chair": ("+y", "+z", 0, None), "lego_entity": ("+z", "+x", -0.5, None), "matrixcity": ("+z", "+y", 0, None),
+    "lego_bulldozer": ("+x", "+z", None, -0.5), "minecraft": ("+y", "+x", 0, None),
+    "metal_materials": ("+z", "+y", 0, None), "wukang_mansion": ("+x", "+z", None, -1),
+    "truck": ("+x", "+z", None, -0.5), "room_floor": ("+x", "+z", None, -0.5), "desk_bookshelf": ("+x", "+z", 0, None),
+    "hotdog": ("+z", "-x", None, -0.5), "orchids": ("+x", "+z", None, -1.2), "china_art_museum": ("+x", "+z", 0, None),
+    "traffic": ("+x", "+z", 0, None), "ficus": ("+y", "+z", None, -0.5), "shoe_rack": ("+x", "+z", None, -0.5),
+    "street": ("+x", "+z", -1, None),
+}  # fmt: skip
+SHIFTS = {"matrixcity": (0, 1.5, 0), "room_floor": (0, 0.35, 0.15)}
+LEFT_IS_0 = {
+    "lego_entity", "matrixcity", "metal_materials", "desk_bookshelf", "orchids", "china_art_museum", "traffic",
+    "ficus", "shoe_rack",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_the_published_reading_puts_the_panels_where_that_code_does_in_the_scene(name: str, stack: PanelStack) -> None:
+    """That code spans three panels evenly from half a thickness below `ground` to half a thickness above its end."""
+    scale, thickness_cm, _ = PUBLISHED[name]
+    out, up, ground, coefficient = PLACES[name]
+    z_min = ground if coefficient is None else thickness_cm * scale * coefficient
+    z_max = z_min + thickness_cm * scale
+    wanted = np.linspace(z_min - thickness_cm * scale / 2, z_max + thickness_cm * scale / 2, 3)
+    axes = axes_matrix(out=out, up=up)  # type: ignore[arg-type]
+    chosen = preset(name, "published-code")
+    for x_m, along in zip(chosen.stack(stack).x_m, wanted, strict=True):
+        place = (chosen.scene_from_stack @ [x_m, 0.0, 0.0, 1.0])[:3]
+        assert place == pytest.approx(axes[:, 0] * along + SHIFTS.get(name, (0, 0, 0)), abs=1e-9)
+    assert chosen.left_index == (None if name == "minecraft" else 0 if name in LEFT_IS_0 else 1)
+
+
+# Table S1: r_p2d, d_thick; table S2: rotation, translation; as printed.
+SEED = {
+    "Metal Materials": (0.03, 12, [0, 0, 0], [0, 0, 0]), "MatrixCity": (0.23, 5, [0, 0, 0], [0, -1.5, 0]),
+    "Desk & Bookshelf": (0.03, 6, [-114, 0, 90], [4.8, -2.5, 0]),
+    "Hot Dog": (0.06, 10, [0, -92, 14], [2.9, 0.04, 0.16]), "Orchids": (0.04, 100, [-90, 0, 90], [19.16, -1.78, 0]),
+    "Lego Bulldozer": (0.08, 6, [0, 0, 0], [0, 0, 0]), "Ficus": (0.05, 10, [0, 0, 0], [0, 0, 0]),
+    "Chair": (0.06, 9.1, [0, 0, 0], [0, 0, 0]), "Traffic": (0.04, 8.75, [216, -1, -28], [-0.36, 0, 2.54]),
+    "Street": (0.02, 100, [-116, 0, 114], [2.56, 0, 1.46]), "Minecraft": (2.00, 74.07, [0, 0, 0], [0, 0, 0]),
+    "Lego Entity": (0.08, 11, [0, 0, 0], [0, 0, 0]), "Truck": (0.08, 6, [80, 182, -92], [0.5, -0.24, 0.1]),
+    "Shoe Rack": (0.08, 12, [234, 0, 122], [2.6, -0.24, 3.1]),
+    "Room Floor": (0.02, 46.7, [-20, -90, 86], [0, 0.13, -3.07]),
+    "Wukang Mansion": (0.07, 6, [194, 23, -31], [0.34, -0.02, 2.02]),
+    "China Art Museum": (0.03, 25, [234, 4, -61], [0.54, 0.33, 0.72]),
+}  # fmt: skip
+
+
+def test_the_data_file_is_tables_s1_and_s2() -> None:
+    tables = {table.title: table for table in preset_file().scene.values()}
+    assert set(tables) == set(SEED)
+    for title, (scale, thickness_cm, rotation, translation) in SEED.items():
+        table = tables[title]
+        assert (table.scale_per_cm, table.thickness_cm) == (scale, thickness_cm)
+        assert (list(table.rotation_deg), list(table.translation_m)) == (rotation, translation)
+
+
 def test_lego_s_panels_stand_at_minus_6_0_and_6_cm_there_and_3_cm_apart_in_the_seed_s_reading(
     stack: PanelStack,
 ) -> None:
