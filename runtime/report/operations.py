@@ -230,4 +230,4 @@ def _pixels(stack: PanelStack) -> int:
 def spoken(count: float) -> str:
     """A count as billions, in a column's width: `0.43`, `12`, `5,310`."""
     billions = count / 1e9
-    return f"{billions:.2g}" if billions < 10 else f"{billions:,.0f}"
+    return f"{billions:#.2g}" if billions < 10 else f"{billions:,.0f}"
