@@ -13,6 +13,7 @@ import numpy as np
 from runtime.budget_control import BudgetControl
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
 from runtime.config import Settings
+from runtime.content.plan import Saving
 from runtime.errors import EndOfRecording, PanelLost
 from runtime.eyes.calibration import Calibration
 from runtime.eyes.calibration_drift import SeparationWatch
@@ -316,7 +317,8 @@ class Loop:
 
     def plan_items(self) -> list[dict[str, Any]]:
         """What is left out at present; a saving or a cost that this run did not measure is None."""
-        return [asdict(item) for item in self.pipeline.plan_items()]
+        known = replace(self.pipeline.measured, reuse=Saving(saves_ms=self.stats.reuse_saves_ms()))
+        return [asdict(item) for item in self.pipeline.plan_items(known)]
 
     def _measure_pending(self) -> None:
         """Quality at the true eyes at the moment of the light, once the recording has told where they were."""

@@ -13,6 +13,7 @@ from runtime.records import FrameAccount
 
 STAGES = ("sensor", "track", "render", "prepare", "inference", "finish", "present", "wait")
 NOT_OVERHEAD = ("render", "prepare", "inference", "finish", "present", "wait")
+SOLVING = ("render", "prepare", "inference", "finish")  # what a frame that is presented again does without
 WINDOW = 8192  # turns that quantiles are taken over
 
 
@@ -47,6 +48,7 @@ class RunStats:
         self.faults: dict[str, int] = {}
         self._times_s: deque[float] = deque(maxlen=60)
         self._stages = {stage: Ring() for stage in STAGES}
+        self._solving = {"ran": Ring(), "reused": Ring()}
         self._overhead, self._skew, self._latency = Ring(), Ring(), Ring()
 
     def add(self, account: FrameAccount, *, turn_ms: float) -> None:
@@ -59,6 +61,8 @@ class RunStats:
         self.inferences += account.inference == "ran"
         for stage, ring in self._stages.items():
             ring.add(account.measured_ms.get(stage, 0.0))
+        if account.inference in self._solving and self.frames > 1:
+            self._solving[account.inference].add(sum(account.measured_ms.get(stage, 0.0) for stage in SOLVING))
         if self.frames > 1:  # the first turn pays for what is allocated once
             spent = sum(account.measured_ms.get(stage, 0.0) for stage in NOT_OVERHEAD)
             self._overhead.add(max(0.0, turn_ms - spent))
@@ -66,6 +70,12 @@ class RunStats:
             self._skew.add(account.skew_ms)
             if account.capture_ns:
                 self._latency.add((account.present_ns - account.capture_ns) / 1e6)
+
+    def reuse_saves_ms(self) -> float | None:
+        """Median of a frame that was solved less that of one presented again; None before there are both."""
+        medians = [ring.quantiles(("p50",)).get("p50") for ring in self._solving.values()]
+        ran, reused = medians
+        return None if ran is None or reused is None else ran - reused
 
     def recent_fps(self) -> float:
         """Presented frames a second over the last turns."""

@@ -73,6 +73,12 @@ def describe(answer: dict[str, Any]) -> Iterator[str]:
             yield row(name.removesuffix("_ms"), timings(answer[name], unit))
     for part, count in dict(answer.get("faults") or {}).items():
         yield row(f"faults {part}", str(count))
+    if budget := answer.get("budget"):
+        held = {True: "held", False: "not held"}.get(budget.get("held"), "")
+        remark = ", ".join(
+            text for text in (held, budget.get("measuring") and f"measuring {budget['measuring']}") if text
+        )
+        yield row("budget", f"{budget['budget_ms']:g} ms: {budget['level']}", remark)
     for item in answer.get("plan") or ():
         yield row("left out", str(item.get("what", "")), str(item.get("why", "")))
 

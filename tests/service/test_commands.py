@@ -20,6 +20,8 @@ ACCOUNT = {
     "frames": 100, "presented": 98, "dropped": 2, "stage_ms": {"render": {"p50": 3.0}, "inference": {"p50": 12.0}},
     "eyes_m": [[0.9, -0.03, 0.0], [0.9, 0.03, 0.0]], "eyes_label": "held", "faults": {"sensor": 4},
     "plan": [{"what": "warp of the centre panel", "why": "identity"}],
+    "budget": {"budget_ms": 16.0, "level": "fast at 0.75", "held": True, "measuring": ""},
+    "loading": "reading a.glb",
 }  # fmt: skip
 
 
@@ -46,7 +48,8 @@ def test_people_see_state_reason_rate_eyes_and_faults(server):
     result = ask_status("--socket", str(server.path))
     assert result.exit_code == 0
     for words in ("degraded: sensor", "unplugged", "31.2 frames/s", "2 dropped", "(0.900, -0.030, 0.000)", "held",
-                  "inference 12.00", "faults sensor", "warp of the centre panel"):  # fmt: skip
+                  "inference 12.00", "faults sensor", "warp of the centre panel", "16 ms: fast at 0.75  (held)",
+                  "reading a.glb"):  # fmt: skip
         assert words in result.stdout
 
 
