@@ -70,10 +70,14 @@ def compare(
     else:
         console = Console(highlight=False)
         speed = after["yardstick_ms"] / before["yardstick_ms"]
-        console.print(f"machine: {speed:.2f} times the time of the yardstick; frame times are compared net of it")
+        console.print(
+            f"machine: {speed:.2f} times the time of the yardstick; frame times are compared net of it", soft_wrap=True
+        )
         for change in sorted(changes, key=lambda change: not change.worse):
             verdict = "worse " if change.worse else "better"
-            console.print(f"{verdict} {change.what}: {change.text}", style="red" if change.worse else "green")
+            console.print(
+                f"{verdict} {change.what}: {change.text}", style="red" if change.worse else "green", soft_wrap=True
+            )
         console.print(
             f"{len(worse)} worse, {len(changes) - len(worse)} better" if changes else "no change beyond noise"
         )

@@ -63,9 +63,11 @@ def stability(
             )
         for case in failed:
             error = f"error {case.forward_error:.2g}, tolerance {case.tolerance:.2g} ({case.measure})"
-            console.print(f"FAILS {case.stage}: {case.name}: {case.behaviour}, {error} {case.note}", style="red")
+            console.print(
+                f"FAILS {case.stage}: {case.name}: {case.behaviour}, {error} {case.note}", style="red", soft_wrap=True
+            )
         verdict = f"{len(failed)} of {len(cases)} cases fail" if failed else f"all {len(cases)} cases pass"
-        console.print(f"{verdict}, in {seconds:.0f} s" + (f"; see {out / 'index.html'}" if out else ""))
+        console.print(f"{verdict}, in {seconds:.0f} s" + (f"; see {out / 'index.html'}" if out else ""), soft_wrap=True)
     if failed:
         raise typer.Exit(1)
 
