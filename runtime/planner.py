@@ -43,10 +43,9 @@ class Planner:
 
 def observed(measured: Measured, predictor: Predictor) -> Measured:
     """The same with what the predictor left out of its last frame."""
-    part = focused_part(predictor)
-    if part is None:
-        return replace(measured, channels=predictor.channels)
-    return replace(measured, channels=part.channels, active_fraction=part.active_fraction)
+    inner = predictor.small if isinstance(predictor, ReducedPredictor) else predictor
+    fraction = inner.active_fraction if isinstance(inner, FocusedPredictor) else 1.0
+    return replace(measured, channels=inner.channels, active_fraction=fraction)
 
 
 def focused_part(predictor: Predictor) -> FocusedPredictor | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter_ns
 from typing import Any
@@ -12,16 +12,21 @@ import cv2
 import numpy as np
 
 from runtime.artifacts import OutputFolder, read_image, write_json, write_png
-from runtime.config import load_settings, load_stack
+from runtime.config import ModelSettings, load_settings, load_stack
+from runtime.content.base import ContentInfo
+from runtime.content.plan import Measured, Saving, network_items
 from runtime.errors import InputError
-from runtime.model.predictor import Prediction, load_predictor
+from runtime.model.predictor import Prediction, Predictor, load_predictor
 from runtime.model.still import solve_still
-from runtime.optics.quality import quality
-from runtime.optics.retina import seen_by
+from runtime.optics.quality import Quality, quality
+from runtime.optics.retina import Retina, seen_by
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, U8
+from runtime.planner import focused_part, observed
+from runtime.planning import planned_predictor
+from runtime.records import F64, U8, PlanItem
 
 SEPARATION_MIN_M = 0.005
+COMPARED = 3  # timed runs with and without the plan
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,16 +62,66 @@ def solve_pair(request: SolveRequest) -> dict[str, Any]:
     if not (math.isfinite(request.fov_deg) and 0 < request.fov_deg < 180):
         raise InputError("solve", "--fov", "must lie between 0 and 180 degrees")
     eyes_m = checked_eyes(request.left_eye, request.right_eye, stack)
-    predictor = load_predictor(request.model, stack, model_settings)
+    model_settings = model_settings.model_copy(update={"name": request.model})
+    settings = settings.model_copy(update={"model": model_settings})
+    predictor = planned_predictor(settings, stack)
     try:
         prediction, timing = _timed(pictures, eyes_m, request, predictor)
         with OutputFolder(request.out) as folder:
             measured = _write(folder.staging, prediction.layers, pictures, eyes_m, stack, request.fov_deg)
-            result = measured | timing | {"model": predictor.name, "provider": predictor.provider, "plan": []}
+            plan = _left_out(pictures, eyes_m, request, predictor, model_settings, measured["psnr_db"])
+            named = {"model": predictor.name, "provider": predictor.provider, "plan": [asdict(item) for item in plan]}
+            result = measured | timing | named
             write_json(folder.staging / "solve.json", result)
     finally:
         predictor.close()
     return result
+
+
+def _left_out(
+    pictures: list[U8],
+    eyes_m: F64,
+    request: SolveRequest,
+    predictor: Predictor,
+    settings: ModelSettings,
+    planned_db: float,
+) -> list[PlanItem]:
+    """What the model left out of these pictures, and what that saved and cost against a model that leaves out nothing.
+
+    Both are timed again, in turn, so that what slows one slows the other.
+    """
+    numbers = observed(Measured(), predictor)
+    info = ContentInfo(request.left.name)
+    if not network_items(info, numbers):
+        return []
+    plain = load_predictor(settings.name, predictor.stack, settings)
+    part = focused_part(predictor)
+    # In colour, or unfocused, one saving is all there is.
+    between = part.whole if part is not None and numbers.channels == 1 and numbers.active_fraction < 1 else None
+    ways = {"plain": plain, "planned": predictor} | ({"between": between} if between else {})
+    times: dict[str, list[float]] = {name: [] for name in ways}
+    shown_db = {"planned": planned_db}
+    try:
+        for turn in range(COMPARED + 1):
+            for name, way in ways.items():
+                begin_ns = perf_counter_ns()
+                solved = solve_still(*pictures, eyes_m=eyes_m, fov_deg=request.fov_deg, predictor=way)
+                if turn:
+                    times[name].append((perf_counter_ns() - begin_ns) / 1e6)
+                elif name != "planned":
+                    shown_db[name] = _shown(solved.layers, pictures, eyes_m, predictor.stack, request.fov_deg)[
+                        0
+                    ].psnr_db
+    finally:
+        plain.close()
+
+    def saving(without: str, with_it: str) -> Saving:
+        saved_ms = float(np.median(times[without]) - np.median(times[with_it]))
+        return Saving(saved_ms, shown_db[without] - shown_db[with_it])
+
+    middle = "between" if between else "plain" if numbers.channels == 3 else "planned"
+    numbers = replace(numbers, one_channel=saving("plain", middle), focus=saving(middle, "planned"))
+    return network_items(info, numbers)
 
 
 def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stack: PanelStack) -> F64:
@@ -104,22 +159,30 @@ def _write(
 ) -> dict[str, Any]:
     for n, layer in enumerate(layers):
         write_png(folder / f"layer-{n}.png", layer)
-    size = (stack.width_px, stack.height_px)
-    targets, retinas = [], []
-    for picture, eye_m, name in zip(pictures, eyes_m, ("left", "right"), strict=True):
-        same = (picture.shape[1], picture.shape[0]) == size
-        wanted = picture if same else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-        retina = seen_by(eye_m, layers, stack, fov_deg=fov_deg)
+    measured, seen, wanted = _shown(layers, pictures, eyes_m, stack, fov_deg)
+    for name, retina, target in zip(("left", "right"), seen, wanted, strict=True):
         write_png(folder / f"seen-{name}.png", (np.clip(retina.image, 0, 1) * 255 + 0.5).astype(np.uint8))
-        write_png(folder / f"wanted-{name}.png", np.asarray(wanted, np.uint8))
-        targets.append(np.asarray(wanted, np.float32) / np.float32(255))
-        retinas.append(retina)
-    try:
-        measured = quality([r.image for r in retinas], targets, [r.mask for r in retinas])
-    except ValueError as error:
-        raise InputError("solve", "--left-eye", f"{error}: nothing of the display can be seen from there") from None
+        write_png(folder / f"wanted-{name}.png", target)
     return {
         "psnr_db": round(measured.psnr_db, 3),
         "ssim": round(measured.ssim, 4),
         "eye_psnr_db": [round(value, 3) for value in measured.eye_psnr_db],
     }
+
+
+def _shown(
+    layers: U8, pictures: list[U8], eyes_m: F64, stack: PanelStack, fov_deg: float
+) -> tuple[Quality, list[Retina], list[U8]]:
+    """Displayed quality, what the eyes see, and what they should see. Raises InputError where they see nothing."""
+    size = (stack.width_px, stack.height_px)
+    wanted = [
+        picture if picture.shape[1::-1] == size else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+        for picture in pictures
+    ]
+    seen = [seen_by(eye_m, layers, stack, fov_deg=fov_deg) for eye_m in eyes_m]
+    targets = [np.asarray(picture, np.float32) / np.float32(255) for picture in wanted]
+    try:
+        measured = quality([retina.image for retina in seen], targets, [retina.mask for retina in seen])
+    except ValueError as error:
+        raise InputError("solve", "--left-eye", f"{error}: nothing of the display can be seen from there") from None
+    return measured, seen, [np.asarray(picture, np.uint8) for picture in wanted]

@@ -116,11 +116,8 @@ def make_plan(
         band = f"{chosen.dead_band_mm:g} mm" if fixed_m else f"the tracker's own noise, at most {most_m * 1000:g} mm"
         why = f"the content stands still; as long as the eyes stay within {band} of those solved for"
         items.append(_item("render and inference", why, numbers.reuse))
-    if focus:
-        items += _focus_items(info, numbers)
-    if on and chosen.one_channel and numbers.channels == 1:
-        why = "the pictures are grey: one channel is solved for all three"
-        items.append(_item("two of three colour channels", why, numbers.one_channel))
+    if on:
+        items += network_items(info, numbers)
     if seeing != (True, True):
         side = "right" if seeing[0] else "left"
         items.append(_item(f"the {side} eye", f"it is over {chosen.range_deg:g} degrees off the axis", numbers.one_eye))
@@ -135,6 +132,15 @@ def make_plan(
         why = f"the budget of {settings.model.budget_ms:g} ms: {numbers.level}"
         items.append(_item("model or resolution", why, numbers.level_saving))
     return Plan(reuse, focus, seeing, fixed_m, most_m, tuple(items))
+
+
+def network_items(info: ContentInfo, numbers: Measured) -> list[PlanItem]:
+    """What the model left out of the pictures that it was given."""
+    items = _focus_items(info, numbers)
+    if numbers.channels == 1:
+        why = "the pictures are grey: one channel is solved for all three"
+        items.append(_item("two of three colour channels", why, numbers.one_channel))
+    return items
 
 
 def _focus_items(info: ContentInfo, numbers: Measured) -> list[PlanItem]:

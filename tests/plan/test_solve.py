@@ -1,0 +1,77 @@
+"""`phasestack solve` leaves out what its pictures do not need, and says so."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from runtime.artifacts import write_json, write_png
+from runtime.commands.solve import solve
+
+app = typer.Typer()
+app.command()(solve)
+runner = CliRunner()
+
+
+def pictures(folder: Path, *, grey: bool) -> None:
+    """A textured square that the eyes see some pixels apart, on a background that they share."""
+    random = np.random.default_rng(3)
+    texture = cv2.GaussianBlur(random.integers(0, 256, (60, 80, 3), np.uint8), (0, 0), 2)
+    texture = np.clip((texture.astype(np.float64) - 128) * 5 + 128, 0, 255).astype(np.uint8)
+    for name, shift in (("left", 3), ("right", -3)):
+        picture = np.full((270, 480, 3), (90, 90, 90) if grey else (90, 120, 150), np.uint8)
+        picture[100:160, 200 + shift : 280 + shift] = texture[..., :1] if grey else texture
+        write_png(folder / f"{name}.png", picture)
+    write_json(folder / "panels.json", {"width_m": 0.5184, "height_m": 0.2916, "x_m": [-0.06, 0.0, 0.06]})
+
+
+def solved(folder: Path, config: str = "", model: str = "balanced") -> dict[str, Any]:
+    (folder / "config.toml").write_text(config, encoding="utf-8")
+    eyes = ["--left-eye", "0.6", "-0.031", "0", "--right-eye", "0.6", "0.031", "0"]
+    files = ["--left", str(folder / "left.png"), "--right", str(folder / "right.png")]
+    where = ["--panels", str(folder / "panels.json"), "--config", str(folder / "config.toml")]
+    done = runner.invoke(app, [*files, *eyes, *where, "--model", model, "--out", str(folder / "out"), "--json"])
+    assert done.exit_code == 0, done.output
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
+
+
+@pytest.mark.parametrize("model", ["fast", "balanced", "best"])
+def test_the_window_is_solved_alone_and_costs_no_quality(tmp_path: Path, model: str) -> None:
+    pictures(tmp_path, grey=False)
+    planned = solved(tmp_path, model=model)
+    (item,) = planned["plan"]
+    assert item["what"] == "inference beside the active window"
+    assert item["costs_db"] < 0.1
+    assert isinstance(item["saves_ms"], float)
+    plain = solved(tmp_path, "[plan]\nenabled = false\n", model=model)
+    assert plain["plan"] == []
+    assert planned["psnr_db"] - plain["psnr_db"] == pytest.approx(-item["costs_db"], abs=0.002)
+
+
+def test_grey_pictures_are_solved_in_one_channel(tmp_path: Path) -> None:
+    pictures(tmp_path, grey=True)
+    assert {item["what"] for item in solved(tmp_path)["plan"]} == {
+        "inference beside the active window",
+        "two of three colour channels",
+    }
+    (item,) = solved(tmp_path, "[plan]\nfocus = false\n")["plan"]
+    assert item["what"] == "two of three colour channels"
+    assert abs(item["costs_db"]) < 0.02
+    (item,) = solved(tmp_path, "[plan]\none_channel = false\n")["plan"]
+    assert item["what"] == "inference beside the active window"
+
+
+def test_pictures_that_differ_everywhere_leave_nothing_out(tmp_path: Path) -> None:
+    pictures(tmp_path, grey=False)
+    random = np.random.default_rng(0)
+    for name in ("left", "right"):
+        write_png(tmp_path / f"{name}.png", random.integers(0, 256, (270, 480, 3), np.uint8))
+    assert solved(tmp_path)["plan"] == []
