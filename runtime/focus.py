@@ -201,19 +201,18 @@ class FocusedPredictor(Predictor):
             return
         area = self._solved
         for layer in self._layers:
-            layer[area.v0 : area.v1, area.u0 : area.u1] = (EVEN, EVEN, EVEN, 255)
+            _fill(layer, area, (EVEN, EVEN, EVEN))
         self._solved, self._background = None, None
 
     def _paint_background(self, colour: tuple[int, ...]) -> None:
         """The centre panel as if both eyes saw nothing but the background; once, as long as nothing changes."""
-        codes = (*_centre_codes(self.stack.count)[list(colour)].tolist(), 255)
+        codes = _centre_codes(self.stack.count)[list(colour)].tolist()
         layer = self._layers[self.stack.count // 2]
         if self._background != colour:
-            layer[:] = codes
+            _fill(layer, PixelBox(0, 0, self.stack.width_px, self.stack.height_px), codes)
             self._background = colour
         elif self._solved is not None:
-            area = self._solved
-            layer[area.v0 : area.v1, area.u0 : area.u1] = codes
+            _fill(layer, self._solved, codes)
 
     def _part(self, stack: PanelStack) -> UnrolledPredictor:
         size = (stack.width_px, stack.height_px)
@@ -222,6 +221,12 @@ class FocusedPredictor(Predictor):
                 self._parts.pop(next(iter(self._parts))).close()
             self._parts[size] = self._make(stack)
         return self._parts[size]
+
+
+def _fill(layer: U8, area: PixelBox, codes: Sequence[int]) -> None:
+    """One colour in a part of an RGBA layer; whole pixels at a time, which is many times as fast as bytes."""
+    pixel = np.array([*codes, 255], np.uint8).view(np.uint32)
+    layer.view(np.uint32)[area.v0 : area.v1, area.u0 : area.u1, 0] = pixel
 
 
 def _centre_codes(panels: int) -> U8:
