@@ -15,7 +15,16 @@ from time import perf_counter_ns
 import cv2
 import numpy as np
 
-from runtime.content.active import Window, differing_box, still_fits, wave_px, whole_rays, window_of
+from runtime.content.active import (
+    Window,
+    differing_box,
+    steepness,
+    steepness_beside,
+    still_fits,
+    wave_px,
+    whole_rays,
+    window_of,
+)
 from runtime.content.base import ContentSource, View
 from runtime.content.camera import PixelBox, union
 from runtime.model.fade import Fade
@@ -69,11 +78,11 @@ class FocusedPredictor(Predictor):
         box = union(boxes)
         if not box.width_px:
             return
-        wanted = window_of(box, eyes_m, self.stack)
-        if wanted is not None and self.window is not None and still_fits(self.window, wanted):
-            wanted = self.window
-        self._aimed = wanted
-        self._wanted_background = tuple(round(value * 255) for value in content.info.background)
+        colour = tuple(round(value * 255) for value in content.info.background)
+        steep = max(steepness(np.array([code], np.uint8)) for code in colour)
+        wanted = window_of(box, eyes_m, self.stack, steep=steep)
+        self._aimed = self._kept(wanted)
+        self._wanted_background = colour
 
     @property
     def one_channel(self) -> bool:
@@ -115,17 +124,17 @@ class FocusedPredictor(Predictor):
         else:
             box = differing_box(left, right)
             differs = box.width_px > 0 and box.height_px > 0
-            found = window_of(box, eyes_m, self.stack) if differs else None
+            steep = steepness_beside(left, box)
+            found = window_of(box, eyes_m, self.stack, steep=steep) if differs else None
             if found is None and differs:
                 self.window, self.active_fraction = None, 1.0
                 prediction = self.whole.predict(images, eyes_m)
                 self.channels = self.whole.channels
                 return prediction
-            if found is not None and self.window is not None and still_fits(self.window, found):
-                found = self.window
-            if found is None:
+            kept = self._kept(found)
+            if kept is None:
                 return self._filled(left, begin_ns)
-            window = found
+            window = kept
             area = window.box
             cut = [[np.ascontiguousarray(image[area.v0 : area.v1, area.u0 : area.u1])] for image in (left, right)]
         found_ms = (perf_counter_ns() - begin_ns) / 1e6
@@ -141,6 +150,12 @@ class FocusedPredictor(Predictor):
         else:
             self._fill_with(left, but=window.box)
         return self._place(window, solved, eyes_m, found_ms + (perf_counter_ns() - begin_ns) / 1e6)
+
+    def _kept(self, wanted: Window | None) -> Window | None:
+        """The last frame's window where it will do: then nothing is allocated again."""
+        if wanted is None or self.window is None or not still_fits(self.window, wanted):
+            return wanted
+        return replace(self.window, steps=wanted.steps)
 
     def warm_up(self, eyes_m: F64) -> None:
         self.whole.warm_up(eyes_m)
@@ -185,7 +200,7 @@ class FocusedPredictor(Predictor):
         box, kept = window.box, whole_rays(window, eyes_m, self.stack)
         return Fade(
             Box(kept.u0 - box.u0, kept.v0 - box.v0, kept.u1 - box.u0, kept.v1 - box.v0),
-            over_px=wave_px(eyes_m, self.stack),
+            over_px=wave_px(eyes_m, self.stack, steps=window.steps),
             left=box.u0 > 0,
             top=box.v0 > 0,
             right=box.u1 < self.stack.width_px,

@@ -16,10 +16,10 @@ COARSE_STEP = 16  # of the look that decides whether a closer one is worth its t
 WHOLE_ABOVE = 0.6  # of the panel: a larger window is not worth cutting out
 MOST_SLACK = 1.3  # of a kept window's area over the one that would do
 STEPS = 16  # windows are whole sixteenths of the panel, so that a few sizes serve all
-# Measured with the shipped models: a wave along the line of the eyes that fades out over twelve parallaxes beside a
-# difference costs less than a tenth of a decibel even before mid-grey, where sin² is steepest; over six, 0.4. A window
-# must also hold each panel's part of what the eyes see through another.
-WAVE_STEPS = 12.0
+# Measured with the shipped models: a wave along the line of the eyes that fades out over fourteen parallaxes beside a
+# difference costs 0.06 dB before mid-grey, where sin² is steepest, and over six up to 0.4; before white or black,
+# where it is level, six cost 0.02. A window must also hold each panel's part of what the eyes see through another.
+WAVE_STEPS = (6.0, 14.0)
 PANEL_CROSSINGS = 2.0
 ROOM_PX = 16
 EDGE_PX = 2
@@ -32,6 +32,7 @@ class Window:
     box: PixelBox  # panel pixels
     stack: PanelStack  # the same panels, cut to the box and moved to its centre
     shift_m: F64  # (3,) of the stack frame: where the box's centre is (0, y, z)
+    steps: float  # parallaxes over which what is driven beside the difference fades out
 
 
 def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> PixelBox:
@@ -65,22 +66,45 @@ def stray_px(eyes_m: F64, stack: PanelStack) -> F64:
     return stray
 
 
-def wave_px(eyes_m: F64, stack: PanelStack) -> tuple[float, float]:
-    """How far, right and down, the outer panels are driven beside a difference. eyes_m: (2, 3), frame `stack`."""
+def steepness(codes: U8) -> float:
+    """How visible an error of phase is before these 8-bit codes: 0 before black or white to 1 before mid-grey.
+
+    The slope of sin² in its own terms, 2·sqrt(I·(1 - I)), root mean square.
+    """
+    intensities = codes.astype(np.float64) / 255
+    return float(np.sqrt((4 * intensities * (1 - intensities)).mean())) if codes.size else 0.0
+
+
+def steepness_beside(picture: U8, box: PixelBox) -> float:
+    """The same of what lies right and left of a box in an (h, w, 4) picture: there a wave must fade."""
+    rows = slice(box.v0, box.v1, COARSE_STEP)
+    beside = (picture[rows, : box.u0 : COARSE_STEP, :3], picture[rows, box.u1 :: COARSE_STEP, :3])
+    return max(steepness(side) for side in beside)
+
+
+def wave_steps(steep: float) -> float:
+    """How many parallaxes the outer panels are driven beside a difference, before a background so steep (0 to 1)."""
+    least, most = WAVE_STEPS
+    return least + (most - least) * steep
+
+
+def wave_px(eyes_m: F64, stack: PanelStack, *, steps: float) -> tuple[float, float]:
+    """The same in pixels, right and down. eyes_m: (2, 3), frame `stack`."""
     left, right = stray_px(eyes_m, stack)
-    across, down = np.abs(left - right).max(axis=0) * WAVE_STEPS
+    across, down = np.abs(left - right).max(axis=0) * steps
     return float(across), float(down)
 
 
-def room_px(low: float, high: float, stray: F64, *, eyes_px: F64, weights: F64) -> tuple[float, float]:
+def room_px(low: float, high: float, stray: F64, *, eyes_px: F64, weights: F64, steps: float) -> tuple[float, float]:
     """Along one axis: how far before and after a difference from `low` to `high` the panels take part in it.
 
     Pixels from the centre of the panel. stray: (2, N) as `stray_px` has it; eyes_px: (2,) the eyes' places on
-    this axis; weights: (2, N) how far along its ray from the centre panel to the eye each panel lies.
+    this axis; weights: (2, N) how far along its ray from the centre panel to the eye each panel lies; steps: as
+    `wave_steps` has it.
     """
     before = (weights * (low - eyes_px[:, None])).max()
     after = (weights * (eyes_px[:, None] - high)).max()
-    room = WAVE_STEPS * float(np.abs(stray[0] - stray[1]).max()) + ROOM_PX
+    room = steps * float(np.abs(stray[0] - stray[1]).max()) + ROOM_PX
     return PANEL_CROSSINGS * max(float(before), 0.0) + room, PANEL_CROSSINGS * max(float(after), 0.0) + room
 
 
@@ -116,16 +140,21 @@ def _eyes_px(eyes_m: F64, stack: PanelStack) -> F64:
     return places
 
 
-def window_of(box: PixelBox, eyes_m: F64, stack: PanelStack) -> Window | None:
+def window_of(box: PixelBox, eyes_m: F64, stack: PanelStack, *, steep: float = 1.0) -> Window | None:
     """The window that a difference is solved in: grown by its room, rounded up to whole sixteenths of the panel.
 
-    None where it would be most of the panel: then the whole is as fast.
+    steep: of what lies beside it (`steepness`). None where it would be most of the panel: then the whole is as fast.
     """
     stray, weights, eyes_px = stray_px(eyes_m, stack), _weights(eyes_m, stack), _eyes_px(eyes_m, stack)
     spans: list[tuple[int, int]] = []
     for axis, (start, end, whole) in enumerate(((box.u0, box.u1, stack.width_px), (box.v0, box.v1, stack.height_px))):
         before, after = room_px(
-            start - whole / 2, end - whole / 2, stray[..., axis], eyes_px=eyes_px[:, axis], weights=weights
+            start - whole / 2,
+            end - whole / 2,
+            stray[..., axis],
+            eyes_px=eyes_px[:, axis],
+            weights=weights,
+            steps=wave_steps(steep),
         )
         low, high = max(start - before, 0.0), min(end + after, float(whole))
         step = whole / STEPS
@@ -135,16 +164,16 @@ def window_of(box: PixelBox, eyes_m: F64, stack: PanelStack) -> Window | None:
     (u0, u1), (v0, v1) = spans
     if (u1 - u0) * (v1 - v0) > WHOLE_ABOVE * stack.width_px * stack.height_px:
         return None
-    return cut_out(PixelBox(u0, v0, u1, v1), stack)
+    return cut_out(PixelBox(u0, v0, u1, v1), stack, steps=wave_steps(steep))
 
 
-def cut_out(box: PixelBox, stack: PanelStack) -> Window:
+def cut_out(box: PixelBox, stack: PanelStack, *, steps: float = WAVE_STEPS[1]) -> Window:
     """The panels behind a box of pixels, as a stack of their own."""
     pitch_u, pitch_v = stack.width_m / stack.width_px, stack.height_m / stack.height_px
     cut = PanelStack(pitch_u * box.width_px, pitch_v * box.height_px, stack.x_m, box.width_px, box.height_px)
     y_m = ((box.u0 + box.u1) / 2 - stack.width_px / 2) * pitch_u
     z_m = (stack.height_px / 2 - (box.v0 + box.v1) / 2) * pitch_v
-    return Window(box, cut, np.array([0.0, y_m, z_m]))
+    return Window(box, cut, np.array([0.0, y_m, z_m]), steps)
 
 
 def still_fits(window: Window, wanted: Window) -> bool:

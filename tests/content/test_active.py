@@ -7,7 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runtime.content.active import cut_out, differing_box, still_fits, stray_px, whole_rays, window_of
+from runtime.content.active import (
+    cut_out,
+    differing_box,
+    steepness,
+    steepness_beside,
+    still_fits,
+    stray_px,
+    whole_rays,
+    window_of,
+)
 from runtime.content.camera import PixelBox
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
@@ -84,3 +93,26 @@ def test_windows_have_few_sizes() -> None:
         assert window is not None
         sizes.add(window.box.width_px)
     assert len(sizes) <= 5
+
+
+def test_a_phase_s_error_shows_most_before_mid_grey() -> None:
+    assert steepness(np.array([0, 255], np.uint8)) == 0.0
+    assert steepness(np.array([127], np.uint8)) == pytest.approx(1.0, abs=0.01)
+    picture = np.full((100, 200, 4), 255, np.uint8)
+    box = PixelBox(80, 20, 120, 60)
+    picture[20:60, 80:120] = 127  # within the box nothing fades
+    assert steepness_beside(picture, box) == 0.0
+    picture[70:, :80] = 127  # neither in other rows
+    assert steepness_beside(picture, box) == 0.0
+    picture[20:60, :80, :3] = 127
+    assert steepness_beside(picture, box) > 0.9
+
+
+def test_before_white_a_window_is_smaller_than_before_grey() -> None:
+    box = PixelBox(400, 200, 440, 240)
+    white, grey = (window_of(box, EYES, STACK, steep=steep) for steep in (0.0, 1.0))
+    assert white is not None
+    assert grey is not None
+    assert white.box.width_px < 0.7 * grey.box.width_px
+    assert still_fits(grey, white) == (grey.box.width_px <= 1.3 * white.box.width_px)
+    assert not still_fits(white, grey)
