@@ -16,6 +16,7 @@ from runtime.report.machine import describe
 from runtime.report.methods import Method, shipped_and_references
 from runtime.report.page import Page, Section, Tile
 from runtime.report.pairs import StillPair, eyes_at, procedural_pairs, read_pairs
+from runtime.report.plan_section import surveyed
 from runtime.report.simulate import Simulation
 from runtime.report.sweep_page import gap_section, knob_section, resolution_section, tolerance_section, volume_section
 
@@ -96,6 +97,9 @@ def whole_report(
     runs = latency.plan_on_and_off(frames=60 if quick else 150, scale=scale)
     sections.insert(len(sections) - 1, latency.latency_section(runs, scale=scale))
     record["runs"] = [{"name": run.name, "latency_ms": run.latency_ms, "summary": run.summary} for run in runs]
+    progress("what scenes do not need")
+    section, record["plan"] = surveyed(quick=quick)
+    sections.insert(len(sections) - 1, section)
     if with_focal:
         stacks = []
         full = StackGeometry().stack()

@@ -66,21 +66,23 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
         axes.set(xscale="log", xlabel="median time of a whole prediction, ms", ylabel="displayed PSNR, dB")
         axes.set(xlim=(low, high))
         axes.margins(y=0.1 if np.ptp([r.psnr_db for r in dots]) else 0.5)
-        for result in results:
-            if not result.trained:
-                axes.axvline(result.ms_p50, color=KINDS["network"][1], linestyle=":", linewidth=1.4)
-                axes.annotate(
-                    f"{result.name} (time only)",
-                    (result.ms_p50, 0.02),
-                    xycoords=axes.get_xaxis_transform(),
-                    xytext=(-3, 0),
-                    textcoords="offset points",
-                    rotation=90,
-                    ha="right",
-                    va="bottom",
-                    fontsize=8.5,
-                    color=KINDS["network"][1],
-                )
+        colour = KINDS["network"][1]
+        timed_only = sorted((r for r in results if not r.trained), key=lambda r: r.ms_p50)
+        for index, result in enumerate(timed_only):
+            axes.axvline(result.ms_p50, color=colour, linestyle=":", linewidth=1.4)
+            right = index == len(timed_only) - 1  # two lines may be as good as one: their names stand outside
+            axes.annotate(
+                f"{result.name} (time only)",
+                (result.ms_p50, 0.02),
+                xycoords=axes.get_xaxis_transform(),
+                xytext=(3 if right else -3, 0),
+                textcoords="offset points",
+                rotation=90,
+                ha="left" if right else "right",
+                va="bottom",
+                fontsize=8.5,
+                color=colour,
+            )
         axes.set_title("Error against run time: up and to the left is better")
         axes.xaxis.set_major_formatter("{x:g}")
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=5, fontsize=8.5)

@@ -18,6 +18,7 @@ from runtime.report.horizon import Horizon, horizon_section, psnr_at
 from runtime.report.latency import Run, latency_section
 from runtime.report.machine import describe
 from runtime.report.page import Figure, Page, Section, Table, Tile
+from runtime.report.plan_section import plan_section
 from runtime.report.plots import drawing, label_points, png
 from runtime.report.stability.page import stability_page
 from runtime.report.stability.trial import Answer, Trial, settle
@@ -161,6 +162,18 @@ def test_an_untrained_network_has_a_time_and_no_error() -> None:
     assert rows["fast"]["PSNR dB"] == "36.00"
     assert dict(zip(rows, table.styles, strict=True)) == {"eyereal": "", "fast": "good", "SART-10": "good"}
     assert any("untrained" in text for text in section.text)
+
+
+def test_the_survey_of_the_plan_is_a_table_of_scenes_and_two_plots() -> None:
+    row = {"kind": "sparse object on white", "ms_with": 12.3, "ms_without": 40.0, "faster": 3.3, "db_with": 38.0,
+           "db_without": 38.01, "active_fraction": 0.08, "channels": 1, "left_out": ({"what": "pixels"},)}  # fmt: skip
+    record = {"model": "balanced", "width_px": 1920, "height_px": 1080, "scenes": [row], "other_sparse": [row]}
+    section = plan_section(record, {"plan-scenes": b"one", "plan-regions": b"two"})
+    (table,) = section.tables
+    assert [list(cells) for cells in table.rows] == [
+        ["sparse object on white", "12.3", "40.0", "3.30", "38.00", "38.01", "8%", "1", "pixels"]
+    ] * 2
+    assert [figure.png for figure in section.figures] == [b"one", b"two"]
 
 
 def test_names_of_dots_lie_neither_on_one_another_nor_beyond_the_axes() -> None:
