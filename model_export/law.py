@@ -1,0 +1,66 @@
+"""Weights that follow a law: `python -m model_export.law RECIPE.json`, before or instead of a training.
+
+λ = 0.01 + 0.05·t² (t: tolerance in millimetres at the ordinary separation of eyes), the same for every frequency.
+Its two numbers were chosen on procedural pairs and built-in scenes (docs/models.md). What a training finds starts
+here; without weights the network starts from one constant.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from model_export.checkpoint import plain_weights
+from model_export.network import SpectralSolver
+from model_export.recipe import Recipe, read_recipe
+from runtime.artifacts import write_text
+from runtime.model.chain import RELATIVE_TOLERANCE_MAX_MM
+
+AT_NONE, GROWTH = 0.01, 0.05
+SEED = 1
+ITERATIONS = 200
+
+
+def regularisation(tolerance_mm: Tensor) -> Tensor:
+    """λ for tolerances in millimetres."""
+    return AT_NONE + GROWTH * tolerance_mm**2
+
+
+def following(recipe: Recipe) -> Recipe:
+    """The recipe with weights that follow the law to some hundredths; the same every time."""
+    torch.manual_seed(SEED)
+    solver = SpectralSolver(recipe.hidden)
+    tolerances = torch.linspace(0.0, RELATIVE_TOLERANCE_MAX_MM, 65)
+    spectrum = torch.linspace(0.01, 4.0, 24)
+    wanted = torch.log(regularisation(tolerances))
+    optimiser = torch.optim.LBFGS(solver.parameters(), max_iter=ITERATIONS, line_search_fn="strong_wolfe")
+
+    def loss() -> Tensor:
+        optimiser.zero_grad()
+        found = torch.stack([torch.log(solver.regularisation(spectrum, t.reshape(1))) for t in tolerances])
+        error = (found - wanted[:, None]).square().mean()
+        error.backward()  # type: ignore[no-untyped-call]
+        return error
+
+    optimiser.step(loss)  # type: ignore[no-untyped-call]
+    return recipe.model_copy(update={"weights": plain_weights(solver)})
+
+
+def main() -> int:
+    """Put the weights into recipe files."""
+    parser = argparse.ArgumentParser(prog="python -m model_export.law", description=__doc__)
+    parser.add_argument("recipes", nargs="+", help="shipped names or JSON files: read")
+    parser.add_argument("--out", type=Path, required=True, help="folder: written, NAME.json each")
+    asked = parser.parse_args()
+    for name in asked.recipes:
+        recipe = following(read_recipe(name))
+        write_text(asked.out / f"{recipe.name}.json", recipe.text())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
