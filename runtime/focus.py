@@ -17,6 +17,7 @@ import numpy as np
 
 from runtime.content.active import (
     Window,
+    coarse_box,
     differing_box,
     steepness,
     steepness_beside,
@@ -122,15 +123,15 @@ class FocusedPredictor(Predictor):
         if aimed is not None:
             window, cut = aimed, [[left], [right]]
         else:
-            box = differing_box(left, right)
-            differs = box.width_px > 0 and box.height_px > 0
-            steep = steepness_beside(left, box)
-            found = window_of(box, eyes_m, self.stack, steep=steep) if differs else None
-            if found is None and differs:
-                self.window, self.active_fraction = None, 1.0
-                prediction = self.whole.predict(images, eyes_m)
-                self.channels = self.whole.channels
-                return prediction
+            # A coarse look tells for next to nothing what is too large; only the rest is worth a close one.
+            for look in (coarse_box, differing_box):
+                box = look(left, right)
+                found = self._around(box, left, eyes_m)
+                if box.width_px and found is None:
+                    self.window, self.active_fraction = None, 1.0
+                    prediction = self.whole.predict(images, eyes_m)
+                    self.channels = self.whole.channels
+                    return prediction
             kept = self._kept(found)
             if kept is None:
                 return self._filled(left, begin_ns)
@@ -150,6 +151,12 @@ class FocusedPredictor(Predictor):
         else:
             self._fill_with(left, but=window.box)
         return self._place(window, solved, eyes_m, found_ms + (perf_counter_ns() - begin_ns) / 1e6)
+
+    def _around(self, box: PixelBox, picture: U8, eyes_m: F64) -> Window | None:
+        """The window around a box in which the eyes' pictures differ; None where nothing does, or too much."""
+        if not box.width_px:
+            return None
+        return window_of(box, eyes_m, self.stack, steep=steepness_beside(picture, box))
 
     def _kept(self, wanted: Window | None) -> Window | None:
         """The last frame's window where it will do: then nothing is allocated again."""

@@ -18,6 +18,11 @@ def plan(
     eyes: Annotated[
         tuple[float, float, float] | None, typer.Option(help="x y z between the eyes, metres, frame `stack`")
     ] = None,
+    survey: Annotated[
+        bool, typer.Option("--survey", help="six kinds of scenes, the plan on and off, and cost against region size")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="with --survey: folder for table, plots and JSON")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="with --survey: half the resolution, fewer repeats")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
 ) -> None:
     """What this scene leaves out, why, what each saving saves and what it costs, measured here.
@@ -25,7 +30,12 @@ def plan(
     Example: phasestack plan --scene sparse
 
     Example: phasestack plan --scene lego_bulldozer --budget-ms 40 --json
+
+    Example: phasestack plan --survey --out out/plan
     """
+    if survey or out is not None or quick:
+        _survey(config, survey, out, scene, model, scale, budget_ms, eyes, quick, as_json)
+        return
     from runtime.planning import plan_for
 
     result = plan_for(config, scene=scene, model=model, scale=scale, budget_ms=budget_ms, middle_m=eyes, quiet=as_json)
@@ -33,6 +43,56 @@ def plan(
         typer.echo(json.dumps(result))
     else:
         _print(result)
+
+
+def _survey(
+    config: Path | None,
+    survey: bool,
+    out: Path | None,
+    scene: str | None,
+    model: str | None,
+    scale: float,
+    budget_ms: float | None,
+    eyes: tuple[float, float, float] | None,
+    quick: bool,
+    as_json: bool,
+) -> None:
+    from runtime.errors import InputError
+    from runtime.planning import survey as survey_to
+
+    if not survey:
+        raise InputError("plan", "--survey", "--out and --quick belong to it")
+    if out is None:
+        raise InputError("plan", "--out", "--survey needs a folder for its files")
+    for option, value in (("--scene", scene), ("--budget-ms", budget_ms), ("--eyes", eyes)):
+        if value is not None:
+            raise InputError("plan", option, "is of no use with --survey, which has scenes and a viewer of its own")
+    result = survey_to(config, out=out, model=model, scale=scale, quick=quick, quiet=as_json)
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        _print_survey(result, out)
+
+
+def _print_survey(result: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    table = Table("scene", "on ms", "off ms", "faster", "on dB", "off dB", "active", "channels")
+    for row in (*result["scenes"], *result["other_sparse"]):
+        table.add_row(
+            row["kind"],
+            f"{row['ms_with']:.1f}",
+            f"{row['ms_without']:.1f}",
+            f"{row['faster']:.2f}",
+            f"{row['db_with']:.2f}",
+            f"{row['db_without']:.2f}",
+            f"{row['active_fraction']:.0%}",
+            str(row["channels"]),
+        )
+    console.print(table)
+    console.print(f"{out}")
 
 
 def _print(result: dict[str, Any]) -> None:

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runtime.content.active import (
+    coarse_box,
     cut_out,
     differing_box,
     steepness,
@@ -47,6 +48,22 @@ def test_a_picture_that_differs_everywhere_is_whole() -> None:
     random = np.random.default_rng(0)
     left, right = random.integers(0, 256, (2, 270, 480, 4), np.uint8)
     assert differing_box(left, right) == PixelBox(0, 0, 480, 270)
+
+
+def test_a_coarse_look_never_finds_more_than_a_close_one() -> None:
+    random = np.random.default_rng(1)
+    for _ in range(20):
+        left = np.full((270, 480, 4), 100, np.uint8)
+        right = left.copy()
+        u, v = random.integers(0, 400), random.integers(0, 200)
+        right[v : v + random.integers(1, 70), u : u + random.integers(1, 80), 0] = 50
+        coarse, close = coarse_box(left, right), differing_box(left, right)
+        if coarse.width_px:
+            assert close.u0 <= coarse.u0
+            assert close.v0 <= coarse.v0
+            assert coarse.u1 <= close.u1
+            assert coarse.v1 <= close.v1
+            assert close.width_px - coarse.width_px <= 32
 
 
 def test_a_window_s_panels_are_the_same_panels() -> None:

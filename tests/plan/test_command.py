@@ -9,6 +9,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from runtime.artifacts import read_image
 from runtime.commands.plan import plan
 from runtime.errors import InputError
 
@@ -62,3 +63,47 @@ def test_a_preset_without_its_data_shows_a_stand_in_and_says_so(name: str) -> No
     done = runner.invoke(app, ["--scene", name, "--scale", "0.1", "--json"])
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["scene"].startswith(f"{name} (stand-in")
+
+
+def test_the_survey_tells_time_and_error_with_and_without(tmp_path: Path) -> None:
+    done = runner.invoke(app, ["--survey", "--quick", "--scale", "0.2", "--out", str(tmp_path / "a" / "b"), "--json"])
+    assert done.exit_code == 0, done.output
+    folder = tmp_path / "a" / "b"
+    result = json.loads(done.stdout)
+    assert json.loads((folder / "plan-survey.json").read_text(encoding="utf-8")) == result
+    assert [row["name"] for row in result["scenes"]] == ["sparse", "texture", "grey", "flat", "thin", "moving"]
+    rows = {row["name"]: row for row in (*result["scenes"], *result["other_sparse"])}
+    assert rows["texture"]["active_fraction"] == 1.0
+    assert rows["grey"]["channels"] == 1
+    assert rows["flat"]["active_fraction"] == 0.0
+    assert rows["sparse"]["active_fraction"] < 0.4
+    assert {item["what"] for item in rows["sparse"]["left_out"]} == {"inference beside the active window"}
+    for row in rows.values():
+        assert row["ms_with"] > 0
+        assert row["ms_with_p99"] >= row["ms_with"]
+        assert row["db_without"] - row["db_with"] < 0.3  # few pixels: a tenth is asserted at half size
+    sizes = {(row["width_px"], row["height_px"]) for row in result["regions"]}
+    assert len(sizes) == 2
+    for size in sizes:
+        active = [row["active_px"] for row in result["regions"] if (row["width_px"], row["height_px"]) == size]
+        assert active == sorted(active)
+        assert active[0] < active[-1]
+    for name in ("plan-scenes.png", "plan-regions.png"):
+        picture = read_image(folder / name)
+        assert picture.shape[0] > 300
+        assert picture.std() > 10
+    assert "| sparse object on white |" in (folder / "plan-survey.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--survey"], "--out"),
+        (["--out", "x"], "--survey"),
+        (["--survey", "--out", "x", "--scene", "demo"], "--scene"),
+    ],
+)
+def test_the_survey_s_options_go_together(options: list[str], said: str) -> None:
+    done = runner.invoke(app, options)
+    assert isinstance(done.exception, InputError)
+    assert said in str(done.exception)
