@@ -20,6 +20,7 @@ from runtime.records import F64
 MARGIN = 4  # pixels to spare, right and below, in buffers that are resampled into
 SEARCH = 96  # pixels among which a whole place in the source is looked for
 GOOD_PHASE = 1 / 24  # of a pixel: the search ends here; so small a shift leaves an error below -55 dB
+LEAST_RUN = 8  # pixels of source and result that are worth resizing
 WORST_PHASE = 1 / 12  # where nothing better is found
 
 Image = NDArray[Any]
@@ -71,7 +72,7 @@ def _whole_place(scale: float, shift: float, source_px: int, result_px: int) -> 
             return None
     start, source = first + best, int(np.rint(places[best]))
     count = min(source_px - source, int(np.ceil((result_px - start) * scale)) + 1)
-    if count < 8 or result_px - start < 8:
+    if count < LEAST_RUN or result_px - start < LEAST_RUN or count < LEAST_RUN * scale:
         return None
     return first, start, source, count
 

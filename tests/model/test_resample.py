@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -42,6 +43,16 @@ def test_samples_are_where_the_matrix_says(
     # The steepest slope of the picture is 1000/7 + 1000/9 a pixel.
     tolerance = (WORST_PHASE + 1 / 32) * 254 * 1.5 + 2
     assert np.abs(result - exact)[inside].max(initial=0.0) <= tolerance
+
+
+@pytest.mark.parametrize("scale", [20.0, 400.0])
+def test_an_image_that_shrinks_to_a_few_pixels_or_less_is_sampled_all_the_same(scale: float) -> None:
+    image = smooth(1)
+    matrix = np.array([[scale, 0.0, 3.0], [0.0, scale, 3.0], [0.0, 0.0, 1.0]])
+    result = resample(image, image_from_result=matrix, out=buffer(HEIGHT, WIDTH))
+    if scale < 100:
+        exact = sample_bilinear(image.astype(np.float32), u=np.float32([[13.0]]), v=np.float32([[13.0]]))
+        assert np.abs(result[0, 0] - exact[0, 0]).max() <= 12
 
 
 def test_beside_the_image_stands_the_given_value() -> None:
