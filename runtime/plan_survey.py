@@ -67,6 +67,7 @@ class RegionResult:
     active_px: int
     ms_with: float
     ms_without: float
+    share: float  # of the time without the plan, median over pairs of frames drawn one after the other
 
 
 def others() -> Iterator[tuple[str, Scene]]:
@@ -162,6 +163,7 @@ def survey_regions(
                         active_px,
                         done["planned"].frame_ms,
                         done["plain"].frame_ms,
+                        float(np.median(np.array(done["planned"].times_ms) / np.array(done["plain"].times_ms))),
                     )
                 )
         finally:
