@@ -1,8 +1,8 @@
-"""Weights that follow a law: `python -m model_export.law RECIPE.json`, before or instead of a training.
+"""Weights that follow a law: `python -m model_export.law RECIPE --growth 0.05 --out DIR`, before or instead of a training.
 
-λ = 0.01 + 0.05·t² (t: tolerance in millimetres at the ordinary separation of eyes), the same for every frequency.
-Its two numbers were chosen on procedural pairs and built-in scenes (docs/models.md). What a training finds starts
-here; without weights the network starts from one constant.
+λ = 0.01 + growth·t² (t: tolerance in millimetres at the ordinary separation of eyes), the same for every frequency.
+Its numbers were chosen on procedural pairs and built-in scenes (docs/models.md). What a training finds starts here;
+without weights the network starts from one constant.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from model_export.recipe import Recipe, read_recipe
 from runtime.artifacts import write_text
 from runtime.model.chain import RELATIVE_TOLERANCE_MAX_MM
 
-AT_NONE, GROWTH = 0.01, 0.05
+AT_NONE = 0.01
 SEED = 1
 ITERATIONS = 200
 
 
-def regularisation(tolerance_mm: Tensor) -> Tensor:
+def regularisation(tolerance_mm: Tensor, *, growth: float) -> Tensor:
     """λ for tolerances in millimetres."""
-    return AT_NONE + GROWTH * tolerance_mm**2
+    return AT_NONE + growth * tolerance_mm**2
 
 
-def following(recipe: Recipe) -> Recipe:
+def following(recipe: Recipe, *, growth: float) -> Recipe:
     """The recipe with weights that follow the law to some hundredths; the same every time."""
     torch.manual_seed(SEED)
     solver = SpectralSolver(recipe.hidden)
     tolerances = torch.linspace(0.0, RELATIVE_TOLERANCE_MAX_MM, 65)
     spectrum = torch.linspace(0.01, 4.0, 24)
-    wanted = torch.log(regularisation(tolerances))
+    wanted = torch.log(regularisation(tolerances, growth=growth))
     optimiser = torch.optim.LBFGS(solver.parameters(), max_iter=ITERATIONS, line_search_fn="strong_wolfe")
 
     def loss() -> Tensor:
@@ -55,9 +55,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m model_export.law", description=__doc__)
     parser.add_argument("recipes", nargs="+", help="shipped names or JSON files: read")
     parser.add_argument("--out", type=Path, required=True, help="folder: written, NAME.json each")
+    parser.add_argument("--growth", type=float, required=True, help="per square millimetre")
     asked = parser.parse_args()
     for name in asked.recipes:
-        recipe = following(read_recipe(name))
+        recipe = following(read_recipe(name), growth=asked.growth)
         write_text(asked.out / f"{recipe.name}.json", recipe.text())
     return 0
 
