@@ -1,4 +1,4 @@
-"""Weights that follow a law: `python -m model_export.law RECIPE --growth 0.05 --out DIR`, before or instead of a training.
+"""Weights that follow a law, before or instead of a training: `python -m model_export.law NAME --growth G --out DIR`.
 
 λ = 0.01 + growth·t² (t: tolerance in millimetres at the ordinary separation of eyes), the same for every frequency.
 Its numbers were chosen on procedural pairs and built-in scenes (docs/models.md). What a training finds starts here;

@@ -32,9 +32,9 @@ Rung = tuple[str, float]  # a model's name, and the share of the panels' columns
 
 SCALES = (1.0, 0.75, 0.5)  # of a model that isn't shipped: it has no lighter sister
 REPEATS = 3
-# Of `prepare`, `inference` and `finish` against balanced, as `phasestack report` measured them: a simulated clock
+# Of `prepare`, `inference` and `finish` against balanced, about as on two cores at 1920x1080: a simulated clock
 # must not depend on the machine.
-SIMULATED_COST = {"best": 2.2, "balanced": 1.0, "fast": 0.6}
+SIMULATED_COST = {"best": 2.1, "balanced": 1.0, "fast": 0.7}
 SOLVING = ("prepare", "inference", "finish")
 
 
