@@ -9,7 +9,8 @@ from math import prod
 import numpy as np
 from numpy.typing import NDArray
 
-ROWS = 32
+STRIP = 192 * 1024  # numbers of 16 bits: with what it is made from, a strip stays in a core's own cache
+WORTH_A_THREAD = 2 * STRIP  # an image of fewer numbers is done before another thread has woken
 
 Work = Callable[[slice, NDArray[np.int16]], None]
 
@@ -24,7 +25,7 @@ class RowPool:
         """width_px: of the widest image, three channels."""
         self._threads = max(1, threads)
         self._pool = ThreadPoolExecutor(self._threads, "rows") if self._threads > 1 else None
-        self._scratch = np.zeros((self._threads, ROWS * width_px * 3), np.int16)
+        self._scratch = np.zeros((self._threads, max(STRIP, width_px * 3)), np.int16)
 
     def each(self, shape: tuple[int, ...], work: Work) -> None:
         """`work` on every strip of rows of an image; strips don't overlap. What it raises is raised here.
@@ -33,18 +34,18 @@ class RowPool:
         in it.
         """
         height_px, row = shape[0], shape[1:]
-        numbers = ROWS * prod(row)
+        rows = self._scratch.shape[1] // prod(row)
 
-        def share(index: int) -> None:
-            strip = self._scratch[index, :numbers].reshape(ROWS, *row)
-            for start in range(index * ROWS, height_px, self._threads * ROWS):
-                stop = min(start + ROWS, height_px)
+        def share(index: int, of: int) -> None:
+            strip = self._scratch[index, : rows * prod(row)].reshape(rows, *row)
+            for start in range(index * rows, height_px, of * rows):
+                stop = min(start + rows, height_px)
                 work(slice(start, stop), strip[: stop - start])
 
-        if self._pool is None:
-            share(0)
+        if self._pool is None or prod(shape) <= WORTH_A_THREAD:
+            share(0, 1)
         else:
-            list(self._pool.map(share, range(self._threads)))
+            list(self._pool.map(share, range(self._threads), [self._threads] * self._threads))
 
     def close(self) -> None:
         """End the threads. May be called twice."""
