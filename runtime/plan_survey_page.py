@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from runtime.artifacts import write_json
+from runtime.artifacts import write_bytes, write_json, write_text
 from runtime.plan_survey import RegionResult, SceneResult
 from runtime.report.plots import COLOURS, INK, drawing, png
 
+HEADINGS = ("scene", "on ms", "off ms", "times faster", "on dB", "off dB", "active", "channels")
 WITH, WITHOUT = COLOURS[0], "#b8bfcc"
 
 
@@ -28,11 +29,30 @@ def write_survey(
         "other_sparse": [asdict(row) for row in others],
         "regions": [asdict(row) for row in regions],
     }
+    words, bars, lines = (
+        table(scenes, others, facts),
+        scenes_png([*scenes, *others], facts),
+        regions_png(regions, facts),
+    )
     write_json(folder / "plan-survey.json", result)
-    (folder / "plan-survey.md").write_text(table(scenes, others, facts), encoding="utf-8")
-    (folder / "plan-scenes.png").write_bytes(scenes_png([*scenes, *others], facts))
-    (folder / "plan-regions.png").write_bytes(regions_png(regions, facts))
+    write_text(folder / "plan-survey.md", words)
+    write_bytes(folder / "plan-scenes.png", bars)
+    write_bytes(folder / "plan-regions.png", lines)
     return result
+
+
+def cells(row: Mapping[str, Any]) -> list[str]:
+    """One scene of plan-survey.json as words, under HEADINGS."""
+    return [
+        row["kind"],
+        f"{row['ms_with']:.1f}",
+        f"{row['ms_without']:.1f}",
+        f"{row['faster']:.2f}",
+        f"{row['db_with']:.2f}",
+        f"{row['db_without']:.2f}",
+        f"{row['active_fraction']:.0%}",
+        str(row["channels"]),
+    ]
 
 
 def table(scenes: Sequence[SceneResult], others: Sequence[SceneResult], facts: dict[str, Any]) -> str:

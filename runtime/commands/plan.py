@@ -78,19 +78,12 @@ def _print_survey(result: dict[str, Any], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from runtime.plan_survey_page import HEADINGS, cells
+
     console = Console()
-    table = Table("scene", "on ms", "off ms", "faster", "on dB", "off dB", "active", "channels")
+    table = Table(*HEADINGS)
     for row in (*result["scenes"], *result["other_sparse"]):
-        table.add_row(
-            row["kind"],
-            f"{row['ms_with']:.1f}",
-            f"{row['ms_without']:.1f}",
-            f"{row['faster']:.2f}",
-            f"{row['db_with']:.2f}",
-            f"{row['db_without']:.2f}",
-            f"{row['active_fraction']:.0%}",
-            str(row["channels"]),
-        )
+        table.add_row(*cells(row))
     console.print(table)
     console.print(f"{out}")
 

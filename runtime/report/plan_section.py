@@ -28,19 +28,10 @@ def surveyed(*, quick: bool) -> tuple[Section, dict[str, Any]]:
 
 def plan_section(record: dict[str, Any], pictures: dict[str, bytes]) -> Section:
     """The survey's record and its two plots as a section."""
-    headings = ["scene", "on ms", "off ms", "times faster", "on dB", "off dB", "active", "channels", "left out"]
+    from runtime.plan_survey_page import HEADINGS, cells
+
     rows = [
-        [
-            row["kind"],
-            f"{row['ms_with']:.1f}",
-            f"{row['ms_without']:.1f}",
-            f"{row['faster']:.2f}",
-            f"{row['db_with']:.2f}",
-            f"{row['db_without']:.2f}",
-            f"{row['active_fraction']:.0%}",
-            str(row["channels"]),
-            "; ".join(str(item["what"]) for item in row["left_out"]),
-        ]
+        [*cells(row), "; ".join(str(item["what"]) for item in row["left_out"])]
         for row in (*record["scenes"], *record["other_sparse"])
     ]
     text = [
@@ -49,4 +40,4 @@ def plan_section(record: dict[str, Any], pictures: dict[str, bytes]) -> Section:
         "By command: phasestack plan --survey.",
     ]
     figures = [Figure(name, pictures[name], caption) for name, caption in CAPTIONS.items()]
-    return Section("What a scene does not need", text, figures, [Table(headings, rows)])
+    return Section("What a scene does not need", text, figures, [Table([*HEADINGS, "left out"], rows)])
