@@ -14,13 +14,13 @@ import numpy as np
 from calib.charts import FOV_DEG, Kind, alone, eye_chart, line_picture
 from calib.keys import Key, TerminalKeys, WindowKeys, first_of
 from calib.viewpoints import Viewpoint
-from runtime.artifacts import OutputFolder, write_json, write_png
 from runtime.clock import NS_PER_MS, MonotonicClock
 from runtime.config import ModelSettings, Settings
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.records import U8, LayerFrame
+from runtime.support.artifacts import OutputFolder, write_json, write_png
 
 if TYPE_CHECKING:
     from runtime.model.predictor import Predictor
@@ -156,8 +156,8 @@ class ChartDisplay:
 
     def __init__(self, settings: Settings, drawer: Drawer) -> None:
         """Opens the panels. Raises InputError, MissingPart, PanelLost."""
-        from runtime.gl import offscreen_context
         from runtime.panels.registry import open_panels
+        from runtime.support.gl import offscreen_context
 
         self._drawer = drawer
         self._sink = open_panels(settings.output, drawer.stack, MonotonicClock(), offscreen_context())

@@ -14,10 +14,10 @@ from calib.panel_run import asked_settings, fit_registration
 from calib.pictures import file_pictures, layers_for, scene_pictures
 from calib.registration import error_over_panel_px, register, true_from_ideal
 from calib.vernier import simulate, write_settings
-from runtime.artifacts import OutputFolder, write_bytes, write_json, write_text
 from runtime.config import Settings
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
+from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_text
 
 SHIFTS_PX = (0.0, 0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
 JUDGED_EYES_M = ((0.6, -0.03, 0.0), (0.6, 0.03, 0.0))

@@ -11,11 +11,11 @@ import numpy as np
 
 from calib.grey import CHANNELS, Series, fit_series, lut_text, read_series
 from calib.panel_figures import grey_figure
-from runtime.artifacts import OutputFolder, write_bytes, write_text
 from runtime.config import Settings
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, LayerFrame
+from runtime.support.artifacts import OutputFolder, write_bytes, write_text
 
 
 def fit_lut(
@@ -70,8 +70,8 @@ def ask_series(greys: Sequence[float], *, show: Callable[[float], None], ask: Ca
 
 def _screen(settings: Settings, stack: PanelStack, panel: int) -> tuple[Callable[[float], None], Callable[[], None]]:
     from runtime.clock import MonotonicClock
-    from runtime.gl import offscreen_context
     from runtime.panels.registry import open_panels, panel_settings
+    from runtime.support.gl import offscreen_context
 
     # The bare panel is measured: no curve, whatever is configured.
     bare = tuple(

@@ -9,7 +9,7 @@ from typing import Any
 from calib.experiment import DEFAULT, SIGMAS_M, Case, run_case, time_solvers
 from calib.figures import methods_figure, timing_figure
 from calib.page import Picture, page
-from runtime.artifacts import OutputFolder, write_bytes, write_json, write_text
+from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_text
 
 COUNTS = (3, 10, 27, 100, 1000, 10_000, 100_000, 1_000_000)
 SENSOR_SCALE_OFF = 1.03

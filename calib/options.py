@@ -32,6 +32,6 @@ def tell(summary: dict[str, Any], as_json: bool, text: str) -> None:
     if not as_json:
         typer.echo(text)
         return
-    from runtime.artifacts import to_json
+    from runtime.support.artifacts import to_json
 
     typer.echo(to_json(summary))

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from runtime.artifacts import write_text
 from runtime.errors import InputError
 from runtime.records import F64
+from runtime.support.artifacts import write_text
 
 COLUMNS = ("sensor_x", "sensor_y", "sensor_z", "stack_x", "stack_y", "stack_z")
 NOTES = ("viewpoint", "spread_mm", "samples", "accepted_at", "sensor_serial")

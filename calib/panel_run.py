@@ -15,12 +15,12 @@ from calib.panel_figures import registration_figure
 from calib.registration import Setting, StackRegistration, parts, register
 from calib.store import save
 from calib.vernier import STEPS_PX, Nudging, chart, nominal, read_settings, resumed, write_settings
-from runtime.artifacts import OutputFolder, write_bytes, write_json, write_png, write_text
 from runtime.clock import NS_PER_MS, MonotonicClock
 from runtime.config import Settings, load_settings
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import U8, LayerFrame
+from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_png, write_text
 
 POLL_NS = 30 * NS_PER_MS
 SHOW_AGAIN_POLLS = 5
@@ -53,8 +53,8 @@ def nudge_verniers(
     """Let a person set the verniers on the panels. Raises InputError, MissingPart, PanelLost."""
     import typer
 
-    from runtime.gl import offscreen_context
     from runtime.panels.registry import open_panels, panel_settings
+    from runtime.support.gl import offscreen_context
 
     asked = asked_settings(stack, eye_m=eye_m, reference=reference)
     nudging = resumed(asked, read_settings(out, stack) if out.exists() else [])

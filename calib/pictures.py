@@ -17,7 +17,7 @@ def scene_pictures(settings: Settings, stack: PanelStack, eyes_m: F64) -> tuple[
     """(h, w, 4) what a left and a right eye (2, 3) should see of the configured scene. Raises InputError."""
     from runtime.content.base import View
     from runtime.content.registry import open_content
-    from runtime.gl import offscreen_context
+    from runtime.support.gl import offscreen_context
 
     content = open_content(settings.content, stack, offscreen_context())
     try:
@@ -35,7 +35,7 @@ def scene_pictures(settings: Settings, stack: PanelStack, eyes_m: F64) -> tuple[
 
 def file_pictures(paths: tuple[Path, Path]) -> tuple[U8, U8]:
     """(h, w, 3) two image files of one size. Raises InputError."""
-    from runtime.artifacts import read_image
+    from runtime.support.artifacts import read_image
 
     left, right = read_image(paths[0]), read_image(paths[1])
     if left.shape != right.shape:

@@ -14,12 +14,12 @@ from calib.figures import eye_error_figure, geometry_figure, residual_figure
 from calib.page import Picture, page
 from calib.pairs import Pairs, read_pairs
 from calib.viewpoints import spherical_m, viewing_volume_m
-from runtime.artifacts import OutputFolder, write_bytes, write_json, write_text
 from runtime.config import read_table
 from runtime.errors import InputError
 from runtime.eyes.calibration import Calibration, load_calibration, similarity_defect
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
+from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_text
 
 LISTED_POINTS = 200
 

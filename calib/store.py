@@ -12,10 +12,10 @@ import numpy as np
 from calib.pairs import Pairs
 from calib.solution import Solution
 from calib.viewpoints import viewing_volume_m
-from runtime.artifacts import write_bytes, write_text
 from runtime.errors import InputError
 from runtime.eyes.calibration import load_calibration
 from runtime.records import F64
+from runtime.support.artifacts import write_bytes, write_text
 
 if TYPE_CHECKING:
     from tomlkit.items import Array

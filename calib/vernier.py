@@ -13,10 +13,10 @@ import numpy as np
 
 from calib.keys import Key
 from calib.registration import Setting, ideal_partner, through
-from runtime.artifacts import write_text
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
+from runtime.support.artifacts import write_text
 
 COLUMNS = (
     "reference", "panel", "eye_x", "eye_y", "eye_z", "reference_u", "reference_v", "panel_u", "panel_v",

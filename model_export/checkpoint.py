@@ -14,9 +14,9 @@ from torch import Tensor, nn
 from model_export.eyereal import EyeRealNet
 from model_export.network import SpectralSolver
 from model_export.recipe import Recipe
-from runtime.artifacts import write_bytes
 from runtime.config import validated
 from runtime.errors import InputError
+from runtime.support.artifacts import write_bytes
 
 WIDTH_KEY = "subnets.in_conv.0.weight"
 FAMILIES = {"subnets.": "eyereal", "lambda_net.": "spectral"}

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from runtime.artifacts import write_bytes, write_text
+from runtime.support.artifacts import write_bytes, write_text
 
 COLUMNS = ("iteration", "training_loss_db", "held_out_exact_db", "held_out_off_db", "held_out_loss_db")
 

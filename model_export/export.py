@@ -17,10 +17,10 @@ from model_export.onnx_files import eyereal_bytes, half_precision, quantised, sp
 from model_export.recipe import DESIGN_RANGE, Recipe, read_recipe
 from model_export.stress import eyereal_feeds, ordinary_pictures
 from model_export.validate import OPSETS, Report, check_model
-from runtime.artifacts import write_bytes
 from runtime.errors import InputError
 from runtime.model.contract import Contract
 from runtime.model.predictor import SHIPPED
+from runtime.support.artifacts import write_bytes
 
 CALIBRATION_PAIRS = 8
 CALIBRATION_SIZE = (270, 480)

@@ -24,7 +24,6 @@ from model_export.checkpoint import solver_of
 from model_export.export import spectral_file
 from model_export.recipe import Recipe, read_recipe
 from model_export.stills import random_still
-from runtime.artifacts import write_text
 from runtime.config import ModelSettings
 from runtime.model.predictor import load_predictor
 from runtime.model.still import solve_still
@@ -33,6 +32,7 @@ from runtime.optics.retina import panel_positions, ray_mask
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 from runtime.report.pairs import StillPair
+from runtime.support.artifacts import write_text
 
 SEED = 777  # of the pairs: neither the training's nor those that models are judged on
 BESIDE_MM = 2.0

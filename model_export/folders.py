@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 
 from model_export.data import CENTRE, TrainingPair
-from runtime.artifacts import read_image
 from runtime.content.eyereal import Pair, read_folder
 from runtime.content.presets import preset
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_raster
 from runtime.records import F64, U8
+from runtime.support.artifacts import read_image
 
 FOV_DEG = 40.0  # horizontal: what the published network takes its pictures to be
 PANELS = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 1920, 1080)

@@ -17,8 +17,8 @@ from torch import Tensor
 from model_export.checkpoint import plain_weights
 from model_export.network import SpectralSolver
 from model_export.recipe import Recipe, read_recipe
-from runtime.artifacts import write_text
 from runtime.model.chain import RELATIVE_TOLERANCE_MAX_MM
+from runtime.support.artifacts import write_text
 
 AT_NONE = 0.01
 SEED = 1

@@ -9,8 +9,8 @@ from model_export.checkpoint import solver_of
 from model_export.export import spectral_file
 from model_export.recipe import read_recipe
 from model_export.validate import check_model
-from runtime.artifacts import write_bytes
 from runtime.model.predictor import SHIPPED, model_path
+from runtime.support.artifacts import write_bytes
 
 
 def shipped_bytes(name: str) -> bytes:

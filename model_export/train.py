@@ -20,10 +20,10 @@ from model_export.distributed import World, together
 from model_export.folders import folder_pairs, mixed
 from model_export.recipe import Recipe, Training, read_recipe
 from model_export.unroll import UnrolledSolver, displayed_mse
-from runtime.artifacts import write_text
 from runtime.config import validated
 from runtime.errors import InputError
 from runtime.report.progress import progress_bar
+from runtime.support.artifacts import write_text
 
 HELD_OUT_SEED = 9_000_001  # of the validation pairs: no training seed reaches it
 PAIRS_A_STEP = 2

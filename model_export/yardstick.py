@@ -14,7 +14,7 @@ PUBLISHED = (("eyereal", "fp32"), ("eyereal int8", "int8"))
 def write_eyereal(path: Path, *, precision: str, width_px: int, height_px: int) -> None:
     """The published network at a fixed size, with random weights. Needs torch and onnx, and some 3 GiB at 1080p."""
     from model_export.export import ExportRequest, eyereal_model
-    from runtime.artifacts import write_bytes
+    from runtime.support.artifacts import write_bytes
 
     request = ExportRequest(
         arch="eyereal",
@@ -31,7 +31,7 @@ def write_eyereal(path: Path, *, precision: str, width_px: int, height_px: int) 
 def write_half(path: Path, *, name: str) -> None:
     """A shipped model in fp16, made from its recipe. Needs torch and onnx."""
     from model_export.export import ExportRequest, spectral_model
-    from runtime.artifacts import write_bytes
+    from runtime.support.artifacts import write_bytes
 
     data, _ = spectral_model(ExportRequest(arch=name, out=path, precision="fp16"))
     write_bytes(path, data)

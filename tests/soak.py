@@ -20,10 +20,10 @@ if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from runtime.clock import MonotonicClock
+from runtime.daemon.client import ask
+from runtime.daemon.server import StatusServer
 from runtime.errors import SensorLost
-from runtime.service import StatusServer
-from runtime.service.client import ask
-from tests.service.rig import TRACKING, BreakablePanels, Rig
+from tests.daemon.rig import TRACKING, BreakablePanels, Rig
 
 SIZE = {"width_px": 64, "height_px": 36}
 GROWTH_MAX = 0.01

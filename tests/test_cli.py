@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from runtime.artifacts import write_png
+from runtime.support.artifacts import write_png
 
 PANELS = {"width_m": 0.5184, "height_m": 0.2916, "x_m": [-0.06, 0.0, 0.06]}
 

@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 STAGES = {"sensor", "eyes", "content", "model", "panels"}
-SHARED = {"records", "config", "clock", "errors", "artifacts", "gl", "optics"}
+SHARED = {"records", "config", "clock", "errors", "support", "optics"}
 HEAVY = ("torch", "cv2", "onnxruntime", "scipy", "numpy")
 
 
@@ -70,7 +70,7 @@ def test_optics_imports_only_records_and_itself() -> None:
     assert [line for path in modules_of("runtime/optics") for line in broken(path, {"records", "optics"})] == []
 
 
-@pytest.mark.parametrize("module", ["records", "errors", "clock", "config", "artifacts", "gl"])
+@pytest.mark.parametrize("module", ["records", "errors", "clock", "config", "support/artifacts", "support/gl"])
 def test_what_all_share_depends_on_no_stage(module: str) -> None:
     assert broken(ROOT / "runtime" / f"{module}.py", SHARED) == []
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from runtime.artifacts import read_image
+from runtime.support.artifacts import read_image
 from tests.test_cli import phasestack
 
 FRAMES = 40

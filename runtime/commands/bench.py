@@ -32,9 +32,9 @@ def bench(
     """
     if context.invoked_subcommand is not None:
         return
-    from runtime.artifacts import to_json, write_json
     from runtime.report import benchmark
     from runtime.report.progress import status_line
+    from runtime.support.artifacts import to_json, write_json
 
     with status_line("bench") as tell:
         record = benchmark.measured(progress=tell)
@@ -58,8 +58,8 @@ def compare(
     """
     from rich.console import Console
 
-    from runtime.artifacts import to_json
     from runtime.report import benchmark
+    from runtime.support.artifacts import to_json
 
     before, after = benchmark.read(old), benchmark.read(new)
     changes = benchmark.compare(before, after)
@@ -108,12 +108,12 @@ def robust(
 
     from rich.console import Console
 
-    from runtime.artifacts import OutputFolder, to_json, write_json
     from runtime.report import robust as check
     from runtime.report.frontier import check_models
     from runtime.report.machine import describe
     from runtime.report.progress import progress_bar
     from runtime.report.robust_plot import robust_plot
+    from runtime.support.artifacts import OutputFolder, to_json, write_json
 
     names = list(dict.fromkeys(model or SHIPPED))
     check_models([name for name in names if name not in SHIPPED])

@@ -86,8 +86,8 @@ def reload(config: Config = None, socket: Socket = None) -> None:
 def tell(request: dict[str, Any], config: Path | None, socket: Path | None) -> None:
     """Send one request. Exits with 1 where no daemon answers, 2 where it refuses."""
     from runtime.commands.status import sockets
+    from runtime.daemon.client import NotRunning, ask
     from runtime.errors import InputError
-    from runtime.service.client import NotRunning, ask
 
     try:
         answer = ask(sockets(config, socket), request, timeout_s=ANSWERS_WITHIN_S)

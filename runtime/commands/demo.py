@@ -20,9 +20,9 @@ def demo(
 
     Example: phasestack demo --out out/demo
     """
-    from runtime.assembly import RunOptions
     from runtime.commands.running import drive, print_summary
     from runtime.config import Settings
+    from runtime.daemon.build import RunOptions
     from runtime.sensor.recording import Recording
     from runtime.sensor.replay import demo_recording_path
 

@@ -107,7 +107,7 @@ def usb(settings: Settings) -> Iterator[Row]:
 
 def opengl(settings: Settings) -> Iterator[Row]:
     """OpenGL without a screen, for the content and offscreen panels."""
-    from runtime.gl import describe, offscreen_context
+    from runtime.support.gl import describe, offscreen_context
 
     context = offscreen_context()
     found = describe(context)
@@ -204,8 +204,8 @@ def service(settings: Settings) -> Iterator[Row]:
 
 def _daemon(settings: Settings) -> dict[str, Any] | None:
     """What the running daemon says of itself; None where none runs."""
-    from runtime.service.client import NotRunning, ask
-    from runtime.service.location import candidates
+    from runtime.daemon.client import NotRunning, ask
+    from runtime.daemon.location import candidates
 
     try:
         return ask(candidates(settings.service.socket), {"command": "status"}, timeout_s=2.0)

@@ -58,12 +58,12 @@ def _cards(settings: Settings, monitors: tuple[Monitor, ...] | None) -> list[U8]
 def _write(settings: Settings, out: Path) -> None:
     import numpy as np
 
-    from runtime.artifacts import OutputFolder, write_png
     from runtime.clock import MonotonicClock
-    from runtime.gl import offscreen_context
     from runtime.panels.offscreen import OffscreenPanels
     from runtime.panels.registry import panel_settings
     from runtime.records import LayerFrame
+    from runtime.support.artifacts import OutputFolder, write_png
+    from runtime.support.gl import offscreen_context
 
     stack = settings.stack.stack()
     panels = OffscreenPanels(
@@ -98,9 +98,9 @@ def _show(settings: Settings, seconds: float) -> None:
 
 def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
     from runtime.clock import MonotonicClock
-    from runtime.gl import offscreen_context
     from runtime.panels.registry import panel_settings
     from runtime.panels.window import WindowPanels
+    from runtime.support.gl import offscreen_context
 
     kind = "span" if settings.output.kind == "span" else "windows"
     output = settings.output.model_copy(update={"kind": kind})
@@ -114,11 +114,11 @@ def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
 def _every_monitor() -> tuple[PanelSink, list[U8]]:
     from runtime.clock import MonotonicClock
     from runtime.config import OutputSettings, PanelSettings
-    from runtime.gl import offscreen_context
     from runtime.optics.stack import PanelStack
     from runtime.panels.card import identity_card
     from runtime.panels.display import connected_monitors
     from runtime.panels.window import WindowPanels
+    from runtime.support.gl import offscreen_context
 
     monitors = connected_monitors()
     width, height = max(m.width_px for m in monitors), max(m.height_px for m in monitors)

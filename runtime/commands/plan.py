@@ -36,7 +36,7 @@ def plan(
     if survey or out is not None or quick:
         _survey(config, survey, out, scene, model, scale, budget_ms, eyes, quick, as_json)
         return
-    from runtime.planning import plan_for
+    from runtime.plan.planning import plan_for
 
     result = plan_for(config, scene=scene, model=model, scale=scale, budget_ms=budget_ms, middle_m=eyes, quiet=as_json)
     if as_json:
@@ -58,7 +58,7 @@ def _survey(
     as_json: bool,
 ) -> None:
     from runtime.errors import InputError
-    from runtime.planning import survey as survey_to
+    from runtime.plan.planning import survey as survey_to
 
     if not survey:
         raise InputError("plan", "--survey", "--out and --quick belong to it")
@@ -78,7 +78,7 @@ def _print_survey(result: dict[str, Any], out: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from runtime.plan_survey_page import HEADINGS, cells
+    from runtime.report.survey_page import HEADINGS, cells
 
     console = Console()
     table = Table(*HEADINGS)

@@ -32,9 +32,9 @@ def report(
     """
     from rich.console import Console
 
-    from runtime.artifacts import OutputFolder, to_json, write_json, write_text
     from runtime.report.assemble import whole_report
     from runtime.report.progress import status_line
+    from runtime.support.artifacts import OutputFolder, to_json, write_json, write_text
 
     parts = ["phasestack report", *([f"--pairs {pairs.name}"] if pairs else []), *(["--focal"] if focal else [])]
     parts += [f"--model {Path(name).name}" for name in model or []] + (["--quick"] if quick else [])

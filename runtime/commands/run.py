@@ -32,8 +32,8 @@ def run(
 
     Example: phasestack run --replay demo --headless --max-speed --frames 30 --out out/run
     """
-    from runtime.commands.daemon import run_daemon
     from runtime.config import Overrides
+    from runtime.daemon.supervise import run_daemon
 
     overrides = Overrides(replay=replay, headless=headless, scene=scene, model=model, budget_ms=budget_ms)
     summary = run_daemon(config, overrides, frames=frames, max_speed=max_speed, out=out, scale=scale, quiet=as_json)

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from runtime.assembly import RunOptions
     from runtime.config import Settings
-    from runtime.loop import Supervisor
+    from runtime.daemon.build import RunOptions
+    from runtime.frame.loop import Supervisor
     from runtime.records import FrameAccount
 
 
@@ -31,8 +31,8 @@ def drive(
 
     measured_times: frames.jsonl tells the machine's stage times, not the simulated clock's.
     """
-    from runtime.assembly import build_loop
-    from runtime.run_output import RunOutput
+    from runtime.daemon.build import build_loop
+    from runtime.evaluation.run_output import RunOutput
 
     with ExitStack() as cleanup:
         output = cleanup.enter_context(RunOutput(out)) if out is not None else None

@@ -11,19 +11,19 @@ from typing import Any
 import cv2
 import numpy as np
 
-from runtime.artifacts import OutputFolder, read_image, write_json, write_png
 from runtime.config import ModelSettings, load_settings, load_stack
 from runtime.content.base import ContentInfo
-from runtime.content.plan import Measured, Saving, network_items
 from runtime.errors import InputError
 from runtime.model.predictor import Prediction, Predictor, load_predictor
 from runtime.model.still import solve_still
 from runtime.optics.quality import Quality, quality
 from runtime.optics.retina import Retina, seen_by
 from runtime.optics.stack import PanelStack
-from runtime.planner import focused_part, observed
-from runtime.planning import planned_predictor
+from runtime.plan.planner import focused_part, observed
+from runtime.plan.planning import planned_predictor
+from runtime.plan.savings import Measured, Saving, network_items
 from runtime.records import F64, U8, PlanItem
+from runtime.support.artifacts import OutputFolder, read_image, write_json, write_png
 
 SEPARATION_MIN_M = 0.005
 COMPARED = 3  # timed runs with and without the plan

@@ -27,12 +27,12 @@ def stability(
 
     from rich.console import Console
 
-    from runtime.artifacts import OutputFolder, to_json, write_json, write_text
     from runtime.commands.solving import checked_eyes
     from runtime.report.machine import describe
     from runtime.report.progress import progress_bar
     from runtime.report.stability import suite
     from runtime.report.stability.page import stability_page, stages_of
+    from runtime.support.artifacts import OutputFolder, to_json, write_json, write_text
 
     started = time.perf_counter()
     trials = list(suite.every_trial(_fit(), checked_eyes, full=full))

@@ -25,7 +25,7 @@ def status(
 
     Example: phasestack status --json
     """
-    from runtime.service.client import NotRunning, ask
+    from runtime.daemon.client import NotRunning, ask
 
     try:
         answer = ask(sockets(config, socket), {"command": "status"})
@@ -47,7 +47,7 @@ def sockets(config: Path | None, socket: Path | None) -> tuple[Path, ...]:
     if socket is not None:
         return (socket,)
     from runtime.config import load_settings
-    from runtime.service.location import candidates
+    from runtime.daemon.location import candidates
 
     return candidates(load_settings(config).service.socket)
 

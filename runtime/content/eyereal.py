@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from runtime.artifacts import read_image
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.images import WarpedPicture, image_from_view, rgba_from_rgb
 from runtime.content.presets import Preset
 from runtime.errors import ContentFailure, InputError
 from runtime.optics.views import image_from_stack
 from runtime.records import F64, U8
+from runtime.support.artifacts import read_image
 
 NAME = re.compile(r"pair(\d+)_x(-?[\d.]+)_y(-?[\d.]+)_z(-?[\d.]+)_([01])\.(?:jpg|jpeg|png)$", re.IGNORECASE)
 KEPT = 4  # pairs in memory

@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from runtime.artifacts import read_image
 from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings
 from runtime.content.base import ContentInfo, ContentSource, View
@@ -21,6 +20,7 @@ from runtime.errors import ContentFailure, InputError
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import U8
+from runtime.support.artifacts import read_image
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEOS = (".mp4", ".mkv", ".avi", ".mov", ".webm", ".m4v")

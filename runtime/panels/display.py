@@ -11,9 +11,9 @@ import glfw as _glfw
 import moderngl
 
 from runtime.errors import MissingPart, PanelLost
-from runtime.gl import MINIMUM_VERSION
 from runtime.panels import edid, xlib
 from runtime.panels.monitors import Monitor, in_order
+from runtime.support.gl import MINIMUM_VERSION
 
 log = logging.getLogger("phasestack.panels")
 

@@ -81,7 +81,7 @@ def _predictor(method: Method, pair: StillPair, threads: int) -> Predictor:
     """Raises InputError, MissingPart."""
     from runtime.config import ModelSettings
     from runtime.model.predictor import load_predictor
-    from runtime.reduced import ReducedPredictor
+    from runtime.plan.reduced import ReducedPredictor
 
     if method.source == "sart":
         from runtime.model.sart import SartPredictor

@@ -100,7 +100,7 @@ def predictor_multiply_adds(predictor: Predictor, pair: StillPair, *, path: Path
     from runtime.model.network import NetworkPredictor
     from runtime.model.sart import SartPredictor
     from runtime.model.unrolled import UnrolledPredictor
-    from runtime.reduced import ReducedPredictor
+    from runtime.plan.reduced import ReducedPredictor
 
     if isinstance(predictor, ReducedPredictor):
         enlarged = LINEAR * RGBA * predictor.stack.count * _pixels(predictor.stack)

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from runtime.artifacts import read_image
 from runtime.config import StackGeometry, read_table, validated
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, stack_from_eye
 from runtime.records import F64, U8
+from runtime.support.artifacts import read_image
 
 if TYPE_CHECKING:
     from runtime.content.scenes import Scene
@@ -132,7 +132,7 @@ class Painter:
     def __init__(self, scene: str | Scene, stack: PanelStack) -> None:
         """Raises InputError for an unknown scene, MissingPart without OpenGL."""
         from runtime.content.procedural import ProceduralSource
-        from runtime.gl import offscreen_context
+        from runtime.support.gl import offscreen_context
 
         self._context = offscreen_context()
         self._source = ProceduralSource(scene, stack=stack, context=self._context)

@@ -17,7 +17,7 @@ CAPTIONS = {
 
 def surveyed(*, quick: bool) -> tuple[Section, dict[str, Any]]:
     """Measure it in a process of its own. The section, and what report.json has of it. Raises FatalError."""
-    from runtime.planning import survey
+    from runtime.plan.planning import survey
 
     with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
         out = Path(folder) / "plan"
@@ -28,7 +28,7 @@ def surveyed(*, quick: bool) -> tuple[Section, dict[str, Any]]:
 
 def plan_section(record: dict[str, Any], pictures: dict[str, bytes]) -> Section:
     """The survey's record and its two plots as a section."""
-    from runtime.plan_survey_page import HEADINGS, cells
+    from runtime.report.survey_page import HEADINGS, cells
 
     rows = [
         [*cells(row), "; ".join(str(item["what"]) for item in row["left_out"])]

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from runtime.artifacts import write_bytes
 from runtime.errors import ModelFailure
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
 from runtime.report.eyesight import judged
 from runtime.report.methods import Method, opened
 from runtime.report.pairs import StillPair
+from runtime.support.artifacts import write_bytes
 
 REFERENCE = Method("SART-30", "iterative", "sart", 30)
 POOR_DB = 28.0

@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from runtime.artifacts import write_bytes
 from runtime.clock import NS_PER_S
 from runtime.optics.views import stack_from_eye
 from runtime.records import F64, EyePoints, SensorFrame
 from runtime.sensor.recording import RecordingWriter
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import demo_recording_path
+from runtime.support.artifacts import write_bytes
 
 RATE_HZ, SECONDS, SEED = 30, 10, 20240229
 IPD_M, NOISE_M = 0.062, 0.0025

@@ -14,11 +14,11 @@ from calib.charts import FOV_DEG, alone, eye_chart, line_picture
 from calib.commands import app
 from calib.keys import Key
 from calib.viewpoints import grid
-from runtime.artifacts import read_image
 from runtime.errors import InputError
 from runtime.optics.quality import psnr_db
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
+from runtime.support.artifacts import read_image
 
 run = CliRunner()
 

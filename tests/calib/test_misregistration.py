@@ -74,9 +74,9 @@ def test_the_correction_gives_the_picture_back(small_stack) -> None:
 def test_the_correction_is_what_the_presentation_shader_does() -> None:
     """One homography, through OpenCV here and through the panels' own shader there."""
     from runtime.clock import SimulatedClock
-    from runtime.gl import offscreen_context
     from runtime.panels.offscreen import OffscreenPanels
     from runtime.records import LayerFrame
+    from runtime.support.gl import offscreen_context
 
     layers = smooth_layers()
     matrix = true_from_ideal(np.array([[2.0, 1], [-1, 3], [1, -2], [0, 2]]), width_px=480, height_px=270)

@@ -13,9 +13,9 @@ from calib.commands import app
 from calib.cost_run import misaligned
 from calib.registration import error_over_panel_px
 from calib.vernier import nominal, read_settings, simulate, write_settings
-from runtime.artifacts import read_image
 from runtime.config import StackGeometry, load_settings
 from runtime.errors import InputError
+from runtime.support.artifacts import read_image
 
 run = CliRunner()
 STACK = StackGeometry().stack()

@@ -11,8 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from calib.commands import app
-from runtime.artifacts import read_image
 from runtime.errors import InputError
+from runtime.support.artifacts import read_image
 
 run = CliRunner()
 PUBLISHED = """stack_from_sensor = [

@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import ArrayLike
 
 from runtime.content.base import View
-from runtime.gl import offscreen_context
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack, raster_from_stack
+from runtime.support.gl import offscreen_context
 
 
 @pytest.fixture(scope="session")

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.artifacts import write_png
 from runtime.content.base import View
 from runtime.content.eyereal import EyeRealSource, is_data_set, read_folder
 from runtime.content.presets import preset
 from runtime.content.procedural import ProceduralSource
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
+from runtime.support.artifacts import write_png
 from tests.content.conftest import image_view, panel_view
 
 LEGO = preset("lego_bulldozer", "published-code")

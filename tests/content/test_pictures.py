@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from runtime.artifacts import write_png
 from runtime.config import ContentSettings
 from runtime.content.base import ContentSource
 from runtime.content.registry import open_content
 from runtime.errors import ContentFailure, InputError
 from runtime.optics.stack import PanelStack
+from runtime.support.artifacts import write_png
 from tests.content.conftest import panel_view
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)

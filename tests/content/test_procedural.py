@@ -112,7 +112,7 @@ def test_raster_and_eye_image_agree_under_the_plane_induced_homography(
 
 
 def test_the_same_view_and_time_give_the_same_bytes_in_another_context_too(context: Any, stack: PanelStack) -> None:
-    from runtime.gl import offscreen_context
+    from runtime.support.gl import offscreen_context
 
     view = panel_view(EYES["ahead"], stack.panel(1))
     first = ProceduralSource("demo", stack=stack, context=context).render(view, time_ns=0).copy()

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import moderngl
 import pytest
 
-from runtime.gl import offscreen_context
+from runtime.support.gl import offscreen_context
 from tests.panels import xserver
 
 

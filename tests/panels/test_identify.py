@@ -10,11 +10,11 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from runtime.artifacts import read_image
 from runtime.commands.doctor import doctor
 from runtime.commands.identify import identify
 from runtime.errors import InputError
 from runtime.panels.card import BARS, identity_card
+from runtime.support.artifacts import read_image
 from tests.panels.edids import block
 from tests.panels.xserver import HEIGHT_PX, WIDTH_PX
 from tests.waiting import eventually

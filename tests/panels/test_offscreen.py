@@ -11,11 +11,11 @@ import pytest
 from runtime.clock import SimulatedClock
 from runtime.config import OutputSettings, PanelSettings
 from runtime.errors import InputError, PanelLost
-from runtime.gl import offscreen_context
 from runtime.optics.stack import PanelStack
 from runtime.panels.offscreen import OffscreenPanels
 from runtime.panels.registry import open_panels
 from runtime.records import LayerFrame
+from runtime.support.gl import offscreen_context
 
 WIDTH, HEIGHT = 48, 32
 

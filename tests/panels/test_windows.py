@@ -201,7 +201,7 @@ PRESENTING = """
 import numpy as np
 from runtime.clock import MonotonicClock
 from runtime.config import OutputSettings, PanelSettings
-from runtime.gl import offscreen_context
+from runtime.support.gl import offscreen_context
 from runtime.panels.registry import open_panels
 from runtime.records import LayerFrame
 from tests.panels.test_windows import STACK

@@ -9,9 +9,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from runtime.artifacts import read_image
 from runtime.commands.plan import plan
 from runtime.errors import InputError
+from runtime.support.artifacts import read_image
 
 app = typer.Typer()
 app.command()(plan)

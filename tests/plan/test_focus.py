@@ -11,18 +11,18 @@ import pytest
 
 from runtime.config import Settings
 from runtime.content.base import View
-from runtime.content.plan import solved_eyes
 from runtime.content.procedural import ProceduralSource
 from runtime.content.scenes import Scene, scene
-from runtime.focus import FocusedPredictor
-from runtime.gl import offscreen_context
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
-from runtime.plan_measure import displayed_psnr, draw
-from runtime.planning import focused, planned_predictor
-from runtime.reduced import ladder_predictor
+from runtime.plan.focus import FocusedPredictor
+from runtime.plan.measure import displayed_psnr, draw
+from runtime.plan.planning import focused, planned_predictor
+from runtime.plan.reduced import ladder_predictor
+from runtime.plan.savings import solved_eyes
+from runtime.support.gl import offscreen_context
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 960, 540)
 EYES = np.array([[0.6, -0.031, 0.05], [0.6, 0.031, 0.05]])
@@ -150,7 +150,7 @@ def test_still_pictures_are_warped_as_the_model_asks() -> None:
 
 
 def test_one_eye_alone_costs_no_inference(context: Any, whole: Predictor) -> None:
-    from runtime.content.plan import make_plan
+    from runtime.plan.savings import make_plan
 
     source = ProceduralSource("demo", stack=STACK, context=context)
     aside = np.array([[0.12, 0.42, 0.0], [0.07, 0.50, 0.0]])

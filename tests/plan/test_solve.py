@@ -12,8 +12,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from runtime.artifacts import write_json, write_png
 from runtime.commands.solve import solve
+from runtime.support.artifacts import write_json, write_png
 
 app = typer.Typer()
 app.command()(solve)

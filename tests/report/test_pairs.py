@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.artifacts import write_png
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
 from runtime.report.pairs import Painter, beside, eyes_at, read_pairs
+from runtime.support.artifacts import write_png
 
 EYES = [[0.7, -0.03, 0.1], [0.7, 0.03, 0.1]]
 

@@ -1,0 +1,1 @@
+"""One frame: solver, presenter, pacing, policy, timing, states and statistics."""

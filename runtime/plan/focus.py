@@ -1,0 +1,257 @@
+"""A model that runs only where the two eyes' pictures differ; the rest is filled in, in closed form.
+
+Panels that are cut to a window and moved to its centre are a smaller stack, seen by eyes moved the same way: any
+model for evenly spaced panels serves it. Where the eyes agree, the outer panels stand at the middle of their
+range, from which the solver starts, and the centre panel carries the picture. What drives the outer panels fades out
+towards the window's edge (`model.fade`): there is no seam.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from time import perf_counter_ns
+
+import cv2
+import numpy as np
+
+from runtime.content.base import ContentSource, View
+from runtime.content.camera import PixelBox, union
+from runtime.model.fade import Fade
+from runtime.model.level import EVEN
+from runtime.model.predictor import Prediction, Predictor
+from runtime.model.transfer import SUBCODE, emphasised, phase_codes
+from runtime.model.unrolled import UnrolledPredictor
+from runtime.model.visible import Box
+from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.views import raster_from_stack
+from runtime.plan.active import (
+    Window,
+    coarse_box,
+    differing_box,
+    steepness,
+    steepness_beside,
+    still_fits,
+    wave_px,
+    whole_rays,
+    window_of,
+)
+from runtime.records import F64, U8
+
+SIZES_KEPT = 6
+
+
+class FocusedPredictor(Predictor):
+    """Wraps a model that draws on the centre panel's pixels and starts with even outer panels.
+
+    Call `aim` before `rasters` where the content may know where it lies: then only the window is drawn, too.
+    Without it, the pictures themselves tell where they differ.
+    """
+
+    def __init__(self, whole: UnrolledPredictor, make: Callable[[PanelStack], UnrolledPredictor]) -> None:
+        """whole: the model for all of the panels; make: the same model for smaller ones of the same pitch."""
+        self.whole, self._make = whole, make
+        self.name, self.provider, self.parameters = whole.name, whole.provider, whole.parameters
+        self.stack = whole.stack
+        self._parts: dict[tuple[int, int], UnrolledPredictor] = {}
+        self._layers = np.full((self.stack.count, self.stack.height_px, self.stack.width_px, 4), 255, np.uint8)
+        self._layers[..., :3] = EVEN
+        self._solved: PixelBox | None = None  # where the outer panels are not even
+        self._aimed: Window | None = None
+        self._wanted_background: tuple[int, ...] = (255, 255, 255)
+        self._background: tuple[int, ...] | None = None  # that fills the centre panel beside the aimed window
+        self.window: Window | None = None  # of the last frame
+        self.active_fraction = 1.0  # of the panel's pixels that went through the model
+
+    def aim(self, content: ContentSource, eyes_m: F64, *, time_ns: int) -> None:
+        """Ask the content where it lies, so that only that is drawn and solved."""
+        self._aimed = None
+        if content.info.background is None:
+            return
+        raster = self._middle()
+        boxes = []
+        for side, eye_m in enumerate(eyes_m):
+            view = View(eye_m, side, raster_from_stack(eye_m, raster), raster.width_px, raster.height_px)
+            box = content.extent(view, time_ns=time_ns)
+            if box is None:
+                return
+            boxes.append(box)
+        box = union(boxes)
+        if not box.width_px:
+            return
+        colour = tuple(round(value * 255) for value in content.info.background)
+        steep = max(steepness(np.array([code], np.uint8)) for code in colour)
+        wanted = window_of(box, eyes_m, self.stack, steep=steep)
+        self._aimed = self._kept(wanted)
+        self._wanted_background = colour
+
+    @property
+    def one_channel(self) -> bool:
+        """True where grey pictures are solved in one channel."""
+        return self.whole.one_channel
+
+    @property
+    def interpolation(self) -> str:
+        return self.whole.interpolation
+
+    @property
+    def emphasis(self) -> float:
+        return self.whole.emphasis
+
+    def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
+        return super().windows(eyes_m) if self._aimed is not None else self.whole.windows(eyes_m)
+
+    def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
+        """The whole centre panel, or the aimed window of it."""
+        if self._aimed is None:
+            return self.whole.rasters(eyes_m)
+        box, whole = self._aimed.box, self._middle()
+        return (
+            replace(
+                whole,
+                left_m=whole.left_m + box.u0 * whole.pitch_u_m,
+                top_m=whole.top_m - box.v0 * whole.pitch_v_m,
+                width_px=box.width_px,
+                height_px=box.height_px,
+            ),
+        )
+
+    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64) -> Prediction:
+        begin_ns = perf_counter_ns()
+        left, right = images[0][0], images[1][0]
+        aimed, self._aimed = self._aimed, None
+        if aimed is not None:
+            window, cut = aimed, [[left], [right]]
+        else:
+            # A coarse look tells for next to nothing what is too large; only the rest is worth a close one.
+            for look in (coarse_box, differing_box):
+                box = look(left, right)
+                found = self._around(box, left, eyes_m)
+                if box.width_px and found is None:
+                    self.window, self.active_fraction = None, 1.0
+                    prediction = self.whole.predict(images, eyes_m)
+                    self.channels = self.whole.channels
+                    return prediction
+            kept = self._kept(found)
+            if kept is None:
+                return self._filled(left, begin_ns)
+            window = kept
+            area = window.box
+            cut = [[np.ascontiguousarray(image[area.v0 : area.v1, area.u0 : area.u1])] for image in (left, right)]
+        found_ms = (perf_counter_ns() - begin_ns) / 1e6
+        # Solved before anything is painted: where the model fails, the last good layers stay as they were.
+        part = self._part(window.stack)
+        part.fade = self._fade(window, eyes_m)
+        solved = part.predict(cut, eyes_m - window.shift_m)
+        self.channels = part.channels
+        begin_ns = perf_counter_ns()
+        if aimed is not None:
+            self._even_out(but=window.box)
+            self._paint_background(self._wanted_background)
+        else:
+            self._fill_with(left, but=window.box)
+        return self._place(window, solved, eyes_m, found_ms + (perf_counter_ns() - begin_ns) / 1e6)
+
+    def _around(self, box: PixelBox, picture: U8, eyes_m: F64) -> Window | None:
+        """The window around a box in which the eyes' pictures differ; None where nothing does, or too much."""
+        if not box.width_px:
+            return None
+        return window_of(box, eyes_m, self.stack, steep=steepness_beside(picture, box))
+
+    def _kept(self, wanted: Window | None) -> Window | None:
+        """The last frame's window where it will do: then nothing is allocated again."""
+        if wanted is None or self.window is None or not still_fits(self.window, wanted):
+            return wanted
+        return replace(self.window, steps=wanted.steps)
+
+    def warm_up(self, eyes_m: F64) -> None:
+        self.whole.warm_up(eyes_m)
+        super().warm_up(eyes_m)
+
+    def close(self) -> None:
+        for part in (self.whole, *self._parts.values()):
+            part.close()
+        self._parts = {}
+
+    def _filled(self, picture: U8, begin_ns: int) -> Prediction:
+        """Layers of which the centre panel alone carries the picture, for both eyes."""
+        self._fill_with(picture, but=None)
+        self.window, self.active_fraction, self.channels = None, 0.0, 3
+        filled_ms = (perf_counter_ns() - begin_ns) / 1e6
+        return Prediction(self._layers, {"prepare": filled_ms, "inference": 0.0, "finish": 0.0})
+
+    def _fill_with(self, picture: U8, *, but: PixelBox | None) -> None:
+        """The picture on the centre panel, as both eyes see it where they agree."""
+        self._even_out(but=but)
+        self._background = None
+        sharp = emphasised(picture, self.whole.emphasis)
+        cv2.LUT(sharp, _centre_codes(self.stack.count), dst=self._layers[self.stack.count // 2])
+
+    def _place(self, window: Window, solved: Prediction, eyes_m: F64, filled_ms: float) -> Prediction:
+        """The window's layers among the rest."""
+        area = window.box
+        centre = self.stack.count // 2
+        for index, (layer, part) in enumerate(zip(self._layers, solved.layers, strict=True)):
+            # Near the window's edge the centre panel can't know what rays meet that leave the window.
+            kept = whole_rays(window, eyes_m, self.stack) if index == centre else area
+            rows, columns = slice(kept.v0 - area.v0, kept.v1 - area.v0), slice(kept.u0 - area.u0, kept.u1 - area.u0)
+            layer[kept.v0 : kept.v1, kept.u0 : kept.u1] = part[rows, columns]
+        self._solved, self.window = area, window
+        self.active_fraction = area.width_px * area.height_px / (self.stack.width_px * self.stack.height_px)
+        stage_ms = dict(solved.stage_ms)
+        stage_ms["prepare"] = stage_ms.get("prepare", 0.0) + filled_ms
+        return Prediction(self._layers, stage_ms)
+
+    def _fade(self, window: Window, eyes_m: F64) -> Fade:
+        """How a window ends: gently, but where the panels themselves do."""
+        box, kept = window.box, whole_rays(window, eyes_m, self.stack)
+        return Fade(
+            Box(kept.u0 - box.u0, kept.v0 - box.v0, kept.u1 - box.u0, kept.v1 - box.v0),
+            over_px=wave_px(eyes_m, self.stack, steps=window.steps),
+            left=box.u0 > 0,
+            top=box.v0 > 0,
+            right=box.u1 < self.stack.width_px,
+            bottom=box.v1 < self.stack.height_px,
+        )
+
+    def _middle(self) -> PlaneRaster:
+        return self.stack.panel(self.stack.count // 2)
+
+    def _even_out(self, *, but: PixelBox | None) -> None:
+        """Bring the outer panels back to the middle of their range where the last frame drove them."""
+        if self._solved is None or self._solved == but:
+            return
+        area = self._solved
+        for layer in self._layers:
+            _fill(layer, area, (EVEN, EVEN, EVEN))
+        self._solved, self._background = None, None
+
+    def _paint_background(self, colour: tuple[int, ...]) -> None:
+        """The centre panel as if both eyes saw nothing but the background; once, as long as nothing changes."""
+        codes = _centre_codes(self.stack.count)[list(colour)].tolist()
+        layer = self._layers[self.stack.count // 2]
+        if self._background != colour:
+            _fill(layer, PixelBox(0, 0, self.stack.width_px, self.stack.height_px), codes)
+            self._background = colour
+        elif self._solved is not None:
+            _fill(layer, self._solved, codes)
+
+    def _part(self, stack: PanelStack) -> UnrolledPredictor:
+        size = (stack.width_px, stack.height_px)
+        if size not in self._parts:
+            while len(self._parts) >= SIZES_KEPT:
+                self._parts.pop(next(iter(self._parts))).close()
+            self._parts[size] = self._make(stack)
+        return self._parts[size]
+
+
+def _fill(layer: U8, area: PixelBox, codes: Sequence[int]) -> None:
+    """One colour in a part of an RGBA layer; whole pixels at a time, which is many times as fast as bytes."""
+    pixel = np.array([*codes, 255], np.uint8).view(np.uint32)
+    layer.view(np.uint32)[area.v0 : area.v1, area.u0 : area.u1, 0] = pixel
+
+
+def _centre_codes(panels: int) -> U8:
+    """(256,) the centre panel's code for each code of the picture, the others standing at EVEN."""
+    phases = phase_codes(2).reshape(256, -1)[:, 0].astype(np.int32)
+    return np.clip((phases - (panels - 1) * EVEN * SUBCODE + SUBCODE // 2) // SUBCODE, 0, 255).astype(np.uint8)

@@ -1,0 +1,207 @@
+"""The levels that a time budget chooses from, and what each of them takes and shows on the present content."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import perf_counter_ns
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from runtime.config import Settings
+from runtime.content.base import ContentSource
+from runtime.errors import FatalError, PhasestackError
+from runtime.frame.pipeline import drawn_for, retina_view
+from runtime.model.predictor import SHIPPED, Predictor
+from runtime.optics.quality import psnr_db
+from runtime.optics.retina import seen_by
+from runtime.optics.stack import PanelStack
+from runtime.plan.levels import Level
+from runtime.plan.planning import LADDER
+from runtime.plan.reduced import ladder_predictor
+from runtime.records import F32, F64, U8
+
+log = logging.getLogger("phasestack.budget")
+
+T = TypeVar("T")
+Rung = tuple[str, float]  # a model's name, and the share of the panels' columns and rows that it solves
+
+SCALES = (1.0, 0.75, 0.5)  # of a model that isn't shipped: it has no lighter sister
+REPEATS = 3
+# Of `prepare`, `inference` and `finish` against balanced, about as on two cores at 1920x1080: a simulated clock
+# must not depend on the machine.
+SIMULATED_COST = {"best": 2.1, "balanced": 1.0, "fast": 0.7}
+SOLVING = ("prepare", "inference", "finish")
+
+
+class NoLongerAsked(PhasestackError):
+    """The loop does not want to know any more."""
+
+
+class Ask(Protocol):
+    """Runs a call where content can be drawn, and answers with its result."""
+
+    def __call__(self, call: Callable[[], T]) -> T: ...
+
+
+class LoopCalls:
+    """`Ask` for other threads: the loop's thread, which has the GL context, serves one call between two turns."""
+
+    def __init__(self) -> None:
+        self._asked: queue.SimpleQueue[tuple[Callable[[], Any], queue.SimpleQueue[tuple[Any, Exception | None]]]] = (
+            queue.SimpleQueue()
+        )
+        self._closed = threading.Event()
+
+    def __call__(self, call: Callable[[], T]) -> T:
+        """Raises NoLongerAsked, and whatever the call raises."""
+        answers: queue.SimpleQueue[tuple[Any, Exception | None]] = queue.SimpleQueue()
+        self._asked.put((call, answers))
+        while not self._closed.is_set():
+            try:
+                result, error = answers.get(timeout=0.1)
+            except queue.Empty:
+                continue
+            if error is not None:
+                raise error
+            answer: T = result
+            return answer
+        raise NoLongerAsked("the loop has other things to do")
+
+    def serve(self) -> None:
+        """Run one call, where one waits."""
+        try:
+            call, answers = self._asked.get_nowait()
+        except queue.Empty:
+            return
+        try:
+            answers.put((call(), None))
+        except Exception as error:  # it belongs to who asked
+            answers.put((None, error))
+
+    def close(self) -> None:
+        """Nobody serves any more; who waits is told."""
+        self._closed.set()
+
+
+@dataclass(frozen=True, slots=True)
+class Scenery:
+    """What is drawn while a level is measured or made ready."""
+
+    content: ContentSource
+    eyes_m: F64  # (2, 3) left, right; frame `stack`
+    time_ns: int
+    stack: PanelStack
+    fov_deg: float
+
+    def pictures(self, predictor: Predictor) -> tuple[list[list[U8]], float]:
+        """What a model wants to see (copies), and how many milliseconds drawing it took."""
+        begin_ns = perf_counter_ns()
+        images = drawn_for(predictor, self.content, self.eyes_m, time_ns=self.time_ns)
+        taken_ms = (perf_counter_ns() - begin_ns) / 1e6
+        return [[image.copy() for image in eye] for eye in images], taken_ms
+
+    def wanted(self) -> list[F32]:
+        """Both eyes' own pictures, (h, w, 3) in [0, 1], of the panels' size."""
+        pictures = []
+        for side, eye_m in enumerate(self.eyes_m):
+            size = {"width_px": self.stack.width_px, "height_px": self.stack.height_px}
+            view = retina_view(eye_m, side, fov_deg=self.fov_deg, **size)
+            picture = self.content.render(view, time_ns=self.time_ns)[..., :3]
+            pictures.append(picture.astype(np.float32) / np.float32(255))
+        return pictures
+
+    def psnr_db(self, layers: U8, wanted: list[F32]) -> float:
+        """Displayed PSNR of layers, both eyes pooled."""
+        squared, counted = 0.0, 0
+        for eye_m, target in zip(self.eyes_m, wanted, strict=True):
+            seen = seen_by(eye_m, layers, self.stack, fov_deg=self.fov_deg)
+            errors = (seen.image[seen.mask].astype(np.float64) - target[seen.mask]) ** 2
+            squared, counted = squared + float(errors.sum()), counted + errors.size
+        return psnr_db(squared / max(counted, 1))
+
+
+def rungs(settings: Settings, stack: PanelStack) -> tuple[Rung, ...]:
+    """What a budget may choose from: the shipped models' ladder, or the configured model at fewer pixels."""
+    if settings.model.name in SHIPPED and stack.count == 3 and stack.is_evenly_spaced:
+        return LADDER
+    return tuple((settings.model.name, scale) for scale in SCALES)
+
+
+def ready_level(rung: Rung, settings: Settings, scenery: Scenery, ask: Ask) -> Predictor:
+    """A level's predictor that has drawn and solved the present picture: its first frame costs no more than others.
+
+    Raises PhasestackError.
+    """
+    predictor = ladder_predictor(*rung, scenery.stack, settings)
+    try:
+        predictor.warm_up(scenery.eyes_m)
+        images, _ = ask(lambda: scenery.pictures(predictor))
+        predictor.predict(images, scenery.eyes_m)
+    except BaseException:
+        predictor.close()
+        raise
+    return predictor
+
+
+def measured_levels(
+    settings: Settings,
+    scenery: Scenery,
+    ask: Ask,
+    *,
+    simulated: bool = False,
+    tell: Callable[[str], None] = lambda _: None,
+) -> list[Level]:
+    """What each level takes and how well it shows the present picture; those that can't be had are left out.
+
+    simulated: times are the simulated clock's instead of the machine's. Raises FatalError where none can be had.
+    """
+    wanted = ask(scenery.wanted)
+    levels: list[Level] = []
+    for rung in rungs(settings, scenery.stack):
+        level = Level(*rung, 0.0, 0.0)
+        tell(level.label)
+        try:
+            level = _measured(rung, settings, scenery, ask, wanted, simulated=simulated)
+        except FatalError as error:  # a network of fixed size has no smaller ones
+            log.info("budget: %s is left out: %s", level.label, error)
+            continue
+        levels.append(level)
+        log.info("budget: %s takes %.1f ms and shows %.1f dB", level.label, level.expected_ms, level.psnr_db)
+    if not levels:
+        raise FatalError("budget: no model can be had in any size")
+    return levels
+
+
+def _measured(
+    rung: Rung, settings: Settings, scenery: Scenery, ask: Ask, wanted: list[F32], *, simulated: bool
+) -> Level:
+    predictor = ready_level(rung, settings, scenery, ask)
+    try:
+        times_ms = []
+        for _ in range(1 if simulated else REPEATS):
+            images, drawing_ms = ask(lambda: scenery.pictures(predictor))
+            begin_ns = perf_counter_ns()
+            layers = predictor.predict(images, scenery.eyes_m).layers
+            times_ms.append(drawing_ms + (perf_counter_ns() - begin_ns) / 1e6)
+        shown_db = scenery.psnr_db(layers, wanted)
+    finally:
+        predictor.close()
+    cost_ms = min(times_ms)  # the least disturbed: the loop may be at work beside this
+    if simulated:
+        cost_ms = sum(simulated_stage_ms(rung, settings)[stage] for stage in ("render", *SOLVING))
+    return Level(*rung, cost_ms, shown_db)
+
+
+def simulated_stage_ms(rung: Rung, settings: Settings) -> dict[str, float]:
+    """What each stage costs on a simulated clock at one level; the configuration tells it for the configured model."""
+    name, scale = rung
+    pixels = scale * scale
+    relative = SIMULATED_COST.get(name, 1.0) / SIMULATED_COST.get(settings.model.name, 1.0)
+    factors = {"render": pixels} | dict.fromkeys(SOLVING, pixels * relative)
+    stages = {"render": 0.0} | dict.fromkeys(SOLVING, 0.0) | settings.loop.simulated_stage_ms
+    return {stage: cost * factors.get(stage, 1.0) for stage, cost in stages.items()}

@@ -1,0 +1,250 @@
+"""Puts content and models together to measure a plan, and builds what a plan asks for."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from runtime.config import ModelSettings, Settings, load_settings, validated
+
+if TYPE_CHECKING:
+    from runtime.content.base import ContentSource
+    from runtime.model.predictor import Predictor
+    from runtime.optics.stack import PanelStack
+    from runtime.plan.focus import FocusedPredictor
+    from runtime.plan.levels import Level
+    from runtime.plan.measure import Trial
+    from runtime.records import F64
+
+MIDDLE_M = (0.6, 0.0, 0.05)
+HALF_IPD_M = 0.031
+SURVEY_REPEATS = 15
+LADDER = (("best", 1.0), ("balanced", 1.0), ("fast", 1.0), ("fast", 0.75), ("fast", 0.5))
+
+
+def focused(predictor: Predictor, settings: ModelSettings) -> FocusedPredictor | None:
+    """The predictor made to run on windows, where its kind can; None for others (`sart`, whole-picture networks)."""
+    from runtime.model.unrolled import UnrolledPredictor
+    from runtime.plan.focus import FocusedPredictor
+
+    if not isinstance(predictor, UnrolledPredictor):
+        return None
+
+    def make(part: PanelStack) -> UnrolledPredictor:
+        # One session serves every size: loading another for a new window would cost as much as solving it.
+        return UnrolledPredictor(
+            predictor.session,
+            part,
+            tolerance_mm=predictor.tolerance_mm,
+            threads=settings.threads,
+            one_channel=predictor.one_channel,
+        )
+
+    return FocusedPredictor(predictor, make)
+
+
+def planned_predictor(settings: Settings, stack: PanelStack) -> Predictor:
+    """The configured model with the savings that the plan allows. Raises InputError, MissingPart."""
+    from runtime.model.predictor import load_predictor
+    from runtime.model.unrolled import UnrolledPredictor
+
+    predictor = load_predictor(settings.model.name, stack, settings.model)
+    if isinstance(predictor, UnrolledPredictor):
+        predictor.one_channel = settings.plan.enabled and settings.plan.one_channel
+    if settings.plan.enabled and settings.plan.focus:
+        return focused(predictor, settings.model) or predictor
+    return predictor
+
+
+def plan_for(
+    config: Path | None,
+    *,
+    scene: str | None,
+    model: str | None,
+    scale: float,
+    budget_ms: float | None,
+    middle_m: tuple[float, float, float] | None,
+    quiet: bool,
+) -> dict[str, Any]:
+    """Measure and plan one scene; everything that `phasestack plan` prints. Raises PhasestackError."""
+    import cv2
+    import numpy as np
+
+    from runtime.content.registry import open_content
+    from runtime.model.predictor import load_predictor
+    from runtime.plan.measure import measure
+    from runtime.plan.planner import focused_part
+    from runtime.plan.savings import make_plan
+    from runtime.support.gl import offscreen_context
+
+    settings = _overridden(load_settings(config), scene=scene, model=model, budget_ms=budget_ms)
+    cv2.setNumThreads(settings.model.threads or -1)
+    stack = settings.stack.stack()
+    stack = replace(
+        stack, width_px=max(16, round(stack.width_px * scale)), height_px=max(16, round(stack.height_px * scale))
+    )
+    middle = np.array(middle_m or MIDDLE_M)
+    half = np.array([0.0, HALF_IPD_M, 0.0])
+    eyes_m = np.array([middle - half, middle + half])
+    if settings.sensor.fixed_eyes_m is not None and middle_m is None:
+        eyes_m = np.array(settings.sensor.fixed_eyes_m)
+    with ExitStack() as cleanup:
+        tell = _teller(cleanup, quiet)
+        context = offscreen_context()
+        cleanup.callback(context.release)
+        content = open_content(settings.content, stack, context)
+        cleanup.callback(content.close)
+        plain = load_predictor(settings.model.name, stack, settings.model)
+        cleanup.callback(plain.close)
+        predictor = planned_predictor(settings, stack)
+        cleanup.callback(predictor.close)
+        tell("with and without the plan")
+        numbers, without, with_plan = measure(
+            content, plain, predictor, eyes_m, stack, fov_deg=settings.content.fov_deg, band_m=_band_m(settings)
+        )
+        levels: list[Level] = []
+        if settings.model.budget_ms > 0:
+            levels, numbers, with_plan = _budget(settings, stack, content, eyes_m, numbers, with_plan, tell)
+        planned = make_plan(
+            content.info,
+            stack,
+            settings,
+            eyes_m=eyes_m,
+            measured=numbers,
+            can_focus=focused_part(predictor) is not None,
+            loaded_modules=sys.modules,
+        )
+        return {
+            "scene": content.info.name,
+            "model": plain.name,
+            "width_px": stack.width_px,
+            "height_px": stack.height_px,
+            "plan": [asdict(item) for item in planned.items],
+            "active_fraction": round(numbers.active_fraction, 4),
+            "channels": numbers.channels,
+            "frame_ms": round(with_plan.frame_ms, 2),
+            "frame_ms_without": round(without.frame_ms, 2),
+            "psnr_db": round(with_plan.psnr_db, 3),
+            "psnr_db_without": round(without.psnr_db, 3),
+            "level": numbers.level,
+            "levels": [
+                {"label": level.label, "ms": round(level.expected_ms, 2), "psnr_db": round(level.psnr_db, 3)}
+                for level in levels
+            ],
+        }
+
+
+def survey(
+    config: Path | None, *, out: Path, model: str | None, scale: float, quick: bool, quiet: bool
+) -> dict[str, Any]:
+    """Six kinds of scenes, other small objects and growing regions, with the plan and without; files in `out`.
+
+    Raises PhasestackError; leaves nothing new then.
+    """
+    from datetime import UTC, datetime
+
+    import cv2
+    import numpy as np
+
+    from runtime.plan.survey import QUICK_REGIONS, REGIONS, survey_regions, survey_scenes
+    from runtime.report.survey_page import write_survey
+    from runtime.support.artifacts import OutputFolder
+    from runtime.support.gl import offscreen_context
+
+    settings = _overridden(load_settings(config), scene=None, model=model, budget_ms=None)
+    cv2.setNumThreads(settings.model.threads or -1)
+    stack = settings.stack.stack()
+    scale *= 0.5 if quick else 1.0
+    stack = replace(
+        stack, width_px=max(16, round(stack.width_px * scale)), height_px=max(16, round(stack.height_px * scale))
+    )
+    half = np.array([0.0, HALF_IPD_M, 0.0])
+    eyes_m = np.array([np.array(MIDDLE_M) - half, np.array(MIDDLE_M) + half])
+    with ExitStack() as cleanup, OutputFolder(out) as folder:
+        tell = _teller(cleanup, quiet)
+        context = offscreen_context()
+        cleanup.callback(context.release)
+        repeats = SURVEY_REPEATS // 3 if quick else SURVEY_REPEATS
+        scenes, others = survey_scenes(settings, stack, context, eyes_m, repeats=repeats, progress=tell)
+        regions = survey_regions(
+            settings,
+            stack,
+            context,
+            eyes_m,
+            regions=QUICK_REGIONS if quick else REGIONS,
+            repeats=max(3, repeats // 3),
+            progress=tell,
+        )
+        facts = {
+            "model": settings.model.name,
+            "width_px": stack.width_px,
+            "height_px": stack.height_px,
+            "threads": settings.model.threads,
+            "eyes_m": eyes_m.tolist(),
+            "date": datetime.now(UTC).strftime("%Y-%m-%d"),
+        }
+        return write_survey(folder.staging, scenes, others, regions, facts)
+
+
+def _budget(
+    settings: Settings,
+    stack: PanelStack,
+    content: ContentSource,
+    eyes_m: F64,
+    numbers: Any,
+    present: Trial,
+    tell: Callable[[str], None],
+) -> tuple[list[Level], Any, Trial]:
+    """Measure the ladder of models and resolutions and choose by the budget."""
+    from runtime.plan.levels import BudgetKeeper, Level, useful
+    from runtime.plan.measure import trial
+    from runtime.plan.reduced import ladder_predictor
+    from runtime.plan.savings import Saving
+
+    trials: dict[str, Trial] = {}
+    levels = []
+    for name, scale in LADDER:
+        level = Level(name, scale, 0.0, 0.0)
+        tell(level.label)
+        predictor = ladder_predictor(name, scale, stack, settings)
+        result = trial(content, predictor, eyes_m, stack, fov_deg=settings.content.fov_deg, repeats=3)
+        predictor.close()
+        trials[level.label] = result
+        levels.append(replace(level, expected_ms=result.frame_ms, psnr_db=result.psnr_db))
+    levels = useful(levels)
+    keeper = BudgetKeeper(levels, settings.model.budget_ms)
+    saving = Saving(present.frame_ms - keeper.level.expected_ms, present.psnr_db - keeper.level.psnr_db)
+    numbers = replace(numbers, level=keeper.level.label, level_saving=saving)
+    return levels, numbers, trials[keeper.level.label]
+
+
+def _band_m(settings: Settings) -> float:
+    return (settings.plan.dead_band_mm or settings.model.tolerance_mm) / 1000
+
+
+def _overridden(settings: Settings, *, scene: str | None, model: str | None, budget_ms: float | None) -> Settings:
+    """Settings with what the command line says."""
+    table = settings.model_dump()
+    for section, name, value, option in (
+        ("content", "scene", scene, "--scene"),
+        ("model", "name", model, "--model"),
+        ("model", "budget_ms", budget_ms, "--budget-ms"),
+    ):
+        if value is not None:
+            table[section][name] = value
+            validated(Settings, table, source=option)
+    return validated(Settings, table, source="settings")
+
+
+def _teller(cleanup: ExitStack, quiet: bool) -> Callable[[str], None]:
+    """Shows what is being measured, on stderr."""
+    if quiet or not sys.stderr.isatty():
+        return lambda text: None
+    from rich.console import Console
+
+    status = cleanup.enter_context(Console(stderr=True).status("loading"))
+    return lambda text: status.update(f"measuring: {text}")

@@ -1,0 +1,59 @@
+"""A model at fewer pixels than the panels have, its layers enlarged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from time import perf_counter_ns
+
+import cv2
+import numpy as np
+
+from runtime.config import Settings
+from runtime.model.predictor import Prediction, Predictor
+from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.records import F64, U8
+
+
+class ReducedPredictor(Predictor):
+    """Wraps a model for a stack of the same size with fewer pixels."""
+
+    def __init__(self, small: Predictor, stack: PanelStack) -> None:
+        """small: the model for the same panels at fewer pixels; stack: the panels as they are."""
+        self.small, self.stack = small, stack
+        self.name, self.provider, self.parameters = small.name, small.provider, small.parameters
+        self._layers = np.empty((stack.count, stack.height_px, stack.width_px, 4), np.uint8)
+
+    def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
+        return self.small.rasters(eyes_m)
+
+    @property
+    def interpolation(self) -> str:
+        return self.small.interpolation
+
+    def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
+        return self.small.windows(eyes_m)
+
+    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64) -> Prediction:
+        solved = self.small.predict(images, eyes_m)
+        begin_ns = perf_counter_ns()
+        size = (self.stack.width_px, self.stack.height_px)
+        for layer, out in zip(solved.layers, self._layers, strict=True):
+            cv2.resize(layer, size, dst=out, interpolation=cv2.INTER_LINEAR)
+        stage_ms = dict(solved.stage_ms)
+        stage_ms["finish"] = stage_ms.get("finish", 0.0) + (perf_counter_ns() - begin_ns) / 1e6
+        return Prediction(self._layers, stage_ms)
+
+    def close(self) -> None:
+        self.small.close()
+
+
+def ladder_predictor(name: str, scale: float, stack: PanelStack, settings: Settings) -> Predictor:
+    """One level of the ladder: a model at a share of the panels' columns and rows, focused where the plan says so."""
+    from runtime.plan.planning import planned_predictor
+
+    chosen = settings.model_copy(update={"model": settings.model.model_copy(update={"name": name})})
+    if scale == 1.0:
+        return planned_predictor(chosen, stack)
+    small = replace(stack, width_px=round(stack.width_px * scale), height_px=round(stack.height_px * scale))
+    return ReducedPredictor(planned_predictor(chosen, small), stack)

@@ -1,0 +1,246 @@
+"""Another scene, model or configuration while it runs: loaded beside the loop, taken over or refused, never half."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from runtime.clock import MonotonicClock
+from runtime.commands import daemon as daemon_module
+from runtime.config import Overrides
+from runtime.content import loader
+from runtime.daemon import server as server_module
+from runtime.daemon.client import ask
+from runtime.daemon.notify import Notifier
+from runtime.daemon.server import StatusServer
+from runtime.daemon.signals import Signals
+from tests.daemon.rig import SMALL, TRACKING, Rig
+
+SLOW_S = 0.6
+
+
+class Served:
+    """A loop with a daemon that listens; what is asked of it is answered while the loop turns."""
+
+    def __init__(self, folder: Path, **changes: dict[str, Any]) -> None:
+        self.config = folder / "phasestack.toml"
+        self.server = StatusServer(folder / "status.sock", group="root", clock=MonotonicClock())
+        self._signals, self._notifier = Signals(), Notifier(MonotonicClock(), {})
+        self.rig = Rig(**changes)
+        self.rig._supervisor = daemon_module.Daemon(
+            self.config,
+            Overrides(),
+            self.rig.settings,
+            signals=self._signals,
+            notifier=self._notifier,
+            server=self.server,
+            metrics=None,
+        )
+
+    def __enter__(self) -> Served:
+        self.rig.__enter__()
+        self.rig.turn_until(TRACKING)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.rig.__exit__(*exception)
+        self.server.close()
+
+    @property
+    def loop(self) -> Any:
+        return self.rig.loop
+
+    def status(self) -> dict[str, Any]:
+        return ask([self.server.path], {"command": "status"})
+
+    def asked(self, name: str, value: Any = None, *, meanwhile: Callable[[], None] = lambda: None) -> dict[str, Any]:
+        """The answer to a command; the loop turns until it is there."""
+        answers: list[dict[str, Any]] = []
+        request = {"command": name, "value": value}
+        asking = threading.Thread(target=lambda: answers.append(ask([self.server.path], request, timeout_s=30.0)))
+        asking.start()
+        while asking.is_alive():
+            self.loop.turn()
+            meanwhile()
+        return answers[0]
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Served]:
+    with Served(tmp_path) as made:
+        yield made
+
+
+@pytest.fixture
+def slow_loading(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = loader.prepare_content
+
+    def prepare(settings: Any, stack: Any, *, progress: Any = lambda _: None) -> Any:
+        progress(f"reading {settings.scene}")
+        time.sleep(SLOW_S)
+        return real(settings, stack, progress=progress)
+
+    monkeypatch.setattr(loader, "prepare_content", prepare)
+
+
+@pytest.mark.usefixtures("slow_loading")
+def test_the_loop_goes_on_with_the_present_scene_while_another_is_loaded(served: Served) -> None:
+    told: list[tuple[str, str]] = []
+    before = served.loop.stats.frames
+
+    def meanwhile() -> None:
+        if len(told) < 3:
+            status = served.status()
+            told.append((status["scene"], status.get("loading", "")))
+
+    assert served.asked("scene", "sparse", meanwhile=meanwhile) == {"ok": True}
+    accounts = served.rig.accounts[before:]
+    assert len(accounts) > 10
+    assert all(account.presented for account in accounts)
+    assert max(sum(account.measured_ms.values()) for account in accounts) < 1000 * SLOW_S / 2
+    assert ("demo", "reading sparse") in told
+    served.rig.turns(2)
+    status = served.status()
+    assert (status["scene"], status.get("loading")) == ("sparse", None)
+    assert served.loop.pipeline.content.info.name == "sparse"
+
+
+def a_mesh(folder: Path, broken: str) -> Path:
+    path = folder / f"{broken}.obj"
+    match broken:
+        case "NaN":
+            path.write_text("v 0 0 0\nv nan 0 1\nv 0 1 0\nf 1 2 3\n")
+        case "no faces":
+            path.write_text("v 0 0 0\nv 1 0 1\nv 0 1 0\n")
+        case "no texture":
+            path.write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 1\nv 0 1 0\nusemtl a\nf 1 2 3\n")
+            (folder / "a.mtl").write_text("newmtl a\nmap_Kd gone.png\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("broken", "field"),
+    [("NaN", "vertices: 1 of 3"), ("no faces", "faces"), ("no texture", "gone.png"), ("missing", "neither a file")],
+)
+def test_content_that_can_t_be_loaded_is_refused_and_the_last_good_stays(
+    served: Served, tmp_path: Path, caplog: pytest.LogCaptureFixture, broken: str, field: str
+) -> None:
+    path = a_mesh(tmp_path, broken)
+    served.rig.turns(3)
+    content = served.loop.pipeline.content
+    answer = served.asked("scene", str(path))
+    assert not answer["ok"]
+    assert str(path) in answer["error"]
+    assert field in answer["error"]
+    assert "\n" not in answer["error"]
+    assert all(account.presented for account in served.rig.turns(3))
+    assert served.loop.pipeline.content is content
+    status = served.status()
+    assert (status["scene"], status["refused"], status["state"]) == ("demo", answer["error"], TRACKING)
+    told = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
+    assert len(told) == 1
+    assert answer["error"] in told[0]
+    assert served.asked("scene", "sparse") == {"ok": True}
+    served.rig.turns(2)
+    assert "refused" not in served.status()
+
+
+def test_a_good_mesh_is_shown(served: Served, tmp_path: Path) -> None:
+    path = tmp_path / "ball.glb"
+    trimesh.creation.icosphere(subdivisions=3).export(path)
+    before = served.loop.layers.copy()
+    assert served.asked("scene", str(path)) == {"ok": True}
+    served.rig.turns(2)
+    assert served.loop.pipeline.content.info.name == "ball"
+    assert not np.array_equal(served.loop.layers, before)
+
+
+@pytest.mark.usefixtures("slow_loading")
+def test_a_newer_scene_overtakes_one_that_is_being_loaded(served: Served) -> None:
+    answers: list[dict[str, Any]] = []
+    request = {"command": "scene", "value": "texture"}
+    first = threading.Thread(target=lambda: answers.append(ask([served.server.path], request)))
+    first.start()
+    while "loading" not in served.status():
+        served.loop.turn()
+    assert served.asked("scene", "sparse") == {"ok": True}
+    first.join(5.0)
+    assert answers == [{"ok": False, "error": "overtaken by a newer change"}]
+    assert served.loop.pipeline.content.info.name == "sparse"
+
+
+@pytest.mark.usefixtures("slow_loading")
+def test_what_takes_very_long_is_answered_with_where_to_look(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server_module, "LOOP_ANSWERS_WITHIN_S", 0.2)
+    monkeypatch.setattr(server_module, "LOADED_WITHIN_S", 0.3)
+    answer = served.asked("scene", "sparse")
+    assert answer["ok"]
+    assert "status" in answer["note"]
+
+
+def configuration(**model: Any) -> str:
+    tables = SMALL | {"model": SMALL["model"] | model}
+    return "\n".join(
+        f"[{section}]\n" + "\n".join(f"{name} = {value!r}" for name, value in table.items())
+        for section, table in tables.items()
+    )
+
+
+def test_a_reload_with_another_model_is_warm_when_it_is_taken_over(served: Served) -> None:
+    served.config.write_text(configuration(name="balanced"))
+    assert served.asked("reload") == {"ok": True}
+    assert served.status()["model"] == "balanced"
+    served.config.write_text(configuration(name="nothing.onnx"))
+    answer = served.asked("reload")
+    assert not answer["ok"]
+    assert "nothing.onnx" in answer["error"]
+    assert served.loop.pipeline.predictor.name == "balanced"
+    assert all(account.presented for account in served.rig.turns(3))
+
+
+def test_the_plan_follows_the_viewer_and_the_content(served: Served) -> None:
+    served.rig.plan.eyes_m = np.array([[0.135, 0.43, 0.0], [0.09, 0.47, 0.0]])  # the right eye is off by 79.2 degrees
+    served.rig.turns(30)
+    before = [item["what"] for item in served.loop.plan_items()]
+    assert "the right eye" not in before
+    served.rig.plan.eyes_m = np.array([[0.123, 0.43, 0.0], [0.078, 0.47, 0.0]])  # 80.6 degrees
+    deadline = time.monotonic() + 10.0
+    while "the right eye" not in [item["what"] for item in served.loop.plan_items()]:
+        served.loop.turn()
+        assert time.monotonic() < deadline
+    assert served.loop.pipeline.plan.eyes == (True, False)
+    assert "the right eye" in [item["what"] for item in served.loop.summary()["plan"]]
+    served.rig.plan.eyes_m = np.array([[0.7, -0.031, 0.0], [0.7, 0.031, 0.0]])
+    while served.loop.pipeline.plan.eyes != (True, True):
+        served.loop.turn()
+        assert time.monotonic() < deadline
+    assert served.asked("scene", "moving") == {"ok": True}
+    served.rig.turns(2)
+    assert "render and inference" in before
+    assert "render and inference" not in [item["what"] for item in served.status()["plan"]]
+
+
+def test_a_still_head_costs_no_inference_whatever_its_sensor_s_noise(served: Served) -> None:
+    served.rig.plan.sway_m, served.rig.plan.noise_m = 0.0, 0.0015
+    deadline = time.monotonic() + 10.0
+    while served.loop._rest.place is None:
+        served.loop.turn()
+        assert time.monotonic() < deadline
+    served.rig.turns(3)
+    accounts = served.rig.turns(200)
+    assert [account.inference for account in accounts] == ["reused"] * 200
+    assert all(account.presented for account in accounts)
+    (item,) = [item for item in served.loop.plan_items() if item["what"] == "render and inference"]
+    assert item["saves_ms"] > 0
+    assert item["costs_db"] is None  # what the eyes would have seen of a fresh frame is not known here
+    assert len({account.eyes_m.tobytes() for account in accounts}) == 1
+    served.rig.plan.eyes_m = served.rig.plan.eyes_m + np.array([0.0, 0.02, 0.0])
+    while served.loop.turn().inference != "ran":
+        assert time.monotonic() < deadline

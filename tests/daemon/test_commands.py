@@ -1,0 +1,110 @@
+"""`phasestack status` and `phasestack ctl` against a real socket."""
+
+from __future__ import annotations
+
+import json
+import threading
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from runtime.clock import NS_PER_S, SimulatedClock
+from runtime.commands import ctl
+from runtime.commands.status import status
+from runtime.daemon.server import StatusServer
+from runtime.errors import InputError
+
+ACCOUNT = {
+    "state": "degraded: sensor", "reason": "sensor: unplugged", "missing": {"sensor": "unplugged"}, "fps": 31.25,
+    "frames": 100, "presented": 98, "dropped": 2, "stage_ms": {"render": {"p50": 3.0}, "inference": {"p50": 12.0}},
+    "eyes_m": [[0.9, -0.03, 0.0], [0.9, 0.03, 0.0]], "eyes_label": "held", "faults": {"sensor": 4},
+    "plan": [{"what": "warp of the centre panel", "why": "identity"}],
+    "budget": {"budget_ms": 16.0, "level": "fast at 0.75", "held": True, "measuring": ""},
+    "loading": "reading a.glb",
+}  # fmt: skip
+
+
+@pytest.fixture
+def clock():
+    return SimulatedClock()
+
+
+@pytest.fixture
+def server(tmp_path, clock):
+    made = StatusServer(tmp_path / "status.sock", group="root", clock=clock)
+    made.publish(lambda: ACCOUNT)
+    yield made
+    made.close()
+
+
+def ask_status(*arguments):
+    app = typer.Typer()
+    app.command()(status)
+    return CliRunner().invoke(app, list(arguments))
+
+
+def test_people_see_state_reason_rate_eyes_and_faults(server):
+    result = ask_status("--socket", str(server.path))
+    assert result.exit_code == 0
+    for words in ("degraded: sensor", "unplugged", "31.2 frames/s", "2 dropped", "(0.900, -0.030, 0.000)", "held",
+                  "inference 12.00", "faults sensor", "warp of the centre panel", "16 ms: fast at 0.75  (held)",
+                  "reading a.glb"):  # fmt: skip
+        assert words in result.stdout
+
+
+def test_machines_get_one_object(server):
+    result = ask_status("--json", "--socket", str(server.path))
+    assert json.loads(result.stdout)["state"] == "degraded: sensor"
+
+
+def test_a_loop_that_stands_still_is_a_failure(server, clock):
+    clock.advance_ns(6 * NS_PER_S)
+    result = ask_status("--socket", str(server.path))
+    assert result.exit_code == 1
+    assert "has not completed a turn for 6 s" in result.stderr
+
+
+def test_without_a_daemon_status_fails_with_one_line(tmp_path):
+    result = ask_status("--socket", str(tmp_path / "none.sock"))
+    assert result.exit_code == 1
+    assert result.stderr.count("\n") == 1
+    assert "no daemon" in result.stderr
+
+
+def test_the_configuration_says_where_the_socket_is(server, tmp_path):
+    config = tmp_path / "phasestack.toml"
+    config.write_text(f'[service]\nsocket = "{server.path}"\n')
+    assert ask_status("--config", str(config)).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name", "value"),
+    [
+        (["scene", "lego_bulldozer"], "scene", "lego_bulldozer"),
+        (["pause"], "pause", None),
+        (["resume"], "resume", None),
+        (["flat"], "flat", None),
+        (["budget", "16"], "budget", 16.0),
+        (["reload"], "reload", None),
+    ],
+)
+def test_every_command_arrives(server, arguments, name, value):
+    taken = []
+
+    def loop():
+        taken.append(server.commands.get(timeout=5))
+        taken[0].done()
+
+    thread = threading.Thread(target=loop)
+    thread.start()
+    result = CliRunner().invoke(ctl.app, [*arguments, "--socket", str(server.path)])
+    thread.join()
+    assert result.exit_code == 0
+    assert (taken[0].name, taken[0].value) == (name, value)
+
+
+def test_a_refusal_is_bad_input(server):
+    result = CliRunner().invoke(ctl.app, ["budget", "99999999", "--socket", str(server.path)])
+    assert isinstance(result.exception, InputError)
+    assert "budget must lie in" in str(result.exception)

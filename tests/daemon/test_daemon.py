@@ -1,0 +1,228 @@
+"""`phasestack run` as systemd runs it: a process, a notification socket, signals, a configuration that changes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from runtime.daemon.client import ask
+from runtime.errors import TransientError
+from tests.daemon.test_notify import Supervisor
+
+CONFIG = """
+[stack]
+width_px = 192
+height_px = 108
+[sensor]
+loop = true
+[model]
+name = "fast"
+threads = 1
+[loop]
+rate_hz = 60.0
+[service]
+socket = "{folder}/status.sock"
+log_format = "json"
+"""
+
+
+PHASESTACK = (sys.executable, "-c", "from runtime.cli import main; main()")
+
+
+class Daemon:
+    """One process of `phasestack run`."""
+
+    def __init__(
+        self, folder, *extra: str, config: str = CONFIG, watchdog_s: float = 0.0, headless: bool = True
+    ) -> None:
+        self.socket = folder / "status.sock"
+        self.config = folder / "phasestack.toml"
+        self.config.write_text(config.format(folder=folder))
+        self.supervisor = Supervisor(str(folder / "notify"))
+        self.heard: list[str] = []
+        environment = {**os.environ, "NOTIFY_SOCKET": str(folder / "notify"), "OMP_NUM_THREADS": "1"}
+        if watchdog_s:
+            environment["WATCHDOG_USEC"] = str(int(watchdog_s * 1e6))
+        arguments = ["run", "--config", str(self.config), "--replay", "demo", *extra]
+        if headless:
+            arguments.append("--headless")
+        self.process = subprocess.Popen(
+            [*PHASESTACK, *arguments], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+
+    def hears(self, message: str, *, within_s: float = 30.0) -> bool:
+        deadline = time.monotonic() + within_s
+        while time.monotonic() < deadline:
+            self.heard += self.supervisor.heard()
+            if any(message in heard for heard in self.heard):
+                return True
+            if self.process.poll() is not None:
+                return False
+            time.sleep(0.02)
+        return False
+
+    def status(self) -> dict:
+        return ask([self.socket], {"command": "status"})
+
+    def ends(self) -> tuple[int, str]:
+        _, errors = self.process.communicate(timeout=30)
+        self.heard += self.supervisor.heard()
+        return self.process.returncode, errors
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        if not self.process.stderr.closed:
+            self.process.communicate(timeout=30)
+        self.supervisor.close()
+
+
+@pytest.fixture
+def started(tmp_path):
+    made = []
+
+    def start(*extra, **keywords) -> Daemon:
+        folder = tmp_path / str(len(made))
+        folder.mkdir()
+        made.append(Daemon(folder, *extra, **keywords))
+        return made[-1]
+
+    yield start
+    for daemon in made:
+        daemon.close()
+
+
+def test_ready_comes_after_the_first_presented_frame_and_stopping_before_the_end(started):
+    daemon = started(watchdog_s=2.0)
+    assert daemon.hears("READY=1")
+    assert daemon.status()["presented"] >= 1
+    assert daemon.hears("WATCHDOG=1")
+    daemon.process.send_signal(signal.SIGTERM)
+    code, errors = daemon.ends()
+    assert code == 0
+    assert any(message.startswith("STOPPING=1") for message in daemon.heard)
+    assert "SIGTERM" in errors
+    assert not daemon.socket.exists()
+
+
+@pytest.mark.parametrize(
+    ("number", "after_s"),
+    [(signal.SIGTERM, 0.05), (signal.SIGTERM, 0.5), (signal.SIGTERM, 1.0), (signal.SIGTERM, 1.6), (signal.SIGINT, 1.0)],
+)
+def test_a_signal_at_any_stage_of_the_start_ends_it_without_a_traceback(started, number, after_s):
+    daemon = started()
+    time.sleep(after_s)
+    daemon.process.send_signal(number)
+    code, errors = daemon.ends()
+    # Before our handlers are there a signal kills; 130 is what shells make of an interrupt.
+    assert code in (0, 130, -number)
+    assert "Traceback" not in errors
+
+
+@pytest.mark.parametrize("after_s", [0.7, 1.2])
+def test_a_hangup_during_the_start_is_a_reload_that_comes_when_it_can(started, after_s):
+    daemon = started()
+    time.sleep(after_s)
+    daemon.process.send_signal(signal.SIGHUP)
+    if daemon.hears("READY=1"):  # before our handlers are there it ends the process, as it ends any
+        daemon.process.send_signal(signal.SIGTERM)
+    code, errors = daemon.ends()
+    assert code in (0, -signal.SIGHUP)
+    assert "Traceback" not in errors
+
+
+def test_a_bad_configuration_on_reload_is_refused_and_the_old_one_stays(started):
+    daemon = started()
+    assert daemon.hears("READY=1")
+    daemon.config.write_text("[loop]\nrate_hz = -1\n")
+    daemon.process.send_signal(signal.SIGHUP)
+    assert daemon.hears("RELOADING=1")
+    answer = ask([daemon.socket], {"command": "reload"})
+    assert not answer["ok"]
+    assert "rate_hz" in answer["error"]
+    assert daemon.status()["state"] in ("tracking", "holding", "flat")
+    daemon.process.send_signal(signal.SIGTERM)
+    code, errors = daemon.ends()
+    assert code == 0
+    assert any("refused" in line and "rate_hz" in line for line in errors.splitlines())
+
+
+def test_commands_change_what_it_does(started):
+    daemon = started()
+    assert daemon.hears("READY=1")
+    assert ask([daemon.socket], {"command": "flat"}) == {"ok": True}
+    assert daemon.hears("STATUS=flat (asked for)")
+    assert ask([daemon.socket], {"command": "resume"}) == {"ok": True}
+    assert daemon.hears("STATUS=tracking")
+    refused = ask([daemon.socket], {"command": "scene", "value": "no-such-scene"})
+    assert not refused["ok"]
+    assert "no-such-scene" in refused["error"]
+    assert ask([daemon.socket], {"command": "pause"}) == {"ok": True}
+    frames = daemon.status()["frames"]
+    time.sleep(0.2)
+    assert daemon.status()["frames"] > frames  # paused is a still picture, not a still loop
+
+
+def test_the_status_socket_in_use_is_refused_in_one_line_and_the_other_goes_on(started, tmp_path):
+    first = started()
+    assert first.hears("READY=1")
+    second = started(config=CONFIG.replace("{folder}", str(tmp_path / "0")))
+    code, errors = second.ends()
+    assert code == 2
+    assert "is in use by another phasestack" in errors.splitlines()[-1]
+    assert "Traceback" not in errors
+    assert first.status()["ok"]
+
+
+def test_every_log_line_is_one_object(started):
+    daemon = started("--frames", "20")
+    code, errors = daemon.ends()
+    assert code == 0
+    lines = [line for line in errors.splitlines() if line.startswith("{")]
+    assert any(json.loads(line)["message"].startswith("state: starting ->") for line in lines)
+
+
+NO_SCREEN = CONFIG + '[output]\nkind = "windows"\n' + '[[output.panels]]\nconnector = "HDMI-1"\n' * 3
+
+
+def test_a_panel_that_is_missing_at_the_start_is_waited_for_and_more_time_asked_for(started, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    daemon = started(config=NO_SCREEN, headless=False)
+    assert daemon.hears("EXTEND_TIMEOUT_USEC=")
+    assert daemon.hears("waiting for a panel")
+    assert not daemon.hears("READY=1", within_s=0.5)
+    daemon.process.send_signal(signal.SIGTERM)
+    code, errors = daemon.ends()
+    assert "Traceback" not in errors
+    assert code in (0, 2)
+
+
+def test_by_hand_a_missing_panel_is_refused_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    config = tmp_path / "phasestack.toml"
+    config.write_text(NO_SCREEN.format(folder=tmp_path))
+    environment = {name: value for name, value in os.environ.items() if name != "NOTIFY_SOCKET"}
+    command = [*PHASESTACK, "run", "--config", str(config), "--replay", "demo"]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert result.returncode == 2
+    assert "no X server" in result.stderr.splitlines()[-1]
+    assert "Traceback" not in result.stderr
+
+
+def test_killed_outright_it_leaves_a_socket_that_the_next_one_takes_over(started):
+    first = started()
+    assert first.hears("READY=1")
+    first.process.kill()
+    first.ends()
+    assert first.socket.exists()
+    with pytest.raises(TransientError):
+        first.status()
+    second = started(config=CONFIG.replace("{folder}", str(first.socket.parent)))
+    assert second.hears("READY=1")
+    assert first.status()["pid"] == second.process.pid

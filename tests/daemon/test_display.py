@@ -1,0 +1,111 @@
+"""The whole daemon on real windows: three virtual monitors, one that goes and returns, an X server that dies."""
+
+from __future__ import annotations
+
+import signal
+
+import numpy as np
+import pytest
+
+from runtime.daemon.client import ask
+from runtime.panels.xlib import SERVER_DIED
+from tests.daemon.test_daemon import Daemon
+from tests.panels import xserver
+from tests.panels.xserver import HEIGHT_PX, WIDTH_PX
+from tests.waiting import eventually
+
+pytestmark = pytest.mark.windows
+
+CONFIG = f"""
+[stack]
+width_px = {WIDTH_PX}
+height_px = {HEIGHT_PX}
+[sensor]
+loop = true
+[model]
+name = "fast"
+threads = 1
+[loop]
+rate_hz = 30.0
+[service]
+socket = "{{folder}}/status.sock"
+[output]
+kind = "windows"
+[[output.panels]]
+connector = "DUMMY0"
+[[output.panels]]
+connector = "DUMMY1"
+[[output.panels]]
+connector = "DUMMY2"
+"""
+
+
+@pytest.fixture
+def x(tmp_path, monkeypatch):
+    servers = [xserver.start_or_skip(tmp_path)]
+    monkeypatch.setenv("DISPLAY", servers[0].name)
+    yield servers
+    servers[-1].stop()
+
+
+@pytest.fixture
+def daemon(x, tmp_path):
+    started = Daemon(tmp_path, config=CONFIG, headless=False, watchdog_s=2.0)
+    assert started.hears("READY=1")
+    yield started
+    started.close()
+
+
+def state(daemon: Daemon) -> str:
+    return daemon.status()["state"]
+
+
+def shows_something_on(x: list[xserver.XServer]) -> bool:
+    return all(int(np.ptp(x[-1].panel(index))) > 0 for index in range(3))
+
+
+def test_it_shows_a_scene_takes_another_and_stops_in_order(daemon, x):
+    assert eventually(lambda: shows_something_on(x))
+    status = daemon.status()
+    assert (status["panels"], status["scene"]) == ("windows", "demo")
+    assert status["skew_ms"] >= 0
+    demo = x[0].panel(1)
+    for scene in ("texture", "demo", "texture"):  # drawn in the content's context, whichever windows there are
+        assert ask([daemon.socket], {"command": "scene", "value": scene}) == {"ok": True}
+    assert eventually(lambda: daemon.status()["scene"] == "texture")
+    assert eventually(lambda: np.mean(x[0].panel(1).astype(float) != demo) > 0.5)
+    assert state(daemon) in ("tracking", "holding", "flat")
+    daemon.process.send_signal(signal.SIGTERM)
+    code, errors = daemon.ends()
+    assert code == 0, errors
+
+
+def test_a_monitor_goes_and_returns_and_the_watchdog_stays_fed(daemon, x):
+    assert eventually(lambda: shows_something_on(x))
+    x[0].unplug(1)
+    assert eventually(lambda: state(daemon) == "degraded: panel")
+    assert "DUMMY1" in daemon.status()["reason"]
+    daemon.heard.clear()
+    assert daemon.hears("WATCHDOG=1", within_s=5.0)  # by completed turns: nothing can be presented
+    dropped = daemon.status()["dropped"]
+    assert eventually(lambda: daemon.status()["dropped"] > dropped)
+    x[0].plug(1)
+    assert eventually(lambda: state(daemon) in ("tracking", "holding", "flat"), within_s=15.0)
+    assert eventually(lambda: shows_something_on(x))
+
+
+def test_the_x_server_dies_and_the_daemon_that_is_started_again_waits_for_it(daemon, x, tmp_path):
+    x[0].stop()
+    code, errors = daemon.ends()
+    assert code == SERVER_DIED
+    assert "the X server died" in errors
+    again = tmp_path / "again"
+    again.mkdir()
+    second = Daemon(again, config=CONFIG, headless=False)  # as systemd does
+    try:
+        assert second.hears("EXTEND_TIMEOUT_USEC=")
+        x.append(xserver.XServer(tmp_path, display=x[0].number))
+        assert second.hears("READY=1")
+        assert eventually(lambda: shows_something_on(x))
+    finally:
+        second.close()

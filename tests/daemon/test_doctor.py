@@ -1,0 +1,111 @@
+"""The doctor finds what is wrong, says what to do, and its exit code tells scripts."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from runtime.clock import NS_PER_S, SimulatedClock
+from runtime.commands import doctor_checks
+from runtime.commands.doctor import doctor
+from runtime.daemon.server import StatusServer
+
+
+def examined(tmp_path, text=""):
+    config = tmp_path / "phasestack.toml"
+    config.write_text(f'{text}\n[service]\nsocket = "{tmp_path}/status.sock"\n')
+    app = typer.Typer()
+    app.command()(doctor)
+    result = CliRunner().invoke(app, ["--json", "--config", str(config)])
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+    return result.exit_code, {check["name"]: check for check in json.loads(result.stdout)["checks"]}
+
+
+@pytest.fixture(autouse=True)
+def nowhere(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+
+
+def test_the_defaults_are_well(tmp_path):
+    code, checks = examined(tmp_path)
+    assert code == 0
+    assert {name for name, check in checks.items() if check["state"] == "ok"} >= {
+        "opengl", "sensor", "calibration", "model",
+    }  # fmt: skip
+    assert checks["service"]["state"] == "skip"
+
+
+def test_monitors_without_an_x_server_fail_with_a_remedy(tmp_path):
+    code, checks = examined(tmp_path, '[output]\nkind = "windows"')
+    assert code == 1
+    assert checks["monitors"]["state"] == "fail"
+    assert "DISPLAY" in checks["monitors"]["remedy"]
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "words"),
+    [
+        ('[sensor]\ndriver = "crystal-ball"', "sensor", "unknown"),
+        ('[sensor]\nsource = "missing.mcap"', "sensor", "missing.mcap"),
+        ('[calibration]\nfile = "missing.toml"', "calibration", "missing.toml"),
+        ('[model]\nname = "missing.onnx"', "model", "missing.onnx"),
+        ('[model]\nprovider = "tensorrt"', "model", "tensorrt"),
+    ],
+)
+def test_what_is_wrong_is_named_and_the_rest_is_still_checked(tmp_path, text, name, words):
+    code, checks = examined(tmp_path, text)
+    assert code == 1
+    assert checks[name]["state"] == "fail"
+    assert words in checks[name]["detail"]
+    assert set(checks) >= {"opengl", "sensor", "calibration", "model", "service"}
+
+
+def test_a_real_sensor_with_the_demos_calibration_is_a_failure(tmp_path):
+    _, checks = examined(tmp_path, '[sensor]\ndriver = "usb-eyes"\nsource = ""')
+    assert checks["calibration"]["state"] == "fail"
+    assert "calibrate" in checks["calibration"]["remedy"]
+    assert checks["usb"]["state"] == "fail"
+
+
+@pytest.mark.parametrize(
+    ("account", "seconds", "state"),
+    [
+        ({"state": "tracking", "reason": "eyes seen"}, 0, "ok"),
+        ({"state": "degraded: sensor", "reason": "sensor: unplugged"}, 0, "fail"),
+        ({"state": "tracking"}, 60, "fail"),
+    ],
+)
+def test_a_running_daemon_is_asked_how_it_is(tmp_path, account, seconds, state):
+    clock = SimulatedClock()
+    server = StatusServer(tmp_path / "status.sock", group="root", clock=clock)
+    server.publish(lambda: account)
+    clock.advance_ns(seconds * NS_PER_S)
+    try:
+        code, checks = examined(tmp_path, '[sensor]\ndriver = "openni2"')
+    finally:
+        server.close()
+    assert checks["service"]["state"] == state
+    assert checks["sensor"]["state"] == "skip"  # it has the device: opening it here would fail, or disturb
+    assert code == 1
+
+
+def test_a_check_that_breaks_is_a_failed_row(monkeypatch, tmp_path):
+    def broken(_settings):
+        raise RuntimeError("boom")
+
+    monkeypatch.setitem(doctor_checks.CHECKS, "opengl", broken)
+    code, checks = examined(tmp_path)
+    assert code == 1
+    assert "boom" in checks["opengl"]["detail"]
+    assert checks["model"]["state"] == "ok"
+
+
+def test_people_get_a_table(tmp_path):
+    app = typer.Typer()
+    app.command()(doctor)
+    result = CliRunner().invoke(app, [], env={"COLUMNS": "160"})
+    assert "what to do" in result.stdout

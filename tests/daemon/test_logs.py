@@ -1,0 +1,93 @@
+"""Log lines for people, journald and machines; repeated ones do not flood."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+
+import pytest
+
+from runtime.clock import NS_PER_S, SimulatedClock
+from runtime.config import ServiceSettings
+from runtime.support.logs import BURST, ROOTS, configure, event
+
+log = logging.getLogger("phasestack.test")
+
+
+@pytest.fixture(autouse=True)
+def restored():
+    loggers = [logging.getLogger(name) for name in ROOTS]
+    before = [(logger.handlers[:], logger.level, logger.propagate) for logger in loggers]
+    yield
+    for logger, (handlers, level, propagate) in zip(loggers, before, strict=True):
+        logger.handlers[:], logger.level, logger.propagate = handlers, level, propagate
+
+
+def logged(settings=None, clock=None, environment=None):
+    stream = io.StringIO()
+    configure(
+        settings or ServiceSettings(), stream=stream, clock=clock or SimulatedClock(), environment=environment or {}
+    )
+    return stream
+
+
+def test_people_read_time_level_message_and_values():
+    stream = logged()
+    event(log, logging.WARNING, "sensor lost", driver="openni2", tries=3)
+    assert stream.getvalue().split(" ", 1)[1] == "warning sensor lost driver=openni2 tries=3\n"
+
+
+def test_journald_gets_a_priority_on_every_line_and_no_time():
+    stream = logged(environment={"JOURNAL_STREAM": "8:1"})
+    log.error("first\nsecond")
+    assert stream.getvalue() == "<3>first\n<3>second\n"
+
+
+def test_machines_get_one_object_a_line_with_the_events_own_fields():
+    stream = logged(ServiceSettings(log_format="json"))
+    event(log, logging.INFO, "state", before="tracking", after="flat", reason="no viewer")
+    line = json.loads(stream.getvalue())
+    assert (line["level"], line["message"], line["after"], line["reason"]) == ("info", "state", "flat", "no viewer")
+
+
+def test_a_traceback_stays_inside_its_json_line():
+    stream = logged(ServiceSettings(log_format="json"))
+    try:
+        raise ValueError("boom")
+    except ValueError:
+        log.exception("failed")
+    assert stream.getvalue().count("\n") == 1
+    assert "ValueError: boom" in json.loads(stream.getvalue())["exception"]
+
+
+def test_a_module_that_logs_under_its_own_name_is_heard():
+    stream = logged()
+    logging.getLogger("runtime.sensor.worker").warning("sensor: hung")
+    assert "sensor: hung" in stream.getvalue()
+
+
+def test_what_is_below_the_level_is_not_logged():
+    stream = logged(ServiceSettings(log_level="warning"))
+    log.info("chatter")
+    assert stream.getvalue() == ""
+
+
+def test_a_message_that_repeats_is_cut_off_and_counted_and_others_still_pass():
+    clock = SimulatedClock()
+    stream = logged(clock=clock)
+    for number in range(100):
+        event(log, logging.WARNING, "model failed", number=number)
+    log.warning("something else")
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == BURST + 1
+    clock.advance_ns(60 * NS_PER_S)
+    event(log, logging.WARNING, "model failed", number=100)
+    assert f"({100 - BURST} more like this were not shown)" in stream.getvalue().splitlines()[-1]
+
+
+def test_configuring_twice_does_not_log_twice():
+    logged()
+    stream = logged()
+    log.info("once")
+    assert stream.getvalue().count("once") == 1

@@ -1,0 +1,136 @@
+"""What systemd hears, on a real datagram socket."""
+
+from __future__ import annotations
+
+import os
+import socket
+
+import pytest
+
+from runtime.clock import NS_PER_MS, SimulatedClock
+from runtime.daemon.notify import Notifier
+from runtime.records import State
+
+
+class Supervisor:
+    def __init__(self, address: str) -> None:
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(address)
+        self._socket.setblocking(False)
+
+    def heard(self) -> list[str]:
+        messages = []
+        while True:
+            try:
+                messages.append(self._socket.recv(4096).decode())
+            except BlockingIOError:
+                return messages
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@pytest.fixture(params=["path", "abstract"])
+def supervisor(request, tmp_path, monkeypatch):
+    name = f"{tmp_path}/notify"
+    made = Supervisor(name if request.param == "path" else "\0" + name)
+    monkeypatch.setenv("NOTIFY_SOCKET", name if request.param == "path" else "@" + name)
+    yield made
+    made.close()
+
+
+def watched(clock, period_ms=1000):
+    return Notifier(clock, {"WATCHDOG_USEC": str(period_ms * 1000), "WATCHDOG_PID": str(os.getpid())})
+
+
+def test_ready_is_said_once(supervisor):
+    notifier = Notifier(SimulatedClock(), {})
+    assert notifier.supervised
+    notifier.ready()
+    notifier.ready()
+    assert supervisor.heard() == ["READY=1"]
+
+
+def test_a_status_is_said_when_it_changes_and_on_one_line(supervisor):
+    notifier = Notifier(SimulatedClock(), {})
+    for text in ("tracking", "tracking", "degraded:\n sensor"):
+        notifier.status(text)
+    assert supervisor.heard() == ["STATUS=tracking", "STATUS=degraded: sensor"]
+
+
+def test_the_start_can_be_extended_until_it_is_over(supervisor):
+    notifier = Notifier(SimulatedClock(), {})
+    notifier.extend_start(2.5)
+    notifier.ready()
+    notifier.extend_start(2.5)
+    assert supervisor.heard() == ["EXTEND_TIMEOUT_USEC=2500000", "READY=1"]
+
+
+def test_presented_frames_feed_the_watchdog_four_times_a_period_at_most(supervisor):
+    clock = SimulatedClock()
+    notifier = watched(clock)
+    for _ in range(100):  # a second of 100 frames/s
+        notifier.turn(State.TRACKING, (), presented=True)
+        clock.advance_ns(10 * NS_PER_MS)
+    assert supervisor.heard() == ["WATCHDOG=1"] * 4
+
+
+def test_turns_that_present_nothing_starve_the_watchdog(supervisor):
+    clock = SimulatedClock()
+    notifier = watched(clock)
+    for state, missing in ((State.TRACKING, ()), (State.DEGRADED, ("sensor",)), (State.STARTING, ("panel",))):
+        clock.advance_ns(2000 * NS_PER_MS)
+        notifier.turn(state, missing, presented=False)
+    assert supervisor.heard() == []
+
+
+def test_while_a_panel_is_missing_completed_turns_feed_it(supervisor):
+    clock = SimulatedClock()
+    notifier = watched(clock)
+    notifier.turn(State.DEGRADED, ("sensor", "panel"), presented=False)
+    assert supervisor.heard() == ["WATCHDOG=1"]
+
+
+@pytest.mark.parametrize(
+    "environment", [{}, {"WATCHDOG_USEC": "x"}, {"WATCHDOG_USEC": "0"}, {"WATCHDOG_USEC": "9", "WATCHDOG_PID": "1"}]
+)
+def test_a_watchdog_that_is_not_ours_is_not_fed(supervisor, environment):
+    Notifier(SimulatedClock(), environment).turn(State.TRACKING, (), presented=True)
+    assert supervisor.heard() == []
+
+
+def test_reloading_and_stopping_are_announced(supervisor):
+    notifier = Notifier(SimulatedClock(5_000_000), {})
+    notifier.ready()
+    notifier.reloading()
+    notifier.reloaded()
+    notifier.stopping("SIGTERM")
+    assert supervisor.heard()[1:] == [
+        "RELOADING=1\nMONOTONIC_USEC=5000", "READY=1", "STOPPING=1\nSTATUS=stopping: SIGTERM",
+    ]  # fmt: skip
+
+
+def test_a_reload_before_the_first_frame_does_not_make_it_ready(supervisor):
+    notifier = Notifier(SimulatedClock(), {})
+    notifier.reloading()
+    notifier.reloaded()
+    assert supervisor.heard() == []
+
+
+def test_a_supervisor_that_does_not_listen_blocks_nobody(supervisor):
+    clock = SimulatedClock()
+    notifier = watched(clock)
+    for _ in range(5000):  # far more than a datagram socket holds
+        clock.advance_ns(1000 * NS_PER_MS)
+        notifier.turn(State.TRACKING, (), presented=True)
+    notifier.close()
+    notifier.close()
+
+
+def test_without_a_supervisor_everything_is_silent(monkeypatch):
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    notifier = Notifier(SimulatedClock(), {})
+    assert not notifier.supervised
+    notifier.ready()
+    notifier.stopping("end")
+    notifier.close()

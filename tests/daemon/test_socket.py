@@ -1,0 +1,210 @@
+"""The status and control socket: who may use it, what it answers, and that the loop never waits for it."""
+
+from __future__ import annotations
+
+import grp
+import os
+import socket
+import stat
+import threading
+import time
+
+import pytest
+
+from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
+from runtime.config import ServiceSettings
+from runtime.daemon import server as server_module
+from runtime.daemon.client import NotRunning, ask
+from runtime.daemon.server import StatusServer, open_status_server
+from runtime.errors import InputError
+
+OWN_GROUP = grp.getgrgid(os.getgid()).gr_name
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "run" / "status.sock"
+
+
+@pytest.fixture
+def clock():
+    return SimulatedClock()
+
+
+@pytest.fixture
+def server(path, clock):
+    made = StatusServer(path, group=OWN_GROUP, clock=clock)
+    yield made
+    made.close()
+
+
+def status(path):
+    return ask([path], {"command": "status"})
+
+
+def test_only_the_owner_and_the_group_may_use_it(server, path):
+    info = path.stat()
+    assert stat.S_ISSOCK(info.st_mode)
+    assert stat.S_IMODE(info.st_mode) == 0o660
+    assert info.st_gid == os.getgid()
+
+
+def test_status_is_the_newest_published_account(server, path, clock):
+    server.publish(lambda: {"state": "starting"})
+    server.publish(lambda: {"state": "tracking", "fps": 60.0})
+    clock.advance_ns(2 * NS_PER_S)
+    answer = status(path)
+    assert (answer["ok"], answer["state"], answer["fps"], answer["pid"]) == (True, "tracking", 60.0, os.getpid())
+    assert (answer["uptime_s"], answer["turn_age_s"]) == (2.0, 2.0)
+
+
+def test_numbers_that_json_has_not_are_null(server, path):
+    server.publish(lambda: {"psnr_db": float("nan")})
+    assert status(path)["psnr_db"] is None
+
+
+def test_many_questions_on_one_connection(server, path):
+    with socket.socket(socket.AF_UNIX) as client:
+        client.connect(str(path))
+        with client.makefile("rwb", buffering=0) as stream:
+            for _ in range(3):
+                stream.write(b'{"command": "status"}\n')
+                assert b'"ok": true' in stream.readline()
+
+
+def answered_by_loop(server, respond):
+    def loop():
+        respond(server.commands.get(timeout=5))
+
+    thread = threading.Thread(target=loop)
+    thread.start()
+    return thread
+
+
+def test_a_command_reaches_the_loop_and_its_answer_the_client(server, path):
+    taken = []
+    thread = answered_by_loop(server, lambda command: (taken.append((command.name, command.value)), command.done()))
+    assert ask([path], {"command": "scene", "value": "demo"}) == {"ok": True}
+    thread.join()
+    assert taken == [("scene", "demo")]
+
+
+def test_what_the_loop_refuses_the_client_is_told(server, path):
+    thread = answered_by_loop(server, lambda command: command.refuse("no such scene"))
+    assert ask([path], {"command": "scene", "value": "x"}) == {"ok": False, "error": "no such scene"}
+    thread.join()
+
+
+def test_a_loop_that_hangs_is_told_and_status_still_answers(server, path, monkeypatch):
+    monkeypatch.setattr(server_module, "LOOP_ANSWERS_WITHIN_S", 0.05)
+    assert "did not answer" in ask([path], {"command": "pause"})["error"]
+    assert status(path)["ok"]
+
+
+@pytest.mark.parametrize(
+    ("line", "problem"),
+    [
+        (b"hello\n", "JSON"),
+        (b"[1]\n", "JSON object"),
+        (b'{"command": "reboot"}\n', "command: unknown"),
+        (b'{"command": "scene"}\n', "value: scene"),
+        (b'{"command": "budget", "value": "fast"}\n', "value: budget"),
+        (b'{"command": "budget", "value": -1}\n', "value: budget"),
+        (b'{"command": "budget", "value": 1e999}\n', "value: budget"),
+        (b'{"command": "budget", "value": true}\n', "value: budget"),
+        (b"\xff\xfe\n", "JSON"),
+    ],
+)
+def test_nonsense_is_refused_and_never_reaches_the_loop(server, line, problem):
+    answer = server.answer(line)
+    assert not answer["ok"]
+    assert problem in answer["error"]
+    assert server.commands.empty()
+
+
+def test_a_request_without_end_is_cut_off(server, path):
+    with socket.socket(socket.AF_UNIX) as client:
+        client.connect(str(path))
+        client.sendall(b"x" * (server_module.LINE_MAX_BYTES + 1))
+        assert b"too long" in client.makefile("rb").readline()
+
+
+def test_clients_beyond_the_limit_are_turned_away_and_the_others_served(server, path):
+    crowd = [socket.socket(socket.AF_UNIX) for _ in range(server_module.CLIENTS_MAX)]
+    for client in crowd:
+        client.connect(str(path))
+        client.sendall(b'{"command": "status"}\n')
+        assert b"true" in client.makefile("rb").readline()
+    assert "too many" in status(path)["error"]
+    for client in crowd:
+        client.close()
+    deadline = time.monotonic() + 5
+    while not status(path)["ok"]:
+        assert time.monotonic() < deadline
+
+
+def test_publishing_costs_the_loop_next_to_nothing(server):
+    clock = MonotonicClock()
+    server._clock = clock
+    begin = clock.now_ns()
+    for _ in range(1000):
+        server.publish(dict)
+    publishing_ns = clock.now_ns() - begin
+    begin = clock.now_ns()
+    for _ in range(1000):
+        sum(range(1000))
+    assert publishing_ns < clock.now_ns() - begin
+
+
+def test_a_second_daemon_is_refused_and_told_who_has_it(server, path, clock):
+    with pytest.raises(InputError, match=f"in use by another phasestack .pid {os.getpid()}"):
+        StatusServer(path, group=OWN_GROUP, clock=clock)
+    assert status(path)["ok"]
+
+
+def test_the_socket_of_a_daemon_that_crashed_is_taken_over(path, clock):
+    path.parent.mkdir()
+    dead = socket.socket(socket.AF_UNIX)
+    dead.bind(str(path))
+    dead.close()
+    server = StatusServer(path, group=OWN_GROUP, clock=clock)
+    assert status(path)["ok"]
+    server.close()
+    server.close()
+    assert not path.exists()
+
+
+def test_somebody_elses_file_is_not_removed(path, clock):
+    path.parent.mkdir()
+    path.write_text("precious")
+    with pytest.raises(InputError, match="not a socket"):
+        StatusServer(path, group=OWN_GROUP, clock=clock)
+    assert path.read_text() == "precious"
+
+
+def test_a_group_that_does_not_exist_is_survived(path, clock):
+    server = StatusServer(path, group="no-such-group", clock=clock)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o660
+    server.close()
+
+
+def test_by_hand_a_run_goes_on_without_its_socket_and_under_a_supervisor_it_does_not(server, path, clock):
+    settings = ServiceSettings(socket=str(path))
+    assert open_status_server(settings, clock=clock, supervised=False) is None
+    with pytest.raises(InputError):
+        open_status_server(settings, clock=clock, supervised=True)
+
+
+def test_without_a_daemon_the_client_says_what_to_do(path):
+    with pytest.raises(NotRunning, match="systemctl start"):
+        status(path)
+    path.parent.mkdir()
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(path))
+    listener.close()
+    with pytest.raises(NotRunning, match="nobody listens"):
+        status(path)
+
+
+def test_a_client_tries_the_next_place(server, path, tmp_path):
+    assert ask([tmp_path / "none", path], {"command": "status"})["ok"]

@@ -1,0 +1,91 @@
+"""The daemon's states: what each turn finds decides, and each transition is told once with its reason."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runtime.frame.states import PARTS, Conditions, StateMachine, judge
+from runtime.records import State
+
+EYES = st.sampled_from(["exact", "interpolated", "predicted", "held", "none"])
+CONDITIONS = st.builds(
+    Conditions,
+    eyes=EYES,
+    missing=st.dictionaries(st.sampled_from(PARTS), st.text("abc", min_size=1, max_size=3)),
+    presented=st.booleans(),
+    flat_wanted=st.booleans(),
+    stopping=st.sampled_from(["", "SIGTERM"]),
+)
+
+
+def well(eyes="predicted", **changes) -> Conditions:
+    return Conditions(**{"eyes": eyes, "missing": {}, "presented": True, **changes})
+
+
+def test_eyes_decide_where_nothing_is_missing():
+    assert judge(well("exact"))[0] is State.TRACKING
+    assert judge(well("predicted"))[0] is State.TRACKING
+    assert judge(well("held"))[0] is State.HOLDING
+    assert judge(well("none"))[0] is State.FLAT
+
+
+def test_flat_can_be_asked_for_while_eyes_are_seen():
+    assert judge(well(flat_wanted=True)) == (State.FLAT, "asked for")
+
+
+def test_what_is_missing_is_named_with_its_reason():
+    machine = StateMachine(now_ns=0)
+    change = machine.update(well(missing={"panel": "DUMMY1 was disconnected", "sensor": "unplugged"}), now_ns=1)
+    assert machine.name == change.after == "degraded: sensor, panel"
+    assert change.reason == "sensor: unplugged; panel: DUMMY1 was disconnected"
+
+
+def test_until_the_first_frame_it_is_starting_and_says_what_it_waits_for():
+    state, reason = judge(well(presented=False, missing={"panel": "no X server"}))
+    assert state is State.STARTING
+    assert "panel: no X server" in reason
+
+
+def test_a_transition_is_told_once_and_again_when_what_is_missing_changes():
+    machine = StateMachine(now_ns=0)
+    told = [
+        machine.update(conditions, now_ns=now)
+        for now, conditions in enumerate(
+            [well(), well(), well(missing={"sensor": "x"}), well(missing={"sensor": "y"}),
+             well(missing={"sensor": "x", "model": "z"}), well()]
+        )
+    ]  # fmt: skip
+    assert [change and change.after for change in told] == [
+        "tracking", None, "degraded: sensor", None, "degraded: sensor, model", "tracking",
+    ]  # fmt: skip
+
+
+@given(st.lists(CONDITIONS, max_size=20))
+def test_stopping_is_never_left(history):
+    machine = StateMachine(now_ns=0)
+    stopped = False
+    for now_ns, conditions in enumerate(history, start=1):
+        change = machine.update(conditions, now_ns=now_ns)
+        assert not (stopped and change)
+        stopped = stopped or bool(conditions.stopping)
+        assert (machine.state is State.STOPPING) == stopped
+
+
+@given(st.lists(st.tuples(CONDITIONS, st.integers(1, 10**9)), min_size=1, max_size=20))
+def test_every_nanosecond_is_counted_in_one_state(history):
+    now_ns = 1000
+    machine = StateMachine(now_ns=now_ns)
+    for conditions, passed_ns in history:
+        now_ns += passed_ns
+        machine.update(conditions, now_ns=now_ns)
+    total = sum(machine.seconds(now_ns=now_ns + 500).values())
+    assert abs(total - (now_ns - 1000 + 500) / 1e9) < 1e-9
+
+
+@given(CONDITIONS)
+def test_the_reason_is_never_empty_and_names_every_missing_part(conditions):
+    state, reason = judge(conditions)
+    assert reason
+    if state is State.DEGRADED:
+        assert all(f"{part}: {why}" in reason for part, why in conditions.missing.items())
