@@ -14,7 +14,7 @@ F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
 
-EyesLabel = Literal["exact", "interpolated", "predicted", "held", "none"]
+EyesLabel = Literal["exact", "interpolated", "predicted", "held", "rested", "none"]
 Inference = Literal["ran", "reused", "skipped"]
 
 
@@ -80,6 +80,19 @@ class LayerFrame:
 
     number: int  # frame number: all panels show the same
     layers: U8  # (N, height_px, width_px, 4) RGBA, rear to front, before a panel's own LUT; alpha unused
+
+
+@dataclass(frozen=True, slots=True)
+class PanelFrame:
+    """What all panels show together at one refresh: a solution aligned to the eyes, the flat picture, or both mixed."""
+
+    number: int  # of the refresh: all panels show the same
+    solved: U8 | None  # (N, height_px, width_px, 4) RGBA, rear to front; layers solved for two eyes; None: none yet
+    solved_version: int  # another number whenever `solved` holds other values
+    solved_from_shown: tuple[F64, ...] = ()  # per panel (3, 3): pixels of `solved` from shown ones; (): as they are
+    flat: U8 | None = None  # the same shape: the picture for eyes anywhere; never aligned
+    flat_version: int = 0
+    flatness: float = 0.0  # 0: `solved` alone, 1: `flat` alone, between: mixed linearly, code by code
 
 
 @dataclass(frozen=True, slots=True)
