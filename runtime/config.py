@@ -158,9 +158,12 @@ class ModelSettings(Section):
     name: str = Field("balanced", description="fast, balanced, best, sart, or an ONNX file with our contract")
     provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = Field("cpu", description="execution provider")
     threads: Annotated[int, Field(ge=0, le=256)] = Field(2, description="inference threads; 0: all cores")
-    tolerance_mm: NonNegative = Field(
-        1.0, description="how far off the eyes the picture should still hold: trades exactness against tolerance"
+    eye_sigma_mm: Literal["auto"] | NonNegative = Field(
+        "auto",
+        description="standard deviation of where light enters an eye, millimetres an axis: a picture for two points "
+        "(0) or a forgiving one; auto: the pupil and the tracker's own covariance together",
     )
+    pupil_mm: NonNegative = Field(4.0, description="diameter of a pupil, millimetres, for eye_sigma_mm = auto")
     transfer: Literal["code", "srgb"] = Field("code", description="panel luminance: code values, or linear via sRGB")
     budget_ms: NonNegative = Field(0.0, description="time for one frame; 0: none. Picks model and resolution")
 
@@ -224,8 +227,9 @@ class PlanSettings(Section):
     one_channel: bool = Field(True, description="solve one channel instead of three while the pictures are grey")
     one_eye: bool = Field(True, description="solve for one eye alone while the other can't see the display")
     dead_band_mm: NonNegative = Field(
-        0.0, description="eye motion that counts as none; 0: from the tracker's noise, at most model.tolerance_mm"
+        0.0, description="eye motion that counts as none; 0: from the tracker's noise, at most most_band_mm"
     )
+    most_band_mm: NonNegative = Field(1.0, description="the widest dead band that the tracker's noise may ask for")
     range_deg: Annotated[float, Field(gt=0, le=90)] = Field(
         80.0, description="an eye farther off the display's axis than this can't see it"
     )

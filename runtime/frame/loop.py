@@ -363,7 +363,7 @@ class Loop:
 def _rest_watch(settings: Settings) -> RestWatch | None:
     """None where the plan may not present a frame again for eyes that are only nearly the same."""
     plan = settings.plan
-    most_m = (plan.dead_band_mm or settings.model.tolerance_mm) / 1000
+    most_m = (plan.dead_band_mm or plan.most_band_mm) / 1000
     return RestWatch(most_m=most_m) if plan.enabled and plan.reuse and most_m > 0 else None
 
 

@@ -109,7 +109,7 @@ def make_plan(
         seeing = eyes_in_range(eyes_m, range_deg=chosen.range_deg)
     if seeing is None or not any(seeing) or not (on and chosen.one_eye):
         seeing = (True, True)
-    most_m = settings.model.tolerance_mm / 1000
+    most_m = chosen.most_band_mm / 1000
     fixed_m = chosen.dead_band_mm / 1000 if chosen.dead_band_mm > 0 else None
     items: list[PlanItem] = []
     if reuse and not info.moving:
