@@ -31,7 +31,7 @@ from runtime.records import (
     U8,
     EyesEstimate,
     FrameAccount,
-    LayerFrame,
+    PanelFrame,
     PresentReport,
     SensorFrame,
     State,
@@ -255,8 +255,9 @@ class Loop:
         else:
             inference, missing, unchanged = "reused", {}, True
         report: PresentReport | None = None
+        number = self.stats.frames
         try:
-            report = self.panels.present(LayerFrame(self.stats.frames, self.layers), unchanged=unchanged)
+            report = self.panels.present(PanelFrame(number, self.layers, number), unchanged=unchanged)
             self._presented = True
         except PanelLost as error:
             missing["panel"] = str(error)
@@ -275,13 +276,11 @@ class Loop:
     def _account(
         self, account: FrameAccount, stages: StageTimes, *, start_ns: int, report: PresentReport | None
     ) -> None:
-        if report is not None:
-            self.stats.missed_vblanks += report.missed_vblanks
-            if account.inference == "ran":
-                # One turn of a machine that was suspended must not make the loop look past every eye for good.
-                longest_ns = round(self.settings.tracker.horizon_max_s * NS_PER_S)
-                cost_ns = min(report.present_ns - start_ns, longest_ns)
-                self._turn_cost_ns += round(EXPECTED_WEIGHT * (cost_ns - self._turn_cost_ns))
+        if report is not None and account.inference == "ran":
+            # One turn of a machine that was suspended must not make the loop look past every eye for good.
+            longest_ns = round(self.settings.tracker.horizon_max_s * NS_PER_S)
+            cost_ns = min(report.present_ns - start_ns, longest_ns)
+            self._turn_cost_ns += round(EXPECTED_WEIGHT * (cost_ns - self._turn_cost_ns))
         self.last = account
         if self._on_account is not None:
             self._on_account(account)
