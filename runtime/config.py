@@ -197,9 +197,13 @@ class OutputSettings(Section):
 class LoopSettings(Section):
     """Pacing, and the stage costs of simulated time."""
 
-    rate_hz: Positive = Field(60.0, description="turns per second at most")
+    rate_hz: Positive = Field(60.0, description="refreshes a second, where the display does not tell its own")
     sensor_latency_ms: NonNegative = Field(15.0, description="from capture to arrival of a replayed sample")
     scanout_ms: NonNegative = Field(8.0, description="from the swap to the middle of the panel's light")
+    solver_late_s: Positive = Field(0.5, description="a solution that takes longer is told as missing")
+    solver_abandon_s: Positive = Field(
+        10.0, description="a solver that does not answer for so long is left behind and made anew"
+    )
     simulated_stage_ms: dict[str, float] = Field(
         default_factory=lambda: {
             "sensor": 0.1,
@@ -214,7 +218,7 @@ class LoopSettings(Section):
         description="what each stage costs on the simulated clock of --max-speed",
     )
     evaluate_every: Annotated[int, Field(ge=0)] = Field(
-        20, description="with --out: every so many frames, measure what the eyes see; 0: last frame only"
+        20, description="with --out: every so many refreshes, measure what the eyes see; 0: the last only"
     )
 
 
@@ -226,10 +230,11 @@ class PlanSettings(Section):
     focus: bool = Field(True, description="run the network only where the two eyes' pictures differ")
     one_channel: bool = Field(True, description="solve one channel instead of three while the pictures are grey")
     one_eye: bool = Field(True, description="solve for one eye alone while the other can't see the display")
+    align: bool = Field(True, description="shift and scale the outer panels at every refresh to where the eyes are then")
     dead_band_mm: NonNegative = Field(
-        0.0, description="eye motion that counts as none; 0: from the tracker's noise, at most most_band_mm"
+        0.0, description="eye motion that is not solved for anew; 0: only while the head rests"
     )
-    most_band_mm: NonNegative = Field(1.0, description="the widest dead band that the tracker's noise may ask for")
+    most_band_mm: NonNegative = Field(1.0, description="a resting head may drift so far until its place is renewed")
     range_deg: Annotated[float, Field(gt=0, le=90)] = Field(
         80.0, description="an eye farther off the display's axis than this can't see it"
     )
