@@ -76,14 +76,6 @@ class EyesEstimate:
 
 
 @dataclass(frozen=True, slots=True)
-class LayerFrame:
-    """What all panels show together."""
-
-    number: int  # frame number: all panels show the same
-    layers: U8  # (N, height_px, width_px, 4) RGBA, rear to front, before a panel's own LUT; alpha unused
-
-
-@dataclass(frozen=True, slots=True)
 class PanelFrame:
     """What all panels show together at one refresh: a solution aligned to the eyes, the flat picture, or both mixed."""
 
@@ -98,12 +90,12 @@ class PanelFrame:
 
 @dataclass(frozen=True, slots=True)
 class PresentReport:
-    """What presenting a LayerFrame came to."""
+    """What presenting a PanelFrame came to."""
 
     number: int
     present_ns: int  # when the last panel's light left, as well as it is known
     skew_ms: float  # between the first and the last panel
-    missed_vblanks: int = 0
+    vblank_ns: int | None = None  # the vertical blank that it was shown at, as well as it is known; None: no such thing
 
 
 @dataclass(frozen=True, slots=True)
