@@ -230,7 +230,7 @@ class PlanSettings(Section):
     focus: bool = Field(True, description="run the network only where the two eyes' pictures differ")
     one_channel: bool = Field(True, description="solve one channel instead of three while the pictures are grey")
     one_eye: bool = Field(True, description="solve for one eye alone while the other can't see the display")
-    align: bool = Field(True, description="shift and scale the outer panels at every refresh to where the eyes are then")
+    align: bool = Field(True, description="shift and scale the panels at every refresh to where the eyes are then")
     dead_band_mm: NonNegative = Field(
         0.0, description="eye motion that is not solved for anew; 0: only while the head rests"
     )

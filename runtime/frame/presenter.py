@@ -349,11 +349,11 @@ class Presenter:
         """Since the first refresh, on the run's clock."""
         return self.stats.seconds()
 
-    def summary(self) -> dict[str, Any]:
-        """The part of summary.json that is counted (contract 5.2)."""
+    def summary(self, *, simulated: bool = False) -> dict[str, Any]:
+        """The part of summary.json that is counted (contract 5.2); simulated: every time is the run's clock's."""
         predictor = self.run_cell.state.predictor
         return {
-            **self.stats.summary(stale_inputs=self.samples.stale_inputs),
+            **self.stats.summary(stale_inputs=self.samples.stale_inputs, simulated=simulated),
             "model": predictor.name,
             "provider": predictor.provider,
             "states": self.machine.seconds(now_ns=self.clock.now_ns()),
