@@ -56,7 +56,7 @@ def drive(
             has_picture = last is not None and (last.frame.solved is not None or last.frame.flat is not None)
             layers = shown_layers(last.frame) if last is not None and has_picture else None
             output.finish(summary, layers, run.observer.look)
-    return summary | {"machine_s": machine_s, "machine_overhead_ms": run.presenter.stats.overhead_measured()}
+    return summary | {"machine_s": round(machine_s, 3)}
 
 
 def _progress(total: int | None) -> Any:
@@ -104,7 +104,7 @@ def print_summary(summary: dict[str, Any], out: Path | None) -> None:
         table.add_row("capture to light", f"{summary['photon_ms']['p50']:.1f} ms (p50)")
     stages = {name: values for name, values in summary["stage_ms"].items() if values and values["max"] > 0.05}
     table.add_row("stages, ms", ", ".join(f"{name} {values['p50']:.1f}" for name, values in stages.items()) + " (p50)")
-    overhead = summary["machine_overhead_ms"]
+    overhead = summary["overhead_ms"]
     if overhead:
         table.add_row("overhead, ms", f"{overhead['p50']:.2f} (p50), {overhead['p99']:.2f} (p99)")
     table.add_row("states, s", ", ".join(f"{state} {seconds:.1f}" for state, seconds in summary["states"].items()))

@@ -195,7 +195,6 @@ class RunObserver:
             return True
 
         self._solver.do(task)
-        self._solver.news()  # a simulated solver does its tasks when it is looked at
 
     def _drawn(self, content: ContentSource, refresh: Refresh, true_m: F64 | None) -> dict[str, tuple[U8, U8]]:
         """Retina pictures: of the eyes solved for, of those aligned to, of the true ones."""

@@ -12,6 +12,7 @@ from runtime.frame.solver import Step
 from runtime.frame.timing import SOLVING_STAGES
 from runtime.records import Solution, SolveRequest
 
+FIRST_REQUEST = SolveRequest(0, None, "none", 0.0, flat_wanted=True)  # before the first refresh: the flat picture
 COST_GAIN = 0.2  # of the newest solution in the running mean of what one costs
 
 
@@ -83,7 +84,7 @@ class SimulatedSolver(SolverHost):
 
     def __init__(self, parts: SolverParts, clock: Clock) -> None:
         self._parts, self._clock = parts, clock
-        self._news = News()
+        self._news = taken_in(News(), parts.step(FIRST_REQUEST))
         self._posted: tuple[int, SolveRequest] | None = None
         self._under_way: tuple[int, Step] | None = None  # when it is complete
         self._idle_since_ns = clock.now_ns()
@@ -101,7 +102,8 @@ class SimulatedSolver(SolverHost):
         return self._news
 
     def do(self, task: Task) -> None:
-        self._tasks.append(task)
+        if not task(self._parts):
+            self._tasks.append(task)
 
     def close(self) -> None:
         if not self._closed:

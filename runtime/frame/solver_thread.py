@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from runtime.clock import NS_PER_S, Clock
 from runtime.errors import PhasestackError
-from runtime.frame.solver_host import COST_GAIN, News, SolverHost, SolverParts, Task, taken_in, total_ns
+from runtime.frame.solver_host import COST_GAIN, FIRST_REQUEST, News, SolverHost, SolverParts, Task, taken_in, total_ns
 from runtime.records import SolveRequest
 
 log = logging.getLogger("phasestack.solver")
@@ -123,12 +123,15 @@ class SolverThread(SolverHost):
         _be_nice()
         try:
             parts = self._make()
+            first = parts.step(FIRST_REQUEST)
         except BaseException as error:
             attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
             attempt.ready.set()
             if attempt.number > 1 and not isinstance(error, PhasestackError):
                 log.exception("solver: it could not be made anew")
             return
+        if not attempt.abandoned.is_set():
+            self._news = taken_in(self._news, first)
         attempt.busy_since_ns = 0
         attempt.ready.set()
         try:
