@@ -240,6 +240,26 @@ class PlanSettings(Section):
     )
 
 
+class LimitSettings(Section):
+    """What a file from outside may hold: more is refused with its figure, before memory is taken for it."""
+
+    file_mib: Annotated[float, Field(gt=0, le=1_000_000)] = Field(
+        2048.0, description="bytes of one file of content or of a recording, MiB"
+    )
+    pixels: Annotated[int, Field(ge=1)] = Field(67_108_864, description="pixels of one picture")
+    triangles: Annotated[int, Field(ge=1)] = Field(2_000_000, description="triangles of a mesh, all instances together")
+    splats: Annotated[int, Field(ge=1)] = Field(3_000_000, description="Gaussians of a splat file")
+    instances: Annotated[int, Field(ge=1)] = Field(4096, description="times that meshes stand in a glTF scene")
+    depth: Annotated[int, Field(ge=1, le=512)] = Field(64, description="how deep JSON or a glTF scene may nest")
+    load_s: Positive = Field(120.0, description="loading of one piece of content is given up after this")
+    recording_s: Annotated[float, Field(gt=0, le=1_000_000)] = Field(
+        21_600.0, description="length of a recording that is replayed, seconds"
+    )
+    chunk_mib: Annotated[float, Field(gt=0, le=4096)] = Field(
+        32.0, description="one chunk or message of a recording, unpacked, MiB"
+    )
+
+
 class ServiceSettings(Section):
     """The daemon's socket, metrics and logs."""
 
@@ -264,6 +284,7 @@ class Settings(Section):
     loop: LoopSettings = Field(default_factory=LoopSettings, description="pacing")
     plan: PlanSettings = Field(default_factory=PlanSettings, description="what is left out")
     service: ServiceSettings = Field(default_factory=ServiceSettings, description="socket, metrics, logs")
+    limits: LimitSettings = Field(default_factory=LimitSettings, description="what files from outside may hold")
 
 
 class Overrides(Section):
