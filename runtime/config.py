@@ -246,9 +246,12 @@ class ModelSettings(Section):
     name: str = Field("balanced", description="fast, balanced, best, sart, or an ONNX file with our contract")
     provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = Field("cpu", description="execution provider")
     threads: Annotated[int, Field(ge=0, le=256)] = Field(2, description="inference threads; 0: all cores")
-    tolerance_mm: NonNegative = Field(
-        1.0, description="how far off the eyes the picture should still hold: trades exactness against tolerance"
+    eye_sigma_mm: Literal["auto"] | NonNegative = Field(
+        "auto",
+        description="standard deviation of where light enters an eye, millimetres an axis: a picture for two points "
+        "(0) or a forgiving one; auto: the pupil and the tracker's own covariance together",
     )
+    pupil_mm: NonNegative = Field(4.0, description="diameter of a pupil, millimetres, for eye_sigma_mm = auto")
     transfer: Literal["code", "srgb"] = Field("code", description="panel luminance: code values, or linear via sRGB")
     budget_ms: NonNegative = Field(0.0, description="time for one frame; 0: none. Picks model and resolution")
 
@@ -306,12 +309,20 @@ class OutputSettings(Section):
 class LoopSettings(Section):
     """Pacing, and the stage costs of simulated time."""
 
-    rate_hz: Annotated[float, within(1.0, 1000.0, "Hz")] = Field(60.0, description="turns per second at most")
+    rate_hz: Annotated[float, within(1.0, 1000.0, "Hz")] = Field(
+        60.0, description="refreshes a second, where the display does not tell its own"
+    )
     sensor_latency_ms: Annotated[float, within(0.0, 10_000.0, "ms")] = Field(
         15.0, description="from capture to arrival of a replayed sample"
     )
     scanout_ms: Annotated[float, within(0.0, 1000.0, "ms")] = Field(
         8.0, description="from the swap to the middle of the panel's light"
+    )
+    solver_late_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
+        0.5, description="a solution that takes longer is told as missing"
+    )
+    solver_abandon_s: Annotated[float, within(0.01, 3600.0, "s")] = Field(
+        10.0, description="a solver that does not answer for so long is left behind and made anew"
     )
     simulated_stage_ms: dict[str, NonNegative] = Field(
         default_factory=lambda: {
@@ -327,7 +338,7 @@ class LoopSettings(Section):
         description="what each stage costs on the simulated clock of --max-speed",
     )
     evaluate_every: Annotated[int, Field(ge=0)] = Field(
-        20, description="with --out: every so many frames, measure what the eyes see; 0: last frame only"
+        20, description="with --out: every so many refreshes, measure what the eyes see; 0: the last only"
     )
 
 
@@ -339,9 +350,13 @@ class PlanSettings(Section):
     focus: bool = Field(True, description="run the network only where the two eyes' pictures differ")
     one_channel: bool = Field(True, description="solve one channel instead of three while the pictures are grey")
     one_eye: bool = Field(True, description="solve for one eye alone while the other can't see the display")
-    dead_band_mm: NonNegative = Field(
-        0.0, description="eye motion that counts as none; 0: from the tracker's noise, at most model.tolerance_mm"
+    align: bool = Field(
+        True, description="shift and scale the outer panels at every refresh to where the eyes are then"
     )
+    dead_band_mm: NonNegative = Field(
+        0.0, description="eye motion that is not solved for anew; 0: only while the head rests"
+    )
+    most_band_mm: NonNegative = Field(1.0, description="a resting head may drift so far until its place is renewed")
     range_deg: Annotated[float, Field(gt=0, le=90)] = Field(
         80.0, description="an eye farther off the display's axis than this can't see it"
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from runtime.content.base import ContentSource
-from runtime.frame.pipeline import retina_view
+from runtime.plan.drawing import retina_view
 from runtime.optics.quality import Quality, quality
 from runtime.optics.retina import Retina, seen_by
 from runtime.optics.stack import PanelStack

@@ -15,7 +15,7 @@ import numpy as np
 from runtime.config import Settings
 from runtime.content.base import ContentSource
 from runtime.errors import FatalError, PhasestackError
-from runtime.frame.pipeline import drawn_for, retina_view
+from runtime.plan.drawing import drawn_for, retina_view
 from runtime.model.predictor import SHIPPED, Predictor
 from runtime.optics.quality import psnr_db
 from runtime.optics.retina import seen_by

@@ -41,7 +41,6 @@ def focused(predictor: Predictor, settings: ModelSettings) -> FocusedPredictor |
         return UnrolledPredictor(
             predictor.session,
             part,
-            tolerance_mm=predictor.tolerance_mm,
             threads=settings.threads,
             one_channel=predictor.one_channel,
         )
@@ -256,7 +255,7 @@ def _check_viewer(eyes_m: F64, stack: PanelStack, *, fov_deg: float, source: str
 
 
 def _band_m(settings: Settings) -> float:
-    return (settings.plan.dead_band_mm or settings.model.tolerance_mm) / 1000
+    return (settings.plan.dead_band_mm or settings.plan.most_band_mm) / 1000
 
 
 def _overridden(settings: Settings, *, scene: str | None, model: str | None, budget_ms: float | None) -> Settings:

@@ -18,7 +18,7 @@ from runtime.records import F32, U8
 FILE = Path(__file__).with_name("golden-eyereal.npz")
 WIDTH = 4  # of the network
 SIZE = (64, 40)  # columns, rows: 40 halves to 1 and is padded on one side only on its way back
-# In the scene's digital units (0.083 a centimetre), as the data set's names have them: `_0`, `_1`; `_0` is the right eye.
+# In the scene's digital units (0.083 a centimetre), as the data set's names have them; `_0` is the right eye.
 EYES = {
     "usual": ((6.487, 0.237, 2.004), (6.486, -0.263, 2.004)),  # 0.82 m: the panels' corners are beyond 40 degrees
     "near": ((4.0, 0.6, 0.8), (4.05, 0.1, 0.8)),  # 0.5 m: much of the panels is

@@ -14,7 +14,7 @@ from runtime.errors import InputError, PanelLost
 from runtime.optics.stack import PanelStack
 from runtime.panels.offscreen import OffscreenPanels
 from runtime.panels.registry import open_panels
-from runtime.records import LayerFrame
+from runtime.records import PanelFrame
 from runtime.support.gl import offscreen_context
 
 WIDTH, HEIGHT = 48, 32
@@ -30,7 +30,7 @@ def shown(context, layers, *panels, clock=None, draw=False):
         context, clock=clock or SimulatedClock(), width_px=WIDTH, height_px=HEIGHT, panels=panels, draw=draw
     )
     try:
-        sink.present(LayerFrame(1, layers))
+        sink.present(PanelFrame(1, layers, 1))
         return [picture[..., :3] for picture in sink.read_back()]
     finally:
         sink.close()
@@ -105,8 +105,9 @@ def test_a_gamma_changes_greys_and_keeps_black_and_white(context):
 def test_the_report_tells_frame_time_and_skew(context, layers):
     clock = SimulatedClock(5_000)
     sink = open_panels(OutputSettings(), PanelStack(0.5, 0.3, (-0.1, 0.0, 0.1), WIDTH, HEIGHT), clock, context)
-    report = sink.present(LayerFrame(41, layers))
-    assert (report.number, report.present_ns, report.skew_ms, report.missed_vblanks) == (41, 5_000, 0.0, 0)
+    report = sink.present(PanelFrame(41, layers, 41))
+    assert (report.number, report.present_ns, report.skew_ms, report.vblank_ns) == (41, 5_000, 0.0, None)
+    assert sink.period_ns is None
     sink.close()
 
 
@@ -121,7 +122,7 @@ class Ticking(SimulatedClock):
 def test_panels_drawn_one_after_the_other_have_a_skew(context, layers):
     panels = (PanelSettings(),) * 3
     sink = OffscreenPanels(context, clock=Ticking(), width_px=WIDTH, height_px=HEIGHT, panels=panels, draw=True)
-    assert sink.present(LayerFrame(1, layers)).skew_ms == 2.0
+    assert sink.present(PanelFrame(1, layers, 1)).skew_ms == 2.0
     sink.close()
 
 
@@ -129,8 +130,8 @@ def test_a_later_frame_replaces_an_earlier_one_on_all_panels(context, layers):
     sink = OffscreenPanels(
         context, clock=SimulatedClock(), width_px=WIDTH, height_px=HEIGHT, panels=(PanelSettings(),) * 3
     )
-    sink.present(LayerFrame(1, layers))
-    sink.present(LayerFrame(2, np.ascontiguousarray(255 - layers)))
+    sink.present(PanelFrame(1, layers, 1))
+    sink.present(PanelFrame(2, np.ascontiguousarray(255 - layers), 2))
     for picture, layer in zip(sink.read_back(), layers, strict=True):
         assert np.array_equal(picture[..., :3], 255 - layer[..., :3])
     sink.close()
@@ -142,8 +143,8 @@ def test_an_unchanged_frame_costs_nothing_and_stays(context, layers):
         context, clock=SimulatedClock(), width_px=WIDTH, height_px=HEIGHT, panels=(PanelSettings(),) * 3
     )
     other = np.zeros_like(layers)
-    sink.present(LayerFrame(0, layers), unchanged=True)  # nothing was shown before: it must be uploaded all the same
-    assert sink.present(LayerFrame(1, other), unchanged=True).number == 1
+    sink.present(PanelFrame(0, layers, 0), unchanged=True)  # nothing was shown before: it must be uploaded all the same
+    assert sink.present(PanelFrame(1, other, 1), unchanged=True).number == 1
     assert np.array_equal(sink.read_back()[0][..., :3], layers[0, ..., :3])
     sink.close()
 
@@ -163,10 +164,10 @@ def test_layers_of_another_size_are_a_mistake_of_the_caller(context, layers):
 def test_a_lost_context_is_a_lost_panel_not_a_crash(layers):
     own = offscreen_context()
     sink = OffscreenPanels(own, clock=SimulatedClock(), width_px=WIDTH, height_px=HEIGHT, panels=(PanelSettings(),) * 3)
-    sink.present(LayerFrame(1, layers))
-    sink._layers.release()  # what a driver's reset leaves behind: objects that are no more
+    sink.present(PanelFrame(1, layers, 1))
+    sink._textures.release()  # what a driver's reset leaves behind: objects that are no more
     with pytest.raises(PanelLost):
-        sink.present(LayerFrame(2, layers))
+        sink.read_back()
     sink.close()
     own.release()
 
@@ -175,7 +176,7 @@ def test_opening_and_closing_gives_the_memory_back(context):
     def open_and_close() -> None:
         panels = (PanelSettings(),) * 3
         sink = OffscreenPanels(context, clock=SimulatedClock(), width_px=512, height_px=512, panels=panels)
-        sink.present(LayerFrame(1, np.zeros((3, 512, 512, 4), np.uint8)))
+        sink.present(PanelFrame(1, np.zeros((3, 512, 512, 4), np.uint8), 1))
         sink.read_back()
         sink.close()
 

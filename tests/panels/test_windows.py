@@ -18,7 +18,7 @@ from runtime.panels import window
 from runtime.panels.display import glfw
 from runtime.panels.registry import open_panels
 from runtime.panels.xlib import SERVER_DIED
-from runtime.records import LayerFrame
+from runtime.records import PanelFrame
 from tests.panels import xserver
 from tests.panels.edids import block
 from tests.panels.xserver import HEIGHT_PX, WIDTH_PX
@@ -37,8 +37,8 @@ def picture(number: int, index: int) -> np.ndarray:
     return layer
 
 
-def frame(number: int) -> LayerFrame:
-    return LayerFrame(number, np.stack([picture(number, index) for index in range(3)]))
+def frame(number: int) -> PanelFrame:
+    return PanelFrame(number, np.stack([picture(number, index) for index in range(3)]), number)
 
 
 @pytest.fixture
@@ -203,14 +203,14 @@ from runtime.clock import MonotonicClock
 from runtime.config import OutputSettings, PanelSettings
 from runtime.support.gl import offscreen_context
 from runtime.panels.registry import open_panels
-from runtime.records import LayerFrame
+from runtime.records import PanelFrame
 from tests.panels.test_windows import STACK
 
 panels = tuple(PanelSettings(connector=f"DUMMY{index}") for index in range(3))
 sink = open_panels(OutputSettings(kind="windows", panels=panels), STACK, MonotonicClock(), offscreen_context())
 layers = np.zeros((3, STACK.height_px, STACK.width_px, 4), np.uint8)
 for number in range(100_000):
-    sink.present(LayerFrame(number, layers))
+    sink.present(PanelFrame(number, layers, number))
     if number == 10:
         print("presenting", flush=True)
 """

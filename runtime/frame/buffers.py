@@ -1,0 +1,35 @@
+"""Buffers for solutions: one is written anew only when nobody holds the layers that it carried."""
+
+from __future__ import annotations
+
+import weakref
+
+import numpy as np
+
+from runtime.records import U8
+
+
+class LayerBuffers:
+    """As many buffers as are held at once, which is three: being written, newest, shown. One thread takes."""
+
+    def __init__(self) -> None:
+        self._buffers: list[tuple[U8, weakref.ref[U8] | None]] = []
+
+    def copy_of(self, layers: U8) -> U8:
+        """The same values in a buffer that is nobody else's as long as the answer lives."""
+        for index, (buffer, holder) in enumerate(self._buffers):
+            if (holder is None or holder() is None) and buffer.shape == layers.shape:
+                break
+        else:
+            index, buffer = len(self._buffers), np.empty(layers.shape, np.uint8)
+            self._buffers.append((buffer, None))
+        view = buffer.view()
+        np.copyto(view, layers)
+        view.flags.writeable = False
+        self._buffers[index] = buffer, weakref.ref(view)
+        return view
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self._buffers)
