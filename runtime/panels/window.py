@@ -15,6 +15,7 @@ from runtime.errors import PanelLost
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.panels.display import Display, Window, glfw
+from runtime.panels.modes import check_mode, refresh_difference
 from runtime.panels.monitors import Monitor, bind, check_shape
 from runtime.panels.presentation import FrameTextures, Mounting, Painter, check
 from runtime.panels.watch import Place, PlacementWatch
@@ -182,7 +183,11 @@ class WindowPanels(PanelSink):
         self.monitors = bind(self._panels, display.monitors())
         if not self._any_shape:
             for number, (panel, monitor) in enumerate(zip(self._panels, self.monitors, strict=True)):
-                check_shape(number, panel, monitor, width_px=self._stack.width_px, height_px=self._stack.height_px)
+                size = {"width_px": self._stack.width_px, "height_px": self._stack.height_px}
+                check_shape(number, panel, monitor, **size)
+                check_mode(number, panel, monitor, **size, allow_rescaling=self._settings.allow_rescaling)
+        if difference := refresh_difference(self.monitors):
+            log.warning("%s", difference)
         display.root.make_current()
         self._textures = FrameTextures(
             display.root.context,

@@ -9,11 +9,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from runtime.frame.loop import Loop
 
 from runtime.config import Settings
 from runtime.daemon.build import RunOptions, build_loop
 from runtime.errors import PanelLost
-from runtime.frame.loop import Loop
 from runtime.records import EyePoints, FrameAccount, PanelFrame, PresentReport, SensorFrame, State
 from runtime.sensor.base import Capabilities, SensorDriver
 from runtime.sensor.registry import register_driver
