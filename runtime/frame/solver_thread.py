@@ -27,6 +27,7 @@ class _Attempt:
         self.number, self.abandoned = number, threading.Event()
         self.ready = threading.Event()
         self.busy_since_ns = 0  # 0: it waits
+        self.last_step_ns = 0  # what the last step took
         self.error: BaseException | None = None
         self.thread: threading.Thread | None = None
 
@@ -102,7 +103,9 @@ class SolverThread(SolverHost):
                 self._attempt = self._begin(attempt.number + 1)
             return f"the solver could not be made anew ({attempt.error})"
         if busy_ns <= self._late_ns:
-            return ""
+            # Until a step is in time again: a state that changed with every solution would say nothing.
+            late = attempt.last_step_ns > self._late_ns
+            return f"the last solution took {attempt.last_step_ns / NS_PER_S:.1f} s" if late else ""
         if busy_ns > self._abandon_ns and len(self._hung) < ABANDONED_MAX:
             log.error("solver: no answer for %.1f s: left behind, and made anew", busy_ns / NS_PER_S)
             attempt.abandoned.set()
@@ -153,6 +156,8 @@ class SolverThread(SolverHost):
     def _step(self, attempt: _Attempt, parts: SolverParts, request: SolveRequest) -> None:
         attempt.busy_since_ns = self._clock.now_ns()
         step = parts.step(request)
+        if not step.idle:
+            attempt.last_step_ns = self._clock.now_ns() - attempt.busy_since_ns
         attempt.busy_since_ns = 0
         if attempt.abandoned.is_set():
             return
