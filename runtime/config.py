@@ -131,7 +131,7 @@ class DetectorSettings(Section):
         4.0, description="farther measurements are not a viewer's face"
     )
     lock_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
-        1.0, description="a viewer who is not seen for this long makes way for another"
+        0.3, description="a viewer not seen for this long makes way for another; less than tracker.hold_s"
     )
 
     @model_validator(mode="after")
