@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -14,6 +17,8 @@ import numpy as np
 
 from runtime.errors import InputError
 from runtime.records import U8
+
+STAGING = ".phasestack-"
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -98,7 +103,8 @@ class OutputFolder:
     """A folder whose new files appear together at the end, or not at all.
 
     Used as a context manager: write into `staging`; on success every file is renamed into `target`,
-    replacing those of the same names; on an error nothing new is left.
+    replacing those of the same names; on an error nothing new is left. A staging folder is locked as long as its
+    process lives, so that the next one to write here can tell what a killed one left, and clears it away.
     """
 
     def __init__(self, target: Path) -> None:
@@ -108,7 +114,11 @@ class OutputFolder:
         try:
             missing = [folder for folder in (self.target, *self.target.parents) if not folder.exists()]
             self.target.mkdir(parents=True, exist_ok=True)
-            self.staging = Path(tempfile.mkdtemp(prefix=".phasestack-", dir=self.target))
+            with _locked(self.target):  # nobody takes the new folder for a dead one before it has its lock
+                _clear_dead(self.target)
+                self.staging = Path(tempfile.mkdtemp(prefix=STAGING, dir=self.target))
+                self._lock = ExitStack()
+                self._lock.enter_context(_locked(self.staging))
         except OSError as error:
             raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
         self._made = missing
@@ -117,14 +127,50 @@ class OutputFolder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
-            for path in sorted(self.staging.rglob("*")):
-                if path.is_file():
-                    destination = self.target / path.relative_to(self.staging)
-                    destination.parent.mkdir(parents=True, exist_ok=True)
-                    path.replace(destination)
-        shutil.rmtree(self.staging, ignore_errors=True)
+        try:
+            if kind is None:
+                for path in sorted(self.staging.rglob("*")):
+                    if path.is_file():
+                        destination = self.target / path.relative_to(self.staging)
+                        destination.parent.mkdir(parents=True, exist_ok=True)
+                        path.replace(destination)
+        finally:
+            self.discard()
+            self._lock.close()
         if kind is not None:
             for folder in self._made:
-                if not any(folder.iterdir()):
+                if folder.is_dir() and not any(folder.iterdir()):
                     folder.rmdir()
+
+    def discard(self) -> None:
+        """Remove what was staged so far, before the end."""
+        shutil.rmtree(self.staging, ignore_errors=True)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """A lock on a folder that ends with the process, however it ends; none where the file system has no locks."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _clear_dead(target: Path) -> None:
+    """Remove the staging folders that no living process holds."""
+    for folder in target.glob(f"{STAGING}*"):
+        try:
+            handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        except OSError:
+            continue
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:  # alive, or a file system that can't tell
+            continue
+        else:
+            shutil.rmtree(folder, ignore_errors=True)
+        finally:
+            os.close(handle)
