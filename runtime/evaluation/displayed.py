@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from runtime.content.base import ContentSource
-from runtime.frame.pipeline import retina_view
 from runtime.optics.carried import intensities
 from runtime.optics.quality import Quality, quality
 from runtime.optics.retina import Retina, seen_by
@@ -50,18 +48,6 @@ def displayed(
     targets = [intensities(picture) for picture in wanted]
     measured = quality([r.image for r in seen], targets, [r.mask for r in seen], similarity=similarity)
     return Look(seen, tuple(wanted), measured)
-
-
-def wanted_pictures(
-    content: ContentSource, eyes_m: F64, stack: PanelStack, *, fov_deg: float, time_ns: int
-) -> tuple[U8, U8]:
-    """(h, w, 3) what content shows a left and a right eye (2, 3) that look at the stack's origin."""
-    size = {"width_px": stack.width_px, "height_px": stack.height_px}
-    left, right = (
-        content.render(retina_view(eye_m, side, fov_deg=fov_deg, **size), time_ns=time_ns)[..., :3].copy()
-        for side, eye_m in enumerate(eyes_m)
-    )
-    return left, right
 
 
 def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:

@@ -14,7 +14,7 @@ from runtime.evaluation.contact_sheet import contact_sheet
 from runtime.evaluation.displayed import Look
 from runtime.optics.carried import intensities
 from runtime.optics.retina import as_codes
-from runtime.records import U8, FrameAccount
+from runtime.records import U8
 from runtime.support.artifacts import OutputFolder, to_json, write_json, write_png
 
 log = logging.getLogger("phasestack.output")
@@ -92,28 +92,11 @@ class RunOutput:
         told["state"] = None if told["state"] is None else str(told["state"])
         self._later(lambda: self._line(told))
 
-    def frame(self, account: FrameAccount, stage_ms: dict[str, float]) -> None:
-        """One line of frames.jsonl, of a turn of the loop."""
-        self.refresh(
-            {
-                "frame": account.frame,
-                "capture_ns": account.capture_ns,
-                "predicted_for_ns": account.predicted_for_ns,
-                "present_ns": account.present_ns,
-                "eyes_m": account.eyes_m,
-                "eyes_label": account.eyes_label,
-                "state": account.state,
-                "presented": account.presented,
-                "inference": account.inference,
-                "stage_ms": dict(stage_ms),
-                "skew_ms": account.skew_ms,
-            }
-        )
-
-    def light(self, frame: int, *, layers: U8, drawn: tuple[U8, U8], info: Mapping[str, Any]) -> None:
+    def light(self, frame: int, *, layers: U8, drawn: tuple[U8, U8] | None, info: Mapping[str, Any]) -> None:
         """`light/<frame>/`: what the panels show at one refresh, and what the eyes that it was solved for should see.
 
-        layers: (N, h, w, 3 or 4), aligned; drawn: (h, w, 3) retina pictures; info: `solved_for_m`, `eyes_m`,
+        layers: (N, h, w, 3 or 4), aligned; drawn: (h, w, 3) retina pictures, None where there
+        were none; info: `solved_for_m`, `eyes_m`,
         `true_eyes_m` (2, 3), frame `stack`, None where not known, `fov` in degrees, and what else there is.
         None of these arrays may be written to afterwards.
         """
@@ -123,7 +106,7 @@ class RunOutput:
             folder = self._folder.staging / "light" / str(frame)
             for n, layer in enumerate(layers):
                 write_png(folder / f"layer-{n}.png", layer)
-            for eye, picture in zip(("left", "right"), drawn, strict=True):
+            for eye, picture in zip(("left", "right"), drawn or (), strict=False):
                 write_png(folder / f"drawn-{eye}.png", picture)
             write_json(folder / "light.json", told)
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from runtime.content.base import ContentSource
-from runtime.evaluation.displayed import displayed, wanted_pictures
+from runtime.evaluation.displayed import displayed
 from runtime.evaluation.trials import timed_in_turn
-from runtime.frame.pipeline import drawn_for
 from runtime.model.predictor import Predictor
 from runtime.optics.stack import PanelStack
+from runtime.plan.drawing import drawn_for, retina_pictures
 from runtime.plan.planner import focused_part, observed
 from runtime.plan.savings import Measured, Saving
 from runtime.records import F64, U8
@@ -43,7 +43,7 @@ def displayed_psnr(
     layers: U8, content: ContentSource, eyes_m: F64, stack: PanelStack, *, fov_deg: float, time_ns: int
 ) -> float:
     """Pooled displayed PSNR of layers at eyes (2, 3)."""
-    wanted = wanted_pictures(content, eyes_m, stack, fov_deg=fov_deg, time_ns=time_ns)
+    wanted = retina_pictures(content, eyes_m, stack, fov_deg=fov_deg, time_ns=time_ns)
     return displayed(layers, wanted, stack, eyes_m=eyes_m, fov_deg=fov_deg, similarity=False).quality.psnr_db
 
 

@@ -14,8 +14,8 @@ from runtime.clock import NS_PER_MS
 from runtime.config import ModelSettings, StackGeometry, read_table
 from runtime.errors import InputError
 from runtime.evaluation.trials import timed
-from runtime.frame.pipeline import drawn_for
 from runtime.optics.stack import PanelStack
+from runtime.plan.drawing import drawn_for
 from runtime.records import F64
 from runtime.report.frontier import measure
 from runtime.report.machine import describe

@@ -11,12 +11,13 @@ from numpy.typing import ArrayLike
 
 from runtime.config import ModelSettings
 from runtime.errors import ModelFailure
-from runtime.frame.pipeline import drawn_for
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.optics.carried import intensities
+from runtime.optics.pupil import POINT_MM
 from runtime.optics.quality import psnr_db, squared_error
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
+from runtime.plan.drawing import drawn_for
 from runtime.records import F64, U8
 from runtime.report.eyesight import single_psnr_db
 from runtime.report.pairs import Painter
@@ -40,11 +41,11 @@ class Simulation:
         self.painter.__exit__()
         self.predictor.close()
 
-    def layers(self, eyes_m: F64) -> U8 | None:
+    def layers(self, eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> U8 | None:
         """Layers for two eyes, drawn straight into the model's rasters as the daemon does; None: it refuses them."""
         images = drawn_for(self.predictor, self.painter.content, eyes_m, time_ns=0)
         try:
-            return np.array(self.predictor.predict(images, eyes_m).layers)
+            return np.array(self.predictor.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm).layers)
         except ModelFailure:
             return None
 

@@ -13,12 +13,12 @@ from runtime.config import Settings
 from runtime.content.base import View
 from runtime.content.procedural import ProceduralSource
 from runtime.content.scenes import Scene, scene
-from runtime.frame.pipeline import raster_views
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 from runtime.plan import measure
+from runtime.plan.drawing import raster_views
 from runtime.plan.focus import FocusedPredictor
 from runtime.plan.measure import displayed_psnr
 from runtime.plan.planning import focused, planned_predictor
