@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 from runtime.config import ModelSettings, load_settings, load_stack
 from runtime.content.base import ContentInfo
 from runtime.errors import InputError
-from runtime.evaluation.displayed import Look, displayed, on_panels_raster
+from runtime.evaluation.displayed import Look, Picture, displayed, expected_db
 from runtime.evaluation.trials import timed, timed_in_turn
 from runtime.model.predictor import Prediction, Predictor, load_predictor
 from runtime.model.still import solve_still
@@ -25,7 +25,7 @@ from runtime.plan.planner import focused_part, observed
 from runtime.plan.planning import planned_predictor
 from runtime.plan.savings import Measured, Saving, network_items
 from runtime.records import F64, U8, PlanItem
-from runtime.support.artifacts import OutputFolder, read_image, write_json, write_png
+from runtime.support.artifacts import OutputFolder, in_8_bits, read_picture, write_json, write_png
 
 SEPARATION_MIN_M = 0.005
 COMPARED = 3  # timed runs with and without the plan
@@ -53,7 +53,8 @@ def solve_pair(request: SolveRequest) -> dict[str, Any]:
     settings = load_settings(request.config)
     model_settings = settings.model
     cv2.setNumThreads(model_settings.threads or -1)
-    pictures = [read_image(path) for path in (request.left, request.right)]
+    stored = [read_picture(path) for path in (request.left, request.right)]
+    pictures = [in_8_bits(picture) for picture in stored]
     if pictures[0].shape != pictures[1].shape:
         sizes = " and ".join(f"{p.shape[1]}x{p.shape[0]}" for p in pictures)
         raise InputError(request.right, "size", f"the two pictures differ: {sizes}")
@@ -70,10 +71,16 @@ def solve_pair(request: SolveRequest) -> dict[str, Any]:
     try:
         prediction, timing = _timed(pictures, eyes_m, request, predictor)
         with OutputFolder(request.out) as folder:
-            measured = _write(folder.staging, prediction.layers, pictures, eyes_m, stack, request)
-            plan = _left_out(pictures, eyes_m, request, predictor, model_settings, measured["psnr_db"])
-            named = {"model": predictor.name, "provider": predictor.provider, "plan": [asdict(item) for item in plan]}
-            result = measured | timing | named | {"eye_sigma_mm": request.eye_sigma_mm}
+            measured = _write(folder.staging, prediction.layers, stored, eyes_m, stack, request)
+            plan = _left_out(pictures, stored, eyes_m, request, predictor, model_settings, measured["psnr_db"])
+            named = {
+                "model": predictor.name,
+                "provider": predictor.provider,
+                "backend": "opencv",
+                "eye_sigma_mm": request.eye_sigma_mm,
+                "plan": [asdict(item) for item in plan],
+            }
+            result = measured | timing | named
             write_json(folder.staging / "solve.json", result)
     finally:
         predictor.close()
@@ -82,6 +89,7 @@ def solve_pair(request: SolveRequest) -> dict[str, Any]:
 
 def _left_out(
     pictures: list[U8],
+    stored: Sequence[Picture],
     eyes_m: F64,
     request: SolveRequest,
     predictor: Predictor,
@@ -90,6 +98,7 @@ def _left_out(
 ) -> list[PlanItem]:
     """What the model left out of these pictures, and what that saved and cost against a model that leaves out nothing.
 
+    stored: the same pictures in their files' own bits, which is what the eyes should see.
     Both are timed again, in turn, so that what slows one slows the other.
     """
     numbers = observed(Measured(), predictor)
@@ -112,7 +121,7 @@ def _left_out(
     finally:
         plain.close()
     shown_db = {
-        name: planned_db if name == "planned" else _shown(way.answer, pictures, eyes_m, stack, request).quality.psnr_db
+        name: planned_db if name == "planned" else _shown(way.answer, stored, eyes_m, stack, request).quality.psnr_db
         for name, way in done.items()
     }
 
@@ -162,7 +171,7 @@ def _timed(
 
 
 def _write(
-    folder: Path, layers: U8, pictures: list[U8], eyes_m: F64, stack: PanelStack, request: SolveRequest
+    folder: Path, layers: U8, pictures: Sequence[Picture], eyes_m: F64, stack: PanelStack, request: SolveRequest
 ) -> dict[str, Any]:
     for n, layer in enumerate(layers):
         write_png(folder / f"layer-{n}.png", layer)
@@ -171,17 +180,18 @@ def _write(
         write_png(folder / f"seen-{name}.png", as_codes(retina.image))
         write_png(folder / f"wanted-{name}.png", as_codes(intensities(target)))
     measured = look.quality
+    expected = expected_db(look, layers, stack, eyes_m=eyes_m, fov_deg=request.fov_deg)
     return {
         "psnr_db": round(measured.psnr_db, 3),
+        "expected_db": {sigma: None if value is None else round(value, 3) for sigma, value in expected.items()},
         "ssim": round(measured.ssim, 4),
         "eye_psnr_db": [round(value, 3) for value in measured.eye_psnr_db],
     }
 
 
-def _shown(layers: U8, pictures: list[U8], eyes_m: F64, stack: PanelStack, request: SolveRequest) -> Look:
+def _shown(layers: U8, pictures: Sequence[Picture], eyes_m: F64, stack: PanelStack, request: SolveRequest) -> Look:
     """What the eyes see, and what they should see. Raises InputError where they see nothing."""
-    wanted = [on_panels_raster(picture, stack) for picture in pictures]
     try:
-        return displayed(layers, wanted, stack, eyes_m=eyes_m, fov_deg=request.fov_deg)
+        return displayed(layers, pictures, stack, eyes_m=eyes_m, fov_deg=request.fov_deg)
     except ValueError as error:
         raise InputError("solve", "--left-eye", f"{error}: nothing of the display can be seen from there") from None
