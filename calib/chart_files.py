@@ -19,7 +19,7 @@ from runtime.config import ModelSettings, Settings
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
-from runtime.records import U8, LayerFrame
+from runtime.records import U8, PanelFrame
 from runtime.support.artifacts import OutputFolder, write_json, write_png
 
 if TYPE_CHECKING:
@@ -178,7 +178,7 @@ class ChartDisplay:
         """A chart on all panels. Raises PanelLost."""
         self._number += 1
         self._shown = chart
-        self._sink.present(LayerFrame(self._number, chart.layers))
+        self._sink.present(PanelFrame(self._number, chart.layers, self._number))
 
     def again(self) -> None:
         """The same chart once more: it takes in the windows' events and keeps them alive. Raises PanelLost."""

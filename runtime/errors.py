@@ -69,3 +69,7 @@ class ModelFailure(TransientError):
 
 class PanelLost(TransientError):
     """A panel's window, monitor or GL context is gone: rebuild it; the loop goes on with none."""
+
+
+class Stopped(PhasestackError):
+    """Told to stop before there was anything to stop."""

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from runtime.config import Settings
     from runtime.panels.base import PanelSink
     from runtime.panels.monitors import Monitor
-    from runtime.records import U8, LayerFrame
+    from runtime.records import U8, PanelFrame
 
 
 def identify(
@@ -61,7 +61,7 @@ def _write(settings: Settings, out: Path) -> None:
     from runtime.clock import MonotonicClock
     from runtime.panels.offscreen import OffscreenPanels
     from runtime.panels.registry import panel_settings
-    from runtime.records import LayerFrame
+    from runtime.records import PanelFrame
     from runtime.support.artifacts import OutputFolder, write_png
     from runtime.support.gl import offscreen_context
 
@@ -74,7 +74,7 @@ def _write(settings: Settings, out: Path) -> None:
         panels=panel_settings(settings.output, stack.count),
     )
     with OutputFolder(out) as folder:
-        panels.present(LayerFrame(0, np.stack(_cards(settings, None))))
+        panels.present(PanelFrame(0, np.stack(_cards(settings, None)), 0))
         for index, picture in enumerate(panels.read_back()):
             write_png(folder.staging / f"monitor-{index}.png", picture)
     typer.echo(f"{stack.count} pictures in {out}")
@@ -84,14 +84,14 @@ def _show(settings: Settings, seconds: float) -> None:
     import numpy as np
 
     from runtime.errors import InputError, PanelLost
-    from runtime.records import LayerFrame
+    from runtime.records import PanelFrame
 
     try:
         panels, cards = _bound(settings) if settings.output.panels else _every_monitor()
     except PanelLost as error:
         raise InputError("output", "panels", str(error)) from None
     try:
-        _hold(panels, LayerFrame(0, np.stack(cards)), seconds)
+        _hold(panels, PanelFrame(0, np.stack(cards), 0), seconds)
     finally:
         panels.close()
 
@@ -139,7 +139,7 @@ def _every_monitor() -> tuple[PanelSink, list[U8]]:
     return panels, cards
 
 
-def _hold(panels: PanelSink, frame: LayerFrame, seconds: float) -> None:
+def _hold(panels: PanelSink, frame: PanelFrame, seconds: float) -> None:
     """Show a frame again and again, so that closed windows and lost monitors come back."""
     import time
 

@@ -42,7 +42,7 @@ class SolveRequest:
     out: Path
     model: str
     repeat: int
-    tolerance_mm: float | None
+    eye_sigma_mm: float
     config: Path | None
 
 
@@ -50,8 +50,6 @@ def solve_pair(request: SolveRequest) -> dict[str, Any]:
     """Layers, what the eyes see of them, and solve.json (design 5.2). Raises InputError."""
     settings = load_settings(request.config)
     model_settings = settings.model
-    if request.tolerance_mm is not None:
-        model_settings = model_settings.model_copy(update={"tolerance_mm": request.tolerance_mm})
     cv2.setNumThreads(model_settings.threads or -1)
     pictures = [read_image(path) for path in (request.left, request.right)]
     if pictures[0].shape != pictures[1].shape:
@@ -61,6 +59,8 @@ def solve_pair(request: SolveRequest) -> dict[str, Any]:
     stack = load_stack(request.panels, width_px=width, height_px=height)
     if not (math.isfinite(request.fov_deg) and 0 < request.fov_deg < 180):
         raise InputError("solve", "--fov", "must lie between 0 and 180 degrees")
+    if not math.isfinite(request.eye_sigma_mm):
+        raise InputError("solve", "--eye-sigma-mm", "must be a finite number")
     eyes_m = checked_eyes(request.left_eye, request.right_eye, stack)
     model_settings = model_settings.model_copy(update={"name": request.model})
     settings = settings.model_copy(update={"model": model_settings})
@@ -71,7 +71,7 @@ def solve_pair(request: SolveRequest) -> dict[str, Any]:
             measured = _write(folder.staging, prediction.layers, pictures, eyes_m, stack, request.fov_deg)
             plan = _left_out(pictures, eyes_m, request, predictor, model_settings, measured["psnr_db"])
             named = {"model": predictor.name, "provider": predictor.provider, "plan": [asdict(item) for item in plan]}
-            result = measured | timing | named
+            result = measured | timing | named | {"eye_sigma_mm": request.eye_sigma_mm}
             write_json(folder.staging / "solve.json", result)
     finally:
         predictor.close()
@@ -105,7 +105,7 @@ def _left_out(
         for turn in range(COMPARED + 1):
             for name, way in ways.items():
                 begin_ns = perf_counter_ns()
-                solved = solve_still(*pictures, eyes_m=eyes_m, fov_deg=request.fov_deg, predictor=way)
+                solved = _solved(pictures, eyes_m, request, way)
                 if turn:
                     times[name].append((perf_counter_ns() - begin_ns) / 1e6)
                 elif name != "planned":
@@ -137,15 +137,21 @@ def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stac
     return np.array([left_eye, right_eye])
 
 
+def _solved(pictures: list[U8], eyes_m: F64, request: SolveRequest, predictor: Predictor) -> Prediction:
+    return solve_still(
+        *pictures, eyes_m=eyes_m, fov_deg=request.fov_deg, predictor=predictor, eye_sigma_mm=request.eye_sigma_mm
+    )
+
+
 def _timed(
     pictures: list[U8], eyes_m: F64, request: SolveRequest, predictor: Any
 ) -> tuple[Prediction, dict[str, float]]:
     """A warm-up, then `repeat` timed runs; medians."""
     inference_ms, total_ms = [], []
-    prediction = solve_still(*pictures, eyes_m=eyes_m, fov_deg=request.fov_deg, predictor=predictor)
+    prediction = _solved(pictures, eyes_m, request, predictor)
     for _ in range(request.repeat):
         start_ns = perf_counter_ns()
-        prediction = solve_still(*pictures, eyes_m=eyes_m, fov_deg=request.fov_deg, predictor=predictor)
+        prediction = _solved(pictures, eyes_m, request, predictor)
         total_ms.append((perf_counter_ns() - start_ns) / 1e6)
         inference_ms.append(prediction.stage_ms["inference"])
     return prediction, {

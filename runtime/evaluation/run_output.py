@@ -9,7 +9,7 @@ import numpy as np
 
 from runtime.evaluation.contact_sheet import contact_sheet
 from runtime.evaluation.probe import Look
-from runtime.records import U8, FrameAccount
+from runtime.records import U8
 from runtime.support.artifacts import OutputFolder, to_json, write_json, write_png
 
 
@@ -30,7 +30,7 @@ class RunOutput:
             self._log.close()
         self._folder.__exit__(*error)
 
-    def frame(self, account: FrameAccount, stage_ms: dict[str, float]) -> None:
+    def frame(self, account: Any, stage_ms: dict[str, float]) -> None:
         """One line of frames.jsonl."""
         assert self._log is not None
         self._log.write(
@@ -51,6 +51,18 @@ class RunOutput:
             )
             + "\n"
         )
+
+    def refresh(self, line: dict[str, Any]) -> None:
+        self._log.write(to_json(line) + "\n")
+
+    def light(self, frame: int, *, layers: U8, drawn: Any, info: Any) -> None:
+        folder = self._folder.staging / "light" / str(frame)
+        for n, layer in enumerate(layers):
+            write_png(folder / f"layer-{n}.png", layer)
+        if drawn:
+            for name, picture in zip(("left", "right"), drawn):
+                write_png(folder / f"drawn-{name}.png", picture)
+        write_json(folder / "light.json", info)
 
     def finish(self, summary: dict[str, Any], layers: U8 | None, look: Look | None) -> None:
         """The pictures of the last frame, the contact sheet and the summary."""

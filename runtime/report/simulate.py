@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from runtime.config import ModelSettings
 from runtime.errors import ModelFailure
 from runtime.model.predictor import Predictor, load_predictor
+from runtime.optics.pupil import POINT_MM
 from runtime.optics.quality import psnr_db
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
@@ -38,7 +39,7 @@ class Simulation:
         self.painter.__exit__()
         self.predictor.close()
 
-    def layers(self, eyes_m: F64) -> U8 | None:
+    def layers(self, eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> U8 | None:
         """Layers for two eyes, drawn straight into the model's rasters as the daemon does; None: it refuses them."""
         rasters = self.predictor.rasters(eyes_m)
         images = [
@@ -51,7 +52,7 @@ class Simulation:
             for eye in eyes_m
         ]
         try:
-            return np.array(self.predictor.predict(images, eyes_m).layers)
+            return np.array(self.predictor.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm).layers)
         except ModelFailure:
             return None
 

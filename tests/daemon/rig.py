@@ -5,15 +5,16 @@ from __future__ import annotations
 import threading
 import time
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from runtime.frame.loop import Loop
 
 from runtime.config import Settings
 from runtime.daemon.build import RunOptions, build_loop
 from runtime.errors import PanelLost
-from runtime.frame.loop import Loop
-from runtime.records import EyePoints, FrameAccount, LayerFrame, PresentReport, SensorFrame, State
+from runtime.records import EyePoints, FrameAccount, PanelFrame, PresentReport, SensorFrame, State
 from runtime.sensor.base import Capabilities, SensorDriver
 from runtime.sensor.registry import register_driver
 
@@ -116,13 +117,13 @@ class BreakablePanels:
 
     def __init__(self, panels: Any, *, keep: bool = True) -> None:
         self._panels, self.lost, self.name, self._keep = panels, "", panels.name, keep
-        self.shown: list[LayerFrame] = []
+        self.shown: list[PanelFrame] = []
 
-    def present(self, frame: LayerFrame, *, unchanged: bool = False) -> PresentReport:
+    def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
         if self.lost:
             raise PanelLost(self.lost)
         if self._keep:
-            self.shown.append(LayerFrame(frame.number, frame.layers.copy()))
+            self.shown.append(replace(frame, solved=None if frame.solved is None else frame.solved.copy()))
         return self._panels.present(frame, unchanged=unchanged)
 
     def close(self) -> None:

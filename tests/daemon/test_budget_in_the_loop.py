@@ -47,10 +47,10 @@ def slowness(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
     """What every prediction takes longer than it does, in seconds."""
     real, added = UnrolledPredictor.predict, {"s": 0.0}
 
-    def predict(self: UnrolledPredictor, images: Any, eyes_m: Any) -> Any:
+    def predict(self: UnrolledPredictor, images: Any, eyes_m: Any, **how: Any) -> Any:
         if threading.current_thread() is threading.main_thread():  # levels are measured beside the loop
             time.sleep(added["s"])
-        return real(self, images, eyes_m)
+        return real(self, images, eyes_m, **how)
 
     monkeypatch.setattr(UnrolledPredictor, "predict", predict)
     return added

@@ -82,9 +82,9 @@ def test_the_copy_sees_what_the_runtime_sees(name: str) -> None:
     copy = UnrolledSolver(solver_of(recipe, source=name), recipe)
     apart = []
     for pair in first_pairs(5, seed=1):
-        predictor = load_predictor(name, pair.stack, ModelSettings(tolerance_mm=pair.tolerance_mm, threads=1))
+        predictor = load_predictor(name, pair.stack, ModelSettings(threads=1))
         rgba = [[cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA)] for picture in pair.images]
-        layers = predictor.predict(rgba, pair.eyes_m).layers[..., :3]
+        layers = predictor.predict(rgba, pair.eyes_m, eye_sigma_mm=pair.tolerance_mm).layers[..., :3]
         predictor.close()
         shown = torch.from_numpy(layers.copy()).permute(0, 3, 1, 2).float() / 255
         with torch.no_grad():

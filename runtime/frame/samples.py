@@ -1,11 +1,11 @@
-"""Where a run's samples come from: a sensor thread in real time, or a recording step by step."""
+"""Where a run's samples come from: a sensor thread in real time, or a recording on the simulated clock."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
-from runtime.clock import NS_PER_S, Clock
+from runtime.clock import Clock
 from runtime.config import SensorSettings
 from runtime.errors import EndOfRecording, FatalError, InputError
 from runtime.records import SensorFrame
@@ -13,22 +13,18 @@ from runtime.sensor.base import SensorDriver, SteppedDriver
 from runtime.sensor.worker import SensorState, SensorWorker
 
 
-class Input(ABC):
-    """The loop's view of the sensor."""
+class Samples(ABC):
+    """The presenter's view of the sensor; nothing here waits or lets time pass."""
 
-    stale_inputs: int
+    stale_inputs: int  # samples that a newer one overtook before they were looked at
 
     @abstractmethod
-    def receive(self) -> SensorFrame | None:
-        """The newest unread sample or None. Raises EndOfRecording, FatalError."""
+    def arrived(self, now_ns: int) -> list[SensorFrame]:
+        """Samples that have arrived and were not given yet, in order. Raises EndOfRecording, FatalError."""
 
     @abstractmethod
     def fault(self) -> str:
         """Why there is no sensor now; empty while all is well."""
-
-    @abstractmethod
-    def wait(self, *, rate_hz: float) -> None:
-        """Let time pass until the next turn is due."""
 
     @property
     @abstractmethod
@@ -40,28 +36,34 @@ class Input(ABC):
         """Let the sensor go. May be called twice."""
 
 
-class SteppedInput(Input):
-    """Each recorded sample gets one turn; the simulated clock is at its arrival."""
+class RecordedSamples(Samples):
+    """A recording on the simulated clock: each sample arrives at its capture plus the configured latency."""
 
-    stale_inputs = 0
-
-    def __init__(self, driver: SensorDriver, clock: Clock) -> None:
+    def __init__(self, driver: SensorDriver) -> None:
         """Raises InputError where the driver can't be stepped, or the recording can't be read."""
         if not isinstance(driver, SteppedDriver):
             raise InputError("run", "--max-speed", f"needs a recording, not the sensor {driver.name}")
-        self._driver, self._clock = driver, clock
+        self._driver = driver
+        self.stale_inputs = 0
         driver.open()
+        self._next: SensorFrame | None = driver.next_sample()
+        self._end: EndOfRecording | None = None
 
-    def receive(self) -> SensorFrame:
-        frame = self._driver.next_sample()
-        self._clock.sleep_until_ns(self._driver.available_ns(frame))
-        return frame
+    def arrived(self, now_ns: int) -> list[SensorFrame]:
+        if self._next is None and self._end is not None:
+            raise self._end
+        frames = []
+        while self._next is not None and self._driver.available_ns(self._next) <= now_ns:
+            frames.append(self._next)
+            try:
+                self._next = self._driver.next_sample()
+            except EndOfRecording as end:
+                self._next, self._end = None, end
+        self.stale_inputs += max(0, len(frames) - 1)
+        return frames
 
     def fault(self) -> str:
         return ""
-
-    def wait(self, *, rate_hz: float) -> None:
-        return
 
     @property
     def serial(self) -> str:
@@ -71,40 +73,34 @@ class SteppedInput(Input):
         self._driver.close()
 
 
-class LiveInput(Input):
-    """A sensor in its own thread; turns are paced on absolute deadlines."""
+class LiveSamples(Samples):
+    """A sensor in its own thread."""
 
     def __init__(self, make_driver: Callable[[], SensorDriver], settings: SensorSettings, clock: Clock) -> None:
         self._worker = SensorWorker(make_driver, settings, clock)
-        self._clock = clock
-        self._due_ns = clock.now_ns()
+        self._overtaken = 0
         self._worker.start()
 
-    def receive(self) -> SensorFrame | None:
-        frame = self._worker.newest()
-        if frame is not None:
-            return frame
+    def arrived(self, now_ns: int) -> list[SensorFrame]:
+        frames = self._worker.take()
+        self._overtaken += max(0, len(frames) - 1)
+        if frames:
+            return frames
         state = self._worker.state
         if state is SensorState.ENDED:
             raise EndOfRecording(self._worker.reason)
         if state is SensorState.FAILED:
             raise self._worker.error or FatalError(self._worker.reason)
-        return None
+        return []
 
     def fault(self) -> str:
         if self._worker.state in (SensorState.RUNNING, SensorState.OPENING, SensorState.ENDED):
             return ""
         return self._worker.reason or str(self._worker.state)
 
-    def wait(self, *, rate_hz: float) -> None:
-        period_ns = round(NS_PER_S / rate_hz)
-        # A late turn is not made up for: the next one is due a period after now.
-        self._due_ns = max(self._due_ns + period_ns, self._clock.now_ns())
-        self._clock.sleep_until_ns(self._due_ns)
-
     @property
     def stale_inputs(self) -> int:  # type: ignore[override]
-        return self._worker.stale_inputs
+        return self._overtaken + self._worker.stale_inputs
 
     @property
     def serial(self) -> str:
