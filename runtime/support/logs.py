@@ -12,6 +12,8 @@ from typing import Any, TextIO
 
 from runtime.clock import NS_PER_S, Clock, MonotonicClock
 from runtime.config import ServiceSettings
+from runtime.errors import one_line
+from runtime.support.crash import written
 
 # What sd-daemon(3) puts before a line so that journald files it under its level.
 PRIORITY = {logging.DEBUG: "<7>", logging.INFO: "<6>", logging.WARNING: "<4>", logging.ERROR: "<3>"}
@@ -19,6 +21,7 @@ ROOTS = ("phasestack", "runtime")  # named for what they tell, or after their mo
 BURST = 5
 REMEMBERED = 1000
 QUIET_NS = 30 * NS_PER_S
+LINE_MAX = 4000  # characters
 
 
 def event(logger: logging.Logger, level: int, message: str, **fields: Any) -> None:
@@ -39,12 +42,12 @@ class TextFormat(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         pairs = "".join(f" {key}={value}" for key, value in _fields(record).items())
-        text = record.getMessage() + pairs
-        if record.exc_info:
-            text += "\n" + self.formatException(record.exc_info)
+        text = one_line(record.getMessage() + pairs, most=LINE_MAX)  # nobody's name or message forges a line
+        if record.exc_info and record.exc_info[1]:
+            text += f": {written(record.exc_info[1])}"  # a traceback is for whoever mends it, not for the log
         if self._journald:
             prefix = PRIORITY.get(record.levelno, "<6>")
-            return "\n".join(prefix + line for line in text.splitlines())
+            return prefix + text
         when = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
         return f"{when} {record.levelname.lower():7} {text}"
 
@@ -60,8 +63,8 @@ class JsonFormat(logging.Formatter):
             "message": record.getMessage(),
             **_fields(record),
         }
-        if record.exc_info:
-            line["exception"] = self.formatException(record.exc_info)
+        if record.exc_info and record.exc_info[1]:
+            line["exception"] = written(record.exc_info[1])
         return json.dumps(line, default=str)
 
 
