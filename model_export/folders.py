@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from model_export.data import CENTRE, TrainingPair
+from model_export.eyereal import PICTURE_FOV_DEG
 from runtime.content.eyereal import Pair, read_folder
 from runtime.content.presets import preset
 from runtime.errors import InputError
@@ -18,7 +19,6 @@ from runtime.optics.views import image_from_raster
 from runtime.records import F64, U8
 from runtime.support.artifacts import read_image
 
-FOV_DEG = 40.0  # horizontal: what the published network takes its pictures to be
 PANELS = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 1920, 1080)
 
 
@@ -43,7 +43,9 @@ def _loaded(pair: Pair, stack: PanelStack) -> TrainingPair:
     pictures = [read_image(path) for path in pair.paths]
     if pictures[0].shape != pictures[1].shape:
         raise InputError(pair.paths[1], "size", f"differs from {pair.paths[0].name}")
-    left, right = (on_centre(picture, pair, side, stack, fov_deg=FOV_DEG) for side, picture in enumerate(pictures))
+    left, right = (
+        on_centre(picture, pair, side, stack, fov_deg=PICTURE_FOV_DEG) for side, picture in enumerate(pictures)
+    )
     return TrainingPair(stack, pair.eyes_m, (left, right), 0.0)
 
 
