@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import cycle
+from itertools import cycle, islice
 from pathlib import Path
 
 import cv2
@@ -71,11 +71,17 @@ def on_centre(picture: U8, pair: Pair, side: int, stack: PanelStack, *, fov_deg:
     return np.asarray(warped, np.uint8)
 
 
-def mixed(procedural: Iterator[TrainingPair], pairs: Sequence[TrainingPair]) -> Iterator[TrainingPair]:
-    """Pairs of folders and procedural ones in turn; procedural alone where there are no others."""
+def mixed(
+    procedural: Iterator[TrainingPair], pairs: Sequence[TrainingPair], *, first: int = 0
+) -> Iterator[TrainingPair]:
+    """Pairs of folders and procedural ones in turn; procedural alone where there are no others.
+
+    first: which of the folders' pairs, in their endless row, is the first.
+    """
     if not pairs:
         yield from procedural
-    for pair, own in zip(procedural, cycle(pairs), strict=False):
+    begun = islice(cycle(pairs), first % max(len(pairs), 1), None)
+    for pair, own in zip(procedural, begun, strict=False):
         yield pair
         yield own
 
