@@ -40,8 +40,14 @@ def test_people_read_time_level_message_and_values():
 
 def test_journald_gets_a_priority_on_every_line_and_no_time():
     stream = logged(environment={"JOURNAL_STREAM": "8:1"})
-    log.error("first\nsecond")
-    assert stream.getvalue() == "<3>first\n<3>second\n"
+    try:
+        raise ValueError("boom")
+    except ValueError:
+        log.exception("first")
+    lines = stream.getvalue().splitlines()
+    assert lines[0] == "<3>first"
+    assert lines[-1] == "<3>| ValueError: boom"
+    assert all(line.startswith("<3>") for line in lines)
 
 
 def test_machines_get_one_object_a_line_with_the_events_own_fields():
