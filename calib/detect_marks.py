@@ -15,6 +15,7 @@ from runtime.records import F64, U8
 
 DETECTION_PX = 2400  # photographs are searched at this size; corners are found in their own
 LEAST_MARKS = 3  # of a panel: twelve points, to place it
+LEAST_EXTENT = 0.3  # of a panel: a corner of it tells little about the others
 LEAST_UNIT_PX = 1.7  # photograph's pixels in one bit of a marker: below this nothing is read reliably
 BLURRED_BITS = 1.1  # an edge that is wider than this many bits is not worth its noise
 LEAST_CONTRAST = 0.35  # of a saddle against its mark's own
@@ -34,6 +35,7 @@ class SeenMarks:
     marks: tuple[int, ...]  # how many of each panel's marks were found
     edge_bits: float  # width of an edge in bits of a marker, median; infinite without marks
     unit_px: float  # photograph's pixels in one bit, median; 0 without marks
+    extents: tuple[float, ...]  # how much of each panel's width or height, the lesser, lies between its marks seen
     mirrored: tuple[int, ...]  # how many of each panel's marks are found in the mirrored photograph
 
     @property
@@ -54,6 +56,9 @@ class SeenMarks:
         if least < LEAST_MARKS:
             panel = self.marks.index(least)
             return f"shows {least} marks of panel {panel}, less than {LEAST_MARKS}: covered, cut off or too oblique"
+        for panel, share in enumerate(self.extents):
+            if share < LEAST_EXTENT:
+                return f"is covered or cut off: of panel {panel} {100 * share:.0f}% of its width or height are seen"
         return ""
 
 
@@ -110,16 +115,22 @@ def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
         image_px.append(refined[good])
         units.append(_unit_px(mark, quad))
         edges.append(_edge_px(picture, quad) / units[-1])
+    places = np.concatenate(panel_px) / [stack.width_px, stack.height_px] if panel_px else np.zeros((0, 2))
+    owners = np.array(panel, dtype=np.intp)
     return SeenMarks(
         name=name,
         width_px=width,
         height_px=height,
-        panel=np.array(panel, dtype=np.intp),
+        panel=owners,
         panel_px=np.concatenate(panel_px) if panel_px else np.zeros((0, 2)),
         image_px=np.concatenate(image_px) if image_px else np.zeros((0, 2)),
         marks=tuple(counts),
         edge_bits=float(np.median(edges)) if edges else float("inf"),
         unit_px=unit_px,
+        extents=tuple(
+            float(np.ptp(places[owners == index], axis=0).min()) if (owners == index).any() else 0.0
+            for index in range(stack.count)
+        ),
         mirrored=tuple(mirrored),
     )
 

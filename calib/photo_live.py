@@ -16,7 +16,7 @@ from runtime.optics.stack import PanelStack
 from runtime.records import U8
 
 STILL_SHARE = 0.002  # of the picture's width: marks that move less between two pictures are held still
-NEW_SHARE = 0.06  # marks that moved more than this since every photograph: another place
+NEW_SHARE = 0.02  # marks that moved more than this since every photograph: another place
 WANTED = 12
 PATIENCE = 3  # pictures held still before one is taken
 
@@ -97,11 +97,11 @@ def _places(seen: SeenMarks) -> dict[tuple[float, ...], Any]:
 
 
 def _moved(before: dict[tuple[float, ...], Any], now: dict[tuple[float, ...], Any]) -> float:
-    """Median movement in pixels of the saddles that both see; infinite where they share few."""
+    """By how many pixels most of the saddles moved that both see; infinite where they share few."""
     common = before.keys() & now.keys()
     if len(common) < 8:
         return float("inf")
-    return float(np.median([np.linalg.norm(before[key] - now[key]) for key in common]))
+    return float(np.percentile([np.linalg.norm(before[key] - now[key]) for key in common], 70))
 
 
 def take_live(
