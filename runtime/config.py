@@ -131,7 +131,7 @@ class DetectorSettings(Section):
         4.0, description="farther measurements are not a viewer's face"
     )
     lock_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
-        1.0, description="a viewer who is not seen for this long makes way for another"
+        0.3, description="a viewer not seen for this long makes way for another; less than tracker.hold_s"
     )
 
     @model_validator(mode="after")
@@ -205,7 +205,9 @@ class ContentSettings(Section):
     """What is shown."""
 
     scene: str = Field("demo", description="a preset's name, `demo`, or a file or folder")
-    reading: Literal["seed", "published-code"] = Field("seed", description="how a preset's d_thick is read")
+    reading: Literal["seed", "published-code", "published-training"] = Field(
+        "seed", description="how a preset's d_thick is read, and where its panels stand"
+    )
     fov_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="horizontal field of view of eye images")
     background: tuple[Unit, Unit, Unit] = Field((1.0, 1.0, 1.0), description="colour behind the scene, 0-1")
     file: str = Field("", description="a preset's data: its .ply or .glb, or its data-set folder; empty: a stand-in")

@@ -101,15 +101,16 @@ class SolverThread(SolverHost):
         if attempt.error is not None:
             if busy_ns > self._abandon_ns:
                 self._attempt = self._begin(attempt.number + 1)
-            return f"the solver could not be made anew ({attempt.error})"
+            return f"the solver failed, it is made anew by and by ({_line(attempt.error)})"
         if busy_ns <= self._late_ns:
             # Until a step is in time again: a state that changed with every solution would say nothing.
             late = attempt.last_step_ns > self._late_ns
             return f"the last solution took {attempt.last_step_ns / NS_PER_S:.1f} s" if late else ""
+        if busy_ns > self._abandon_ns:
+            self._hung = [hung for hung in self._hung if hung.thread is not None and hung.thread.is_alive()]
         if busy_ns > self._abandon_ns and len(self._hung) < ABANDONED_MAX:
             log.error("solver: no answer for %.1f s: left behind, and made anew", busy_ns / NS_PER_S)
             attempt.abandoned.set()
-            self._hung = [hung for hung in self._hung if hung.thread is not None and hung.thread.is_alive()]
             self._hung.append(attempt)
             self.restarts += 1
             self._attempt = self._begin(attempt.number + 1)
@@ -143,6 +144,9 @@ class SolverThread(SolverHost):
                 request = self._next_request()
                 if request is not None:
                     self._step(attempt, parts, request)
+        except Exception as error:  # beside what a step answers with: a bug of ours, or a library's
+            log.exception("solver: unexpected error")
+            attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
         finally:
             parts.close(abandoned=attempt.abandoned.is_set())
 
@@ -156,8 +160,7 @@ class SolverThread(SolverHost):
     def _step(self, attempt: _Attempt, parts: SolverParts, request: SolveRequest) -> None:
         attempt.busy_since_ns = self._clock.now_ns()
         step = parts.step(request)
-        if not step.idle:
-            attempt.last_step_ns = self._clock.now_ns() - attempt.busy_since_ns
+        attempt.last_step_ns = self._clock.now_ns() - attempt.busy_since_ns
         attempt.busy_since_ns = 0
         if attempt.abandoned.is_set():
             return
@@ -180,6 +183,10 @@ class SolverThread(SolverHost):
             attempt.busy_since_ns = 0
             if not done and not attempt.abandoned.is_set():
                 self._tasks.put(task)
+
+
+def _line(error: BaseException) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def _be_nice() -> None:

@@ -16,6 +16,8 @@ from typing import Any, TextIO
 
 from runtime.clock import NS_PER_S, Clock, MonotonicClock
 from runtime.config import ServiceSettings
+from runtime.errors import one_line
+from runtime.support.crash import written
 from runtime.support.log_writer import LogWriter
 
 # What sd-daemon(3) puts before a line so that journald files it under its level.
@@ -31,6 +33,7 @@ BURST = 5
 REMEMBERED = 1000
 QUIET_NS = 30 * NS_PER_S
 CLOSE_S = 1.0  # so long the last lines are waited for
+LINE_MAX = 4000  # characters
 
 
 def event(logger: logging.Logger, level: int, message: str, **fields: Any) -> None:
@@ -42,22 +45,8 @@ def _fields(record: logging.LogRecord) -> dict[str, Any]:
     return getattr(record, "fields", {})
 
 
-def printable(text: str) -> str:
-    """Text on one line: what can't be printed (line breaks, escapes, bidirectional marks) is escaped.
-
-    >>> print(printable("scene" + chr(10) + "12:00:00 error   forged"))
-    scene\\n12:00:00 error   forged
-    """
-    if text.isprintable():
-        return text
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-
-
 class TextFormat(logging.Formatter):
-    """`message key=value`; under journald with a priority and no time (it has its own), else with the time.
-
-    One line a record; those of a traceback follow it, each behind a bar.
-    """
+    """`message key=value`; under journald with a priority and no time (it has its own), else with the time."""
 
     def __init__(self, *, journald: bool) -> None:
         super().__init__()
@@ -65,14 +54,14 @@ class TextFormat(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         pairs = "".join(f" {key}={value}" for key, value in _fields(record).items())
-        lines = [printable(record.getMessage() + pairs)]
-        if record.exc_info:
-            lines += ["| " + printable(line) for line in self.formatException(record.exc_info).splitlines()]
+        text = one_line(record.getMessage() + pairs, most=LINE_MAX)  # nobody's name or message forges a line
+        if record.exc_info and record.exc_info[1]:
+            text += f": {written(record.exc_info[1])}"  # a traceback is for whoever mends it, not for the log
         if self._journald:
             prefix = PRIORITY.get(record.levelno, "<6>")
-            return "\n".join(prefix + line for line in lines)
+            return prefix + text
         when = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
-        return "\n".join([f"{when} {record.levelname.lower():7} {lines[0]}", *lines[1:]])
+        return f"{when} {record.levelname.lower():7} {text}"
 
 
 class JsonFormat(logging.Formatter):
@@ -86,8 +75,8 @@ class JsonFormat(logging.Formatter):
             "message": record.getMessage(),
             **_fields(record),
         }
-        if record.exc_info:
-            line["exception"] = self.formatException(record.exc_info)
+        if record.exc_info and record.exc_info[1]:
+            line["exception"] = written(record.exc_info[1])
         return json.dumps(line, default=str)
 
 
@@ -143,14 +132,20 @@ class Handler(logging.Handler):
         return self._writer.lost if self._writer is not None else 0
 
     def emit(self, record: logging.LogRecord) -> None:
+        if self._memory is not None:
+            self._memory.write(self._line(record).decode())
+        elif self._writer is not None and record.exc_info:
+            # An exception is written down whole in a file: not by whom it befell, whose time it would be.
+            self._writer.put(lambda: self._line(record))
+        elif self._writer is not None:
+            self._writer.put(self._line(record))
+
+    def _line(self, record: logging.LogRecord) -> bytes:
         try:
             line = self.format(record)
         except Exception as error:
             line = self.format(_record(logging.ERROR, f"a log line could not be made: {record.msg!r} ({error})"))
-        if self._memory is not None:
-            self._memory.write(line + "\n")
-        elif self._writer is not None:
-            self._writer.put(line.encode("utf-8", "backslashreplace") + b"\n")
+        return line.encode("utf-8", "backslashreplace") + b"\n"
 
     def flush(self) -> None:
         """Wait a moment for what is not written yet."""
@@ -163,8 +158,7 @@ class Handler(logging.Handler):
         super().close()
 
     def _told(self, count: int) -> bytes:
-        line = self.format(_record(logging.WARNING, f"{count} log lines were lost: they could not be written"))
-        return line.encode() + b"\n"
+        return self._line(_record(logging.WARNING, f"{count} log lines were lost: they could not be written"))
 
 
 def _record(level: int, message: str) -> logging.LogRecord:
