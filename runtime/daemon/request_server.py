@@ -13,7 +13,7 @@ import selectors
 import socket
 import threading
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from runtime.clock import NS_PER_S, MonotonicClock
 
@@ -87,6 +87,7 @@ class RequestServer:
         self._connections: dict[socket.socket, _Connection] = {}
         self._accept_from_ns = 0
         self._stopping = threading.Event()
+        self._address = listening.getsockname()
         listening.setblocking(False)
         listening.listen(BACKLOG)
         self._woken, self._wake = socket.socketpair()
@@ -97,6 +98,11 @@ class RequestServer:
         self._listens = True
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
+
+    @property
+    def address(self) -> Any:
+        """Of the listening socket."""
+        return self._address
 
     @property
     def connections(self) -> int:

@@ -21,7 +21,7 @@ class LogWriter:
     def __init__(self, descriptor: int, *, told: Callable[[int], bytes]) -> None:
         """descriptor: duplicated, -1: there is none; told: the line that says how many lines were lost."""
         self._told = told
-        self._queue: queue.Queue[bytes | None] = queue.Queue(QUEUED_MAX)
+        self._queue: queue.Queue[bytes | Callable[[], bytes] | None] = queue.Queue(QUEUED_MAX)
         self._lock = threading.Lock()
         self._untold = 0
         self._cut_off = False  # a line was left half written
@@ -34,10 +34,8 @@ class LogWriter:
         self._thread = threading.Thread(target=self._run, name="log", daemon=True)
         self._thread.start()
 
-    def put(self, line: bytes) -> None:
-        """One line, with its line break. Never waits."""
-        if len(line) > LINE_MAX_BYTES:
-            line = line[: LINE_MAX_BYTES - 5] + b" ...\n"
+    def put(self, line: bytes | Callable[[], bytes]) -> None:
+        """One line, with its line break, or what makes it on the writer's thread. Never waits."""
         try:
             if self._thread.is_alive():
                 self._queue.put_nowait(line)
@@ -70,7 +68,7 @@ class LogWriter:
         while True:
             line = self._queue.get()
             if line is not None:
-                self._take(line)
+                self._take(line if isinstance(line, bytes) else line())
             self._queue.task_done()
             if line is None or (time.monotonic() > self._give_up_s and self._queue.empty()):
                 break
@@ -78,6 +76,8 @@ class LogWriter:
             os.close(self._descriptor)
 
     def _take(self, line: bytes) -> None:
+        if len(line) > LINE_MAX_BYTES:
+            line = line[: LINE_MAX_BYTES - 5] + b" ...\n"
         if not self._written(line):
             self._lose()
         elif self._untold and self._queue.empty():

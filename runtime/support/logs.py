@@ -32,8 +32,8 @@ ROOTS = ("phasestack", "runtime")  # named for what they tell, or after their mo
 BURST = 5
 REMEMBERED = 1000
 QUIET_NS = 30 * NS_PER_S
-LINE_MAX = 4000  # characters
 CLOSE_S = 1.0  # so long the last lines are waited for
+LINE_MAX = 4000  # characters
 
 
 def event(logger: logging.Logger, level: int, message: str, **fields: Any) -> None:
@@ -46,10 +46,7 @@ def _fields(record: logging.LogRecord) -> dict[str, Any]:
 
 
 class TextFormat(logging.Formatter):
-    """`message key=value`; under journald with a priority and no time (it has its own), else with the time.
-
-    One line a record; a traceback is in a file that the line names.
-    """
+    """`message key=value`; under journald with a priority and no time (it has its own), else with the time."""
 
     def __init__(self, *, journald: bool) -> None:
         super().__init__()
@@ -61,7 +58,8 @@ class TextFormat(logging.Formatter):
         if record.exc_info and record.exc_info[1]:
             text += f": {written(record.exc_info[1])}"  # a traceback is for whoever mends it, not for the log
         if self._journald:
-            return PRIORITY.get(record.levelno, "<6>") + text
+            prefix = PRIORITY.get(record.levelno, "<6>")
+            return prefix + text
         when = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
         return f"{when} {record.levelname.lower():7} {text}"
 
@@ -134,14 +132,20 @@ class Handler(logging.Handler):
         return self._writer.lost if self._writer is not None else 0
 
     def emit(self, record: logging.LogRecord) -> None:
+        if self._memory is not None:
+            self._memory.write(self._line(record).decode())
+        elif self._writer is not None and record.exc_info:
+            # An exception is written down whole in a file: not by whom it befell, whose time it would be.
+            self._writer.put(lambda: self._line(record))
+        elif self._writer is not None:
+            self._writer.put(self._line(record))
+
+    def _line(self, record: logging.LogRecord) -> bytes:
         try:
             line = self.format(record)
         except Exception as error:
             line = self.format(_record(logging.ERROR, f"a log line could not be made: {record.msg!r} ({error})"))
-        if self._memory is not None:
-            self._memory.write(line + "\n")
-        elif self._writer is not None:
-            self._writer.put(line.encode("utf-8", "backslashreplace") + b"\n")
+        return line.encode("utf-8", "backslashreplace") + b"\n"
 
     def flush(self) -> None:
         """Wait a moment for what is not written yet."""
@@ -154,8 +158,7 @@ class Handler(logging.Handler):
         super().close()
 
     def _told(self, count: int) -> bytes:
-        line = self.format(_record(logging.WARNING, f"{count} log lines were lost: they could not be written"))
-        return line.encode() + b"\n"
+        return self._line(_record(logging.WARNING, f"{count} log lines were lost: they could not be written"))
 
 
 def _record(level: int, message: str) -> logging.LogRecord:
