@@ -82,10 +82,9 @@ def read_image(path: Path) -> U8:
     """(h, w, 3) RGB of any format that OpenCV reads. Raises InputError, naming the file."""
     import cv2
 
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, "", f"cannot be read ({error.strerror})") from None
+    from runtime.support.picture_header import read_coded
+
+    data = read_coded(path)
     # libpng would write a line of its own to stderr about a file that is cut off.
     cut_off = data.startswith(b"\x89PNG") and b"IEND" not in data
     image = None if cut_off or not data else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
