@@ -7,7 +7,7 @@ aligned to where the eyes will be when its light leaves.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -165,6 +165,8 @@ class Presenter:
         times.lap("track")
         report, lost = self._present(frame)
         times.lap("present")
+        if report is not None and times.simulated:  # presenting has been paid for only now
+            report = replace(report, present_ns=self.clock.now_ns())
         photon_ns = self._presented_at(timing, report, woke_ns=woke_ns)
         self.solver.post(self._request(timing, eyes))
         self.missing = self._missing(news, lost)
@@ -306,7 +308,7 @@ class Presenter:
         state: State,
         times: RefreshTimes,
     ) -> RefreshAccount:
-        solution = news.solution if frame.flatness < 1.0 else None
+        solution = news.solution if report is not None and frame.flatness < 1.0 else None  # that is shown
         ran = solution is not None and solution.number != self._shown_solution
         stage_ms, machine_ms = dict(times.stage_ms), dict(times.machine_ms)
         if solution is not None and ran:

@@ -33,8 +33,9 @@ def x(screen, monkeypatch):
 def opened(x, context):
     sinks = []
 
-    def open_(*panels: PanelSettings, kind="windows"):
-        sinks.append(open_panels(OutputSettings(kind=kind, panels=panels), STACK, MonotonicClock(), context))
+    def open_(*panels: PanelSettings, **settings):
+        output = OutputSettings(**{"kind": "windows", "panels": panels, **settings})
+        sinks.append(open_panels(output, STACK, MonotonicClock(), context))
         return sinks[-1]
 
     yield open_
@@ -103,8 +104,8 @@ def test_layers_follow_monitors_that_change_places(x, opened, kind):
     assert [monitor.connector for monitor in sink.monitors] == ["DUMMY2", "DUMMY0", "DUMMY1"]
 
 
-def test_a_monitor_in_another_mode_of_the_same_shape_is_bound_anew(x, opened):
-    sink = opened(*BY_CONNECTOR)
+def test_a_monitor_in_another_mode_of_the_same_shape_is_bound_anew_where_that_is_allowed(x, opened):
+    sink = opened(*BY_CONNECTOR, allow_rescaling=True)
     assert presents(sink, 0)
     x.set_mode(2, "half")
     assert "160x90" in lost(sink)
@@ -114,12 +115,13 @@ def test_a_monitor_in_another_mode_of_the_same_shape_is_bound_anew(x, opened):
     assert eventually(lambda: np.abs(x.screenshot()[:90, 640:800] - halved).max() <= 1.0)
 
 
-def test_a_monitor_in_a_mode_of_another_shape_is_held_and_named_until_it_is_put_right(x, opened):
+@pytest.mark.parametrize(("mode", "size"), [("tall", "160x180"), ("half", "160x90")])
+def test_a_monitor_in_a_mode_that_does_not_fit_is_held_and_named_until_it_is_put_right(x, opened, mode, size):
     sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
-    x.set_mode(0, "tall")
-    assert "160x180" in lost(sink)
-    assert eventually(lambda: "panel 1: DUMMY0 shows 160x180" in lost(sink, within_s=0.1))
+    x.set_mode(0, mode)
+    assert size in lost(sink)
+    assert eventually(lambda: f"panel 1: DUMMY0 shows {size}" in lost(sink, within_s=0.1))
     x.plug(0)
     assert comes_back(x, sink, 2, 0, 1)
 
