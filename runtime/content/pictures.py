@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 from abc import ABC, abstractmethod
@@ -22,7 +21,7 @@ from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import U8
 from runtime.support import foreign, progress
 from runtime.support.artifacts import read_image
-from runtime.support.picture_header import UnknownPicture, check_size, size_of_file
+from runtime.support.picture_header import check_size, size_of_file
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEOS = (".mp4", ".mkv", ".avi", ".mov", ".webm", ".m4v")
@@ -106,7 +105,7 @@ class PictureFolder(Frames):
 
     def __init__(self, paths: Sequence[Path], *, rate_hz: float, limits: LimitSettings) -> None:
         self._paths = list(paths)
-        _refuse_too_many_pixels(self._paths[0], limits)
+        size_of_file(self._paths[0], limits=limits)  # before it is unpacked
         self._shape = read_image(self._paths[0]).shape
         for number, path in enumerate(self._paths[1:], start=1):
             if number % TELL_EVERY == 0:
@@ -122,12 +121,6 @@ class PictureFolder(Frames):
         if picture.shape != self._shape:
             raise ContentFailure(f"{self._paths[index]}: its size differs from the first picture's")
         return picture
-
-
-def _refuse_too_many_pixels(path: Path, limits: LimitSettings) -> None:
-    """By the header alone. Raises InputError; a format that only the decoder knows passes."""
-    with contextlib.suppress(UnknownPicture):
-        size_of_file(path, limits=limits)
 
 
 def _refuse_other_size(path: Path, shape: tuple[int, ...], limits: LimitSettings) -> None:
@@ -206,7 +199,7 @@ def open_frames(path: Path, settings: ContentSettings, *, limits: LimitSettings 
         return PictureFolder(paths, rate_hz=settings.picture_rate_hz, limits=limits)
     if path.suffix.lower() in VIDEOS:
         return Video(path, limits=limits)
-    _refuse_too_many_pixels(path, limits)
+    size_of_file(path, limits=limits)
     return Picture(read_image(path))
 
 

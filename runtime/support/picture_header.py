@@ -17,10 +17,6 @@ TURNED = (5, 6, 7, 8)  # by a quarter: width and height are exchanged
 SNIFFED_BYTES = 1 << 20  # of a file: headers, EXIF and colour profiles end before
 
 
-class UnknownPicture(InputError):
-    """No header that Pillow knows: whether it is a picture, a decoder has to say."""
-
-
 def picture_size(coded: bytes, *, turned: bool = False) -> tuple[int, int]:
     """Width and height of a coded picture; turned: after its EXIF orientation. Raises ValueError."""
     from PIL import Image
@@ -83,13 +79,13 @@ def read_coded(path: Path, *, limits: LimitSettings | None = None) -> bytes:
     try:
         width, height = picture_size(data)
     except ValueError:
-        return data  # a format that only the decoder knows, which has a limit of its own
+        raise InputError(path, "", "is not an image that can be decoded") from None
     check_size(width, height, source=path, limits=limits)
     return data
 
 
 def size_of_file(path: Path, *, limits: LimitSettings | None = None) -> tuple[int, int]:
-    """Width and height as a decoder shows them, from the file's beginning. Raises InputError, UnknownPicture."""
+    """Width and height as a decoder shows them, from the file's beginning. Raises InputError."""
     limits = limits or LimitSettings()
     with foreign.open_regular(path, most_bytes=round(limits.file_mib * foreign.MIB)) as file:
         head = file.read(SNIFFED_BYTES)
@@ -99,6 +95,6 @@ def size_of_file(path: Path, *, limits: LimitSettings | None = None) -> tuple[in
             try:
                 width, height = picture_size(head + file.read(), turned=True)
             except ValueError:
-                raise UnknownPicture(path, "", "is not an image that can be decoded") from None
+                raise InputError(path, "", "is not an image that can be decoded") from None
     check_size(width, height, source=path, limits=limits)
     return width, height
