@@ -385,12 +385,12 @@ class LimitSettings(Section):
     """What a file from outside may hold: more is refused with its figure, before memory is taken for it."""
 
     file_mib: Annotated[float, Field(gt=0, le=1_000_000)] = Field(
-        2048.0, description="bytes of one file of content or of a recording, MiB"
+        1024.0, description="one file of content or of a recording, MiB"
     )
-    pixels: Annotated[int, Field(ge=1)] = Field(67_108_864, description="pixels of one picture")
+    pixels: Annotated[int, Field(ge=1)] = Field(134_217_728, description="pixels of one picture; 16384 x 8192")
     triangles: Annotated[int, Field(ge=1)] = Field(2_000_000, description="triangles of a mesh, all instances together")
     splats: Annotated[int, Field(ge=1)] = Field(3_000_000, description="Gaussians of a splat file")
-    instances: Annotated[int, Field(ge=1)] = Field(4096, description="times that meshes stand in a glTF scene")
+    instances: Annotated[int, Field(ge=1)] = Field(2000, description="times that meshes stand in a glTF scene")
     depth: Annotated[int, Field(ge=1, le=512)] = Field(64, description="how deep JSON or a glTF scene may nest")
     load_s: Positive = Field(120.0, description="loading of one piece of content is given up after this")
     recording_s: Annotated[float, Field(gt=0, le=1_000_000)] = Field(
