@@ -202,7 +202,7 @@ class CalibrationSettings(Section):
     viewing_m: tuple[Positive, Positive] = Field(
         (0.4, 0.6), description="nearest and farthest viewer: charts and registration are for there"
     )
-    viewing_side_deg: Annotated[float, Field(gt=0, le=40)] = Field(
+    viewing_side_deg: Annotated[float, Field(ge=2, le=40)] = Field(
         10.0, description="how far to either side viewers stand, seen from the display's middle"
     )
     viewing_up_deg: tuple[float, float] = Field((0.0, 20.0), description="how far up their eyes are: lowest, highest")
