@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,8 +19,11 @@ from runtime.clock import NS_PER_MS, MonotonicClock
 from runtime.config import Settings, load_settings
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
-from runtime.records import U8, PanelFrame
+from runtime.records import F64, U8, PanelFrame
 from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_png, write_text
+
+if TYPE_CHECKING:
+    from tomlkit import TOMLDocument
 
 POLL_NS = 30 * NS_PER_MS
 SHOW_AGAIN_POLLS = 5
@@ -226,16 +229,38 @@ def _plain(rows: list[list[str]]) -> str:
 
 def panels_text(registration: StackRegistration) -> str:
     """`[[output.panels]]` tables with the homographies, to paste into a configuration."""
+    return panels_document(np.stack([panel.true_from_ideal for panel in registration.panels]))
+
+
+def panels_document(matrices: F64, *, x_m: Sequence[float] | None = None) -> str:
+    """The same from (N, 3, 3) homographies; with distances also `[stack]`."""
     import tomlkit
 
     document = tomlkit.document()
+    if x_m is not None:
+        document["stack"] = {"x_m": [round(float(x), 7) for x in x_m]}
     tables = tomlkit.aot()
-    for panel in registration.panels:
+    for matrix in matrices:
         table = tomlkit.table()
-        table["homography"] = panel.true_from_ideal.tolist()
+        table["homography"] = matrix.tolist()
         tables.append(table)
     document["output"] = {"panels": tables}
     return tomlkit.dumps(document)
+
+
+def with_homographies(config: Path, matrices: F64) -> TOMLDocument:
+    """A configuration with other homographies, its comments kept; nothing is written."""
+    import tomlkit
+
+    document = tomlkit.parse(config.read_text(encoding="utf-8"))
+    output: Any = document.setdefault("output", tomlkit.table())
+    if "panels" not in output:
+        output["panels"] = tomlkit.aot()
+        for _ in matrices:
+            output["panels"].append(tomlkit.table())
+    for table, matrix in zip(output["panels"], matrices, strict=True):
+        table["homography"] = matrix.tolist()
+    return document
 
 
 def write_homographies(config: Path, registration: StackRegistration) -> Path | None:
@@ -247,15 +272,8 @@ def write_homographies(config: Path, registration: StackRegistration) -> Path | 
 
     import tomlkit
 
-    document = tomlkit.parse(config.read_text(encoding="utf-8"))
-    output = document.setdefault("output", tomlkit.table())
-    if "panels" not in output:
-        output["panels"] = tomlkit.aot()
-        for _ in registration.panels:
-            output["panels"].append(tomlkit.table())
-    for table, panel in zip(output["panels"], registration.panels, strict=True):
-        table["homography"] = panel.true_from_ideal.tolist()
-    text = tomlkit.dumps(document)
+    matrices = np.stack([panel.true_from_ideal for panel in registration.panels])
+    text = tomlkit.dumps(with_homographies(config, matrices))
     with tempfile.TemporaryDirectory() as folder:
         trial = Path(folder) / config.name
         write_text(trial, text)

@@ -7,6 +7,7 @@ from itertools import product
 
 import numpy as np
 
+from runtime.config import CalibrationSettings
 from runtime.optics.views import stack_from_eye
 from runtime.records import F64
 
@@ -35,14 +36,25 @@ class Viewpoint:
 
     def eyes_m(self, ipd_m: float = IPD_M) -> F64:
         """(2, 3) left and right eye, level, square to the line to the stack's centre; frame `stack`."""
-        right = stack_from_eye(self.midpoint_m)[:3, 0]
-        return self.midpoint_m + np.outer([-ipd_m / 2, ipd_m / 2], right)
+        return eyes_at(self.midpoint_m, ipd_m)
 
 
 def spherical_m(radius_m: float, *, phi_deg: float, theta_deg: float) -> F64:
     """(3,) point in `stack` from the seed's polar angles."""
     phi, theta = np.radians(phi_deg), np.radians(theta_deg)
     return radius_m * np.array([np.sin(phi) * np.sin(theta), np.sin(phi) * np.cos(theta), np.cos(phi)])
+
+
+def eyes_at(midpoint_m: F64, ipd_m: float = IPD_M) -> F64:
+    """(2, 3) left and right eye about a midpoint, level, square to the line to the stack's centre; frame `stack`."""
+    right = stack_from_eye(midpoint_m)[:3, 0]
+    return midpoint_m + np.outer([-ipd_m / 2, ipd_m / 2], right)
+
+
+def viewing_place_m(viewing: CalibrationSettings) -> F64:
+    """(3,) the middle of where viewers stand, frame `stack`: what a registration is exact for."""
+    up_deg = sum(viewing.viewing_up_deg) / 2
+    return spherical_m(sum(viewing.viewing_m) / 2, phi_deg=90 - up_deg, theta_deg=90)
 
 
 def grid() -> tuple[Viewpoint, ...]:

@@ -59,7 +59,9 @@ class Daemon:
             self._notifier.reloading()
             self._reload(presenter, None)
         while self._server is not None and not self._server.commands.empty():
-            self._carry_out(self._server.commands.get(), presenter)
+            command = self._server.commands.get()
+            if command.take():  # else it was refused meanwhile: never done later
+                self._carry_out(command, presenter)
         if self._change is not None and self._change.finished:
             change, self._change = self._change, None
             if not change.problem:
@@ -177,8 +179,6 @@ class Daemon:
             return
         self._change, self._asked_by = change, command
         presenter.solver.do(change.advance)
-        if command is not None:
-            command.begin()
 
     def _answer(self, command: Command | None, problem: str) -> None:
         """What became of a change: to who asked for it, to the log and to the status."""
@@ -220,8 +220,13 @@ def snapshot(run: Run | None, presenter: Presenter, account: RefreshAccount) -> 
         "eye_sigma_now_mm": account.eye_sigma_mm,
         "solution": account.solution,
         "solution_age_now_ms": account.solution_age_ms,
-        "rejected_samples": {"outlier": presenter.viewer.outliers, **presenter.viewer.dropped},
-        "sensor_hz": presenter.viewer.rate_hz,
+        "rejected_samples": {
+            "outlier": presenter.viewer.outliers,
+            **presenter.viewer.dropped,
+            **presenter.samples.refused_inputs,
+        },
+        "sensor_hz": presenter.viewer.rate_hz if "sensor" not in presenter.missing else None,
+        "log_lines_lost": logs.lost(),
         **stats.rates_now(),
         **counted,
     }

@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from runtime.content.base import ContentSource
-from runtime.plan.drawing import retina_view
-from runtime.optics.carried import intensities
+from runtime.optics.carried import expected_psnrs_db, intensities
 from runtime.optics.quality import Quality, quality
 from runtime.optics.retina import Retina, seen_by
 from runtime.optics.stack import PanelStack
@@ -40,9 +38,11 @@ def displayed(
 ) -> Look:
     """What eyes (2, 3), frame `stack`, see of layers (N, H, W, 3 or 4), against a picture for each eye.
 
-    Each is judged in its picture's own raster, `fov_deg` wide. similarity: SSIM as well, else it is NaN.
+    The pictures are `fov_deg` wide. One that has the panels' aspect is compared in their pixels, any other in its own.
+    similarity: SSIM as well, else it is NaN.
     Raises ValueError for eyes that are not before every panel, or that see nothing of them.
     """
+    wanted = [on_panels_raster(picture, stack) for picture in wanted]
     seen = tuple(
         seen_by(eye_m, layers, stack, fov_deg=fov_deg, width_px=picture.shape[1], height_px=picture.shape[0])
         for eye_m, picture in zip(eyes_m, wanted, strict=True)
@@ -52,16 +52,18 @@ def displayed(
     return Look(seen, tuple(wanted), measured)
 
 
-def wanted_pictures(
-    content: ContentSource, eyes_m: F64, stack: PanelStack, *, fov_deg: float, time_ns: int
-) -> tuple[U8, U8]:
-    """(h, w, 3) what content shows a left and a right eye (2, 3) that look at the stack's origin."""
-    size = {"width_px": stack.width_px, "height_px": stack.height_px}
-    left, right = (
-        content.render(retina_view(eye_m, side, fov_deg=fov_deg, **size), time_ns=time_ns)[..., :3].copy()
-        for side, eye_m in enumerate(eyes_m)
-    )
-    return left, right
+def expected_db(
+    look: Look, layers: U8, stack: PanelStack, *, eyes_m: F64, fov_deg: float, sigmas_mm: Sequence[float] = (1.0, 2.0)
+) -> dict[str, float | None]:
+    """Expected PSNR (design 5.5) of a look's layers and pictures, by the eyes' uncertainty in millimetres: "1", "2".
+
+    None where such an error would take an eye to where it sees nothing.
+    """
+    try:
+        values = expected_psnrs_db(layers, look.wanted, stack, eyes_m=eyes_m, fov_deg=fov_deg, sigmas_mm=sigmas_mm)
+    except ValueError:
+        return {f"{sigma_mm:g}": None for sigma_mm in sigmas_mm}
+    return {f"{sigma_mm:g}": value for sigma_mm, value in values.items()}
 
 
 def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:

@@ -7,7 +7,8 @@ the parallax that a late picture lacks does not.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -118,18 +119,24 @@ def expected_psnrs_db(
     views = [_view(eye, picture, stack, fov_deg=fov_deg, step=step) for eye, picture in zip(eyes, drawn, strict=True)]
     wanted = [intensities(picture, step) for picture in drawn]
     right = stack_from_eye(eyes.mean(axis=0))[:3, 0]
-    up = np.array([0.0, 0.0, 1.0])
 
     def error(move_m: F64) -> float:
-        squared, counted = 0.0, 0
-        for view, eye, target in zip(views, eyes, wanted, strict=True):
-            retina = view.seen_from(eye + move_m, layers)
-            total, count = squared_error(retina.image, target, retina.mask)
-            squared, counted = squared + total, counted + count
+        def of_eye(side: int) -> tuple[float, int]:
+            retina = views[side].seen_from(eyes[side] + move_m, layers)
+            return squared_error(retina.image, wanted[side], retina.mask)
+
+        squared, counted = map(sum, zip(*pool.map(of_eye, range(len(views))), strict=True))
         if counted == 0:
             raise ValueError("no ray of these eyes crosses every panel")
         return squared / counted
 
+    with ThreadPoolExecutor(len(views)) as pool:  # numpy and OpenCV let go of the interpreter's lock
+        return _five_points(error, right=right, sigmas_mm=sigmas_mm)
+
+
+def _five_points(error: Callable[[F64], float], *, right: F64, sigmas_mm: Sequence[float]) -> dict[float, float]:
+    """PSNR of the expected error for each standard deviation. error: of a move (3,) in metres."""
+    up = np.array([0.0, 0.0, 1.0])
     unmoved = error(np.zeros(3))
     result = {}
     for sigma_mm in sigmas_mm:
