@@ -7,7 +7,7 @@ import io
 import logging
 import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +63,9 @@ def with_contract(data: bytes, contract: Contract) -> bytes:
     del model.metadata_props[:]
     known = digest(model.SerializeToString(deterministic=True))
     contract = contract.model_copy(update={"graph_sha256": known})
-    onnx.helper.set_model_props(model, {METADATA_KEY: contract.model_dump_json()})
+    # Only a network of whole pictures has a view of its own; the others' contracts don't speak of one.
+    text = contract.model_dump_json(exclude=None if contract.picture_fov_deg else {"picture_fov_deg"})
+    onnx.helper.set_model_props(model, {METADATA_KEY: text})
     return bytes(model.SerializeToString(deterministic=True))
 
 
@@ -117,7 +119,7 @@ def _exported(
     example: tuple[Any, ...],
     inputs: Sequence[str],
     outputs: Sequence[str],
-    axes: dict[str, tuple[str, ...]],
+    axes: Mapping[str, tuple[str, ...]],
     opset: int,
 ) -> bytes:
     buffer = io.BytesIO()

@@ -42,7 +42,13 @@ def solve(
     if as_json:
         typer.echo(json.dumps(result))
     else:
+        expected = ", ".join(
+            f"{value:.2f} dB {who}"
+            for who, value in zip(("a pupil (1 mm)", "a tracker (2 mm)"), result["expected_db"].values(), strict=True)
+            if value is not None
+        )
         typer.echo(
-            f"{result['model']}: displayed {result['psnr_db']:.2f} dB, SSIM {result['ssim']:.4f}; "
+            f"{result['model']}: displayed {result['psnr_db']:.2f} dB to two points, SSIM {result['ssim']:.4f}; "
+            f"{f'expected: {expected}; ' if expected else ''}"
             f"{result['total_ms']:.1f} ms in all, {result['inference_ms']:.1f} ms of it the network; {out}"
         )

@@ -21,6 +21,9 @@ class Conditions:
     presented: bool  # True once any frame has been on the panels
     flat_wanted: bool = False  # the operator asked for the 2D picture
     stopping: str = ""  # why the daemon stops; empty: it does not
+    limited: str = ""  # why the alignment to the eyes is at its limit; empty: it is not
+    late: str = ""  # why fewer refreshes are shown than the display has; empty: all are
+    paused: bool = False  # the operator froze the picture; it is still aligned to the eyes
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +46,17 @@ def judge(conditions: Conditions) -> tuple[State, str]:
         return State.STARTING, f"waiting for {why}" if why else "no frame has been presented yet"
     if missing:
         return State.DEGRADED, why
+    late = [conditions.late] if conditions.late else []
     if conditions.flat_wanted:
-        return State.FLAT, "asked for"
+        return State.FLAT, "; ".join(["asked for", *late])
     if conditions.eyes == "none":
-        return State.FLAT, "no viewer"
+        return State.FLAT, "; ".join(["no viewer", *late])
+    remarks = [*late, *(["the picture is paused"] if conditions.paused else [])]
+    if conditions.limited:
+        remarks.append(f"alignment at its limit until the next solution: {conditions.limited}")
     if conditions.eyes == "held":
-        return State.HOLDING, "eyes lost, the last ones are held"
-    return State.TRACKING, "eyes seen"
+        return State.HOLDING, "; ".join(["eyes lost, the last ones are held", *remarks])
+    return State.TRACKING, "; ".join(["eyes seen", *remarks])
 
 
 class StateMachine:
@@ -77,9 +84,10 @@ class StateMachine:
         before = self.name
         self.state, reason = judge(conditions)
         self.missing = tuple(part for part in PARTS if part in conditions.missing)
+        self.reason = reason
         if self.name == before:
             return None
-        self.reason, self.since_ns = reason, now_ns
+        self.since_ns = now_ns
         return Transition(before, self.name, reason, now_ns)
 
     def seconds(self, *, now_ns: int) -> dict[str, float]:

@@ -69,7 +69,7 @@ class Contract(Section):
     output: Literal["panels", "outer"]
     branch: Literal[1, 2]
     value_range: tuple[float, float]
-    trained_for: TrainedFor
+    trained_for: TrainedFor | None = Field(description="null: not known, or not trained")
     recipe_sha256: str
     width_px: Annotated[int, Field(ge=0, le=16384)] = Field(0, description="fixed input width; 0: any")
     height_px: Annotated[int, Field(ge=0, le=16384)] = Field(0, description="fixed input height; 0: any")
@@ -79,11 +79,15 @@ class Contract(Section):
     precision: Literal["fp32", "fp16", "int8"] = "fp32"
     parameters: Annotated[int, Field(ge=0)] = 0
     cell_px: Annotated[int, Field(ge=1, le=64)] = Field(
-        4, description="chain: parallax of the outer panels in columns of the network's raster")
+        4, description="chain: parallax of the outer panels in columns of the network's raster"
+    )
     reduction: Literal[1, 2, 4] = Field(2, description="chain: the network's raster is so much coarser than a panel")
     emphasis: Annotated[float, Field(ge=0, le=0.5)] = Field(
         0.0,
         description="strength of the sharpening that undoes the blur of interpolation, on the way in and in the eye",
+    )
+    picture_fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
+        0.0, description="horizontal view of the pictures it was trained on, black beside them; 0: whatever is drawn"
     )
     interpolation: Literal["linear", "cubic"] = Field("linear", description="how still pictures are warped")
     steps: Steps = ()

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
+from runtime.evaluation.trials import timed
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
 from runtime.records import F64
@@ -116,17 +117,13 @@ def over_resolutions(scene: str, stack: PanelStack, models: Sequence[str], *, di
                     continue
                 rasters = simulation.predictor.rasters(eyes)
                 blank = [np.full((r.height_px, r.width_px, 4), 128, np.uint8) for r in rasters]
-                times = []
-                for _ in range(7):
-                    start = time.perf_counter()
-                    simulation.predictor.predict([blank, blank], eyes)
-                    times.append((time.perf_counter() - start) * 1e3)
+                done = timed(partial(simulation.predictor.predict, [blank, blank], eyes), runs=7)
                 sizes.append(
                     Size(
                         model,
                         small.width_px,
                         small.height_px,
-                        float(np.median(times)),
+                        done.median_ms,
                         simulation.pooled_db(eyes, layers),
                     )
                 )
