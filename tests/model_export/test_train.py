@@ -87,7 +87,7 @@ def test_the_raster_s_own_sight_is_what_eyes_see_of_panels_that_are_drawn_on_it(
     pair = first_pairs(1, seed=3, width_px=480, height_px=270)[0]
     # Detail that the raster, half as fine as the panels, can't hold is none of its business.
     smooth = tuple(cv2.GaussianBlur(picture, (0, 0), 3.0) for picture in pair.images)
-    pair = replace(pair, images=smooth, eye_sigma_mm=1.0)
+    pair = replace(pair, images=smooth, eye_sigma_mm=4.0)
     with torch.no_grad():
         ours = displayed_mse(net, sight_of(pair, recipe, device=torch.device("cpu")))
     predictor = load_predictor("balanced", pair.stack, ModelSettings(threads=1))
@@ -95,7 +95,7 @@ def test_the_raster_s_own_sight_is_what_eyes_see_of_panels_that_are_drawn_on_it(
     alone = {"steps": session.contract.steps[:1], "emphasis": 0.0}
     session.contract = session.contract.model_copy(update=alone)
     rgba = [[cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA)] for picture in pair.images]
-    layers = predictor.predict(rgba, pair.eyes_m, eye_sigma_mm=1.0).layers[..., :3].astype(np.float64) / 255
+    layers = predictor.predict(rgba, pair.eyes_m, eye_sigma_mm=4.0).layers[..., :3].astype(np.float64) / 255
     predictor.close()
     errors = []
     for eye, picture in zip(pair.eyes_m, pair.images, strict=True):
