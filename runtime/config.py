@@ -131,7 +131,7 @@ class DetectorSettings(Section):
         4.0, description="farther measurements are not a viewer's face"
     )
     lock_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
-        1.0, description="a viewer who is not seen for this long makes way for another"
+        0.3, description="a viewer not seen for this long makes way for another; less than tracker.hold_s"
     )
 
     @model_validator(mode="after")
@@ -199,13 +199,34 @@ class CalibrationSettings(Section):
         0.0, description="the viewer's known eye separation, metres, 0: unknown; checks for drift"
     )
     ipd_tolerance: Positive = Field(0.04, description="warn where the measured one parts by more than this share")
+    viewing_m: tuple[Positive, Positive] = Field(
+        (0.4, 0.6), description="nearest and farthest viewer: charts and registration are for there"
+    )
+    viewing_side_deg: Annotated[float, Field(ge=2, le=40)] = Field(
+        10.0, description="how far to either side viewers stand, seen from the display's middle"
+    )
+    viewing_up_deg: tuple[float, float] = Field((0.0, 20.0), description="how far up their eyes are: lowest, highest")
+    scale_sigma: NonNegative = Field(
+        0.02, description="how far off the sensor's metre may be, standard deviation; 0: it is exact"
+    )
+
+    @model_validator(mode="after")
+    def _viewing(self) -> CalibrationSettings:
+        if self.viewing_m[1] < self.viewing_m[0] * 1.1:
+            raise ValueError("viewing_m: must be the nearest, then the farthest, at least a tenth farther")
+        low, high = self.viewing_up_deg
+        if not (-40 <= low < high <= 40 and high - low >= 2):
+            raise ValueError("viewing_up_deg: must be lowest, then highest, between -40 and 40, 2 degrees apart")
+        return self
 
 
 class ContentSettings(Section):
     """What is shown."""
 
     scene: str = Field("demo", description="a preset's name, `demo`, or a file or folder")
-    reading: Literal["seed", "published-code"] = Field("seed", description="how a preset's d_thick is read")
+    reading: Literal["seed", "published-code", "published-training"] = Field(
+        "seed", description="how a preset's d_thick is read, and where its panels stand"
+    )
     fov_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="horizontal field of view of eye images")
     background: tuple[Unit, Unit, Unit] = Field((1.0, 1.0, 1.0), description="colour behind the scene, 0-1")
     file: str = Field("", description="a preset's data: its .ply or .glb, or its data-set folder; empty: a stand-in")
@@ -364,12 +385,12 @@ class LimitSettings(Section):
     """What a file from outside may hold: more is refused with its figure, before memory is taken for it."""
 
     file_mib: Annotated[float, Field(gt=0, le=1_000_000)] = Field(
-        2048.0, description="bytes of one file of content or of a recording, MiB"
+        1024.0, description="one file of content or of a recording, MiB"
     )
-    pixels: Annotated[int, Field(ge=1)] = Field(67_108_864, description="pixels of one picture")
+    pixels: Annotated[int, Field(ge=1)] = Field(134_217_728, description="pixels of one picture; 16384 x 8192")
     triangles: Annotated[int, Field(ge=1)] = Field(2_000_000, description="triangles of a mesh, all instances together")
     splats: Annotated[int, Field(ge=1)] = Field(3_000_000, description="Gaussians of a splat file")
-    instances: Annotated[int, Field(ge=1)] = Field(4096, description="times that meshes stand in a glTF scene")
+    instances: Annotated[int, Field(ge=1)] = Field(2000, description="times that meshes stand in a glTF scene")
     depth: Annotated[int, Field(ge=1, le=512)] = Field(64, description="how deep JSON or a glTF scene may nest")
     load_s: Positive = Field(120.0, description="loading of one piece of content is given up after this")
     recording_s: Annotated[float, Field(gt=0, le=1_000_000)] = Field(

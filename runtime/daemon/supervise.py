@@ -17,10 +17,11 @@ from runtime.daemon.notify import Notifier
 from runtime.daemon.reconfigure import Reconfiguration
 from runtime.daemon.server import StatusServer, open_status_server
 from runtime.daemon.signals import Signals
-from runtime.errors import PhasestackError, Stopped
+from runtime.errors import InputError, PhasestackError, Stopped, TransientError
 from runtime.frame.presenter import Presenter
 from runtime.records import RefreshAccount
 from runtime.support import logs
+from runtime.support.transient import MayPass, may_pass
 
 log = logging.getLogger("phasestack.daemon")
 
@@ -59,7 +60,9 @@ class Daemon:
             self._notifier.reloading()
             self._reload(presenter, None)
         while self._server is not None and not self._server.commands.empty():
-            self._carry_out(self._server.commands.get(), presenter)
+            command = self._server.commands.get()
+            if command.take():  # else it was refused meanwhile: never done later
+                self._carry_out(command, presenter)
         if self._change is not None and self._change.finished:
             change, self._change = self._change, None
             if not change.problem:
@@ -177,8 +180,6 @@ class Daemon:
             return
         self._change, self._asked_by = change, command
         presenter.solver.do(change.advance)
-        if command is not None:
-            command.begin()
 
     def _answer(self, command: Command | None, problem: str) -> None:
         """What became of a change: to who asked for it, to the log and to the status."""
@@ -220,8 +221,13 @@ def snapshot(run: Run | None, presenter: Presenter, account: RefreshAccount) -> 
         "eye_sigma_now_mm": account.eye_sigma_mm,
         "solution": account.solution,
         "solution_age_now_ms": account.solution_age_ms,
-        "rejected_samples": {"outlier": presenter.viewer.outliers, **presenter.viewer.dropped},
-        "sensor_hz": presenter.viewer.rate_hz,
+        "rejected_samples": {
+            "outlier": presenter.viewer.outliers,
+            **presenter.viewer.dropped,
+            **presenter.samples.refused_inputs,
+        },
+        "sensor_hz": presenter.viewer.rate_hz if "sensor" not in presenter.missing else None,
+        "log_lines_lost": logs.lost(),
         **stats.rates_now(),
         **counted,
     }
@@ -238,7 +244,21 @@ def run_daemon(
     quiet: bool,
     keep_light: int = 0,
 ) -> dict[str, Any]:
-    """The whole life of `phasestack run`; answers the summary. Raises FatalError."""
+    """The whole life of `phasestack run`; answers the summary.
+
+    Raises FatalError where the configuration or a file is wrong, TransientError where starting again may help.
+    """
+    try:
+        return _lived(config, overrides, frames, RunOptions(max_speed, out is not None, scale, keep_light), out, quiet)
+    except Exception as error:
+        if isinstance(error, TransientError) or not may_pass(error):
+            raise
+        raise MayPass(f"{error or type(error).__name__} (this may pass: start again)") from error
+
+
+def _lived(
+    config: Path | None, overrides: Overrides, frames: int | None, options: RunOptions, out: Path | None, quiet: bool
+) -> dict[str, Any]:
     settings = overrides.applied(load_settings(config))
     logs.configure(settings.service)
     clock = MonotonicClock()
@@ -247,26 +267,22 @@ def run_daemon(
         notifier = Notifier(clock)
         cleanup.callback(notifier.close)
         server = (
-            None if max_speed else open_status_server(settings.service, clock=clock, supervised=notifier.supervised)
+            None
+            if options.max_speed
+            else open_status_server(settings.service, clock=clock, supervised=notifier.supervised)
         )
         if server is not None:
             cleanup.callback(server.close)
-        metrics = None
-        if settings.service.metrics_port:
-            from runtime.daemon.metrics import Metrics
-
-            metrics = Metrics()
-            metrics.serve(settings.service.metrics_port)
-            cleanup.callback(metrics.close)
+        metrics = _metrics(settings.service.metrics_port, cleanup)
         daemon = Daemon(config, overrides, signals=signals, notifier=notifier, server=server, metrics=metrics)
         try:
             summary = drive(
                 settings,
-                RunOptions(max_speed=max_speed, measure=out is not None, scale=scale, keep_light=keep_light),
+                options,
                 out=out,
                 frames=frames,
                 total=frames,
-                progress=max_speed and not quiet,
+                progress=options.max_speed and not quiet,
                 supervisor=daemon,
                 wait_for_panels=daemon.wait_for_panels,
                 on_start=daemon.starting,
@@ -279,3 +295,19 @@ def run_daemon(
     if not quiet and not notifier.supervised and "frames" in summary:
         print_summary(summary, out)
     return summary
+
+
+def _metrics(port: int, cleanup: ExitStack) -> Any | None:
+    """None where they are off, or can't be served: the display does not go dark for its figures."""
+    if not port:
+        return None
+    from runtime.daemon.metrics import Metrics
+
+    metrics = Metrics()
+    try:
+        metrics.serve(port)
+    except InputError as error:
+        log.error("no metrics: %s", error)
+        return None
+    cleanup.callback(metrics.close)
+    return metrics

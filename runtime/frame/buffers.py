@@ -23,9 +23,9 @@ class LayerBuffers:
         if index == len(held):
             self._buffers.append((np.empty(layers.shape, np.uint8), _nobody))
         buffer = self._buffers[index][0]
-        view = buffer.view()
-        np.copyto(view, layers)
-        view.flags.writeable = False
+        np.copyto(buffer, layers)
+        # Not `buffer.view()`: a part of that would hold the buffer, and not the view that is asked about.
+        view: U8 = np.asarray(buffer.data.toreadonly())
         self._buffers[index] = buffer, weakref.ref(view)
         return view
 

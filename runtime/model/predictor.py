@@ -49,6 +49,11 @@ class Predictor(ABC):
         """How strongly it sharpens pictures against the blur of interpolation (`transfer.emphasised`)."""
         return 0.0
 
+    @property
+    def black_beside(self) -> bool:
+        """Whether still pictures end in black, not in their repeated edge."""
+        return False
+
     def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
         """Rows and columns of each raster that `predict` will look at: all of them, where it doesn't know better."""
         return tuple((slice(0, raster.height_px), slice(0, raster.width_px)) for raster in self.rasters(eyes_m))

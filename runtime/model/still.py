@@ -43,6 +43,7 @@ def solve_still(
                     rows=rows,
                     columns=columns,
                     cubic=predictor.interpolation == "cubic",
+                    black_beside=predictor.black_beside,
                 )
                 for raster, (rows, columns) in zip(rasters, windows, strict=True)
             ]
@@ -54,7 +55,16 @@ def solve_still(
     return Prediction(prediction.layers, stage_ms)
 
 
-def _warped(rgba: U8, image_from_raster: F64, raster: PlaneRaster, *, rows: slice, columns: slice, cubic: bool) -> U8:
+def _warped(
+    rgba: U8,
+    image_from_raster: F64,
+    raster: PlaneRaster,
+    *,
+    rows: slice,
+    columns: slice,
+    cubic: bool,
+    black_beside: bool,
+) -> U8:
     """A picture on a raster; only the given rows and columns are drawn."""
     import cv2
 
@@ -66,7 +76,7 @@ def _warped(rgba: U8, image_from_raster: F64, raster: PlaneRaster, *, rows: slic
         matrix,
         (columns.stop - columns.start, rows.stop - rows.start),
         flags=(cv2.INTER_CUBIC if cubic else cv2.INTER_LINEAR) | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
+        borderMode=cv2.BORDER_CONSTANT if black_beside else cv2.BORDER_REPLICATE,
     )
     return out
 
