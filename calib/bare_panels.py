@@ -6,7 +6,7 @@ from calib.keys import WindowKeys
 from runtime.clock import NS_PER_MS, MonotonicClock
 from runtime.config import PanelSettings, Settings
 from runtime.optics.stack import PanelStack
-from runtime.records import U8, LayerFrame
+from runtime.records import U8, PanelFrame
 
 SHOW_AGAIN_NS = 50 * NS_PER_MS
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -41,7 +41,7 @@ class BarePanels:
         """(N, H, W, 4) layers on all panels. Raises PanelLost."""
         self._layers = layers
         self._number += 1
-        self._sink.present(LayerFrame(self._number, layers))
+        self._sink.present(PanelFrame(self._number, layers, self._number))
 
     def again(self) -> None:
         """The same once more, a moment later: it takes in the windows' events and keeps them alive."""

@@ -19,7 +19,7 @@ from runtime.config import ModelSettings, Settings
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
-from runtime.records import U8, LayerFrame
+from runtime.records import U8, PanelFrame
 from runtime.support.artifacts import OutputFolder, write_json, write_png
 
 if TYPE_CHECKING:
@@ -214,7 +214,7 @@ class ChartDisplay:
         self._number += 1
         self._shown = chart
         layers = captioned(chart.layers, self._caption) if self._caption else chart.layers
-        self._sink.present(LayerFrame(self._number, layers))
+        self._sink.present(PanelFrame(self._number, layers, self._number))
 
     def caption(self, text: str) -> None:
         """A line of words below the chart; empty: none. Raises PanelLost."""

@@ -14,7 +14,7 @@ from calib.panel_figures import grey_figure
 from runtime.config import Settings
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, LayerFrame
+from runtime.records import F64, PanelFrame
 from runtime.support.artifacts import OutputFolder, write_bytes, write_text
 
 
@@ -88,6 +88,6 @@ def _screen(settings: Settings, stack: PanelStack, panel: int) -> tuple[Callable
         nonlocal number
         number += 1
         layers[panel, ..., :3] = round(255 * grey)
-        sink.present(LayerFrame(number, layers))
+        sink.present(PanelFrame(number, layers, number))
 
     return show, sink.close

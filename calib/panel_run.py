@@ -19,7 +19,7 @@ from runtime.clock import NS_PER_MS, MonotonicClock
 from runtime.config import Settings
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, U8, LayerFrame
+from runtime.records import F64, U8, PanelFrame
 from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_png, write_text
 
 POLL_NS = 30 * NS_PER_MS
@@ -76,7 +76,7 @@ def nudge_verniers(
         def present(layers: U8) -> None:
             nonlocal number
             number += 1
-            sink.present(LayerFrame(number, layers))
+            sink.present(PanelFrame(number, layers, number))
 
         if nudging.finished:
             typer.echo(f"{out}: every vernier has its setting already", err=True)

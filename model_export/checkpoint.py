@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
 import io
-import pickle
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,14 +23,19 @@ FAMILIES = {"subnets.": "eyereal", "lambda_net.": "spectral"}
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """The table that a checkpoint holds; it has at least `model`, a table of tensors. Raises InputError."""
+    """The table that a checkpoint holds; it has at least `model`, a table of tensors. Raises InputError.
+
+    Plain values, tensors, and the `args` of an argparse command line, which is a table of plain values again: the
+    published code saves its own. Nothing else is made, and no code of the file is run.
+    """
     try:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(path, "", f"cannot be read ({error.strerror})") from None
     try:
-        table = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError, OSError, TypeError) as error:
+        with torch.serialization.safe_globals([argparse.Namespace]):
+            table = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged pickle can raise anything
         raise InputError(path, "", f"is no checkpoint of plain weights ({_first_line(error)})") from None
     state = table.get("model") if isinstance(table, dict) else None
     if not isinstance(state, Mapping) or not state or not all(isinstance(v, Tensor) for v in state.values()):

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from model_export.checkpoint import load_eyereal, load_spectral, solver_of
-from model_export.eyereal import LEAST_PX, EyeRealNet
+from model_export.eyereal import LEAST_PX, OFFSET, PICTURE_FOV_DEG, EyeRealNet
 from model_export.network import SpectralSolver
 from model_export.onnx_files import eyereal_bytes, half_precision, quantised, spectral_bytes, with_contract
 from model_export.recipe import DESIGN_RANGE, Recipe, read_recipe
@@ -70,11 +70,14 @@ def spectral_model(request: ExportRequest) -> tuple[bytes, nn.Module]:
         net = solver_of(recipe, source=request.arch)
     else:
         net = solver_of(recipe, source=request.arch)
-    return spectral_file(net, recipe, precision=request.precision, opset=request.opset), net
+    trained = recipe.weights is not None
+    return spectral_file(net, recipe, precision=request.precision, opset=request.opset, trained=trained), net
 
 
-def spectral_file(net: SpectralSolver, recipe: Recipe, *, precision: str = "fp32", opset: int = OPSETS[0]) -> bytes:
-    """The ONNX file of a recipe's network, with its contract."""
+def spectral_file(
+    net: SpectralSolver, recipe: Recipe, *, precision: str = "fp32", opset: int = OPSETS[0], trained: bool = True
+) -> bytes:
+    """The ONNX file of a recipe's network, with its contract; `trained`: on the pairs of `phasestack train`."""
     data = spectral_bytes(net, cell_px=recipe.cell_px, opset=opset)
     if precision == "fp16":
         data = half_precision(data)
@@ -91,7 +94,7 @@ def spectral_file(net: SpectralSolver, recipe: Recipe, *, precision: str = "fp32
         output="outer",
         branch=2,
         value_range=(0.0, 1.0),
-        trained_for=DESIGN_RANGE,
+        trained_for=DESIGN_RANGE if trained else None,
         recipe_sha256=recipe.sha256(),
         precision=precision,
         parameters=_parameters(net),
@@ -133,8 +136,9 @@ def eyereal_model(request: ExportRequest) -> tuple[bytes, nn.Module]:
         eye_order=request.eye_order,
         output="panels",
         branch=1,
-        value_range=(-0.2, 0.8),
-        trained_for=DESIGN_RANGE,
+        value_range=(-OFFSET, 1 - OFFSET),
+        trained_for=None,  # a checkpoint does not tell what it was trained on
+        picture_fov_deg=PICTURE_FOV_DEG,
         recipe_sha256=origin.hexdigest(),
         width_px=0 if request.dynamic else request.width_px,
         height_px=0 if request.dynamic else request.height_px,

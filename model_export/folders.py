@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import cycle
+from itertools import cycle, islice
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from model_export.data import CENTRE, TrainingPair
+from model_export.eyereal import PICTURE_FOV_DEG
 from runtime.content.eyereal import Pair, read_folder
 from runtime.content.presets import preset
 from runtime.errors import InputError
@@ -18,7 +19,6 @@ from runtime.optics.views import image_from_raster
 from runtime.records import F64, U8
 from runtime.support.artifacts import read_image
 
-FOV_DEG = 40.0  # horizontal: what the published network takes its pictures to be
 PANELS = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 1920, 1080)
 
 
@@ -43,7 +43,9 @@ def _loaded(pair: Pair, stack: PanelStack) -> TrainingPair:
     pictures = [read_image(path) for path in pair.paths]
     if pictures[0].shape != pictures[1].shape:
         raise InputError(pair.paths[1], "size", f"differs from {pair.paths[0].name}")
-    left, right = (on_centre(picture, pair, side, stack, fov_deg=FOV_DEG) for side, picture in enumerate(pictures))
+    left, right = (
+        on_centre(picture, pair, side, stack, fov_deg=PICTURE_FOV_DEG) for side, picture in enumerate(pictures)
+    )
     return TrainingPair(stack, pair.eyes_m, (left, right), 0.0)
 
 
@@ -69,11 +71,17 @@ def on_centre(picture: U8, pair: Pair, side: int, stack: PanelStack, *, fov_deg:
     return np.asarray(warped, np.uint8)
 
 
-def mixed(procedural: Iterator[TrainingPair], pairs: Sequence[TrainingPair]) -> Iterator[TrainingPair]:
-    """Pairs of folders and procedural ones in turn; procedural alone where there are no others."""
+def mixed(
+    procedural: Iterator[TrainingPair], pairs: Sequence[TrainingPair], *, first: int = 0
+) -> Iterator[TrainingPair]:
+    """Pairs of folders and procedural ones in turn; procedural alone where there are no others.
+
+    first: which of the folders' pairs, in their endless row, is the first.
+    """
     if not pairs:
         yield from procedural
-    for pair, own in zip(procedural, cycle(pairs), strict=False):
+    begun = islice(cycle(pairs), first % max(len(pairs), 1), None)
+    for pair, own in zip(procedural, begun, strict=False):
         yield pair
         yield own
 

@@ -48,7 +48,9 @@ def with_contract(data: bytes, contract: Contract) -> bytes:
     """The same model with the metadata entry that the runtime asks for."""
     model = onnx.load_from_string(data)
     del model.metadata_props[:]
-    onnx.helper.set_model_props(model, {METADATA_KEY: contract.model_dump_json()})
+    # Only a network of whole pictures has a view of its own; the others' contracts don't speak of one.
+    text = contract.model_dump_json(exclude=None if contract.picture_fov_deg else {"picture_fov_deg"})
+    onnx.helper.set_model_props(model, {METADATA_KEY: text})
     return bytes(model.SerializeToString(deterministic=True))
 
 

@@ -59,11 +59,15 @@ def run_training(request: TrainRequest) -> dict[str, Any] | None:
         own = folder_pairs(request.data, scene=request.scene, **size)
         held_out = held_out_pairs(training.validation_pairs, **size)
         path = request.out / "checkpoint.pth"
-        first, points, before_s = _resumed(path, model, optimiser, recipe) if request.resume else (0, [], 0.0)
+        data = {"scene": request.scene if own else "", "pairs": len(own)}
+        first, points, before_s = _resumed(path, model, optimiser, recipe, data) if request.resume else (0, [], 0.0)
         start = time.monotonic()
         if not points:
             points = [Point(0, math.nan, *validate(model, held_out))]
-        stream = mixed(_share(training, first, world), own)
+        # What a process has taken in the steps before: with folders, every other pair is one of theirs.
+        taken = first * PAIRS_A_STEP
+        own_taken = taken // 2 if own else 0
+        stream = mixed(_share(training, taken - own_taken, world), own, first=own_taken)
         losses: list[float] = []
         with progress_bar(f"training {recipe.name}") as progress:
             for iteration in range(first, training.iterations):
@@ -77,7 +81,7 @@ def run_training(request: TrainRequest) -> dict[str, Any] | None:
                     losses = []
                     if world.rank == 0:
                         seconds = before_s + time.monotonic() - start
-                        _save(request.out, model, optimiser, recipe, done, points, seconds)
+                        _save(request.out, model, optimiser, recipe, done, points, seconds, data)
         if world.rank != 0:
             return None
         seconds = before_s + time.monotonic() - start
@@ -167,11 +171,11 @@ def _step(
     return total / used if used else math.nan
 
 
-def _share(training: Training, first: int, world: World) -> Iterator[TrainingPair]:
-    """This process's pairs from step `first` on: every `world.size`-th of the stream."""
+def _share(training: Training, taken: int, world: World) -> Iterator[TrainingPair]:
+    """This process's procedural pairs after the first `taken` of them: every `world.size`-th of the stream."""
     return endless_pairs(
         training.seed,
-        first=first * PAIRS_A_STEP * world.size + world.rank,
+        first=taken * world.size + world.rank,
         step=world.size,
         width_px=training.width_px,
         height_px=training.height_px,
@@ -187,6 +191,7 @@ def _save(
     iteration: int,
     points: Sequence[Point],
     seconds: float,
+    data: dict[str, Any],
 ) -> None:
     found = trained_recipe(model, recipe)
     write_text(out / "recipe.json", found.text())
@@ -200,26 +205,47 @@ def _save(
             "iteration": iteration,
             "points": [list(point.row()) for point in points],
             "seconds": seconds,
+            "data": data,
         },
     )
     write_curves(out, points, name=recipe.name)
 
 
 def _resumed(
-    path: Path, model: UnrolledSolver, optimiser: torch.optim.Optimizer, recipe: Recipe
+    path: Path, model: UnrolledSolver, optimiser: torch.optim.Optimizer, recipe: Recipe, data: dict[str, Any]
 ) -> tuple[int, list[Point], float]:
-    """(iteration, curve, seconds) that a checkpoint had reached; fills model and optimiser. Raises InputError."""
+    """(iteration, curve, seconds) that a checkpoint had reached; fills model and optimiser. Raises InputError.
+
+    data: the scene and number of the folders' pairs; what was trained with others would be no continuation.
+    """
     table = load_checkpoint(path)
     held = validated(Recipe, table.get("recipe") or {}, source=f"{path}: recipe")
     if (held.name, [s.kind for s in held.steps]) != (recipe.name, [s.kind for s in recipe.steps]):
         raise InputError(path, "recipe", f"was trained as {held.name}, which is not this recipe")
     if held.training.seed != recipe.training.seed:
         raise InputError(path, "recipe.training.seed", f"{held.training.seed}, but {recipe.training.seed} is asked for")
+    if table.get("data", data) != data:
+        asked, had = (f"{item['pairs']} pairs of --data" for item in (data, table["data"]))
+        raise InputError(path, "data", f"was trained with {had} ({table['data']['scene']}), not with {asked}")
+    iteration = table.get("iteration")
+    if not isinstance(iteration, int) or isinstance(iteration, bool) or iteration < 0:
+        raise InputError(path, "iteration", f"{iteration!r} is no number of steps")
     try:
         fill(model.net, table["model"], source=path, arch=recipe.name)
+        _check_optimiser(table["optimiser"], optimiser)
         model.sizes.data.copy_(table["sizes"])
         optimiser.load_state_dict(table["optimiser"])
         points = [Point(int(row[0]), *row[1:]) for row in table["points"]]
-        return int(table["iteration"]), points, float(table["seconds"])
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        return iteration, points, float(table["seconds"])
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, IndexError) as error:
         raise InputError(path, "", f"is no checkpoint that a training can be resumed from ({error})") from None
+
+
+def _check_optimiser(held: dict[str, Any], optimiser: torch.optim.Optimizer) -> None:
+    """Raise ValueError where the optimiser's saved state is not of these parameters: it would be broadcast to them."""
+    parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
+    for number, state in held["state"].items():
+        for name, value in state.items():
+            whole = isinstance(value, Tensor) and value.shape == parameters[number].shape
+            if not whole and not (name == "step" and (not isinstance(value, Tensor) or value.numel() == 1)):
+                raise ValueError(f"optimiser.state.{number}.{name} is not of the parameter's shape")

@@ -72,14 +72,7 @@ class EyesEstimate:
     eyes_m: F64 | None  # (2, 3) left, right; frame `stack`; None with label none
     label: EyesLabel
     age_ns: int = 0  # time_ns - capture_ns
-
-
-@dataclass(frozen=True, slots=True)
-class LayerFrame:
-    """What all panels show together."""
-
-    number: int  # frame number: all panels show the same
-    layers: U8  # (N, height_px, width_px, 4) RGBA, rear to front, before a panel's own LUT; alpha unused
+    sigma_m: float = 0.0  # standard deviation of an axis of the middle between the eyes, at that instant
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +90,12 @@ class PanelFrame:
 
 @dataclass(frozen=True, slots=True)
 class PresentReport:
-    """What presenting a LayerFrame came to."""
+    """What presenting a PanelFrame came to."""
 
     number: int
     present_ns: int  # when the last panel's light left, as well as it is known
     skew_ms: float  # between the first and the last panel
-    missed_vblanks: int = 0
+    vblank_ns: int | None = None  # the vertical blank that it was shown at, as well as it is known; None: no such thing
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,18 +109,60 @@ class PlanItem:
 
 
 @dataclass(frozen=True, slots=True)
-class FrameAccount:
-    """One turn of the loop, as frames.jsonl tells it."""
+class FrameTiming:
+    """When one refresh wakes, is presented and sends its light: a prediction, on the run's clock."""
+
+    id: int  # number of the refresh
+    wake_ns: int
+    present_ns: int  # the vertical blank, or where there is none the end of presenting
+    photon_ns: int  # the middle of the panels' light
+
+
+@dataclass(frozen=True, slots=True)
+class SolveRequest:
+    """What the presenter asks of the solver; a newer one takes the place of one that has not begun."""
+
+    time_ns: int  # the instant to solve for: the middle of the time that the solution will be shown
+    eyes_m: F64 | None  # (2, 3) left, right; frame `stack`; where they will be then; None: no viewer
+    eyes_label: EyesLabel
+    sigma_m: float  # how sure these eyes are: standard deviation of an axis
+    flat_wanted: bool  # the flat picture will be needed, or is shown
+    paused: bool = False  # nothing new is made
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Layers for one pair of eyes, or the flat picture; whoever holds it reads values that never change."""
+
+    number: int  # counts up from 1, flat pictures and solutions together
+    layers: U8  # (N, height_px, width_px, 4) RGBA, rear to front
+    solved_for_m: F64 | None  # (2, 3) left, right; frame `stack`; None: flat, for eyes anywhere
+    solved_for_ns: int  # the instant that it was made for; its content is of that instant
+    seeing: tuple[bool, bool] = (True, True)  # left, right: an eye that can't see the display gave way to the other
+    eye_sigma_mm: float | None = None  # how far off the eyes it was made to hold: pupil and tracker together
+    stage_ms: dict[str, float] = field(default_factory=dict)  # render, prepare, inference, finish; the run's clock
+    machine_ms: dict[str, float] = field(default_factory=dict)  # the same on the machine's clock
+
+
+@dataclass(frozen=True, slots=True)
+class RefreshAccount:
+    """One refresh, as frames.jsonl tells it (contract 5.2)."""
 
     frame: int
-    capture_ns: int
-    predicted_for_ns: int
+    capture_ns: int  # of the newest sample that the eyes are known from; 0: none
+    predicted_for_ns: int  # the light
     present_ns: int
-    eyes_m: F64 | None  # (2, 3), frame `stack`
+    eyes_m: F64 | None  # (2, 3) that the panels are aligned to; frame `stack`
     eyes_label: EyesLabel
+    eye_sigma_mm: float | None  # how sure they are; None without eyes
     state: State
-    inference: Inference
+    solution: int | None  # number of the solution that is shown; None: the flat picture alone
+    solved_for_m: F64 | None  # (2, 3)
+    solution_age_ms: float | None  # the light less the instant that the solution is for
+    inference: Inference  # ran: the first refresh that shows its solution; reused; skipped: no solution is shown
     presented: bool
     skew_ms: float
+    photon_ns: int = 0  # the light, from when it was really presented
+    true_eyes_m: F64 | None = None  # (2, 3) at the light, where the recording knows them
     stage_ms: dict[str, float] = field(default_factory=dict)  # on the run's clock
-    measured_ms: dict[str, float] = field(default_factory=dict)  # on the machine's clock, whatever the run's is
+    machine_ms: dict[str, float] = field(default_factory=dict)  # on the machine's clock, whatever the run's is

@@ -76,7 +76,7 @@ def soak(frames: int, *, warm: int, fault_every: int, report: bool = False) -> S
     """Run it. `warm` turns come before the first look at memory."""
     with (
         tempfile.TemporaryDirectory() as folder,
-        Rig(stack=SIZE, loop={"rate_hz": 10_000.0}, tracker={"hold_s": 1.0}) as rig,
+        Rig(stack=SIZE, loop={"rate_hz": 1000.0}, tracker={"hold_s": 1.0}) as rig,
     ):
         server = StatusServer(Path(folder) / "status.sock", group="root", clock=MonotonicClock())
         rig.loop._on_account = None  # the rig keeps every account: that alone would be a leak

@@ -10,17 +10,24 @@ import typer
 
 
 def config(
-    check: Annotated[Path | None, typer.Option(help="a configuration to validate instead of printing")] = None,
+    check: Annotated[
+        Path | None, typer.Option(help="a configuration to check instead of printing: values, names and files")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="defaults as one JSON object")] = False,
 ) -> None:
     """Print a complete configuration: every setting, its default and what it means. It is valid TOML.
 
     Example: phasestack config > phasestack.toml
+
+    Example: phasestack config --check phasestack.toml
     """
     from runtime.config import load_settings
 
     settings = load_settings(check)
     if check is not None:
+        from runtime.commands.names import check_names
+
+        check_names(settings, source=check)
         typer.echo(f"{check}: valid")
     elif as_json:
         typer.echo(json.dumps(settings.model_dump(mode="json")))

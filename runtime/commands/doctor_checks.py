@@ -126,6 +126,7 @@ def opengl(settings: Settings) -> Iterator[Row]:
 def monitors(settings: Settings) -> Iterator[Row]:
     """Each panel has its monitor."""
     from runtime.errors import InputError, PanelLost
+    from runtime.panels.modes import check_mode, refresh_difference
     from runtime.panels.monitors import bind, check_shape
     from runtime.panels.registry import panel_settings
 
@@ -146,12 +147,16 @@ def monitors(settings: Settings) -> Iterator[Row]:
     try:
         bound = bind(panels, there)
         for number, (panel, monitor) in enumerate(zip(panels, bound, strict=True)):
-            check_shape(number, panel, monitor, width_px=settings.stack.width_px, height_px=settings.stack.height_px)
+            size = {"width_px": settings.stack.width_px, "height_px": settings.stack.height_px}
+            check_shape(number, panel, monitor, **size)
+            check_mode(number, panel, monitor, **size, allow_rescaling=settings.output.allow_rescaling)
     except (InputError, PanelLost) as error:
         yield Row("panels", "fail", str(error), remedy)
         return
     for number, monitor in enumerate(bound):
         yield Row("panels", "ok", f"panel {number} is {monitor}")
+    if difference := refresh_difference(bound):
+        yield Row("panels", "warn", difference, "set them to the same mode")
 
 
 def model(settings: Settings) -> Iterator[Row]:

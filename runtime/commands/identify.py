@@ -73,7 +73,7 @@ def _write(settings: Settings, out: Path, panel: int) -> None:
     from runtime.clock import MonotonicClock
     from runtime.panels.offscreen import OffscreenPanels
     from runtime.panels.registry import panel_settings
-    from runtime.records import LayerFrame
+    from runtime.records import PanelFrame
     from runtime.support.artifacts import OutputFolder, write_png
     from runtime.support.gl import offscreen_context
 
@@ -88,7 +88,7 @@ def _write(settings: Settings, out: Path, panel: int) -> None:
         panels=panel_settings(settings.output, stack.count),
     )
     with OutputFolder(out) as folder:
-        panels.present(LayerFrame(0, alone(cards, panel)))
+        panels.present(PanelFrame(0, alone(cards, panel), 0))
         for index, picture in enumerate(panels.read_back()):
             write_png(folder.staging / f"monitor-{index}.png", picture)
     typer.echo(f"{stack.count} pictures in {out}")
@@ -137,7 +137,7 @@ def _ask(settings: Settings, config: Path) -> None:
     from calib.interview import Interview
     from calib.keys import TerminalKeys, WindowKeys, first_of
     from runtime.errors import InputError, PanelLost
-    from runtime.records import LayerFrame
+    from runtime.records import PanelFrame
 
     document = read_document(config)
     try:
@@ -155,7 +155,7 @@ def _ask(settings: Settings, config: Path) -> None:
         number = 0
         while not interview.finished:
             number += 1
-            panels.present(LayerFrame(number, alone(cards, interview.shown)))
+            panels.present(PanelFrame(number, alone(cards, interview.shown), number))
             key = poll()
             if key is not None:
                 interview.press(key)
@@ -227,11 +227,11 @@ def _hold(panels: PanelSink, cards: list[U8], order: list[int], seconds: float, 
 
     from calib.keys import Key
     from runtime.errors import PanelLost
-    from runtime.records import LayerFrame
+    from runtime.records import PanelFrame
 
     deadline = time.monotonic() + seconds if seconds else float("inf")
     lost, place, number = "", 0, 0
-    frame = LayerFrame(number, alone(cards, order[place]))
+    frame = PanelFrame(number, alone(cards, order[place]), number)
     if len(order) > 1:
         typer.echo("one panel at a time (Enter, n: the next; p: the one before; q: done)")
     try:
@@ -249,7 +249,7 @@ def _hold(panels: PanelSink, cards: list[U8], order: list[int], seconds: float, 
             if key in (Key.ACCEPT, Key.NEXT, Key.RIGHT, Key.PREVIOUS, Key.LEFT) and len(order) > 1:
                 place = (place + (-1 if key in (Key.PREVIOUS, Key.LEFT) else 1)) % len(order)
                 number += 1
-                frame = LayerFrame(number, alone(cards, order[place]))
+                frame = PanelFrame(number, alone(cards, order[place]), number)
             elif key is None:
                 _pause()
     except KeyboardInterrupt:

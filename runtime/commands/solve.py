@@ -23,9 +23,9 @@ def solve(
     fov: Annotated[float, typer.Option(help="the pictures' horizontal field of view, degrees")] = 40.0,
     model: Annotated[str, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = "balanced",
     repeat: Annotated[int, typer.Option(min=1, max=10000, help="timed runs, after the warm-up")] = 1,
-    tolerance_mm: Annotated[
-        float | None, typer.Option(min=0, help="how far off the eyes the picture should still hold; 0: exact")
-    ] = None,
+    eye_sigma_mm: Annotated[
+        float, typer.Option(min=0, max=1000, help="how unsure the eyes are, mm an axis; 1: a pupil; 0: two points")
+    ] = 1.0,
     config: Annotated[Path | None, typer.Option(help="configuration, for the model's settings")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="solve.json's object on stdout")] = False,
 ) -> None:
@@ -37,12 +37,18 @@ def solve(
     from runtime.commands.solving import SolveRequest, solve_pair
 
     result = solve_pair(
-        SolveRequest(left, right, left_eye, right_eye, fov, panels, out, model, repeat, tolerance_mm, config)
+        SolveRequest(left, right, left_eye, right_eye, fov, panels, out, model, repeat, eye_sigma_mm, config)
     )
     if as_json:
         typer.echo(json.dumps(result))
     else:
+        expected = ", ".join(
+            f"{value:.2f} dB {who}"
+            for who, value in zip(("a pupil (1 mm)", "a tracker (2 mm)"), result["expected_db"].values(), strict=True)
+            if value is not None
+        )
         typer.echo(
-            f"{result['model']}: displayed {result['psnr_db']:.2f} dB, SSIM {result['ssim']:.4f}; "
+            f"{result['model']}: displayed {result['psnr_db']:.2f} dB to two points, SSIM {result['ssim']:.4f}; "
+            f"{f'expected: {expected}; ' if expected else ''}"
             f"{result['total_ms']:.1f} ms in all, {result['inference_ms']:.1f} ms of it the network; {out}"
         )

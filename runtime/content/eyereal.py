@@ -16,7 +16,7 @@ from runtime.optics.views import image_from_stack
 from runtime.records import F64, U8
 from runtime.support.artifacts import read_image
 
-NAME = re.compile(r"pair(\d+)_x(-?[\d.]+)_y(-?[\d.]+)_z(-?[\d.]+)_([01])\.(?:jpg|jpeg|png)$", re.IGNORECASE)
+NAME = re.compile(r"pair(\d+)_x(-?[\d.]+)_y(-?[\d.]+)_z(-?[\d.]+)_([01]|left|right)\.(?:jpg|jpeg|png)$", re.IGNORECASE)
 KEPT = 4  # pairs in memory
 
 
@@ -45,11 +45,12 @@ def is_data_set(folder: Path) -> bool:
 def read_folder(folder: Path, preset: Preset) -> tuple[Pair, ...]:
     """Every pair, by number. Raises InputError: no pair, half a pair, coordinates that are no eye.
 
-    Names hold the eyes in the scene's digital units; which one is left is told by geometry. preset: in the published
-    code's reading, which drew the pictures.
+    Names hold the eyes in the scene's digital units. Of `_0` and `_1` geometry tells which one is left; `_left` and
+    `_right`, of the set's newer data, say so, and geometry must agree. preset: in the published code's reading, which
+    drew the pictures.
     """
     stack_from_scene: F64 = np.linalg.inv(preset.scene_from_stack).astype(np.float64)
-    found: dict[int, dict[int, tuple[Path, F64]]] = {}
+    found: dict[int, dict[str, tuple[Path, F64]]] = {}
     for path in sorted(folder.iterdir()):
         match = NAME.match(path.name)
         if not match:
@@ -64,22 +65,25 @@ def read_folder(folder: Path, preset: Preset) -> tuple[Pair, ...]:
                 path, "name", f"its eye is behind the display (x = {eye[0]:.3f} m) with preset {preset.name}"
             )
         halves = found.setdefault(int(match[1]), {})
-        if int(match[5]) in halves:
-            raise InputError(
-                path, f"pair{int(match[1])}", f"_{match[5]} is there twice, as {halves[int(match[5])][0].name} too"
-            )
-        halves[int(match[5])] = (path, eye)
+        half = match[5].lower()
+        if half in halves:
+            raise InputError(path, f"pair{int(match[1])}", f"_{half} is there twice, as {halves[half][0].name} too")
+        halves[half] = (path, eye)
     if not found:
         raise InputError(folder, "", "holds no pair0_x.._y.._z.._0.jpg")
     pairs = []
     for number, halves in sorted(found.items()):
-        missing = {0, 1} - set(halves)
-        if missing:
-            path = next(iter(halves.values()))[0]
-            raise InputError(path, f"pair{number}", f"has no _{missing.pop()} beside it")
-        (first, first_eye), (second, second_eye) = halves[0], halves[1]
+        names = ("left", "right") if "left" in halves or "right" in halves else ("0", "1")
+        path = next(iter(halves.values()))[0]
+        if missing := [name for name in names if name not in halves]:
+            raise InputError(path, f"pair{number}", f"has no _{missing[0]} beside it")
+        if surplus := [name for name in halves if name not in names]:
+            raise InputError(path, f"pair{number}", f"has _{surplus[0]} beside _left and _right")
+        (first, first_eye), (second, second_eye) = (halves[name] for name in names)
         if first_eye[1] == second_eye[1]:
             raise InputError(first, f"pair{number}", "both eyes are at the same y: left can't be told from right")
+        if first_eye[1] > second_eye[1] and names[0] == "left":
+            raise InputError(first, f"pair{number}", f"_left stands to the right of _right with preset {preset.name}")
         if first_eye[1] > second_eye[1]:
             first, second, first_eye, second_eye = second, first, second_eye, first_eye
         pairs.append(Pair(number, (first, second), np.array([first_eye, second_eye]), stack_from_scene[:3, 3]))

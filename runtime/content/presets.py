@@ -20,7 +20,7 @@ PANELS = 3
 ASPECT = 1080 / 1920
 CM = 0.01
 
-Reading = Literal["seed", "published-code"]
+Reading = Literal["seed", "published-code", "published-training"]
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 Triple = tuple[float, float, float]
 
@@ -107,7 +107,10 @@ def preset(name: str, reading: Reading = "seed") -> Preset:
 
     `seed`: r_p2d, rotation and translation as printed; d_thick is the whole depth, so that three panels are
     d_thick/2 apart; light-field = R·scene/(100 r_p2d) + t, metres.
-    `published-code`: that code's scale; d_thick is the gap; the scene's own axes, and its panels' place in the scene.
+    `published-code`: that code's scale; d_thick is the gap; the scene's own axes, and its panels' place in the scene,
+    as it evaluates and infers.
+    `published-training`: the same without `shift`, which its training leaves out wherever it has no part along x: a
+    network trained there knows matrixcity and room_floor so.
     """
     file = preset_file()
     if name not in file.scene:
@@ -127,7 +130,8 @@ def preset(name: str, reading: Reading = "seed") -> Preset:
         scale_per_m = published.scale_per_cm / CM
         scene_from_stack = np.eye(4)
         scene_from_stack[:3, :3] = axes * scale_per_m
-        scene_from_stack[:3, 3] = np.array(published.shift) + axes[:, 0] * published.middle
+        shift = np.array(published.shift if reading == "published-code" or published.shift[0] else (0.0, 0.0, 0.0))
+        scene_from_stack[:3, 3] = shift + axes[:, 0] * published.middle
         gap_m, width_m = published.thickness_cm * CM, published.width_cm * CM
     return Preset(
         name=name,

@@ -111,8 +111,9 @@ def _eyereal(path: Path, settings: ContentSettings, chosen: Preset | None) -> Op
     name = chosen.name if chosen else next((known for known in preset_names() if known in path.resolve().name), "")
     if not name:
         raise InputError(path, "name", "names no preset: set content.scene to one and content.file to the folder")
-    # The data set was drawn by the published code: its scale holds in either reading.
-    pairs = read_folder(path, preset(name, "published-code"))
+    # The data set was drawn by the published code: its scale holds in every reading.
+    reading = "published-code" if settings.reading == "seed" else settings.reading
+    pairs = read_folder(path, preset(name, reading))
     source = EyeRealSource(pairs, fov_deg=settings.fov_deg, background=settings.background, name=name)
     return lambda context: source
 

@@ -123,3 +123,24 @@ def combined(models: tuple[Model, ...]) -> tuple[Vector, Vector]:
         x, y, z = x + share * m.x, y + share * m.y, z + share * m.z
         u, v, w = u + share * m.u, v + share * m.v, w + share * m.w
     return (x, y, z), (u, v, w)
+
+
+def deviation(models: tuple[Model, ...], ahead_s: float, *, acceleration: Sequence[float]) -> float:
+    """Standard deviation of an axis of the models' common position, metres, so many seconds ahead.
+
+    The mixture's: each model's own variance carried on, and the spread of what they predict (shared among the axes).
+    """
+    x, y, z = (
+        sum(m.weight * (place + speed * ahead_s) for m, place, speed in zip(models, places, speeds))
+        for places, speeds in (
+            ([m.x for m in models], [m.u for m in models]),
+            ([m.y for m in models], [m.v for m in models]),
+            ([m.z for m in models], [m.w for m in models]),
+        )
+    )
+    variance = 0.0
+    for m, q in zip(models, acceleration):
+        own = m.var_position + ahead_s * (2 * m.covariance + ahead_s * (m.var_velocity + q * ahead_s / 3))
+        dx, dy, dz = m.x + m.u * ahead_s - x, m.y + m.v * ahead_s - y, m.z + m.w * ahead_s - z
+        variance += m.weight * (own + (dx * dx + dy * dy + dz * dz) / 3)
+    return math.sqrt(max(variance, VARIANCE_FLOOR))

@@ -36,6 +36,7 @@ class RestWatch:
         self._count = 0
         self.place: F64 | None = None  # (2, 3) the resting eyes, the same array as long as they rest; None: they move
         self.noise_m = 0.0  # standard deviation of one sample, laterally; the worse axis of the worse eye
+        self.sigma_m = 0.0  # how sure `place` is: standard deviation of an axis, with the drift that it may have made
 
     def update(self, eyes_m: F64, *, capture_ns: int) -> None:
         """One sample (2, 3), any frame whose x points from the display to the viewer (`stack`)."""
@@ -51,13 +52,13 @@ class RestWatch:
             self._measure_noise()
         if self.place is None:
             if self._stands():
-                self.place = self._median_since(capture_ns - REST_NS)
+                self._settle(capture_ns - REST_NS)
         elif self._left(self.place):
             # What lies before the motion says nothing of where it will end.
             self._keep_last(2)
             self.place = None
         elif slow_checks and self._drifted(self.place):
-            self.place = self._median_since(capture_ns - DRIFT_NS)
+            self._settle(capture_ns - DRIFT_NS)
 
     def forget(self) -> None:
         """The face was lost, or the clock jumped."""
@@ -80,9 +81,13 @@ class RestWatch:
         first = min(int(np.searchsorted(self._times[: self._count], time_ns)), self._count - FEWEST)
         return self._eyes[first : self._count]
 
-    def _median_since(self, time_ns: int) -> F64:
-        place: F64 = np.median(self._since(time_ns), axis=0)
-        return place
+    def _settle(self, since_ns: int) -> None:
+        recent = self._since(since_ns)
+        self.place = np.median(recent, axis=0)
+        # A median is a quarter less sure than a mean; what drifts is renewed beyond this (`_drifted`), even below it.
+        unsure_m = 1.25 * self.noise_m / len(recent) ** 0.5
+        drift_m = self._most_m + 2 * 1.25 * self.noise_m * (4 / max(len(recent), FEWEST)) ** 0.5
+        self.sigma_m = float(np.hypot(unsure_m, drift_m / 3**0.5))
 
     def _measure_noise(self) -> None:
         """From second differences: an even motion does not count."""

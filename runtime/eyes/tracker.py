@@ -123,8 +123,15 @@ class Tracker:
         reach_m = 4 * self.settings.noise_m + self.settings.speed_max * (capture_ns - then_ns) / NS_PER_S
         return math.dist(middle, then) <= reach_m
 
+    def ahead(self, time_ns: int) -> EyesEstimate:
+        """As `at`, for an instant that is not (yet) shown: what `at` answers later does not depend on it."""
+        asked_ns = self._asked_ns
+        estimate = self.at(time_ns)
+        self._asked_ns = asked_ns
+        return estimate
+
     def at(self, time_ns: int) -> EyesEstimate:
-        """Where the eyes are at an instant of the samples' clock.
+        """Where the eyes are at an instant of the samples' clock that is shown.
 
         exact: a sample was taken then; interpolated: between two samples; predicted: after the newest, at
         most `horizon_max_s` ahead; held: the face is lost, the eyes drift to rest; none: never seen, lost
@@ -148,18 +155,23 @@ class Tracker:
             label, ahead_s = "held", known_s + rest_s * -math.expm1(-(ahead_s - known_s) / rest_s)
         elif age_s > self.settings.loss_s:
             label = "held"
-        return EyesEstimate(time_ns, newest.capture_ns, self._eyes(newest, ahead_s, time_ns), label, age_ns)
+        eyes = self._eyes(newest, ahead_s, time_ns)
+        return EyesEstimate(time_ns, newest.capture_ns, eyes, label, age_ns, self._sigma_m(newest, ahead_s))
+
+    def _sigma_m(self, sample: _Sample, ahead_s: float) -> float:
+        return imm.deviation(sample.middle, ahead_s, acceleration=self.settings.acceleration)
 
     def _past(self, time_ns: int, age_ns: int) -> EyesEstimate:
         index = bisect_left(self._history, time_ns, key=lambda sample: sample.capture_ns)
         after = self._history[index]
         if after.capture_ns == time_ns:
             eyes = self._eyes(after, 0.0, time_ns)
-            return EyesEstimate(time_ns, time_ns, eyes, "exact", 0)
+            return EyesEstimate(time_ns, time_ns, eyes, "exact", 0, self._sigma_m(after, 0.0))
         before = self._history[index - 1]
         weight = (time_ns - before.capture_ns) / (after.capture_ns - before.capture_ns)
         eyes = (1 - weight) * self._eyes(before, 0.0, time_ns) + weight * self._eyes(after, 0.0, time_ns)
-        return EyesEstimate(time_ns, after.capture_ns, eyes, "interpolated", time_ns - after.capture_ns)
+        sigma_m = self._sigma_m(after, 0.0)
+        return EyesEstimate(time_ns, after.capture_ns, eyes, "interpolated", time_ns - after.capture_ns, sigma_m)
 
     def _eyes(self, sample: _Sample, ahead_s: float, time_ns: int) -> F64:
         eyes = _eyes(sample.middle, sample.half, ahead_s)

@@ -21,6 +21,8 @@ class Conditions:
     presented: bool  # True once any frame has been on the panels
     flat_wanted: bool = False  # the operator asked for the 2D picture
     stopping: str = ""  # why the daemon stops; empty: it does not
+    limited: str = ""  # why the alignment to the eyes is at its limit; empty: it is not
+    paused: bool = False  # the operator froze the picture; it is still aligned to the eyes
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,9 +49,12 @@ def judge(conditions: Conditions) -> tuple[State, str]:
         return State.FLAT, "asked for"
     if conditions.eyes == "none":
         return State.FLAT, "no viewer"
+    remarks = ["the picture is paused"] if conditions.paused else []
+    if conditions.limited:
+        remarks.append(f"alignment at its limit until the next solution: {conditions.limited}")
     if conditions.eyes == "held":
-        return State.HOLDING, "eyes lost, the last ones are held"
-    return State.TRACKING, "eyes seen"
+        return State.HOLDING, "; ".join(["eyes lost, the last ones are held", *remarks])
+    return State.TRACKING, "; ".join(["eyes seen", *remarks])
 
 
 class StateMachine:
@@ -77,9 +82,10 @@ class StateMachine:
         before = self.name
         self.state, reason = judge(conditions)
         self.missing = tuple(part for part in PARTS if part in conditions.missing)
+        self.reason = reason
         if self.name == before:
             return None
-        self.reason, self.since_ns = reason, now_ns
+        self.since_ns = now_ns
         return Transition(before, self.name, reason, now_ns)
 
     def seconds(self, *, now_ns: int) -> dict[str, float]:

@@ -1,20 +1,21 @@
-"""What a run came to: bounded memory however long it lasts."""
+"""What a run came to: bounded memory however long it lasts. All times are the run's clock's, but for `overhead_ms`."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from runtime.records import FrameAccount
+from runtime.clock import NS_PER_MS, NS_PER_S
+from runtime.frame.timing import SOLVING_STAGES, STAGES
+from runtime.records import RefreshAccount
 
-STAGES = ("sensor", "track", "render", "prepare", "inference", "finish", "present", "wait")
-NOT_OVERHEAD = ("render", "prepare", "inference", "finish", "present", "wait")
-SOLVING = ("render", "prepare", "inference", "finish")  # what a frame that is presented again does without
-WINDOW = 8192  # turns that quantiles are taken over
+WINDOW = 8192  # values that quantiles are taken over
+NOW_NS = NS_PER_S  # rates "now" are those of the last second
+NOW_KEPT = 1024
+OVERHEAD_STAGES = ("sensor", "track")
 
 
 class Ring:
@@ -28,11 +29,11 @@ class Ring:
         self._values[self._count % self._values.size] = value
         self._count += 1
 
-    def quantiles(self, names: Iterable[str]) -> dict[str, float]:
-        """`p50`, `p95`, `p99`, `max`, ... of what is held; empty before the first value."""
+    def quantiles(self, names: Iterable[str]) -> dict[str, float] | None:
+        """`p50`, `p95`, `p99`, `max`, ... of what is held; None before the first value."""
         held = self._values[: min(self._count, self._values.size)]
         if held.size == 0:
-            return {}
+            return None
         return {
             name: round(float(held.max() if name == "max" else np.percentile(held, float(name[1:]))), 4)
             for name in names
@@ -40,67 +41,93 @@ class Ring:
 
 
 class RunStats:
-    """Counters and quantiles of a run, fed one FrameAccount a turn."""
+    """Counters and quantiles of a run, fed one account a refresh."""
 
     def __init__(self) -> None:
-        self.frames = self.presented = self.dropped = self.inferences = 0
-        self.missed_vblanks = 0
+        self.frames = self.presented = self.dropped = self.solutions = self.missed_blanks = 0
         self.faults: dict[str, int] = {}
-        self._times_s: deque[float] = deque(maxlen=60)
+        self._first_ns = self._last_ns = -1
+        self._last_presented_ns = -1
         self._stages = {stage: Ring() for stage in STAGES}
-        self._solving = {"ran": Ring(), "reused": Ring()}
-        self._overhead, self._skew, self._latency = Ring(), Ring(), Ring()
+        self._interval, self._photon, self._overhead = Ring(), Ring(), Ring()
+        self._overhead_run, self._skew, self._age, self._sigma = Ring(), Ring(), Ring(), Ring()
+        self._recent: deque[tuple[int, bool, bool]] = deque(maxlen=NOW_KEPT)  # when, presented, a new solution
 
-    def add(self, account: FrameAccount, *, turn_ms: float) -> None:
-        """One turn; `turn_ms` is its whole duration on the machine's clock, evaluation left out."""
+    def add(self, account: RefreshAccount, *, overhead_ms: float, missed_blanks: int = 0) -> None:
+        """One refresh; overhead_ms: its own work on the machine's clock, presenting and waiting left out."""
+        now_ns, ran = account.present_ns, account.inference == "ran"
+        self._first_ns = now_ns if self._first_ns < 0 else self._first_ns
+        self._last_ns = now_ns
         self.frames += 1
         self.presented += account.presented
-        if account.presented:
-            self._times_s.append(perf_counter())
         self.dropped += not account.presented
-        self.inferences += account.inference == "ran"
-        for stage, ring in self._stages.items():
-            ring.add(account.measured_ms.get(stage, 0.0))
-        if account.inference in self._solving and self.frames > 1:
-            self._solving[account.inference].add(sum(account.measured_ms.get(stage, 0.0) for stage in SOLVING))
-        if self.frames > 1:  # the first turn pays for what is allocated once
-            spent = sum(account.measured_ms.get(stage, 0.0) for stage in NOT_OVERHEAD)
-            self._overhead.add(max(0.0, turn_ms - spent))
-        if account.presented:
-            self._skew.add(account.skew_ms)
-            if account.capture_ns:
-                self._latency.add((account.present_ns - account.capture_ns) / 1e6)
+        self.solutions += ran
+        self.missed_blanks = missed_blanks
+        self._recent.append((now_ns, account.presented, ran))
+        for stage, spent_ms in account.stage_ms.items():
+            self._stages[stage].add(spent_ms)
+        if self.frames > 1:  # the first pays for what is allocated once
+            self._overhead.add(overhead_ms)
+            self._overhead_run.add(sum(account.stage_ms.get(stage, 0.0) for stage in OVERHEAD_STAGES))
+        if not account.presented:
+            self._last_presented_ns = -1
+            return
+        if self._last_presented_ns >= 0:
+            self._interval.add((now_ns - self._last_presented_ns) / NS_PER_MS)
+        self._last_presented_ns = now_ns
+        self._skew.add(account.skew_ms)
+        if account.capture_ns:
+            self._photon.add((account.photon_ns - account.capture_ns) / NS_PER_MS)
+        if account.solution_age_ms is not None:
+            self._age.add(account.solution_age_ms)
+        if account.eye_sigma_mm is not None:
+            self._sigma.add(account.eye_sigma_mm)
+
+    def seconds(self) -> float:
+        """From the first refresh to the last."""
+        return (self._last_ns - self._first_ns) / NS_PER_S if self.frames else 0.0
 
     def reuse_saves_ms(self) -> float | None:
-        """Median of a frame that was solved less that of one presented again; None before there are both."""
-        medians = [ring.quantiles(("p50",)).get("p50") for ring in self._solving.values()]
-        ran, reused = medians
-        return None if ran is None or reused is None else ran - reused
+        """What a refresh that shows a solution again does without; None before there was a solution."""
+        medians = [self._stages[stage].quantiles(("p50",)) for stage in SOLVING_STAGES]
+        known = [median["p50"] for median in medians if median is not None]
+        return sum(known) if known and self.presented > self.solutions > 0 else None
 
-    def recent_fps(self) -> float:
-        """Presented frames a second over the last turns."""
-        if len(self._times_s) < 2:
-            return 0.0
-        return (len(self._times_s) - 1) / max(self._times_s[-1] - self._times_s[0], 1e-9)
+    def rates_now(self) -> dict[str, float | None]:
+        """Refreshes and solutions a second, over the last second; None where too little has happened."""
+        recent = [entry for entry in self._recent if entry[0] > self._last_ns - NOW_NS]
+        if len(recent) < 2:
+            return {"fps_now": None, "solutions_per_s_now": None}
+        span_s = max((recent[-1][0] - recent[0][0]) / NS_PER_S, 1e-9)
+        return {
+            "fps_now": round(sum(presented for _, presented, _ in recent[1:]) / span_s, 2),
+            "solutions_per_s_now": round(sum(ran for _, _, ran in recent[1:]) / span_s, 2),
+        }
 
     def fault(self, part: str) -> None:
         """A fault that the run lives on with."""
         self.faults[part] = self.faults.get(part, 0) + 1
 
-    def summary(self, *, seconds: float, stale_inputs: int) -> dict[str, Any]:
-        """The part of summary.json that is counted (design 5.2)."""
+    def summary(self, *, stale_inputs: int, simulated: bool = False) -> dict[str, Any]:
+        """The counted part of summary.json (contract 5.2); what was not measured is None."""
+        seconds = self.seconds()
+        stages = {stage: ring.quantiles(("p50", "p95", "p99", "max")) for stage, ring in self._stages.items()}
         return {
             "frames": self.frames,
             "presented": self.presented,
             "dropped": self.dropped,
             "stale_inputs": stale_inputs,
-            "inferences": self.inferences,
+            "inferences": self.solutions,
             "seconds": round(seconds, 3),
-            "fps": round(self.presented / seconds, 2) if seconds > 0 else 0.0,
-            "stage_ms": {stage: ring.quantiles(("p50", "p95", "p99", "max")) for stage, ring in self._stages.items()},
-            "overhead_ms": self._overhead.quantiles(("p50", "p99")),
+            "fps": round((self.presented - 1) / seconds, 2) if seconds > 0 else None,
+            "solutions_per_s": round(self.solutions / seconds, 2) if seconds > 0 else None,
+            "stage_ms": stages,
+            "interval_ms": self._interval.quantiles(("p50", "p99")),
+            "photon_ms": self._photon.quantiles(("p50", "p99")),
+            "overhead_ms": (self._overhead_run if simulated else self._overhead).quantiles(("p50", "p99")),
             "skew_ms": self._skew.quantiles(("p50", "p99", "max")),
-            "latency_ms": self._latency.quantiles(("p50", "p95", "p99")),
-            "missed_vblanks": self.missed_vblanks,
+            "solution_age_ms": self._age.quantiles(("p50", "p99")),
+            "eye_sigma_mm": self._sigma.quantiles(("p50", "p99")),
+            "missed_blanks": self.missed_blanks,
             "faults": dict(self.faults),
         }

@@ -1,54 +1,58 @@
-"""Time of the stages of one turn, on the machine's clock and on the run's."""
+"""Time of the stages of one refresh or one solution, on the machine's clock and on the run's."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from time import perf_counter_ns
 
 from runtime.clock import NS_PER_MS, Clock, SimulatedClock
 
+REFRESH_STAGES = ("sensor", "track", "present", "wait")
+SOLVING_STAGES = ("render", "prepare", "inference", "finish")
+STAGES = ("sensor", "track", *SOLVING_STAGES, "present", "wait")
 
-class StageTimes:
-    """Laps of one turn. On a simulated clock each stage takes what the configuration says, and no more."""
 
-    def __init__(self, clock: Clock, simulated_ms: dict[str, float]) -> None:
-        self._clock, self._simulated_ms = clock, simulated_ms
+class RefreshTimes:
+    """Laps of one refresh. On a simulated clock each stage takes what the configuration says, and time passes."""
+
+    def __init__(self, clock: Clock, simulated_ms: Mapping[str, float]) -> None:
+        self._simulated = clock if isinstance(clock, SimulatedClock) else None
+        self._simulated_ms = simulated_ms
         self.stage_ms: dict[str, float] = {}
-        self.measured_ms: dict[str, float] = {}
+        self.machine_ms: dict[str, float] = {}
         self._start_ns = self._last_ns = perf_counter_ns()
-        self._left_out_ns = 0
+
+    @property
+    def simulated(self) -> bool:
+        """True where time passes only as the configuration says."""
+        return self._simulated is not None
 
     def lap(self, stage: str) -> None:
         """What happened since the last lap was `stage`."""
         now_ns = perf_counter_ns()
-        self._add(stage, (now_ns - self._last_ns) / NS_PER_MS)
+        self.machine_ms[stage] = self.machine_ms.get(stage, 0.0) + (now_ns - self._last_ns) / NS_PER_MS
         self._last_ns = now_ns
-
-    def laps(self, split_ms: dict[str, float], *, rest: str) -> None:
-        """What happened since the last lap was several stages; `rest` takes what they don't account for."""
-        now_ns = perf_counter_ns()
-        spent_ms = (now_ns - self._last_ns) / NS_PER_MS
-        self._last_ns = now_ns
-        left_ms = max(0.0, spent_ms - sum(split_ms.values()))
-        for stage, stage_ms in split_ms.items():
-            self._add(stage, stage_ms + (left_ms if stage == rest else 0.0))
-
-    def leave_out(self) -> None:
-        """What happened since the last lap is no part of the turn (measuring quality, say)."""
-        now_ns = perf_counter_ns()
-        self._left_out_ns += now_ns - self._last_ns
-        self._last_ns = now_ns
-
-    def turn_ms(self) -> float:
-        """The turn so far, on the machine's clock."""
-        return (perf_counter_ns() - self._start_ns - self._left_out_ns) / NS_PER_MS
-
-    def _add(self, stage: str, measured_ms: float) -> None:
-        self.measured_ms[stage] = self.measured_ms.get(stage, 0.0) + measured_ms
-        if isinstance(self._clock, SimulatedClock):
-            # `wait` passes on the simulated clock by itself.
+        if self._simulated is None:
+            self.stage_ms[stage] = self.machine_ms[stage]
+        elif stage not in self.stage_ms:
             cost_ms = self._simulated_ms.get(stage, 0.0)
-            if stage not in self.stage_ms and stage != "wait":
-                self._clock.advance_ns(round(cost_ms * NS_PER_MS))
+            if stage != "wait":  # waiting passes on the simulated clock by itself
+                self._simulated.advance_ns(round(cost_ms * NS_PER_MS))
             self.stage_ms[stage] = cost_ms
-        else:
-            self.stage_ms[stage] = self.measured_ms[stage]
+
+    def overhead_ms(self) -> float:
+        """The refresh so far, less presenting and waiting; on the machine's clock."""
+        whole_ms = (perf_counter_ns() - self._start_ns) / NS_PER_MS
+        return max(0.0, whole_ms - self.machine_ms.get("present", 0.0) - self.machine_ms.get("wait", 0.0))
+
+
+class Stopwatch:
+    """Milliseconds since it was made or last asked, on the machine's clock."""
+
+    def __init__(self) -> None:
+        self._last_ns = perf_counter_ns()
+
+    def lap_ms(self) -> float:
+        now_ns = perf_counter_ns()
+        spent_ms, self._last_ns = (now_ns - self._last_ns) / NS_PER_MS, now_ns
+        return spent_ms

@@ -62,7 +62,7 @@ class Contract(Section):
     output: Literal["panels", "outer"]
     branch: Literal[1, 2]
     value_range: tuple[float, float]
-    trained_for: TrainedFor
+    trained_for: TrainedFor | None = Field(description="null: not known, or not trained")
     recipe_sha256: str
     width_px: int = Field(0, description="fixed input width; 0: any")
     height_px: int = Field(0, description="fixed input height; 0: any")
@@ -73,6 +73,9 @@ class Contract(Section):
     emphasis: Annotated[float, Field(ge=0, le=0.5)] = Field(
         0.0,
         description="strength of the sharpening that undoes the blur of interpolation, on the way in and in the eye",
+    )
+    picture_fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
+        0.0, description="horizontal view of the pictures it was trained on, black beside them; 0: whatever is drawn"
     )
     interpolation: Literal["linear", "cubic"] = Field("linear", description="how still pictures are warped")
     steps: Steps = ()

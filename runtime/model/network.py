@@ -14,14 +14,17 @@ from runtime.model.resample import buffer, resample, target_from_source
 from runtime.model.session import ModelSession
 from runtime.model.timing import Stopwatch
 from runtime.optics.malus import phase_from_intensity
+from runtime.optics.pupil import POINT_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.views import image_from_raster, image_from_stack
 from runtime.records import F32, F64, U8
 
 
 class NetworkPredictor(Predictor):
     """Models of `input_frame` panel (one picture per eye and panel) or centre (one per eye), layout NCHW.
 
-    Channels are panel-major, then eye, then RGB. Where the model answers with the outer panels alone, the centre
+    Channels are panel-major, then eye, then RGB; black beside what an eye's picture of the contract's field of view
+    covers, as the network was trained. Where the model answers with the outer panels alone, the centre
     is closed here, as the weighted mean of what each eye lacks.
     """
 
@@ -46,17 +49,25 @@ class NetworkPredictor(Predictor):
         table = np.arange(256, dtype=np.float32) / np.float32(255)
         self._table = table if contract.input_value == "intensity" else phase_from_intensity(table, contract.branch)
 
+    @property
+    def black_beside(self) -> bool:
+        return self.session.contract.picture_fov_deg > 0
+
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         return tuple(self.stack.panel(n) for n in self._panels)
 
-    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64) -> Prediction:
+    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> Prediction:
         watch = Stopwatch()
         channel = 0
         for raster in range(len(self._panels)):
             for side in self._order:
                 picture = images[side][raster]
+                cover = self._covered(eyes_m[side], self.stack.panel(self._panels[raster]))
                 for c in range(3):
-                    self._input[0, channel] = cv2.LUT(np.ascontiguousarray(picture[..., c]), self._table)
+                    plane = np.ascontiguousarray(picture[..., c])
+                    if cover is not None:
+                        plane = np.asarray(cv2.min(plane, cover), np.uint8)
+                    self._input[0, channel] = cv2.LUT(plane, self._table)
                     channel += 1
         watch.lap("prepare")
         answered = self.stack.count if self.session.contract.output == "panels" else self.stack.count - 1
@@ -73,6 +84,26 @@ class NetworkPredictor(Predictor):
             self._close(images, eyes_m, outer)
         watch.lap("finish")
         return Prediction(self._layers, watch.stage_ms)
+
+    def _covered(self, eye_m: F64, raster: PlaneRaster) -> U8 | None:
+        """(h, w) how much of each pixel a picture of the contract's view covers, 0 to 255; None where it has none.
+
+        What a white picture of the panels' pixels would leave there, black beside: bilinear, so that its edge fades
+        over one pixel as it did in training. The least of it and the picture is what the network is fed: a still
+        picture has faded by itself.
+        """
+        fov_deg = self.session.contract.picture_fov_deg
+        if not fov_deg:
+            return None
+        width, height = self.stack.width_px, self.stack.height_px
+        projection = image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg)
+        to_centres = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+        matrix = np.linalg.inv(to_centres) @ image_from_raster(projection, raster) @ to_centres
+        white = np.full((height, width), 255, np.uint8)
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        return np.asarray(
+            cv2.warpPerspective(white, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_CONSTANT), np.uint8
+        )
 
     def _close(self, images: Sequence[Sequence[U8]], eyes_m: F64, outer: Sequence[int]) -> None:
         """The best centre panel for the outer ones: the mean of what the eyes lack (equal slopes assumed)."""

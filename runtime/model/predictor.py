@@ -11,6 +11,7 @@ from pathlib import Path
 from runtime.config import ModelSettings
 from runtime.errors import InputError
 from runtime.model.allocator import keep_freed_memory
+from runtime.optics.pupil import POINT_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
 
@@ -48,13 +49,21 @@ class Predictor(ABC):
         """How strongly it sharpens pictures against the blur of interpolation (`transfer.emphasised`)."""
         return 0.0
 
+    @property
+    def black_beside(self) -> bool:
+        """Whether still pictures end in black, not in their repeated edge."""
+        return False
+
     def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
         """Rows and columns of each raster that `predict` will look at: all of them, where it doesn't know better."""
         return tuple((slice(0, raster.height_px), slice(0, raster.width_px)) for raster in self.rasters(eyes_m))
 
     @abstractmethod
-    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64) -> Prediction:
+    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> Prediction:
         """Layers for `images[eye][raster]`, (h, w, 4) RGBA, left eye first, drawn on `rasters(eyes_m)`.
+
+        eye_sigma_mm: standard deviation, an axis, of where light enters the eyes, common to both, to the right and
+        up; 0 asks for two points.
 
         Raises ModelFailure where inference fails or does not answer with finite numbers.
         """
@@ -106,7 +115,7 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
             raise InputError(path, "contract.panels", "needs evenly spaced panels; use the model sart")
         from runtime.model.unrolled import UnrolledPredictor
 
-        return UnrolledPredictor(session, stack, tolerance_mm=settings.tolerance_mm, threads=settings.threads)
+        return UnrolledPredictor(session, stack, threads=settings.threads)
     from runtime.model.network import NetworkPredictor
 
     return NetworkPredictor(session, stack, source=path)

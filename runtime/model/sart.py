@@ -18,6 +18,7 @@ from runtime.model.predictor import Prediction, Predictor
 from runtime.model.resample import target_from_source
 from runtime.model.timing import Stopwatch
 from runtime.optics.malus import phase_from_intensity
+from runtime.optics.pupil import POINT_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F32, F64, U8
 
@@ -39,7 +40,7 @@ class SartPredictor(Predictor):
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         return (self.stack.panel(self.stack.count // 2),)
 
-    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64) -> Prediction:
+    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> Prediction:
         watch = Stopwatch()
         stack, middle = self.stack, self.rasters(eyes_m)[0]
         table = phase_from_intensity(np.arange(256, dtype=np.float32) / np.float32(255)).astype(np.float32)

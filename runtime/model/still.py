@@ -5,12 +5,21 @@ from __future__ import annotations
 import numpy as np
 
 from runtime.model.predictor import Prediction, Predictor
+from runtime.optics.pupil import POINT_MM
 from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack
 from runtime.records import F64, U8
 
 
-def solve_still(left: U8, right: U8, *, eyes_m: F64, fov_deg: float, predictor: Predictor) -> Prediction:
+def solve_still(
+    left: U8,
+    right: U8,
+    *,
+    eyes_m: F64,
+    fov_deg: float,
+    predictor: Predictor,
+    eye_sigma_mm: float = POINT_MM,
+) -> Prediction:
     """Layers for two pictures (h, w, 3 or 4) that a left and a right eye (2, 3), frame `stack`, should see.
 
     The pictures' horizontal field of view is `fov_deg`; each eye looks at the stack's origin. Warps each picture
@@ -34,18 +43,28 @@ def solve_still(left: U8, right: U8, *, eyes_m: F64, fov_deg: float, predictor: 
                     rows=rows,
                     columns=columns,
                     cubic=predictor.interpolation == "cubic",
+                    black_beside=predictor.black_beside,
                 )
                 for raster, (rows, columns) in zip(rasters, windows, strict=True)
             ]
         )
     warps_ms = (cv2.getTickCount() - start) / cv2.getTickFrequency() * 1e3
-    prediction = predictor.predict(images, eyes_m)
+    prediction = predictor.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
     stage_ms = dict(prediction.stage_ms)
     stage_ms["prepare"] = stage_ms.get("prepare", 0.0) + warps_ms
     return Prediction(prediction.layers, stage_ms)
 
 
-def _warped(rgba: U8, image_from_raster: F64, raster: PlaneRaster, *, rows: slice, columns: slice, cubic: bool) -> U8:
+def _warped(
+    rgba: U8,
+    image_from_raster: F64,
+    raster: PlaneRaster,
+    *,
+    rows: slice,
+    columns: slice,
+    cubic: bool,
+    black_beside: bool,
+) -> U8:
     """A picture on a raster; only the given rows and columns are drawn."""
     import cv2
 
@@ -57,7 +76,7 @@ def _warped(rgba: U8, image_from_raster: F64, raster: PlaneRaster, *, rows: slic
         matrix,
         (columns.stop - columns.start, rows.stop - rows.start),
         flags=(cv2.INTER_CUBIC if cubic else cv2.INTER_LINEAR) | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
+        borderMode=cv2.BORDER_CONSTANT if black_beside else cv2.BORDER_REPLICATE,
     )
     return out
 

@@ -27,6 +27,7 @@ from runtime.model.session import ModelSession
 from runtime.model.timing import Stopwatch
 from runtime.model.transfer import FULL, SUBCODE, emphasised, phase_codes
 from runtime.model.visible import Box, visible_boxes
+from runtime.optics.pupil import POINT_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F32, F64, U8
 
@@ -42,7 +43,6 @@ class UnrolledPredictor(Predictor):
         session: ModelSession,
         stack: PanelStack,
         *,
-        tolerance_mm: float,
         threads: int = 2,
         one_channel: bool = False,
     ) -> None:
@@ -50,7 +50,6 @@ class UnrolledPredictor(Predictor):
         self.session, self.stack = session, stack
         self.name, self.provider = session.contract.name, session.provider
         self.parameters = session.contract.parameters
-        self.tolerance_mm = tolerance_mm
         self.one_channel = one_channel
         self.fade: Fade | None = None  # how this stack ends, where it is a part of larger panels
         self._rows = RowPool(threads, width_px=stack.width_px)
@@ -73,7 +72,7 @@ class UnrolledPredictor(Predictor):
     def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
         return (visible_boxes(eyes_m, self.stack)[CENTRE].slices,)
 
-    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64) -> Prediction:
+    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> Prediction:
         watch = Stopwatch()
         contract = self.session.contract
         try:
@@ -101,7 +100,7 @@ class UnrolledPredictor(Predictor):
             shown = {n: index == last[n] for n in OUTER}
             if step.kind == "chain":
                 needs = self._later_needs(level) if index else self._first_needs(pictures, bench)
-                wave = self._wave(needs, frame, eyes_m, watch, bench=bench)
+                wave = self._wave(needs, frame, eyes_m, watch, bench=bench, eye_sigma_mm=eye_sigma_mm)
                 _drive(level, wave, frame, size=step.size, first=not index, shown=shown)
                 changed: tuple[int, ...] = OUTER
             else:
@@ -164,7 +163,16 @@ class UnrolledPredictor(Predictor):
         reduction, box = self.session.contract.reduction, self._boxes[CENTRE]
         return max(1, box.width_px // reduction), max(1, box.height_px // reduction)
 
-    def _wave(self, needs: Sequence[I16], frame: ChainFrame, eyes_m: F64, watch: Stopwatch, *, bench: Bench) -> F32:
+    def _wave(
+        self,
+        needs: Sequence[I16],
+        frame: ChainFrame,
+        eyes_m: F64,
+        watch: Stopwatch,
+        *,
+        bench: Bench,
+        eye_sigma_mm: float,
+    ) -> F32:
         """The network's answer: what the outer panels must carry for the eyes to differ as they should.
 
         On the chain frame's raster, from one parallax before its first column.
@@ -183,7 +191,7 @@ class UnrolledPredictor(Predictor):
         answer = self.session.run(
             difference.reshape(frame.rows, frame.cells, -1),
             *chain_modes(frame.cells),
-            np.array([relative_tolerance_mm(self.tolerance_mm, eyes_m)], np.float32),
+            np.array([relative_tolerance_mm(eye_sigma_mm, eyes_m)], np.float32),
             output_shape=(frame.rows, frame.cells + 1, 2 * frame.cell_px * self.channels),
         )
         if not np.isfinite(answer.sum()):

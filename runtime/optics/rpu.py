@@ -22,17 +22,18 @@ def image_from_panel_four_points(corners_px: ArrayLike, *, width_px: float, heig
     """H of seed (40) from the images of a panel's four corners, in closed form (seed 42-46, corrected).
 
     corners_px: (4, 2) image pixels of the corners in the order of `panel_corners_px`.
-    Returns 3x3 with h33 = 1. Raises ValueError where the quadrilateral is degenerate.
+    Returns 3x3 with h33 = 1. Raises ValueError where the quadrilateral is degenerate: corners that are not finite,
+    two at one place, or three on a line as far as doubles can tell.
     Use `image_from_raster` to build H; this is its independent check and the better only when all that is
     known are four points.
     """
-    (u0, v0), (u1, v1), (u2, v2), (u3, v3) = np.asarray(corners_px, dtype=np.float64).tolist()
+    corners = np.asarray(corners_px, dtype=np.float64)
+    _check_no_three_on_a_line(corners)
+    (u0, v0), (u1, v1), (u2, v2), (u3, v3) = corners.tolist()
     du1, dv1 = u1 - u2, v1 - v2
     du2, dv2 = u3 - u2, v3 - v2
     du3, dv3 = u0 - u1 + u2 - u3, v0 - v1 + v2 - v3
     determinant = du1 * dv2 - du2 * dv1
-    if not math.isfinite(determinant) or determinant == 0.0:
-        raise ValueError("the panel's corners are collinear in the image: its homography is singular")
     g = (du3 * dv2 - du2 * dv3) / determinant
     h = (du1 * dv3 - du3 * dv1) / determinant
     return np.array(
@@ -42,6 +43,21 @@ def image_from_panel_four_points(corners_px: ArrayLike, *, width_px: float, heig
             [g / width_px, h / height_px, 1.0],
         ]
     )
+
+
+def _check_no_three_on_a_line(corners_px: F64) -> None:
+    """Raise ValueError where three of four corners (4, 2) are collinear or two coincide, within rounding."""
+    size = float(np.abs(corners_px).max())
+    if not math.isfinite(size):
+        raise ValueError("the panel's corners are collinear in the image, or not finite: its homography is singular")
+    scaled = corners_px / (size or 1.0)  # squares of 1e200 would leave float64
+    for left_out in range(4):
+        a, b, c = np.delete(scaled, left_out, axis=0)
+        (ax, ay), (bx, by) = b - a, c - a
+        # A corner is known to eps of the largest coordinate: so much of the sides' lengths can the area be off by.
+        noise = 8 * np.finfo(np.float64).eps * (math.hypot(ax, ay) + math.hypot(bx, by))
+        if abs(ax * by - ay * bx) <= noise:
+            raise ValueError("three of the panel's corners are collinear in the image: its homography is singular")
 
 
 def corners_in_front(image_from_stack: F64, raster: PlaneRaster) -> bool:

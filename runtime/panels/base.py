@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-from runtime.records import LayerFrame, PresentReport
+from runtime.records import PanelFrame, PresentReport
 
 
 class PanelSink(ABC):
@@ -12,13 +12,19 @@ class PanelSink(ABC):
 
     name: str
 
-    @abstractmethod
-    def present(self, frame: LayerFrame, *, unchanged: bool = False) -> PresentReport:
-        """Show a frame on every panel.
+    @property
+    def period_ns(self) -> int | None:
+        """Between two vertical blanks, as the monitor that sets the pace says; None: there is none, or unknown."""
+        return None
 
-        unchanged: the caller vouches that the layers are those of the frame before: panels that still show them
-        upload and draw nothing, so that a picture without a viewer costs next to nothing.
-        Raises PanelLost: rebuilt by a later call, the loop goes on.
+    @abstractmethod
+    def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
+        """Show a frame on every panel: its solution aligned, then mixed with its flat picture.
+
+        The frame's arrays stay as they are until another frame has been presented: a sink may read them as late as
+        that. unchanged: the caller vouches that this shows what the frame before did: panels that still show it
+        upload, draw and swap nothing, so that a picture without a viewer costs next to nothing.
+        Raises PanelLost: rebuilt by a later call, the loop goes on. Raises ValueError for a frame that doesn't fit.
         """
 
     @abstractmethod

@@ -69,6 +69,7 @@ class Display:
         self.faults: list[str] = []
         self._windows: list[Window] = []
         self._closed = False
+        self._outputs: dict[str, int] = {}
         try:
             if glfw.platform_supported(glfw.PLATFORM_X11):
                 glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
@@ -80,7 +81,7 @@ class Display:
                 raise MissingPart("GLFW without X11: only X11 can put a window on a chosen monitor")
             xlib.take_over_errors()
             glfw.set_monitor_callback(self._monitor_changed)
-            self._watch = xlib.ServerWatch(_address(glfw.get_x11_display()))
+            self._watch = xlib.ServerWatch(self._pointer)
         except BaseException:
             glfw.terminate()
             raise
@@ -163,14 +164,30 @@ class Display:
         self._windows.append(window)
         return window
 
+    def output_state(self, connector: str) -> xlib.OutputState | None:
+        """What an output sends now, and to which monitor; None: nothing, or it has gone."""
+        output = self._outputs.get(connector)
+        return None if output is None else xlib.output_state(self._pointer, output)
+
+    def window_state(self, window: Window) -> xlib.WindowState | None:
+        """Where a window is now; None: somebody destroyed it."""
+        return xlib.window_state(self._pointer, glfw.get_x11_window(window.handle))
+
+    @property
+    def _pointer(self) -> int:
+        return _address(glfw.get_x11_display())
+
     def _pairs(self) -> list[tuple[Monitor, Any]]:
-        identities = {name: edid.parse(data) for name, data in xlib.edids().items()}
+        self._outputs = xlib.outputs(self._pointer)
         pairs = []
         for handle in glfw.get_monitors():
             connector = glfw.get_monitor_name(handle).decode()
             mode = glfw.get_video_mode(handle)
             x_px, y_px = glfw.get_monitor_pos(handle)
-            identity = identities.get(connector)
+            state = self.output_state(connector)
+            identity = edid.parse(state.edid) if state is not None and state.edid else None
+            # GLFW rounds the rate to a whole number.
+            refresh_hz = state.refresh_hz if state is not None and state.refresh_hz else float(mode.refresh_rate)
             monitor = Monitor(
                 connector=connector,
                 serial=identity.serial if identity else "",
@@ -179,7 +196,7 @@ class Display:
                 y_px=y_px,
                 width_px=mode.size.width,
                 height_px=mode.size.height,
-                refresh_hz=float(mode.refresh_rate),
+                refresh_hz=refresh_hz,
             )
             pairs.append((monitor, handle))
         return pairs

@@ -9,16 +9,16 @@ from runtime.clock import NS_PER_MS, Clock
 from runtime.config import PanelSettings
 from runtime.errors import PanelLost
 from runtime.panels.base import PanelSink
-from runtime.panels.presentation import Mounting, Painter
-from runtime.records import U8, LayerFrame, PresentReport
+from runtime.panels.presentation import FrameTextures, Mounting, Painter, check
+from runtime.records import U8, PanelFrame, PresentReport
 
 
 class OffscreenPanels(PanelSink):
     """N panels of equal size in one EGL context.
 
-    `present` uploads the frame, once for all panels (0.2 ms a panel at 1080p on llvmpipe), and draws nothing:
-    nobody looks. With `draw` it also runs each panel's presentation shader (13 to 28 ms a panel at 1080p on
-    llvmpipe, next to nothing on a GPU), as windows do. `read_back` draws in any case.
+    `present` only keeps the frame: nobody looks, and an upload would cost a refresh up to 6 ms (three layers at
+    1080p, llvmpipe). `read_back` uploads what is not there yet and draws. With `draw`, `present` does so too (13 to
+    28 ms a panel at 1080p on llvmpipe, next to nothing on a GPU), as windows do.
     """
 
     name = "offscreen"
@@ -37,10 +37,10 @@ class OffscreenPanels(PanelSink):
         self._context, self._clock, self._draw = context, clock, draw
         self._size = (width_px, height_px)
         self._count = len(panels)
-        self._number = -1
-        self._layers = context.texture_array((width_px, height_px, self._count), 4)
-        self._layers.filter = (moderngl.LINEAR, moderngl.LINEAR)
-        self._layers.repeat_x = self._layers.repeat_y = False
+        self._frame: PanelFrame | None = None
+        self._textures: FrameTextures | None = FrameTextures(
+            context, width_px=width_px, height_px=height_px, count=self._count
+        )
         self._painters: list[Painter] = []
         self._targets: list[moderngl.Framebuffer] = []
         for settings in panels:
@@ -56,36 +56,28 @@ class OffscreenPanels(PanelSink):
             self._painters.append(Painter(context, mounting))
             self._targets.append(context.framebuffer([context.texture(screen, 4)]))
 
-    def present(self, frame: LayerFrame, *, unchanged: bool = False) -> PresentReport:
-        """Upload (and draw, if asked to at construction); skew is between the first and the last panel drawn."""
-        if frame.layers.shape != (self._count, self._size[1], self._size[0], 4):
-            raise ValueError(f"layers are {frame.layers.shape}, the panels {self._count} of {self._size}")
-        if unchanged and self._number >= 0:
-            self._number = frame.number
+    def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
+        """Keep it (and draw, if asked to at construction); skew is between the first and the last panel drawn."""
+        check(frame, width_px=self._size[0], height_px=self._size[1], count=self._count)
+        if self._textures is None:
+            raise PanelLost("offscreen panels: closed")
+        if unchanged and self._frame is not None:
             return PresentReport(frame.number, self._clock.now_ns(), 0.0)
-        try:
-            self._layers.write(np.ascontiguousarray(frame.layers))
-            finished_ns = [self._paint(index) for index in range(self._count)] if self._draw else []
-            fault = self._context.error
-        except Exception as error:  # a released or lost context answers with whatever moderngl has at hand
-            raise PanelLost(f"offscreen panels: {error}") from error
-        if fault != "GL_NO_ERROR":
-            raise PanelLost(f"offscreen panels: {fault}")
-        self._number = frame.number
-        done_ns = self._clock.now_ns()
+        finished_ns = self._drawn(frame) if self._draw else []
+        self._frame = frame
         skew_ns = finished_ns[-1] - finished_ns[0] if finished_ns else 0
-        return PresentReport(frame.number, done_ns, skew_ns / NS_PER_MS)
+        return PresentReport(frame.number, self._clock.now_ns(), skew_ns / NS_PER_MS)
 
     def read_back(self) -> tuple[U8, ...]:
         """The monitors' pictures of the last frame, rear to front: (h, w, 4) RGBA each, top row first.
 
-        Raises ValueError before the first frame.
+        Raises ValueError before the first frame, PanelLost where the context is gone.
         """
-        if self._number < 0:
+        if self._frame is None:
             raise ValueError("nothing has been presented yet")
+        self._drawn(self._frame)
         pictures = []
-        for index, target in enumerate(self._targets):
-            self._paint(index)
+        for target in self._targets:
             width, height = target.size
             bottom_up = np.frombuffer(target.read(components=4), np.uint8).reshape(height, width, 4)
             pictures.append(np.ascontiguousarray(bottom_up[::-1]))
@@ -102,12 +94,25 @@ class OffscreenPanels(PanelSink):
             for attachment in target.color_attachments:
                 attachment.release()
             target.release()
-        if self._painters:
-            self._layers.release()
-        self._painters, self._targets = [], []
+        if self._textures is not None:
+            self._textures.release()
+        self._textures, self._painters, self._targets = None, [], []
 
-    def _paint(self, index: int) -> int:
+    def _drawn(self, frame: PanelFrame) -> list[int]:
+        """Upload and draw; when each panel was finished."""
+        try:
+            assert self._textures is not None
+            self._textures.upload(frame)
+            finished_ns = [self._paint(self._textures, frame, index) for index in range(self._count)]
+            fault = self._context.error
+        except Exception as error:  # a released or lost context answers with whatever moderngl has at hand
+            raise PanelLost(f"offscreen panels: {error}") from error
+        if fault != "GL_NO_ERROR":
+            raise PanelLost(f"offscreen panels: {fault}")
+        return finished_ns
+
+    def _paint(self, textures: FrameTextures, frame: PanelFrame, index: int) -> int:
         self._targets[index].use()
-        self._painters[index].draw(self._layers, index)
+        self._painters[index].draw(textures, frame, index)
         self._context.finish()
         return self._clock.now_ns()

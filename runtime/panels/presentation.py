@@ -1,4 +1,4 @@
-"""The presentation shader: one layer of the uploaded frame on to one panel's framebuffer."""
+"""The presentation shader: one layer of the uploaded frame, aligned and mixed, on to one panel's framebuffer."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import moderngl
 import numpy as np
 
 from runtime.config import PanelSettings
+from runtime.optics.alignment import EVEN_CODE, is_identity, scale_and_shift
 from runtime.panels import lut
 from runtime.panels.geometry import layer_from_screen, permutes_pixels
-from runtime.records import F32, F64
+from runtime.records import F32, F64, PanelFrame
 
 VERTEX = """#version 330 core
 // One triangle that covers the framebuffer; pixel: the monitor's pixels, top left origin, v down.
@@ -25,24 +26,47 @@ void main() {
 }
 """
 
+# runtime.optics.alignment.shown_layers is the reference for what `shown` answers. Aligned layers are sampled with
+# weights of full precision, which hardware's filters (1/256) have not, and are even beside their edge.
 FRAGMENT = """#version 330 core
-uniform sampler2DArray layers;
+uniform sampler2DArray solved;
+uniform sampler2DArray flat_picture;
 uniform sampler2D curve;
 uniform int layer;
 uniform vec2 size_px;
-uniform bool exact;
+uniform bool exact;              // the mounting takes pixels to pixels
+uniform bool aligned;
+uniform vec4 solved_from_shown;  // scale u, v, shift u, v in pixels
+uniform float flatness;
+uniform float even;
 in vec3 layer_px;
 out vec4 colour;
 float grey(float phase, int channel) {
     return texture(curve, vec2((phase * 255.0 + 0.5) / 256.0, (float(channel) + 0.5) / 3.0)).r;
 }
+vec3 solved_texel(ivec2 at) {
+    bool inside = all(greaterThanEqual(at, ivec2(0))) && all(lessThan(at, ivec2(size_px)));
+    return inside ? texelFetch(solved, ivec3(at, layer), 0).rgb : vec3(even);
+}
+vec3 aligned_at(vec2 px) {
+    vec2 place = clamp(px * solved_from_shown.xy + solved_from_shown.zw - 0.5, vec2(-2.0), size_px + 1.0);
+    vec2 low = floor(place), weight = place - low;
+    ivec2 at = ivec2(low);
+    return mix(mix(solved_texel(at), solved_texel(at + ivec2(1, 0)), weight.x),
+               mix(solved_texel(at + ivec2(0, 1)), solved_texel(at + ivec2(1, 1)), weight.x), weight.y);
+}
+vec3 as_it_is(sampler2DArray layers, vec2 px) {
+    return exact ? texelFetch(layers, ivec3(floor(px), layer), 0).rgb : texture(layers, vec3(px / size_px, layer)).rgb;
+}
+vec3 shown(vec2 px) {
+    if (flatness >= 1.0) return as_it_is(flat_picture, px);
+    vec3 phase = aligned ? aligned_at(px) : as_it_is(solved, px);
+    return flatness > 0.0 ? mix(phase, as_it_is(flat_picture, px), flatness) : phase;
+}
 void main() {
     vec2 px = layer_px.xy / layer_px.z;
     vec3 phase = vec3(0.0);
-    if (layer_px.z > 0.0 && all(greaterThanEqual(px, vec2(0.0))) && all(lessThan(px, size_px))) {
-        phase = exact ? texelFetch(layers, ivec3(floor(px), layer), 0).rgb
-                      : texture(layers, vec3(px / size_px, layer)).rgb;
-    }
+    if (layer_px.z > 0.0 && all(greaterThanEqual(px, vec2(0.0))) && all(lessThan(px, size_px))) phase = shown(px);
     colour = vec4(grey(phase.r, 0), grey(phase.g, 1), grey(phase.b, 2), 1.0);
 }
 """
@@ -87,6 +111,77 @@ class Mounting:
         )
 
 
+class FrameTextures:
+    """The layers of the newest frame in one share group: uploaded where their version is another one."""
+
+    def __init__(self, context: moderngl.Context, *, width_px: int, height_px: int, count: int) -> None:
+        self._shape = (count, height_px, width_px, 4)
+        self._solved, self._flat = (context.texture_array((width_px, height_px, count), 4) for _ in range(2))
+        for array in (self._solved, self._flat):
+            array.filter = (moderngl.LINEAR, moderngl.LINEAR)
+            array.repeat_x = array.repeat_y = False
+        self._solved_version: int | None = None
+        self._flat_version: int | None = None
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Columns and rows of a layer."""
+        return self._shape[2], self._shape[1]
+
+    def lacks(self, frame: PanelFrame) -> tuple[bool, bool]:
+        """Whether its solution, and its flat picture, are seen and not here yet."""
+        return (
+            shows_solved(frame) and frame.solved_version != self._solved_version,
+            shows_flat(frame) and frame.flat_version != self._flat_version,
+        )
+
+    def upload(self, frame: PanelFrame) -> None:
+        """Take in what the frame shows and is not here yet. It fits (`check`)."""
+        lacks_solved, lacks_flat = self.lacks(frame)
+        if lacks_solved and frame.solved is not None:
+            self._solved_version = None  # until it is here as a whole
+            self._solved.write(np.ascontiguousarray(frame.solved))
+            self._solved_version = frame.solved_version
+        if lacks_flat and frame.flat is not None:
+            self._flat_version = None
+            self._flat.write(np.ascontiguousarray(frame.flat))
+            self._flat_version = frame.flat_version
+
+    def use(self) -> None:
+        """Bind them where a Painter looks for them, in the context that is current."""
+        self._solved.use(0)
+        self._flat.use(1)
+
+    def release(self) -> None:
+        """Give the GL objects back."""
+        self._solved.release()
+        self._flat.release()
+
+
+def shows_solved(frame: PanelFrame) -> bool:
+    """Whether anything of the solution is seen."""
+    return frame.solved is not None and frame.flatness < 1.0
+
+
+def shows_flat(frame: PanelFrame) -> bool:
+    """Whether anything of the flat picture is seen."""
+    return frame.solved is None or frame.flatness > 0.0
+
+
+def check(frame: PanelFrame, *, width_px: int, height_px: int, count: int) -> None:
+    """Raises ValueError for layers of another shape, too few matrices, or nothing to show."""
+    for name, layers, needed in (
+        ("solved", frame.solved, shows_solved(frame)),
+        ("flat", frame.flat, shows_flat(frame)),
+    ):
+        if layers is None and needed:
+            raise ValueError(f"a frame without its {name} layers")
+        if layers is not None and layers.shape != (count, height_px, width_px, 4):
+            raise ValueError(f"{name} layers are {layers.shape}, the panels {count} of {width_px}x{height_px}")
+    if frame.solved_from_shown and len(frame.solved_from_shown) != count:
+        raise ValueError(f"a frame aligns {len(frame.solved_from_shown)} panels of {count}")
+
+
 class Painter:
     """The presentation shader in one context; vertex arrays and framebuffers are not shared between contexts."""
 
@@ -97,18 +192,24 @@ class Painter:
         self._curve = context.texture((lut.ENTRIES, 3), 1, table.tobytes(), dtype="f4")
         self._curve.filter = (moderngl.LINEAR, moderngl.LINEAR)
         self._curve.repeat_x = self._curve.repeat_y = False
-        self._program["layers"] = 0
-        self._program["curve"] = 1
+        self._program["solved"] = 0
+        self._program["flat_picture"] = 1
+        self._program["curve"] = 2
+        self._program["even"] = EVEN_CODE / 255
         self._program["screen_px"] = (float(mounting.screen_width_px), float(mounting.screen_height_px))
         self._program["layer_from_screen"] = tuple(mounting.layer_from_screen.T.ravel())
         self._program["exact"] = permutes_pixels(mounting.layer_from_screen)
 
-    def draw(self, layers: moderngl.TextureArray, index: int) -> None:
-        """Layer `index` of the frame over the whole of the framebuffer in use."""
+    def draw(self, textures: FrameTextures, frame: PanelFrame, index: int) -> None:
+        """Panel `index` of the frame that was uploaded, over the whole of the framebuffer in use."""
+        matrix = frame.solved_from_shown[index] if frame.solved_from_shown else np.eye(3)
         self._program["layer"] = index
-        self._program["size_px"] = (float(layers.size[0]), float(layers.size[1]))
-        layers.use(0)
-        self._curve.use(1)
+        self._program["size_px"] = tuple(map(float, textures.size_px))
+        self._program["aligned"] = not is_identity(matrix)
+        self._program["solved_from_shown"] = scale_and_shift(matrix)
+        self._program["flatness"] = 1.0 if frame.solved is None else float(frame.flatness)
+        textures.use()
+        self._curve.use(2)
         self._array.render(moderngl.TRIANGLES, vertices=3)
 
     def release(self) -> None:

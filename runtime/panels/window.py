@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import moderngl
-import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
 from runtime.config import OutputSettings, PanelSettings
@@ -16,9 +15,11 @@ from runtime.errors import PanelLost
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.panels.display import Display, Window, glfw
+from runtime.panels.modes import check_mode, refresh_difference
 from runtime.panels.monitors import Monitor, bind, check_shape
-from runtime.panels.presentation import Mounting, Painter
-from runtime.records import LayerFrame, PresentReport
+from runtime.panels.presentation import FrameTextures, Mounting, Painter, check
+from runtime.panels.watch import Place, PlacementWatch
+from runtime.records import PanelFrame, PresentReport
 
 log = logging.getLogger("phasestack.panels")
 
@@ -46,13 +47,14 @@ class Surface:
 class WindowPanels(PanelSink):
     """All panels of the stack on X11 monitors.
 
-    `present` uploads the frame once into a texture that all windows share, draws every window and waits for
-    the drawing, and only then swaps them, one directly after the other: a fault before the first swap leaves
+    `present` uploads a new solution once into textures that all windows share, draws every window, aligned, and waits
+    for the drawing, and only then swaps them, one directly after the other: a fault before the first swap leaves
     the old frame on all. Only the first window waits for its vertical blank: N windows that each waited in
     turn would divide the rate by N. `skew_ms` is the time between the first and the last return from a swap;
     what it can't know is how far the monitors' own blanks lie apart (`kind = "span"` has one swap).
 
-    Where a monitor, a window or the context is lost, everything is closed, `present` raises
+    Once a second every window and monitor is compared with what was bound (a question a refresh, some 0.1 ms).
+    Where a monitor, a window or the context is lost or became another, everything is closed, `present` raises
     PanelLost, and a later `present` builds it anew: half a second later, or as soon as X says that a missing
     monitor is there. The death of the X server ends the process with exit status 75, to be started again.
     Uses GLFW, so: one thread, the main one. The `content` context is current again after every call.
@@ -72,9 +74,11 @@ class WindowPanels(PanelSink):
         self._clock, self._content = clock, content
         self._display: Display | None = None
         self._surfaces: list[Surface] = []
-        self._layers: moderngl.TextureArray | None = None
+        self._textures: FrameTextures | None = None
+        self._watch: PlacementWatch | None = None
         self._retry_ns, self._lost = 0, ""
-        self._swapped_ns = 0
+        self._shown = False  # these windows show the frame before
+        self._away = False  # another context than content's may be current
         self.monitors: tuple[Monitor, ...] = ()
         try:
             self._open()
@@ -84,10 +88,16 @@ class WindowPanels(PanelSink):
         finally:
             self._give_back()
 
-    def present(self, frame: LayerFrame, *, unchanged: bool = False) -> PresentReport:
+    @property
+    def period_ns(self) -> int | None:
+        """Of the first panel's monitor: the one whose vertical blank is waited for."""
+        refresh_hz = self.monitors[0].refresh_hz if self.monitors else 0.0
+        return round(NS_PER_S / refresh_hz) if refresh_hz else None
+
+    def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
         """Show a frame on every panel at once; an unchanged one stays as it is, where it is still shown.
 
-        Raises PanelLost; ValueError for layers of another shape.
+        Raises PanelLost; ValueError for a frame that doesn't fit the panels.
         """
         if not self._surfaces and not self._may_try():
             raise PanelLost(self._lost)
@@ -115,27 +125,32 @@ class WindowPanels(PanelSink):
         self._drop()
         self._give_back()
 
-    def _present(self, frame: LayerFrame, unchanged: bool) -> PresentReport:
-        display, layers = self._display, self._layers
-        assert display is not None and layers is not None
-        if fault := display.poll():
+    def _present(self, frame: PanelFrame, unchanged: bool) -> PresentReport:
+        display, textures, watch = self._display, self._textures, self._watch
+        assert display is not None and textures is not None and watch is not None
+        if fault := display.poll() or watch.look():
             raise PanelLost(fault)
-        width, height, count = layers.size[0], layers.size[1], len(self._panels)
-        if frame.layers.shape != (count, height, width, 4):
-            raise ValueError(f"layers are {frame.layers.shape}, the panels {count} of {width}x{height}")
-        if unchanged and self._swapped_ns:
+        check(frame, width_px=self._stack.width_px, height_px=self._stack.height_px, count=len(self._panels))
+        if unchanged and self._shown:
             return PresentReport(frame.number, self._clock.now_ns(), 0.0)
-        display.root.make_current()
-        layers.write(np.ascontiguousarray(frame.layers))
-        # Another context may use what this one has uploaded only after this one is known to be done.
-        display.root.context.finish()
+        self._away = True
+        if any(textures.lacks(frame)):
+            display.root.make_current()
+            textures.upload(frame)
+            # Another context may use what this one has uploaded only after this one is known to be done.
+            display.root.context.finish()
         for surface in self._surfaces:
-            self._draw(surface, layers)
+            self._draw(surface, textures, frame)
         swapped_ns = [self._swap(surface) for surface in self._surfaces]
-        missed = self._missed_vblanks(swapped_ns[0])
-        return PresentReport(frame.number, swapped_ns[-1], (swapped_ns[-1] - swapped_ns[0]) / NS_PER_MS, missed)
+        self._shown = True
+        return PresentReport(
+            frame.number,
+            swapped_ns[-1],
+            (swapped_ns[-1] - swapped_ns[0]) / NS_PER_MS,
+            vblank_ns=swapped_ns[0] if self._settings.vsync else None,
+        )
 
-    def _draw(self, surface: Surface, layers: moderngl.TextureArray) -> None:
+    def _draw(self, surface: Surface, textures: FrameTextures, frame: PanelFrame) -> None:
         surface.window.make_current()
         context = surface.window.context
         context.screen.use()
@@ -144,7 +159,7 @@ class WindowPanels(PanelSink):
             context.clear()
         for spot in surface.spots:
             context.viewport = spot.viewport
-            spot.painter.draw(layers, spot.index)
+            spot.painter.draw(textures, frame, spot.index)
         context.finish()
         if fault := _reset_status() or _error(context):
             raise PanelLost(f"the GL context of panel {surface.spots[0].index}: {fault}")
@@ -153,14 +168,6 @@ class WindowPanels(PanelSink):
         surface.window.make_current()
         glfw.swap_buffers(surface.window.handle)
         return self._clock.now_ns()
-
-    def _missed_vblanks(self, swapped_ns: int) -> int:
-        """Vertical blanks since the last swap that brought no new frame."""
-        before_ns, self._swapped_ns = self._swapped_ns, swapped_ns
-        refresh_hz = self.monitors[0].refresh_hz
-        if not (before_ns and refresh_hz):
-            return 0
-        return max(0, round((swapped_ns - before_ns) * refresh_hz / NS_PER_S) - 1)
 
     def _may_try(self) -> bool:
         """Whether it is time to look for the panels again: now and then, or at once where a monitor came or went."""
@@ -171,23 +178,44 @@ class WindowPanels(PanelSink):
         return self._clock.now_ns() >= self._retry_ns
 
     def _open(self) -> None:
+        self._away = True
         self._display = display = self._display or Display()
         self.monitors = bind(self._panels, display.monitors())
         if not self._any_shape:
             for number, (panel, monitor) in enumerate(zip(self._panels, self.monitors, strict=True)):
-                check_shape(number, panel, monitor, width_px=self._stack.width_px, height_px=self._stack.height_px)
+                size = {"width_px": self._stack.width_px, "height_px": self._stack.height_px}
+                check_shape(number, panel, monitor, **size)
+                check_mode(number, panel, monitor, **size, allow_rescaling=self._settings.allow_rescaling)
+        if difference := refresh_difference(self.monitors):
+            log.warning("%s", difference)
         display.root.make_current()
-        self._layers = display.root.context.texture_array(
-            (self._stack.width_px, self._stack.height_px, len(self._panels)), 4
+        self._textures = FrameTextures(
+            display.root.context,
+            width_px=self._stack.width_px,
+            height_px=self._stack.height_px,
+            count=len(self._panels),
         )
-        self._layers.filter = (moderngl.LINEAR, moderngl.LINEAR)
-        self._layers.repeat_x = self._layers.repeat_y = False
         spanning = self._settings.kind == "span"
         self._surfaces = [self._span(display)] if spanning else self._windows(display)
         for number, surface in enumerate(self._surfaces):
             surface.window.make_current()
             glfw.swap_interval(1 if self._settings.vsync and number == 0 else 0)
         glfw.poll_events()
+        self._watch = PlacementWatch(display, self.monitors, self._places(), self._clock)
+
+    def _places(self) -> tuple[Place, ...]:
+        """Where each window belongs, with the panels in it."""
+        return tuple(
+            Place(surface.window, tuple(spot.index for spot in surface.spots), *rectangle)
+            for surface, rectangle in zip(self._surfaces, self._rectangles(), strict=True)
+        )
+
+    def _rectangles(self) -> list[tuple[int, int, int, int]]:
+        if self._settings.kind != "span":
+            return [(m.x_px, m.y_px, m.width_px, m.height_px) for m in self.monitors]
+        left, top = min(m.x_px for m in self.monitors), min(m.y_px for m in self.monitors)
+        right, bottom = self.screen_size_px()
+        return [(left, top, right - left, bottom - top)]
 
     def _windows(self, display: Display) -> list[Surface]:
         surfaces = []
@@ -198,14 +226,11 @@ class WindowPanels(PanelSink):
         return surfaces
 
     def _span(self, display: Display) -> Surface:
-        left, top = min(m.x_px for m in self.monitors), min(m.y_px for m in self.monitors)
-        right, bottom = self.screen_size_px()
-        window = display.spanning_window(
-            x_px=left, y_px=top, width_px=right - left, height_px=bottom - top, title="panels"
-        )
+        ((left, top, width, height),) = self._rectangles()
+        window = display.spanning_window(x_px=left, y_px=top, width_px=width, height_px=height, title="panels")
         spots = []
         for index, monitor in enumerate(self.monitors):
-            below = bottom - (monitor.y_px + monitor.height_px)
+            below = top + height - (monitor.y_px + monitor.height_px)
             viewport = (monitor.x_px - left, below, monitor.width_px, monitor.height_px)
             spots.append(self._spot(window, index, viewport))
         return Surface(window, tuple(spots))
@@ -228,10 +253,11 @@ class WindowPanels(PanelSink):
             self._retry_ns = self._clock.now_ns() + LOOK_NS
 
     def _drop(self) -> None:
+        self._away = True
         display, self._display = self._display, None
-        self._surfaces, self._layers = [], None
+        self._surfaces, self._textures, self._watch = [], None, None
         self._retry_ns = self._clock.now_ns() + RETRY_NS
-        self._swapped_ns = 0
+        self._shown = False
         if display is not None:
             try:
                 display.close()
@@ -239,8 +265,10 @@ class WindowPanels(PanelSink):
                 log.exception("closing the display")
 
     def _give_back(self) -> None:
-        content: Any = self._content
-        content.__enter__()
+        if self._away:
+            content: Any = self._content
+            content.__enter__()
+            self._away = False
 
 
 def _error(context: moderngl.Context) -> str:

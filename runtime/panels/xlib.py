@@ -1,4 +1,4 @@
-"""The little of Xlib and RandR that GLFW does not offer: EDIDs by connector, and what happens on X's errors.
+"""The little of Xlib and RandR that GLFW does not offer: outputs, windows as others see them, and X's errors.
 
 Bound by ctypes to libraries that GLFW needs anyway. By default Xlib ends the process on any error.
 """
@@ -11,13 +11,33 @@ import logging
 import os
 import select
 import threading
-from ctypes import POINTER, byref, c_char_p, c_int, c_long, c_ubyte, c_ulong, c_ushort, c_void_p
+from ctypes import POINTER, byref, c_char_p, c_int, c_long, c_ubyte, c_uint, c_ulong, c_ushort, c_void_p
+from dataclasses import dataclass
 
 log = logging.getLogger("phasestack.panels")
 
 ErrorHandler = ctypes.CFUNCTYPE(c_int, c_void_p, c_void_p)
 IOErrorHandler = ctypes.CFUNCTYPE(c_int, c_void_p)
 SERVER_DIED = 75  # sysexits.h: a temporary failure, try again
+
+
+class _Mode(ctypes.Structure):
+    _fields_ = (
+        ("id", c_ulong),
+        ("width", c_uint),
+        ("height", c_uint),
+        ("dot_clock", c_ulong),
+        ("h_sync_start", c_uint),
+        ("h_sync_end", c_uint),
+        ("h_total", c_uint),
+        ("h_skew", c_uint),
+        ("v_sync_start", c_uint),
+        ("v_sync_end", c_uint),
+        ("v_total", c_uint),
+        ("name", c_char_p),
+        ("name_length", c_uint),
+        ("flags", c_ulong),
+    )
 
 
 class _Resources(ctypes.Structure):
@@ -28,6 +48,8 @@ class _Resources(ctypes.Structure):
         ("crtcs", POINTER(c_ulong)),
         ("noutput", c_int),
         ("outputs", POINTER(c_ulong)),
+        ("nmode", c_int),
+        ("modes", POINTER(_Mode)),
     )
 
 
@@ -41,6 +63,72 @@ class _Output(ctypes.Structure):
         ("mm_height", c_ulong),
         ("connection", c_ushort),
     )
+
+
+class _Crtc(ctypes.Structure):
+    """The beginning of XRRCrtcInfo."""
+
+    _fields_ = (
+        ("timestamp", c_ulong),
+        ("x", c_int),
+        ("y", c_int),
+        ("width", c_uint),
+        ("height", c_uint),
+        ("mode", c_ulong),
+    )
+
+
+class _Attributes(ctypes.Structure):
+    """XWindowAttributes."""
+
+    _fields_ = (
+        ("x", c_int),
+        ("y", c_int),
+        ("width", c_int),
+        ("height", c_int),
+        ("border_width", c_int),
+        ("depth", c_int),
+        ("visual", c_void_p),
+        ("root", c_ulong),
+        ("window_class", c_int),
+        ("bit_gravity", c_int),
+        ("win_gravity", c_int),
+        ("backing_store", c_int),
+        ("backing_planes", c_ulong),
+        ("backing_pixel", c_ulong),
+        ("save_under", c_int),
+        ("colormap", c_ulong),
+        ("map_installed", c_int),
+        ("map_state", c_int),
+        ("all_event_masks", c_long),
+        ("your_event_mask", c_long),
+        ("do_not_propagate_mask", c_long),
+        ("override_redirect", c_int),
+        ("screen", c_void_p),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class OutputState:
+    """What one output of the graphics card sends, and to which monitor."""
+
+    x_px: int  # of its top left corner on the X screen
+    y_px: int
+    width_px: int
+    height_px: int
+    refresh_hz: float  # 0: unknown
+    edid: bytes  # empty: none
+
+
+@dataclass(frozen=True, slots=True)
+class WindowState:
+    """Where a window is on the X screen, and whether it and all above it are mapped."""
+
+    viewable: bool
+    x_px: int
+    y_px: int
+    width_px: int
+    height_px: int
 
 
 @functools.cache
@@ -59,6 +147,13 @@ def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
     randr.XRRGetOutputInfo.restype = POINTER(_Output)
     randr.XRRGetOutputInfo.argtypes = [c_void_p, POINTER(_Resources), c_ulong]
     randr.XRRFreeOutputInfo.argtypes = [POINTER(_Output)]
+    randr.XRRGetCrtcInfo.restype = POINTER(_Crtc)
+    randr.XRRGetCrtcInfo.argtypes = [c_void_p, POINTER(_Resources), c_ulong]
+    randr.XRRFreeCrtcInfo.argtypes = [POINTER(_Crtc)]
+    x11.XGetWindowAttributes.argtypes = [c_void_p, c_ulong, POINTER(_Attributes)]
+    x11.XTranslateCoordinates.argtypes = [
+        c_void_p, c_ulong, c_ulong, c_int, c_int, POINTER(c_int), POINTER(c_int), POINTER(c_ulong)
+    ]  # fmt: skip
     randr.XRRGetOutputProperty.argtypes = [
         c_void_p, c_ulong, c_ulong, c_long, c_long, c_int, c_int, c_ulong,
         POINTER(c_ulong), POINTER(c_int), POINTER(c_ulong), POINTER(c_ulong), POINTER(POINTER(c_ubyte)),
@@ -66,7 +161,19 @@ def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
     return x11, randr
 
 
+class _Refusals:
+    """Requests that the X server has refused in this process."""
+
+    count = 0
+
+
+def refusals() -> int:
+    """How many requests the X server has refused so far: another number says that something has gone."""
+    return _Refusals.count
+
+
 def _note_error(_display: int, _event: int) -> int:
+    _Refusals.count += 1
     log.warning("the X server refused a request")
     return 0
 
@@ -125,34 +232,69 @@ class ServerWatch:
                 _end()
 
 
-def edids() -> dict[str, bytes]:
-    """EDID of every output that has one, by connector name; empty where no X server answers."""
-    try:
-        x11, randr = _libraries()
-    except OSError:
-        return {}
-    take_over_errors()
-    display = x11.XOpenDisplay(None)
-    if not display:
+def outputs(display: int) -> dict[str, int]:
+    """The X server's number of every output, by connector name. `display` is an open Display pointer."""
+    x11, randr = _libraries()
+    resources = randr.XRRGetScreenResourcesCurrent(display, x11.XDefaultRootWindow(display))
+    if not resources:
         return {}
     found = {}
-    try:
-        edid = x11.XInternAtom(display, b"EDID", 0)
-        resources = randr.XRRGetScreenResourcesCurrent(display, x11.XDefaultRootWindow(display))
-        if not resources:
-            return {}
-        for output in resources.contents.outputs[: resources.contents.noutput]:
-            info = randr.XRRGetOutputInfo(display, resources, output)
-            if not info:
-                continue
-            data = _property(x11, randr, display, output, edid)
-            if data:
-                found[info.contents.name.decode()] = data
+    for output in resources.contents.outputs[: resources.contents.noutput]:
+        info = randr.XRRGetOutputInfo(display, resources, output)
+        if info:
+            found[info.contents.name.decode()] = output
             randr.XRRFreeOutputInfo(info)
-        randr.XRRFreeScreenResources(resources)
-    finally:
-        x11.XCloseDisplay(display)
+    randr.XRRFreeScreenResources(resources)
     return found
+
+
+def output_state(display: int, output: int) -> OutputState | None:
+    """What an output sends now; None: nothing, or there is no such output any more. Four round trips."""
+    x11, randr = _libraries()
+    resources = randr.XRRGetScreenResourcesCurrent(display, x11.XDefaultRootWindow(display))
+    if not resources:
+        return None
+    try:
+        info = randr.XRRGetOutputInfo(display, resources, output)
+        crtc = info.contents.crtc if info else 0
+        if info:
+            randr.XRRFreeOutputInfo(info)
+        state = randr.XRRGetCrtcInfo(display, resources, crtc) if crtc else None
+        if not state:
+            return None
+        place = state.contents
+        refresh_hz = {mode.id: _refresh_hz(mode) for mode in resources.contents.modes[: resources.contents.nmode]}
+        answer = OutputState(
+            place.x,
+            place.y,
+            place.width,
+            place.height,
+            refresh_hz.get(place.mode, 0.0),
+            _property(x11, randr, display, output, x11.XInternAtom(display, b"EDID", 0)),
+        )
+        randr.XRRFreeCrtcInfo(state)
+        return answer
+    finally:
+        randr.XRRFreeScreenResources(resources)
+
+
+def window_state(display: int, window: int) -> WindowState | None:
+    """Where a window is now; None: it was destroyed. Three round trips."""
+    x11 = _libraries()[0]
+    attributes = _Attributes()
+    if not x11.XGetWindowAttributes(display, window, byref(attributes)):
+        return None
+    x, y, child = c_int(), c_int(), c_ulong()
+    if not x11.XTranslateCoordinates(display, window, attributes.root, 0, 0, byref(x), byref(y), byref(child)):
+        return None
+    is_viewable = 2
+    return WindowState(attributes.map_state == is_viewable, x.value, y.value, attributes.width, attributes.height)
+
+
+def _refresh_hz(mode: _Mode) -> float:
+    interlaced, double_scan = 0x10, 0x20
+    lines = mode.v_total * (2.0 if mode.flags & double_scan else 1.0) / (2.0 if mode.flags & interlaced else 1.0)
+    return float(mode.dot_clock / (mode.h_total * lines)) if mode.h_total and lines else 0.0
 
 
 def _property(x11: ctypes.CDLL, randr: ctypes.CDLL, display: int, output: int, atom: int) -> bytes:

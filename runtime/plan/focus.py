@@ -23,6 +23,7 @@ from runtime.model.predictor import Prediction, Predictor
 from runtime.model.transfer import SUBCODE, emphasised, phase_codes
 from runtime.model.unrolled import UnrolledPredictor
 from runtime.model.visible import Box
+from runtime.optics.pupil import POINT_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import raster_from_stack
 from runtime.plan.active import (
@@ -116,7 +117,7 @@ class FocusedPredictor(Predictor):
             ),
         )
 
-    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64) -> Prediction:
+    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> Prediction:
         begin_ns = perf_counter_ns()
         left, right = images[0][0], images[1][0]
         aimed, self._aimed = self._aimed, None
@@ -129,7 +130,7 @@ class FocusedPredictor(Predictor):
                 found = self._around(box, left, eyes_m)
                 if box.width_px and found is None:
                     self.window, self.active_fraction = None, 1.0
-                    prediction = self.whole.predict(images, eyes_m)
+                    prediction = self.whole.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
                     self.channels = self.whole.channels
                     return prediction
             kept = self._kept(found)
@@ -142,7 +143,7 @@ class FocusedPredictor(Predictor):
         # Solved before anything is painted: where the model fails, the last good layers stay as they were.
         part = self._part(window.stack)
         part.fade = self._fade(window, eyes_m)
-        solved = part.predict(cut, eyes_m - window.shift_m)
+        solved = part.predict(cut, eyes_m - window.shift_m, eye_sigma_mm=eye_sigma_mm)
         self.channels = part.channels
         begin_ns = perf_counter_ns()
         if aimed is not None:

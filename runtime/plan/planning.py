@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from runtime.config import ModelSettings, Settings, load_settings, validated
+from runtime.errors import FatalError, InputError
 
 if TYPE_CHECKING:
     from runtime.content.base import ContentSource
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 MIDDLE_M = (0.6, 0.0, 0.05)
 HALF_IPD_M = 0.031
+FARTHEST_M = 100.0  # of a viewer
 SURVEY_REPEATS = 15
 LADDER = (("best", 1.0), ("balanced", 1.0), ("fast", 1.0), ("fast", 0.75), ("fast", 0.5))
 
@@ -39,7 +41,6 @@ def focused(predictor: Predictor, settings: ModelSettings) -> FocusedPredictor |
         return UnrolledPredictor(
             predictor.session,
             part,
-            tolerance_mm=predictor.tolerance_mm,
             threads=settings.threads,
             one_channel=predictor.one_channel,
         )
@@ -87,11 +88,13 @@ def plan_for(
     stack = replace(
         stack, width_px=max(16, round(stack.width_px * scale)), height_px=max(16, round(stack.height_px * scale))
     )
-    middle = np.array(middle_m or MIDDLE_M)
+    middle = np.array(MIDDLE_M if middle_m is None else middle_m)
     half = np.array([0.0, HALF_IPD_M, 0.0])
     eyes_m = np.array([middle - half, middle + half])
+    where = "plan: --eyes"
     if settings.sensor.fixed_eyes_m is not None and middle_m is None:
-        eyes_m = np.array(settings.sensor.fixed_eyes_m)
+        eyes_m, where = np.array(settings.sensor.fixed_eyes_m), "sensor.fixed_eyes_m"
+    _check_viewer(eyes_m, stack, fov_deg=settings.content.fov_deg, source=where)
     with ExitStack() as cleanup:
         tell = _teller(cleanup, quiet)
         context = offscreen_context()
@@ -199,7 +202,11 @@ def _budget(
     present: Trial,
     tell: Callable[[str], None],
 ) -> tuple[list[Level], Any, Trial]:
-    """Measure the ladder of models and resolutions and choose by the budget."""
+    """Measure what the running daemon would choose from (`ladder.rungs`), and choose by the budget.
+
+    Raises FatalError where no level can be had.
+    """
+    from runtime.plan.ladder import rungs
     from runtime.plan.levels import BudgetKeeper, Level, useful
     from runtime.plan.measure import trial
     from runtime.plan.reduced import ladder_predictor
@@ -207,14 +214,19 @@ def _budget(
 
     trials: dict[str, Trial] = {}
     levels = []
-    for name, scale in LADDER:
+    for name, scale in rungs(settings, stack):
         level = Level(name, scale, 0.0, 0.0)
         tell(level.label)
-        predictor = ladder_predictor(name, scale, stack, settings)
+        try:
+            predictor = ladder_predictor(name, scale, stack, settings)
+        except FatalError:  # a network of fixed size has no smaller ones
+            continue
         result = trial(content, predictor, eyes_m, stack, fov_deg=settings.content.fov_deg, repeats=3)
         predictor.close()
         trials[level.label] = result
         levels.append(replace(level, expected_ms=result.frame_ms, psnr_db=result.psnr_db))
+    if not levels:
+        raise FatalError("budget: no model can be had in any size")
     levels = useful(levels)
     keeper = BudgetKeeper(levels, settings.model.budget_ms)
     saving = Saving(present.frame_ms - keeper.level.expected_ms, present.psnr_db - keeper.level.psnr_db)
@@ -222,8 +234,28 @@ def _budget(
     return levels, numbers, trials[keeper.level.label]
 
 
+def _check_viewer(eyes_m: F64, stack: PanelStack, *, fov_deg: float, source: str) -> None:
+    """Raise InputError, naming the option, for eyes (2, 3) from which nothing of the display can be seen."""
+    import numpy as np
+
+    from runtime.optics.retina import seen_by
+
+    if not np.isfinite(eyes_m).all():
+        raise InputError(source, "", "must be three finite numbers, metres")
+    if np.abs(eyes_m).max() > FARTHEST_M:
+        raise InputError(source, "", f"is farther than {FARTHEST_M:g} m: metres are meant")
+    nearest_m = float(eyes_m[:, 0].min())
+    if nearest_m <= max(stack.x_m):
+        raise InputError(source, "", f"x = {nearest_m:g} m : not in front of the panels (x > {max(stack.x_m):g} m)")
+    # Few pixels tell as much: the same rays at a coarser raster.
+    coarse = replace(stack, width_px=64, height_px=36)
+    blank = np.zeros((stack.count, coarse.height_px, coarse.width_px, 3), np.uint8)
+    if not any(seen_by(eye_m, blank, coarse, fov_deg=fov_deg).mask.any() for eye_m in eyes_m):
+        raise InputError(source, "", "nothing of the display can be seen from there")
+
+
 def _band_m(settings: Settings) -> float:
-    return (settings.plan.dead_band_mm or settings.model.tolerance_mm) / 1000
+    return (settings.plan.dead_band_mm or settings.plan.most_band_mm) / 1000
 
 
 def _overridden(settings: Settings, *, scene: str | None, model: str | None, budget_ms: float | None) -> Settings:

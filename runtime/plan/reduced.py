@@ -11,6 +11,7 @@ import numpy as np
 
 from runtime.config import Settings
 from runtime.model.predictor import Prediction, Predictor
+from runtime.optics.pupil import POINT_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
 
@@ -34,8 +35,8 @@ class ReducedPredictor(Predictor):
     def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
         return self.small.windows(eyes_m)
 
-    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64) -> Prediction:
-        solved = self.small.predict(images, eyes_m)
+    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> Prediction:
+        solved = self.small.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
         begin_ns = perf_counter_ns()
         size = (self.stack.width_px, self.stack.height_px)
         for layer, out in zip(solved.layers, self._layers, strict=True):

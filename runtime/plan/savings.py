@@ -52,8 +52,7 @@ class Plan:
     reuse: bool
     focus: bool
     eyes: tuple[bool, bool]  # left, right: which are solved for
-    dead_band_m: float | None  # fixed; None: from the tracker's noise
-    most_band_m: float
+    dead_band_m: float | None  # eyes that moved less are not solved for anew; None: only those of a head at rest
     items: tuple[PlanItem, ...] = field(default=())
 
 
@@ -75,11 +74,11 @@ def seeing_eyes(eyes_m: F64, before: tuple[bool, bool], *, range_deg: float) -> 
     return left, right
 
 
-def solved_eyes(eyes_m: F64, plan: Plan) -> F64:
-    """The eyes (2, 3) to draw and solve for: one that can't see gives way to the other, and costs nothing."""
-    if plan.eyes == (True, False):
+def selected_eyes(eyes_m: F64, seeing: tuple[bool, bool]) -> F64:
+    """Eyes (2, 3) as they are drawn and solved for: one that can't see gives way to the other, and costs nothing."""
+    if seeing == (True, False):
         return eyes_m[[0, 0]]
-    if plan.eyes == (False, True):
+    if seeing == (False, True):
         return eyes_m[[1, 1]]
     return eyes_m
 
@@ -109,12 +108,11 @@ def make_plan(
         seeing = eyes_in_range(eyes_m, range_deg=chosen.range_deg)
     if seeing is None or not any(seeing) or not (on and chosen.one_eye):
         seeing = (True, True)
-    most_m = settings.model.tolerance_mm / 1000
     fixed_m = chosen.dead_band_mm / 1000 if chosen.dead_band_mm > 0 else None
     items: list[PlanItem] = []
     if reuse and not info.moving:
-        band = f"{chosen.dead_band_mm:g} mm" if fixed_m else f"the tracker's own noise, at most {most_m * 1000:g} mm"
-        why = f"the content stands still; as long as the eyes stay within {band} of those solved for"
+        band = f"the eyes stay within {chosen.dead_band_mm:g} mm" if fixed_m else "the head rests"
+        why = f"the content stands still; as long as {band}, the same solution is shown"
         items.append(_item("render and inference", why, numbers.reuse))
     if on:
         items += network_items(info, numbers)
@@ -131,7 +129,7 @@ def make_plan(
     if numbers.level:
         why = f"the budget of {settings.model.budget_ms:g} ms: {numbers.level}"
         items.append(_item("model or resolution", why, numbers.level_saving))
-    return Plan(reuse, focus, seeing, fixed_m, most_m, tuple(items))
+    return Plan(reuse, focus, seeing, fixed_m, tuple(items))
 
 
 def network_items(info: ContentInfo, numbers: Measured) -> list[PlanItem]:

@@ -129,7 +129,7 @@ def _sweeps(record: dict[str, Any], *, stack: Any, small: Any, progress: Progres
     progress("tolerance knob")
     # 2 mm are few pixels of small panels: there, there is nothing to trade.
     finer = stack if stack.width_px < 1920 else replace(stack, width_px=960, height_px=540)
-    knob = sweeps.over_tolerance("texture", finer, MODELS, distance_m=KNOB_DISTANCE_M)
+    knob = sweeps.over_uncertainty("texture", finer, MODELS, distance_m=KNOB_DISTANCE_M)
     progress("panel gap")
     gaps = sweeps.over_gaps("demo", small, MODELS, distance_m=distance_m - 0.06)
     progress("resolution")
@@ -150,7 +150,7 @@ def _sweeps(record: dict[str, Any], *, stack: Any, small: Any, progress: Progres
         for h in horizons
     ]
     record["knob"] = [
-        {"model": c.name, "tolerance_mm": [float(mark) for mark in c.marks], "exact_db": c.x, "off_2mm_db": c.y}
+        {"model": c.name, "eye_sigma_mm": [float(mark) for mark in c.marks], "exact_db": c.x, "off_2mm_db": c.y}
         for c in knob
     ]
     record["gaps"] = [{"model": c.name, "gap_mm": c.x, "psnr_db": c.y} for c in gaps]

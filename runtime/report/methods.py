@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from runtime.optics.pupil import POINT_MM
 from runtime.records import U8
 from runtime.report.pairs import StillPair
 
@@ -28,7 +29,7 @@ class Method:
     kind: Kind
     source: str  # `cg`, `filter`, `mean`, `sart`, or what `load_predictor` takes
     iterations: int = 0
-    tolerance_mm: float | None = None  # of the networks; None: the default
+    eye_sigma_mm: float = POINT_MM  # that networks solve for
     scale: float = 1.0  # a network works at this share of the panels' columns and rows; its layers are enlarged
     trained: bool = True  # where not, time and memory are the network's, its picture is nobody's
 
@@ -53,7 +54,16 @@ def opened(method: Method, pair: StillPair, *, threads: int) -> Opened:
 
     predictor = _predictor(method, pair, threads)
     return Opened(
-        lambda p: solve_still(p.images[0], p.images[1], eyes_m=p.eyes_m, fov_deg=p.fov_deg, predictor=predictor).layers,
+        lambda p: (
+            solve_still(
+                p.images[0],
+                p.images[1],
+                eyes_m=p.eyes_m,
+                fov_deg=p.fov_deg,
+                predictor=predictor,
+                eye_sigma_mm=method.eye_sigma_mm,
+            ).layers
+        ),
         predictor.parameters,
         _precision(predictor),
         lambda p: predictor_multiply_adds(predictor, p, path=model_path(method.source)),
@@ -88,8 +98,6 @@ def _predictor(method: Method, pair: StillPair, threads: int) -> Predictor:
 
         return SartPredictor(pair.stack, iterations=method.iterations)
     settings = ModelSettings(threads=threads)
-    if method.tolerance_mm is not None:
-        settings = settings.model_copy(update={"tolerance_mm": method.tolerance_mm})
     if method.scale == 1.0:
         return load_predictor(method.source, pair.stack, settings)
     small = replace(

@@ -135,13 +135,13 @@ class Painter:
         from runtime.support.gl import offscreen_context
 
         self._context = offscreen_context()
-        self._source = ProceduralSource(scene, stack=stack, context=self._context)
+        self.content = ProceduralSource(scene, stack=stack, context=self._context)
 
     def __enter__(self) -> Painter:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._source.close()
+        self.content.close()
         self._context.release()
 
     def draw(self, eye_m: ArrayLike, pixels_from_stack: F64, *, width_px: int, height_px: int) -> U8:
@@ -149,7 +149,7 @@ class Painter:
         from runtime.content.base import View
 
         eye = np.asarray(eye_m, dtype=np.float64)
-        return self._source.render(View(eye, 0, pixels_from_stack, width_px, height_px), time_ns=0).copy()
+        return self.content.render(View(eye, 0, pixels_from_stack, width_px, height_px), time_ns=0).copy()
 
     def image(self, eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float = FOV_DEG) -> U8:
         """(h, w, 3) what an eye that looks at the stack's origin sees."""

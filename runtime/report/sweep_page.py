@@ -87,7 +87,8 @@ def knob_section(curves: Sequence[Curve], *, where: str) -> Section:
             dots = [(x, y, mark) for x, y, mark in zip(curve.x, curve.y, curve.marks, strict=False)]
             label_points(figure, axes, dots, lines=list(zip(curve.x, curve.y, strict=True)))
     text = [
-        f"The setting model.tolerance_mm from 0 to 8 mm on {where}: how strongly the outer panels are driven. "
+        "The uncertainty of the eyes that is solved for, model.eye_sigma_mm, from 0 to 8 mm "
+        f"on {where}: how strongly the outer panels are driven. "
         "What is perfect at one point and useless 2 mm beside it is worth nothing on a real display.",
     ]
     caption = "A dot a setting, its millimetres beside it. To the right: more exact. Up: more tolerant."

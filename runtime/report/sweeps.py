@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from runtime.config import ModelSettings
+from runtime.evaluation.trials import timed
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
 from runtime.records import F64
@@ -117,39 +117,34 @@ def over_resolutions(scene: str, stack: PanelStack, models: Sequence[str], *, di
                     continue
                 rasters = simulation.predictor.rasters(eyes)
                 blank = [np.full((r.height_px, r.width_px, 4), 128, np.uint8) for r in rasters]
-                times = []
-                for _ in range(7):
-                    start = time.perf_counter()
-                    simulation.predictor.predict([blank, blank], eyes)
-                    times.append((time.perf_counter() - start) * 1e3)
+                done = timed(partial(simulation.predictor.predict, [blank, blank], eyes), runs=7)
                 sizes.append(
                     Size(
                         model,
                         small.width_px,
                         small.height_px,
-                        float(np.median(times)),
+                        done.median_ms,
                         simulation.pooled_db(eyes, layers),
                     )
                 )
     return sizes
 
 
-def over_tolerance(
+def over_uncertainty(
     scene: str, stack: PanelStack, models: Sequence[str], *, distance_m: float, off_mm: float = 2.0
 ) -> list[Curve]:
-    """The knob `model.tolerance_mm`: PSNR at the eyes (x) against PSNR beside them (y), a point a setting."""
+    """Over the uncertainty that is solved for: PSNR at the eyes (x) against PSNR beside them (y), a point a setting."""
     eyes = eyes_at(distance_m=distance_m)
     curves = []
     for model in models:
         exact, beside_db, marks = [], [], []
-        for tolerance_mm in (0.0, 0.5, 1.0, 2.0, 4.0, 8.0):
-            settings = ModelSettings(tolerance_mm=tolerance_mm)
-            with Simulation(scene, stack, model=model, settings=settings) as simulation:
-                layers = simulation.layers(eyes)
+        with Simulation(scene, stack, model=model) as simulation:
+            for eye_sigma_mm in (0.0, 0.5, 1.0, 2.0, 4.0, 8.0):
+                layers = simulation.layers(eyes, eye_sigma_mm=eye_sigma_mm)
                 if layers is None:
                     continue
                 exact.append(simulation.pooled_db(eyes, layers))
-                marks.append(f"{tolerance_mm:g}")
+                marks.append(f"{eye_sigma_mm:g}")
                 places = [place for eye in eyes for place in beside(eye, off_mm)]
                 beside_db.append(float(np.mean([simulation.psnr_db(place, layers) for place in places])))
         curves.append(Curve(model, exact, beside_db, marks))

@@ -75,14 +75,14 @@ def test_the_correction_is_what_the_presentation_shader_does() -> None:
     """One homography, through OpenCV here and through the panels' own shader there."""
     from runtime.clock import SimulatedClock
     from runtime.panels.offscreen import OffscreenPanels
-    from runtime.records import LayerFrame
+    from runtime.records import PanelFrame
     from runtime.support.gl import offscreen_context
 
     layers = smooth_layers()
     matrix = true_from_ideal(np.array([[2.0, 1], [-1, 3], [1, -2], [0, 2]]), width_px=480, height_px=270)
     panels = (PanelSettings(), PanelSettings(homography=tuple(map(tuple, matrix.tolist()))), PanelSettings())
     sink = OffscreenPanels(offscreen_context(), clock=SimulatedClock(), width_px=480, height_px=270, panels=panels)
-    sink.present(LayerFrame(1, layers))
+    sink.present(PanelFrame(1, layers, 1))
     shown = sink.read_back()[1]
     sink.close()
     ours = corrected(layers, [np.eye(3), matrix, np.eye(3)])[1]

@@ -115,6 +115,32 @@ def test_a_half_that_is_there_twice_is_named(tmp_path: Path) -> None:
         read_folder(tmp_path, LEGO)
 
 
+def test_newer_data_name_the_eyes_left_and_right(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    write_pair(tmp_path, context, stack)
+    for half, side in (("1", "left"), ("0", "right")):
+        path = next(tmp_path.glob(f"*_{half}.png"))
+        path.rename(path.with_name(path.name.replace(f"_{half}.png", f"_{side}.png")))
+    assert is_data_set(tmp_path)
+    (pair,) = read_folder(tmp_path, LEGO)
+    assert [path.name.endswith(f"_{side}.png") for path, side in zip(pair.paths, ("left", "right"), strict=True)]
+    assert pair.eyes_m[0, 1] < pair.eyes_m[1, 1]
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (("y-0.3_z2.0_right", "y0.2_z2.0_left"), "_left stands to the right of _right with preset lego_bulldozer"),
+        (("y-0.3_z2.0_left",), "has no _right beside it"),
+        (("y-0.3_z2.0_left", "y0.2_z2.0_right", "y0.2_z2.0_1"), "has _1 beside _left and _right"),
+    ],
+)
+def test_names_of_sides_that_make_no_pair_are_told(tmp_path: Path, names: tuple[str, ...], said: str) -> None:
+    for name in names:
+        (tmp_path / f"pair0_x6.0_{name}.jpg").write_bytes(b"")
+    with pytest.raises(InputError, match=f"pair0: {said}"):
+        read_folder(tmp_path, LEGO)
+
+
 def test_a_folder_without_pairs_and_a_truncated_picture_are_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds no pair0"):
         read_folder(tmp_path, LEGO)

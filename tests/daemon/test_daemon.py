@@ -188,7 +188,8 @@ def test_every_log_line_is_one_object(started):
     assert any(json.loads(line)["message"].startswith("state: starting ->") for line in lines)
 
 
-NO_SCREEN = CONFIG + '[output]\nkind = "windows"\n' + '[[output.panels]]\nconnector = "HDMI-1"\n' * 3
+PANEL = '[[output.panels]]\nconnector = "HDMI-%d"\n'
+NO_SCREEN = CONFIG + '[output]\nkind = "windows"\n' + "".join(PANEL % n for n in range(3))
 
 
 def test_a_panel_that_is_missing_at_the_start_is_waited_for_and_more_time_asked_for(started, monkeypatch):

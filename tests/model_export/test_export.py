@@ -20,7 +20,7 @@ from model_export.network import SpectralSolver  # noqa: E402
 from model_export.recipe import read_recipe  # noqa: E402
 from model_export.ship import shipped_bytes  # noqa: E402
 from model_export.validate import check_model, validate_file  # noqa: E402
-from runtime.cli import app  # noqa: E402
+from runtime.commands.app import app  # noqa: E402
 from runtime.errors import InputError  # noqa: E402
 from runtime.model.predictor import SHIPPED, load_predictor, model_path  # noqa: E402
 from runtime.model.still import solve_still  # noqa: E402
@@ -98,7 +98,7 @@ def test_the_eye_that_the_data_had_first_gets_the_first_channels(tmp_path: Path)
         predictor = load_predictor(str(request.out), STACK)
         rgba = [[np.dstack([p, p[..., :1]])] * 3 for p in pictures]
         layers[order] = predictor.predict(rgba, EYES).layers.copy()
-        layers[f"{order} swapped"] = predictor.predict(rgba[::-1], EYES).layers.copy()
+        layers[f"{order} swapped"] = predictor.predict(rgba[::-1], EYES[::-1]).layers.copy()
     assert np.array_equal(layers["left-right"], layers["right-left swapped"])
     assert not np.array_equal(layers["left-right"], layers["right-left"])
 

@@ -1,25 +1,55 @@
-"""The published network: its keys and size, and what a checkpoint must be to be imported."""
+"""The published network: its keys and size, what a checkpoint must be to be imported, and that it does and is fed
+what the official code does and feeds (golden arrays, made by running that code)."""
 
 from __future__ import annotations
 
+import argparse
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 from model_export.checkpoint import load_eyereal, load_spectral  # noqa: E402
+from model_export.export import ExportRequest, eyereal_model, spectral_model  # noqa: E402
 from model_export.eyereal import OFFSET, EyeRealNet  # noqa: E402
+from runtime.content.eyereal import Pair, read_folder  # noqa: E402
+from runtime.content.presets import preset  # noqa: E402
 from runtime.errors import InputError  # noqa: E402
+from runtime.model.contract import parse_contract  # noqa: E402
+from runtime.model.network import NetworkPredictor  # noqa: E402
+from runtime.model.session import ModelSession  # noqa: E402
+from runtime.model.still import solve_still  # noqa: E402
+from runtime.optics.stack import PanelStack  # noqa: E402
+from runtime.support.artifacts import read_image, write_png  # noqa: E402
+from tests.model_export.golden import EYES, SIZE, WIDTH, golden, picture, weights  # noqa: E402
+
+
+def saved(path: Path, net: EyeRealNet, **more: object) -> Path:
+    """A checkpoint with everything that the official training saves: AdamW, a LambdaLR, and its command line."""
+    parser = argparse.ArgumentParser()
+    for option, default in (("--FOV", 40.0), ("--embed_dim", 4), ("--output_dir", "./outputs/"), ("--ground", None)):
+        parser.add_argument(option, default=default)
+    args = parser.parse_args([])
+    args.train_NTF, args.local_rank, args.names = False, 0, ["chair"]
+    optimizer = torch.optim.AdamW(net.parameters(), lr=2e-4, weight_decay=5e-5)
+    scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 1.0 / (1 + step))
+    net.eval()(torch.rand(1, 18, 32, 32)).sum().backward()
+    optimizer.step()
+    table = {
+        "model": net.state_dict(), "optimizer": optimizer.state_dict(), "epoch": 7, "args": args,
+        "lr_scheduler": scheduler.state_dict(),
+    }  # fmt: skip
+    torch.save(table | more, path)
+    return path
 
 
 @pytest.fixture
 def published(tmp_path: Path) -> Path:
     """A checkpoint as the official code writes it, of a narrow network."""
     torch.manual_seed(3)
-    path = tmp_path / "published.pth"
-    torch.save({"model": EyeRealNet(4).state_dict(), "epoch": 7}, path)
-    return path
+    return saved(tmp_path / "published.pth", EyeRealNet(4))
 
 
 @pytest.mark.parametrize(("width", "parameters"), [(32, 17_303_721), (16, 4_329_561)])
@@ -47,7 +77,7 @@ def test_any_size_from_32_up_comes_out_as_it_went_in(size: tuple[int, int]) -> N
 
 def test_a_published_checkpoint_is_imported_with_every_weight(published: Path) -> None:
     net = load_eyereal(published)
-    state = torch.load(published, weights_only=True)["model"]
+    state = torch.load(published, weights_only=False)["model"]
     assert all(torch.equal(value, state[key]) for key, value in net.state_dict().items())
 
 
@@ -62,6 +92,20 @@ def test_a_checkpoint_that_runs_code_is_refused_and_its_code_not_run(tmp_path: P
     torch.save({"model": Evil()}, path)
     with pytest.raises(InputError, match="no checkpoint of plain weights"):
         load_eyereal(path)
+    assert not ran.exists()
+
+
+def test_a_command_line_that_carries_code_is_refused_and_its_code_not_run(published: Path, tmp_path: Path) -> None:
+    """The allow-list holds the table that `args` is, and nothing that could stand in it."""
+    ran = tmp_path / "ran"
+
+    class Evil:
+        def __reduce__(self) -> tuple[object, tuple[Path]]:
+            return (Path.touch, (ran,))
+
+    saved(published, EyeRealNet(4), args=argparse.Namespace(hidden=Evil()))
+    with pytest.raises(InputError, match="no checkpoint of plain weights"):
+        load_eyereal(published)
     assert not ran.exists()
 
 
@@ -86,7 +130,7 @@ def damaged(state: dict[str, object], change: str) -> dict[str, object]:
     ],
 )
 def test_a_damaged_checkpoint_is_refused_by_the_key_that_is_amiss(published: Path, change: str, problem: str) -> None:
-    state = torch.load(published, weights_only=True)["model"]
+    state = torch.load(published, weights_only=False)["model"]
     torch.save({"model": damaged(state, change)}, published)
     with pytest.raises(InputError, match=re.escape(problem)):
         load_eyereal(published)
@@ -109,3 +153,115 @@ def test_a_truncated_checkpoint_is_refused(published: Path) -> None:
     published.write_bytes(published.read_bytes()[:-4000])
     with pytest.raises(InputError, match=r"published\.pth"):
         load_eyereal(published)
+
+
+def test_a_checkpoint_of_the_old_tar_format_is_one_line(tmp_path: Path) -> None:
+    import io
+    import tarfile
+
+    path = tmp_path / "legacy.pth"
+    with tarfile.open(path, "w", format=tarfile.PAX_FORMAT) as archive:
+        for name in ("storages", "tensors", "pickle"):
+            archive.addfile(tarfile.TarInfo(name), io.BytesIO())
+    with pytest.raises(InputError, match=r"legacy\.pth: is no checkpoint of plain weights"):
+        load_eyereal(path)
+
+
+# ---- what the official code does and feeds
+
+
+@pytest.fixture(scope="module")
+def official(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint of the golden arrays' weights."""
+    net = EyeRealNet(WIDTH)
+    shapes = {key: tuple(value.shape) for key, value in net.state_dict().items()}
+    net.load_state_dict({key: torch.from_numpy(value) for key, value in weights(shapes).items()})
+    path = tmp_path_factory.mktemp("official") / "official.pth"
+    torch.save({"model": net.state_dict()}, path)
+    return path
+
+
+@pytest.mark.parametrize("place", EYES)
+def test_the_forward_is_the_official_one(official: Path, place: str) -> None:
+    """Aligned corners, padding on the one side that is left over, skip before upsampled, sigmoid less 0.2."""
+    with torch.no_grad():
+        ours = load_eyereal(official)(torch.from_numpy(golden(f"{place}_x"))[None])[0].numpy()
+    assert golden(f"{place}_y").min() < -0.15, "the case must need the clip"
+    np.testing.assert_allclose(ours, golden(f"{place}_y"), atol=2e-3)
+
+
+def pair_of(folder: Path, place: str) -> Pair:
+    """The golden pictures as the data set names them, read as the data set is."""
+    for half, (x, y, z) in enumerate(EYES[place]):
+        write_png(folder / f"pair0_x{x}_y{y}_z{z}_{half}.png", picture(half))
+    (pair,) = read_folder(folder, preset("lego_bulldozer", "published-code"))
+    return pair
+
+
+def predictor_of(official: Path, folder: Path) -> NetworkPredictor:
+    request = ExportRequest(
+        "eyereal", folder / "eyereal.onnx", checkpoint=official, width_px=SIZE[0], height_px=SIZE[1],
+        eye_order="right-left",
+    )  # fmt: skip
+    request.out.write_bytes(eyereal_model(request)[0])
+    chosen = preset("lego_bulldozer", "published-code")
+    stack = chosen.stack(PanelStack(1.0, 1.0, (-1.0, 0.0, 1.0), *SIZE))
+    # The published code's panels have square pixels, whatever their shape.
+    stack = PanelStack(stack.width_m, stack.width_m * SIZE[1] / SIZE[0], stack.x_m, *SIZE)
+    return NetworkPredictor(ModelSession(request.out, threads=1), stack, source=request.out)
+
+
+@pytest.mark.parametrize("place", EYES)
+def test_what_the_network_is_fed_and_the_layers_that_are_shown_are_the_official_codes(
+    official: Path, tmp_path: Path, place: str
+) -> None:
+    """All 18 channels of one pair: panel by panel, `_0` before `_1`, red before green before blue, black beside."""
+    pair = pair_of(tmp_path, place)
+    predictor = predictor_of(official, tmp_path)
+    pictures = [read_image(path) for path in pair.paths]
+    done = solve_still(*pictures, eyes_m=pair.eyes_m, fov_deg=40.0, predictor=predictor)
+    fed, wanted = predictor._input[0], golden(f"{place}_x")
+    if place == "near":
+        assert (wanted == 0).mean() > 0.3, "the case must have black beside"
+    codes = np.abs(fed - wanted) * 255
+    for channel in range(18):
+        assert codes[channel].mean() < 0.5, f"channel {channel}"
+    assert np.quantile(codes, 0.99) < 8  # OpenCV samples at 1/32 of a pixel, and in 8 bits
+    with torch.no_grad():
+        answer = load_eyereal(official)(torch.from_numpy(fed.copy())[None])[0].numpy()
+    # Of the same answer the same grey levels: clipped, rounded half up.
+    shown = np.floor(np.clip(answer, 0, 1) * 255 + 0.5).reshape(3, 3, *SIZE[::-1]).transpose(0, 2, 3, 1)
+    assert np.abs(done.layers[..., :3] - shown).mean() < 0.01
+    apart = done.layers[..., :3].astype(float) - golden(f"{place}_layers")
+    assert np.median(np.abs(apart)) <= 1
+    assert abs(apart.mean()) < 0.25, "values that are cut off instead of rounded are half a level lower"
+    predictor.close()
+
+
+def test_pictures_of_another_view_are_black_beside_the_network_s_own_40_degrees(official: Path, tmp_path: Path) -> None:
+    """`--fov 70` shows the network what it was trained on: the 40 degrees in the middle."""
+    pair = pair_of(tmp_path, "near")
+    predictor = predictor_of(official, tmp_path)
+    white = np.full((200, 320, 3), 255, np.uint8)
+    solve_still(white, white, eyes_m=pair.eyes_m, fov_deg=70.0, predictor=predictor)
+    fed, beside = predictor._input[0], golden("near_x") == 0
+    assert (fed[beside] < 0.6).all() and fed[beside].mean() < 0.01
+    solve_still(white, white, eyes_m=pair.eyes_m, fov_deg=20.0, predictor=predictor)
+    assert (predictor._input[0] == 0).mean() > 0.7, "a smaller picture ends in black too, not in its repeated edge"
+    predictor.close()
+
+
+def test_an_export_says_what_it_was_trained_for_only_where_that_is_known(official: Path, tmp_path: Path) -> None:
+    def trained_for(data: bytes) -> object:
+        import onnx
+
+        model = onnx.load_from_string(data)
+        return parse_contract({item.key: item.value for item in model.metadata_props}, source="x").trained_for
+
+    size = {"width_px": 64, "height_px": 40}
+    checkpoint = ExportRequest("eyereal", tmp_path / "a.onnx", checkpoint=official, **size)
+    random = ExportRequest("eyereal", tmp_path / "a.onnx", random_init=1, base_width=4, **size)
+    assert trained_for(eyereal_model(checkpoint)[0]) is None
+    assert trained_for(eyereal_model(random)[0]) is None
+    assert trained_for(spectral_model(ExportRequest("fast", tmp_path / "a.onnx", random_init=1))[0]) is None
+    assert trained_for(spectral_model(ExportRequest("fast", tmp_path / "a.onnx"))[0]) is not None

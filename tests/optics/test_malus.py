@@ -72,3 +72,19 @@ def test_single_precision_stays_single(dtype: type) -> None:
     assert intensity_from_phase(phase).dtype == dtype
     # Where the slope of sin² is 1 at most, the error of the phase is that of the intensity.
     assert np.abs(intensity_from_phase(phase) - value).max() < 4 * np.finfo(dtype).eps
+
+
+@pytest.mark.parametrize("dtype", [bool, np.int8, np.int32, np.int64])
+def test_whole_numbers_are_taken_as_numbers_and_not_rounded_to_their_type(dtype: type) -> None:
+    """Seen: pi/2 became 1 in an integer's type, and sin²(1) was told for white."""
+    np.testing.assert_allclose(intensity_from_phase(np.array([0, 1], dtype)), [0.0, 1.0], atol=1e-15)  # type: ignore[type-var]
+    np.testing.assert_allclose(phase_from_intensity(np.array([0, 1], dtype), 1), [0.0, 1.0], atol=1e-15)  # type: ignore[type-var]
+    np.testing.assert_allclose(phase_from_intensity(np.array([0, 1], dtype), 2), [2.0, 1.0], atol=1e-15)  # type: ignore[type-var]
+
+
+@pytest.mark.parametrize("values", [np.array([0, 255], np.uint8), np.array(["1"]), np.array([1j])])
+def test_what_is_neither_phase_nor_intensity_is_refused(values: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="real numbers"):
+        intensity_from_phase(values)
+    with pytest.raises(ValueError, match="real numbers"):
+        phase_from_intensity(values)

@@ -105,6 +105,22 @@ def test_collinear_corners_are_refused(positions: list[float]) -> None:
         image_from_panel_four_points(corners, width_px=10, height_px=10)
 
 
+@given(quadrilaterals(), st.integers(0, 3), st.integers(0, 3), floats(-1.0, 2.0), floats(1e-12, 1e12))
+def test_any_three_corners_on_a_line_or_two_at_one_place_are_refused(
+    corners: np.ndarray, moved: int, steps: int, along: float, size: float
+) -> None:
+    """Seen in the issue: only the triangle of corners 1, 2 and 3 was looked at."""
+    first, second = (moved + 1) % 4, (moved + 2 + steps % 2) % 4
+    flat = corners.copy()
+    flat[moved] = corners[first] + along * (corners[second] - corners[first])
+    with pytest.raises(ValueError, match="collinear"):
+        image_from_panel_four_points(flat * size, width_px=640, height_px=480)
+    flat[moved] = corners[first]
+    with pytest.raises(ValueError, match="collinear"):
+        image_from_panel_four_points(flat * size, width_px=640, height_px=480)
+    image_from_panel_four_points(corners * size, width_px=640, height_px=480)
+
+
 def test_corners_that_are_not_finite_are_refused() -> None:
     with pytest.raises(ValueError, match="collinear"):
         image_from_panel_four_points([[0, 0], [np.inf, 0], [1, 1], [0, 1]], width_px=10, height_px=10)

@@ -39,6 +39,59 @@ def test_a_budget_chooses_model_and_resolution_and_says_what_it_costs() -> None:
     assert any(item["what"] == "model or resolution" for item in result["plan"])
 
 
+def labels(*options: str) -> list[str]:
+    done = runner.invoke(app, ["--scene", "grey", "--scale", "0.1", "--budget-ms", "0.001", "--json", *options])
+    assert done.exit_code == 0, done.output
+    return [level["label"] for level in json.loads(done.stdout)["levels"]]
+
+
+def test_a_budget_is_planned_from_the_levels_that_the_daemon_would_choose_from(tmp_path: Path) -> None:
+    assert {label.split()[0] for label in labels("--model", "sart")} == {"sart"}
+    two = tmp_path / "two.toml"
+    two.write_text("[stack]\nx_m = [-0.03, 0.03]\n")
+    assert not {"fast", "best"} & set(labels("--config", str(two)))
+
+
+@pytest.mark.parametrize("model", ["balanced", "sart"])
+def test_what_can_be_chosen_is_the_ladder_of_the_running_loop(model: str) -> None:
+    from runtime.config import Settings
+    from runtime.plan.ladder import rungs
+    from runtime.plan.levels import Level
+
+    settings = Settings.model_validate({"model": {"name": model}})
+    known = {Level(name, scale, 0.0, 0.0).label for name, scale in rungs(settings, settings.stack.stack())}
+    shown = set(labels("--model", model))
+    assert shown <= known, "levels that are slower and worse than another are left out"
+    assert len(known) > 1
+
+
+@pytest.mark.parametrize(
+    ("eyes", "said"),
+    [
+        ("0 0 0", "not in front of the panels"),
+        ("-1 0 0", "not in front of the panels"),
+        ("0.06 0 0", "not in front of the panels"),
+        ("nan 0 0", "finite"),
+        ("0.6 inf 0", "finite"),
+        ("0.061 40 0", "nothing of the display can be seen"),
+        ("1e300 0 0", "metres are meant"),
+        ("600 0 0", "metres are meant"),
+    ],
+)
+def test_eyes_that_see_nothing_are_one_line(eyes: str, said: str) -> None:
+    done = runner.invoke(app, ["--scene", "flat", "--scale", "0.1", "--eyes", *eyes.split()])
+    assert isinstance(done.exception, InputError), done.exception
+    assert str(done.exception).startswith("plan: --eyes: ")
+    assert said in str(done.exception)
+
+
+def test_fixed_eyes_of_the_configuration_are_checked_by_their_own_name(tmp_path: Path) -> None:
+    config = tmp_path / "phasestack.toml"
+    config.write_text("[sensor]\nfixed_eyes_m = [[-0.6, -0.03, 0], [-0.6, 0.03, 0]]\n")
+    done = runner.invoke(app, ["--config", str(config), "--scale", "0.1"])
+    assert str(done.exception).startswith("sensor.fixed_eyes_m: ")
+
+
 def test_people_get_a_table() -> None:
     done = runner.invoke(app, ["--scene", "flat", "--scale", "0.25"])
     assert done.exit_code == 0, done.output

@@ -131,9 +131,10 @@ def tiny_input(model: str, value: float) -> Answer:
 def poisoned(model: str, value: float) -> U8:
     """A network whose tolerance input is not a number: what it answers isn't either."""
     predictor = load_predictor(model, STACK, ModelSettings(threads=1))
-    predictor.__dict__["tolerance_mm"] = value
     images = pictures("lines one pixel wide")
-    done = solve_still(images[0], images[1], eyes_m=eyes_at(distance_m=0.6), fov_deg=FOV_DEG, predictor=predictor)
+    done = solve_still(
+        images[0], images[1], eyes_m=eyes_at(distance_m=0.6), fov_deg=FOV_DEG, predictor=predictor, eye_sigma_mm=value
+    )
     return done.layers
 
 

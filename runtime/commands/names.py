@@ -1,0 +1,88 @@
+"""What settings name outside the configuration: drivers, scenes, models, files. Known or there, or told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from runtime.errors import InputError
+from runtime.support.plausible import nearest
+
+if TYPE_CHECKING:
+    from runtime.config import Settings
+
+
+def scene_names() -> tuple[str, ...]:
+    """Every scene that is no file."""
+    from runtime.content.presets import preset_names
+    from runtime.content.scenes import SCENES
+
+    return (*SCENES, *preset_names(), "external")
+
+
+def scene_from_here(name: str) -> str:
+    """A scene for a daemon that runs elsewhere: a file's or folder's absolute path; a known name as it is.
+
+    What is neither known nor there is left as it is: the daemon says what it knows.
+    """
+    try:
+        if not Path(name).exists() or (Path(name).name == name and name in scene_names()):
+            return name
+        return str(Path(name).absolute())
+    except (OSError, ValueError):  # too long, or a NUL character
+        return name
+
+
+def check_names(settings: Settings, *, source: str | Path) -> None:
+    """Raise InputError for the first name that nobody knows, or file that is not there, naming its field."""
+    from runtime.eyes.calibration import load_calibration
+    from runtime.model.predictor import SHIPPED
+    from runtime.sensor.registry import driver_names
+
+    sensor, content, output = settings.sensor, settings.content, settings.output
+    if sensor.driver not in driver_names():
+        _unknown("sensor.driver", sensor.driver, driver_names(), source)
+    if sensor.driver == "replay" and sensor.source != "demo":
+        _there("sensor.source", sensor.source, source)
+    if sensor.openni2_folder:
+        _there("sensor.openni2_folder", sensor.openni2_folder, source)
+    if settings.detector.kind == "yunet":
+        _there("detector.yunet_model", settings.detector.yunet_model, source)
+    if settings.calibration.file:
+        _there("calibration.file", settings.calibration.file, source)
+        load_calibration(Path(settings.calibration.file))
+    if content.scene not in scene_names():
+        _known_or_there("content.scene", content.scene, scene_names(), source)
+    if content.file:
+        _there("content.file", content.file, source)
+    if settings.model.name not in (*SHIPPED, "sart"):
+        _known_or_there("model.name", settings.model.name, (*SHIPPED, "sart"), source)
+    for number, panel in enumerate(output.panels):
+        if panel.lut:
+            _there(f"output.panels.{number}.lut", panel.lut, source)
+        if output.kind != "offscreen" and not (panel.edid_serial or panel.connector or panel.index >= 0):
+            raise InputError(source, f"output.panels.{number}", "names no monitor: set edid_serial or connector")
+    if output.kind != "offscreen" and not output.panels:
+        raise InputError(
+            source,
+            "output.panels",
+            f"{output.kind} need one table a panel that names its monitor (phasestack identify)",
+        )
+
+
+def _there(field: str, path: str, source: str | Path) -> None:
+    if not path or not Path(path).exists():
+        raise InputError(source, field, f"{path!r} is not there")
+
+
+def _unknown(field: str, name: str, known: tuple[str, ...], source: str | Path) -> None:
+    hint = nearest(name, known) or f"; known: {', '.join(known)}"
+    raise InputError(source, field, f"nobody knows {name!r}{hint}")
+
+
+def _known_or_there(field: str, name: str, known: tuple[str, ...], source: str | Path) -> None:
+    if Path(name).exists():
+        return
+    if "/" in name or Path(name).suffix:
+        _there(field, name, source)
+    _unknown(field, name, known, source)

@@ -1,0 +1,372 @@
+"""One refresh after the other: receive, map, predict, align, present, account. It waits for nothing but its time.
+
+The solver works beside it (`solver_host`) and hands over complete solutions; every refresh shows the newest one,
+aligned to where the eyes will be when its light leaves.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from runtime.clock import NS_PER_MS, Clock
+from runtime.errors import EndOfRecording, PanelLost
+from runtime.frame.pacing import Pacer
+from runtime.frame.policy import Flatness, wants_flat
+from runtime.frame.run_state import RunCell
+from runtime.frame.samples import Samples
+from runtime.frame.solver_host import News, SolverHost
+from runtime.frame.states import Conditions, Part, StateMachine
+from runtime.frame.stats import RunStats
+from runtime.frame.timing import SOLVING_STAGES, RefreshTimes
+from runtime.frame.viewer import Viewer
+from runtime.optics.alignment import align
+from runtime.optics.stack import PanelStack
+from runtime.panels.base import PanelSink
+from runtime.plan.savings import selected_eyes
+from runtime.records import (
+    F64,
+    EyesEstimate,
+    FrameTiming,
+    PanelFrame,
+    PresentReport,
+    RefreshAccount,
+    SensorFrame,
+    Solution,
+    SolveRequest,
+    State,
+)
+
+log = logging.getLogger("phasestack.presenter")
+
+
+class Supervisor(Protocol):
+    """What the presenter tells the outside, and asks it, once a refresh. Nothing here may wait."""
+
+    def stop_reason(self) -> str:
+        """Why to stop; empty: go on."""
+
+    def obey(self, presenter: Presenter) -> None:
+        """Carry out what an operator asked for since the last refresh."""
+
+    def refreshed(self, presenter: Presenter, account: RefreshAccount) -> None:
+        """One refresh is complete."""
+
+
+class Unsupervised:
+    """Nobody watches: a demo, a test."""
+
+    def stop_reason(self) -> str:
+        return ""
+
+    def obey(self, presenter: Presenter) -> None:
+        return
+
+    def refreshed(self, presenter: Presenter, account: RefreshAccount) -> None:
+        return
+
+
+@dataclass(frozen=True, slots=True)
+class Refresh:
+    """All of one refresh, for those who look at it closely."""
+
+    account: RefreshAccount
+    frame: PanelFrame
+    solution: Solution | None
+
+
+class Observer(Protocol):
+    """Who looks at refreshes: files, sampled quality. Quick: it runs between two refreshes."""
+
+    def sampled(self, sample: SensorFrame) -> None:
+        """A sample arrived."""
+
+    def refreshed(self, refresh: Refresh) -> None:
+        """A refresh is complete."""
+
+
+class Unobserved:
+    """Nobody looks."""
+
+    def sampled(self, sample: SensorFrame) -> None:
+        return
+
+    def refreshed(self, refresh: Refresh) -> None:
+        return
+
+
+class Presenter:
+    """One run. Everything it needs is given; it owns none of it but what it counts."""
+
+    def __init__(
+        self,
+        run: RunCell,
+        stack: PanelStack,
+        *,
+        clock: Clock,
+        pacer: Pacer,
+        samples: Samples,
+        viewer: Viewer,
+        solver: SolverHost,
+        panels: PanelSink,
+        stage_ms: dict[str, float],
+        supervisor: Supervisor | None = None,
+        observer: Observer | None = None,
+    ) -> None:
+        """stage_ms: what stages of a refresh cost on a simulated clock."""
+        self.run_cell, self.stack, self.clock = run, stack, clock
+        self.pacer, self.samples, self.viewer, self.solver, self.panels = pacer, samples, viewer, solver, panels
+        self._stage_ms = stage_ms
+        self._supervisor, self._observer = supervisor or Unsupervised(), observer or Unobserved()
+        self._adopted = run.state.version
+        self.stats = RunStats()
+        self.machine = StateMachine(now_ns=clock.now_ns())
+        self.flat_asked = False
+        self.paused = False
+        self.missing: dict[str, str] = {}  # parts that don't work at present, and why
+        self.last: Refresh | None = None
+        self._flatness = Flatness()
+        self._presented = False
+        self._shown_solution: int | None = None  # number of the solution that was on the panels before
+        self._drew_solution = False  # a solution has been on the panels before
+        self._aligned: tuple[int, bytes, tuple[F64, ...], str] | None = None
+
+    def run(self, *, frames: int | None = None) -> str:
+        """Refreshes until the recording ends, `frames` are done, or the supervisor says so. Answers why it stopped."""
+        reason = ""
+        while not reason:
+            try:
+                self.refresh()
+            except EndOfRecording:
+                reason = "the recording has ended"
+            reason = reason or self._supervisor.stop_reason()
+            if frames is not None and self.stats.frames >= frames:
+                reason = reason or f"{frames} frames done"
+        self.machine.update(Conditions("none", {}, presented=True, stopping=reason), now_ns=self.clock.now_ns())
+        return reason
+
+    def refresh(self) -> RefreshAccount:
+        """One refresh. Raises EndOfRecording, FatalError."""
+        times = RefreshTimes(self.clock, self._stage_ms)
+        timing = self.pacer.predict(self.clock.now_ns())
+        self.clock.sleep_until_ns(timing.wake_ns)
+        times.lap("wait")
+        woke_ns = self.clock.now_ns()
+        self._supervisor.obey(self)
+        self._adopt_settings()
+        self._receive(woke_ns)
+        times.lap("sensor")
+        eyes = self.viewer.at(timing.photon_ns)
+        news = self.solver.news()
+        frame, limited = self._compose(timing, eyes, news)
+        times.lap("track")
+        report, lost = self._present(frame)
+        times.lap("present")
+        if report is not None and times.simulated:  # presenting has been paid for only now
+            report = replace(report, present_ns=self.clock.now_ns())
+        photon_ns = self._presented_at(timing, report, woke_ns=woke_ns)
+        self.solver.post(self._request(timing, eyes))
+        self.missing = self._missing(news, lost)
+        state = self._judge(eyes, limited)
+        account = self._account(timing, eyes, news, frame, report, photon_ns, state, times)
+        self._tell(account, frame, news.solution, times)
+        return account
+
+    def _adopt_settings(self) -> None:
+        """Other settings may have been taken over since the last refresh."""
+        state = self.run_cell.state
+        if state.version != self._adopted:
+            self._adopted = state.version
+            self.viewer.adopt(state.settings, state.calibration)
+
+    def _receive(self, now_ns: int) -> None:
+        for sample in self.samples.arrived(now_ns):
+            self.viewer.take(sample, serial=self.samples.serial)
+            self._observer.sampled(sample)
+
+    def _compose(self, timing: FrameTiming, eyes: EyesEstimate, news: News) -> tuple[PanelFrame, str]:
+        """What the panels are given, and why an alignment is at its limit (empty: it is not)."""
+        settings = self.run_cell.state.settings
+        solution, flat = news.solution, news.flat
+        target = 1.0 if eyes.eyes_m is None or self.flat_asked else 0.0
+        if solution is None:
+            self._flatness.value = 1.0
+        elif not self._drew_solution and target == 0.0:
+            self._flatness.value = 0.0  # the first picture is not faded in
+        blend_s = settings.tracker.blend_s
+        flatness = self._flatness.value
+        if not self.paused:
+            flatness = self._flatness.toward(target, blend_s=blend_s, now_ns=self.clock.now_ns())
+        if solution is None or flat is None:
+            flatness = self._flatness.value = 1.0 if solution is None else 0.0
+        self._drew_solution = self._drew_solution or (solution is not None and flatness < 1.0)
+        matrices, limited = self._alignment(eyes, solution)
+        frame = PanelFrame(
+            timing.id,
+            solution.layers if solution is not None else None,
+            solution.number if solution is not None else 0,
+            matrices,
+            flat.layers if flat is not None else None,
+            flat.number if flat is not None else 0,
+            flatness,
+        )
+        return frame, limited
+
+    def _alignment(self, eyes: EyesEstimate, solution: Solution | None) -> tuple[tuple[F64, ...], str]:
+        """One matrix a panel; the last one where no eyes are known; () where none is needed."""
+        plan = self.run_cell.state.settings.plan
+        if solution is None or solution.solved_for_m is None or not (plan.enabled and plan.align):
+            return (), ""
+        if eyes.eyes_m is None:
+            last = self._aligned
+            return (last[2], "") if last is not None and last[0] == solution.number else ((), "")
+        eyes_m = selected_eyes(eyes.eyes_m, solution.seeing)
+        key = eyes_m.tobytes()
+        if self._aligned is None or self._aligned[:2] != (solution.number, key):
+            found = align(self.stack, solved_for_m=solution.solved_for_m, eyes_m=eyes_m)
+            self._aligned = solution.number, key, found.solved_from_shown, found.limited
+        return self._aligned[2], self._aligned[3]
+
+    def _present(self, frame: PanelFrame) -> tuple[PresentReport | None, str]:
+        """Put it on the panels; None and why, where they are not there or there is nothing to show yet."""
+        if frame.solved is None and frame.flat is None:
+            return None, ""
+        unchanged = self.last is not None and self.last.account.presented and _same(frame, self.last.frame)
+        try:
+            report = self.panels.present(frame, unchanged=unchanged)
+        except PanelLost as error:
+            self.fault("panel")
+            return None, str(error)
+        self._presented = True
+        return report, ""
+
+    def _presented_at(self, timing: FrameTiming, report: PresentReport | None, *, woke_ns: int) -> int:
+        """Tell the pacer what happened; answers when the light leaves."""
+        blank_ns = report.vblank_ns if report is not None else None
+        return self.pacer.presented(timing, woke_ns=woke_ns, done_ns=self.clock.now_ns(), blank_ns=blank_ns)
+
+    def _request(self, timing: FrameTiming, eyes: EyesEstimate) -> SolveRequest:
+        """What to solve next: the eyes in the middle of the time that a solution begun now will be shown.
+
+        It is complete after its cost, first shown half a period later on average, and replaced when the next one is.
+        """
+        cost_ns, period_ns = self.solver.solve_cost_ns, self.pacer.period_ns
+        shown_ns = max(cost_ns, period_ns)
+        middle_ns = timing.photon_ns + cost_ns + (period_ns + shown_ns) // 2
+        then = self.viewer.ahead(middle_ns) if eyes.eyes_m is not None else eyes
+        if then.eyes_m is None:
+            then = eyes
+        return SolveRequest(
+            middle_ns,
+            then.eyes_m,
+            then.label,
+            # A solution is aligned to better known eyes when it is shown: what matters is how sure those are.
+            eyes.sigma_m,
+            wants_flat(eyes, flat_asked=self.flat_asked, flatness=self._flatness.value),
+            self.paused,
+        )
+
+    def _missing(self, news: News, lost: str) -> dict[str, str]:
+        missing = dict(news.missing)
+        if lost:
+            missing["panel"] = lost
+        if fault := self.samples.fault():
+            missing["sensor"] = fault
+        for part in news.missing:
+            if part not in self.missing or news.missing[part] != self.missing[part]:
+                self.fault(part)
+        return missing
+
+    def _judge(self, eyes: EyesEstimate, limited: str) -> State:
+        parts: dict[Part, str] = {part: why for part, why in self.missing.items()}  # type: ignore[misc]
+        conditions = Conditions(
+            eyes.label,
+            parts,
+            presented=self._presented,
+            flat_wanted=self.flat_asked,
+            limited=limited,
+            paused=self.paused,
+        )
+        transition = self.machine.update(conditions, now_ns=self.clock.now_ns())
+        if transition is not None:
+            log.info(
+                "state: %s -> %s (%s)", transition.before, transition.after, transition.reason, extra={"always": True}
+            )
+        return self.machine.state
+
+    def _account(
+        self,
+        timing: FrameTiming,
+        eyes: EyesEstimate,
+        news: News,
+        frame: PanelFrame,
+        report: PresentReport | None,
+        photon_ns: int,
+        state: State,
+        times: RefreshTimes,
+    ) -> RefreshAccount:
+        solution = news.solution if report is not None and frame.flatness < 1.0 else None  # that is shown
+        ran = solution is not None and solution.number != self._shown_solution
+        stage_ms, machine_ms = dict(times.stage_ms), dict(times.machine_ms)
+        if solution is not None and ran:
+            stage_ms |= {stage: solution.stage_ms.get(stage, 0.0) for stage in SOLVING_STAGES}
+            machine_ms |= {stage: solution.machine_ms.get(stage, 0.0) for stage in SOLVING_STAGES}
+        if solution is not None:
+            self._shown_solution = solution.number
+        return RefreshAccount(
+            frame=timing.id,
+            capture_ns=eyes.capture_ns,
+            predicted_for_ns=timing.photon_ns,
+            present_ns=report.present_ns if report is not None else self.clock.now_ns(),
+            eyes_m=eyes.eyes_m,
+            eyes_label=eyes.label,
+            eye_sigma_mm=eyes.sigma_m * 1e3 if eyes.eyes_m is not None else None,
+            state=state,
+            solution=solution.number if solution is not None else None,
+            solved_for_m=solution.solved_for_m if solution is not None else None,
+            solution_age_ms=(photon_ns - solution.solved_for_ns) / NS_PER_MS if solution is not None else None,
+            inference="ran" if ran else "reused" if solution is not None else "skipped",
+            presented=report is not None,
+            skew_ms=report.skew_ms if report is not None else 0.0,
+            photon_ns=photon_ns,
+            stage_ms=stage_ms,
+            machine_ms=machine_ms,
+        )
+
+    def _tell(self, account: RefreshAccount, frame: PanelFrame, solution: Solution | None, times: RefreshTimes) -> None:
+        self.last = Refresh(account, frame, solution)
+        self._supervisor.refreshed(self, account)
+        overhead_ms = times.overhead_ms()
+        self.stats.add(account, overhead_ms=overhead_ms, missed_blanks=self.pacer.missed)
+        self._observer.refreshed(self.last)
+
+    def fault(self, part: str) -> None:
+        """Count a fault that the run lives on with."""
+        self.stats.fault(part)
+
+    def seconds(self) -> float:
+        """Since the first refresh, on the run's clock."""
+        return self.stats.seconds()
+
+    def summary(self, *, simulated: bool = False) -> dict[str, Any]:
+        """The part of summary.json that is counted (contract 5.2); simulated: every time is the run's clock's."""
+        predictor = self.run_cell.state.predictor
+        return {
+            **self.stats.summary(stale_inputs=self.samples.stale_inputs, simulated=simulated),
+            "model": predictor.name,
+            "provider": predictor.provider,
+            "states": self.machine.seconds(now_ns=self.clock.now_ns()),
+        }
+
+
+def _same(frame: PanelFrame, before: PanelFrame) -> bool:
+    """Whether two frames show the same picture on every panel."""
+    return (
+        (frame.solved_version, frame.flat_version if frame.flatness > 0.0 else 0, frame.flatness)
+        == (before.solved_version, before.flat_version if before.flatness > 0.0 else 0, before.flatness)
+        and len(frame.solved_from_shown) == len(before.solved_from_shown)
+        and all(np.array_equal(a, b) for a, b in zip(frame.solved_from_shown, before.solved_from_shown, strict=True))
+    )

@@ -1,0 +1,40 @@
+"""What a run is made with at one moment: one immutable value, replaced as a whole by whoever reconfigures."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, replace
+from typing import Any
+
+from runtime.config import Settings
+from runtime.content.base import ContentSource
+from runtime.eyes.calibration import Calibration
+from runtime.model.predictor import Predictor
+
+
+@dataclass(frozen=True, slots=True)
+class RunState:
+    """Settings, calibration, content and model that belong together. Content and model are the solver's alone."""
+
+    version: int  # another number for each value
+    settings: Settings
+    calibration: Calibration
+    content: ContentSource
+    predictor: Predictor
+
+
+class RunCell:
+    """Holds the newest RunState. Readers take `state` once and use that; any thread may."""
+
+    def __init__(
+        self, settings: Settings, *, calibration: Calibration, content: ContentSource, predictor: Predictor
+    ) -> None:
+        self._lock = threading.Lock()
+        self.state = RunState(0, settings, calibration, content, predictor)
+
+    def replace(self, **changes: Any) -> RunState:
+        """Fields of RunState that change; answers the state before, whose parts are the caller's to close."""
+        with self._lock:
+            before = self.state
+            self.state = replace(before, version=before.version + 1, **changes)
+            return before

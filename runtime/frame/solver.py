@@ -1,0 +1,178 @@
+"""Draws content and predicts layers for where the eyes will be; one thread uses it, the one with its GL context."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from runtime.content.base import View
+from runtime.errors import ContentFailure, ModelFailure
+from runtime.frame.buffers import LayerBuffers
+from runtime.frame.policy import FramePolicy, Made
+from runtime.frame.run_state import RunCell, RunState
+from runtime.frame.timing import Stopwatch
+from runtime.model.flat import flat_layers
+from runtime.optics.pupil import configured_sigma_mm
+from runtime.optics.stack import PanelStack
+from runtime.optics.views import raster_from_stack
+from runtime.plan.drawing import drawn_for
+from runtime.plan.planner import Planner, observed
+from runtime.plan.savings import Measured, Plan, seeing_eyes
+from runtime.records import F64, U8, PlanItem, Solution, SolveRequest
+
+log = logging.getLogger("phasestack.solver")
+
+FLAT_EYE_M = (0.7, 0.0, 0.0)  # where the flat picture is drawn from before any viewer was seen
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What became of one request."""
+
+    solution: Solution | None = None  # a new one for two eyes
+    flat: Solution | None = None  # a new flat picture
+    missing: dict[str, str] = field(default_factory=dict)  # parts that failed (content, model), and why
+
+    @property
+    def idle(self) -> bool:
+        """There was nothing to do."""
+        return self.solution is None and self.flat is None and not self.missing
+
+
+class Solver:
+    """One solution or flat picture a step, from whatever the run is made with at its beginning."""
+
+    def __init__(self, run: RunCell, stack: PanelStack) -> None:
+        self.run, self.stack = run, stack
+        self.measured = Measured()  # what is known of the plan's times and errors
+        self.plan: Plan | None = None
+        self._planned_for: tuple[int, tuple[bool, bool], Measured] | None = None
+        self._seeing = (True, True)
+        self._policy = FramePolicy()
+        self._buffers = LayerBuffers()
+        self._number = 0
+        self._solved: Made | None = None
+        self._flat: Made | None = None
+        self._middle_m: F64 = np.array(FLAT_EYE_M)
+        self._missing: dict[str, str] = {}
+        self._failed_for: Made | None = None
+
+    def step(self, request: SolveRequest) -> Step:
+        """Do what the request calls for, if anything. A part that fails is named; what there is stays good."""
+        state = self.run.state
+        self._replan(state, request.eyes_m)
+        time_ns = request.time_ns
+        try:
+            revision = state.content.revision(time_ns=time_ns)
+        except Exception as error:
+            return Step(missing=self._failed("content", error, expected=ContentFailure))
+        job = self._policy.next_job(
+            request,
+            plan=self.plan,
+            state_version=state.version,
+            revision=revision,
+            solved=self._solved,
+            flat=self._flat,
+        )
+        if job.kind == "flat":
+            return self._draw_flat(state, revision=revision, time_ns=time_ns)
+        if job.kind == "solve":
+            assert job.eyes_m is not None
+            return self._solve(state, request, job.eyes_m, revision=revision)
+        return Step(missing=self._missing)
+
+    def _solve(self, state: RunState, request: SolveRequest, eyes_m: F64, *, revision: int) -> Step:
+        settings, watch = state.settings.model, Stopwatch()
+        stages: dict[str, float] = {}
+        try:
+            images = drawn_for(state.predictor, state.content, eyes_m, time_ns=request.time_ns)
+        except Exception as error:
+            return Step(missing=self._failed("content", error, expected=ContentFailure))
+        stages["render"] = watch.lap_ms()
+        sigma_mm = configured_sigma_mm(
+            settings.eye_sigma_mm, pupil_mm=settings.pupil_mm, tracker_sigma_m=request.sigma_m
+        )
+        try:
+            prediction = state.predictor.predict(images, eyes_m, eye_sigma_mm=sigma_mm)
+        except Exception as error:
+            return Step(missing=self._failed("model", error, expected=ModelFailure))
+        layers = self._buffers.copy_of(prediction.layers)
+        rest_ms = max(0.0, watch.lap_ms() - sum(prediction.stage_ms.values()))
+        stages |= prediction.stage_ms
+        stages["finish"] = stages.get("finish", 0.0) + rest_ms
+        self._missing = {}
+        self._solved = Made(state.version, revision, eyes_m)
+        self._middle_m = eyes_m.mean(axis=0)
+        self._number += 1
+        solution = Solution(
+            self._number,
+            layers,
+            eyes_m,
+            request.time_ns,
+            seeing=self.plan.eyes if self.plan is not None else (True, True),
+            eye_sigma_mm=sigma_mm,
+            stage_ms=stages,
+            machine_ms=stages,
+        )
+        return Step(solution=solution)
+
+    def _draw_flat(self, state: RunState, *, revision: int, time_ns: int) -> Step:
+        watch = Stopwatch()
+        missing: dict[str, str] = {}
+        try:
+            raster = self.stack.panel(self.stack.count // 2)
+            middle = self._middle_m
+            view = View(middle, 0, raster_from_stack(middle, raster), raster.width_px, raster.height_px)
+            picture = state.content.render(view, time_ns=time_ns)
+        except Exception as error:
+            missing = self._failed("content", error, expected=ContentFailure)
+            if self._flat is not None:
+                return Step(missing=missing)
+            picture = np.full((self.stack.height_px, self.stack.width_px, 4), 255, np.uint8)
+        layers: U8 = flat_layers(picture, self.stack)
+        if not missing:
+            self._missing.pop("content", None)
+            self._flat = Made(state.version, revision, None, self._policy.episode)
+        self._number += 1
+        stages = {"render": watch.lap_ms()}
+        flat = Solution(self._number, layers, None, time_ns, stage_ms=stages, machine_ms=stages)
+        return Step(flat=flat, missing=missing)
+
+    def plan_items(self, measured: Measured | None = None) -> tuple[PlanItem, ...]:
+        """What is left out now, with what is known of its time and error. Any thread may ask."""
+        state = self.run.state
+        numbers = observed(measured or self.measured, state.predictor)
+        planner = Planner(state.settings, self.stack)
+        return planner.plan(state.content.info, state.predictor, seeing=self._seeing, measured=numbers).items
+
+    def _replan(self, state: RunState, eyes_m: F64 | None) -> None:
+        """Make the plan again where the content, the model, the settings or what the eyes can see have changed."""
+        range_deg = state.settings.plan.range_deg
+        seeing = self._seeing if eyes_m is None else seeing_eyes(eyes_m, self._seeing, range_deg=range_deg)
+        if seeing != self._seeing:
+            log.info("plan: %s", _who_sees(seeing))
+        self._seeing = seeing
+        made_for = (state.version, seeing, self.measured)
+        if made_for != self._planned_for:
+            self._planned_for = made_for
+            self.plan = Planner(state.settings, self.stack).plan(state.content.info, state.predictor, seeing=seeing)
+
+    def _failed(self, part: str, error: Exception, *, expected: type[Exception]) -> dict[str, str]:
+        self._missing[part] = str(error).splitlines()[0] if str(error) else type(error).__name__
+        if isinstance(error, expected):
+            log.warning("%s: %s", part, error)
+        else:
+            log.exception("%s: unexpected error", part)
+        return dict(self._missing)
+
+
+def _who_sees(seeing: tuple[bool, bool]) -> str:
+    """One line for the log."""
+    match seeing:
+        case (True, False):
+            return "the right eye can't see the display: solved for the left one alone"
+        case (False, True):
+            return "the left eye can't see the display: solved for the right one alone"
+    return "solved for both eyes"

@@ -1,0 +1,146 @@
+"""Where a solver runs: the presenter's view of it, and the host of simulated time."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+from runtime.clock import NS_PER_MS, Clock
+from runtime.frame.solver import Step
+from runtime.frame.timing import SOLVING_STAGES
+from runtime.records import Solution, SolveRequest
+
+FIRST_REQUEST = SolveRequest(0, None, "none", 0.0, flat_wanted=True)  # before the first refresh: the flat picture
+COST_GAIN = 0.2  # of the newest solution in the running mean of what one costs
+
+
+class SolverParts(Protocol):
+    """A solver and what belongs to its thread: GL context, time budget."""
+
+    def step(self, request: SolveRequest) -> Step:
+        """One request."""
+
+    def simulated_stage_ms(self) -> Mapping[str, float]:
+        """What each stage costs on a simulated clock at present."""
+
+    def close(self, *, abandoned: bool = False) -> None:
+        """Release everything, on the thread that made it; abandoned: only what no other solver uses by now."""
+
+
+@dataclass(frozen=True, slots=True)
+class News:
+    """The newest of what the solver made; one value, replaced as a whole."""
+
+    solution: Solution | None = None
+    flat: Solution | None = None
+    missing: Mapping[str, str] = field(default_factory=dict)  # content, model: why the last step failed
+    solutions: int = 0  # made so far
+
+
+Task = Callable[[SolverParts], bool]  # done on the solver's thread between two steps, until it answers True
+
+
+class SolverHost(ABC):
+    """The presenter asks (`post`) and looks (`news`); neither waits."""
+
+    solve_cost_ns: int  # what a solution takes at present, as well as it is known
+
+    @abstractmethod
+    def post(self, request: SolveRequest) -> None:
+        """The newest wish; one that was not begun is forgotten."""
+
+    @abstractmethod
+    def news(self) -> News:
+        """The newest complete solution and flat picture, and what failed."""
+
+    @abstractmethod
+    def do(self, task: Task) -> None:
+        """Have something done between two steps, again and again until it answers True."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop, and release what the solver holds. May be called twice."""
+
+
+def taken_in(news: News, step: Step) -> News:
+    """The news with what a step made; the newest wins, and what failed is as the last step found it."""
+    return News(
+        step.solution or news.solution,
+        step.flat or news.flat,
+        step.missing,
+        news.solutions + (step.solution is not None),
+    )
+
+
+def total_ns(stage_ms: Mapping[str, float]) -> int:
+    """Nanoseconds of the solver's stages together."""
+    return round(sum(stage_ms.get(stage, 0.0) for stage in SOLVING_STAGES) * NS_PER_MS)
+
+
+class SimulatedSolver(SolverHost):
+    """Solves at once and hands over when the simulated clock has passed what the configured stages cost."""
+
+    def __init__(self, parts: SolverParts, clock: Clock) -> None:
+        self._parts, self._clock = parts, clock
+        self._news = taken_in(News(), parts.step(FIRST_REQUEST))
+        self._posted: tuple[int, SolveRequest] | None = None
+        self._under_way: tuple[int, Step] | None = None  # when it is complete
+        self._idle_since_ns = clock.now_ns()
+        self._tasks: list[Task] = []
+        self._closed = False
+        self.solve_cost_ns = total_ns(parts.simulated_stage_ms())
+
+    def post(self, request: SolveRequest) -> None:
+        self._advance()
+        self._posted = self._clock.now_ns(), request
+        self._advance()
+
+    def news(self) -> News:
+        self._advance()
+        return self._news
+
+    def do(self, task: Task) -> None:
+        if not task(self._parts):
+            self._tasks.append(task)
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            self._parts.close()
+
+    def _advance(self) -> None:
+        """Everything that happened up to now, in order."""
+        now_ns = self._clock.now_ns()
+        while True:
+            if self._under_way is not None:
+                done_ns, step = self._under_way
+                if done_ns > now_ns:
+                    return
+                self._news = taken_in(self._news, step)
+                self._under_way, self._idle_since_ns = None, done_ns
+            self._tasks = [task for task in self._tasks if not task(self._parts)]
+            if self._posted is None:
+                return
+            (posted_ns, request), self._posted = self._posted, None
+            begun_ns = max(posted_ns, self._idle_since_ns)
+            step = self._timed(self._parts.step(request))
+            self._under_way = begun_ns + self._cost_of(step), step
+
+    def _timed(self, step: Step) -> Step:
+        """With the stage times that the configuration says."""
+        stages = dict(self._parts.simulated_stage_ms())
+        self.solve_cost_ns = total_ns(stages)
+        solving = {stage: stages.get(stage, 0.0) for stage in SOLVING_STAGES}
+        solution, flat = step.solution, step.flat
+        if solution is not None:
+            solution = replace(solution, stage_ms=solving)
+        if flat is not None:
+            flat = replace(flat, stage_ms={"render": solving["render"]})
+        return replace(step, solution=solution, flat=flat)
+
+    @staticmethod
+    def _cost_of(step: Step) -> int:
+        made = step.solution or step.flat
+        return total_ns(made.stage_ms) if made is not None else 0

@@ -1,0 +1,188 @@
+"""The solver's own thread: hands over complete solutions, and is left behind where a call does not return."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from collections.abc import Callable
+
+from runtime.clock import NS_PER_S, Clock
+from runtime.errors import PhasestackError
+from runtime.frame.solver_host import COST_GAIN, FIRST_REQUEST, News, SolverHost, SolverParts, Task, taken_in, total_ns
+from runtime.records import SolveRequest
+from runtime.support.priority import SOLVER_NICENESS, set_niceness
+
+log = logging.getLogger("phasestack.solver")
+
+IDLE_S = 0.02  # between two looks at tasks while nothing is asked
+ABANDONED_MAX = 4  # hung threads that are left behind; with more, the solver stays as it is
+
+
+class _Attempt:
+    """One thread with one solver. Once abandoned, nothing that it makes counts any more."""
+
+    def __init__(self, number: int) -> None:
+        self.number, self.abandoned = number, threading.Event()
+        self.ready = threading.Event()
+        self.busy_since_ns = 0  # 0: it waits
+        self.last_step_ns = 0  # what the last step took
+        self.error: BaseException | None = None
+        self.thread: threading.Thread | None = None
+
+
+class SolverThread(SolverHost):
+    """Runs a solver beside the presenter. `post`, `news` and `watch` never wait."""
+
+    def __init__(
+        self, make: Callable[[], SolverParts], clock: Clock, *, late_s: float, abandon_s: float, first_cost_ns: int = 0
+    ) -> None:
+        """make: a solver with its own GL context, called on the thread that will use it, again after it hung.
+
+        late_s: a step that takes longer is told as missing; abandon_s: after this the thread is left behind.
+        """
+        self._make, self._clock = make, clock
+        self._late_ns, self._abandon_ns = round(late_s * NS_PER_S), round(abandon_s * NS_PER_S)
+        self._lock = threading.Condition()
+        self._request: SolveRequest | None = None
+        self._news = News()
+        self._tasks: queue.SimpleQueue[Task] = queue.SimpleQueue()
+        self._closing = threading.Event()
+        self._hung: list[_Attempt] = []
+        self.solve_cost_ns = first_cost_ns
+        self.restarts = 0
+        self._attempt = self._begin(1)
+
+    def wait_ready(self, tell: Callable[[], bool] = lambda: True) -> None:
+        """Until the solver can be asked. tell: called now and then; False: stop waiting.
+
+        Raises whatever making it raised.
+        """
+        while not self._attempt.ready.wait(0.1):
+            if not tell():
+                return
+        if self._attempt.error is not None:
+            raise self._attempt.error
+
+    def post(self, request: SolveRequest) -> None:
+        with self._lock:
+            self._request = request
+            self._lock.notify()
+
+    def news(self) -> News:
+        late = self._late_reason()
+        news = self._news
+        if not late:
+            return news
+        return News(news.solution, news.flat, {**news.missing, "model": late}, news.solutions)
+
+    def do(self, task: Task) -> None:
+        self._tasks.put(task)
+
+    def close(self, timeout_s: float = 5.0) -> None:
+        self._closing.set()
+        with self._lock:
+            self._lock.notify_all()
+        thread = self._attempt.thread
+        if thread is not None and thread is not threading.current_thread():
+            thread.join(timeout_s)
+
+    @property
+    def left_behind(self) -> int:
+        """Threads that are still in a call that did not return."""
+        hung = [*self._hung, *([self._attempt] if self._closing.is_set() else [])]
+        return sum(attempt.thread is not None and attempt.thread.is_alive() for attempt in hung)
+
+    def _late_reason(self) -> str:
+        """Why there is no solver at the moment, empty where all is well; leaves a hung thread behind."""
+        attempt = self._attempt
+        busy_ns = self._clock.now_ns() - attempt.busy_since_ns if attempt.busy_since_ns else 0
+        if attempt.error is not None:
+            if busy_ns > self._abandon_ns:
+                self._attempt = self._begin(attempt.number + 1)
+            return f"the solver failed, it is made anew by and by ({_line(attempt.error)})"
+        if busy_ns <= self._late_ns:
+            # Until a step is in time again: a state that changed with every solution would say nothing.
+            late = attempt.last_step_ns > self._late_ns
+            return f"the last solution took {attempt.last_step_ns / NS_PER_S:.1f} s" if late else ""
+        if busy_ns > self._abandon_ns:
+            self._hung = [hung for hung in self._hung if hung.thread is not None and hung.thread.is_alive()]
+        if busy_ns > self._abandon_ns and len(self._hung) < ABANDONED_MAX:
+            log.error("solver: no answer for %.1f s: left behind, and made anew", busy_ns / NS_PER_S)
+            attempt.abandoned.set()
+            self._hung.append(attempt)
+            self.restarts += 1
+            self._attempt = self._begin(attempt.number + 1)
+        return f"the solver has not answered for {int(busy_ns / NS_PER_S)} s"
+
+    def _begin(self, number: int) -> _Attempt:
+        attempt = _Attempt(number)
+        attempt.busy_since_ns = self._clock.now_ns() if number > 1 else 0
+        attempt.thread = threading.Thread(target=self._run, args=(attempt,), name=f"solver-{number}", daemon=True)
+        attempt.thread.start()
+        return attempt
+
+    def _run(self, attempt: _Attempt) -> None:
+        set_niceness(SOLVER_NICENESS)
+        try:
+            parts = self._make()
+            first = parts.step(FIRST_REQUEST)
+        except BaseException as error:
+            attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
+            attempt.ready.set()
+            if attempt.number > 1 and not isinstance(error, PhasestackError):
+                log.exception("solver: it could not be made anew")
+            return
+        if not attempt.abandoned.is_set():
+            self._news = taken_in(self._news, first)
+        attempt.busy_since_ns = 0
+        attempt.ready.set()
+        try:
+            while not (attempt.abandoned.is_set() or self._closing.is_set()):
+                self._do_tasks(attempt, parts)
+                request = self._next_request()
+                if request is not None:
+                    self._step(attempt, parts, request)
+        except Exception as error:  # beside what a step answers with: a bug of ours, or a library's
+            log.exception("solver: unexpected error")
+            attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
+        finally:
+            parts.close(abandoned=attempt.abandoned.is_set())
+
+    def _next_request(self) -> SolveRequest | None:
+        with self._lock:
+            if self._request is None and not self._closing.is_set():
+                self._lock.wait(IDLE_S)
+            request, self._request = self._request, None
+        return request
+
+    def _step(self, attempt: _Attempt, parts: SolverParts, request: SolveRequest) -> None:
+        attempt.busy_since_ns = self._clock.now_ns()
+        step = parts.step(request)
+        attempt.last_step_ns = self._clock.now_ns() - attempt.busy_since_ns
+        attempt.busy_since_ns = 0
+        if attempt.abandoned.is_set():
+            return
+        self._news = taken_in(self._news, step)
+        if step.solution is not None:
+            cost_ns = total_ns(step.solution.stage_ms)
+            gain = COST_GAIN if self.solve_cost_ns else 1.0
+            self.solve_cost_ns += round(gain * (cost_ns - self.solve_cost_ns))
+
+    def _do_tasks(self, attempt: _Attempt, parts: SolverParts) -> None:
+        """Each once; those that are not done come again after the next step."""
+        for _ in range(self._tasks.qsize()):
+            task = self._tasks.get()
+            attempt.busy_since_ns = self._clock.now_ns()
+            try:
+                done = task(parts)
+            except Exception:
+                log.exception("solver: a task failed")
+                done = True
+            attempt.busy_since_ns = 0
+            if not done and not attempt.abandoned.is_set():
+                self._tasks.put(task)
+
+
+def _line(error: BaseException) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__

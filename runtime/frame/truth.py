@@ -1,0 +1,59 @@
+"""Where the eyes really were, for recordings that know it: asked about an instant once later samples have told."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from runtime.clock import NS_PER_S
+from runtime.records import F64
+
+GAP_NS = NS_PER_S // 5  # a longer gap says nothing of what happened in it
+KEPT = 512
+
+
+class Unknown:
+    """The truth of that instant is not known yet."""
+
+
+UNKNOWN = Unknown()
+
+
+class TrueEyes:
+    """The recorded truth at samples' captures, interpolated between them."""
+
+    def __init__(self) -> None:
+        self._known: deque[tuple[int, F64]] = deque(maxlen=KEPT)
+        self._ended = False
+
+    def add(self, capture_ns: int, eyes_m: F64) -> None:
+        """A sample's truth, (2, 3), frame `stack`."""
+        if not self._known or capture_ns > self._known[-1][0]:
+            self._known.append((capture_ns, eyes_m))
+
+    def end(self) -> None:
+        """No more samples will come."""
+        self._ended = True
+
+    @property
+    def known(self) -> bool:
+        """True where this recording has told any truth."""
+        return bool(self._known)
+
+    def at(self, time_ns: int) -> F64 | Unknown | None:
+        """(2, 3) at an instant; None: it will never be known."""
+        if not self._known:
+            return None
+        if time_ns > self._known[-1][0]:
+            return None if self._ended else UNKNOWN
+        after_ns, after_m = self._known[-1]
+        for before_ns, before_m in reversed(self._known):
+            if before_ns <= time_ns:
+                if before_ns == time_ns:
+                    return before_m
+                if after_ns - before_ns > GAP_NS:
+                    return None
+                weight = (time_ns - before_ns) / (after_ns - before_ns)
+                eyes: F64 = (1 - weight) * before_m + weight * after_m
+                return eyes
+            after_ns, after_m = before_ns, before_m
+        return None

@@ -1,0 +1,204 @@
+"""Layers that were solved for eyes at one place, aligned to where the eyes are now.
+
+Parallel planes seen from one point differ by a scale and a shift. A ray from the middle between the eyes through
+point c of the reference plane (x = r) meets panel n (x = a) at c·k + m·(1 - k), k = (m_x - a) / (m_x - r). What is
+shown at p on panel n for a new middle n goes to the reference plane along the new ray, and from there to panel n along
+the old middle's: both are a scale and a shift, so that q = p·s + t with (o: the old middle, d = n - o, D = o_x - a)
+
+    s = 1 + d_x·(r - a) / ((D + d_x)·(o_x - r)),    t = (a - r) / (o_x - r) · (o·d_x - d·D) / (D + d_x).
+
+Written so, nothing is left of rounding where the middle has not moved (s = 1, t = 0) or the panel is the reference
+plane. The middle's rays are carried exactly; so are both eyes' of a head that faces the panels and moved parallel to
+them. One that came nearer or went away keeps the disparity of where it was: no shift could change that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.optics.stack import PanelStack
+from runtime.records import F32, F64, U8, PanelFrame
+
+EVEN_CODE = 128  # the middle of a panel's range: what lies beside the solution
+FARTHEST_M = 1e6  # of any coordinate: what is farther counts as not finite
+NEAREST_M = 0.01  # of an eye before the front panel: nearer, its rays graze the panels
+MOST_SHIFT = 0.5  # of a panel's width or height, that its middle may be moved: by then half of what is seen is even
+MOST_SCALE = 2.0  # that a panel may be drawn larger, or smaller by
+ROWS = 32  # that are resampled together: their float32 pixels fit a core's cache
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """How every panel is drawn for where the eyes are now."""
+
+    solved_from_shown: tuple[F64, ...]  # per panel (3, 3), a scale and a shift: pixels of the solved layer from shown
+    limited: str = ""  # why it is at its limit, with the eyes too far from those solved for; empty: it is not
+
+
+def reference_x_m(stack: PanelStack) -> float:
+    """The plane whose points stay where they are: the centre panel, or midway between the two in the middle."""
+    half = stack.count // 2
+    return stack.x_m[half] if stack.count % 2 else (stack.x_m[half - 1] + stack.x_m[half]) / 2
+
+
+def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
+    """The alignment of layers solved for eyes (2, 3) to eyes (2, 3) somewhere else; both frame `stack`.
+
+    It ends where an eye comes within `NEAREST_M` of the front panel, where a panel's middle would move by more than
+    `MOST_SHIFT` of its size, or where a panel would be drawn `MOST_SCALE` times larger or smaller: then it is that of
+    the furthest allowed place on the straight way from the old eyes to the new ones, continuously. Eyes that
+    are not finite leave the layers as they are. Never raises for any values.
+    """
+    if not (np.abs(solved_for_m).max() <= FARTHEST_M and np.abs(eyes_m).max() <= FARTHEST_M):  # nor NaN
+        return Alignment(_as_they_are(stack), "the eyes' positions are not finite")
+    old, new = _middle(solved_for_m), _middle(eyes_m)
+    share, limited = 1.0, ""
+    for most, least, why in _limits(stack, solved_for_m, eyes_m, old=old, new=new):
+        # Every limit says: share · most <= least.
+        reach = 0.0 if least < 0.0 else least / most if most > 0.0 else 1.0
+        if reach < share:
+            share, limited = reach, why
+    if share == 0.0:
+        return Alignment(_as_they_are(stack), limited)
+    step = (new - old) * share
+    return Alignment(tuple(_solved_from_shown(stack, n, old=old, step=step) for n in range(stack.count)), limited)
+
+
+def scale_and_shift(matrix: F64) -> tuple[float, float, float, float]:
+    """(scale_u, scale_v, shift_u, shift_v) of a 3x3. Raises ValueError where it is anything more than that."""
+    (su, a, tu), (b, sv, tv), last = matrix.tolist()
+    if a or b or last != [0.0, 0.0, 1.0]:
+        raise ValueError("an alignment is a scale and a shift")
+    return su, sv, tu, tv
+
+
+def is_identity(matrix: F64) -> bool:
+    """True where shown pixels are the solved ones: nothing is resampled."""
+    return scale_and_shift(matrix) == (1.0, 1.0, 0.0, 0.0)
+
+
+def shown_layers(frame: PanelFrame) -> U8:
+    """(N, h, w, 4): exactly what the panels show, before a panel's own curve, rotation and mirroring.
+
+    The reference for the presentation shader: bilinear with exact weights (for moved eyes bicubic was never better by
+    more than 0.05 dB: docs/mathematics.md), `EVEN_CODE` beside the solution, mixed with the flat picture before it is
+    rounded. Where nothing is to be done the frame's own array is answered.
+    Raises ValueError for a frame that has nothing to show.
+    """
+    solved, flat, flatness = frame.solved, frame.flat, frame.flatness
+    if solved is None:
+        flatness = 1.0
+    if flatness > 0.0 and flat is None:
+        raise ValueError("a frame without its flat picture")
+    if flatness >= 1.0 or solved is None:
+        assert flat is not None
+        return flat
+    maps = frame.solved_from_shown or (np.eye(3),) * len(solved)
+    if flatness <= 0.0 and all(is_identity(matrix) for matrix in maps):
+        return solved
+    out = np.empty_like(solved)
+    for n, matrix in enumerate(maps):
+        mixed = None if flat is None or flatness <= 0.0 else flat[n]
+        if mixed is None and is_identity(matrix):
+            out[n] = solved[n]
+            continue
+        for rows, codes in _resampled(solved[n], matrix):
+            if mixed is not None:
+                codes += (mixed[rows] - codes) * np.float32(flatness)
+            codes += np.float32(0.5)
+            np.copyto(out[n, rows], codes, casting="unsafe")
+    return out
+
+
+def _middle(eyes_m: F64) -> F64:
+    middle: F64 = (eyes_m[0] + eyes_m[1]) / 2
+    return middle
+
+
+def _as_they_are(stack: PanelStack) -> tuple[F64, ...]:
+    return tuple(np.eye(3) for _ in range(stack.count))
+
+
+def _solved_from_shown(stack: PanelStack, index: int, *, old: F64, step: F64) -> F64:
+    raster, reference_m = stack.panel(index), reference_x_m(stack)
+    distance_m, height_m = old[0] - raster.x_m, old[0] - reference_m
+    now_m = distance_m + step[0]
+    magnified = step[0] * (reference_m - raster.x_m) / (now_m * height_m)
+    shift_m = (raster.x_m - reference_m) / height_m * (old[1:] * step[0] - step[1:] * distance_m) / now_m
+    matrix = np.eye(3)
+    matrix[0, 0] = matrix[1, 1] = 1.0 + magnified
+    # The pixels' origin is the top left corner, not the middle.
+    matrix[0, 2] = (raster.left_m * magnified + shift_m[0]) / raster.pitch_u_m
+    matrix[1, 2] = -(raster.top_m * magnified + shift_m[1]) / raster.pitch_v_m
+    matrix += 0.0  # no negative zeros
+    return matrix
+
+
+def _limits(
+    stack: PanelStack, solved_for_m: F64, eyes_m: F64, *, old: F64, new: F64
+) -> Iterator[tuple[float, float, str]]:
+    """(most, least, why): the share of the way that may be gone is limited by share · most <= least."""
+    front_m = stack.x_m[-1]
+    for name, before, after in zip(("left", "right"), solved_for_m, eyes_m, strict=True):
+        room_m = before[0] - front_m - NEAREST_M
+        why = f"the {name} eye is {after[0] - front_m:.3g} m before the front panel, the nearest is {NEAREST_M} m"
+        yield before[0] - after[0], room_m, why
+        if room_m < 0.0:
+            return
+    reference_m, step = reference_x_m(stack), new - old
+    moved_m = float(np.linalg.norm(step))
+    for n, x_m in enumerate(stack.x_m):
+        if x_m == reference_m:
+            continue
+        why = f"the eyes are {moved_m:.3g} m from where the layers were solved for: panel {n} is no longer in line"
+        distance_m, weight = old[0] - x_m, (x_m - reference_m) / (old[0] - reference_m)
+        for axis, size_m in ((1, stack.width_m), (2, stack.height_m)):
+            shift = abs(weight * (old[axis] * step[0] - step[axis] * distance_m))
+            yield shift - MOST_SHIFT * size_m * step[0], MOST_SHIFT * size_m * distance_m, why
+        larger, smaller = MOST_SCALE - 1.0, 1.0 / MOST_SCALE - 1.0
+        yield step[0] * (-weight - larger), larger * distance_m, why
+        yield step[0] * (weight + smaller), -smaller * distance_m, why
+
+
+def _places(count: int, *, scale: float, shift: float) -> tuple[NDArray[np.intp], F32]:
+    """Before each shown pixel the padded source pixel (0 is the even one beside it), and how far it lies past that."""
+    place = np.clip((np.arange(count) + 0.5) * scale + shift - 0.5, -1.0, count)
+    first = np.minimum(np.floor(place), count - 1.0)
+    return first.astype(np.intp) + 1, (place - first).astype(np.float32)
+
+
+def _resampled(layer: U8, matrix: F64) -> Iterator[tuple[slice, F32]]:
+    """Strips of rows of the shown layer and their codes (rows, w, 4), not yet rounded; overwritten by the next."""
+    su, sv, tu, tv = scale_and_shift(matrix)
+    height, width = layer.shape[:2]
+    columns, across = _places(width, scale=su, shift=tu)
+    rows, down = _places(height, scale=sv, shift=tv)
+    for begin in range(0, height, ROWS):
+        strip = slice(begin, min(begin + ROWS, height))
+        first, weight = rows[strip], down[strip, None, None]
+        low, high = int(first.min()), int(first.max()) + 2  # in padded rows
+        source = np.full((high - low, width + 2, 4), EVEN_CODE, np.float32)
+        source[..., 3] = 255.0
+        inside = slice(max(low, 1), min(high, height + 1))
+        source[inside.start - low : max(inside.stop, inside.start) - low, 1:-1] = layer[
+            inside.start - 1 : inside.stop - 1
+        ]
+        lines = _between(source.take(first - low, axis=0), source.take(first + 1 - low, axis=0), weight)
+        # A pixel of four floats is gathered as one number.
+        pixels = lines.view(np.complex128)[..., 0]
+        left, right = (
+            pixels.take(columns + k, axis=1).view(np.float32).reshape(*pixels.shape[:1], width, 4) for k in (0, 1)
+        )
+        yield strip, _between(left, right, across[:, None])
+
+
+def _between(low: F32, high: F32, weight: F32) -> F32:
+    """low · (1 - weight) + high · weight, in `low`."""
+    high -= low
+    high *= weight
+    low += high
+    return low

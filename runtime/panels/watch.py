@@ -1,0 +1,102 @@
+"""Whether windows and monitors are still what was bound: asked of the X server once a second, a question at a time.
+
+GLFW tells of monitors that come and go and of windows that are asked to close or become another size. It doesn't tell
+of a window that somebody destroyed, unmapped or moved, nor of a monitor that got another place or mode: what is shown
+then is on the wrong panel, or on none, and every swap succeeds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from runtime.clock import NS_PER_S, Clock
+from runtime.panels import xlib
+from runtime.panels.display import Display, Window
+from runtime.panels.monitors import Monitor
+
+REFRESH_TOLERANCE = 1e-3  # of a monitor's rate
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where one window belongs on the X screen."""
+
+    window: Window
+    panels: tuple[int, ...]  # that are shown in it
+    x_px: int
+    y_px: int
+    width_px: int
+    height_px: int
+
+
+class PlacementWatch:
+    """Every window and every monitor is looked at once in `every_ns`, one of them a call.
+
+    All at once where the X server has refused a request since the last look: something has gone.
+    """
+
+    def __init__(
+        self, display: Display, monitors: Sequence[Monitor], places: Sequence[Place], clock: Clock,
+        *, every_ns: int = NS_PER_S,
+    ) -> None:  # fmt: skip
+        """monitors: as they were bound, one a panel. Nothing is asked in the first `every_ns`."""
+        self._display, self._clock = display, clock
+        # Against what was there when it was bound; what came between binding and here differs from the monitor.
+        self._states = [display.output_state(monitor.connector) for monitor in monitors]
+        self._monitors = monitors
+        self._questions: list[Callable[[], str]] = [
+            *(lambda place=place: self._window_fault(place) for place in places),
+            *(lambda panel=panel: self._monitor_fault(panel) for panel in range(len(monitors))),
+        ]
+        self._every_ns, self._next = every_ns, 0
+        self._due_ns = clock.now_ns() + every_ns
+        self._refusals = xlib.refusals()
+
+    def look(self) -> str:
+        """What is wrong, with which panel; empty: nothing, or no question was due."""
+        if xlib.refusals() != self._refusals:
+            faults = [fault for fault in (question() for question in self._questions) if fault]
+            self._refusals = xlib.refusals()  # after the questions: those about what has gone are refused too
+            return "; ".join(faults)
+        now_ns = self._clock.now_ns()
+        if now_ns < self._due_ns:
+            return ""
+        self._due_ns = now_ns + self._every_ns // len(self._questions)
+        question = self._questions[self._next]
+        self._next = (self._next + 1) % len(self._questions)
+        return question()
+
+    def _window_fault(self, place: Place) -> str:
+        state = self._display.window_state(place.window)
+        whose = f"panel {place.panels[0]}" if len(place.panels) == 1 else "the panels"
+        if state is None:
+            return f"{whose}: the window was destroyed"
+        if not state.viewable:
+            return f"{whose}: the window was unmapped"
+        now = (state.x_px, state.y_px, state.width_px, state.height_px)
+        then = (place.x_px, place.y_px, place.width_px, place.height_px)
+        return "" if now == then else f"{whose}: the window is {_rectangle(*now)}, not {_rectangle(*then)}"
+
+    def _monitor_fault(self, panel: int) -> str:
+        monitor, then, now = (
+            self._monitors[panel],
+            self._states[panel],
+            self._display.output_state(self._monitors[panel].connector),
+        )
+        whose = f"panel {panel}: {monitor.connector}"
+        if now is None:
+            return f"{whose} shows nothing any more"
+        place = (now.x_px, now.y_px, now.width_px, now.height_px)
+        bound = (monitor.x_px, monitor.y_px, monitor.width_px, monitor.height_px)
+        if place != bound:
+            return f"{whose} became {_rectangle(*place)}, it was {_rectangle(*bound)}"
+        if monitor.refresh_hz and abs(now.refresh_hz / monitor.refresh_hz - 1.0) > REFRESH_TOLERANCE:
+            return f"{whose} shows {now.refresh_hz:.3f} frames a second, it was {monitor.refresh_hz:.3f}"
+        if then is not None and now.edid != then.edid:
+            return f"{whose} has another monitor"
+        return ""
+
+
+def _rectangle(x_px: int, y_px: int, width_px: int, height_px: int) -> str:
+    return f"{width_px}x{height_px}+{x_px}+{y_px}"

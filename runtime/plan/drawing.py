@@ -1,0 +1,60 @@
+"""Drawing what a model wants to see: the one place where content, views and models meet."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from runtime.content.base import ContentSource, View
+from runtime.model.predictor import Predictor
+from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.views import image_from_stack, raster_from_stack
+from runtime.plan.planner import focused_part
+from runtime.records import F64, U8
+
+
+def raster_views(eyes_m: F64, raster: PlaneRaster) -> tuple[View, View]:
+    """Left and right eye's views of one raster; eyes (2, 3), frame `stack`."""
+    left, right = (
+        View(eye, side, raster_from_stack(eye, raster), raster.width_px, raster.height_px)
+        for side, eye in enumerate(eyes_m)
+    )
+    return left, right
+
+
+def retina_view(eye_m: F64, side: int, *, width_px: int, height_px: int, fov_deg: float) -> View:
+    """The view of an eye's own image, looking at the stack's origin."""
+    projection = image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
+    return View(eye_m, side, projection, width_px, height_px)
+
+
+def retina_pictures(
+    content: ContentSource, eyes_m: F64, stack: PanelStack, *, fov_deg: float, time_ns: int
+) -> tuple[U8, U8]:
+    """What content shows to eyes (2, 3), frame `stack`: (h, w, 3) each, of the panels' size, as retina pictures."""
+    left, right = (
+        np.ascontiguousarray(
+            content.render(
+                retina_view(eye, side, width_px=stack.width_px, height_px=stack.height_px, fov_deg=fov_deg),
+                time_ns=time_ns,
+            )[..., :3]
+        )
+        for side, eye in enumerate(eyes_m)
+    )
+    return left, right
+
+
+def drawn_for(predictor: Predictor, content: ContentSource, eyes_m: F64, *, time_ns: int) -> list[list[U8]]:
+    """images[side][raster] that a model wants for eyes (2, 3), aimed where the content lies.
+
+    Copied only where a source's array would be drawn over by the next raster: else they are the source's own.
+    """
+    images: list[list[U8]] = [[], []]
+    part = focused_part(predictor)
+    if part is not None:
+        part.aim(content, eyes_m, time_ns=time_ns)
+    rasters = predictor.rasters(eyes_m)
+    for raster in rasters:
+        for view in raster_views(eyes_m, raster):
+            picture = content.render(view, time_ns=time_ns)
+            images[view.side].append(picture.copy() if len(rasters) > 1 else picture)
+    return images

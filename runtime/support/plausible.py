@@ -1,0 +1,75 @@
+"""What a setting can be: ranges that tell a wrong unit, texts that a path can hold, and names that were misspelt."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from pathlib import PurePosixPath
+
+from pydantic import AfterValidator
+
+TEXT_MAX_BYTES = 4095  # of a path on Linux
+PART_MAX_BYTES = 255  # of one part of a path
+SOCKET_MAX_BYTES = 107  # of a Unix socket's path
+# What a value may have been given in, by its own unit: factor and name.
+OTHER_UNITS = {
+    "m": ((1e-3, "millimetres"), (1e-2, "centimetres")),
+    "s": ((1e-3, "milliseconds"),),
+    "ms": ((1e-3, "microseconds"),),
+}
+
+
+def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterValidator:
+    """A number from low to high, or 0 where that means "not set"; what is outside may be of another unit.
+
+    >>> within(0.005, 20.0, "m").func(518.4)
+    Traceback (most recent call last):
+    ValueError: 518.4 m is beyond 20 m: did you mean millimetres (0.5184)?
+    """
+
+    def check(value: float) -> float:
+        if low <= value <= high or (zero and value == 0):
+            return value
+        named = f" {unit}" if unit else ""
+        bound, side = (high, "beyond") if value > high else (low, "below")
+        for factor, other in OTHER_UNITS.get(unit, ()):
+            if abs(value) > abs(bound) and low <= value * factor <= high:
+                raise ValueError(
+                    f"{value:g}{named} is {side} {bound:g}{named}: did you mean {other} ({value * factor:g})?"
+                )
+        raise ValueError(f"{value:g}{named} is {side} {bound:g}{named}; it may be {low:g} to {high:g}{named}")
+
+    return AfterValidator(check)
+
+
+def check_text(value: str) -> str:
+    """The text, where a name or a path can be that. Raises ValueError."""
+    if "\0" in value:
+        raise ValueError("holds a NUL character")
+    try:
+        size = len(value.encode())
+        longest = max(len(part.encode()) for part in value.split("/"))
+    except UnicodeEncodeError:
+        raise ValueError("is not UTF-8") from None
+    if size > TEXT_MAX_BYTES or longest > PART_MAX_BYTES:
+        raise ValueError(f"is too long ({len(value)} characters, beginning {value[:20]!r})")
+    return value
+
+
+def socket_path(value: str) -> str:
+    """The text, where a socket can be there. Raises ValueError."""
+    if not value or value.endswith("/") or PurePosixPath(value).name in ("", ".", ".."):
+        raise ValueError(f"{value!r} names no file: a socket's path, such as /run/phasestack/status.sock")
+    if len(value.encode()) > SOCKET_MAX_BYTES:
+        raise ValueError(f"is too long for a socket ({len(value.encode())} bytes, {SOCKET_MAX_BYTES} at most)")
+    return value
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """`: did you mean model?` where a known word is like it, else an empty text.
+
+    >>> nearest("modle", ["model", "loop"])
+    ': did you mean model?'
+    """
+    like = difflib.get_close_matches(word, list(known), n=1)
+    return f": did you mean {like[0]}?" if like else ""

@@ -1,0 +1,226 @@
+"""A configuration must make sense, not only have the form: units, counts, names, files, and where paths start."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from runtime.commands.names import check_names, scene_from_here, scene_names
+from runtime.config import Overrides, Settings, load_settings, load_stack
+from runtime.errors import InputError
+from runtime.support.artifacts import write_png
+
+
+def loaded(folder: Path, text: str) -> Settings:
+    file = folder / "phasestack.toml"
+    file.write_text(text, encoding="utf-8")
+    return load_settings(file)
+
+
+PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "field", "said"),
+    [
+        ("[stack]\nwidth_m = 518.4", "stack.width_m", "did you mean millimetres (0.5184)?"),
+        ("[stack]\nheight_m = 29.16", "stack.height_m", "did you mean millimetres (0.02916)?"),
+        ("[stack]\nx_m = [-60, 0, 60]", "stack.x_m.0", "did you mean millimetres (-0.06)?"),
+        ("[stack]\nx_m = [0.0, 1e-9, 0.06]", "stack.x_m", "are one panel"),
+        ("[stack]\nwidth_m = 1e-300", "stack.width_m", "below 0.005 m"),
+        ("[stack]\nwidth_m = 1e-30", "stack.width_m", "below 0.005 m"),
+        ("[stack]\nwidth_m = 1e308", "stack.width_m", "beyond 20 m"),
+        ("[stack]\nheight_m = 0.5", "stack.height_m", "did you mean height_m = 0.2916? (or set stack.pixel_aspect)"),
+        ("[calibration]\nipd_m = 63", "calibration.ipd_m", "did you mean millimetres (0.063)?"),
+        ("[calibration]\nipd_m = 6.3", "calibration.ipd_m", "did you mean centimetres (0.063)?"),
+        ("[tracker]\nipd_max_m = 75", "tracker.ipd_max_m", "did you mean millimetres (0.075)?"),
+        ("[tracker]\nipd_min_m = 0.08", "tracker.ipd_min_m", "is not below ipd_max_m"),
+        ("[tracker]\nhorizon_max_s = 120", "tracker.horizon_max_s", "did you mean milliseconds (0.12)?"),
+        ("[tracker]\nhold_s = 500", "tracker.hold_s", "did you mean milliseconds (0.5)?"),
+        ("[sensor]\nstart_s = 1e300", "sensor.start_s", "beyond"),
+        ("[sensor]\nfixed_eyes_m = [[600, -31, 0], [600, 31, 0]]", "sensor.fixed_eyes_m.0.0", "millimetres (0.6)"),
+        ("[detector]\nrange_min_m = 5.0", "detector.range_min_m", "is not below range_max_m"),
+        ("[content]\ndepth_m = [-50, 50]", "content.depth_m.0", "did you mean millimetres (-0.05)?"),
+        ("[loop]\nrate_hz = 0.01", "loop.rate_hz", "may be 1 to 1000 Hz"),
+        ("[loop]\nrate_hz = 60000", "loop.rate_hz", "may be 1 to 1000 Hz"),
+        ("[loop]\nsimulated_stage_ms = { render = -1 }", "loop.simulated_stage_ms.render", "greater than or equal"),
+        ("[[output.panels]]\ngamma = 1e308", "output.panels.0.gamma", "beyond 10"),
+        ("[[output.panels]]\nhomography = [[1, 0, 0], [0, 1, 0]]", "output.panels.0.homography.2", "required"),
+        (PANEL.format(1), "output.panels", "has 1 of 3 tables"),
+        (PANEL.format(1) + PANEL.format(2), "output.panels", "has 2 of 3 tables"),
+        (
+            PANEL.format(1) + PANEL.format(2) + PANEL.format(1),
+            "output.panels.2",
+            "is bound to the monitor of panels.0",
+        ),
+        ("[[output.panels]]\nindex = 0\n" * 3, "output.panels.1", "is bound to the monitor of panels.0 (index 0)"),
+        ('[[output.panels]]\nedid_serial = "A"\n' * 3, "output.panels.1", "(edid_serial A)"),
+        ('[service]\nsocket = ""', "service.socket", "names no file"),
+        ('[service]\nsocket = "/"', "service.socket", "names no file"),
+        ('[service]\nsocket = "."', "service.socket", "names no file"),
+        (f'[service]\nsocket = "/tmp/{"s" * 120}"', "service.socket", "too long for a socket"),
+        ("[modle]\nname = 'fast'", "modle", "did you mean model?"),
+        ("[model]\nnaem = 'fast'", "model.naem", "did you mean name?"),
+        ("[[output.panels]]\nedid_seril = 'A'", "output.panels.0.edid_seril", "did you mean edid_serial?"),
+        ("[loop]\nzebra = 1", "loop.zebra", "is no setting"),
+    ],
+)
+def test_what_makes_no_sense_is_told_with_its_field_and_what_may_have_been_meant(
+    tmp_path: Path, text: str, field: str, said: str
+) -> None:
+    with pytest.raises(InputError) as told:
+        loaded(tmp_path, text)
+    assert str(told.value).startswith(f"{tmp_path}/phasestack.toml: {field}: ")
+    assert said in str(told.value)
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("section, key", [
+    ("sensor", "source"), ("calibration", "file"), ("content", "scene"), ("content", "file"), ("model", "name"),
+    ("detector", "yunet_model"), ("sensor", "openni2_folder"), ("sensor", "driver"), ("service", "socket"),
+])  # fmt: skip
+@pytest.mark.parametrize(
+    ("value", "said"), [('"a\\u0000b"', "NUL"), (f'"{"x" * 5000}"', "too long"), (f'"{"y" * 300}.toml"', "too long")]
+)
+def test_no_name_or_path_holds_what_a_file_system_can_not(
+    tmp_path: Path, section: str, key: str, value: str, said: str
+) -> None:
+    with pytest.raises(InputError, match=rf"phasestack\.toml: {section}\.{key}: .*{said}"):
+        loaded(tmp_path, f"[{section}]\n{key} = {value}")
+
+
+def test_pixels_that_are_not_square_need_to_be_told(tmp_path: Path) -> None:
+    tall = "[stack]\nheight_m = 0.5\npixel_aspect = 0.583\n"
+    assert loaded(tmp_path, tall).stack.height_m == 0.5
+    with pytest.raises(InputError, match="pixel_aspect"):
+        loaded(tmp_path, tall.replace("0.583", "1.7"))
+    assert loaded(tmp_path, "[stack]\nheight_m = 0.285\n").stack.height_m == 0.285, "2% are a bezel's tolerance"
+
+
+def test_a_panels_file_takes_its_pixels_from_the_pictures_whatever_their_shape(tmp_path: Path) -> None:
+    """`solve` of a portrait picture on a landscape panel is the user's own wish; millimetres are not."""
+    file = tmp_path / "panels.json"
+    file.write_text(json.dumps({"width_m": 0.5184, "height_m": 0.2916, "x_m": [-0.06, 0, 0.06]}))
+    assert load_stack(file, width_px=600, height_px=800).width_px == 600
+    file.write_text(json.dumps({"width_m": 518.4, "height_m": 291.6, "x_m": [-60, 0, 60]}))
+    with pytest.raises(InputError, match=r"panels\.json: width_m: .*millimetres \(0\.5184\)"):
+        load_stack(file, width_px=600, height_px=800)
+
+
+def test_one_serial_on_two_monitors_is_told_apart_by_connector(tmp_path: Path) -> None:
+    text = "".join(f'[[output.panels]]\nedid_serial = "A"\nconnector = "DP-{n}"\n' for n in range(3))
+    assert len(loaded(tmp_path, text).output.panels) == 3
+
+
+def test_paths_are_relative_to_the_file_and_names_stay_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, elsewhere = tmp_path / "etc", tmp_path / "elsewhere"
+    folder.mkdir()
+    elsewhere.mkdir()
+    text = (
+        '[calibration]\nfile = "calibration.toml"\n[sensor]\nsource = "lean.mcap"\n[content]\nscene = "scenes/a.glb"\n'
+        'file = "../b.ply"\n[model]\nname = "own.onnx"\n[service]\nsocket = "status.sock"\n'
+        + '[[output.panels]]\nlut = "luts/0.csv"\n'
+        * 3
+    )
+    found = loaded(folder, text)
+    monkeypatch.chdir(tmp_path)
+    named_from_here = load_settings(Path("etc/phasestack.toml"))
+    monkeypatch.chdir(elsewhere)
+    assert load_settings(Path("../etc/phasestack.toml")).model.name.endswith("etc/own.onnx")
+    for settings in (found, named_from_here):
+        assert settings.calibration.file == f"{folder}/calibration.toml"
+        assert settings.sensor.source == f"{folder}/lean.mcap"
+        assert settings.content.scene == f"{folder}/scenes/a.glb"
+        assert os.path.normpath(settings.content.file) == f"{tmp_path}/b.ply"
+        assert settings.model.name == f"{folder}/own.onnx"
+        assert settings.service.socket == f"{folder}/status.sock"
+        assert settings.output.panels[2].lut == f"{folder}/luts/0.csv"
+    names = loaded(folder, '[content]\nscene = "demo"\n[model]\nname = "fast"\n[sensor]\nsource = "demo"\n')
+    assert (names.content.scene, names.model.name, names.sensor.source) == ("demo", "fast", "demo")
+    serial = loaded(folder, '[sensor]\ndriver = "openni2"\nsource = "1d27/0601@1/5"\n')
+    assert serial.sensor.source == "1d27/0601@1/5", "a device's URI is no path"
+
+
+def test_a_file_beside_the_configuration_is_found_from_any_folder(tmp_path: Path) -> None:
+    """The whole command, run elsewhere: today it looks for the file in the working directory."""
+    from runtime.eyes.calibration import DEMO_FILE
+
+    shutil.copy(DEMO_FILE, tmp_path / "calibration.toml")
+    config = tmp_path / "phasestack.toml"
+    config.write_text('[calibration]\nfile = "calibration.toml"\n')
+    done = checked(config, cwd="/")
+    assert (done.returncode, done.stdout) == (0, f"{config}: valid\n"), done.stderr
+
+
+def checked(config: Path, cwd: str | Path = ".") -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "runtime.cli", "config", "--check", str(config)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize(
+    ("text", "field", "said"),
+    [
+        ('[sensor]\ndriver = "openni"', "sensor.driver", "did you mean openni2?"),
+        ('[sensor]\ndriver = "crystal-ball"', "sensor.driver", "known: replay, fixed, openni2, usb-eyes"),
+        ('[sensor]\nsource = "missing.mcap"', "sensor.source", "is not there"),
+        ('[calibration]\nfile = "missing.toml"', "calibration.file", "is not there"),
+        ('[content]\nscene = "lego_buldozer"', "content.scene", "did you mean lego_bulldozer?"),
+        ('[content]\nscene = "missing.glb"', "content.scene", "is not there"),
+        ('[content]\nfile = "missing.ply"', "content.file", "is not there"),
+        ('[model]\nname = "balancd"', "model.name", "did you mean balanced?"),
+        ('[model]\nname = "missing.onnx"', "model.name", "is not there"),
+        ('[detector]\nkind = "yunet"', "detector.yunet_model", "is not there"),
+        ('[[output.panels]]\nlut = "missing.csv"\n' * 3, "output.panels.0.lut", "is not there"),
+        ('[output]\nkind = "windows"', "output.panels", "one table a panel"),
+        ('[output]\nkind = "span"\n' + "[[output.panels]]\n" * 3, "output.panels.0", "names no monitor"),
+    ],
+)
+def test_check_knows_every_name_and_looks_for_every_file(tmp_path: Path, text: str, field: str, said: str) -> None:
+    settings = loaded(tmp_path, text)
+    with pytest.raises(InputError) as told:
+        check_names(settings, source="a.toml")
+    assert str(told.value).startswith(f"a.toml: {field}: ")
+    assert said in str(told.value)
+
+
+def test_check_exits_with_2_and_one_line(tmp_path: Path) -> None:
+    config = tmp_path / "phasestack.toml"
+    config.write_text('[model]\nname = "balancd"\n')
+    done = checked(config)
+    assert done.returncode == 2
+    assert done.stderr == f"phasestack: {config}: model.name: nobody knows 'balancd': did you mean balanced?\n"
+
+
+def test_what_the_command_line_says_is_checked_like_the_file() -> None:
+    for option, overrides in (
+        ("--scene", Overrides(scene="s" * 5000)),
+        ("--replay", Overrides(replay="a\0b")),
+        ("--model", Overrides(model="m" * 300)),
+        ("--budget-ms", Overrides(budget_ms=float("nan"))),
+    ):
+        with pytest.raises(InputError, match=f"^{option}: "):
+            overrides.applied(Settings())
+    assert Overrides(model="fast", budget_ms=5.0).applied(Settings()).model.budget_ms == 5.0
+
+
+def test_a_scene_for_the_daemon_is_absolute_and_a_name_stays_a_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import numpy as np
+
+    monkeypatch.chdir(tmp_path)
+    write_png(tmp_path / "a.png", np.zeros((4, 4, 3), np.uint8))
+    (tmp_path / "demo").mkdir()
+    (tmp_path / "pictures").mkdir()
+    assert scene_from_here("a.png") == str(tmp_path / "a.png")
+    assert scene_from_here("pictures") == str(tmp_path / "pictures")
+    assert scene_from_here("demo") == "demo", "a folder of that name does not hide the scene"
+    assert "lego_bulldozer" in scene_names()
+    assert scene_from_here("nowhere") == "nowhere"
+    assert scene_from_here("n" * 5000) == "n" * 5000
