@@ -79,7 +79,8 @@ class Contract(Section):
     precision: Literal["fp32", "fp16", "int8"] = "fp32"
     parameters: Annotated[int, Field(ge=0)] = 0
     cell_px: Annotated[int, Field(ge=1, le=64)] = Field(
-        4, description="chain: parallax of the outer panels in columns of the network's raster")
+        4, description="chain: parallax of the outer panels in columns of the network's raster"
+    )
     reduction: Literal[1, 2, 4] = Field(2, description="chain: the network's raster is so much coarser than a panel")
     emphasis: Annotated[float, Field(ge=0, le=0.5)] = Field(
         0.0,
