@@ -155,6 +155,19 @@ class PairsFile:
     def __len__(self) -> int:
         return len(self._rows)
 
+    def points(self) -> tuple[F64, F64]:
+        """(K, 3) in `sensor` and (K, 3) in `stack` of all pairs so far."""
+        table = np.array([[float(row[name]) for name in COLUMNS] for row in self._rows]).reshape(-1, 6)
+        return table[:, :3], table[:, 3:]
+
+    def undo(self) -> str:
+        """Take the newest pair out again; answers its viewpoint, empty where there is none. On disk when it returns."""
+        if not self._rows:
+            return ""
+        name = self._rows.pop()["viewpoint"]
+        self._write()
+        return name
+
     def accept(self, pair: CapturedPair) -> None:
         """Add a pair; one of the same viewpoint is replaced. On disk when this returns.
 
@@ -169,6 +182,9 @@ class PairsFile:
             )
         self._rows = [row for row in self._rows if not pair.viewpoint or row["viewpoint"] != pair.viewpoint]
         self._rows.append(pair.row())
+        self._write()
+
+    def _write(self) -> None:
         text = io.StringIO()
         writer = csv.DictWriter(text, (*COLUMNS, *NOTES), lineterminator="\n")
         writer.writeheader()

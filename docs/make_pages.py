@@ -16,7 +16,7 @@ from typing import Any
 
 import typer.main
 
-from runtime.cli import app
+from runtime.commands.app import app
 
 FOLDER = Path(__file__).resolve().parent / "commands"
 NOTICE = "<!-- Made by `make docs` from the command's own help: change that, not this page. -->\n\n"

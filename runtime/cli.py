@@ -1,73 +1,140 @@
-"""The `phasestack` command. Only names and options are here; each command imports what it needs when it runs."""
+"""The entry point `phasestack`: whatever happens in a command ends in an exit code and at most one line on stderr.
+
+0 done, 1 a check has failed, 2 bad usage or input, 70 an error of ours (its whole story is in a file that the line
+names), 75 what may pass, 130 Ctrl-C, 141 nobody reads what is printed. The commands are in `runtime.commands.app`,
+imported only within the guard: an interrupt finds it in place.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import io
+import os
+import signal
 import sys
-from collections.abc import Callable
 
-import typer
+TYPE_CHECKING = False  # typing's own would be one more import before the guard stands
+if TYPE_CHECKING:
+    from types import FrameType
+    from typing import Any
 
-from calib.commands import app as calibrate_app
-from model_export.commands import export, train, validate
-from runtime.commands.bench import app as bench_app
-from runtime.commands.config import config
-from runtime.commands.ctl import app as ctl_app
-from runtime.commands.demo import demo
-from runtime.commands.doctor import doctor
-from runtime.commands.identify import identify
-from runtime.commands.plan import plan
-from runtime.commands.record import record
-from runtime.commands.report import report
-from runtime.commands.run import run
-from runtime.commands.solve import solve
-from runtime.commands.stability import stability
-from runtime.commands.status import status
-from runtime.errors import PhasestackError
+BAD_INPUT, OWN_ERROR, MAY_PASS, INTERRUPTED, NOBODY_READS = 2, 70, 75, 130, 141
 
-app = typer.Typer(
-    name="phasestack",
-    help="Realtime runtime of a glasses-free 3D display made of stacked LCD panels.\n\n"
-    "Example: phasestack demo --out out/demo",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-)
-COMMANDS: tuple[Callable[..., None] | tuple[str, typer.Typer], ...] = (
-    demo,
-    run,
-    solve,
-    record,
-    ("calibrate", calibrate_app),
-    plan,
-    train,
-    export,
-    validate,
-    report,
-    stability,
-    ("bench", bench_app),
-    doctor,
-    status,
-    ("ctl", ctl_app),
-    identify,
-    config,
-)
-for command in COMMANDS:
-    if isinstance(command, tuple):
-        app.add_typer(command[1], name=command[0])
-    else:
-        app.command()(command)
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    """While modules are imported nothing is open and nothing is written: an interrupt needs no unwinding."""
+    os._exit(INTERRUPTED)
 
 
 def main() -> None:
-    """The entry point: one line on stderr and exit 2 for what a user can mend, never a traceback."""
+    """Run the command that the arguments name; never returns."""
+    output = _fill_standard_descriptors()
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.default_int_handler:  # not where the shell has it ignored, for a job in the background
+        signal.signal(signal.SIGINT, _leave)
+    try:
+        from runtime.commands.app import app
+        from runtime.support.crash import watch_threads
+        from runtime.support.privacy import keep_quiet
+
+        keep_quiet()
+        watch_threads()
+        signal.signal(signal.SIGINT, before)
+        code = _code_of(app, output)
+    except BaseException as error:
+        code = _told(error, output)
+    sys.exit(_flushed(code, output))
+
+
+def _code_of(app: Any, output: _Output) -> int:
     try:
         app()
-    except PhasestackError as error:
-        print(f"phasestack: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
+    except SystemExit as error:
+        if isinstance(error.__context__, BrokenPipeError):  # typer ends any of them so, a socket's too
+            return _told(error.__context__, output)
+        if isinstance(error.code, str):
+            _say(error.code)
+            return 1
+        return error.code or 0
+    return 0
+
+
+def _told(error: BaseException, output: _Output) -> int:
+    """The exit code of what a command was ended by, told in one line."""
+    from runtime.errors import PhasestackError, TransientError, one_line
+
+    if _is_interrupt(error):
+        return INTERRUPTED
+    if isinstance(error, OSError) and error is output.problem:
+        if isinstance(error, BrokenPipeError):
+            return NOBODY_READS
+        _say(f"phasestack: stdout: cannot be written ({error.strerror})")
+        return BAD_INPUT
+    if isinstance(error, PhasestackError):
+        _say(f"phasestack: {one_line(str(error), most=2000)}")
+        return MAY_PASS if isinstance(error, TransientError) else BAD_INPUT
+    from runtime.support.crash import written
+
+    _say(f"phasestack: {written(error)}")
+    return OWN_ERROR
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """An interrupt, or what a library made of one that fell into its import."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+def _say(line: str) -> None:
+    with contextlib.suppress(OSError, ValueError):  # where nobody reads stderr either, the exit code has to do
+        print(line, file=sys.stderr, flush=True)
+
+
+class _Output(io.FileIO):
+    """Standard output that remembers why it could not be written: a full disk, or a reader that went away."""
+
+    problem: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data)
+        except OSError as error:
+            self.problem = error
+            raise
+
+
+def _flushed(code: int, output: _Output) -> int:
+    """The exit code once all that was printed is out: Python's own last flush would tell a failure in a traceback."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError) as error:
+            problem = output.problem if stream is sys.stdout else error
+            code = code or _told(problem or error, output)
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, stream.fileno())
+            os.close(nowhere)
+    return code
+
+
+def _fill_standard_descriptors() -> _Output:
+    """Where stdin, stdout or stderr is closed, it leads nowhere: no file that is opened later takes its place.
+
+    Answers what is below the new `sys.stdout`.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(number, True)
+    os.close(number)
+    output = _Output(1, "wb", closefd=False)
+    sys.stdout = io.TextIOWrapper(
+        io.BufferedWriter(output),
+        encoding=getattr(sys.stdout, "encoding", "utf-8"),
+        errors="backslashreplace",
+        line_buffering=output.isatty(),
+    )
+    sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115, PTH123 - for the whole process
+    return output
 
 
 if __name__ == "__main__":

@@ -131,7 +131,7 @@ class DetectorSettings(Section):
         4.0, description="farther measurements are not a viewer's face"
     )
     lock_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
-        1.0, description="a viewer who is not seen for this long makes way for another"
+        0.3, description="a viewer not seen for this long makes way for another; less than tracker.hold_s"
     )
 
     @model_validator(mode="after")
@@ -199,6 +199,25 @@ class CalibrationSettings(Section):
         0.0, description="the viewer's known eye separation, metres, 0: unknown; checks for drift"
     )
     ipd_tolerance: Positive = Field(0.04, description="warn where the measured one parts by more than this share")
+    viewing_m: tuple[Positive, Positive] = Field(
+        (0.4, 0.6), description="nearest and farthest viewer: charts and registration are for there"
+    )
+    viewing_side_deg: Annotated[float, Field(ge=2, le=40)] = Field(
+        10.0, description="how far to either side viewers stand, seen from the display's middle"
+    )
+    viewing_up_deg: tuple[float, float] = Field((0.0, 20.0), description="how far up their eyes are: lowest, highest")
+    scale_sigma: NonNegative = Field(
+        0.02, description="how far off the sensor's metre may be, standard deviation; 0: it is exact"
+    )
+
+    @model_validator(mode="after")
+    def _viewing(self) -> CalibrationSettings:
+        if self.viewing_m[1] < self.viewing_m[0] * 1.1:
+            raise ValueError("viewing_m: must be the nearest, then the farthest, at least a tenth farther")
+        low, high = self.viewing_up_deg
+        if not (-40 <= low < high <= 40 and high - low >= 2):
+            raise ValueError("viewing_up_deg: must be lowest, then highest, between -40 and 40, 2 degrees apart")
+        return self
 
 
 class ContentSettings(Section):
@@ -247,6 +266,9 @@ class ModelSettings(Section):
 
     name: str = Field("balanced", description="fast, balanced, best, sart, or an ONNX file with our contract")
     provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = Field("cpu", description="execution provider")
+    backend: Literal["auto", "opencv"] = Field(
+        "auto", description="what does all that surrounds the network; auto: the one there is"
+    )
     threads: Annotated[int, Field(ge=0, le=256)] = Field(2, description="inference threads; 0: all cores")
     eye_sigma_mm: Literal["auto"] | NonNegative = Field(
         "auto",
@@ -352,15 +374,33 @@ class PlanSettings(Section):
     focus: bool = Field(True, description="run the network only where the two eyes' pictures differ")
     one_channel: bool = Field(True, description="solve one channel instead of three while the pictures are grey")
     one_eye: bool = Field(True, description="solve for one eye alone while the other can't see the display")
-    align: bool = Field(
-        True, description="shift and scale the outer panels at every refresh to where the eyes are then"
-    )
+    align: bool = Field(True, description="shift and scale the panels at every refresh to where the eyes are then")
     dead_band_mm: NonNegative = Field(
         0.0, description="eye motion that is not solved for anew; 0: only while the head rests"
     )
     most_band_mm: NonNegative = Field(1.0, description="a resting head may drift so far until its place is renewed")
     range_deg: Annotated[float, Field(gt=0, le=90)] = Field(
         80.0, description="an eye farther off the display's axis than this can't see it"
+    )
+
+
+class LimitSettings(Section):
+    """What a file from outside may hold: more is refused with its figure, before memory is taken for it."""
+
+    file_mib: Annotated[float, Field(gt=0, le=1_000_000)] = Field(
+        1024.0, description="one file of content or of a recording, MiB"
+    )
+    pixels: Annotated[int, Field(ge=1)] = Field(134_217_728, description="pixels of one picture; 16384 x 8192")
+    triangles: Annotated[int, Field(ge=1)] = Field(2_000_000, description="triangles of a mesh, all instances together")
+    splats: Annotated[int, Field(ge=1)] = Field(3_000_000, description="Gaussians of a splat file")
+    instances: Annotated[int, Field(ge=1)] = Field(2000, description="times that meshes stand in a glTF scene")
+    depth: Annotated[int, Field(ge=1, le=512)] = Field(64, description="how deep JSON or a glTF scene may nest")
+    load_s: Positive = Field(120.0, description="loading of one piece of content is given up after this")
+    recording_s: Annotated[float, Field(gt=0, le=1_000_000)] = Field(
+        21_600.0, description="length of a recording that is replayed, seconds"
+    )
+    chunk_mib: Annotated[float, Field(gt=0, le=4096)] = Field(
+        32.0, description="one chunk or message of a recording, unpacked, MiB"
     )
 
 
@@ -388,6 +428,7 @@ class Settings(Section):
     loop: LoopSettings = Field(default_factory=LoopSettings, description="pacing")
     plan: PlanSettings = Field(default_factory=PlanSettings, description="what is left out")
     service: ServiceSettings = Field(default_factory=ServiceSettings, description="socket, metrics, logs")
+    limits: LimitSettings = Field(default_factory=LimitSettings, description="what files from outside may hold")
 
     @model_validator(mode="after")
     def _agree(self) -> Settings:
@@ -408,6 +449,7 @@ class Overrides(BaseModel):
     scene: str | None = None
     model: str | None = None
     budget_ms: float | None = None
+    backend: str | None = None
 
     def applied(self, settings: Settings) -> Settings:
         """The settings with these in force. Raises InputError, naming the option."""
@@ -421,6 +463,8 @@ class Overrides(BaseModel):
             settings = changed(settings, "model", {"name": self.model}, source="--model")
         if self.budget_ms is not None:
             settings = changed(settings, "model", {"budget_ms": self.budget_ms}, source="--budget-ms")
+        if self.backend is not None:
+            settings = changed(settings, "model", {"backend": self.backend}, source="--backend")
         return settings
 
 

@@ -4,6 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
+PART_CHARACTERS_MAX = 300  # of a message: a foreign name must not fill the screen, nor forge a line of the log
+
+
+def one_line(text: str, *, most: int = PART_CHARACTERS_MAX) -> str:
+    """Text on one line: what can't be printed (line breaks, escapes, NUL) becomes `?`, a long one's middle `...`.
+
+    >>> one_line("a\\nb"), one_line("x" * 9, most=7)
+    ('a?b', 'xx...xx')
+    """
+    if len(text) > most:
+        half = (most - 3) // 2
+        text = f"{text[:half]}...{text[-half:]}"
+    return "".join(c if c.isprintable() else "?" for c in text)
+
 
 class PhasestackError(Exception):
     """Everything that phasestack raises on purpose."""
@@ -22,7 +36,7 @@ class InputError(FatalError):
 
     def __init__(self, source: str | Path, field: str, problem: str) -> None:
         self.source, self.field, self.problem = str(source), field, problem
-        super().__init__(": ".join(part for part in (self.source, field, problem) if part))
+        super().__init__(": ".join(one_line(part) for part in (self.source, field, problem) if part))
 
 
 class MissingPart(FatalError):
@@ -55,3 +69,7 @@ class ModelFailure(TransientError):
 
 class PanelLost(TransientError):
     """A panel's window, monitor or GL context is gone: rebuild it; the loop goes on with none."""
+
+
+class Stopped(PhasestackError):
+    """Told to stop before there was anything to stop."""

@@ -25,13 +25,15 @@ def scene(
     config: Config = None,
     socket: Socket = None,
 ) -> None:
-    """Show another scene: a preset's name, `demo`, or a file on the daemon's machine.
+    """Show another scene: a preset's name, `demo`, or a file or folder of this machine, seen from here.
 
     The present scene goes on while it is loaded, and stays where it can't be: then this exits with 2 and one line.
 
     Example: phasestack ctl scene demo
     """
-    tell({"command": "scene", "value": name}, config, socket)
+    from runtime.commands.names import scene_from_here
+
+    tell({"command": "scene", "value": scene_from_here(name)}, config, socket)
 
 
 @app.command()

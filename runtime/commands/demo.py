@@ -11,7 +11,7 @@ import typer
 
 def demo(
     out: Annotated[Path, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = Path("out/demo"),
-    frames: Annotated[int | None, typer.Option(min=1, help="turns; default: the whole recording")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="refreshes; default: the whole recording")] = None,
     scale: Annotated[float, typer.Option(min=0.05, max=2.0, help="panel resolution, times 1920x1080")] = 1.0,
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="the summary as one JSON object on stdout")] = False,
@@ -20,6 +20,7 @@ def demo(
 
     Example: phasestack demo --out out/demo
     """
+    from runtime.clock import NS_PER_S
     from runtime.commands.running import drive, print_summary
     from runtime.config import Settings
     from runtime.daemon.build import RunOptions
@@ -29,15 +30,15 @@ def demo(
     settings = Settings()
     if model is not None:
         settings = settings.model_copy(update={"model": settings.model.model_copy(update={"name": model})})
-    samples = sum(1 for _ in Recording(demo_recording_path()).samples())
+    captures_ns = [sample.capture_ns for sample in Recording(demo_recording_path()).samples()]
+    refreshes = round((captures_ns[-1] - captures_ns[0]) / NS_PER_S * settings.loop.rate_hz)
     summary = drive(
         settings,
         RunOptions(max_speed=True, measure=True, scale=scale),
         out=out,
         frames=frames,
-        total=min(samples, frames or samples),
+        total=min(refreshes, frames or refreshes),
         progress=True,
-        measured_times=True,
     )
     if as_json:
         typer.echo(json.dumps(summary))

@@ -1,43 +1,62 @@
-"""Writes one of the benchmark's motions as a recording, to run it through the whole pipeline.
+"""`phasestack record --motion`: one of the tracker benchmark's motions as a recording, with its true eyes.
 
-    python -m runtime.commands.motion_recording walk walk.mcap
-    phasestack run --replay walk.mcap --headless --max-speed --out out/walk
-
-Noise, outliers and dropouts are the benchmark's; the truth is in the file, so the run's summary tells the displayed
+Noise, outliers and dropouts are the benchmark's; the truth is in the file, so a run's summary tells the displayed
 quality at the true eyes. The sensor stands where the demo's calibration, the default, says.
 """
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
+from typing import Any
+
+SECONDS, RATE_HZ, NOISE_MM = 12.0, 30.0, 3.0
+SECONDS_MAX, NOISE_MAX_MM = 3600.0, 100.0
+RATE_LEAST_HZ, RATE_MOST_HZ = 15.0, 240.0
 
 
-def write_motion(path: Path, motion: str, *, seconds: float = 12.0, rate_hz: float = 30.0) -> None:
-    """Raises InputError for a motion that is not known, or a file that can't be written."""
+def write_motion(
+    path: Path,
+    motion: str,
+    *,
+    seed: int = 0,
+    seconds: float = SECONDS,
+    rate_hz: float = RATE_HZ,
+    noise_mm: float = NOISE_MM,
+) -> dict[str, Any]:
+    """Answers what was written. `seed`: of the head's path and of the noise; 0 is the benchmark's own.
+
+    Raises InputError for a motion that is not known, a number out of range, or a file that can't be written.
+    """
     import numpy as np
 
     from runtime.clock import NS_PER_S
     from runtime.errors import InputError
     from runtime.eyes.demo_geometry import demo_sensor_from_stack
-    from runtime.eyes.motions import MOTIONS, observe, true_eyes
+    from runtime.eyes.motions import MOTIONS, observe, path_of, true_eyes
     from runtime.records import EyePoints, SensorFrame
-    from runtime.sensor.recording import recording_to
+    from runtime.sensor.recording import RecordingLimits, recording_to
     from runtime.sensor.recording_format import RecordingHeader
+    from runtime.support.foreign import real, whole
 
     if motion not in MOTIONS:
-        raise InputError("motion", "", f"unknown: {motion!r}; known: {', '.join(MOTIONS)}")
+        raise InputError("record", "--motion", f"unknown: {motion!r}; known: {', '.join(MOTIONS)}")
+    rate_hz = real(rate_hz, least=RATE_LEAST_HZ, most=RATE_MOST_HZ, source="record", field="--rate-hz")
+    seconds = real(seconds, least=2 / rate_hz, most=SECONDS_MAX, source="record", field="--seconds")
+    noise_mm = real(noise_mm, least=0.0, most=NOISE_MAX_MM, source="record", field="--noise-mm")
+    seed = whole(seed, least=0, most=(1 << 63) - 1, source="record", field="--seed")
+    way = path_of(seed)
+    how = {"seconds": seconds, "rate_hz": rate_hz, "noise_m": noise_mm / 1000}
+    observed = observe(motion, **how, seed=1 + seed, path=way)
+    truth = true_eyes(motion, np.array([o.capture_ns for o in observed]) / NS_PER_S, path=way)
     sensor_from_stack = demo_sensor_from_stack()
-    observed = observe(motion, seconds=seconds, rate_hz=rate_hz)
-    truth = true_eyes(motion, np.array([o.capture_ns for o in observed]) / NS_PER_S)
-    with recording_to(path, RecordingHeader(driver="motion", serial="demo", truth=True)) as writer:
+    header = RecordingHeader(driver="motion", serial="demo", truth=True)
+    with recording_to(path, header, limits=RecordingLimits(max_s=2 * SECONDS_MAX)) as writer:
         for number, (seen, eyes) in enumerate(zip(observed, truth, strict=True), start=1):
             points = None
             if seen.points is not None:
                 place = seen.points.eyes_m @ sensor_from_stack[:3, :3].T + sensor_from_stack[:3, 3]
                 points = EyePoints(place, seen.points.confidence)
-            writer.write(SensorFrame(number, seen.capture_ns, points, true_eyes_m=eyes))
-
-
-if __name__ == "__main__":
-    write_motion(Path(sys.argv[2]), sys.argv[1])
+            if not writer.write(SensorFrame(number, seen.capture_ns, points, true_eyes_m=eyes)):
+                raise InputError(path, "", "the recording would be larger than its limit")
+    told = {"motion": motion, "seed": seed, "rate_hz": rate_hz, "noise_mm": noise_mm}
+    return told | {"file": str(path), "samples": len(observed), "seconds": (len(observed) - 1) / rate_hz}

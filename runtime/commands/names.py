@@ -25,10 +25,10 @@ def scene_from_here(name: str) -> str:
 
     What is neither known nor there is left as it is: the daemon says what it knows.
     """
-    if name in scene_names():
-        return name
     try:
-        return str(Path(name).absolute()) if Path(name).exists() else name
+        if not Path(name).exists() or (Path(name).name == name and name in scene_names()):
+            return name
+        return str(Path(name).absolute())
     except (OSError, ValueError):  # too long, or a NUL character
         return name
 

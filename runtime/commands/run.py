@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 from typing import Annotated
@@ -9,19 +10,39 @@ from typing import Annotated
 import typer
 
 
+def leave_at_once() -> None:
+    """End the process though a solver's call never returned: waiting for its thread would never end."""
+    import logging
+    import os
+    import sys
+
+    from runtime.support import logs
+
+    logging.getLogger("phasestack.run").warning("a call that never returned is left to the system")
+    logs.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(0)
+
+
 def run(
     config: Annotated[Path | None, typer.Option(help="TOML file; see `phasestack config`")] = None,
     replay: Annotated[str | None, typer.Option(help="a recording, or `demo`, instead of the sensor")] = None,
     headless: Annotated[bool, typer.Option("--headless", help="offscreen panels, whatever is configured")] = False,
-    frames: Annotated[int | None, typer.Option(min=1, help="stop after so many turns")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="stop after so many refreshes")] = None,
     max_speed: Annotated[
-        bool, typer.Option("--max-speed", help="every recorded sample, simulated clock, no waiting: reproducible")
+        bool, typer.Option("--max-speed", help="a recording on a simulated clock, no waiting: reproducible")
     ] = False,
     out: Annotated[Path | None, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = None,
     scene: Annotated[str | None, typer.Option(help="a built-in scene, a preset's name, a file or folder")] = None,
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
     scale: Annotated[float, typer.Option(min=0.05, max=2.0, help="panel resolution, times the configured one")] = 1.0,
     budget_ms: Annotated[float | None, typer.Option(min=0, help="time for a frame; picks model and size")] = None,
+    backend: Annotated[str | None, typer.Option(help="what surrounds the network: auto or opencv")] = None,
+    keep_light: Annotated[
+        int, typer.Option(min=0, help="with --out: every so many refreshes leave what the panels show; 0: none")
+    ] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="the summary as one JSON object on stdout")] = False,
 ) -> None:
     """Run the display: eyes in, layers out, until SIGTERM. SIGHUP reads the configuration again.
@@ -34,8 +55,25 @@ def run(
     """
     from runtime.config import Overrides
     from runtime.daemon.supervise import run_daemon
+    from runtime.errors import InputError
 
-    overrides = Overrides(replay=replay, headless=headless, scene=scene, model=model, budget_ms=budget_ms)
-    summary = run_daemon(config, overrides, frames=frames, max_speed=max_speed, out=out, scale=scale, quiet=as_json)
+    if keep_light and out is None:
+        raise InputError("run", "--keep-light", "needs --out")
+    overrides = Overrides(
+        replay=replay, headless=headless, scene=scene, model=model, budget_ms=budget_ms, backend=backend
+    )
+    summary = run_daemon(
+        config,
+        overrides,
+        frames=frames,
+        max_speed=max_speed,
+        out=out,
+        scale=scale,
+        quiet=as_json,
+        keep_light=keep_light,
+    )
+    left_behind = summary.pop("left_behind", 0)
     if as_json:
         typer.echo(json.dumps(summary))
+    if left_behind:
+        leave_at_once()

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from runtime.config import Settings
-    from runtime.daemon.build import RunOptions
-    from runtime.frame.loop import Supervisor
-    from runtime.records import FrameAccount
+    from runtime.daemon.build import Run, RunOptions
+    from runtime.frame.presenter import Supervisor
 
 
 def drive(
@@ -22,44 +22,41 @@ def drive(
     frames: int | None,
     total: int | None,
     progress: bool,
-    measured_times: bool,
     supervisor: Supervisor | None = None,
     wait_for_panels: Any = None,
     on_start: Callable[[str], bool] = lambda _: True,
+    on_built: Callable[[Run], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Run to the end and answer the summary. `total`: turns that the progress bar counts to, where it is known.
-
-    measured_times: frames.jsonl tells the machine's stage times, not the simulated clock's.
-    """
-    from runtime.daemon.build import build_loop
+    """Run to the end and answer the summary. `total`: refreshes that the progress bar counts to, where it is known."""
+    from runtime.daemon.build import build_run
     from runtime.evaluation.run_output import RunOutput
+    from runtime.optics.alignment import shown_layers
 
     with ExitStack() as cleanup:
         output = cleanup.enter_context(RunOutput(out)) if out is not None else None
         advance = cleanup.enter_context(_progress(total)) if progress else None
-
-        def account(frame: FrameAccount) -> None:
-            if output is not None:
-                output.frame(frame, frame.measured_ms if measured_times else frame.stage_ms)
-            if advance is not None:
-                advance(frame)
-
-        loop = build_loop(
+        run = build_run(
             settings,
             options,
             cleanup,
             supervisor=supervisor,
-            on_account=account,
+            output=output,
+            on_account=advance,
             wait_for_panels=wait_for_panels,
             on_start=on_start,
         )
-        reason = loop.run(frames=frames)
-        if loop.look is None or settings.loop.evaluate_every == 0:
-            loop.measure()
-        summary = loop.summary() | {"stopped": reason}
+        on_built(run)
+        begin_s = perf_counter()
+        reason = run.presenter.run(frames=frames)
+        machine_s = perf_counter() - begin_s
+        run.observer.finish()
+        summary = run.summary() | {"stopped": reason}
         if output is not None:
-            output.finish(summary, loop.layers, loop.look)
-    return summary
+            last = run.presenter.last
+            has_picture = last is not None and (last.frame.solved is not None or last.frame.flat is not None)
+            layers = shown_layers(last.frame) if last is not None and has_picture else None
+            output.finish(summary, layers, run.observer.look)
+    return summary | {"machine_s": round(machine_s, 3), "left_behind": run.solver.left_behind}
 
 
 def _progress(total: int | None) -> Any:
@@ -86,15 +83,26 @@ def print_summary(summary: dict[str, Any], out: Path | None) -> None:
     console = Console()
     table = Table(title="phasestack", show_header=False, title_justify="left")
     presented = f"{summary['presented']} of {summary['frames']} presented, {summary['dropped']} dropped"
-    table.add_row("frames", f"{presented}, {summary['inferences']} inferences")
-    table.add_row("time", f"{summary['seconds']:.1f} s, {summary['fps']:.1f} frames/s with measuring")
-    table.add_row("model", f"{summary['model']} on {summary['provider']}")
+    table.add_row("refreshes", f"{presented}; {summary['inferences']} solutions")
+    rates = f"{summary['seconds']:.1f} s"
+    if summary["fps"] is not None:
+        rates += f", {summary['fps']:.1f} refreshes/s, {summary['solutions_per_s']:.1f} solutions/s"
+    if abs(summary["machine_s"] - summary["seconds"]) > 0.1 * summary["seconds"]:
+        rates += f" (simulated; it took {summary['machine_s']:.1f} s)"
+    table.add_row("time", rates)
+    table.add_row("model", f"{summary['model']} on {summary['provider']}, {summary['backend']}")
     if summary["psnr_db"] is not None:
         quality = f"{summary['psnr_db']:.2f} dB, SSIM {summary['ssim']:.4f} at the eyes used"
         if summary["psnr_db_true_eyes"] is not None:
             quality += f"; {summary['psnr_db_true_eyes']:.2f} dB at the true eyes"
-        table.add_row("displayed", f"{quality} ({summary['quality_frames']} frames)")
-    stages = {name: values for name, values in summary["stage_ms"].items() if values.get("max", 0) > 0.05}
+        table.add_row("displayed", f"{quality} ({summary['quality_frames']} refreshes)")
+        carried = f"{summary['carried_db']:.2f} dB at the eyes used"
+        if summary["carried_db_true_eyes"] is not None:
+            carried += f"; {summary['carried_db_true_eyes']:.2f} dB at the true eyes"
+        table.add_row("carried", f"{carried} (ghosts and fringes, without a late picture's parallax)")
+    if summary["photon_ms"] is not None:
+        table.add_row("capture to light", f"{summary['photon_ms']['p50']:.1f} ms (p50)")
+    stages = {name: values for name, values in summary["stage_ms"].items() if values and values["max"] > 0.05}
     table.add_row("stages, ms", ", ".join(f"{name} {values['p50']:.1f}" for name, values in stages.items()) + " (p50)")
     overhead = summary["overhead_ms"]
     if overhead:

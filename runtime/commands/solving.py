@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from time import perf_counter_ns
 from typing import Any
 
 import cv2
 import numpy as np
 
-from runtime.config import ModelSettings, load_settings, load_stack
+from runtime.config import ModelSettings, Overrides, changed, load_settings, load_stack
 from runtime.content.base import ContentInfo
 from runtime.errors import InputError
+from runtime.evaluation.displayed import Look, Picture, displayed, expected_db
+from runtime.evaluation.trials import timed, timed_in_turn
 from runtime.model.predictor import Prediction, Predictor, load_predictor
 from runtime.model.still import solve_still
-from runtime.optics.quality import Quality, quality
-from runtime.optics.retina import Retina, seen_by
+from runtime.optics.carried import intensities
+from runtime.optics.retina import as_codes
 from runtime.optics.stack import PanelStack
 from runtime.plan.planner import focused_part, observed
 from runtime.plan.planning import planned_predictor
 from runtime.plan.savings import Measured, Saving, network_items
 from runtime.records import F64, U8, PlanItem
-from runtime.support.artifacts import OutputFolder, read_image, write_json, write_png
+from runtime.support.artifacts import OutputFolder, in_8_bits, read_picture, write_json, write_png
 
 SEPARATION_MIN_M = 0.005
 COMPARED = 3  # timed runs with and without the plan
@@ -44,14 +46,19 @@ class SolveRequest:
     repeat: int
     eye_sigma_mm: float
     config: Path | None
+    backend: str | None = None
+    no_plan: bool = False
 
 
 def solve_pair(request: SolveRequest) -> dict[str, Any]:
     """Layers, what the eyes see of them, and solve.json (design 5.2). Raises InputError."""
-    settings = load_settings(request.config)
+    settings = Overrides(backend=request.backend).applied(load_settings(request.config))
+    if request.no_plan:
+        settings = changed(settings, "plan", {"enabled": False}, source="--no-plan")
     model_settings = settings.model
     cv2.setNumThreads(model_settings.threads or -1)
-    pictures = [read_image(path) for path in (request.left, request.right)]
+    stored = [read_picture(path) for path in (request.left, request.right)]
+    pictures = [in_8_bits(picture) for picture in stored]
     if pictures[0].shape != pictures[1].shape:
         sizes = " and ".join(f"{p.shape[1]}x{p.shape[0]}" for p in pictures)
         raise InputError(request.right, "size", f"the two pictures differ: {sizes}")
@@ -68,10 +75,16 @@ def solve_pair(request: SolveRequest) -> dict[str, Any]:
     try:
         prediction, timing = _timed(pictures, eyes_m, request, predictor)
         with OutputFolder(request.out) as folder:
-            measured = _write(folder.staging, prediction.layers, pictures, eyes_m, stack, request.fov_deg)
-            plan = _left_out(pictures, eyes_m, request, predictor, model_settings, measured["psnr_db"])
-            named = {"model": predictor.name, "provider": predictor.provider, "plan": [asdict(item) for item in plan]}
-            result = measured | timing | named | {"eye_sigma_mm": request.eye_sigma_mm}
+            measured = _write(folder.staging, prediction.layers, stored, eyes_m, stack, request)
+            plan = _left_out(pictures, stored, eyes_m, request, predictor, model_settings, measured["psnr_db"])
+            named = {
+                "model": predictor.name,
+                "provider": predictor.provider,
+                "backend": "opencv",
+                "eye_sigma_mm": request.eye_sigma_mm,
+                "plan": [asdict(item) for item in plan],
+            }
+            result = measured | timing | named
             write_json(folder.staging / "solve.json", result)
     finally:
         predictor.close()
@@ -80,6 +93,7 @@ def solve_pair(request: SolveRequest) -> dict[str, Any]:
 
 def _left_out(
     pictures: list[U8],
+    stored: Sequence[Picture],
     eyes_m: F64,
     request: SolveRequest,
     predictor: Predictor,
@@ -88,36 +102,35 @@ def _left_out(
 ) -> list[PlanItem]:
     """What the model left out of these pictures, and what that saved and cost against a model that leaves out nothing.
 
+    stored: the same pictures in their files' own bits, which is what the eyes should see.
     Both are timed again, in turn, so that what slows one slows the other.
     """
     numbers = observed(Measured(), predictor)
     info = ContentInfo(request.left.name)
     if not network_items(info, numbers):
         return []
-    plain = load_predictor(settings.name, predictor.stack, settings)
+    stack = predictor.stack
+    plain = load_predictor(settings.name, stack, settings)
     part = focused_part(predictor)
     # In colour, or unfocused, one saving is all there is.
     between = part.whole if part is not None and numbers.channels == 1 and numbers.active_fraction < 1 else None
     ways = {"plain": plain, "planned": predictor} | ({"between": between} if between else {})
-    times: dict[str, list[float]] = {name: [] for name in ways}
-    shown_db = {"planned": planned_db}
+
+    def solved_by(way: Predictor) -> Callable[[int], U8]:
+        return lambda _: _solved(pictures, eyes_m, request, way).layers
+
+    calls = {name: solved_by(way) for name, way in ways.items()}
     try:
-        for turn in range(COMPARED + 1):
-            for name, way in ways.items():
-                begin_ns = perf_counter_ns()
-                solved = _solved(pictures, eyes_m, request, way)
-                if turn:
-                    times[name].append((perf_counter_ns() - begin_ns) / 1e6)
-                elif name != "planned":
-                    shown_db[name] = _shown(solved.layers, pictures, eyes_m, predictor.stack, request.fov_deg)[
-                        0
-                    ].psnr_db
+        done = timed_in_turn(calls, runs=COMPARED, keep=lambda layers: layers.copy())
     finally:
         plain.close()
+    shown_db = {
+        name: planned_db if name == "planned" else _shown(way.answer, stored, eyes_m, stack, request).quality.psnr_db
+        for name, way in done.items()
+    }
 
     def saving(without: str, with_it: str) -> Saving:
-        saved_ms = float(np.median(times[without]) - np.median(times[with_it]))
-        return Saving(saved_ms, shown_db[without] - shown_db[with_it])
+        return Saving(done[without].median_ms - done[with_it].median_ms, shown_db[without] - shown_db[with_it])
 
     middle = "between" if between else "plain" if numbers.channels == 3 else "planned"
     numbers = replace(numbers, one_channel=saving("plain", middle), focus=saving(middle, "planned"))
@@ -144,51 +157,45 @@ def _solved(pictures: list[U8], eyes_m: F64, request: SolveRequest, predictor: P
 
 
 def _timed(
-    pictures: list[U8], eyes_m: F64, request: SolveRequest, predictor: Any
+    pictures: list[U8], eyes_m: F64, request: SolveRequest, predictor: Predictor
 ) -> tuple[Prediction, dict[str, float]]:
     """A warm-up, then `repeat` timed runs; medians."""
-    inference_ms, total_ms = [], []
-    prediction = _solved(pictures, eyes_m, request, predictor)
-    for _ in range(request.repeat):
-        start_ns = perf_counter_ns()
+    inference_ms: list[float] = []
+
+    def solved() -> Prediction:
         prediction = _solved(pictures, eyes_m, request, predictor)
-        total_ms.append((perf_counter_ns() - start_ns) / 1e6)
         inference_ms.append(prediction.stage_ms["inference"])
-    return prediction, {
-        "inference_ms": round(float(np.median(inference_ms)), 3),
-        "total_ms": round(float(np.median(total_ms)), 3),
+        return prediction
+
+    done = timed(solved, runs=request.repeat)
+    return done.answer, {
+        "inference_ms": round(float(np.median(inference_ms[-request.repeat :])), 3),
+        "total_ms": round(done.median_ms, 3),
     }
 
 
 def _write(
-    folder: Path, layers: U8, pictures: list[U8], eyes_m: F64, stack: PanelStack, fov_deg: float
+    folder: Path, layers: U8, pictures: Sequence[Picture], eyes_m: F64, stack: PanelStack, request: SolveRequest
 ) -> dict[str, Any]:
     for n, layer in enumerate(layers):
         write_png(folder / f"layer-{n}.png", layer)
-    measured, seen, wanted = _shown(layers, pictures, eyes_m, stack, fov_deg)
-    for name, retina, target in zip(("left", "right"), seen, wanted, strict=True):
-        write_png(folder / f"seen-{name}.png", (np.clip(retina.image, 0, 1) * 255 + 0.5).astype(np.uint8))
-        write_png(folder / f"wanted-{name}.png", target)
+    look = _shown(layers, pictures, eyes_m, stack, request)
+    for name, retina, target in zip(("left", "right"), look.seen, look.wanted, strict=True):
+        write_png(folder / f"seen-{name}.png", as_codes(retina.image))
+        write_png(folder / f"wanted-{name}.png", as_codes(intensities(target)))
+    measured = look.quality
+    expected = expected_db(look, layers, stack, eyes_m=eyes_m, fov_deg=request.fov_deg)
     return {
         "psnr_db": round(measured.psnr_db, 3),
+        "expected_db": {sigma: None if value is None else round(value, 3) for sigma, value in expected.items()},
         "ssim": round(measured.ssim, 4),
         "eye_psnr_db": [round(value, 3) for value in measured.eye_psnr_db],
     }
 
 
-def _shown(
-    layers: U8, pictures: list[U8], eyes_m: F64, stack: PanelStack, fov_deg: float
-) -> tuple[Quality, list[Retina], list[U8]]:
-    """Displayed quality, what the eyes see, and what they should see. Raises InputError where they see nothing."""
-    size = (stack.width_px, stack.height_px)
-    wanted = [
-        picture if picture.shape[1::-1] == size else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-        for picture in pictures
-    ]
-    seen = [seen_by(eye_m, layers, stack, fov_deg=fov_deg) for eye_m in eyes_m]
-    targets = [np.asarray(picture, np.float32) / np.float32(255) for picture in wanted]
+def _shown(layers: U8, pictures: Sequence[Picture], eyes_m: F64, stack: PanelStack, request: SolveRequest) -> Look:
+    """What the eyes see, and what they should see. Raises InputError where they see nothing."""
     try:
-        measured = quality([retina.image for retina in seen], targets, [retina.mask for retina in seen])
+        return displayed(layers, pictures, stack, eyes_m=eyes_m, fov_deg=request.fov_deg)
     except ValueError as error:
         raise InputError("solve", "--left-eye", f"{error}: nothing of the display can be seen from there") from None
-    return measured, seen, [np.asarray(picture, np.uint8) for picture in wanted]

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from runtime.errors import one_line
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -19,7 +21,7 @@ def status(
     socket: Annotated[Path | None, typer.Option(help="the socket itself, whatever the configuration says")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
 ) -> None:
-    """Ask the running daemon: its state and why, rate, stage times, eyes, faults.
+    """Ask the running daemon: its state and why, rates now, eyes and how sure they are, times, faults.
 
     Exits with 1 where no daemon answers, or its loop has stood still for five seconds.
 
@@ -46,33 +48,34 @@ def sockets(config: Path | None, socket: Path | None) -> tuple[Path, ...]:
     """Where the daemon may listen: the one given, or the configured one and the person's own."""
     if socket is not None:
         return (socket,)
-    from runtime.config import load_settings
-    from runtime.daemon.location import candidates
+    from runtime.daemon.location import candidates, configured_socket
 
-    return candidates(load_settings(config).service.socket)
+    return candidates(configured_socket(config))
 
 
 def describe(answer: dict[str, Any]) -> Iterator[str]:
-    """The answer as lines for people; what the daemon did not say is left out."""
+    """The answer as lines for people; what the daemon did not say, or did not measure, is left out."""
     yield row("state", answer.get("state", "unknown"), answer.get("reason", ""))
     for part, why in dict(answer.get("missing") or {}).items():
         yield row(f"  missing {part}", why)
-    yield row("up", duration(float(answer.get("uptime_s", 0.0))), f"pid {answer.get('pid', '?')}")
-    frames = [f"{answer[name]} {name}" for name in ("frames", "presented", "dropped", "stale_inputs") if name in answer]
-    if "fps" in answer:
-        yield row("rate", f"{float(answer['fps']):.1f} frames/s", ", ".join(frames))
-    for name in ("scene", "loading", "refused", "model", "provider", "panels"):
-        if answer.get(name):
+    if answer.get("paused"):
+        yield row("paused", "the picture is frozen until `phasestack ctl resume`")
+    if answer.get("flat_asked"):
+        yield row("flat", "asked for, until `phasestack ctl resume`")
+    if "uptime_s" in answer:
+        yield row("up", duration(float(answer["uptime_s"])), f"pid {answer.get('pid', '?')}")
+    yield from rates(answer)
+    for name in ("scene", "content", "loading", "refused", "model", "provider", "panels"):
+        if answer.get(name) and (name != "content" or answer["content"] != answer.get("scene")):
             yield row(name, str(answer[name]))
-    if answer.get("eyes_m"):
-        left, right = answer["eyes_m"]
-        text = "  ".join(f"({x:.3f}, {y:.3f}, {z:.3f})" for x, y, z in (left, right))
-        yield row("eyes", f"{text} m", str(answer.get("eyes_label", "")))
-    for name, unit in (("overhead_ms", "ms"), ("skew_ms", "ms"), ("stage_ms", "ms")):
-        if answer.get(name) is not None:
-            yield row(name.removesuffix("_ms"), timings(answer[name], unit))
+    yield from eyes(answer)
+    for name in ("photon_ms", "solution_age_ms", "interval_ms", "overhead_ms", "skew_ms", "stage_ms"):
+        if text := timings(answer.get(name), "ms"):
+            yield row(TOLD_AS.get(name, name.removesuffix("_ms")), text)
     for part, count in dict(answer.get("faults") or {}).items():
         yield row(f"faults {part}", str(count))
+    if answer.get("log_lines_lost"):
+        yield row("log", f"{answer['log_lines_lost']} lines were lost: they could not be written")
     if budget := answer.get("budget"):
         held = {True: "held", False: "not held"}.get(budget.get("held"), "")
         remark = ", ".join(
@@ -83,18 +86,64 @@ def describe(answer: dict[str, Any]) -> Iterator[str]:
         yield row("left out", str(item.get("what", "")), str(item.get("why", "")))
 
 
+TOLD_AS = {"photon_ms": "capture to light", "solution_age_ms": "solution's age", "interval_ms": "between frames"}
+
+
+def rates(answer: dict[str, Any]) -> Iterator[str]:
+    """Refreshes and solutions a second, now and since the start."""
+    now = [
+        f"{float(answer[name]):.1f} {what}/s"
+        for name, what in (("fps_now", "refreshes"), ("solutions_per_s_now", "solutions"))
+        if answer.get(name) is not None
+    ]
+    if now:
+        yield row("now", ", ".join(now))
+    counts = [
+        f"{answer[name]} {name.replace('_', ' ')}"
+        for name in ("frames", "presented", "dropped", "missed_blanks", "stale_inputs")
+        if answer.get(name) is not None
+    ]
+    if answer.get("fps") is not None:
+        yield row("rate", f"{float(answer['fps']):.1f} frames/s", ", ".join(counts))
+    elif counts:
+        yield row("refreshes", ", ".join(counts))
+
+
+def eyes(answer: dict[str, Any]) -> Iterator[str]:
+    """Where they are, how that is known and how sure it is; what the sensor brings and what of it is refused."""
+    if answer.get("eyes_m"):
+        left, right = answer["eyes_m"]
+        text = "  ".join(f"({x:.3f}, {y:.3f}, {z:.3f})" for x, y, z in (left, right))
+        label, sigma_mm = str(answer.get("eyes_label", "")), answer.get("eye_sigma_now_mm")
+        sure = "" if sigma_mm is None else f"to {float(sigma_mm):.2f} mm (one standard deviation)"
+        yield row("eyes", f"{text} m", ", ".join(filter(None, (label, sure))))
+    if answer.get("solution_age_now_ms") is not None:
+        yield row("solution", f"{float(answer['solution_age_now_ms']):.0f} ms old at its light")
+    if answer.get("sensor_hz") is not None:
+        yield row("sensor", f"{float(answer['sensor_hz']):.1f} samples/s")
+    refused = {why: count for why, count in dict(answer.get("rejected_samples") or {}).items() if count}
+    if refused:
+        yield row("rejected", ", ".join(f"{count} {why}" for why, count in refused.items()), "samples")
+
+
 def row(name: str, value: str, remark: str = "") -> str:
-    """One aligned line."""
-    return f"{name:16} {value}" + (f"  ({remark})" if remark else "")
+    """One aligned line; what came through the socket can't break it."""
+    return one_line(f"{name:16} {value}" + (f"  ({remark})" if remark else ""), most=2000)
 
 
 def timings(value: Any, unit: str) -> str:
-    """A number, or quantiles, or quantiles per stage, on one line."""
-    if isinstance(value, dict):
-        if all(isinstance(part, dict) for part in value.values()):
-            return ", ".join(f"{name} {part.get('p50', 0.0):.2f}" for name, part in value.items()) + f" {unit} (median)"
-        return ", ".join(f"{name} {float(part):.2f}" for name, part in value.items()) + f" {unit}"
-    return f"{float(value):.2f} {unit}"
+    """A number, or quantiles, or quantiles per stage, on one line; empty where nothing was measured."""
+    if value is None:
+        return ""
+    if not isinstance(value, dict):
+        return f"{float(value):.2f} {unit}"
+    stages = {
+        name: part["p50"] for name, part in value.items() if isinstance(part, dict) and part.get("p50") is not None
+    }
+    if stages:
+        return ", ".join(f"{name} {p50:.2f}" for name, p50 in stages.items()) + f" {unit} (median)"
+    plain = {name: part for name, part in value.items() if isinstance(part, (int, float))}
+    return ", ".join(f"{name} {part:.2f}" for name, part in plain.items()) + f" {unit}" if plain else ""
 
 
 def duration(seconds: float) -> str:

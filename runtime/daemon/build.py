@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from runtime.clock import Clock, MonotonicClock, SimulatedClock
+from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock, SimulatedClock
 from runtime.config import Settings
-from runtime.records import FrameAccount
+from runtime.records import RefreshAccount
+from runtime.support.priority import PRESENTER_NICENESS, set_niceness
 
 if TYPE_CHECKING:
-    from runtime.frame.loop import Loop, Supervisor
-    from runtime.frame.pipeline import Pipeline
+    from runtime.daemon.solver_parts import RunningSolver
+    from runtime.frame.observer import Output, RunObserver
+    from runtime.frame.presenter import Presenter, Supervisor
+    from runtime.frame.solver_host import SolverHost
     from runtime.optics.stack import PanelStack
+    from runtime.panels.base import PanelSink
     from runtime.sensor.base import SensorDriver
 
-log = logging.getLogger("phasestack.assembly")
+log = logging.getLogger("phasestack.build")
 
-WARM_EYES_M = ((0.6, -0.031, 0.0), (0.6, 0.031, 0.0))
+SWITCH_INTERVAL_S = 0.0005  # between Python threads: the presenter must not wait long for the solver's
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +36,42 @@ class RunOptions:
     max_speed: bool = False
     measure: bool = False
     scale: float = 1.0
+    keep_light: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What was put together."""
+
+    presenter: Presenter
+    observer: RunObserver
+    solver: SolverHost
+    newest_parts: Callable[[], RunningSolver]
+    simulated: bool
+
+    @property
+    def parts(self) -> RunningSolver:
+        """The solver at present: for the status, and for tests."""
+        return self.newest_parts()
+
+    def plan_items(self) -> list[dict[str, Any]]:
+        """What is left out at present; a saving or a cost that this run did not measure is None."""
+        from dataclasses import asdict
+
+        from runtime.plan.savings import Saving
+
+        solver = self.parts.solver
+        known = replace(solver.measured, reuse=Saving(saves_ms=self.presenter.stats.reuse_saves_ms()))
+        return [asdict(item) for item in solver.plan_items(known)]
+
+    def summary(self) -> dict[str, Any]:
+        """summary.json (contract 5.2)."""
+        return {
+            **self.presenter.summary(simulated=self.simulated),
+            **self.observer.means.summary(),
+            "backend": "opencv",
+            "plan": self.plan_items(),
+        }
 
 
 def scaled_stack(settings: Settings, scale: float) -> PanelStack:
@@ -43,104 +84,136 @@ def scaled_stack(settings: Settings, scale: float) -> PanelStack:
     )
 
 
-def build_pipeline(settings: Settings, stack: PanelStack, context: Any, on_fault: Callable[[str], None]) -> Pipeline:
-    """Content and model. Raises FatalError; leaves nothing open then."""
-    from runtime.content.registry import open_content
-    from runtime.frame.pipeline import Pipeline
-    from runtime.plan.planner import Planner
-    from runtime.plan.planning import planned_predictor
-
-    predictor = planned_predictor(settings, stack)
-    try:
-        content = open_content(settings.content, stack, context)
-    except BaseException:
-        predictor.close()
-        raise
-    planner = Planner(settings, stack)
-    return Pipeline(stack, content=content, predictor=predictor, planner=planner, on_fault=on_fault)
-
-
-def build_loop(
+def build_run(
     settings: Settings,
     options: RunOptions,
     cleanup: ExitStack,
     *,
     supervisor: Supervisor | None = None,
-    on_account: Callable[[FrameAccount], None] | None = None,
+    output: Output | None = None,
+    on_account: Callable[[RefreshAccount], None] | None = None,
     wait_for_panels: Callable[[str], bool] | None = None,
     on_start: Callable[[str], bool] = lambda _: True,
-) -> Loop:
-    """A loop ready for its first turn; whatever it holds is closed by `cleanup`.
+) -> Run:
+    """A run ready for its first refresh; whatever it holds is closed by `cleanup`.
 
     wait_for_panels: asked when a panel is not there yet; True: try again. on_start: told what takes long before the
-    first turn; False: leave it. Raises FatalError, PanelLost.
+    first refresh; False: leave it. Raises FatalError, PanelLost.
     """
     import cv2
-    import numpy as np
 
-    from runtime.evaluation.probe import QualityProbe
+    from runtime.daemon.solver_parts import SolverMaker
     from runtime.eyes.calibration import load_calibration
     from runtime.eyes.detect import EyeFinder
-    from runtime.eyes.tracker import Tracker
-    from runtime.frame.inputs import Input, LiveInput, SteppedInput
-    from runtime.frame.loop import Loop
-    from runtime.plan.budget import BudgetControl
+    from runtime.frame.observer import RunObserver
+    from runtime.frame.presenter import Presenter
+    from runtime.frame.samples import LiveSamples, RecordedSamples, Samples
+    from runtime.frame.solver_host import SimulatedSolver, total_ns
+    from runtime.frame.solver_thread import SolverThread
+    from runtime.frame.viewer import Viewer
     from runtime.sensor.detecting import DetectingDriver
     from runtime.sensor.registry import open_sensor
     from runtime.support.gl import offscreen_context
 
     cv2.setNumThreads(settings.model.threads or -1)
-    clock: Clock = SimulatedClock() if options.max_speed else MonotonicClock()
+    simulated = options.max_speed
+    clock: Clock = SimulatedClock() if simulated else MonotonicClock()
     stack = scaled_stack(settings, options.scale)
     calibration = load_calibration(Path(settings.calibration.file) if settings.calibration.file else None)
+    for warning in calibration.warnings:
+        log.warning("%s", warning)
 
     def make_driver() -> SensorDriver:
         driver = open_sensor(settings.sensor, clock, latency_ms=settings.loop.sensor_latency_ms)
         return DetectingDriver(driver, lambda: EyeFinder(settings.detector).find)
 
     driver = make_driver()
-    source: Input
-    for warning in calibration.warnings:
-        log.warning("%s", warning)
-    if options.max_speed:
-        source = SteppedInput(driver, clock)
-        cleanup.callback(source.close)
+    samples: Samples
+    if simulated:
+        samples = RecordedSamples(driver)
+        cleanup.callback(samples.close)
     context = offscreen_context()
     cleanup.callback(context.release)
     panels = _open_panels(settings, stack, clock, context, wait_for_panels)
     cleanup.callback(panels.close)
-    faults: dict[str, Loop] = {}
-    pipeline = build_pipeline(settings, stack, context, lambda part: faults["loop"].fault(part))
-    cleanup.callback(lambda: faults["loop"].pipeline.close() if faults else pipeline.close())
-    pipeline.predictor.warm_up(np.array(WARM_EYES_M))
-    budget = BudgetControl(settings, pipeline, simulated=options.max_speed)
-    cleanup.callback(budget.close)
-    budget.start(on_start)
-    if not options.max_speed:
-        source = LiveInput(make_driver, settings.sensor, clock)
-        cleanup.callback(source.close)
-    loop = Loop(
-        settings,
-        clock=clock,
-        context=context,
-        budget=budget,
-        source=source,
-        calibration=calibration,
-        tracker=Tracker(settings.tracker),
-        pipeline=pipeline,
-        panels=panels,
-        supervisor=supervisor,
-        probe=QualityProbe(stack, fov_deg=settings.content.fov_deg) if options.measure else None,
+    maker = SolverMaker(settings, stack, calibration, on_start=on_start)
+    solver: SolverHost
+    if simulated:
+        solver = SimulatedSolver(maker(context=context, simulated=True), clock)
+        cleanup.callback(solver.close)
+    else:
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        thread = SolverThread(
+            maker,
+            clock,
+            late_s=settings.loop.solver_late_s,
+            abandon_s=settings.loop.solver_abandon_s,
+            first_cost_ns=total_ns(settings.loop.simulated_stage_ms),
+        )
+        solver = thread
+        cleanup.callback(solver.close)
+        thread.wait_ready(lambda: on_start("loading content and model"))
+        samples = LiveSamples(make_driver, settings.sensor, clock)
+        cleanup.callback(samples.close)
+    run = maker.run
+    if run is None:
+        from runtime.errors import Stopped
+
+        raise Stopped("told to stop while starting")
+    viewer = Viewer(settings, calibration, front_m=max(stack.x_m), in_stack_frame=driver.capabilities.in_stack_frame)
+    observer = RunObserver(
+        stack,
+        solver,
+        fov_deg=settings.content.fov_deg,
+        measure=options.measure,
+        evaluate_every=settings.loop.evaluate_every if options.measure else 0,
+        keep_light=options.keep_light,
+        output=output,
         on_account=on_account,
-        in_stack_frame=driver.capabilities.in_stack_frame,
+        simulated=simulated,
     )
-    faults["loop"] = loop
-    return loop
+    presenter = Presenter(
+        run,
+        stack,
+        clock=clock,
+        pacer=_pacer(settings, panels),
+        samples=samples,
+        viewer=viewer,
+        solver=solver,
+        panels=panels,
+        stage_ms=settings.loop.simulated_stage_ms,
+        supervisor=supervisor,
+        observer=observer,
+    )
+    if not simulated:
+        set_niceness(PRESENTER_NICENESS)  # this thread's, once all others have been started
+    return Run(presenter, observer, solver, lambda: _newest(maker), simulated)
+
+
+def _newest(maker: Any) -> RunningSolver:
+    parts: RunningSolver = maker.parts
+    return parts
+
+
+def _pacer(settings: Settings, panels: PanelSink) -> Any:
+    from runtime.frame.pacing import Pacer
+
+    period_ns = panels.period_ns or round(NS_PER_S / settings.loop.rate_hz)
+    work_ms = _refresh_ms(settings.loop.simulated_stage_ms)
+    return Pacer(
+        period_ns=period_ns,
+        photon_ns=round(settings.loop.scanout_ms * NS_PER_MS),
+        work_ns=round(work_ms * NS_PER_MS),
+    )
+
+
+def _refresh_ms(stage_ms: Mapping[str, float]) -> float:
+    return sum(stage_ms.get(stage, 0.0) for stage in ("sensor", "track", "present"))
 
 
 def _open_panels(
     settings: Settings, stack: PanelStack, clock: Clock, context: Any, wait: Callable[[str], bool] | None
-) -> Any:
+) -> PanelSink:
     from runtime.errors import PanelLost
     from runtime.panels.registry import open_panels
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import socket
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from runtime.errors import TransientError
+
+ANSWER_MAX_BYTES = 1 << 22
 
 
 class NotRunning(TransientError):
@@ -20,13 +24,7 @@ def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10
     problems = []
     for path in paths:
         try:
-            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-                connection.settimeout(timeout_s)
-                connection.connect(str(path))
-                connection.sendall(json.dumps(request).encode() + b"\n")
-                with connection.makefile("rb") as stream:
-                    line = stream.readline()
-            answer = json.loads(line)
+            answer = json.loads(_exchanged(path, json.dumps(request).encode() + b"\n", timeout_s))
         except (OSError, ValueError) as error:
             problems.append(f"{path}: {_advice(error)}")
             continue
@@ -34,6 +32,29 @@ def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10
             return answer
         problems.append(f"{path}: answered nonsense")
     raise NotRunning("; ".join(problems) or "no socket is configured")
+
+
+def _exchanged(path: Path, line: bytes, timeout_s: float) -> bytes:
+    """One line there and one back, within the time altogether."""
+    deadline_s = time.monotonic() + timeout_s
+    received = b""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
+        channel.settimeout(timeout_s)
+        channel.connect(str(path))
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # turned away: the answer says why
+            channel.sendall(line)
+        while b"\n" not in received and len(received) <= ANSWER_MAX_BYTES:
+            remaining_s = deadline_s - time.monotonic()
+            if remaining_s <= 0:
+                raise TimeoutError
+            channel.settimeout(remaining_s)
+            data = channel.recv(65536)
+            if not data:
+                break
+            received += data
+    if not received:
+        raise ConnectionResetError("the connection was closed without an answer")
+    return received.partition(b"\n")[0]
 
 
 def _advice(error: Exception) -> str:

@@ -17,22 +17,27 @@ BUDGET_MAX_MS = 10_000.0
 class Command:
     """One wish of an operator. The loop carries it out between two turns, or begins to, and answers exactly once.
 
+    Whoever carries it out takes it first, and leaves it where `take` says so: what was given up is never done.
     `flat` with value True holds the 2D picture until `resume`; `pause` freezes the picture until `resume`.
     """
 
     name: Name
     value: Any = None  # scene: str; budget: milliseconds, 0 for none; the others: None
     _answers: queue.SimpleQueue[str] = field(default_factory=queue.SimpleQueue)
-    _begun: threading.Event = field(default_factory=threading.Event)
+    _decided: threading.Lock = field(default_factory=threading.Lock)  # who has it says whether it is carried out
 
-    def begin(self) -> None:
-        """It takes longer than a turn, and has begun."""
-        self._begun.set()
+    def take(self) -> bool:
+        """It is carried out from now on. False: who asked has given it up; it must not be done."""
+        return self._decided.acquire(blocking=False)
+
+    def give_up(self) -> bool:
+        """It is not wanted any more. False: too late, it has been taken."""
+        return self._decided.acquire(blocking=False)
 
     @property
-    def begun(self) -> bool:
-        """True where the loop is at it."""
-        return self._begun.is_set()
+    def taken(self) -> bool:
+        """It is being carried out, or was given up."""
+        return self._decided.locked()
 
     def done(self) -> None:
         """It was carried out."""
@@ -45,7 +50,7 @@ class Command:
     def wait(self, timeout_s: float) -> str | None:
         """Empty: done. Text: why not. None: the loop did not answer in time."""
         try:
-            return self._answers.get(timeout=timeout_s)
+            return self._answers.get(timeout=timeout_s) if timeout_s > 0 else self._answers.get_nowait()
         except queue.Empty:
             return None
 

@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
+import tomllib
 from pathlib import Path
+from typing import Any
+
+from runtime.errors import InputError
+
+# Where the daemon listens without a configuration: `ServiceSettings().socket`, without loading all settings.
+DEFAULT_SOCKET = "/run/phasestack/status.sock"
 
 
 def user_socket() -> Path | None:
@@ -16,3 +24,24 @@ def candidates(configured: str) -> tuple[Path, ...]:
     """Where to look, in this order: the configured socket, then the person's own."""
     own = user_socket()
     return (Path(configured),) if own is None else (Path(configured), own)
+
+
+def configured_socket(config: Path | None) -> str:
+    """The socket that a configuration names. Nothing else of it is looked at: a client is started quickly.
+
+    Raises InputError, naming the file and the field.
+    """
+    if config is None:
+        return DEFAULT_SOCKET
+    try:
+        text = config.read_text(encoding="utf-8")
+        table: Any = json.loads(text) if config.suffix.lower() == ".json" else tomllib.loads(text)
+    except OSError as error:
+        raise InputError(config, "", f"cannot be read ({error.strerror})") from None
+    except ValueError as error:  # not UTF-8, not TOML or JSON, or a NUL in the path
+        raise InputError(config, "", f"malformed: {error}") from None
+    service = table.get("service", {}) if isinstance(table, dict) else {}
+    socket = service.get("socket", DEFAULT_SOCKET) if isinstance(service, dict) else DEFAULT_SOCKET
+    if not isinstance(socket, str) or not socket or "\0" in socket:
+        raise InputError(config, "service.socket", "names no file")
+    return str(config.absolute().parent / socket)

@@ -50,10 +50,12 @@ class Notifier:
         if not self._ready:
             self._send(f"EXTEND_TIMEOUT_USEC={int(seconds * 1e6)}")
 
-    def turn(self, state: State, missing: tuple[str, ...], *, presented: bool) -> None:
-        """One turn of the loop is complete: feeds the watchdog, if it presented a frame.
+    def refreshed(self, state: State, missing: tuple[str, ...], *, presented: bool) -> None:
+        """One refresh is complete: feeds the watchdog, if it was presented.
 
-        Where a panel is missing no frame can be presented, and a completed turn is enough. While it starts,
+        The rule: the presenter's clock alone feeds it. A solver that fails or hangs leaves the last solution on the
+        panels, aligned to the eyes, and is made anew by itself: no reason to restart. Where a panel is missing
+        nothing can be presented, and a completed refresh is enough. While it starts,
         the start's own limit watches. Sent at most four times per watchdog period.
         """
         alive = presented or (state is State.DEGRADED and "panel" in missing)

@@ -2,33 +2,41 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import grp
 import json
 import logging
 import os
 import queue
-import socketserver
+import socket
 import stat
-import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
-from runtime.clock import NS_PER_S, Clock
+from runtime.clock import NS_PER_S, Clock, MonotonicClock
 from runtime.config import ServiceSettings
 from runtime.daemon.commands import Command, parse
 from runtime.daemon.location import user_socket
-from runtime.errors import InputError
+from runtime.daemon.request_server import Limits, Pending, RequestServer
+from runtime.errors import InputError, TransientError
 from runtime.support.artifacts import to_json
+from runtime.support.foreign import nesting
 
 log = logging.getLogger("phasestack.service")
 
 LINE_MAX_BYTES = 65536
-CLIENTS_MAX = 16
-CLIENT_IDLE_S = 5.0
+DEPTH_MAX = 8
+CLIENTS_MAX = 64
+REQUEST_S = 5.0
 LOOP_ANSWERS_WITHIN_S = 5.0
 LOADED_WITHIN_S = 60.0  # what has begun is waited for so long
+OWN_MODE = 0o600
+
+
+class SocketInUse(TransientError):
+    """Another phasestack has the socket; the text says which."""
 
 
 class StatusServer:
@@ -39,23 +47,21 @@ class StatusServer:
     """
 
     def __init__(self, path: Path, *, group: str, clock: Clock) -> None:
-        """Raises InputError where the socket belongs to a running daemon or can't be made there."""
+        """Raises SocketInUse where the socket belongs to a running daemon, InputError where it can't be made."""
         self.path = path
         self.commands: queue.SimpleQueue[Command] = queue.SimpleQueue()
         self._clock = clock
         self._started_ns = clock.now_ns()
         self._snapshot: tuple[int, Callable[[], dict[str, Any]]] = (self._started_ns, dict)
-        self._slots = threading.BoundedSemaphore(CLIENTS_MAX)
         self._lock = _claim(path)
         try:
-            self._server = _listen(path, group, self)
+            listening = _bound(path, group)
         except BaseException:
-            self._lock.close()
+            os.close(self._lock)
             raise
-        self._thread = threading.Thread(
-            target=self._server.serve_forever, kwargs={"poll_interval": 0.1}, name="status", daemon=True
-        )
-        self._thread.start()
+        self._own = _identity(path)
+        limits = Limits(clients=CLIENTS_MAX, request_bytes=LINE_MAX_BYTES, request_s=REQUEST_S)
+        self._server: RequestServer | None = RequestServer(listening, _Lines(self), limits, name="status")
 
     def publish(self, snapshot: Callable[[], dict[str, Any]]) -> None:
         """The newest account of the loop, once a turn; called (if ever) on the server's thread.
@@ -66,17 +72,19 @@ class StatusServer:
 
     def close(self) -> None:
         """Stop answering and remove the socket. May be called twice."""
-        if self._lock.closed:
+        if self._server is None:
             return
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join(timeout=2.0)
-        self.path.unlink(missing_ok=True)
-        self._lock.close()
+        self._server.close()
+        self._server = None
+        if _identity(self.path) == self._own:  # where it was deleted, another daemon's may be there
+            self.path.unlink(missing_ok=True)
+        os.close(self._lock)
 
-    def answer(self, line: bytes) -> dict[str, Any]:
-        """One request to one answer; `ok` says whether it was done, `error` why not."""
+    def answer(self, line: bytes) -> dict[str, Any] | Waiting:
+        """One request to one answer (`ok` says whether it was done, `error` why not), or to a command's wait."""
         try:
+            if nesting(line, most=DEPTH_MAX) > DEPTH_MAX:
+                raise ValueError
             request = json.loads(line)
         except ValueError:
             return {"ok": False, "error": "a request is one JSON object on one line"}
@@ -88,14 +96,7 @@ class StatusServer:
             return {"ok": False, "error": str(error)}
         log.info("asked for: %s %s", command.name, "" if command.value is None else command.value)
         self.commands.put(command)
-        refused = command.wait(LOOP_ANSWERS_WITHIN_S)
-        if refused is None and command.begun:
-            refused = command.wait(LOADED_WITHIN_S - LOOP_ANSWERS_WITHIN_S)
-            if refused is None:
-                return {"ok": True, "note": f"still loading after {LOADED_WITHIN_S:.0f} s: ask `phasestack status`"}
-        if refused is None:
-            return {"ok": False, "error": f"the loop did not answer within {LOOP_ANSWERS_WITHIN_S:.0f} s"}
-        return {"ok": not refused} | ({"error": refused} if refused else {})
+        return Waiting(command)
 
     def _status(self) -> dict[str, Any]:
         published_ns, snapshot = self._snapshot
@@ -108,89 +109,146 @@ class StatusServer:
             **snapshot(),
         }
 
-    def serve(self, stream: socketserver.StreamRequestHandler) -> None:
-        """One client, until it hangs up or says nothing for a while."""
-        if not self._slots.acquire(blocking=False):
-            stream.wfile.write(b'{"ok": false, "error": "too many clients"}\n')
-            return
-        try:
-            while line := stream.rfile.readline(LINE_MAX_BYTES + 1):
-                if len(line) > LINE_MAX_BYTES:
-                    stream.wfile.write(b'{"ok": false, "error": "the request is too long"}\n')
-                    return
-                stream.wfile.write(to_json(self.answer(line)).encode() + b"\n")
-        except (TimeoutError, BrokenPipeError, ConnectionResetError):
-            return
-        finally:
-            self._slots.release()
+
+class _Lines:
+    """The service of the socket: one JSON object a line, as many as the client likes."""
+
+    one_request = False
+
+    def __init__(self, owner: StatusServer) -> None:
+        self._owner = owner
+
+    def cut(self, received: bytes, *, ended: bool) -> tuple[bytes, bytes] | None:
+        line, broken, rest = received.partition(b"\n")
+        return (line, rest) if broken or (ended and line) else None
+
+    def answer(self, request: bytes) -> bytes | Pending:
+        answer = self._owner.answer(request)
+        return answer if isinstance(answer, Waiting) else _line(answer)
+
+    def refusal(self, why: str) -> bytes:
+        return _line({"ok": False, "error": why})
 
 
-class _Handler(socketserver.StreamRequestHandler):
-    timeout = CLIENT_IDLE_S
+class Waiting:
+    """A client that waits for what becomes of its command."""
 
-    def handle(self) -> None:
-        assert isinstance(self.server, _Server)
-        self.server.owner.serve(self)
+    def __init__(self, command: Command) -> None:
+        self._command, self._clock = command, MonotonicClock()
+        self._asked_ns = self._clock.now_ns()
+
+    def poll(self) -> bytes | None:
+        """The answer, once there is one. A command that nobody has taken in time is given up: it is never done."""
+        refused = self._command.wait(0.0)
+        if refused is not None:
+            return _line({"ok": not refused} | ({"error": refused} if refused else {}))
+        waited_s = (self._clock.now_ns() - self._asked_ns) / NS_PER_S
+        if waited_s > LOOP_ANSWERS_WITHIN_S and self._command.give_up():
+            problem = f"the loop did not answer within {LOOP_ANSWERS_WITHIN_S:g} s: nothing was done"
+            return _line({"ok": False, "error": problem})
+        if waited_s > LOADED_WITHIN_S:
+            return _line({"ok": True, "note": f"still loading after {LOADED_WITHIN_S:g} s: ask `phasestack status`"})
+        return None
+
+    def abandon(self) -> bytes:
+        problem = "the daemon stops" + (": nothing was done" if self._command.give_up() else "")
+        return _line({"ok": False, "error": problem})
 
 
-class _Server(socketserver.ThreadingUnixStreamServer):
-    daemon_threads = True
-    block_on_close = False
-
-    def __init__(self, path: Path, owner: StatusServer) -> None:
-        self.owner = owner
-        super().__init__(str(path), _Handler)
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        log.exception("a client of the status socket could not be answered")
+def _line(answer: dict[str, Any]) -> bytes:
+    return to_json(answer).encode() + b"\n"
 
 
-def _claim(path: Path) -> TextIO:
-    """A locked file beside the socket: the daemon that holds it owns the socket, whatever else has crashed."""
+def _claim(path: Path) -> int:
+    """A locked file beside the socket: the daemon that holds it owns the socket, whatever else has crashed.
+
+    A link is never followed, and nothing is written to a file that is not ours alone.
+    """
     lock_path = path.with_name(path.name + ".lock")
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        lock = lock_path.open("a+", encoding="utf-8")
+        lock = os.open(lock_path, flags, OWN_MODE)
     except OSError as error:
-        raise InputError("service", "socket", f"{path} can't be made ({error.strerror})") from None
+        problem = "is a link" if error.errno == errno.ELOOP else f"can't be made ({error.strerror})"
+        raise InputError("service", "socket", f"{lock_path} {problem}") from error
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        lock.seek(0)
-        owner = lock.read(32).strip() or "unknown"
-        lock.close()
-        raise InputError("service", "socket", f"{path} is in use by another phasestack (pid {owner})") from None
-    lock.truncate(0)
-    lock.write(f"{os.getpid()}\n")
-    lock.flush()
+        found = os.fstat(lock)
+        if not stat.S_ISREG(found.st_mode) or found.st_nlink != 1 or found.st_uid != os.geteuid():
+            raise InputError("service", "socket", f"{lock_path} is not a file of this user's alone")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            owner = os.pread(lock, 32, 0).decode(errors="replace").strip()
+            raise SocketInUse(
+                f"service: socket: {path} is in use by another phasestack (pid {owner if owner.isdigit() else '?'})"
+            ) from None
+        os.fchmod(lock, OWN_MODE)
+        os.ftruncate(lock, 0)
+        os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
+    except OSError as error:
+        os.close(lock)
+        raise InputError("service", "socket", f"{lock_path} can't be written ({error.strerror})") from error
+    except BaseException:
+        os.close(lock)
+        raise
     return lock
 
 
-def _listen(path: Path, group: str, owner: StatusServer) -> _Server:
+def _bound(path: Path, group: str) -> socket.socket:
+    """The socket at its place. Only a dead one is replaced: with its lock deleted, one may still be listened to."""
     try:
-        if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
+        found = path.lstat() if path.is_symlink() or path.exists() else None
+        if found is not None and not stat.S_ISSOCK(found.st_mode):
             raise InputError("service", "socket", f"{path} exists and is not a socket")
+        if found is not None and _is_listened_to(path):
+            raise SocketInUse(f"service: socket: {path} is in use by another phasestack")
         path.unlink(missing_ok=True)
+        made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         # The mode must hold from the first moment, so it is the mask that makes it, not a later chmod.
         mask = os.umask(0o117)
         try:
-            server = _Server(path, owner)
+            made.bind(str(path))
+        except BaseException:
+            made.close()
+            raise
         finally:
             os.umask(mask)
     except OSError as error:
-        raise InputError("service", "socket", f"{path} can't be made ({error.strerror or error})") from None
+        raise InputError("service", "socket", f"{path} can't be made ({error.strerror or error})") from error
     try:
         os.chown(path, -1, grp.getgrnam(group).gr_gid)
     except (KeyError, PermissionError):
         log.info("the status socket is this user's alone: group %s is not there or not ours", group)
-    return server
+    return made
+
+
+def _is_listened_to(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(str(path))
+        except BlockingIOError:
+            return True  # its backlog is full
+        except ConnectionRefusedError:
+            return False
+        return True
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """What is at a path, whatever it is called later."""
+    try:
+        found = path.lstat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 def open_status_server(settings: ServiceSettings, *, clock: Clock, supervised: bool) -> StatusServer | None:
     """The socket that the settings name; in a person's session, where its default can't be made, their own.
 
-    Under a supervisor it is the socket or nothing: raises InputError where another phasestack has it or it
-    can't be made. A run by hand then goes on without one, and the log says why.
+    Under a supervisor it is the socket or nothing: raises SocketInUse where another phasestack has it, InputError
+    where it can't be made. A run by hand then goes on without one, and the log says why.
     """
     path = Path(settings.socket)
     own = user_socket()
@@ -198,7 +256,7 @@ def open_status_server(settings: ServiceSettings, *, clock: Clock, supervised: b
         path = own
     try:
         return StatusServer(path, group=settings.group, clock=clock)
-    except InputError as error:
+    except (InputError, SocketInUse) as error:
         if supervised:
             raise
         log.warning("no status socket: %s", error)

@@ -11,17 +11,17 @@ from typing import Any
 from runtime.clock import MonotonicClock
 from runtime.commands.running import drive, print_summary
 from runtime.config import Overrides, Settings, load_settings
-from runtime.daemon.build import RunOptions
+from runtime.daemon.build import Run, RunOptions
 from runtime.daemon.commands import Command
 from runtime.daemon.notify import Notifier
-from runtime.daemon.reconfigure import Changeover
+from runtime.daemon.reconfigure import Reconfiguration
 from runtime.daemon.server import StatusServer, open_status_server
 from runtime.daemon.signals import Signals
-from runtime.errors import PhasestackError
-from runtime.frame.loop import Loop
-from runtime.plan.planner import Planner
-from runtime.records import FrameAccount
+from runtime.errors import InputError, PhasestackError, Stopped, TransientError
+from runtime.frame.presenter import Presenter
+from runtime.records import RefreshAccount
 from runtime.support import logs
+from runtime.support.transient import MayPass, may_pass
 
 log = logging.getLogger("phasestack.daemon")
 
@@ -31,61 +31,65 @@ NEEDS_RESTART = ("stack", "sensor", "detector", "output", "service")
 
 
 class Daemon:
-    """The loop's supervisor: carries wishes in and news out, once a turn."""
+    """The run's supervisor: carries what operators ask in and news out, once a refresh."""
 
     def __init__(
         self,
         config: Path | None,
         overrides: Overrides,
-        settings: Settings,
         *,
         signals: Signals,
         notifier: Notifier,
         server: StatusServer | None,
         metrics: Any | None,
     ) -> None:
-        self._config, self._overrides, self._settings = config, overrides, settings
+        self._config, self._overrides = config, overrides
         self._signals, self._notifier, self._server, self._metrics = signals, notifier, server, metrics
+        self.run: Run | None = None  # set when it has been put together
         self._faults_told: dict[str, int] = {}
         self._missed_told = 0
-        self._change: Changeover | None = None
+        self._change: Reconfiguration | None = None
         self._asked_by: Command | None = None  # for the change under way; None: a signal
         self._refused = ""  # why the last change was refused, until one is taken
 
     def stop_reason(self) -> str:
         return f"{self._signals.stop} received" if self._signals.stop else ""
 
-    def obey(self, loop: Loop) -> None:
+    def obey(self, presenter: Presenter) -> None:
         if self._signals.take_reload():
             self._notifier.reloading()
-            self._reload(loop, None)
+            self._reload(presenter, None)
         while self._server is not None and not self._server.commands.empty():
-            self._carry_out(self._server.commands.get(), loop)
-        if self._change is not None and self._change.poll(loop.context):
+            command = self._server.commands.get()
+            if command.take():  # else it was refused meanwhile: never done later
+                self._carry_out(command, presenter)
+        if self._change is not None and self._change.finished:
             change, self._change = self._change, None
             if not change.problem:
-                change.commit(loop)
-                self._settings = change.settings
-                log.info("changed: scene %s, model %s", loop.pipeline.content.info.name, loop.pipeline.predictor.name)
+                state = presenter.run_cell.state
+                log.info("changed: scene %s, model %s", state.content.info.name, state.predictor.name)
             self._answer(self._asked_by, change.problem)
 
-    def turn(self, loop: Loop, account: FrameAccount) -> None:
-        machine = loop.machine
+    def refreshed(self, presenter: Presenter, account: RefreshAccount) -> None:
+        machine = presenter.machine
         if account.presented:
             self._notifier.ready()
         self._notifier.status(f"{machine.name} ({machine.reason})")
-        self._notifier.turn(machine.state, machine.missing, presented=account.presented)
+        self._notifier.refreshed(machine.state, machine.missing, presented=account.presented)
         if self._server is not None:
-            self._server.publish(lambda: snapshot(loop, account) | self._loading())
+            self._server.publish(lambda: snapshot(self.run, presenter, account) | self._loading())
         if self._metrics is not None:
-            self._metrics.frame(account)
-            self._metrics.missed_vblanks(loop.stats.missed_vblanks - self._missed_told)
-            self._missed_told = loop.stats.missed_vblanks
-            self._metrics.fps(loop.stats.recent_fps())
-            for part, count in loop.stats.faults.items():
+            self._metrics.refresh(account)
+            self._metrics.missed_blanks(presenter.stats.missed_blanks - self._missed_told)
+            self._missed_told = presenter.stats.missed_blanks
+            for part, count in presenter.stats.faults.items():
                 for _ in range(count - self._faults_told.get(part, 0)):
                     self._metrics.fault(part)
                 self._faults_told[part] = count
+
+    def watches(self, run: Run) -> None:
+        """The run that it supervises."""
+        self.run = run
 
     def wait_for_panels(self, why: str) -> bool:
         """A panel is not there yet: under a supervisor wait for it, by hand refuse."""
@@ -112,63 +116,70 @@ class Daemon:
             told["refused"] = self._refused
         return told
 
-    def _carry_out(self, command: Command, loop: Loop) -> None:
+    def _carry_out(self, command: Command, presenter: Presenter) -> None:
         match command.name:
             case "pause":
-                loop.paused = True
+                presenter.paused = True
                 command.done()
             case "resume":
-                loop.paused = loop.flat_wanted = False
+                presenter.paused = presenter.flat_asked = False
                 command.done()
             case "flat":
-                loop.flat_wanted = True
+                presenter.flat_asked = True
                 command.done()
             case "reload":
-                self._reload(loop, command)
+                self._reload(presenter, command)
             case "scene":
-                content = self._settings.content.model_copy(update={"scene": command.value})
-                settings = self._settings.model_copy(update={"content": content})
-                self._begin(loop, settings, command, reload_content=True)
+                settings = presenter.run_cell.state.settings
+                content = settings.content.model_copy(update={"scene": command.value})
+                changed = settings.model_copy(update={"content": content})
+                self._begin(presenter, changed, command, reload_content=True)
             case "budget":
-                self._set_budget(loop, command.value)
+                self._set_budget(presenter, command.value)
                 command.done()
 
-    def _set_budget(self, loop: Loop, budget_ms: float) -> None:
-        """In force at once; which level holds it is measured beside the loop, where it isn't known yet."""
-        self._settings = _with_budget(self._settings, budget_ms)
-        loop.apply(self._settings)
+    def _set_budget(self, presenter: Presenter, budget_ms: float) -> None:
+        """In force at once; which level holds it is measured beside the solver, where it isn't known yet."""
+        presenter.run_cell.replace(settings=_with_budget(presenter.run_cell.state.settings, budget_ms))
         if self._change is not None:
             self._change.settings = _with_budget(self._change.settings, budget_ms)
-        loop.pipeline.plan_with(Planner(loop.settings, loop.pipeline.stack))
-        loop.budget.changed(loop.settings, content=False, model=False)
 
-    def _reload(self, loop: Loop, command: Command | None) -> None:
+        def tell(parts: Any) -> bool:
+            parts.budget.changed()
+            return True
+
+        presenter.solver.do(tell)
+
+    def _reload(self, presenter: Presenter, command: Command | None) -> None:
         """Read the configuration again."""
         try:
             settings = self._overrides.applied(load_settings(self._config))
         except PhasestackError as error:
             self._answer(command, str(error))
             return
-        changed = [name for name in NEEDS_RESTART if getattr(settings, name) != getattr(self._settings, name)]
+        present = presenter.run_cell.state.settings
+        changed = [name for name in NEEDS_RESTART if getattr(settings, name) != getattr(present, name)]
         if changed:
             self._answer(command, f"{self._config}: {changed[0]}: a change needs a restart of the service")
         else:
-            self._begin(loop, settings, command)
+            self._begin(presenter, settings, command)
 
-    def _begin(self, loop: Loop, settings: Settings, command: Command | None, *, reload_content: bool = False) -> None:
+    def _begin(
+        self, presenter: Presenter, settings: Settings, command: Command | None, *, reload_content: bool = False
+    ) -> None:
         """Load what the settings change; what was being loaded is overtaken."""
         if self._change is not None:
             self._change.abandon()
             self._change = None
             self._answer(self._asked_by, "overtaken by a newer change")
+        present = presenter.run_cell.state.settings
         try:
-            change = Changeover(settings, self._settings, loop.pipeline.stack, reload_content=reload_content)
+            change = Reconfiguration(settings, present, presenter.stack, reload_content=reload_content)
         except PhasestackError as error:
             self._answer(command, str(error))
             return
         self._change, self._asked_by = change, command
-        if command is not None:
-            command.begin()
+        presenter.solver.do(change.advance)
 
     def _answer(self, command: Command | None, problem: str) -> None:
         """What became of a change: to who asked for it, to the log and to the status."""
@@ -187,24 +198,38 @@ def _with_budget(settings: Settings, budget_ms: float) -> Settings:
     return settings.model_copy(update={"model": settings.model.model_copy(update={"budget_ms": budget_ms})})
 
 
-def snapshot(loop: Loop, account: FrameAccount) -> dict[str, Any]:
+def snapshot(run: Run | None, presenter: Presenter, account: RefreshAccount) -> dict[str, Any]:
     """What `status` answers."""
-    machine, stats = loop.machine, loop.stats
-    counted = stats.summary(seconds=loop.seconds(), stale_inputs=loop.source.stale_inputs)
+    machine, stats, state = presenter.machine, presenter.stats, presenter.run_cell.state
+    counted = stats.summary(stale_inputs=presenter.samples.stale_inputs)
     return {
         "state": machine.name,
         "reason": machine.reason,
-        "missing": loop.missing,
-        "scene": loop.settings.content.scene,
-        "plan": loop.plan_items(),
-        "model": loop.pipeline.predictor.name,
-        "provider": loop.pipeline.predictor.provider,
-        "budget": loop.budget.describe(),
-        "panels": loop.panels.name,
+        "missing": presenter.missing,
+        "paused": presenter.paused,
+        "flat_asked": presenter.flat_asked,
+        "scene": state.settings.content.scene,
+        "content": state.content.info.name,
+        "plan": run.plan_items() if run is not None else [],
+        "model": state.predictor.name,
+        "provider": state.predictor.provider,
+        "backend": "opencv",
+        "budget": run.parts.budget.describe() if run is not None else None,
+        "panels": presenter.panels.name,
         "eyes_m": account.eyes_m,
         "eyes_label": account.eyes_label,
-        "skew_ms": account.skew_ms,
-        **{key: counted[key] for key in counted if key != "skew_ms"},
+        "eye_sigma_now_mm": account.eye_sigma_mm,
+        "solution": account.solution,
+        "solution_age_now_ms": account.solution_age_ms,
+        "rejected_samples": {
+            "outlier": presenter.viewer.outliers,
+            **presenter.viewer.dropped,
+            **presenter.samples.refused_inputs,
+        },
+        "sensor_hz": presenter.viewer.rate_hz if "sensor" not in presenter.missing else None,
+        "log_lines_lost": logs.lost(),
+        **stats.rates_now(),
+        **counted,
     }
 
 
@@ -217,8 +242,23 @@ def run_daemon(
     out: Path | None,
     scale: float,
     quiet: bool,
+    keep_light: int = 0,
 ) -> dict[str, Any]:
-    """The whole life of `phasestack run`; answers the summary. Raises FatalError."""
+    """The whole life of `phasestack run`; answers the summary.
+
+    Raises FatalError where the configuration or a file is wrong, TransientError where starting again may help.
+    """
+    try:
+        return _lived(config, overrides, frames, RunOptions(max_speed, out is not None, scale, keep_light), out, quiet)
+    except Exception as error:
+        if isinstance(error, TransientError) or not may_pass(error):
+            raise
+        raise MayPass(f"{error or type(error).__name__} (this may pass: start again)") from error
+
+
+def _lived(
+    config: Path | None, overrides: Overrides, frames: int | None, options: RunOptions, out: Path | None, quiet: bool
+) -> dict[str, Any]:
     settings = overrides.applied(load_settings(config))
     logs.configure(settings.service)
     clock = MonotonicClock()
@@ -227,32 +267,47 @@ def run_daemon(
         notifier = Notifier(clock)
         cleanup.callback(notifier.close)
         server = (
-            None if max_speed else open_status_server(settings.service, clock=clock, supervised=notifier.supervised)
+            None
+            if options.max_speed
+            else open_status_server(settings.service, clock=clock, supervised=notifier.supervised)
         )
         if server is not None:
             cleanup.callback(server.close)
-        metrics = None
-        if settings.service.metrics_port:
-            from runtime.daemon.metrics import Metrics
-
-            metrics = Metrics()
-            metrics.serve(settings.service.metrics_port)
-            cleanup.callback(metrics.close)
-        daemon = Daemon(config, overrides, settings, signals=signals, notifier=notifier, server=server, metrics=metrics)
-        summary = drive(
-            settings,
-            RunOptions(max_speed=max_speed, measure=out is not None, scale=scale),
-            out=out,
-            frames=frames,
-            total=frames,
-            progress=max_speed and not quiet,
-            measured_times=not max_speed,
-            supervisor=daemon,
-            wait_for_panels=daemon.wait_for_panels,
-            on_start=daemon.starting,
-        )
+        metrics = _metrics(settings.service.metrics_port, cleanup)
+        daemon = Daemon(config, overrides, signals=signals, notifier=notifier, server=server, metrics=metrics)
+        try:
+            summary = drive(
+                settings,
+                options,
+                out=out,
+                frames=frames,
+                total=frames,
+                progress=options.max_speed and not quiet,
+                supervisor=daemon,
+                wait_for_panels=daemon.wait_for_panels,
+                on_start=daemon.starting,
+                on_built=daemon.watches,
+            )
+        except Stopped as reason:
+            summary = {"stopped": str(reason)}
         notifier.stopping(summary["stopped"])
     log.info("stopped: %s", summary["stopped"])
-    if not quiet and not notifier.supervised:
+    if not quiet and not notifier.supervised and "frames" in summary:
         print_summary(summary, out)
     return summary
+
+
+def _metrics(port: int, cleanup: ExitStack) -> Any | None:
+    """None where they are off, or can't be served: the display does not go dark for its figures."""
+    if not port:
+        return None
+    from runtime.daemon.metrics import Metrics
+
+    metrics = Metrics()
+    try:
+        metrics.serve(port)
+    except InputError as error:
+        log.error("no metrics: %s", error)
+        return None
+    cleanup.callback(metrics.close)
+    return metrics

@@ -1,77 +1,190 @@
-"""The files of a run (design 5.2)."""
+"""The files of a run (design 5.2). They are for looking at afterwards: losing them must not stop what they tell of."""
 
 from __future__ import annotations
 
+import logging
+import queue
+import threading
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TextIO
 
-import numpy as np
-
+from runtime.errors import InputError
 from runtime.evaluation.contact_sheet import contact_sheet
-from runtime.evaluation.probe import Look
-from runtime.records import U8, FrameAccount
+from runtime.evaluation.displayed import Look
+from runtime.optics.carried import intensities
+from runtime.optics.retina import as_codes
+from runtime.records import U8
 from runtime.support.artifacts import OutputFolder, to_json, write_json, write_png
+
+log = logging.getLogger("phasestack.output")
+
+# A line of frames.jsonl, in this order; what a caller knows beyond these comes after them.
+FIELDS = (
+    "frame",
+    "capture_ns",
+    "predicted_for_ns",
+    "present_ns",
+    "eyes_m",
+    "eyes_label",
+    "eye_sigma_mm",
+    "state",
+    "presented",
+    "solution",
+    "solved_for_m",
+    "solution_age_ms",
+    "true_eyes_m",
+    "inference",
+    "stage_ms",
+    "skew_ms",
+)
+WAITING = 64  # pieces of work that may wait for the disk
 
 
 class RunOutput:
-    """Writes a run's files into a folder; they appear together when it is left without an error."""
+    """Writes a run's files into a folder; they appear together when it is left without an error.
 
-    def __init__(self, target: Path) -> None:
+    A thread of its own writes, so that no refresh waits for a disk. Where the disk fails on the way (full, gone, not
+    ours any more), the files are abandoned: `problem` says why, one line of the log tells it, and the run goes on.
+    """
+
+    def __init__(self, target: Path, *, every_one: bool = True) -> None:
+        """every_one: wait for a disk that is slower than the run; otherwise what it can't take in time is left out."""
         self._folder = OutputFolder(target)
-        self._log: TextIO | None = None
+        self._target, self._every_one = target, every_one
+        self._lines: TextIO | None = None
+        self._work: queue.Queue[Callable[[], None] | None] = queue.Queue(WAITING)
+        self._writer = threading.Thread(target=self._write, name="output", daemon=True)
+        self.problem = ""  # why the files were abandoned
+        self.left_out = 0  # lines and lights that the disk was too slow for
 
     def __enter__(self) -> RunOutput:
+        """Raises InputError where the folder can't be written."""
         self._folder.__enter__()
-        self._log = (self._folder.staging / "frames.jsonl").open("w", encoding="utf-8")
+        try:
+            self._lines = (self._folder.staging / "frames.jsonl").open("w", encoding="utf-8")
+        except OSError as error:
+            self._folder.__exit__(InputError, None, None)
+            raise InputError(self._target, "", f"cannot be written ({error.strerror})") from None
+        self._writer.start()
         return self
 
-    def __exit__(self, *error: Any) -> None:
-        if self._log is not None:
-            self._log.close()
-        self._folder.__exit__(*error)
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        self._work.put(None)
+        self._writer.join()
+        self._attempt(self._close_lines)
+        if self.left_out:
+            log.warning("output: the disk was too slow for %d lines or pictures of %s", self.left_out, self._target)
+        if self.problem:
+            kind = kind or InputError  # nothing half-written is left
+        self._attempt(lambda: self._folder.__exit__(kind, error, trace))
 
-    def frame(self, account: FrameAccount, stage_ms: dict[str, float]) -> None:
-        """One line of frames.jsonl."""
-        assert self._log is not None
-        self._log.write(
-            to_json(
-                {
-                    "frame": account.frame,
-                    "capture_ns": account.capture_ns,
-                    "predicted_for_ns": account.predicted_for_ns,
-                    "present_ns": account.present_ns,
-                    "eyes_m": account.eyes_m,
-                    "eyes_label": account.eyes_label,
-                    "state": str(account.state),
-                    "inference": account.inference,
-                    "presented": account.presented,
-                    "stage_ms": {stage: round(value, 4) for stage, value in stage_ms.items()},
-                    "skew_ms": round(account.skew_ms, 4),
-                }
-            )
-            + "\n"
-        )
+    def refresh(self, line: Mapping[str, Any]) -> None:
+        """One line of frames.jsonl: FIELDS, null where a run doesn't know one, and whatever else there is.
+
+        Arrays in it must not be written to afterwards.
+        """
+        told: dict[str, Any] = {name: line.get(name) for name in FIELDS}
+        told |= {name: value for name, value in line.items() if name not in FIELDS}
+        told["stage_ms"] = {stage: round(value, 4) for stage, value in (told["stage_ms"] or {}).items()}
+        for name in ("skew_ms", "solution_age_ms", "eye_sigma_mm"):
+            told[name] = None if told[name] is None else round(told[name], 4)
+        told["state"] = None if told["state"] is None else str(told["state"])
+        self._later(lambda: self._line(told))
+
+    def light(self, frame: int, *, layers: U8, drawn: tuple[U8, U8] | None, info: Mapping[str, Any]) -> None:
+        """`light/<frame>/`: what the panels show at one refresh, and what the eyes that it was solved for should see.
+
+        layers: (N, h, w, 3 or 4), aligned; drawn: (h, w, 3) retina pictures, None where there
+        were none; info: `solved_for_m`, `eyes_m`,
+        `true_eyes_m` (2, 3), frame `stack`, None where not known, `fov` in degrees, and what else there is.
+        None of these arrays may be written to afterwards.
+        """
+        told = {name: info.get(name) for name in ("solved_for_m", "eyes_m", "true_eyes_m", "fov")} | dict(info)
+
+        def write() -> None:
+            folder = self._folder.staging / "light" / str(frame)
+            for n, layer in enumerate(layers):
+                write_png(folder / f"layer-{n}.png", layer)
+            for eye, picture in zip(("left", "right"), drawn or (), strict=False):
+                write_png(folder / f"drawn-{eye}.png", picture)
+            write_json(folder / "light.json", told)
+
+        self._later(write)
 
     def finish(self, summary: dict[str, Any], layers: U8 | None, look: Look | None) -> None:
         """The pictures of the last frame, the contact sheet and the summary."""
-        folder = self._folder.staging
-        write_json(folder / "summary.json", summary)
-        if layers is None:
+
+        def write() -> None:
+            folder = self._folder.staging
+            write_json(folder / "summary.json", summary)
+            if layers is None:
+                return
+            for n, layer in enumerate(layers):
+                write_png(folder / f"layer-{n}.png", layer)
+            if look is not None:
+                for side, eye in enumerate(("left", "right")):
+                    write_png(folder / f"seen-{eye}.png", as_codes(look.seen[side].image))
+                    write_png(folder / f"wanted-{eye}.png", as_codes(intensities(look.wanted[side])))
+            write_png(folder / "contact-sheet.png", contact_sheet(layers, look, headline=headline(summary)))
+
+        self._work.put(write)
+
+    def _later(self, work: Callable[[], None]) -> None:
+        if self.problem:
             return
-        for n, layer in enumerate(layers):
-            write_png(folder / f"layer-{n}.png", layer)
-        if look is not None:
-            for side, eye in enumerate(("left", "right")):
-                seen = (np.clip(look.seen[side].image, 0, 1) * 255 + 0.5).astype(np.uint8)
-                write_png(folder / f"seen-{eye}.png", seen)
-                write_png(folder / f"wanted-{eye}.png", look.wanted[side])
-        write_png(folder / "contact-sheet.png", contact_sheet(layers, look, headline=headline(summary)))
+        if self._every_one:
+            self._work.put(work)
+            return
+        try:
+            self._work.put_nowait(work)
+        except queue.Full:
+            self.left_out += 1
+
+    def _write(self) -> None:
+        """The writer's thread: work in its order, until told to stop."""
+        while (work := self._work.get()) is not None:
+            if not self.problem:
+                self._attempt(work)
+
+    def _attempt(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except (OSError, InputError) as error:
+            self._abandon(str(error), trace=False)
+        except Exception as error:  # a mistake of ours in what is only for looking at must not end the run either
+            self._abandon(f"{type(error).__name__}: {error}", trace=True)
+
+    def _abandon(self, why: str, *, trace: bool) -> None:
+        if self.problem:
+            return
+        self.problem = why
+        log.warning("output: abandoned, nothing new is left in %s: %s", self._target, why, exc_info=trace)
+        self._folder.discard()  # now: it may be what fills the disk
+
+    def _line(self, told: dict[str, Any]) -> None:
+        assert self._lines is not None
+        self._lines.write(to_json(told) + "\n")
+
+    def _close_lines(self) -> None:
+        if self._lines is not None:
+            self._lines.close()
 
 
 def headline(summary: dict[str, Any]) -> str:
     """A run in one line."""
     parts = [f"phasestack: {summary['presented']} of {summary['frames']} frames presented"]
     parts.append(f"model {summary['model']} on {summary['provider']}")
-    if summary.get("psnr_db") is not None:
-        parts.append(f"displayed {summary['psnr_db']:.1f} dB, SSIM {summary['ssim']:.3f} (mean of sampled frames)")
+    means = [
+        (name, summary.get(key))
+        for name, key in (
+            ("exact", "psnr_db"),
+            ("carried", "carried_db"),
+            ("carried at the true eyes", "carried_db_true_eyes"),
+        )
+    ]
+    told = [f"{name} {value:.1f} dB" for name, value in means if value is not None]
+    if told:
+        similarity = f", SSIM {summary['ssim']:.3f}" if summary.get("ssim") is not None else ""
+        parts.append(f"displayed, mean of sampled frames: {', '.join(told)}{similarity}")
     return "   |   ".join(parts)

@@ -86,9 +86,33 @@ MOTIONS: dict[str, Motion] = {
 }
 
 
-def true_eyes(motion: str, times_s: F64, *, distance_m: float = 0.6) -> F64:
+@dataclass(frozen=True, slots=True)
+class Path:
+    """How one viewer makes a motion: where in it they begin, how fast and how far they go, and to which side first."""
+
+    start_s: float = 0.0
+    pace: float = 1.0
+    size: float = 1.0
+    side: float = 1.0  # -1: left and right are exchanged
+
+
+BENCHMARK_PATH = Path()
+
+
+def path_of(seed: int) -> Path:
+    """Another path for each seed, of the same kind; 0: the benchmark's own."""
+    if seed == 0:
+        return BENCHMARK_PATH
+    random = np.random.default_rng([seed, 0x70617468])
+    return Path(
+        random.uniform(0, 600), random.uniform(0.85, 1.1), random.uniform(0.85, 1.1), random.choice([-1.0, 1.0])
+    )
+
+
+def true_eyes(motion: str, times_s: F64, *, distance_m: float = 0.6, path: Path = BENCHMARK_PATH) -> F64:
     """(n, 2, 3) left and right eye in `stack`, metres."""
-    neck, pitch = MOTIONS[motion](times_s)
+    neck, pitch = MOTIONS[motion](path.start_s + path.pace * times_s)
+    neck, pitch = path.size * neck * [1.0, path.side, 1.0], path.size * pitch
     forward, _, up = NECK_TO_EYES_M
     c, s = np.cos(pitch), np.sin(pitch)
     middle = neck + np.stack([forward * c + up * s, np.zeros_like(c), up * c - forward * s], 1)
@@ -110,11 +134,15 @@ def observe(
     dropout_every_s: float = 4.0,
     dropout_s: float = 0.2,
     seed: int = 1,
+    path: Path = BENCHMARK_PATH,
 ) -> list[Observation]:
-    """What a sensor delivers of a motion. Outliers put one eye or both 4 to 20 cm off; no dropouts where 0 s."""
+    """What a sensor delivers of a motion; `seed` is of its noise.
+
+    Outliers put one eye or both 4 to 20 cm off; no dropouts where 0 s.
+    """
     random = np.random.default_rng([seed, *motion.encode(), round(rate_hz)])
     times_s = np.arange(round(seconds * rate_hz)) / rate_hz
-    eyes = true_eyes(motion, times_s) + random.normal(0.0, noise_m, (len(times_s), 2, 3))
+    eyes = true_eyes(motion, times_s, path=path) + random.normal(0.0, noise_m, (len(times_s), 2, 3))
     wrong = random.random(len(times_s)) < outliers
     direction = random.normal(size=(len(times_s), 3))
     offset = direction / np.linalg.norm(direction, axis=1, keepdims=True) * random.uniform(0.04, 0.2, (len(times_s), 1))

@@ -84,9 +84,10 @@ class RestWatch:
     def _settle(self, since_ns: int) -> None:
         recent = self._since(since_ns)
         self.place = np.median(recent, axis=0)
-        # A median is a quarter less sure than a mean; drift below the limit is even within it.
+        # A median is a quarter less sure than a mean; what drifts is renewed beyond this (`_drifted`), even below it.
         unsure_m = 1.25 * self.noise_m / len(recent) ** 0.5
-        self.sigma_m = float(np.hypot(unsure_m, self._most_m / 3**0.5))
+        drift_m = self._most_m + 2 * 1.25 * self.noise_m * (4 / max(len(recent), FEWEST)) ** 0.5
+        self.sigma_m = float(np.hypot(unsure_m, drift_m / 3**0.5))
 
     def _measure_noise(self) -> None:
         """From second differences: an even motion does not count."""

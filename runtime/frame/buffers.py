@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from collections.abc import Callable
 
 import numpy as np
 
@@ -13,19 +14,18 @@ class LayerBuffers:
     """As many buffers as are held at once, which is three: being written, newest, shown. One thread takes."""
 
     def __init__(self) -> None:
-        self._buffers: list[tuple[U8, weakref.ref[U8] | None]] = []
+        self._buffers: list[tuple[U8, Callable[[], U8 | None]]] = []
 
     def copy_of(self, layers: U8) -> U8:
         """The same values in a buffer that is nobody else's as long as the answer lives."""
-        for index, (buffer, holder) in enumerate(self._buffers):
-            if (holder is None or holder() is None) and buffer.shape == layers.shape:
-                break
-        else:
-            index, buffer = len(self._buffers), np.empty(layers.shape, np.uint8)
-            self._buffers.append((buffer, None))
-        view = buffer.view()
-        np.copyto(view, layers)
-        view.flags.writeable = False
+        held = [holder() is not None for _, holder in self._buffers]
+        index = held.index(False) if False in held else len(held)
+        if index == len(held):
+            self._buffers.append((np.empty(layers.shape, np.uint8), _nobody))
+        buffer = self._buffers[index][0]
+        np.copyto(buffer, layers)
+        # Not `buffer.view()`: a part of that would hold the buffer, and not the view that is asked about.
+        view: U8 = np.asarray(buffer.data.toreadonly())
         self._buffers[index] = buffer, weakref.ref(view)
         return view
 
@@ -33,3 +33,7 @@ class LayerBuffers:
     def count(self) -> int:
         """How many there are."""
         return len(self._buffers)
+
+
+def _nobody() -> None:
+    return None

@@ -64,9 +64,9 @@ class FramePolicy:
         self._flat_wanted = request.flat_wanted
         if request.paused and solved is not None:
             return Decision("nothing")
+        present = (state_version, revision, self._episode)
         wants_flat = flat is None or (
-            request.flat_wanted
-            and (flat.state_version, flat.revision, flat.episode) != (state_version, revision, self._episode)
+            request.flat_wanted and (flat.state_version, flat.revision, flat.episode) != present
         )
         eyes_m = self._eyes_to_solve(request, plan, state_version=state_version, revision=revision, solved=solved)
         if wants_flat and (eyes_m is None or flat is None or not self._flat_was_last):

@@ -7,13 +7,14 @@ aligned to where the eyes will be when its light leaves.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 
 from runtime.clock import NS_PER_MS, Clock
 from runtime.errors import EndOfRecording, PanelLost
+from runtime.frame.lateness import Lateness
 from runtime.frame.pacing import Pacer
 from runtime.frame.policy import Flatness, wants_flat
 from runtime.frame.run_state import RunCell
@@ -124,6 +125,7 @@ class Presenter:
         self._adopted = run.state.version
         self.stats = RunStats()
         self.machine = StateMachine(now_ns=clock.now_ns())
+        self._lateness = Lateness(pacer.period_ns)
         self.flat_asked = False
         self.paused = False
         self.missing: dict[str, str] = {}  # parts that don't work at present, and why
@@ -165,10 +167,12 @@ class Presenter:
         times.lap("track")
         report, lost = self._present(frame)
         times.lap("present")
+        if report is not None and times.simulated:  # presenting has been paid for only now
+            report = replace(report, present_ns=self.clock.now_ns())
         photon_ns = self._presented_at(timing, report, woke_ns=woke_ns)
         self.solver.post(self._request(timing, eyes))
         self.missing = self._missing(news, lost)
-        state = self._judge(eyes, limited)
+        state = self._judge(eyes, limited, shown=report is not None)
         account = self._account(timing, eyes, news, frame, report, photon_ns, state, times)
         self._tell(account, frame, news.solution, times)
         return account
@@ -278,7 +282,7 @@ class Presenter:
                 self.fault(part)
         return missing
 
-    def _judge(self, eyes: EyesEstimate, limited: str) -> State:
+    def _judge(self, eyes: EyesEstimate, limited: str, *, shown: bool) -> State:
         parts: dict[Part, str] = {part: why for part, why in self.missing.items()}  # type: ignore[misc]
         conditions = Conditions(
             eyes.label,
@@ -286,6 +290,7 @@ class Presenter:
             presented=self._presented,
             flat_wanted=self.flat_asked,
             limited=limited,
+            late=self._lateness.update(presented=shown, now_ns=self.clock.now_ns()),
             paused=self.paused,
         )
         transition = self.machine.update(conditions, now_ns=self.clock.now_ns())
@@ -306,7 +311,7 @@ class Presenter:
         state: State,
         times: RefreshTimes,
     ) -> RefreshAccount:
-        solution = news.solution if frame.flatness < 1.0 else None
+        solution = news.solution if report is not None and frame.flatness < 1.0 else None  # that is shown
         ran = solution is not None and solution.number != self._shown_solution
         stage_ms, machine_ms = dict(times.stage_ms), dict(times.machine_ms)
         if solution is not None and ran:
@@ -349,11 +354,11 @@ class Presenter:
         """Since the first refresh, on the run's clock."""
         return self.stats.seconds()
 
-    def summary(self) -> dict[str, Any]:
-        """The part of summary.json that is counted (contract 5.2)."""
+    def summary(self, *, simulated: bool = False) -> dict[str, Any]:
+        """The part of summary.json that is counted (contract 5.2); simulated: every time is the run's clock's."""
         predictor = self.run_cell.state.predictor
         return {
-            **self.stats.summary(stale_inputs=self.samples.stale_inputs),
+            **self.stats.summary(stale_inputs=self.samples.stale_inputs, simulated=simulated),
             "model": predictor.name,
             "provider": predictor.provider,
             "states": self.machine.seconds(now_ns=self.clock.now_ns()),

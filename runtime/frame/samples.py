@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from runtime.clock import Clock
 from runtime.config import SensorSettings
@@ -21,6 +21,11 @@ class Samples(ABC):
     @abstractmethod
     def arrived(self, now_ns: int) -> list[SensorFrame]:
         """Samples that have arrived and were not given yet, in order. Raises EndOfRecording, FatalError."""
+
+    @property
+    def refused_inputs(self) -> Mapping[str, int]:
+        """Samples that arrived and are none, by reason, as the driver tells them."""
+        return {}
 
     @abstractmethod
     def fault(self) -> str:
@@ -66,6 +71,10 @@ class RecordedSamples(Samples):
         return ""
 
     @property
+    def refused_inputs(self) -> Mapping[str, int]:
+        return self._driver.refused
+
+    @property
     def serial(self) -> str:
         return self._driver.serial
 
@@ -101,6 +110,10 @@ class LiveSamples(Samples):
     @property
     def stale_inputs(self) -> int:  # type: ignore[override]
         return self._overtaken + self._worker.stale_inputs
+
+    @property
+    def refused_inputs(self) -> Mapping[str, int]:
+        return self._worker.refused_inputs
 
     @property
     def serial(self) -> str:

@@ -12,6 +12,7 @@ from runtime.frame.solver import Step
 from runtime.frame.timing import SOLVING_STAGES
 from runtime.records import Solution, SolveRequest
 
+FIRST_REQUEST = SolveRequest(0, None, "none", 0.0, flat_wanted=True)  # before the first refresh: the flat picture
 COST_GAIN = 0.2  # of the newest solution in the running mean of what one costs
 
 
@@ -58,6 +59,11 @@ class SolverHost(ABC):
     def do(self, task: Task) -> None:
         """Have something done between two steps, again and again until it answers True."""
 
+    @property
+    def left_behind(self) -> int:
+        """Threads that are in a call that did not return, once it was closed."""
+        return 0
+
     @abstractmethod
     def close(self) -> None:
         """Stop, and release what the solver holds. May be called twice."""
@@ -83,7 +89,7 @@ class SimulatedSolver(SolverHost):
 
     def __init__(self, parts: SolverParts, clock: Clock) -> None:
         self._parts, self._clock = parts, clock
-        self._news = News()
+        self._news = taken_in(News(), parts.step(FIRST_REQUEST))
         self._posted: tuple[int, SolveRequest] | None = None
         self._under_way: tuple[int, Step] | None = None  # when it is complete
         self._idle_since_ns = clock.now_ns()
@@ -101,7 +107,8 @@ class SimulatedSolver(SolverHost):
         return self._news
 
     def do(self, task: Task) -> None:
-        self._tasks.append(task)
+        if not task(self._parts):
+            self._tasks.append(task)
 
     def close(self) -> None:
         if not self._closed:

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import logging
-import os
 import queue
 import threading
 from collections.abc import Callable
 
 from runtime.clock import NS_PER_S, Clock
 from runtime.errors import PhasestackError
-from runtime.frame.solver_host import COST_GAIN, News, SolverHost, SolverParts, Task, taken_in, total_ns
+from runtime.frame.solver_host import COST_GAIN, FIRST_REQUEST, News, SolverHost, SolverParts, Task, taken_in, total_ns
 from runtime.records import SolveRequest
+from runtime.support.priority import SOLVER_NICENESS, set_niceness
 
 log = logging.getLogger("phasestack.solver")
 
-NICENESS = 5  # of the solver's threads: the presenter's turn comes first
 IDLE_S = 0.02  # between two looks at tasks while nothing is asked
 ABANDONED_MAX = 4  # hung threads that are left behind; with more, the solver stays as it is
 
@@ -27,6 +26,7 @@ class _Attempt:
         self.number, self.abandoned = number, threading.Event()
         self.ready = threading.Event()
         self.busy_since_ns = 0  # 0: it waits
+        self.last_step_ns = 0  # what the last step took
         self.error: BaseException | None = None
         self.thread: threading.Thread | None = None
 
@@ -100,13 +100,16 @@ class SolverThread(SolverHost):
         if attempt.error is not None:
             if busy_ns > self._abandon_ns:
                 self._attempt = self._begin(attempt.number + 1)
-            return f"the solver could not be made anew ({attempt.error})"
+            return f"the solver failed, it is made anew by and by ({_line(attempt.error)})"
         if busy_ns <= self._late_ns:
-            return ""
+            # Until a step is in time again: a state that changed with every solution would say nothing.
+            late = attempt.last_step_ns > self._late_ns
+            return f"the last solution took {attempt.last_step_ns / NS_PER_S:.1f} s" if late else ""
+        if busy_ns > self._abandon_ns:
+            self._hung = [hung for hung in self._hung if hung.thread is not None and hung.thread.is_alive()]
         if busy_ns > self._abandon_ns and len(self._hung) < ABANDONED_MAX:
             log.error("solver: no answer for %.1f s: left behind, and made anew", busy_ns / NS_PER_S)
             attempt.abandoned.set()
-            self._hung = [hung for hung in self._hung if hung.thread is not None and hung.thread.is_alive()]
             self._hung.append(attempt)
             self.restarts += 1
             self._attempt = self._begin(attempt.number + 1)
@@ -120,15 +123,18 @@ class SolverThread(SolverHost):
         return attempt
 
     def _run(self, attempt: _Attempt) -> None:
-        _be_nice()
+        set_niceness(SOLVER_NICENESS)
         try:
             parts = self._make()
+            first = parts.step(FIRST_REQUEST)
         except BaseException as error:
             attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
             attempt.ready.set()
             if attempt.number > 1 and not isinstance(error, PhasestackError):
                 log.exception("solver: it could not be made anew")
             return
+        if not attempt.abandoned.is_set():
+            self._news = taken_in(self._news, first)
         attempt.busy_since_ns = 0
         attempt.ready.set()
         try:
@@ -137,6 +143,9 @@ class SolverThread(SolverHost):
                 request = self._next_request()
                 if request is not None:
                     self._step(attempt, parts, request)
+        except Exception as error:  # beside what a step answers with: a bug of ours, or a library's
+            log.exception("solver: unexpected error")
+            attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
         finally:
             parts.close(abandoned=attempt.abandoned.is_set())
 
@@ -150,6 +159,7 @@ class SolverThread(SolverHost):
     def _step(self, attempt: _Attempt, parts: SolverParts, request: SolveRequest) -> None:
         attempt.busy_since_ns = self._clock.now_ns()
         step = parts.step(request)
+        attempt.last_step_ns = self._clock.now_ns() - attempt.busy_since_ns
         attempt.busy_since_ns = 0
         if attempt.abandoned.is_set():
             return
@@ -174,9 +184,5 @@ class SolverThread(SolverHost):
                 self._tasks.put(task)
 
 
-def _be_nice() -> None:
-    """This thread, and those that it starts, give way to the presenter; where the system has no such thing, not."""
-    try:
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
-    except (OSError, AttributeError):
-        log.debug("solver: its priority can't be lowered here")
+def _line(error: BaseException) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -108,10 +108,6 @@ class RunStats:
         """A fault that the run lives on with."""
         self.faults[part] = self.faults.get(part, 0) + 1
 
-    def overhead_measured(self) -> dict[str, float] | None:
-        """Quantiles of a refresh's own work on the machine's clock, whatever the run's is."""
-        return self._overhead.quantiles(("p50", "p99"))
-
     def summary(self, *, stale_inputs: int, simulated: bool = False) -> dict[str, Any]:
         """The counted part of summary.json (contract 5.2); what was not measured is None."""
         seconds = self.seconds()

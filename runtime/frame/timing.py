@@ -22,6 +22,11 @@ class RefreshTimes:
         self.machine_ms: dict[str, float] = {}
         self._start_ns = self._last_ns = perf_counter_ns()
 
+    @property
+    def simulated(self) -> bool:
+        """True where time passes only as the configuration says."""
+        return self._simulated is not None
+
     def lap(self, stage: str) -> None:
         """What happened since the last lap was `stage`."""
         now_ns = perf_counter_ns()

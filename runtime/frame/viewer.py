@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import replace
 
 import numpy as np
 
+from runtime.clock import NS_PER_S
 from runtime.config import Settings
 from runtime.eyes.calibration import Calibration
 from runtime.eyes.calibration_drift import SeparationWatch
@@ -33,6 +34,7 @@ class Viewer:
         self._rest = _rest_watch(settings)
         self._drift = _drift_watch(settings)
         self._serial_checked = False
+        self._captures_ns: deque[int] = deque(maxlen=64)
         self.dropped: Counter[str] = Counter()  # eyes that were not used, by reason
 
     def adopt(self, settings: Settings, calibration: Calibration) -> None:
@@ -55,8 +57,16 @@ class Viewer:
         """True while the head rests."""
         return self._rest is not None and self._rest.place is not None
 
+    @property
+    def rate_hz(self) -> float | None:
+        """Samples a second, by the newest ones' captures; None before there are two."""
+        if len(self._captures_ns) < 2 or self._captures_ns[-1] <= self._captures_ns[0]:
+            return None
+        return round((len(self._captures_ns) - 1) * NS_PER_S / (self._captures_ns[-1] - self._captures_ns[0]), 2)
+
     def take(self, frame: SensorFrame, *, serial: str) -> None:
         """One sample, as it came."""
+        self._captures_ns.append(frame.capture_ns)
         points = frame.eyes
         if points is not None and not self._in_stack_frame:
             points = self._calibration.apply(points)

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from runtime.optics.retina import Mask
+from runtime.optics.retina import Mask, strips
 from runtime.records import F32
+
+HALF_WINDOW = 5  # of SSIM, pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,24 +32,47 @@ def ssim(a: F32, b: F32, mask: Mask) -> float:
     import cv2
 
     def blur(x: F32) -> F32:
-        return np.asarray(cv2.GaussianBlur(x, (11, 11), 1.5), dtype=np.float32)
+        return np.asarray(cv2.GaussianBlur(x, (11, 11), 1.5), dtype=np.float32)[inside]
 
     c1, c2 = np.float32(0.01**2), np.float32(0.03**2)
-    mean_a, mean_b = blur(a), blur(b)
-    var_a, var_b = blur(a * a) - mean_a**2, blur(b * b) - mean_b**2
-    covariance = blur(a * b) - mean_a * mean_b
-    value = (2 * mean_a * mean_b + c1) * (2 * covariance + c2) / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
-    return float(value[mask].mean())
+    total, counted = 0.0, 0
+    for rows in strips(len(mask)):
+        if not mask[rows].any():
+            continue
+        # With half a window more at both ends, every row's window is whole; beyond the image it is mirrored.
+        first = max(rows.start - HALF_WINDOW, 0)
+        around, inside = slice(first, rows.stop + HALF_WINDOW), slice(rows.start - first, rows.stop - first)
+        x, y = a[around], b[around]
+        mean_x, mean_y = blur(x), blur(y)
+        var_x, var_y = blur(x * x) - mean_x**2, blur(y * y) - mean_y**2
+        covariance = blur(x * y) - mean_x * mean_y
+        value = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
+        value /= (mean_x**2 + mean_y**2 + c1) * (var_x + var_y + c2)
+        part = value[mask[rows]]
+        total, counted = total + float(part.sum(dtype=np.float64)), counted + part.size
+    return total / counted
 
 
-def quality(seen: Sequence[F32], wanted: Sequence[F32], masks: Sequence[Mask]) -> Quality:
-    """Pooled displayed quality over eyes. Raises ValueError where no ray crosses every panel."""
+def squared_error(image: F32, target: F32, mask: Mask) -> tuple[float, int]:
+    """Sum of the squared difference over the rays that count and all channels, and how many numbers that is."""
+    total, counted = 0.0, 0
+    for rows in strips(len(mask)):
+        difference = (image[rows] - target[rows])[mask[rows]].astype(np.float64).ravel()
+        total, counted = total + float(difference @ difference), counted + difference.size
+    return total, counted
+
+
+def quality(seen: Sequence[F32], wanted: Sequence[F32], masks: Sequence[Mask], *, similarity: bool = True) -> Quality:
+    """Pooled displayed quality over eyes. Raises ValueError where no ray of an eye crosses every panel.
+
+    similarity: SSIM as well; otherwise it is NaN.
+    """
     errors, weights, per_eye, similarities = 0.0, 0, [], []
     for image, target, mask in zip(seen, wanted, masks, strict=True):
-        squared = (image[mask].astype(np.float64) - target[mask]) ** 2
-        if squared.size == 0:
+        squared, counted = squared_error(image, target, mask)
+        if counted == 0:
             raise ValueError("no ray of this eye crosses every panel")
-        errors, weights = errors + float(squared.sum()), weights + squared.size
-        per_eye.append(psnr_db(float(squared.mean())))
-        similarities.append(ssim(image, target, mask))
+        errors, weights = errors + squared, weights + counted
+        per_eye.append(psnr_db(squared / counted))
+        similarities.append(ssim(image, target, mask) if similarity else np.nan)
     return Quality(psnr_db(errors / weights), float(np.mean(similarities)), tuple(per_eye))

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from runtime.optics.malus import intensity_from_phase
 from runtime.optics.rpu import panel_from_image
-from runtime.optics.stack import PanelStack
-from runtime.optics.views import image_from_stack, stack_from_eye
+from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.views import image_from_stack
 from runtime.records import F32, F64, U8
 
 Mask = NDArray[np.bool_]
+
+STRIP_ROWS = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,50 +29,114 @@ class Retina:
 
 
 def sample_bilinear(layer: NDArray[np.uint8] | F32, *, u: F32, v: F32) -> F32:
-    """Exact bilinear samples of (H, W, C) at continuous pixel positions (h, w), edges clamped; float32 (h, w, C)."""
-    height, width = layer.shape[:2]
-    # fmax and fmin, since a ray that never meets the panel has no position: NaN would make an index out of range.
-    x = np.fmin(np.fmax(u - np.float32(0.5), np.float32(0)), np.float32(width - 1))
-    y = np.fmin(np.fmax(v - np.float32(0.5), np.float32(0)), np.float32(height - 1))
-    column = np.minimum(x.astype(np.int32), max(width - 2, 0))
-    row = np.minimum(y.astype(np.int32), max(height - 2, 0))
-    right, below = min(1, width - 1), min(1, height - 1) * width
-    flat = layer.reshape(-1, layer.shape[2])
-    index = row * width + column
-    fx, fy = (x - column)[..., None], (y - row)[..., None]
-    top = flat[index] * (1 - fx) + flat[index + right] * fx
-    result: F32 = top * (1 - fy) + (flat[index + below] * (1 - fx) + flat[index + below + right] * fx) * fy
+    """Exact bilinear samples of (H, W, C) at continuous pixel positions (h, w), edges clamped; float32 (h, w, C).
+
+    Exact: weights are float32, not the 32nds of a pixel that image libraries round to, which at 45 dB would show.
+    At most 32767 pixels a side.
+    """
+    planes = _planes(layer)
+    result: F32 = np.empty((*u.shape, len(planes)), np.float32)
+    for rows in strips(u.shape[0]):
+        samples = _Samples(u[rows], v[rows], layer.shape)
+        for channel, plane in enumerate(planes):
+            result[rows, :, channel] = samples.of(plane)
     return result
+
+
+def strips(rows: int) -> Iterator[slice]:
+    """An image's rows, a few at a time: what one step writes is still in the cache for the next."""
+    return (slice(start, min(start + STRIP_ROWS, rows)) for start in range(0, rows, STRIP_ROWS))
+
+
+def _planes(layer: NDArray[np.uint8] | F32) -> list[F32]:
+    return [np.ascontiguousarray(layer[..., channel], np.float32) for channel in range(layer.shape[2])]
+
+
+class _Samples:
+    """Between which pixels positions (h, w) lie, and how near each: the same for every channel."""
+
+    def __init__(self, u: F32, v: F32, shape: tuple[int, ...]) -> None:
+        height, width = shape[:2]
+        # fmax and fmin, since a ray that never meets the panel has no position: NaN would make an index out of range.
+        x = np.fmin(np.fmax(u - np.float32(0.5), np.float32(0)), np.float32(width - 1))
+        y = np.fmin(np.fmax(v - np.float32(0.5), np.float32(0)), np.float32(height - 1))
+        self._corner = np.empty((*x.shape, 2), np.int16)
+        self._corner[..., 0] = np.fmin(x, np.float32(max(width - 2, 0)))
+        self._corner[..., 1] = np.fmin(y, np.float32(max(height - 2, 0)))
+        self._x, self._y = x - self._corner[..., 0], y - self._corner[..., 1]
+        self._right, self._below = slice(min(1, width - 1), None), slice(min(1, height - 1), None)
+
+    def of(self, plane: F32) -> F32:
+        """(h, w) samples of (H, W)."""
+        import cv2
+
+        right, below = self._right, self._below
+        no_second_map: Any = None  # OpenCV's own stubs forget that there may be none
+        top, top_right, bottom, bottom_right = (
+            np.asarray(cv2.remap(part, self._corner, no_second_map, cv2.INTER_NEAREST), np.float32)
+            for part in (plane, plane[:, right], plane[below], plane[below, right])
+        )
+        _mix(top, top_right, self._x)
+        _mix(bottom, bottom_right, self._x)
+        _mix(top, bottom, self._y)
+        return top
+
+
+def _mix(a: F32, b: F32, weight: F32) -> None:
+    """a + (b - a)·weight, into `a`; `b` is written over."""
+    b -= a
+    b *= weight
+    a += b
+
+
+@dataclass(frozen=True, slots=True)
+class Rays:
+    """The rays of an eye's image that looks at the stack's origin: all, or every so-manieth of every such row."""
+
+    from_stack: F64  # (3, 4) `image_from_stack`
+    u: F64  # (w,) columns
+    v: F64  # (h, 1) rows
+
+    @classmethod
+    def of_eye(cls, eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float, step: int = 1) -> Rays:
+        """Of an eye (3,), frame `stack`, whose image is so many pixels large and `fov_deg` wide."""
+        return cls(
+            image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg),
+            np.arange(0, width_px, step, dtype=np.float64) + 0.5,
+            (np.arange(0, height_px, step, dtype=np.float64) + 0.5)[:, None],
+        )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return len(self.v), len(self.u)
+
+    def on(self, raster: PlaneRaster, rows: slice = slice(None)) -> tuple[F64, F64]:
+        """(h, w) where some rows' rays cross a plane, in its raster's pixels (M_RPU)."""
+        h = panel_from_image(self.from_stack, raster)
+        u, v = self.u, self.v[rows]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            weight = h[2, 0] * u + h[2, 1] * v + h[2, 2]
+            return (h[0, 0] * u + h[0, 1] * v + h[0, 2]) / weight, (h[1, 0] * u + h[1, 1] * v + h[1, 2]) / weight
+
+    def toward_panels(self) -> Mask:
+        """(h, w) True where the ray goes towards the panels (not away behind the eye)."""
+        # A ray's direction is the inverse of the projection's left part times (u, v, 1); its x must be negative.
+        toward = np.linalg.inv(self.from_stack[:, :3])[0]
+        result: Mask = toward[0] * self.u + toward[1] * self.v + toward[2] < 0.0
+        return result
 
 
 def panel_positions(
     eye_m: ArrayLike, stack: PanelStack, *, index: int, width_px: int, height_px: int, fov_deg: float
 ) -> tuple[F32, F32]:
     """Where the rays of an eye's image cross panel `index`: (h, w) u and v in that panel's pixels (M_RPU)."""
-    projection = image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
-    h = panel_from_image(projection, stack.panel(index))
-    u, v = np.arange(width_px) + 0.5, (np.arange(height_px) + 0.5)[:, None]
-    weight = h[2, 0] * u + h[2, 1] * v + h[2, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return (
-            ((h[0, 0] * u + h[0, 1] * v + h[0, 2]) / weight).astype(np.float32),
-            ((h[1, 0] * u + h[1, 1] * v + h[1, 2]) / weight).astype(np.float32),
-        )
+    u, v = Rays.of_eye(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg).on(stack.panel(index))
+    return u.astype(np.float32), v.astype(np.float32)
 
 
 def ray_mask(eye_m: ArrayLike, stack: PanelStack, *, width_px: int, height_px: int, fov_deg: float) -> Mask:
     """(h, w) True where the ray goes towards the panels (not away behind the eye)."""
-    pose = stack_from_eye(eye_m)
-    camera = np.linalg.inv(
-        image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)[:, :3]
-        @ pose[:3, :3]
-        @ np.diag([1.0, -1.0, -1.0])
-    )
-    rotation = pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])
-    toward = (rotation @ camera)[0]
-    u, v = np.arange(width_px) + 0.5, (np.arange(height_px) + 0.5)[:, None]
-    result: Mask = toward[0] * u + toward[1] * v + toward[2] < 0.0
-    return result
+    return Rays.of_eye(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg).toward_panels()
 
 
 def seen_by(
@@ -80,26 +147,55 @@ def seen_by(
     fov_deg: float,
     width_px: int | None = None,
     height_px: int | None = None,
+    step: int = 1,
 ) -> Retina:
     """What a pinhole eye sees (seed 6, 7): panel values summed along each ray, then sin².
 
     layers: (N, H, W, 3 or 4), rear to front, uint8 code values or float in [0, 1]; a fourth channel is ignored.
-    The image has the layers' size unless told. Raises ValueError for an eye that is not before every panel.
+    The image has the layers' size unless told; step: only every so-manieth ray of every so-manieth row of it.
+    Raises ValueError for an eye that is not before every panel.
     """
+    eye = checked_eye(eye_m, stack)
+    width, height = width_px or layers.shape[2], height_px or layers.shape[1]
+    rays = Rays.of_eye(eye, width_px=width, height_px=height, fov_deg=fov_deg, step=step)
+    panels = [stack.panel(index) for index in range(stack.count)]
+    return through_layers(layers, lambda rows: (rays.on(panel, rows) for panel in panels), rays.toward_panels(), stack)
+
+
+def checked_eye(eye_m: ArrayLike, stack: PanelStack) -> F64:
+    """(3,) an eye in front of every panel. Raises ValueError for any other."""
     eye = np.asarray(eye_m, dtype=np.float64)
     if not np.isfinite(eye).all() or eye[0] <= max(stack.x_m):
         raise ValueError("the eye must be in front of every panel")
-    width, height = width_px or layers.shape[2], height_px or layers.shape[1]
-    view = {"width_px": width, "height_px": height, "fov_deg": fov_deg}
-    total = np.zeros((height, width, 3), np.float32)
-    mask = ray_mask(eye, stack, **view)  # type: ignore[arg-type]
-    for index in range(stack.count):
-        u, v = panel_positions(eye, stack, index=index, **view)  # type: ignore[arg-type]
-        total += sample_bilinear(layers[index][..., :3], u=u, v=v)
-        mask &= (u > 0.5) & (u < stack.width_px - 0.5) & (v > 0.5) & (v < stack.height_px - 0.5)
-    if layers.dtype == np.uint8:
-        total *= np.float32(1 / 255)
-    return Retina(intensity_from_phase(total), mask)
+    return eye
+
+
+def through_layers(
+    layers: U8 | F32, positions: Callable[[slice], Iterable[tuple[F64, F64]]], mask: Mask, stack: PanelStack
+) -> Retina:
+    """What rays see, given where they cross each panel.
+
+    positions: for some rows of the image, (h, w) u and v on every panel, rear to front; mask: (h, w) of the rays that
+    may count at all; those count that cross every panel half a pixel inside its edge.
+    """
+    image, counted = np.empty((*mask.shape, 3), np.float32), mask.copy()
+    planes = [_planes(layer[..., :3]) for layer in layers]
+    unit = np.float32(1 / 255 if layers.dtype == np.uint8 else 1)
+    for rows in strips(mask.shape[0]):
+        total = np.zeros((3, rows.stop - rows.start, mask.shape[1]), np.float32)
+        for layer, (u, v) in zip(planes, positions(rows), strict=True):
+            x, y = u.astype(np.float32), v.astype(np.float32)
+            samples = _Samples(x, y, layer[0].shape)
+            for channel in range(3):
+                total[channel] += samples.of(layer[channel])
+            counted[rows] &= (x > 0.5) & (x < stack.width_px - 0.5) & (y > 0.5) & (y < stack.height_px - 0.5)
+        image[rows] = np.moveaxis(intensity_from_phase(total * unit), 0, -1)
+    return Retina(image, counted)
+
+
+def as_codes(image: F32) -> U8:
+    """8-bit code values of intensities, clipped to [0, 1]."""
+    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def pupil_points(diameter_m: float, rings: int = 2) -> F64:

@@ -78,6 +78,7 @@ class WindowPanels(PanelSink):
         self._watch: PlacementWatch | None = None
         self._retry_ns, self._lost = 0, ""
         self._shown = False  # these windows show the frame before
+        self._away = False  # another context than content's may be current
         self.monitors: tuple[Monitor, ...] = ()
         try:
             self._open()
@@ -132,6 +133,7 @@ class WindowPanels(PanelSink):
         check(frame, width_px=self._stack.width_px, height_px=self._stack.height_px, count=len(self._panels))
         if unchanged and self._shown:
             return PresentReport(frame.number, self._clock.now_ns(), 0.0)
+        self._away = True
         if any(textures.lacks(frame)):
             display.root.make_current()
             textures.upload(frame)
@@ -176,6 +178,7 @@ class WindowPanels(PanelSink):
         return self._clock.now_ns() >= self._retry_ns
 
     def _open(self) -> None:
+        self._away = True
         self._display = display = self._display or Display()
         self.monitors = bind(self._panels, display.monitors())
         if not self._any_shape:
@@ -250,6 +253,7 @@ class WindowPanels(PanelSink):
             self._retry_ns = self._clock.now_ns() + LOOK_NS
 
     def _drop(self) -> None:
+        self._away = True
         display, self._display = self._display, None
         self._surfaces, self._textures, self._watch = [], None, None
         self._retry_ns = self._clock.now_ns() + RETRY_NS
@@ -261,8 +265,10 @@ class WindowPanels(PanelSink):
                 log.exception("closing the display")
 
     def _give_back(self) -> None:
-        content: Any = self._content
-        content.__enter__()
+        if self._away:
+            content: Any = self._content
+            content.__enter__()
+            self._away = False
 
 
 def _error(context: moderngl.Context) -> str:

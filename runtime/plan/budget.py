@@ -1,4 +1,4 @@
-"""The time budget of a running loop: measures the levels, keeps the next ones ready, and switches between two turns."""
+"""The time budget of a running solver: measures levels, keeps the next ones ready, switches between two solutions."""
 
 from __future__ import annotations
 
@@ -7,55 +7,73 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
 from runtime.config import Settings
+from runtime.content.base import ContentSource
 from runtime.errors import PhasestackError
-from runtime.frame.pipeline import Pipeline
 from runtime.model.predictor import Predictor
+from runtime.optics.stack import PanelStack
 from runtime.plan.ladder import (
-    SOLVING,
-    LoopCalls,
     NoLongerAsked,
     Rung,
     Scenery,
+    SolverCalls,
     measured_levels,
     ready_level,
     simulated_stage_ms,
 )
 from runtime.plan.levels import BudgetKeeper, Level, useful
 from runtime.plan.savings import Saving
-from runtime.records import F64, FrameAccount
+from runtime.records import F64
 from runtime.support.background import Job
 
 log = logging.getLogger("phasestack.budget")
 
 T = TypeVar("T")
 
-SPENT = ("render", *SOLVING)  # the stages that a level changes, and that the budget is for
 FRAMES_KEPT = 30
 FEWEST_FRAMES = 5
 VIEWER_M = ((0.6, -0.031, 0.0), (0.6, 0.031, 0.0))  # before anybody was seen
 
 
-class BudgetControl:
-    """Holds `model.budget_ms` for one pipeline; without a budget it does nothing. The loop's thread uses it.
+class Solving(Protocol):
+    """What the budget changes: the model that is used, and what is told of it."""
 
-    Levels are measured on the content and eyes of the moment: before the first frame where the settings have a
-    budget, else on a thread of its own, which asks the loop for one drawing a turn. A level is switched to only when
-    its predictor is warm; the neighbours of the present one are kept so.
+    @property
+    def settings(self) -> Settings:
+        """Those in force."""
+
+    @property
+    def content(self) -> ContentSource:
+        """What is drawn at present."""
+
+    def use(self, predictor: Predictor) -> Predictor:
+        """Another model from the next solution on. Answers the one before it, which is the caller's to close."""
+
+    def tell_level(self, label: str, saving: Saving) -> None:
+        """What the plan says of the level that is shown; empty: no budget."""
+
+
+class BudgetControl:
+    """Holds `model.budget_ms` for one solver; without a budget it does nothing. The solver's thread uses it.
+
+    Levels are measured on the content and eyes of the moment: before the first solution where the settings have a
+    budget, else on a thread of its own, which asks the solver's for one drawing a step. A level is switched to only
+    when its predictor is warm; the neighbours of the present one are kept so.
     """
 
-    def __init__(self, settings: Settings, pipeline: Pipeline, *, simulated: bool = False) -> None:
+    def __init__(self, solving: Solving, stack: PanelStack, *, simulated: bool = False) -> None:
         """simulated: the clock is; levels cost what the configuration says, and the choice is the same every time."""
-        self._settings, self._pipeline, self._simulated = settings, pipeline, simulated
-        self._configured: Rung = (settings.model.name, 1.0)
+        self._solving, self._stack, self.simulated = solving, stack, simulated
+        self._settings = solving.settings
+        self._configured: Rung = (self._settings.model.name, 1.0)
         self._shown = self._configured
         self._levels: list[Level] = []
         self._keeper: BudgetKeeper | None = None
-        self._calls = LoopCalls()
+        self._calls = SolverCalls()
         self._measuring: Job[list[Level]] | None = None
         self._doing = ""  # what is being measured
         self._kept: dict[Rung, Predictor] = {}
@@ -96,15 +114,16 @@ class BudgetControl:
 
         scenery = self._scenery()
         try:
-            self._choose(measured_levels(self._settings, scenery, ask, simulated=self._simulated, tell=told))
+            self._choose(measured_levels(self._settings, scenery, ask, simulated=self.simulated, tell=told))
             if self._wanted() != self._shown:
                 self._switch(self._wanted(), ready_level(self._wanted(), self._settings, scenery, ask))
         except PhasestackError as error:
             self._problem = str(error)
             log.error("budget: it can't be held: %s", error)
 
-    def changed(self, settings: Settings, *, content: bool, model: bool) -> None:
-        """Other settings hold. content: another scene is shown; model: the pipeline has another configured model."""
+    def changed(self, *, content: bool = False, model: bool = False) -> None:
+        """Other settings hold. content: another scene is shown; model: another one is configured and in use."""
+        settings = self._solving.settings
         budget_too = settings.model.budget_ms != self.budget_ms
         self._settings = settings
         if content or model:
@@ -122,17 +141,20 @@ class BudgetControl:
         elif budget_too:
             self._choose(self._levels)
 
-    def turn(self, account: FrameAccount) -> None:
-        """One turn is complete: learn from it, and take over what has become ready."""
+    def step(self, *, eyes_m: F64 | None, time_ns: int, took_ms: float | None) -> None:
+        """One step of the solver is complete: learn from it, and take over what has become ready.
+
+        eyes_m: (2, 3) of the newest request, frame `stack`; took_ms: of the solution, where one was made.
+        """
         if self.budget_ms <= 0 and self._shown == self._configured:
             return
-        self._time_ns = account.present_ns
-        if account.eyes_m is not None:
-            self._eyes_m = account.eyes_m
+        self._time_ns = time_ns
+        if eyes_m is not None:
+            self._eyes_m = eyes_m
         self._calls.serve()
         self._take_measurement()
-        if account.inference == "ran" and self._wanted() == self._shown:
-            self._frame_took(sum(account.stage_ms.get(stage, 0.0) for stage in SPENT))
+        if took_ms is not None and self._wanted() == self._shown:
+            self._frame_took(took_ms)
         self._approach(self._wanted())
 
     def describe(self) -> dict[str, Any] | None:
@@ -209,13 +231,13 @@ class BudgetControl:
 
     def _neighbours(self) -> list[Rung]:
         """The levels that may be wanted next, the lighter one first: it is wanted in a hurry."""
-        if self._keeper is None or self._simulated:
+        if self._keeper is None or self.simulated:
             return []
         near = (self._keeper.index + 1, self._keeper.index - 1)
         return [_rung(self._keeper.levels[index]) for index in near if 0 <= index < len(self._keeper.levels)]
 
     def _switch(self, rung: Rung, predictor: Predictor) -> None:
-        previous = self._pipeline.use(predictor)
+        previous = self._solving.use(predictor)
         if self._shown in self._neighbours():
             self._kept[self._shown] = previous
         else:
@@ -271,20 +293,19 @@ class BudgetControl:
     def _report(self) -> None:
         """Tell the plan."""
         label = self._label() if self.budget_ms > 0 and self._keeper is not None else ""
-        self._pipeline.measured = replace(self._pipeline.measured, level=label, level_saving=self._saving())
+        self._solving.tell_level(label, self._saving())
 
     def _label(self) -> str:
         return Level(*self._shown, 0.0, 0.0).label
 
     def _scenery(self) -> Scenery:
-        pipeline = self._pipeline
         fov_deg = self._settings.content.fov_deg
-        return Scenery(pipeline.content, self._eyes_m, self._time_ns, pipeline.stack, fov_deg)
+        return Scenery(self._solving.content, self._eyes_m, self._time_ns, self._stack, fov_deg)
 
     def _stop_asking(self) -> None:
         """What is being measured or made ready is for a picture that is no more."""
         self._calls.close()
-        self._calls = LoopCalls()
+        self._calls = SolverCalls()
         if self._job is not None:
             self._job[1].abandon()
         if self._measuring is not None:

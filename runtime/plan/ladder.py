@@ -15,11 +15,10 @@ import numpy as np
 from runtime.config import Settings
 from runtime.content.base import ContentSource
 from runtime.errors import FatalError, PhasestackError
-from runtime.plan.drawing import drawn_for, retina_view
+from runtime.evaluation.displayed import displayed
 from runtime.model.predictor import SHIPPED, Predictor
-from runtime.optics.quality import psnr_db
-from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
+from runtime.plan.drawing import drawn_for, retina_view
 from runtime.plan.levels import Level
 from runtime.plan.planning import LADDER
 from runtime.plan.reduced import ladder_predictor
@@ -39,7 +38,7 @@ SOLVING = ("prepare", "inference", "finish")
 
 
 class NoLongerAsked(PhasestackError):
-    """The loop does not want to know any more."""
+    """The solver does not want to know any more."""
 
 
 class Ask(Protocol):
@@ -48,8 +47,8 @@ class Ask(Protocol):
     def __call__(self, call: Callable[[], T]) -> T: ...
 
 
-class LoopCalls:
-    """`Ask` for other threads: the loop's thread, which has the GL context, serves one call between two turns."""
+class SolverCalls:
+    """`Ask` for other threads: the solver's thread, which has the GL context, serves one call between two steps."""
 
     def __init__(self) -> None:
         self._asked: queue.SimpleQueue[tuple[Callable[[], Any], queue.SimpleQueue[tuple[Any, Exception | None]]]] = (
@@ -70,7 +69,7 @@ class LoopCalls:
                 raise error
             answer: T = result
             return answer
-        raise NoLongerAsked("the loop has other things to do")
+        raise NoLongerAsked("the solver has other things to do")
 
     def serve(self) -> None:
         """Run one call, where one waits."""
@@ -117,12 +116,8 @@ class Scenery:
 
     def psnr_db(self, layers: U8, wanted: list[F32]) -> float:
         """Displayed PSNR of layers, both eyes pooled."""
-        squared, counted = 0.0, 0
-        for eye_m, target in zip(self.eyes_m, wanted, strict=True):
-            seen = seen_by(eye_m, layers, self.stack, fov_deg=self.fov_deg)
-            errors = (seen.image[seen.mask].astype(np.float64) - target[seen.mask]) ** 2
-            squared, counted = squared + float(errors.sum()), counted + errors.size
-        return psnr_db(squared / max(counted, 1))
+        look = displayed(layers, wanted, self.stack, eyes_m=self.eyes_m, fov_deg=self.fov_deg, similarity=False)
+        return look.quality.psnr_db
 
 
 def rungs(settings: Settings, stack: PanelStack) -> tuple[Rung, ...]:

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from time import perf_counter_ns
 
 import numpy as np
 
-from runtime.content.base import ContentSource, View
+from runtime.content.base import ContentSource
+from runtime.evaluation.displayed import displayed
+from runtime.evaluation.trials import timed_in_turn
 from runtime.model.predictor import Predictor
-from runtime.optics.quality import quality
-from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
-from runtime.optics.views import image_from_stack, raster_from_stack
+from runtime.plan.drawing import drawn_for, retina_pictures
 from runtime.plan.planner import focused_part, observed
 from runtime.plan.savings import Measured, Saving
-from runtime.records import F32, F64, U8
+from runtime.records import F64, U8
 
 REPEATS = 5
 
@@ -35,35 +34,17 @@ class Trial:
         return float(np.median(self.times_ms))
 
 
-def draw(content: ContentSource, predictor: Predictor, eyes_m: F64, *, time_ns: int, aim: bool = True) -> U8:
+def draw(content: ContentSource, predictor: Predictor, eyes_m: F64, *, time_ns: int) -> U8:
     """One frame's layers (N, h, w, 4), straight from content and model; the predictor's own array."""
-    part = focused_part(predictor)
-    if aim and part is not None:
-        part.aim(content, eyes_m, time_ns=time_ns)
-    images: list[list[U8]] = [[], []]
-    rasters = predictor.rasters(eyes_m)
-    for raster in rasters:
-        for side, eye_m in enumerate(eyes_m):
-            view = View(eye_m, side, raster_from_stack(eye_m, raster), raster.width_px, raster.height_px)
-            picture = content.render(view, time_ns=time_ns)
-            images[side].append(picture.copy() if len(rasters) > 1 else picture)
-    return predictor.predict(images, eyes_m).layers
+    return predictor.predict(drawn_for(predictor, content, eyes_m, time_ns=time_ns), eyes_m).layers
 
 
 def displayed_psnr(
     layers: U8, content: ContentSource, eyes_m: F64, stack: PanelStack, *, fov_deg: float, time_ns: int
 ) -> float:
     """Pooled displayed PSNR of layers at eyes (2, 3)."""
-    seen, wanted, masks = [], [], []
-    for side, eye_m in enumerate(eyes_m):
-        retina = seen_by(eye_m, layers, stack, fov_deg=fov_deg)
-        size = {"width_px": stack.width_px, "height_px": stack.height_px}
-        view = View(eye_m, side, image_from_stack(eye_m, fov_deg=fov_deg, **size), **size)
-        target: F32 = content.render(view, time_ns=time_ns)[..., :3].astype(np.float32) / np.float32(255)
-        seen.append(retina.image)
-        wanted.append(target)
-        masks.append(retina.mask)
-    return quality(seen, wanted, masks).psnr_db
+    wanted = retina_pictures(content, eyes_m, stack, fov_deg=fov_deg, time_ns=time_ns)
+    return displayed(layers, wanted, stack, eyes_m=eyes_m, fov_deg=fov_deg, similarity=False).quality.psnr_db
 
 
 def trials(
@@ -80,24 +61,20 @@ def trials(
 
     The first frame of each is not timed. step_ns: between one repeat and the next, for content that moves.
     """
-    times: dict[str, list[float]] = {name: [] for name in ways}
-    layers: dict[str, U8] = {}
-    for repeat in range(repeats + 1):
-        for name, predictor in ways.items():
-            begin_ns = perf_counter_ns()
-            drawn = draw(content, predictor, eyes_m, time_ns=repeat * step_ns)
-            if repeat:
-                times[name].append((perf_counter_ns() - begin_ns) / 1e6)
-            if repeat == repeats:
-                layers[name] = drawn.copy()
+
+    def frames(predictor: Predictor) -> Callable[[int], U8]:
+        return lambda run: draw(content, predictor, eyes_m, time_ns=run * step_ns)
+
+    calls = {name: frames(predictor) for name, predictor in ways.items()}
+    done = timed_in_turn(calls, runs=repeats, keep=lambda layers: layers.copy())
     last_ns = repeats * step_ns
     return {
         name: Trial(
-            layers[name],
-            tuple(times[name]),
-            displayed_psnr(layers[name], content, eyes_m, stack, fov_deg=fov_deg, time_ns=last_ns),
+            way.answer,
+            way.times_ms,
+            displayed_psnr(way.answer, content, eyes_m, stack, fov_deg=fov_deg, time_ns=last_ns),
         )
-        for name in ways
+        for name, way in done.items()
     }
 
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import perf_counter_ns
 from typing import Any
 
 import numpy as np
 
+from runtime.clock import NS_PER_MS
 from runtime.config import ModelSettings, StackGeometry, read_table
 from runtime.errors import InputError
+from runtime.evaluation.trials import timed
 from runtime.optics.stack import PanelStack
-from runtime.optics.views import raster_from_stack
+from runtime.plan.drawing import drawn_for
 from runtime.records import F64
 from runtime.report.frontier import measure
 from runtime.report.machine import describe
@@ -39,13 +41,12 @@ def yardstick_ms() -> float:
     right = np.random.default_rng(2).random((240, 1920), dtype=np.float32)
     matrix = np.array([[1.01, 0.0, 3.3], [0.0, 1.01, 1.7]])
     table = np.arange(256, dtype=np.uint8)[::-1].copy()
-    times = []
-    for _ in range(9):
-        start = time.perf_counter()
+
+    def work() -> None:
         cv2.LUT(cv2.warpAffine(picture, matrix, (1920, 1080)), table)
         _ = left @ right
-        times.append((time.perf_counter() - start) * 1e3)
-    return float(np.median(times))
+
+    return timed(work, runs=9).median_ms
 
 
 def scatter(values: Sequence[float]) -> float:
@@ -61,35 +62,25 @@ def stage_times(model: str, stack: PanelStack, eyes_m: F64) -> dict[str, Any]:
 
     predictor = load_predictor(model, stack, ModelSettings())
     stages: dict[str, list[float]] = {}
-    totals: list[float] = []
     with Painter("demo", stack) as painter:
-        for run in range(RUNS + 2):
-            start = time.perf_counter()
-            rasters = predictor.rasters(eyes_m)
-            images = [
-                [
-                    painter.draw(eye, raster_from_stack(eye, r), width_px=r.width_px, height_px=r.height_px)
-                    for r in rasters
-                ]
-                for eye in eyes_m
-            ]
-            drawn = time.perf_counter()
+
+        def frame() -> None:
+            start_ns = perf_counter_ns()
+            images = drawn_for(predictor, painter.content, eyes_m, time_ns=0)
+            render_ms = (perf_counter_ns() - start_ns) / NS_PER_MS
             prediction = predictor.predict(images, eyes_m)
-            done = time.perf_counter()
-            if run < 2:
-                continue
-            totals.append((done - start) * 1e3)
-            stages.setdefault("render", []).append((drawn - start) * 1e3)
-            for name, value in prediction.stage_ms.items():
+            for name, value in ({"render": render_ms} | prediction.stage_ms).items():
                 stages.setdefault(name, []).append(value)
+
+        done = timed(frame, runs=RUNS, warm_up=2)
     predictor.close()
     return {
         "name": model,
         "width_px": stack.width_px,
         "height_px": stack.height_px,
-        "stage_ms": {name: float(np.median(values)) for name, values in stages.items()},
-        "total_ms": float(np.median(totals)),
-        "total_scatter": scatter(totals),
+        "stage_ms": {name: float(np.median(values[-RUNS:])) for name, values in stages.items()},
+        "total_ms": done.median_ms,
+        "total_scatter": scatter(done.times_ms),
     }
 
 
@@ -142,6 +133,10 @@ def compare(old: dict[str, Any], new: dict[str, Any]) -> list[Change]:
             gain = after[key] - before[key]
             if abs(gain) > WORSE_DB:
                 changes.append(Change(_name(after), gain < 0, f"{gain:+.2f} dB {label}"))
+        for sigma in sorted(before.get("expected_db", {}).keys() & after.get("expected_db", {}).keys()):
+            gain = after["expected_db"][sigma] - before["expected_db"][sigma]
+            if abs(gain) > WORSE_DB:
+                changes.append(Change(_name(after), gain < 0, f"{gain:+.2f} dB expected of eyes unsure by {sigma} mm"))
         gain = after["psnr_db_off_eye"].get("2mm", 0.0) - before["psnr_db_off_eye"].get("2mm", 0.0)
         if abs(gain) > WORSE_DB:
             changes.append(Change(_name(after), gain < 0, f"{gain:+.2f} dB 2 mm off the eyes"))
@@ -193,6 +188,9 @@ def read(path: Path) -> dict[str, Any]:
                 raise InputError(path, f"{name}[{index}].name", "must be a name")
             if name == "methods" and not isinstance(entry.get("psnr_db_off_eye"), dict):
                 raise InputError(path, f"{name}[{index}].psnr_db_off_eye", "must be a table")
+            expected = entry.get("expected_db", {})  # files of earlier versions have none
+            if not isinstance(expected, dict) or not all(isinstance(db, int | float) for db in expected.values()):
+                raise InputError(path, f"{name}[{index}].expected_db", "must be a table of numbers")
     return table
 
 

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from runtime.optics.malus import intensity_from_phase
-from runtime.optics.quality import Quality, psnr_db, quality
-from runtime.optics.retina import Mask, sample_bilinear, seen_by
-from runtime.optics.rpu import panel_from_image
+from runtime.evaluation.displayed import Picture, displayed, expected_db
+from runtime.optics.carried import intensities
+from runtime.optics.quality import Quality, psnr_db
+from runtime.optics.retina import Mask, seen_by
 from runtime.optics.stack import PanelStack
-from runtime.optics.views import image_from_stack
 from runtime.records import F32, U8
 from runtime.report.pairs import OffView, StillPair
 
+SIGMAS_MM = (1.0, 2.0)  # a pupil alone, a pupil and a good tracker
 OFF_STEP = 3  # beside the eyes, every third ray of every third row is enough for a mean squared error
 
 
@@ -24,20 +24,21 @@ OFF_STEP = 3  # beside the eyes, every third ray of every third row is enough fo
 class Seen:
     """What a pair's eyes see of some layers, in numbers."""
 
-    quality: Quality
+    quality: Quality  # exactly at the eyes
+    expected_db: dict[str, float]  # "1": of eyes that are 1 mm unsure; without those that would see nothing
     off_db: dict[str, float]  # "2mm": mean over eyes and directions; empty where the pair has no such views
 
 
-def as_intensity(image: U8) -> F32:
-    return image[..., :3].astype(np.float32) / np.float32(255)
+def as_intensity(image: Picture) -> F32:
+    return intensities(image)
 
 
 def judged(pair: StillPair, layers: U8) -> Seen:
-    """Displayed quality at the eyes (design 5.5), and beside them."""
-    retinas = [seen_by(eye, layers, pair.stack, fov_deg=pair.fov_deg, **_size(pair)) for eye in pair.eyes_m]
-    wanted = [as_intensity(image) for image in pair.images]
-    exact = quality([r.image for r in retinas], wanted, [r.mask for r in retinas])
-    return Seen(exact, off_eye_db(pair.off, layers, pair.stack, fov_deg=pair.fov_deg))
+    """Displayed quality at the eyes, expected of eyes that are not quite there (design 5.5), and beside them."""
+    look = displayed(layers, pair.wanted, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg)
+    expected = expected_db(look, layers, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, sigmas_mm=SIGMAS_MM)
+    known = {sigma: value for sigma, value in expected.items() if value is not None}
+    return Seen(look.quality, known, off_eye_db(pair.off, layers, pair.stack, fov_deg=pair.fov_deg))
 
 
 def off_eye_db(views: Iterable[OffView], layers: U8, stack: PanelStack, *, fov_deg: float) -> dict[str, float]:
@@ -50,7 +51,7 @@ def off_eye_db(views: Iterable[OffView], layers: U8, stack: PanelStack, *, fov_d
 
 
 def single_psnr_db(
-    eye_m: ArrayLike, layers: U8, stack: PanelStack, *, wanted: U8, fov_deg: float, step: int = 1
+    eye_m: ArrayLike, layers: U8, stack: PanelStack, *, wanted: Picture, fov_deg: float, step: int = 1
 ) -> float:
     """Displayed PSNR of one eye over every `step`-th ray of every `step`-th row. NaN where no ray counts."""
     image, mask = seen_rays(
@@ -64,21 +65,5 @@ def seen_rays(
     eye_m: ArrayLike, layers: U8, stack: PanelStack, *, width_px: int, height_px: int, fov_deg: float, step: int
 ) -> tuple[F32, Mask]:
     """`seen_by` for some of an image's rays: every `step`-th column and row, from the first."""
-    u, v = np.arange(0, width_px, step) + 0.5, (np.arange(0, height_px, step) + 0.5)[:, None]
-    projection = image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
-    # A ray's direction is the inverse of the projection's left part times (u, v, 1); it must go towards the panels.
-    toward = np.linalg.inv(projection[:, :3])[0]
-    mask: Mask = toward[0] * u + toward[1] * v + toward[2] < 0
-    total = np.zeros((*mask.shape, 3), np.float32)
-    for index in range(stack.count):
-        h = panel_from_image(projection, stack.panel(index))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            weight = h[2, 0] * u + h[2, 1] * v + h[2, 2]
-            x, y = (((row[0] * u + row[1] * v + row[2]) / weight).astype(np.float32) for row in h[:2])
-        total += sample_bilinear(layers[index][..., :3], u=x, v=y)
-        mask &= (x > 0.5) & (x < stack.width_px - 0.5) & (y > 0.5) & (y < stack.height_px - 0.5)
-    return intensity_from_phase(total * np.float32(1 / 255)), mask
-
-
-def _size(pair: StillPair) -> dict[str, int]:
-    return {"width_px": pair.images[0].shape[1], "height_px": pair.images[0].shape[0]}
+    retina = seen_by(eye_m, layers, stack, width_px=width_px, height_px=height_px, fov_deg=fov_deg, step=step)
+    return retina.image, retina.mask

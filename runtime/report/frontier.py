@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from runtime.errors import InputError
+from runtime.evaluation.trials import timed
 from runtime.records import U8
 from runtime.report.eyesight import Seen, judged
 from runtime.report.methods import Kind, Method, opened
@@ -24,7 +24,7 @@ SLOW_S = 4.0  # a first run that takes longer counts, and is the only one
 
 
 @dataclass(frozen=True, slots=True)
-class Timed:
+class MethodRun:
     """One method on one pair, as the process that ran it saw it."""
 
     layers: U8
@@ -40,11 +40,12 @@ class PairResult:
     """One method on one pair."""
 
     pair: str
-    psnr_db: float
+    psnr_db: float  # exact
     ssim: float
     eye_psnr_db: tuple[float, ...]
     psnr_db_off_eye: dict[str, float]
     ms_p50: float
+    expected_db: dict[str, float]  # by the eyes' uncertainty in millimetres: "1", "2"
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +62,12 @@ class MethodResult:
     runs: int
     memory_mib: float
     parameters: int
-    psnr_db: float  # mean over pairs
+    psnr_db: float  # exact; mean over pairs
     ssim: float
     worst_eye_psnr_db: float  # least of all eyes and pairs
     psnr_db_off_eye: dict[str, float]
     multiply_adds: float  # of one prediction, mean over pairs
+    expected_db: dict[str, float] = field(default_factory=dict)  # by the eyes' uncertainty in mm; mean over pairs
     scale: float = 1.0  # of the panels' columns and rows that a network works at
     trained: bool = True  # where not, the picture is nobody's: time, memory and sizes count, the error does not
     pairs: list[PairResult] = field(default_factory=list)
@@ -75,25 +77,18 @@ class MethodResult:
         return asdict(self)
 
 
-def run_method(method: Method, pair: StillPair, threads: int) -> Timed:
+def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:
     """Open, warm up, time, and note the peak of memory. Runs in a process of its own."""
     import cv2
 
     cv2.setNumThreads(threads)
     ready = opened(method, pair, threads=threads)
     _forget_peak()
-    start = time.perf_counter()
-    layers = ready.solve(pair)
-    first_s = time.perf_counter() - start
-    run_ms = [first_s * 1e3]
-    if first_s < SLOW_S:
-        run_ms = []
-        while len(run_ms) < FEWEST_RUNS or (sum(run_ms) < ENOUGH_S * 1e3 and len(run_ms) < MOST_RUNS):
-            start = time.perf_counter()
-            layers = ready.solve(pair)
-            run_ms.append((time.perf_counter() - start) * 1e3)
-    layers, peak_mib = np.array(layers[..., :3]), _peak_mib()
-    return Timed(layers, run_ms, peak_mib, ready.parameters, ready.precision, ready.multiply_adds(pair))
+    done = timed(lambda: ready.solve(pair), runs=FEWEST_RUNS, most=MOST_RUNS, enough_s=ENOUGH_S, slow_s=SLOW_S)
+    layers, peak_mib = np.array(done.answer[..., :3]), _peak_mib()
+    return MethodRun(
+        layers, list(done.times_ms), peak_mib, ready.parameters, ready.precision, ready.multiply_adds(pair)
+    )
 
 
 def _forget_peak() -> None:
@@ -125,15 +120,15 @@ def measure(
     for index, method in enumerate(methods):
         runs = []
         for pair in pairs if method.trained else pairs[:1]:
-            timed = apart(run_method, method, replace(pair, off=()), threads)
-            runs.append((pair, timed, judged(pair, timed.layers)))
+            run = apart(run_method, method, replace(pair, off=()), threads)
+            runs.append((pair, run, judged(pair, run.layers)))
         results.append(_together(method, runs))
         progress(index + 1, len(methods))
     return results
 
 
-def _together(method: Method, runs: Sequence[tuple[StillPair, Timed, Seen]]) -> MethodResult:
-    all_ms = np.concatenate([timed.run_ms for _, timed, _ in runs])
+def _together(method: Method, runs: Sequence[tuple[StillPair, MethodRun, Seen]]) -> MethodResult:
+    all_ms = np.concatenate([run.run_ms for _, run, _ in runs])
     pairs = [
         PairResult(
             pair.name,
@@ -141,9 +136,10 @@ def _together(method: Method, runs: Sequence[tuple[StillPair, Timed, Seen]]) -> 
             seen.quality.ssim,
             seen.quality.eye_psnr_db,
             seen.off_db,
-            float(np.median(timed.run_ms)),
+            float(np.median(run.run_ms)),
+            seen.expected_db,
         )
-        for pair, timed, seen in runs
+        for pair, run, seen in runs
     ]
     distances = list(dict.fromkeys(name for result in pairs for name in result.psnr_db_off_eye))
     first = runs[0][0].stack
@@ -156,7 +152,7 @@ def _together(method: Method, runs: Sequence[tuple[StillPair, Timed, Seen]]) -> 
         ms_p50=float(np.median(all_ms)),
         ms_p99=float(np.percentile(all_ms, 99)),
         runs=len(all_ms),
-        memory_mib=max(timed.memory_mib for _, timed, _ in runs),
+        memory_mib=max(run.memory_mib for _, run, _ in runs),
         parameters=runs[0][1].parameters,
         psnr_db=float(np.mean([result.psnr_db for result in pairs])),
         ssim=float(np.mean([result.ssim for result in pairs])),
@@ -165,7 +161,11 @@ def _together(method: Method, runs: Sequence[tuple[StillPair, Timed, Seen]]) -> 
             name: float(np.mean([r.psnr_db_off_eye[name] for r in pairs if name in r.psnr_db_off_eye]))
             for name in distances
         },
-        multiply_adds=float(np.mean([timed.multiply_adds for _, timed, _ in runs])),
+        expected_db={
+            name: float(np.mean([r.expected_db[name] for r in pairs if name in r.expected_db]))
+            for name in dict.fromkeys(name for result in pairs for name in result.expected_db)
+        },
+        multiply_adds=float(np.mean([run.multiply_adds for _, run, _ in runs])),
         scale=method.scale,
         trained=method.trained,
         pairs=pairs,

@@ -12,12 +12,14 @@ from numpy.typing import ArrayLike
 from runtime.config import ModelSettings
 from runtime.errors import ModelFailure
 from runtime.model.predictor import Predictor, load_predictor
+from runtime.optics.carried import intensities
 from runtime.optics.pupil import POINT_MM
-from runtime.optics.quality import psnr_db
+from runtime.optics.quality import psnr_db, squared_error
+from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
-from runtime.optics.views import raster_from_stack
+from runtime.plan.drawing import drawn_for
 from runtime.records import F64, U8
-from runtime.report.eyesight import as_intensity, seen_rays, single_psnr_db
+from runtime.report.eyesight import single_psnr_db
 from runtime.report.pairs import Painter
 
 
@@ -41,20 +43,17 @@ class Simulation:
 
     def layers(self, eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> U8 | None:
         """Layers for two eyes, drawn straight into the model's rasters as the daemon does; None: it refuses them."""
-        rasters = self.predictor.rasters(eyes_m)
-        images = [
-            [
-                self.painter.draw(
-                    eye, raster_from_stack(eye, raster), width_px=raster.width_px, height_px=raster.height_px
-                )
-                for raster in rasters
-            ]
-            for eye in eyes_m
-        ]
+        images = drawn_for(self.predictor, self.painter.content, eyes_m, time_ns=0)
         try:
             return np.array(self.predictor.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm).layers)
         except ModelFailure:
             return None
+
+    def pictures(self, eyes_m: F64) -> tuple[list[U8], float]:
+        """What eyes (2, 3) should see, and the field of view of these pictures: both eyes' own, filled by the panel."""
+        fov_deg = max(self.fov_deg(eye) for eye in eyes_m)
+        size = {"width_px": self.stack.width_px, "height_px": self.stack.height_px}
+        return [self.painter.image(eye, **size, fov_deg=fov_deg) for eye in eyes_m], fov_deg
 
     def psnr_db(self, eye_m: ArrayLike, layers: U8) -> float:
         """Displayed PSNR of one eye over the panel. NaN where no ray crosses every panel."""
@@ -71,9 +70,9 @@ class Simulation:
             fov_deg = self.fov_deg(eye)
             size = {"width_px": self.stack.width_px, "height_px": self.stack.height_px}
             wanted = self.painter.image(eye, **size, fov_deg=fov_deg)
-            image, mask = seen_rays(eye, layers, self.stack, **size, fov_deg=fov_deg, step=1)
-            difference = image[mask] - as_intensity(wanted)[mask]
-            total, count = total + float(np.square(difference, dtype=np.float64).sum()), count + difference.size
+            retina = seen_by(eye, layers, self.stack, fov_deg=fov_deg)
+            squared, counted = squared_error(retina.image, intensities(wanted), retina.mask)
+            total, count = total + squared, count + counted
         return psnr_db(total / count) if count else math.nan
 
     def fov_deg(self, eye_m: ArrayLike) -> float:

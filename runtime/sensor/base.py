@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
@@ -19,6 +20,7 @@ class Capabilities:
     infrared: bool = False
     eye_points: bool = False  # it finds the eyes itself: no detector is needed
     in_stack_frame: bool = False  # its eye points are in frame `stack` already: no calibration is applied
+    may_pause: bool = False  # silence is its own (a gap in a recording): it is neither stalled nor reopened for it
 
 
 class SensorDriver(ABC):
@@ -45,6 +47,18 @@ class SensorDriver(ABC):
         Raises SensorTimeout (nothing new), SensorLost (close and reopen), EndOfRecording.
         """
 
+    def read_arrived(self, timeout_s: float) -> list[SensorFrame]:
+        """All frames that have arrived and were not read, oldest first; waits for one, at most `timeout_s`.
+
+        Raises as `read_newest` does. A driver that keeps only the newest answers with that one.
+        """
+        return [self.read_newest(timeout_s)]
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """Samples that arrived and are none, counted by reason."""
+        return {}
+
     @abstractmethod
     def close(self) -> None:
         """Release everything. May be called twice, and after a failed `open`; never raises."""
@@ -67,5 +81,22 @@ class SteppedDriver(SensorDriver):
         """The next sample, in order, none left out, at once. Raises EndOfRecording, SensorLost."""
 
     @abstractmethod
+    def peek(self) -> SensorFrame | None:
+        """What `next_sample` will deliver, or None where nothing is left. Its eyes may not be searched for yet.
+
+        Raises SensorLost.
+        """
+
+    @abstractmethod
     def available_ns(self, frame: SensorFrame) -> int:
         """When a sample arrives, on the run's clock: the caller lets its clock pass until then."""
+
+    def take_until(self, time_ns: int) -> list[SensorFrame]:
+        """All samples that have arrived by a time of the run's clock, oldest first, each once; none: an empty list.
+
+        Where nothing is left, `peek` answers None. Raises SensorLost.
+        """
+        frames = []
+        while (following := self.peek()) is not None and self.available_ns(following) <= time_ns:
+            frames.append(self.next_sample())
+        return frames

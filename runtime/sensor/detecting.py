@@ -5,12 +5,12 @@ The search then happens in the sensor's thread, not in the loop's.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from runtime.errors import InputError
 from runtime.records import EyePoints, SensorFrame
-from runtime.sensor.base import Capabilities, SensorDriver, SteppedDriver
+from runtime.sensor.base import SensorDriver, SteppedDriver
 
 FindEyes = Callable[[SensorFrame], EyePoints | None]
 
@@ -37,12 +37,27 @@ class DetectingDriver(SteppedDriver):
         except BaseException:
             self._driver.close()
             raise
-        self.capabilities = Capabilities(has.colour, has.depth, has.infrared, eye_points=True)
+        self.capabilities = replace(has, eye_points=True)
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
         frame = self._driver.read_newest(timeout_s)
         self.overtaken, self.missed = self._driver.overtaken, self._driver.missed
         return self._with_eyes(frame)
+
+    def read_arrived(self, timeout_s: float) -> list[SensorFrame]:
+        if self._find is not None:
+            # A search takes as long as some cameras' period: only the newest picture is searched.
+            return [self.read_newest(timeout_s)]
+        frames = self._driver.read_arrived(timeout_s)
+        self.overtaken, self.missed = self._driver.overtaken, self._driver.missed
+        return [self._with_eyes(frame) for frame in frames]
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        return self._driver.refused
+
+    def peek(self) -> SensorFrame | None:
+        return self._stepped().peek()
 
     def next_sample(self) -> SensorFrame:
         return self._with_eyes(self._stepped().next_sample())

@@ -38,6 +38,11 @@ class FixedDriver(SteppedDriver):
         capture_ns = self._start_ns + (self._count - 1) * PERIOD_NS
         return SensorFrame(self._count, capture_ns, self._eyes, true_eyes_m=self._eyes.eyes_m)
 
+    def peek(self) -> SensorFrame:
+        frame = self.next_sample()
+        self._count -= 1
+        return frame
+
     def available_ns(self, frame: SensorFrame) -> int:
         return frame.capture_ns
 

@@ -11,15 +11,18 @@ from pathlib import Path
 from typing import IO, Any
 
 from runtime.clock import NS_PER_S
+from runtime.config import LimitSettings
 from runtime.errors import InputError
 from runtime.records import Intrinsics, SensorFrame
 from runtime.sensor import recording_format as fmt
+from runtime.sensor.mcap_records import mcap_records
 from runtime.sensor.recording_format import RecordingHeader
+from runtime.support import foreign, progress
 
 CHUNK_BYTES = 4096  # some 20 eye samples
 MESSAGE_OVERHEAD_BYTES = 64
 INDEX_BYTES_PER_CHUNK = 256
-RECORD_LIMIT_BYTES = 256 << 20
+TELL_EVERY = 1024
 MAGIC = b"\x89MCAP0\r\n"
 
 log = logging.getLogger(__name__)
@@ -47,7 +50,7 @@ class RecordingWriter:
         from mcap.writer import CompressionType, IndexType, Writer
 
         self._file, self._limits, self._chunk_bytes = file, limits or RecordingLimits(), chunk_bytes
-        self._images = header.colour or header.depth
+        self._images, self._eye_points = header.colour or header.depth, header.eye_points
         # Eye points alone are so few that plain bytes, the same with every version of a library, are worth more.
         compression = CompressionType.LZ4 if self._images else CompressionType.NONE
         index = IndexType.CHUNK | IndexType.METADATA
@@ -76,7 +79,8 @@ class RecordingWriter:
             messages.append((fmt.COLOUR_TOPIC, fmt.colour_message(frame.colour, capture_ns=at)))
         if self._images and frame.depth_mm is not None:
             messages.append((fmt.DEPTH_TOPIC, fmt.depth_message(frame.depth_mm, capture_ns=at)))
-        messages.append((fmt.EYES_TOPIC, fmt.eyes_message(frame)))
+        if self._eye_points:
+            messages.append((fmt.EYES_TOPIC, fmt.eyes_message(frame)))
         first_ns = at if self._first_ns is None else self._first_ns
         size = sum(len(data) + MESSAGE_OVERHEAD_BYTES for _, data in messages)
         chunks = self._chunks + len(messages)
@@ -150,9 +154,9 @@ class _Appearing(RecordingWriter):
 class Recording:
     """An opened recording. Samples are read as they are asked for: images do not pile up in memory."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, limits: LimitSettings | None = None) -> None:
         """Reads the header and the first sample. Raises InputError, naming the file."""
-        self.path = path
+        self.path, self._limits = path, limits or LimitSettings()
         self.is_whole = self._ends_well()
         self.header = self._read_header()
         first = next(self.samples(), None)
@@ -162,7 +166,7 @@ class Recording:
 
     def _ends_well(self) -> bool:
         try:
-            with self.path.open("rb") as file:
+            with self._opened() as file:
                 if file.read(len(MAGIC)) != MAGIC:
                     raise InputError(self.path, "", "is not an MCAP recording")
                 file.seek(-len(MAGIC), 2)
@@ -172,6 +176,9 @@ class Recording:
         if not is_whole:
             log.warning("%s: is cut off; it is read up to its last whole chunk", self.path)
         return is_whole
+
+    def _opened(self) -> IO[bytes]:
+        return foreign.open_regular(self.path, most_bytes=round(self._limits.file_mib * foreign.MIB))
 
     def _read_header(self) -> RecordingHeader:
         for kind, record in self._records():
@@ -185,21 +192,28 @@ class Recording:
         raise InputError(self.path, fmt.METADATA_NAME, "is missing: not a recording of phasestack")
 
     def _records(self) -> Iterator[tuple[str, Any]]:
-        """Metadata and messages (with their topic as the kind `message`) until the end or the break."""
+        """Metadata, and messages as pairs of topic and record, until the end or the break."""
+        for number, record in enumerate(self._to_the_break()):
+            if number % TELL_EVERY == 0:
+                progress.tell(f"{self.path.name}: records read", number)
+            yield record
+
+    def _to_the_break(self) -> Iterator[tuple[str, Any]]:
         from mcap.records import Channel, Message, Metadata
-        from mcap.stream_reader import StreamReader
 
         topics: dict[int, str] = {}
+        most_bytes = round(self._limits.chunk_mib * foreign.MIB)
         try:
-            with self.path.open("rb") as file:
-                reader = StreamReader(file, validate_crcs=True, record_size_limit=RECORD_LIMIT_BYTES)
-                for record in reader.records:
+            with self._opened() as file:
+                for record in mcap_records(file, source=self.path, most_bytes=most_bytes):
                     if isinstance(record, Channel):
                         topics[record.id] = record.topic
-                    elif isinstance(record, Metadata):
-                        yield "metadata", record
                     elif isinstance(record, Message):
                         yield "message", (topics.get(record.channel_id, ""), record)
+                        continue
+                    yield ("metadata" if isinstance(record, Metadata) else "other"), record
+        except InputError:
+            raise
         except OSError as error:
             raise InputError(self.path, "", f"cannot be read ({error.strerror})") from None
         except Exception as error:  # mcap, lz4 and zstandard each raise their own for a broken file
@@ -208,16 +222,29 @@ class Recording:
             self.is_whole = False
 
     def samples(self) -> Iterator[SensorFrame]:
-        """All whole samples in the order of recording. Raises InputError for a sample that is not one of ours."""
+        """All whole samples in the order of recording. Raises InputError for a sample that is not one of ours.
+
+        A message of eye points completes a sample. A recording that has none (pictures alone) has a sample for each
+        time stamp: pictures of one stamp that follow each other are one sample, numbered from 1.
+        """
         parts: dict[str, Any] = {}
+        stamp_ns: int | None = None  # of the pictures in `parts`
         intrinsics: Intrinsics | None = None
+        number = 0
         for kind, value in self._records():
             if kind != "message":
                 continue
             topic, message = value
             try:
+                if topic in (fmt.COLOUR_TOPIC, fmt.DEPTH_TOPIC) and not self.header.eye_points:
+                    at_ns = fmt.capture_ns_of_image(message.data)
+                    if parts and at_ns != stamp_ns:
+                        number += 1
+                        yield SensorFrame(number, stamp_ns or 0, intrinsics=intrinsics, **parts)
+                        parts = {}
+                    stamp_ns = at_ns
                 if topic == fmt.COLOUR_TOPIC:
-                    parts["colour"] = fmt.colour_from_message(message.data)
+                    parts["colour"] = fmt.colour_from_message(message.data, most_pixels=self._limits.pixels)
                 elif topic == fmt.DEPTH_TOPIC:
                     parts["depth_mm"] = fmt.depth_from_message(message.data)
                 elif topic == fmt.CALIBRATION_TOPIC:
@@ -225,5 +252,7 @@ class Recording:
                 elif topic == fmt.EYES_TOPIC:
                     yield replace(fmt.frame_from_eyes_message(message.data), intrinsics=intrinsics, **parts)
                     parts = {}
-            except (ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
+            except ValueError as error:
                 raise InputError(self.path, topic, f"malformed message: {error}") from None
+        if parts and not self.header.eye_points:
+            yield SensorFrame(number + 1, stamp_ns or 0, intrinsics=intrinsics, **parts)

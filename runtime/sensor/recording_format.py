@@ -4,18 +4,28 @@ from __future__ import annotations
 
 import base64
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
 
+from runtime.clock import NS_PER_S
+from runtime.errors import InputError
 from runtime.records import F64, U8, U16, EyePoints, Intrinsics, SensorFrame
+from runtime.support.foreign import parsed_json, real, shown, whole
+from runtime.support.picture_header import picture_size
 
 SCHEMA_VERSION = 1
 METADATA_NAME = "phasestack.recording"
 EYES_TOPIC, COLOUR_TOPIC, DEPTH_TOPIC, CALIBRATION_TOPIC = "/eyes", "/colour", "/depth", "/camera"
 POSITION_DIGITS = 7  # a tenth of a micrometre: four digits below the best sensor's noise
 JPEG_QUALITY = 92
+TIME_MAX_NS = 1 << 62  # 146 years: sums and differences of two still fit 64 bits
+SEQUENCE_MAX = 1 << 62
+COORDINATE_MAX_M = 1e6  # beyond what any sensor says, in any unit; the tracker judges what a viewer's eyes are
+IMAGE_SIDE_MAX_PX = 1 << 15
+MESSAGE_DEPTH_MAX = 16
 
 _PAIR = {"type": ["array", "null"], "minItems": 2, "maxItems": 2}
 EYES_SCHEMA = {
@@ -111,37 +121,81 @@ def eyes_message(frame: SensorFrame) -> bytes:
 def _pair(value: Any) -> F64 | None:
     if value is None:
         return None
-    array = np.array(value, dtype=np.float64)  # None becomes NaN
-    if array.shape != (2, 3):
-        raise ValueError(f"two points of three coordinates expected, got shape {array.shape}")
-    return array
+    if not (_has(value, 2) and all(_has(point, 3) for point in value)):
+        raise ValueError(f"two points of three coordinates expected, got {shown(value)}")
+    return np.array([[_coordinate(number) for number in point] for point in value])
+
+
+def _has(value: Any, count: int) -> bool:
+    return isinstance(value, list) and len(value) == count
+
+
+def _coordinate(value: Any) -> float:
+    if value is None:  # this one was not measured
+        return float("nan")
+    return real(value, least=-COORDINATE_MAX_M, most=COORDINATE_MAX_M, problem=_of("a coordinate"))
+
+
+def _of(name: str) -> Callable[[str], ValueError]:
+    return lambda problem: ValueError(f"{name} {problem}")
+
+
+def _table(data: bytes) -> dict[str, Any]:
+    """A message's JSON object. Raises ValueError."""
+    try:
+        table = parsed_json(data, source="", most_depth=MESSAGE_DEPTH_MAX)
+    except InputError as error:
+        raise ValueError(str(error)) from None
+    if not isinstance(table, dict):
+        raise ValueError(f"an object expected, got {shown(table)}")
+    return table
+
+
+def _required(table: dict[str, Any], name: str) -> Any:
+    if name not in table:
+        raise ValueError(f"{name} is missing")
+    return table[name]
 
 
 def frame_from_eyes_message(data: bytes) -> SensorFrame:
     """Back from `eyes_message`. Raises ValueError where the message is not one."""
-    try:
-        record = json.loads(data)
-        eyes_m = _pair(record["eyes_m"])
-        eyes = None
-        if eyes_m is not None:
-            confidence = np.array(record.get("confidence", [1.0, 1.0]), dtype=np.float64)
-            completed = record.get("completed", "")
-            if confidence.shape != (2,) or completed not in ("", "left", "right"):
-                raise ValueError("malformed confidence or completed")
-            eyes = EyePoints(eyes_m, confidence, completed)
-        return SensorFrame(
-            sequence=int(record["sequence"]),
-            capture_ns=int(record["capture_ns"]),
-            eyes=eyes,
-            true_eyes_m=_pair(record.get("true_eyes_m")),
-        )
-    except (KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"not an eye sample: {error!r}") from None
+    record = _table(data)
+    eyes_m = _pair(_required(record, "eyes_m"))
+    eyes = None
+    if eyes_m is not None:
+        confidence = record.get("confidence", [1.0, 1.0])
+        completed = record.get("completed", "")
+        if not _has(confidence, 2) or completed not in ("", "left", "right"):
+            raise ValueError("malformed confidence or completed")
+        certain = [real(c, least=0, most=1, problem=_of("confidence")) for c in confidence]
+        eyes = EyePoints(eyes_m, np.array(certain), completed)
+    return SensorFrame(
+        sequence=whole(_required(record, "sequence"), least=0, most=SEQUENCE_MAX, problem=_of("sequence")),
+        capture_ns=whole(_required(record, "capture_ns"), least=0, most=TIME_MAX_NS, problem=_of("capture_ns")),
+        eyes=eyes,
+        true_eyes_m=_pair(record.get("true_eyes_m")),
+    )
 
 
 def _stamp(capture_ns: int) -> dict[str, Any]:
     seconds, nanoseconds = divmod(capture_ns, 1_000_000_000)
     return {"timestamp": {"sec": seconds, "nsec": nanoseconds}, "frame_id": "sensor"}
+
+
+def capture_ns_of_image(data: bytes) -> int:
+    """The capture time that a colour or depth message carries. Raises ValueError."""
+    stamp = _required(_table(data), "timestamp")
+    if not isinstance(stamp, dict):
+        raise ValueError("timestamp is not an object")
+    seconds = whole(stamp.get("sec"), least=0, most=TIME_MAX_NS // NS_PER_S, problem=_of("timestamp.sec"))
+    return seconds * NS_PER_S + whole(stamp.get("nsec"), least=0, most=NS_PER_S - 1, problem=_of("timestamp.nsec"))
+
+
+def _coded_bytes(table: dict[str, Any]) -> bytes:
+    text = _required(table, "data")
+    if not isinstance(text, str):
+        raise ValueError("data is not text")
+    return base64.b64decode(text)  # raises ValueError
 
 
 def colour_message(colour: U8, *, capture_ns: int) -> bytes:
@@ -155,12 +209,15 @@ def colour_message(colour: U8, *, capture_ns: int) -> bytes:
     return json.dumps(_stamp(capture_ns) | {"data": text, "format": "jpeg"}).encode()
 
 
-def colour_from_message(data: bytes) -> U8:
+def colour_from_message(data: bytes, *, most_pixels: int = 1 << 26) -> U8:
     """Back from `colour_message` (JPEG is lossy). Raises ValueError."""
     import cv2
 
-    coded = np.frombuffer(base64.b64decode(json.loads(data)["data"]), np.uint8)
-    image = cv2.imdecode(coded, cv2.IMREAD_COLOR) if coded.size else None
+    coded = _coded_bytes(_table(data))
+    width, height = picture_size(coded)
+    if max(width, height) > IMAGE_SIDE_MAX_PX or width * height > most_pixels:
+        raise ValueError(f"a colour image has {width} by {height} pixels; at most {most_pixels:,} (limits.pixels)")
+    image = cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise ValueError("a colour image cannot be decoded")
     return np.ascontiguousarray(image[..., ::-1])
@@ -176,9 +233,14 @@ def depth_message(depth_mm: U16, *, capture_ns: int) -> bytes:
 
 def depth_from_message(data: bytes) -> U16:
     """Back from `depth_message`, exactly. Raises ValueError."""
-    record = json.loads(data)
-    raw = np.frombuffer(base64.b64decode(record["data"]), "<u2")
-    return raw.reshape(int(record["height"]), int(record["width"])).astype(np.uint16)
+    record = _table(data)
+    width, height = (
+        whole(record.get(name), least=1, most=IMAGE_SIDE_MAX_PX, problem=_of(name)) for name in ("width", "height")
+    )
+    raw = _coded_bytes(record)
+    if len(raw) != 2 * width * height:
+        raise ValueError(f"{width} by {height} pixels of 16 bits don't have {len(raw)} bytes")
+    return np.frombuffer(raw, "<u2").reshape(height, width).astype(np.uint16)
 
 
 def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
@@ -192,6 +254,13 @@ def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
 
 def intrinsics_from_message(data: bytes) -> Intrinsics:
     """Back from `calibration_message`. Raises ValueError."""
-    record = json.loads(data)
-    k = record["K"]
-    return Intrinsics(int(record["width"]), int(record["height"]), k[0], k[4], k[2] + 0.5, k[5] + 0.5)
+    record = _table(data)
+    width, height = (
+        whole(record.get(name), least=1, most=IMAGE_SIDE_MAX_PX, problem=_of(name)) for name in ("width", "height")
+    )
+    if not _has(record.get("K"), 9):
+        raise ValueError("K is not nine numbers")
+    k = [real(number, least=-1e6, most=1e6, problem=_of("K")) for number in record["K"]]
+    if k[0] <= 0 or k[4] <= 0:
+        raise ValueError(f"K: focal lengths of {k[0]:g} and {k[4]:g} pixels")
+    return Intrinsics(width, height, k[0], k[4], k[2] + 0.5, k[5] + 0.5)

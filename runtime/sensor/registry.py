@@ -6,7 +6,7 @@ from collections.abc import Callable
 from importlib.metadata import entry_points
 
 from runtime.clock import Clock
-from runtime.config import SensorSettings
+from runtime.config import LimitSettings, SensorSettings
 from runtime.errors import InputError
 from runtime.sensor.base import SensorDriver
 
@@ -14,10 +14,13 @@ DriverFactory = Callable[[SensorSettings, Clock, float], SensorDriver]
 ENTRY_POINTS = "phasestack.sensors"
 
 
-def _replay(settings: SensorSettings, clock: Clock, latency_ms: float) -> SensorDriver:
+def _replay(
+    settings: SensorSettings, clock: Clock, latency_ms: float, limits: LimitSettings | None = None
+) -> SensorDriver:
     from runtime.sensor.replay import ReplayDriver
 
-    return ReplayDriver(settings.source, clock, loop=settings.loop, start_s=settings.start_s, latency_ms=latency_ms)
+    s = settings
+    return ReplayDriver(s.source, clock, loop=s.loop, start_s=s.start_s, latency_ms=latency_ms, limits=limits)
 
 
 def _fixed(settings: SensorSettings, clock: Clock, latency_ms: float) -> SensorDriver:
@@ -56,8 +59,12 @@ def driver_names() -> tuple[str, ...]:
     return (*_FACTORIES, *(point.name for point in entry_points(group=ENTRY_POINTS) if point.name not in _FACTORIES))
 
 
-def open_sensor(settings: SensorSettings, clock: Clock, *, latency_ms: float = 0.0) -> SensorDriver:
-    """The configured driver, not yet opened. `latency_ms`: from capture to arrival, of what is only replayed.
+def open_sensor(
+    settings: SensorSettings, clock: Clock, *, latency_ms: float = 0.0, limits: LimitSettings | None = None
+) -> SensorDriver:
+    """The configured driver, not yet opened.
+
+    latency_ms: from capture to arrival, of what is only replayed; limits: of a recording's bytes, None: the defaults.
 
     Raises InputError for a name that nobody registered, MissingPart for an SDK that is not installed.
     """
@@ -67,4 +74,6 @@ def open_sensor(settings: SensorSettings, clock: Clock, *, latency_ms: float = 0
             factory = point.load()
     if factory is None:
         raise InputError("sensor", "driver", f"unknown: {settings.driver!r}; known: {', '.join(driver_names())}")
+    if factory is _replay:
+        return _replay(settings, clock, latency_ms, limits)
     return factory(settings, clock, latency_ms)

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import logging
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
+from runtime.config import LimitSettings
 from runtime.errors import EndOfRecording, InputError, SensorLost, SensorTimeout
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, SteppedDriver
 from runtime.sensor.recording import Recording
+from runtime.support import progress
+
+ROUND_INTERVAL_MIN_NS = NS_PER_S // 240  # between the rounds of a looped recording: the fastest sensor's period
+ARRIVED_MAX = 1024  # samples in one answer: who was away for long gets them in several
+TELL_EVERY = 1024
+OLDER, SAME_INSTANT = "older than the sample before", "of the same instant as the sample before"
+
+log = logging.getLogger(__name__)
 
 
 def demo_recording_path() -> Path:
@@ -22,84 +33,148 @@ def demo_recording_path() -> Path:
 class ReplayDriver(SteppedDriver):
     """Recorded times are shifted on to the run's clock: the first sample is captured at `open`.
 
+    Any rate and any gap is played as it was recorded. A sample that is no later than the one before it is not
+    delivered; `refused` counts them by reason, and the first is told.
+
     `next_sample` delivers every sample once, in order, and never waits: the caller's simulated clock is
-    advanced by the caller (a sample is available at `available_ns(frame)`). `read_newest` waits for its
-    clock to reach a sample's availability and, like a camera, passes over samples that newer ones overtook.
+    advanced by the caller (a sample is available at `available_ns(frame)`). `read_arrived` waits for its clock to
+    reach a sample's availability and answers with all that are due; `read_newest`, like a camera, passes over
+    samples that newer ones overtook.
     """
 
     name = "replay"
 
     def __init__(
-        self, source: str, clock: Clock, *, loop: bool = False, start_s: float = 0.0, latency_ms: float = 0.0
+        self,
+        source: str,
+        clock: Clock,
+        *,
+        loop: bool = False,
+        start_s: float = 0.0,
+        latency_ms: float = 0.0,
+        limits: LimitSettings | None = None,
     ) -> None:
-        """source: a recording's path, or `demo`. latency_ms: from a sample's capture to its arrival."""
+        """source: a recording's path, or `demo`. latency_ms: from a sample's capture to its arrival.
+
+        Raises InputError for a start beyond the longest recording.
+        """
+        self._limits = limits or LimitSettings()
+        if not 0 <= start_s <= self._limits.recording_s:
+            problem = f"is {start_s:g}; a recording has at most {self._limits.recording_s:g} s (limits.recording_s)"
+            raise InputError("sensor", "start_s", problem)
         self.path = demo_recording_path() if source == "demo" else Path(source)
         self._clock, self._loop, self._start_ns = clock, loop, round(start_s * NS_PER_S)
         self._latency_ns = round(latency_ms * NS_PER_MS)
-        self.capabilities = Capabilities(eye_points=True)
+        self.capabilities = Capabilities(eye_points=True, may_pause=True)
         self._frames: Iterator[SensorFrame] | None = None
         self._next: SensorFrame | None = None
+        self._refused: Counter[str] = Counter()
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        return self._refused
 
     def open(self) -> None:
         """Raises InputError where the file is not a recording, or ends before the start that was asked for."""
-        recording = Recording(self.path)
+        recording = Recording(self.path, limits=self._limits)
         header = recording.header
         self.serial = header.serial
-        self.capabilities = Capabilities(header.colour, header.depth, False, header.eye_points)
-        self._frames = self._shifted(recording, self._clock.now_ns())
+        self.capabilities = Capabilities(header.colour, header.depth, False, header.eye_points, may_pause=True)
+        self._refused = Counter()
+        self._frames = self._shifted(recording)
         self._next = next(self._frames, None)
         if self._next is None:
             self.close()
             raise InputError(self.path, "start", "the recording ends before the time to start at")
 
-    def _shifted(self, recording: Recording, now_ns: int) -> Iterator[SensorFrame]:
-        """Samples on the run's clock; when looped, the next round follows at the recording's own interval."""
+    def _ordered(self, recording: Recording) -> Iterator[SensorFrame]:
+        """Samples from the start on, each later than the one before it. Raises InputError for too long a recording."""
         start_ns = recording.first.capture_ns + self._start_ns
-        shift_ns = now_ns - start_ns
-        last_ns = interval_ns = sequence_shift = last_sequence = 0
+        last_ns = -1
+        for number, frame in enumerate(recording.samples()):
+            if number % TELL_EVERY == 0:
+                progress.tell("samples read", number)
+            if frame.capture_ns <= last_ns:
+                self._refuse(OLDER if frame.capture_ns < last_ns else SAME_INSTANT, frame)
+                continue
+            if frame.capture_ns - recording.first.capture_ns > self._limits.recording_s * NS_PER_S:
+                seconds = (frame.capture_ns - recording.first.capture_ns) / NS_PER_S
+                problem = f"sample {number} is {seconds:.6g} s after the first; at most {self._limits.recording_s:g}"
+                raise InputError(self.path, "capture_ns", f"{problem} (limits.recording_s)")
+            last_ns = frame.capture_ns
+            if frame.capture_ns >= start_ns:
+                yield frame
+
+    def _refuse(self, reason: str, frame: SensorFrame) -> None:
+        if not self._refused[reason]:
+            log.warning("%s: sample %d is %s: such samples are left out", self.path, frame.sequence, reason)
+        self._refused[reason] += 1
+
+    def _shifted(self, recording: Recording) -> Iterator[SensorFrame]:
+        """Samples on the run's clock; when looped, the next round follows at the recording's own interval."""
+        last_ns = interval_ns = sequence_shift = last_sequence = shift_ns = 0
+        is_first_round = True
         while True:
             delivered = 0
-            for frame in recording.samples():
-                if frame.capture_ns < start_ns:
-                    continue
-                if delivered == 0:
-                    if last_ns:
-                        shift_ns = last_ns + interval_ns - frame.capture_ns
-                        sequence_shift = last_sequence + 1 - frame.sequence
-                    elif self._start_ns:
-                        shift_ns = now_ns - frame.capture_ns
+            for frame in self._ordered(recording):
+                if delivered == 0 and is_first_round:
+                    # Skipping to the start takes time: the run's clock is read when the first sample is at hand.
+                    shift_ns = self._clock.now_ns() - frame.capture_ns
+                elif delivered == 0:
+                    shift_ns = last_ns + interval_ns - frame.capture_ns
+                    sequence_shift = last_sequence + 1 - frame.sequence
                 capture_ns = frame.capture_ns + shift_ns
                 interval_ns = capture_ns - last_ns if delivered else interval_ns or NS_PER_S // 30
                 last_ns, last_sequence, delivered = capture_ns, frame.sequence + sequence_shift, delivered + 1
                 yield replace(frame, capture_ns=capture_ns, sequence=last_sequence)
+            interval_ns, is_first_round = max(interval_ns, ROUND_INTERVAL_MIN_NS), False
             if not self._loop or not delivered:
                 return
 
     def available_ns(self, frame: SensorFrame) -> int:
         return frame.capture_ns + self._latency_ns
 
-    def next_sample(self) -> SensorFrame:
+    def peek(self) -> SensorFrame | None:
         if self._frames is None:
             raise SensorLost("the recording is not open")
-        if self._next is None:
+        return self._next
+
+    def next_sample(self) -> SensorFrame:
+        frame = self.peek()
+        if frame is None or self._frames is None:
             raise EndOfRecording(f"{self.path}: no more samples")
-        frame, self._next = self._next, next(self._frames, None)
+        self._next = next(self._frames, None)
         return frame
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
-        if self._frames is None:
-            raise SensorLost("the recording is not open")
-        if self._next is None:
-            raise EndOfRecording(f"{self.path}: no more samples")
-        deadline_ns = self._clock.now_ns() + round(timeout_s * NS_PER_S)
-        if self.available_ns(self._next) > deadline_ns:
-            self._clock.sleep_until_ns(deadline_ns)
-            raise SensorTimeout(f"{self.path}: no sample within {timeout_s} s")
-        self._clock.sleep_until_ns(self.available_ns(self._next))
-        frame = self.next_sample()
-        while self._next is not None and self.available_ns(self._next) <= self._clock.now_ns():
+        frame = self._first_due(timeout_s)
+        now_ns = self._clock.now_ns()
+        while self._is_due(now_ns):
             frame, self.overtaken = self.next_sample(), self.overtaken + 1
         return frame
+
+    def read_arrived(self, timeout_s: float) -> list[SensorFrame]:
+        frames = [self._first_due(timeout_s)]
+        now_ns = self._clock.now_ns()
+        while len(frames) < ARRIVED_MAX and self._is_due(now_ns):
+            frames.append(self.next_sample())
+        return frames
+
+    def _is_due(self, now_ns: int) -> bool:
+        return self._next is not None and self.available_ns(self._next) <= now_ns
+
+    def _first_due(self, timeout_s: float) -> SensorFrame:
+        """The oldest unread sample, once it is available. Raises SensorTimeout, EndOfRecording, SensorLost."""
+        following = self.peek()
+        if following is None:
+            raise EndOfRecording(f"{self.path}: no more samples")
+        due_ns = self.available_ns(following)
+        deadline_ns = self._clock.now_ns() + round(timeout_s * NS_PER_S)
+        if due_ns > deadline_ns:
+            self._clock.sleep_until_ns(deadline_ns)
+            raise SensorTimeout(f"{self.path}: no sample within {timeout_s} s")
+        self._clock.sleep_until_ns(due_ns)
+        return self.next_sample()
 
     def close(self) -> None:
         self._frames = self._next = None

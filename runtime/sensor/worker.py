@@ -1,10 +1,11 @@
-"""The thread that a sensor lives in: the newest sample wins, and a hanging SDK is left behind."""
+"""The thread that a sensor lives in: samples wait in a bounded queue, and a hanging SDK is left behind."""
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
 from enum import StrEnum
 
 from runtime.clock import NS_PER_S, Clock
@@ -12,10 +13,13 @@ from runtime.config import SensorSettings
 from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout, TransientError
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, SensorDriver
+from runtime.support.transient import may_pass
 
 TIMEOUTS_TO_REOPEN = 2
 HANG_MARGIN_S = 0.5
 ABANDONED_MAX = 8
+QUEUE_MAX = 1024  # samples that wait to be read: four seconds of the fastest sensor
+PICTURES_MAX = 8  # the same of samples that carry pictures
 
 log = logging.getLogger(__name__)
 
@@ -50,11 +54,12 @@ class SensorWorker:
         """make_driver: an unopened driver, a fresh one at each call."""
         self._make, self._settings, self._clock = make_driver, settings, clock
         self._lock, self._watching = threading.Lock(), threading.Lock()
-        self._frame: SensorFrame | None = None
+        self._queue: deque[SensorFrame] = deque()
         self._attempt: _Attempt | None = None
         self._hung: list[_Attempt] = []
         self._state, self.reason = SensorState.STOPPED, ""
-        self._overwritten = self._overtaken = self._missed = 0
+        self._passed_over = self._overtaken = self._missed = 0
+        self._refused: Counter[str] = Counter()
         self._driver: SensorDriver | None = None
         self._serial = ""
         self.error: FatalError | None = None
@@ -75,12 +80,20 @@ class SensorWorker:
         self._attempt = attempt
         attempt.thread.start()
 
-    def newest(self) -> SensorFrame | None:
-        """The newest sample that was not read yet, or None. Never waits."""
+    def take(self) -> list[SensorFrame]:
+        """All samples that arrived and were not read yet, oldest first. Never waits."""
         self._watch()
         with self._lock:
-            frame, self._frame = self._frame, None
-        return frame
+            frames = list(self._queue)
+            self._queue.clear()
+        return frames
+
+    def newest(self) -> SensorFrame | None:
+        """The newest sample that was not read yet, or None; those that it overtook are counted. Never waits."""
+        frames = self.take()
+        with self._lock:
+            self._passed_over += max(0, len(frames) - 1)
+        return frames[-1] if frames else None
 
     @property
     def state(self) -> SensorState:
@@ -90,13 +103,18 @@ class SensorWorker:
 
     @property
     def stale_inputs(self) -> int:
-        """Samples that a newer one overtook before anybody read them."""
-        return self._overwritten + self._overtaken + (self._driver.overtaken if self._driver else 0)
+        """Samples that a newer one overtook and that `take` never handed out."""
+        return self._passed_over + self._overtaken + (self._driver.overtaken if self._driver else 0)
 
     @property
     def missed_inputs(self) -> int:
         """Samples that the device counted and that never arrived."""
         return self._missed + (self._driver.missed if self._driver else 0)
+
+    @property
+    def refused_inputs(self) -> Mapping[str, int]:
+        """Samples that arrived and are none, by reason, as the driver tells them."""
+        return self._refused + Counter(self._driver.refused) if self._driver else self._refused
 
     @property
     def capabilities(self) -> Capabilities | None:
@@ -157,6 +175,7 @@ class SensorWorker:
             if driver is not None and driver is self._driver:
                 self._overtaken += driver.overtaken
                 self._missed += driver.missed
+                self._refused.update(driver.refused)
                 self._driver = None
 
     def _allow(self, attempt: _Attempt, limit_s: float) -> None:
@@ -178,10 +197,12 @@ class SensorWorker:
                 self._set(attempt, SensorState.ENDED, str(error))
                 return
             except FatalError as error:
-                if not attempt.abandoned.is_set():
-                    self.error = error
-                self._set(attempt, SensorState.FAILED, str(error))
-                return
+                if not may_pass(error):
+                    if not attempt.abandoned.is_set():
+                        self.error = error
+                    self._set(attempt, SensorState.FAILED, str(error))
+                    return
+                self._set(attempt, SensorState.LOST, str(error))  # no descriptor, no memory: there may be later
             except TransientError as error:
                 self._set(attempt, SensorState.LOST, str(error))
             except Exception as error:
@@ -212,8 +233,10 @@ class SensorWorker:
         while not attempt.abandoned.is_set():
             self._allow(attempt, s.timeout_s + HANG_MARGIN_S)
             try:
-                frame = driver.read_newest(s.timeout_s)
+                frames = driver.read_arrived(s.timeout_s)
             except SensorTimeout as error:
+                if driver.capabilities.may_pause:
+                    continue
                 timeouts += 1
                 self._set(attempt, SensorState.STALLED, str(error))
                 if timeouts >= TIMEOUTS_TO_REOPEN:
@@ -223,7 +246,15 @@ class SensorWorker:
             with self._lock:
                 if attempt.abandoned.is_set():
                     return
-                self._overwritten += self._frame is not None
-                self._frame = frame
+                for frame in frames:
+                    self._keep(frame)
             if self._state is not SensorState.RUNNING:
                 self._set(attempt, SensorState.RUNNING, "")
+
+    def _keep(self, frame: SensorFrame) -> None:
+        """Let a sample wait to be read; where too many wait, the oldest goes."""
+        most = QUEUE_MAX if frame.colour is None and frame.depth_mm is None else PICTURES_MAX
+        while len(self._queue) >= most:
+            self._queue.popleft()
+            self._passed_over += 1
+        self._queue.append(frame)

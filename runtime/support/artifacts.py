@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -13,7 +16,11 @@ from typing import Any, Self
 import numpy as np
 
 from runtime.errors import InputError
-from runtime.records import U8
+from runtime.records import U8, U16
+from runtime.support.picture_header import read_coded
+
+STAGING = ".phasestack-"
+PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -79,26 +86,65 @@ def write_png(path: Path, image: U8) -> None:
 
 
 def read_image(path: Path) -> U8:
-    """(h, w, 3) RGB of any format that OpenCV reads. Raises InputError, naming the file."""
+    """(h, w, 3) RGB in 8 bits of any common picture file; where it is transparent, white shows through.
+
+    Raises InputError, naming the file.
+    """
+    return in_8_bits(read_picture(path))
+
+
+def in_8_bits(picture: U8 | U16) -> U8:
+    """The nearest 8-bit code values."""
+    if picture.dtype == np.uint8:
+        return np.asarray(picture, np.uint8)
+    return ((picture.astype(np.uint32) + 128) // 257).astype(np.uint8)
+
+
+def read_picture(path: Path) -> U8 | U16:
+    """(h, w, 3) RGB in the file's own 8 or 16 bits; where it is transparent, white shows through.
+
+    Raises InputError, naming the file: also for one that would take too much memory, before it is unpacked.
+    """
     import cv2
 
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, "", f"cannot be read ({error.strerror})") from None
+    data = read_coded(path)
+    unreadable = InputError(path, "", "is not an image that can be decoded")
     # libpng would write a line of its own to stderr about a file that is cut off.
-    cut_off = data.startswith(b"\x89PNG") and b"IEND" not in data
-    image = None if cut_off or not data else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        raise InputError(path, "", "is not an image that can be decoded")
+    if data.startswith(PNG) and b"IEND" not in data:
+        raise unreadable
+    coded = np.frombuffer(data, np.uint8)
+    image: Any = cv2.imdecode(coded, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if image is None or image.dtype not in (np.uint8, np.uint16):
+        raise unreadable
+    if _may_be_transparent(data):
+        stored: Any = cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)
+        if stored is not None and stored.ndim == 3 and stored.shape[2] == 4:
+            if not np.array_equal(stored[..., :3], image):
+                raise InputError(path, "orientation", "a transparent picture that its EXIF entry turns can't be read")
+            image = _on_white(image, stored[..., 3:])
     return np.ascontiguousarray(image[..., ::-1])
+
+
+def _may_be_transparent(data: bytes) -> bool:
+    if data.startswith(PNG):
+        return data[25:26] in (b"\x04", b"\x06") or b"tRNS" in data[: data.find(b"IDAT")]
+    return not data.startswith(JPEG)
+
+
+def _on_white(colour: U8 | U16, alpha: U8 | U16) -> U8 | U16:
+    """colour·a + white·(1 - a), rounded to the picture's own codes."""
+    white = int(np.iinfo(colour.dtype).max)
+    mixed = colour.astype(np.uint64) * alpha + np.uint64(white) * (white - alpha.astype(np.uint64))
+    codes = (mixed + white // 2) // white
+    return codes.astype(np.uint8) if colour.dtype == np.uint8 else codes.astype(np.uint16)
 
 
 class OutputFolder:
     """A folder whose new files appear together at the end, or not at all.
 
     Used as a context manager: write into `staging`; on success every file is renamed into `target`,
-    replacing those of the same names; on an error nothing new is left.
+    replacing those of the same names; on an error nothing new is left. A staging folder is locked as long as its
+    process lives, so that the next one to write here can tell what a killed one left, and clears it away.
     """
 
     def __init__(self, target: Path) -> None:
@@ -108,7 +154,11 @@ class OutputFolder:
         try:
             missing = [folder for folder in (self.target, *self.target.parents) if not folder.exists()]
             self.target.mkdir(parents=True, exist_ok=True)
-            self.staging = Path(tempfile.mkdtemp(prefix=".phasestack-", dir=self.target))
+            with _locked(self.target):  # nobody takes the new folder for a dead one before it has its lock
+                _clear_dead(self.target)
+                self.staging = Path(tempfile.mkdtemp(prefix=STAGING, dir=self.target))
+                self._lock = ExitStack()
+                self._lock.enter_context(_locked(self.staging))
         except OSError as error:
             raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
         self._made = missing
@@ -117,14 +167,50 @@ class OutputFolder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
-            for path in sorted(self.staging.rglob("*")):
-                if path.is_file():
-                    destination = self.target / path.relative_to(self.staging)
-                    destination.parent.mkdir(parents=True, exist_ok=True)
-                    path.replace(destination)
-        shutil.rmtree(self.staging, ignore_errors=True)
+        try:
+            if kind is None:
+                for path in sorted(self.staging.rglob("*")):
+                    if path.is_file():
+                        destination = self.target / path.relative_to(self.staging)
+                        destination.parent.mkdir(parents=True, exist_ok=True)
+                        path.replace(destination)
+        finally:
+            self.discard()
+            self._lock.close()
         if kind is not None:
             for folder in self._made:
-                if not any(folder.iterdir()):
+                if folder.is_dir() and not any(folder.iterdir()):
                     folder.rmdir()
+
+    def discard(self) -> None:
+        """Remove what was staged so far, before the end."""
+        shutil.rmtree(self.staging, ignore_errors=True)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """A lock on a folder that ends with the process, however it ends; none where the file system has no locks."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _clear_dead(target: Path) -> None:
+    """Remove the staging folders that no living process holds."""
+    for folder in target.glob(f"{STAGING}*"):
+        try:
+            handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        except OSError:
+            continue
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:  # alive, or a file system that can't tell
+            continue
+        else:
+            shutil.rmtree(folder, ignore_errors=True)
+        finally:
+            os.close(handle)

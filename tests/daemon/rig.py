@@ -1,20 +1,20 @@
-"""A real loop with real content, network and offscreen panels, small; and parts of it that break when told to."""
+"""A real run with real content, network and offscreen panels, small; and parts of it that break when told to."""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from runtime.config import Settings
-from runtime.daemon.build import RunOptions, build_loop
+from runtime.daemon.build import Run, RunOptions, build_run
 from runtime.errors import PanelLost
-from runtime.frame.loop import Loop
-from runtime.records import EyePoints, FrameAccount, PanelFrame, PresentReport, SensorFrame, State
+from runtime.frame.presenter import Presenter
+from runtime.records import EyePoints, PanelFrame, PresentReport, RefreshAccount, SensorFrame, State
 from runtime.sensor.base import Capabilities, SensorDriver
 from runtime.sensor.registry import register_driver
 
@@ -26,7 +26,7 @@ SMALL: dict[str, Any] = {
     },
     "tracker": {"hold_s": 0.1, "blend_s": 0.02},
     "model": {"name": "fast", "threads": 1},
-    "loop": {"rate_hz": 200.0},
+    "loop": {"rate_hz": 200.0, "solver_late_s": 5.0, "solver_abandon_s": 60.0},  # a busy machine is no fault
 }  # fmt: skip
 
 
@@ -78,38 +78,86 @@ class FragileDriver(SensorDriver):
 
 
 class Rig:
-    """A loop and the means to break it. Use as a context manager."""
+    """A run and the means to break it. Use as a context manager."""
 
     def __init__(self, *, supervisor: Any = None, **changes: dict[str, Any]) -> None:
         self.plan = Plan()
         register_driver("fragile", lambda settings, clock, latency_ms: FragileDriver(self.plan, clock))
         tables = {name: {**SMALL.get(name, {}), **changes.get(name, {})} for name in {**SMALL, **changes}}
         self.settings = Settings.model_validate(tables)
-        self._supervisor = supervisor
+        self.supervisor = supervisor
         self._cleanup = ExitStack()
-        self.accounts: list[FrameAccount] = []
+        self.accounts: list[RefreshAccount] = []
 
     def __enter__(self) -> Rig:
-        self.loop: Loop = build_loop(
-            self.settings, RunOptions(), self._cleanup, supervisor=self._supervisor, on_account=self.accounts.append
-        )
+        try:
+            self.run: Run = build_run(
+                self.settings,
+                RunOptions(),
+                self._cleanup,
+                supervisor=self.supervisor,
+                on_account=self.accounts.append,
+            )
+        except BaseException:
+            self._cleanup.close()
+            raise
         return self
 
     def __exit__(self, *exception: object) -> None:
         self.plan.released.set()
         self._cleanup.close()
 
-    def turn_until(self, state: str, *, within_s: float = 10.0) -> FrameAccount:
-        """Turns of the loop until its state is called this. Raises AssertionError where it never is."""
-        deadline = time.monotonic() + within_s
-        while time.monotonic() < deadline:
-            account = self.loop.turn()
-            if self.loop.machine.name == state:
-                return account
-        raise AssertionError(f"never {state}; {self.loop.machine.name} ({self.loop.machine.reason})")
+    @property
+    def presenter(self) -> Presenter:
+        return self.run.presenter
 
-    def turns(self, count: int) -> list[FrameAccount]:
-        return [self.loop.turn() for _ in range(count)]
+    @property
+    def content(self) -> Any:
+        """What is drawn at present."""
+        return self.presenter.run_cell.state.content
+
+    @property
+    def predictor(self) -> Any:
+        """What solves at present."""
+        return self.presenter.run_cell.state.predictor
+
+    def refresh_until(self, wanted: str | Callable[[], Any], *, within_s: float = 30.0) -> RefreshAccount:
+        """Refreshes until the state is called this, or until it holds. Raises AssertionError where it never does."""
+        deadline = time.monotonic() + within_s
+        machine = self.presenter.machine
+        while time.monotonic() < deadline:
+            account = self.presenter.refresh()
+            if machine.name == wanted if isinstance(wanted, str) else wanted():
+                return account
+        raise AssertionError(f"never {wanted}; {machine.name} ({machine.reason})")
+
+    def refresh_until_solved(self, *, times: int = 1) -> RefreshAccount:
+        """Refreshes until so many other solutions are shown."""
+        for _ in range(times):
+            ran = self.refresh_until(lambda: self.accounts[-1].inference == "ran")
+        return ran
+
+    def refreshes(self, count: int) -> list[RefreshAccount]:
+        return [self.presenter.refresh() for _ in range(count)]
+
+    def refreshes_for(self, seconds: float) -> list[RefreshAccount]:
+        """Refreshes for so long."""
+        deadline, done = time.monotonic() + seconds, []
+        while time.monotonic() < deadline:
+            done.append(self.presenter.refresh())
+        return done
+
+    def break_panels(self, *, keep: bool = True) -> BreakablePanels:
+        """The panels, from now on in the hands of the test."""
+        panels = BreakablePanels(self.presenter.panels, keep=keep)
+        self.presenter.panels = panels  # type: ignore[assignment]
+        return panels
+
+    def break_predictor(self) -> BreakablePredictor:
+        """The model, from now on in the hands of the test."""
+        predictor = BreakablePredictor(self.predictor)
+        self.presenter.run_cell.replace(predictor=predictor)
+        return predictor
 
 
 class BreakablePanels:
@@ -123,22 +171,30 @@ class BreakablePanels:
         if self.lost:
             raise PanelLost(self.lost)
         if self._keep:
-            self.shown.append(replace(frame, solved=None if frame.solved is None else frame.solved.copy()))
+            self.shown.append(frame)
         return self._panels.present(frame, unchanged=unchanged)
 
     def close(self) -> None:
         self._panels.close()
+
+    @property
+    def period_ns(self) -> int | None:
+        return self._panels.period_ns
 
 
 class BreakablePredictor:
     """Any predictor; `answer`, where set, is called in its place."""
 
     def __init__(self, predictor: Any) -> None:
-        self._predictor, self.answer = predictor, None
-        self.name, self.provider = predictor.name, predictor.provider
+        self._predictor, self.name, self.provider = predictor, predictor.name, predictor.provider
+        self.answer: Callable[..., Any] | None = None
 
-    def predict(self, images: Any, eyes_m: Any) -> Any:
-        return (self.answer or self._predictor.predict)(images, eyes_m)
+    def predict(self, images: Any, eyes_m: Any, **how: Any) -> Any:
+        return (self.answer or self._predictor.predict)(images, eyes_m, **how)
+
+    def well(self, images: Any, eyes_m: Any, **how: Any) -> Any:
+        """What it would have answered."""
+        return self._predictor.predict(images, eyes_m, **how)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._predictor, name)

@@ -1,4 +1,7 @@
-"""Another scene, model or configuration while it runs: loaded beside the loop, taken over or refused, never half."""
+"""Another scene, model or configuration while it runs: loaded beside it, taken over or refused, never half.
+
+Whatever changes, no refresh is lost: the presenter goes on with the solution that there is.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +15,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from runtime.clock import MonotonicClock
-from runtime.commands import daemon as daemon_module
+from runtime.clock import NS_PER_S, MonotonicClock
 from runtime.config import Overrides
 from runtime.content import loader
 from runtime.daemon import server as server_module
@@ -21,32 +23,34 @@ from runtime.daemon.client import ask
 from runtime.daemon.notify import Notifier
 from runtime.daemon.server import StatusServer
 from runtime.daemon.signals import Signals
+from runtime.daemon.supervise import Daemon
+from runtime.records import RefreshAccount
 from tests.daemon.rig import SMALL, TRACKING, Rig
 
 SLOW_S = 0.6
 
 
 class Served:
-    """A loop with a daemon that listens; what is asked of it is answered while the loop turns."""
+    """A run with a daemon that listens; what is asked of it is answered while it refreshes."""
 
     def __init__(self, folder: Path, **changes: dict[str, Any]) -> None:
         self.config = folder / "phasestack.toml"
         self.server = StatusServer(folder / "status.sock", group="root", clock=MonotonicClock())
-        self._signals, self._notifier = Signals(), Notifier(MonotonicClock(), {})
-        self.rig = Rig(**changes)
-        self.rig._supervisor = daemon_module.Daemon(
+        self.daemon = Daemon(
             self.config,
             Overrides(),
-            self.rig.settings,
-            signals=self._signals,
-            notifier=self._notifier,
+            signals=Signals(),
+            notifier=Notifier(MonotonicClock(), {}),
             server=self.server,
             metrics=None,
         )
+        self.rig = Rig(supervisor=self.daemon, **changes)
 
     def __enter__(self) -> Served:
         self.rig.__enter__()
-        self.rig.turn_until(TRACKING)
+        self.daemon.watches(self.rig.run)
+        self.rig.refresh_until(TRACKING)
+        self.rig.refresh_until_solved()
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -54,20 +58,25 @@ class Served:
         self.server.close()
 
     @property
-    def loop(self) -> Any:
-        return self.rig.loop
+    def run(self) -> Any:
+        return self.rig.run
+
+    @property
+    def budget(self) -> Any:
+        """Of the solver at present."""
+        return self.run.parts.budget
 
     def status(self) -> dict[str, Any]:
         return ask([self.server.path], {"command": "status"})
 
     def asked(self, name: str, value: Any = None, *, meanwhile: Callable[[], None] = lambda: None) -> dict[str, Any]:
-        """The answer to a command; the loop turns until it is there."""
+        """The answer to a command; refreshes go on until it is there."""
         answers: list[dict[str, Any]] = []
         request = {"command": name, "value": value}
         asking = threading.Thread(target=lambda: answers.append(ask([self.server.path], request, timeout_s=30.0)))
         asking.start()
         while asking.is_alive():
-            self.loop.turn()
+            self.rig.presenter.refresh()
             meanwhile()
         return answers[0]
 
@@ -91,9 +100,9 @@ def slow_loading(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("slow_loading")
-def test_the_loop_goes_on_with_the_present_scene_while_another_is_loaded(served: Served) -> None:
+def test_the_present_scene_goes_on_while_another_is_loaded(served: Served) -> None:
     told: list[tuple[str, str]] = []
-    before = served.loop.stats.frames
+    before = len(served.rig.accounts)
 
     def meanwhile() -> None:
         if len(told) < 3:
@@ -101,15 +110,21 @@ def test_the_loop_goes_on_with_the_present_scene_while_another_is_loaded(served:
             told.append((status["scene"], status.get("loading", "")))
 
     assert served.asked("scene", "sparse", meanwhile=meanwhile) == {"ok": True}
+    served.rig.refresh_until_solved()
     accounts = served.rig.accounts[before:]
     assert len(accounts) > 10
-    assert all(account.presented for account in accounts)
-    assert max(sum(account.measured_ms.values()) for account in accounts) < 1000 * SLOW_S / 2
+    assert all(account.presented and account.solution is not None for account in accounts)
+    assert longest_gap_s(accounts) < SLOW_S / 2
     assert ("demo", "reading sparse") in told
-    served.rig.turns(2)
+    served.rig.refreshes(2)
     status = served.status()
     assert (status["scene"], status.get("loading")) == ("sparse", None)
-    assert served.loop.pipeline.content.info.name == "sparse"
+    assert served.rig.content.info.name == "sparse"
+
+
+def longest_gap_s(accounts: list[RefreshAccount]) -> float:
+    """Between two refreshes."""
+    return float(np.diff([account.present_ns for account in accounts]).max()) / NS_PER_S
 
 
 def a_mesh(folder: Path, broken: str) -> Path:
@@ -133,33 +148,32 @@ def test_content_that_can_t_be_loaded_is_refused_and_the_last_good_stays(
     served: Served, tmp_path: Path, caplog: pytest.LogCaptureFixture, broken: str, field: str
 ) -> None:
     path = a_mesh(tmp_path, broken)
-    served.rig.turns(3)
-    content = served.loop.pipeline.content
+    content = served.rig.content
     answer = served.asked("scene", str(path))
     assert not answer["ok"]
     assert str(path) in answer["error"]
     assert field in answer["error"]
     assert "\n" not in answer["error"]
-    assert all(account.presented for account in served.rig.turns(3))
-    assert served.loop.pipeline.content is content
+    assert all(account.presented for account in served.rig.refreshes(3))
+    assert served.rig.content is content
     status = served.status()
     assert (status["scene"], status["refused"], status["state"]) == ("demo", answer["error"], TRACKING)
     told = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
     assert len(told) == 1
     assert answer["error"] in told[0]
     assert served.asked("scene", "sparse") == {"ok": True}
-    served.rig.turns(2)
+    served.rig.refreshes(2)
     assert "refused" not in served.status()
 
 
 def test_a_good_mesh_is_shown(served: Served, tmp_path: Path) -> None:
     path = tmp_path / "ball.glb"
     trimesh.creation.icosphere(subdivisions=3).export(path)
-    before = served.loop.layers.copy()
+    before = served.rig.presenter.last.solution.layers.copy()
     assert served.asked("scene", str(path)) == {"ok": True}
-    served.rig.turns(2)
-    assert served.loop.pipeline.content.info.name == "ball"
-    assert not np.array_equal(served.loop.layers, before)
+    served.rig.refresh_until_solved()
+    assert served.rig.content.info.name == "ball"
+    assert not np.array_equal(served.rig.presenter.last.solution.layers, before)
 
 
 @pytest.mark.usefixtures("slow_loading")
@@ -169,11 +183,11 @@ def test_a_newer_scene_overtakes_one_that_is_being_loaded(served: Served) -> Non
     first = threading.Thread(target=lambda: answers.append(ask([served.server.path], request)))
     first.start()
     while "loading" not in served.status():
-        served.loop.turn()
+        served.rig.presenter.refresh()
     assert served.asked("scene", "sparse") == {"ok": True}
     first.join(5.0)
     assert answers == [{"ok": False, "error": "overtaken by a newer change"}]
-    assert served.loop.pipeline.content.info.name == "sparse"
+    assert served.rig.content.info.name == "sparse"
 
 
 @pytest.mark.usefixtures("slow_loading")
@@ -201,46 +215,87 @@ def test_a_reload_with_another_model_is_warm_when_it_is_taken_over(served: Serve
     answer = served.asked("reload")
     assert not answer["ok"]
     assert "nothing.onnx" in answer["error"]
-    assert served.loop.pipeline.predictor.name == "balanced"
-    assert all(account.presented for account in served.rig.turns(3))
+    assert served.rig.predictor.name == "balanced"
+    assert all(account.presented for account in served.rig.refreshes(3))
+
+
+def test_changes_of_scene_model_and_settings_lose_no_refresh_and_keep_a_picture_on_the_panels(served: Served) -> None:
+    before = len(served.rig.accounts)
+    for number in range(4):
+        assert served.asked("scene", ("sparse", "texture")[number % 2]) == {"ok": True}
+        served.config.write_text(configuration(name=("balanced", "fast")[number % 2]))
+        assert served.asked("reload") == {"ok": True}
+        served.rig.refresh_until_solved()
+    accounts = served.rig.accounts[before:]
+    assert all(account.presented for account in accounts)
+    assert all(account.solution is not None for account in accounts)
+    frames = [account.frame for account in accounts]
+    assert frames == list(range(frames[0], frames[0] + len(frames)))
+    numbers = [account.solution for account in accounts]
+    assert numbers == sorted(numbers)
+    assert served.rig.presenter.stats.dropped == 0
+    assert served.rig.presenter.stats.faults == {}
+
+
+def test_what_is_paused_stays_and_is_told_and_goes_on(served: Served) -> None:
+    assert served.asked("pause") == {"ok": True}
+    served.rig.refreshes(10)  # what was under way comes yet
+    number = served.rig.accounts[-1].solution
+    accounts = served.rig.refreshes(50)
+    assert {account.solution for account in accounts} == {number}
+    assert served.status()["paused"] is True
+    assert served.asked("resume") == {"ok": True}
+    served.rig.refresh_until_solved()
+    assert served.status()["paused"] is False
+
+
+def test_the_status_tells_rates_now_ages_and_how_sure_the_eyes_are(served: Served) -> None:
+    served.rig.refreshes_for(1.2)
+    status = served.status()
+    assert 0 < status["solutions_per_s_now"] <= status["fps_now"]
+    assert status["interval_ms"]["p50"] > 0
+    assert status["photon_ms"]["p50"] > 0
+    assert status["solution_age_ms"]["p50"] is not None
+    assert status["eye_sigma_now_mm"] > 0
+    assert status["sensor_hz"] == pytest.approx(100, rel=0.5)
+    assert (status["paused"], status["flat_asked"], status["faults"]) == (False, False, {})
+    assert "psnr_db" not in status  # nobody measured it
+
+
+def items(served: Served) -> list[str]:
+    return [item["what"] for item in served.run.plan_items()]
 
 
 def test_the_plan_follows_the_viewer_and_the_content(served: Served) -> None:
+    solver = served.run.parts.solver
     served.rig.plan.eyes_m = np.array([[0.135, 0.43, 0.0], [0.09, 0.47, 0.0]])  # the right eye is off by 79.2 degrees
-    served.rig.turns(30)
-    before = [item["what"] for item in served.loop.plan_items()]
+    served.rig.refresh_until_solved(times=10)
+    before = items(served)
     assert "the right eye" not in before
     served.rig.plan.eyes_m = np.array([[0.123, 0.43, 0.0], [0.078, 0.47, 0.0]])  # 80.6 degrees
-    deadline = time.monotonic() + 10.0
-    while "the right eye" not in [item["what"] for item in served.loop.plan_items()]:
-        served.loop.turn()
-        assert time.monotonic() < deadline
-    assert served.loop.pipeline.plan.eyes == (True, False)
-    assert "the right eye" in [item["what"] for item in served.loop.summary()["plan"]]
+    served.rig.refresh_until(lambda: "the right eye" in items(served))
+    served.rig.refresh_until(lambda: solver.plan.eyes == (True, False))
+    served.rig.refresh_until(lambda: served.rig.presenter.last.solution.seeing == (True, False))
+    assert "the right eye" in [item["what"] for item in served.run.summary()["plan"]]
     served.rig.plan.eyes_m = np.array([[0.7, -0.031, 0.0], [0.7, 0.031, 0.0]])
-    while served.loop.pipeline.plan.eyes != (True, True):
-        served.loop.turn()
-        assert time.monotonic() < deadline
+    served.rig.refresh_until(lambda: solver.plan.eyes == (True, True))
     assert served.asked("scene", "moving") == {"ok": True}
-    served.rig.turns(2)
+    served.rig.refreshes(2)
     assert "render and inference" in before
     assert "render and inference" not in [item["what"] for item in served.status()["plan"]]
 
 
-def test_a_still_head_costs_no_inference_whatever_its_sensor_s_noise(served: Served) -> None:
+def test_a_head_at_rest_costs_no_solution_whatever_its_sensor_s_noise(served: Served) -> None:
     served.rig.plan.sway_m, served.rig.plan.noise_m = 0.0, 0.0015
-    deadline = time.monotonic() + 10.0
-    while served.loop._rest.place is None:
-        served.loop.turn()
-        assert time.monotonic() < deadline
-    served.rig.turns(3)
-    accounts = served.rig.turns(200)
+    served.rig.refresh_until(lambda: served.rig.accounts[-1].eyes_label == "rested")
+    served.rig.refreshes_for(0.3)  # its last solution comes
+    accounts = served.rig.refreshes(200)
     assert [account.inference for account in accounts] == ["reused"] * 200
     assert all(account.presented for account in accounts)
-    (item,) = [item for item in served.loop.plan_items() if item["what"] == "render and inference"]
-    assert item["saves_ms"] > 0
-    assert item["costs_db"] is None  # what the eyes would have seen of a fresh frame is not known here
+    assert {account.eyes_label for account in accounts} == {"rested"}
     assert len({account.eyes_m.tobytes() for account in accounts}) == 1
+    (item,) = [item for item in served.run.plan_items() if item["what"] == "render and inference"]
+    assert item["saves_ms"] > 0
+    assert item["costs_db"] is None  # what the eyes would have seen of a fresh solution is not known here
     served.rig.plan.eyes_m = served.rig.plan.eyes_m + np.array([0.0, 0.02, 0.0])
-    while served.loop.turn().inference != "ran":
-        assert time.monotonic() < deadline
+    served.rig.refresh_until_solved()

@@ -1,10 +1,13 @@
-"""Faults are injected into the real loop: it degrades, says why, goes on, and recovers. One test each."""
+"""Faults are injected into a real run: it degrades, says why, goes on without losing a refresh, and recovers."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,20 +16,48 @@ from runtime.clock import NS_PER_S, MonotonicClock
 from runtime.daemon.notify import Notifier
 from runtime.errors import ContentFailure, InputError, ModelFailure, SensorLost
 from runtime.model.session import ModelSession
+from runtime.records import RefreshAccount
 from runtime.sensor.recording import Recording
-from tests.daemon.rig import TRACKING, BreakablePanels, BreakablePredictor, Rig
+from tests.daemon.rig import TRACKING, BreakablePredictor, Rig
 from tests.daemon.test_notify import Supervisor
+
+SLEEP_S = 2.0  # of a model that takes its time
+PROMPT = {"solver_late_s": 0.3, "solver_abandon_s": 0.8}  # how soon a solver is told as late, and left behind
 
 
 @pytest.fixture
-def rig():
+def rig() -> Iterator[Rig]:
     with Rig() as made:
-        made.turn_until(TRACKING)
+        made.refresh_until(TRACKING)
+        made.refresh_until_solved()
         yield made
 
 
-def presented_all(accounts) -> bool:
+@pytest.fixture
+def watched() -> Iterator[Rig]:
+    """The same, whose solver is soon told as late and left behind."""
+    with Rig(loop=PROMPT) as made:
+        made.refresh_until_solved(times=3)
+        made.refresh_until(TRACKING)
+        yield made
+
+
+def presented_all(accounts: list[RefreshAccount]) -> bool:
     return all(account.presented for account in accounts)
+
+
+def longest_gap_s(accounts: list[RefreshAccount]) -> float:
+    """Between two refreshes, or between an eye's capture and its light."""
+    return float(np.diff([account.present_ns for account in accounts]).max()) / NS_PER_S
+
+
+def alignments(rig: Rig, count: int) -> int:
+    """How many different alignments so many refreshes have."""
+    found = set()
+    for _ in range(count):
+        rig.presenter.refresh()
+        found.add(rig.presenter.last.frame.solved_from_shown[0].tobytes())
+    return len(found)
 
 
 @pytest.mark.parametrize(
@@ -34,138 +65,214 @@ def presented_all(accounts) -> bool:
 )
 def test_a_sensor_that_raises_degrades_and_comes_back(rig, fault):
     rig.plan.fault = fault
-    rig.turn_until("degraded: sensor")
-    assert str(fault.args[-1]) in rig.loop.machine.reason
-    assert presented_all(rig.turns(3))
+    rig.refresh_until("degraded: sensor")
+    assert str(fault.args[-1]) in rig.presenter.machine.reason
+    assert presented_all(rig.refreshes(3))
     rig.plan.fault = None
-    rig.turn_until(TRACKING)
+    rig.refresh_until(TRACKING)
     assert rig.plan.opened >= 2
 
 
 def test_a_sensor_that_hangs_is_left_behind_and_opened_anew(rig):
     rig.plan.hang.set()
-    rig.turn_until("degraded: sensor")
-    longest_ms = max(sum(account.measured_ms.values()) for account in rig.turns(5))
-    assert longest_ms < 1000 * rig.settings.sensor.timeout_s * 20  # the loop never waits for it
+    rig.refresh_until("degraded: sensor")
+    assert longest_gap_s(rig.refreshes(5)) < 20 * rig.settings.sensor.timeout_s  # no refresh waits for it
     rig.plan.hang.clear()
-    rig.turn_until(TRACKING)
+    rig.refresh_until(TRACKING)
     assert rig.plan.opened >= 2
 
 
 def test_a_sensor_that_can_not_be_opened_is_waited_for(rig):
     rig.plan.fault = rig.plan.refuse = SensorLost("unplugged")
-    rig.turn_until("degraded: sensor")
-    assert presented_all(rig.turns(3))
+    rig.refresh_until("degraded: sensor")
+    assert presented_all(rig.refreshes(3))
     rig.plan.fault = rig.plan.refuse = None
-    rig.turn_until(TRACKING)
+    rig.refresh_until(TRACKING)
 
 
 def test_a_sensor_that_never_will_be_ends_the_run_with_one_line(rig):
     rig.plan.fault = SensorLost("unplugged")
     rig.plan.refuse = InputError("sensor", "driver", "is not allowed here")
     with pytest.raises(InputError, match="not allowed here"):
-        rig.turns(10_000)
+        rig.refreshes(10_000)
+
+
+def held_as_it_was(rig: Rig) -> tuple[int, np.ndarray]:
+    """Number of the solution that is shown, and a copy of its layers."""
+    solution = rig.presenter.last.solution
+    return solution.number, solution.layers.copy()
 
 
 @pytest.mark.parametrize("fault", [ModelFailure("out of memory"), RuntimeError("unexpected"), MemoryError()])
-def test_a_model_that_raises_keeps_the_last_picture(rig, fault):
-    def fail(images, eyes_m):
+def test_a_model_that_raises_keeps_the_last_solution_aligned_to_the_eyes(rig, fault):
+    def fail(images: Any, eyes_m: Any, **how: Any) -> Any:
         raise fault
 
-    rig.loop.pipeline.predictor = predictor = BreakablePredictor(rig.loop.pipeline.predictor)
-    rig.turns(2)
-    before = rig.loop.layers.copy()
+    predictor = rig.break_predictor()
+    rig.refresh_until_solved(times=2)
     predictor.answer = fail
-    account = rig.turn_until("degraded: model")
+    account = rig.refresh_until("degraded: model")
     assert account.presented
-    assert np.array_equal(rig.loop.layers, before)
-    assert rig.loop.stats.faults["model"] >= 1
+    number, layers = held_as_it_was(rig)
+    assert alignments(rig, 50) > 10
+    assert rig.presenter.last.solution.number == number
+    assert np.array_equal(rig.presenter.last.frame.solved, layers)
+    assert rig.presenter.stats.faults["model"] >= 1
+    assert presented_all(rig.accounts)
     predictor.answer = None
-    rig.turn_until(TRACKING)
+    rig.refresh_until(TRACKING)
+    rig.refresh_until_solved()
 
 
 def test_a_model_that_answers_nan_is_a_model_that_failed(rig, monkeypatch):
-    rig.turns(2)
-    before = rig.loop.layers.copy()
     with monkeypatch.context() as patch:
         patch.setattr(ModelSession, "run", lambda *_, output_shape: np.full(output_shape, np.nan, np.float32))
-        account = rig.turn_until("degraded: model", within_s=2.0)
+        account = rig.refresh_until("degraded: model")
         assert account.presented
-        assert np.array_equal(rig.loop.layers, before)
-    rig.turn_until(TRACKING)
+        number, _ = held_as_it_was(rig)
+        rig.refreshes(20)
+        assert rig.presenter.last.solution.number == number
+    rig.refresh_until(TRACKING)
 
 
 @pytest.mark.parametrize("fault", [ContentFailure("no such frame"), ZeroDivisionError()])
 def test_content_that_raises_keeps_the_last_picture(rig, fault, monkeypatch):
-    def fail(*arguments, **keywords):
+    def fail(*arguments: Any, **keywords: Any) -> Any:
         raise fault
 
-    rig.turns(2)
     with monkeypatch.context() as patch:
-        patch.setattr(rig.loop.pipeline.content, "render", fail)
-        patch.setattr(rig.loop.pipeline.content, "revision", lambda time_ns: time_ns)
-        account = rig.turn_until("degraded: content")
+        patch.setattr(rig.content, "render", fail)
+        patch.setattr(rig.content, "revision", lambda time_ns: time_ns)
+        account = rig.refresh_until("degraded: content")
         assert account.presented
-    rig.turn_until(TRACKING)
+        assert presented_all(rig.refreshes(20))
+    rig.refresh_until(TRACKING)
+
+
+# --- a solver that is slow, fails or hangs costs no refresh --------------------------------------------------------
+
+
+def slow_once(rig: Rig, predictor: BreakablePredictor, seconds: float) -> threading.Event:
+    """The next solution takes so long; set when it begins."""
+    begun = threading.Event()
+
+    def slow(images: Any, eyes_m: Any, **how: Any) -> Any:
+        predictor.answer = None
+        begun.set()
+        time.sleep(seconds)
+        return predictor.well(images, eyes_m, **how)
+
+    predictor.answer = slow
+    return begun
+
+
+def test_a_model_that_sleeps_for_two_seconds_costs_no_refresh_and_the_picture_follows_the_eyes(watched):
+    predictor = watched.break_predictor()
+    watched.refresh_until_solved(times=3)
+    dropped = watched.presenter.stats.dropped
+    begun = slow_once(watched, predictor, SLEEP_S)
+    watched.refresh_until(begun.is_set)
+    watched.presenter.solver._abandon_ns = 60 * NS_PER_S  # it is slow, and does not hang
+    number = watched.presenter.last.solution.number
+    asleep = watched.refreshes_for(0.7 * SLEEP_S)
+    assert {account.solution for account in asleep} == {number}
+    assert presented_all(asleep)
+    assert watched.presenter.stats.dropped == dropped
+    assert longest_gap_s(asleep) < SLEEP_S / 4
+    assert len(asleep) > 0.3 * 0.7 * SLEEP_S * watched.settings.loop.rate_hz  # of a busy machine
+    assert len({account.eyes_m.tobytes() for account in asleep}) > len(asleep) / 4
+    assert watched.presenter.machine.name == "degraded: model"
+    assert "has not answered" in watched.presenter.machine.reason
+    watched.refresh_until_solved(times=2)
+    watched.refresh_until(TRACKING)
+
+
+def test_a_model_that_never_returns_is_left_behind_and_the_solver_is_made_anew(watched):
+    gate = threading.Event()
+
+    def hang(images: Any, eyes_m: Any, **how: Any) -> Any:
+        gate.wait(60.0)
+        raise ModelFailure("too late")
+
+    try:
+        predictor = watched.break_predictor()
+        watched.refresh_until_solved()
+        predictor.answer = hang
+        watched.refresh_until("degraded: model")
+        begun = len(watched.accounts)
+        watched.refresh_until(TRACKING)
+        watched.refresh_until_solved(times=2)
+        while_hung = watched.accounts[begun:]
+        assert presented_all(while_hung)
+        assert longest_gap_s(while_hung) < PROMPT["solver_abandon_s"]
+        assert watched.presenter.solver.restarts == 1
+        assert watched.presenter.solver.left_behind == 1
+        assert watched.predictor is not predictor
+    finally:
+        gate.set()
+
+
+def test_after_a_suspended_machine_it_does_not_look_too_far_ahead_for_ever(rig):
+    predictor = rig.break_predictor()
+    begun = slow_once(rig, predictor, 20 * rig.settings.tracker.hold_s)
+    rig.refresh_until(begun.is_set)
+    rig.refresh_until_solved(times=20)
+    age_ms = [account.solution_age_ms for account in rig.refreshes(20)]
+    assert np.median(np.abs(age_ms)) < 1000 * rig.settings.tracker.hold_s * 5
+    rig.refresh_until(TRACKING)
+
+
+# --- panels --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("why", ["DUMMY1 was disconnected", "a panel's window was closed", "the X server died"])
-def test_a_lost_panel_drops_frames_and_comes_back_with_the_newest(rig, why):
-    rig.loop.panels = panels = BreakablePanels(rig.loop.panels)
+def test_a_lost_panel_drops_refreshes_and_comes_back_with_the_newest(rig, why):
+    panels = rig.break_panels()
     panels.lost = why
-    account = rig.turn_until("degraded: panel")
+    account = rig.refresh_until("degraded: panel")
     assert not account.presented
-    assert why in rig.loop.machine.reason
-    dropped = rig.loop.stats.dropped
-    lost = rig.turns(5)
-    assert rig.loop.stats.dropped == dropped + 5
+    assert why in rig.presenter.machine.reason
+    dropped = rig.presenter.stats.dropped
+    lost = rig.refreshes(5)
+    assert rig.presenter.stats.dropped == dropped + 5
     panels.lost = ""
-    account = rig.turn_until(TRACKING)
+    account = rig.refresh_until(TRACKING)
     assert account.presented
     assert panels.shown[-1].number > lost[-1].frame
 
 
 def test_several_faults_are_all_named(rig):
-    rig.loop.panels = panels = BreakablePanels(rig.loop.panels)
+    panels = rig.break_panels()
     panels.lost = "gone"
     rig.plan.fault = SensorLost("unplugged")
-    rig.turn_until("degraded: sensor, panel")
+    rig.refresh_until("degraded: sensor, panel")
     panels.lost, rig.plan.fault = "", None
-    rig.turn_until(TRACKING)
+    rig.refresh_until(TRACKING)
+
+
+# --- nonsense from the sensor --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("jump_s", [-3600, -5, 5, 3600])
 def test_a_sensor_clock_that_jumps_leaves_no_nonsense_on_the_panels(rig, jump_s):
     rig.plan.clock_jump_ns = jump_s * NS_PER_S
-    for account in rig.turns(30):
+    for account in rig.refreshes(30):
         assert account.presented
         assert account.eyes_m is None or np.abs(account.eyes_m - rig.plan.eyes_m).max() < 0.1
     rig.plan.clock_jump_ns = 0
-    rig.turn_until(TRACKING)
+    rig.refresh_until(TRACKING)
 
 
 @pytest.mark.parametrize("place_m", [(-0.5, 0.0, 0.0), (0.05, 0.0, 0.0), (np.nan, 0.0, 0.0), (1e9, 0.0, 0.0)])
-def test_eyes_at_impossible_places_never_stop_the_loop(rig, place_m):
+def test_eyes_at_impossible_places_never_stop_it(rig, place_m):
     well = rig.plan.eyes_m
     rig.plan.eyes_m = np.array(place_m) + np.array([[0.0, -0.031, 0.0], [0.0, 0.031, 0.0]])
-    assert presented_all(rig.turns(30))
+    assert presented_all(rig.refreshes(30))
     rig.plan.eyes_m = well
-    rig.turn_until(TRACKING)
+    rig.refresh_until(TRACKING)
 
 
-def test_one_very_slow_turn_does_not_make_it_look_too_far_ahead_for_ever(rig):
-    rig.loop.pipeline.predictor = predictor = BreakablePredictor(rig.loop.pipeline.predictor)
-    whole = predictor._predictor.predict
-
-    def slow(images, eyes_m):
-        time.sleep(20 * rig.settings.tracker.hold_s)  # a machine that was suspended, or swapped
-        predictor.answer = None
-        return whole(images, eyes_m)
-
-    predictor.answer = slow
-    rig.turns(1)
-    assert predictor.answer is None
-    rig.turn_until(TRACKING, within_s=3.0)
+# --- the watchdog --------------------------------------------------------------------------------------------------
 
 
 class Watched:
@@ -177,42 +284,66 @@ class Watched:
     def stop_reason(self) -> str:
         return ""
 
-    def obey(self, loop) -> None:
+    def obey(self, presenter: Any) -> None:
         return
 
-    def turn(self, loop, account) -> None:
-        self.notifier.turn(loop.machine.state, loop.machine.missing, presented=account.presented)
+    def refreshed(self, presenter: Any, account: RefreshAccount) -> None:
+        self.notifier.refreshed(presenter.machine.state, presenter.machine.missing, presented=account.presented)
 
 
-def test_a_frame_that_takes_for_ever_starves_the_watchdog(tmp_path, monkeypatch):
-    heard = Supervisor(str(tmp_path / "notify"))
+WATCHDOG_S = 0.4
+
+
+@pytest.fixture
+def heard(tmp_path, monkeypatch) -> Iterator[Supervisor]:
+    made = Supervisor(str(tmp_path / "notify"))
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
-    period_s = 0.4
-    notifier = Notifier(MonotonicClock(), {"WATCHDOG_USEC": str(int(period_s * 1e6))})
-    with Rig(supervisor=Watched(notifier)) as rig:
-        rig.turn_until(TRACKING)
-        rig.turns(20)
-        assert "WATCHDOG=1" in heard.heard()
-        rig.loop.pipeline.predictor = predictor = BreakablePredictor(rig.loop.pipeline.predictor)
-        spoken = []
+    yield made
+    made.close()
 
-        def slow(images, eyes_m):
-            time.sleep(period_s * 1.5)
-            spoken.extend(heard.heard())
-            raise ModelFailure("too slow")
 
-        rig.turns(1)
-        heard.heard()
-        predictor.answer = slow
-        rig.turns(2)
-        assert spoken.count("WATCHDOG=1") <= 1  # at most one from the turn between: nothing feeds it beside the loop
-        predictor.answer = None
-        rig.turn_until(TRACKING)
-        time.sleep(period_s / 2)
-        rig.turns(2)
+@pytest.fixture
+def fed(heard) -> Iterator[Rig]:
+    notifier = Notifier(MonotonicClock(), {"WATCHDOG_USEC": str(int(WATCHDOG_S * 1e6))})
+    with Rig(supervisor=Watched(notifier), loop=PROMPT | {"solver_abandon_s": 60.0}) as rig:
+        rig.refresh_until_solved()
+        rig.refresh_until(TRACKING)
         assert "WATCHDOG=1" in heard.heard()
+        yield rig
     notifier.close()
-    heard.close()
+
+
+def test_a_solver_that_hangs_does_not_starve_the_watchdog(fed, heard):
+    """The presenter's clock alone feeds it: there is a picture, it follows the eyes, and the solver is made anew."""
+    gate = threading.Event()
+    predictor = fed.break_predictor()
+    predictor.answer = lambda images, eyes_m, **how: gate.wait(60.0) and predictor.well(images, eyes_m, **how)
+    fed.refresh_until("degraded: model")
+    heard.heard()
+    fed.refreshes_for(2 * WATCHDOG_S)
+    gate.set()
+    assert heard.heard().count("WATCHDOG=1") >= 2
+
+
+def test_a_refresh_that_takes_for_ever_starves_the_watchdog(fed, heard):
+    panels, spoken = fed.break_panels(keep=False), []
+    present = panels.present
+
+    def slow(frame: Any, *, unchanged: bool = False) -> Any:
+        heard.heard()
+        time.sleep(WATCHDOG_S * 1.5)
+        spoken.extend(heard.heard())
+        return present(frame, unchanged=unchanged)
+
+    panels.present = slow  # type: ignore[method-assign]
+    fed.refreshes(1)
+    assert "WATCHDOG=1" not in spoken  # nothing feeds it beside the presenter: the solver went on meanwhile
+    panels.present = present  # type: ignore[method-assign]
+    fed.refreshes_for(WATCHDOG_S)
+    assert "WATCHDOG=1" in heard.heard()
+
+
+# --- files and logs ------------------------------------------------------------------------------------------------
 
 
 FILL_THE_DISK = """
@@ -264,8 +395,8 @@ def test_a_disk_that_fills_up_while_recording_is_told_in_one_line(disk_filled):
 def test_transitions_are_logged_once_each(rig, caplog):
     caplog.set_level("INFO", logger="phasestack")
     rig.plan.fault = SensorLost("unplugged")
-    rig.turn_until("degraded: sensor")
-    rig.turns(20)
+    rig.refresh_until("degraded: sensor")
+    rig.refreshes(20)
     told = [record.getMessage() for record in caplog.records if "-> degraded: sensor" in record.getMessage()]
     assert len(told) == 1
     assert "unplugged" in told[0]

@@ -38,10 +38,29 @@ def test_people_read_time_level_message_and_values():
     assert stream.getvalue().split(" ", 1)[1] == "warning sensor lost driver=openni2 tries=3\n"
 
 
-def test_journald_gets_a_priority_on_every_line_and_no_time():
+def test_journald_gets_a_priority_and_no_time():
     stream = logged(environment={"JOURNAL_STREAM": "8:1"})
-    log.error("first\nsecond")
-    assert stream.getvalue() == "<3>first\n<3>second\n"
+    log.error("first")
+    assert stream.getvalue() == "<3>first\n"
+
+
+@pytest.mark.parametrize("environment", [{}, {"JOURNAL_STREAM": "8:1"}])
+def test_no_name_in_a_message_forges_a_line(environment):
+    stream = logged(environment=environment)
+    log.error("unknown scene %s", "x\n<6>12:00:00 info all is well\x1b[2J\0")
+    assert stream.getvalue().count("\n") == 1 and "\x1b" not in stream.getvalue() and "\0" not in stream.getvalue()
+
+
+def test_a_traceback_is_in_a_file_that_the_line_names(tmp_path, monkeypatch):
+    monkeypatch.setenv("LOGS_DIRECTORY", str(tmp_path))
+    stream = logged()
+    try:
+        raise ValueError("boom")
+    except ValueError:
+        log.exception("failed")
+    assert stream.getvalue().count("\n") == 1 and "Traceback" not in stream.getvalue()
+    (file,) = tmp_path.iterdir()
+    assert str(file) in stream.getvalue() and "Traceback" in file.read_text() and file.stat().st_mode & 0o777 == 0o600
 
 
 def test_machines_get_one_object_a_line_with_the_events_own_fields():

@@ -9,16 +9,17 @@ import pytest
 
 from runtime.daemon.metrics import LOOPBACK, Metrics
 from runtime.errors import InputError
-from runtime.records import FrameAccount, State
+from runtime.records import RefreshAccount, State
 
 
 def account(**changes):
     values = {
-        "frame": 1, "capture_ns": 1_000_000_000, "predicted_for_ns": 0, "present_ns": 1_070_000_000, "eyes_m": None,
-        "eyes_label": "predicted", "state": State.TRACKING, "inference": "ran", "presented": True, "skew_ms": 0.3,
+        "frame": 1, "capture_ns": 1_000_000_000, "predicted_for_ns": 0, "present_ns": 1_062_000_000, "eyes_m": None,
+        "eyes_label": "predicted", "eye_sigma_mm": 2.5, "state": State.TRACKING, "solution": 7, "solved_for_m": None,
+        "solution_age_ms": 42.0, "inference": "ran", "presented": True, "skew_ms": 0.3, "photon_ns": 1_070_000_000,
         "stage_ms": {"render": 3.0, "inference": 12.5},
     }  # fmt: skip
-    return FrameAccount(**(values | changes))
+    return RefreshAccount(**(values | changes))
 
 
 def free_port() -> int:
@@ -40,31 +41,53 @@ def scraped(port: int) -> dict[str, float]:
     return {name: float(value) for name, value in (line.rsplit(" ", 1) for line in lines if not line.startswith("#"))}
 
 
-def test_frames_stages_faults_and_state_are_told(metrics):
+def test_refreshes_solutions_stages_faults_and_state_are_told(metrics):
     port = free_port()
     metrics.serve(port)
-    metrics.frame(account())
-    metrics.frame(account(presented=False, state=State.DEGRADED, inference="reused"))
+    metrics.refresh(account())
+    metrics.refresh(account(inference="reused", present_ns=1_078_000_000, photon_ns=1_086_000_000))
+    metrics.refresh(account(presented=False, state=State.DEGRADED, inference="skipped", solution_age_ms=None))
     metrics.fault("sensor")
-    metrics.missed_vblanks(2)
-    metrics.fps(59.5)
+    metrics.missed_blanks(2)
+    metrics.missed_blanks(0)
     told = scraped(port)
-    assert told['phasestack_frames_total{result="presented"}'] == 1
-    assert told['phasestack_frames_total{result="dropped"}'] == 1
-    assert told['phasestack_stage_milliseconds_sum{stage="inference"}'] == 25.0
+    assert told['phasestack_refreshes_total{result="presented"}'] == 2
+    assert told['phasestack_refreshes_total{result="dropped"}'] == 1
+    assert told['phasestack_solutions_total{result="ran"}'] == 1
+    assert told['phasestack_stage_milliseconds_sum{stage="inference"}'] == 37.5
     assert told['phasestack_stage_milliseconds_bucket{le="12.0",stage="inference"}'] == 0
-    assert told["phasestack_photon_latency_milliseconds_sum"] == 70.0
+    assert told["phasestack_photon_latency_milliseconds_sum"] == 70.0 + 86.0
+    assert told["phasestack_interval_milliseconds_sum"] == 16.0
+    assert told["phasestack_solution_age_milliseconds_count"] == 2
+    assert told["phasestack_eye_sigma_millimetres_sum"] == 7.5
     assert told['phasestack_state{phasestack_state="degraded"}'] == 1
     assert told['phasestack_state{phasestack_state="tracking"}'] == 0
     assert told['phasestack_faults_total{part="sensor"}'] == 1
-    assert told["phasestack_missed_vblanks_total"] == 2
-    assert told["phasestack_presented_frames_per_second"] == 59.5
+    assert told["phasestack_missed_blanks_total"] == 2
+
+
+def test_nothing_is_told_that_was_not_measured(metrics):
+    """No gauge stands at 0.0 for a quality that nobody looked at, and no rate is a mean since the start."""
+    port = free_port()
+    metrics.serve(port)
+    metrics.refresh(account(solution_age_ms=None, eye_sigma_mm=None, capture_ns=0))
+    told = scraped(port)
+    for name in ("solution_age_milliseconds", "eye_sigma_millimetres", "photon_latency_milliseconds"):
+        assert told[f"phasestack_{name}_count"] == 0
+    assert not [name for name in told if "psnr" in name or "fps" in name or "per_second" in name]
+
+
+def test_a_refresh_that_reached_no_panel_parts_two_intervals(metrics):
+    port = free_port()
+    metrics.serve(port)
+    for number, presented in enumerate([True, False, True, True]):
+        metrics.refresh(account(presented=presented, present_ns=1_000_000_000 + number * 16_000_000))
+    assert scraped(port)["phasestack_interval_milliseconds_count"] == 1
 
 
 def test_it_listens_on_loopback_only(metrics):
     metrics.serve(free_port())
-    server, _ = metrics._server
-    assert server.server_address[0] == LOOPBACK
+    assert metrics.address[0] == LOOPBACK
 
 
 def test_a_port_that_is_taken_is_named(metrics):

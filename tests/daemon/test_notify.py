@@ -70,24 +70,24 @@ def test_presented_frames_feed_the_watchdog_four_times_a_period_at_most(supervis
     clock = SimulatedClock()
     notifier = watched(clock)
     for _ in range(100):  # a second of 100 frames/s
-        notifier.turn(State.TRACKING, (), presented=True)
+        notifier.refreshed(State.TRACKING, (), presented=True)
         clock.advance_ns(10 * NS_PER_MS)
     assert supervisor.heard() == ["WATCHDOG=1"] * 4
 
 
-def test_turns_that_present_nothing_starve_the_watchdog(supervisor):
+def test_refreshes_that_present_nothing_starve_the_watchdog(supervisor):
     clock = SimulatedClock()
     notifier = watched(clock)
     for state, missing in ((State.TRACKING, ()), (State.DEGRADED, ("sensor",)), (State.STARTING, ("panel",))):
         clock.advance_ns(2000 * NS_PER_MS)
-        notifier.turn(state, missing, presented=False)
+        notifier.refreshed(state, missing, presented=False)
     assert supervisor.heard() == []
 
 
-def test_while_a_panel_is_missing_completed_turns_feed_it(supervisor):
+def test_while_a_panel_is_missing_completed_refreshes_feed_it(supervisor):
     clock = SimulatedClock()
     notifier = watched(clock)
-    notifier.turn(State.DEGRADED, ("sensor", "panel"), presented=False)
+    notifier.refreshed(State.DEGRADED, ("sensor", "panel"), presented=False)
     assert supervisor.heard() == ["WATCHDOG=1"]
 
 
@@ -95,7 +95,7 @@ def test_while_a_panel_is_missing_completed_turns_feed_it(supervisor):
     "environment", [{}, {"WATCHDOG_USEC": "x"}, {"WATCHDOG_USEC": "0"}, {"WATCHDOG_USEC": "9", "WATCHDOG_PID": "1"}]
 )
 def test_a_watchdog_that_is_not_ours_is_not_fed(supervisor, environment):
-    Notifier(SimulatedClock(), environment).turn(State.TRACKING, (), presented=True)
+    Notifier(SimulatedClock(), environment).refreshed(State.TRACKING, (), presented=True)
     assert supervisor.heard() == []
 
 
@@ -122,7 +122,7 @@ def test_a_supervisor_that_does_not_listen_blocks_nobody(supervisor):
     notifier = watched(clock)
     for _ in range(5000):  # far more than a datagram socket holds
         clock.advance_ns(1000 * NS_PER_MS)
-        notifier.turn(State.TRACKING, (), presented=True)
+        notifier.refreshed(State.TRACKING, (), presented=True)
     notifier.close()
     notifier.close()
 

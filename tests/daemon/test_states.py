@@ -1,4 +1,4 @@
-"""The daemon's states: what each turn finds decides, and each transition is told once with its reason."""
+"""The daemon's states: what each refresh finds decides, and each transition is told once with its reason."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from runtime.frame.states import PARTS, Conditions, StateMachine, judge
 from runtime.records import State
 
-EYES = st.sampled_from(["exact", "interpolated", "predicted", "held", "none"])
+EYES = st.sampled_from(["exact", "interpolated", "predicted", "rested", "held", "none"])
 CONDITIONS = st.builds(
     Conditions,
     eyes=EYES,
@@ -16,6 +16,8 @@ CONDITIONS = st.builds(
     presented=st.booleans(),
     flat_wanted=st.booleans(),
     stopping=st.sampled_from(["", "SIGTERM"]),
+    limited=st.sampled_from(["", "too far"]),
+    paused=st.booleans(),
 )
 
 
@@ -26,12 +28,20 @@ def well(eyes="predicted", **changes) -> Conditions:
 def test_eyes_decide_where_nothing_is_missing():
     assert judge(well("exact"))[0] is State.TRACKING
     assert judge(well("predicted"))[0] is State.TRACKING
+    assert judge(well("rested"))[0] is State.TRACKING
     assert judge(well("held"))[0] is State.HOLDING
     assert judge(well("none"))[0] is State.FLAT
 
 
 def test_flat_can_be_asked_for_while_eyes_are_seen():
     assert judge(well(flat_wanted=True)) == (State.FLAT, "asked for")
+
+
+def test_a_paused_picture_and_an_alignment_at_its_limit_are_told_beside_the_state():
+    assert judge(well(paused=True)) == (State.TRACKING, "eyes seen; the picture is paused")
+    state, reason = judge(well("held", limited="the eyes are 3 m away"))
+    assert state is State.HOLDING
+    assert "alignment at its limit until the next solution: the eyes are 3 m away" in reason
 
 
 def test_what_is_missing_is_named_with_its_reason():

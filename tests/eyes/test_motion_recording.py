@@ -1,13 +1,25 @@
 """A benchmark's motion as a recording: what the pipeline replays is what the benchmark's tracker sees."""
 
+import json
+
 import numpy as np
 import pytest
+import typer
+from typer.testing import CliRunner
 
 from runtime.commands.motion_recording import write_motion
+from runtime.commands.record import record
 from runtime.errors import InputError
 from runtime.eyes.demo_geometry import demo_stack_from_sensor
-from runtime.eyes.motions import observe, true_eyes
+from runtime.eyes.motions import MOTIONS, observe, path_of, true_eyes
 from runtime.sensor.recording import Recording
+
+app = typer.Typer()
+app.command()(record)
+
+
+def truth_of(path):
+    return np.array([frame.true_eyes_m for frame in Recording(path).samples()])
 
 
 def test_samples_are_the_observations_through_the_demos_calibration(tmp_path):
@@ -21,6 +33,57 @@ def test_samples_are_the_observations_through_the_demos_calibration(tmp_path):
             np.testing.assert_allclose(place, seen.points.eyes_m, atol=1e-6)
     truth = true_eyes("walk", np.array([f.capture_ns for f in frames]) / 1e9)
     np.testing.assert_allclose([f.true_eyes_m for f in frames], truth, atol=1e-6)
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_another_seed_is_another_path_and_not_only_other_noise(tmp_path, motion):
+    for seed in (1, 2):
+        write_motion(tmp_path / f"{seed}.mcap", motion, seed=seed, seconds=4.0)
+        write_motion(tmp_path / f"{seed}-again.mcap", motion, seed=seed, seconds=4.0)
+        assert (tmp_path / f"{seed}.mcap").read_bytes() == (tmp_path / f"{seed}-again.mcap").read_bytes()
+    apart = np.abs(truth_of(tmp_path / "1.mcap") - truth_of(tmp_path / "2.mcap")).max()
+    assert apart > {"still": 0.001, "nod": 0.01}.get(motion, 0.05)
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize("seed", range(1, 9))
+def test_every_path_is_a_motion_of_its_kind(motion, seed):
+    eyes = true_eyes(motion, np.arange(0, 20, 1e-3), path=path_of(seed))
+    np.testing.assert_allclose(np.linalg.norm(eyes[:, 1] - eyes[:, 0], axis=1), 0.063, atol=1e-9)
+    speed = np.linalg.norm(np.diff(eyes.mean(1), axis=0), axis=1) / 1e-3
+    most = {"still": 0.02, "lean": 0.5, "nod": 0.5, "walk": 1.9, "stop-and-go": 1.7}[motion]
+    assert most / 20 < speed.max() < most and (eyes[:, :, 0] > 0.2).all()
+
+
+@pytest.mark.parametrize("rate_hz", [15, 60, 240])
+def test_the_command_makes_any_of_them(tmp_path, rate_hz):
+    out = tmp_path / "new" / "nod.mcap"
+    how = ["--motion", "nod", "--seed", "7", "--rate-hz", str(rate_hz), "--noise-mm", "0", "--seconds", "2"]
+    answer = CliRunner().invoke(app, [*how, "--out", str(out), "--json"])
+    assert answer.exit_code == 0, answer.output
+    told = json.loads(answer.stdout)
+    frames = list(Recording(out).samples())
+    assert told["samples"] == len(frames) == 2 * rate_hz and told["seed"] == 7
+    steps = np.diff([f.capture_ns for f in frames]) * rate_hz / 1e9
+    np.testing.assert_allclose(steps, 1.0, atol=1e-6)
+    pose = demo_stack_from_sensor()
+    off = [np.abs(f.eyes.eyes_m @ pose[:3, :3].T + pose[:3, 3] - f.true_eyes_m).max() for f in frames if f.eyes]
+    assert np.median(off) < 1e-6  # without noise what is measured is the truth, outliers apart
+
+
+@pytest.mark.parametrize(
+    ("how", "names"),
+    [
+        (["--motion", "moonwalk"], "stop-and-go"),
+        (["--motion", "walk", "--images"], "--images"),
+        (["--seed", "3"], "--seed"),
+        (["--motion", "walk", "--seconds", "1e9"], "--seconds"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_by_name_and_leaves_nothing(tmp_path, how, names):
+    answer = CliRunner().invoke(app, [*how, "--out", str(tmp_path / "a.mcap")])
+    assert isinstance(answer.exception, InputError) and names in str(answer.exception)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_unknown_motion_is_refused_and_the_known_ones_are_listed(tmp_path):

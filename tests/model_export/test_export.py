@@ -20,7 +20,7 @@ from model_export.network import SpectralSolver  # noqa: E402
 from model_export.recipe import read_recipe  # noqa: E402
 from model_export.ship import shipped_bytes  # noqa: E402
 from model_export.validate import check_model, validate_file  # noqa: E402
-from runtime.cli import app  # noqa: E402
+from runtime.commands.app import app  # noqa: E402
 from runtime.errors import InputError  # noqa: E402
 from runtime.model.predictor import SHIPPED, load_predictor, model_path  # noqa: E402
 from runtime.model.still import solve_still  # noqa: E402

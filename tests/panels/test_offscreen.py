@@ -11,6 +11,7 @@ import pytest
 from runtime.clock import SimulatedClock
 from runtime.config import OutputSettings, PanelSettings
 from runtime.errors import InputError, PanelLost
+from runtime.optics.alignment import align, shown_layers
 from runtime.optics.stack import PanelStack
 from runtime.panels.offscreen import OffscreenPanels
 from runtime.panels.registry import open_panels
@@ -100,6 +101,163 @@ def test_a_gamma_changes_greys_and_keeps_black_and_white(context):
     (picture,) = shown(context, ramp, PanelSettings(gamma=2.2))
     expected = 255 * (ramp[0, ..., :3] / 255) ** (1 / 2.2)
     assert np.abs(picture - expected).max() <= 0.51
+
+
+# A solution that is aligned to where the eyes are now.
+
+STACK = PanelStack(0.5184, 0.3456, (-0.1, 0.0, 0.06), 480, 320)
+HEAD = np.array([[0.6, -0.031, 0.0], [0.6, 0.031, 0.0]])
+
+
+def smooth(seed: int) -> np.ndarray:
+    """Layers with every frequency up to a pixel, as solutions have."""
+    noise = np.random.default_rng(seed).integers(0, 256, (3, STACK.height_px, STACK.width_px, 4))
+    wave = 127 + 120 * np.sin(np.arange(STACK.width_px) ** 2 / 500)[None, None, :, None]
+    layers = (0.5 * noise + 0.5 * wave).astype(np.uint8)
+    layers[..., 3] = 255
+    return layers
+
+
+@pytest.fixture
+def sink(context):
+    made = open_panels(OutputSettings(), STACK, SimulatedClock(), context)
+    yield made
+    made.close()
+
+
+def codes(pictures) -> np.ndarray:
+    return np.stack(pictures)[..., :3].astype(int)
+
+
+@pytest.mark.parametrize("flatness", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize(
+    "step_m", [(0.0, 0.004, 0.0), (0.01, 0.016, 0.008), (-0.3, -0.1, 0.05), (1.0, 0.9, -0.2), (0.0, 9.0, 0.0)]
+)
+def test_the_shader_shows_what_its_reference_says(sink, step_m, flatness):
+    matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array(step_m)).solved_from_shown
+    frame = PanelFrame(1, smooth(1), 1, matrices, smooth(2), 1, flatness)
+    sink.present(frame)
+    difference = np.abs(codes(sink.read_back()) - codes(shown_layers(frame)))
+    assert difference.max() <= 2
+    assert (difference <= 1).mean() >= 0.999
+
+
+def test_a_panel_that_needs_no_alignment_is_fetched_to_the_bit_beside_those_that_do(sink):
+    frame = PanelFrame(1, smooth(1), 1, align(STACK, solved_for_m=HEAD, eyes_m=HEAD * 1.01).solved_from_shown)
+    sink.present(frame)
+    assert np.array_equal(codes(sink.read_back())[1], codes(frame.solved)[1])
+    assert not np.array_equal(codes(sink.read_back())[0], codes(frame.solved)[0])
+
+
+def test_a_head_that_returns_is_shown_the_solution_to_the_bit_again(sink):
+    solved = smooth(1)
+    for number, eyes_m in enumerate((HEAD, HEAD + 0.01, HEAD)):
+        matrices = align(STACK, solved_for_m=HEAD, eyes_m=eyes_m).solved_from_shown
+        sink.present(PanelFrame(number, solved, 7, matrices))
+        assert np.array_equal(codes(sink.read_back()), codes(solved)) == (number != 1)
+
+
+@pytest.mark.parametrize(("rotation_deg", "clockwise_quarters"), [(0, 0), (90, 1), (180, 2), (270, 3)])
+@pytest.mark.parametrize(("mirror", "axis"), [("none", None), ("horizontal", 2), ("vertical", 1)])
+def test_layers_are_aligned_as_the_viewer_sees_them_then_mirrored_and_turned(
+    context, rotation_deg, clockwise_quarters, mirror, axis
+):
+    panels = (PanelSettings(rotation_deg=rotation_deg, mirror=mirror),) * 3
+    sink = OffscreenPanels(
+        context, clock=SimulatedClock(), width_px=STACK.width_px, height_px=STACK.height_px, panels=panels
+    )
+    matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.02, 0.016, 0.03])).solved_from_shown
+    frame = PanelFrame(1, smooth(1), 1, matrices)
+    sink.present(frame)
+    seen = codes(shown_layers(frame))
+    seen = np.rot90(seen if axis is None else np.flip(seen, axis), -clockwise_quarters, axes=(1, 2))
+    difference = np.abs(codes(sink.read_back()) - seen)
+    assert difference.max() <= 2 and (difference <= 1).mean() >= 0.999
+    sink.close()
+
+
+def test_a_registered_panel_is_aligned_first_and_then_sent_where_registration_found_it(context):
+    shift = PanelSettings(homography=((1.0, 0.0, 5.0), (0.0, 1.0, -3.0), (0.0, 0.0, 1.0)))
+    sink = OffscreenPanels(
+        context, clock=SimulatedClock(), width_px=STACK.width_px, height_px=STACK.height_px, panels=(shift,) * 3
+    )
+    matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.02, 0.016, 0.03])).solved_from_shown
+    frame = PanelFrame(1, smooth(1), 1, matrices)
+    sink.present(frame)
+    picture = codes(sink.read_back())
+    assert np.abs(picture[:, :-3, 5:] - codes(shown_layers(frame))[:, 3:, :-5]).max() <= 2
+    assert not picture[:, :, :5].any() and not picture[:, -3:].any()  # beside the panel there is nothing, not even even
+    sink.close()
+
+
+def test_a_gamma_is_applied_to_what_is_aligned_and_mixed(context):
+    gamma = (PanelSettings(gamma=2.0),) * 3
+    sink = OffscreenPanels(context, clock=SimulatedClock(), width_px=480, height_px=320, panels=gamma)
+    matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 0.016, 0.03])).solved_from_shown
+    frame = PanelFrame(1, smooth(1) // 2 + 64, 1, matrices, smooth(2) // 2 + 64, 1, 0.4)
+    sink.present(frame)
+    # Not rounded before the curve: within what half a code before and after it can be.
+    assert np.abs(codes(sink.read_back()) - 255 * np.sqrt(codes(shown_layers(frame)) / 255)).max() <= 1.5
+    sink.close()
+
+
+def test_a_solution_is_uploaded_once_however_often_it_is_aligned_and_shown(sink, monkeypatch):
+    written = []
+    for name in ("_solved", "_flat"):
+        array = getattr(sink._textures, name)
+        monkeypatch.setattr(sink._textures, name, Counting(array, name, written))
+    solved, flat = smooth(1), smooth(2)
+    for number in range(4):
+        matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + 0.001 * number).solved_from_shown
+        sink.present(PanelFrame(number, solved, 3, matrices, flat, 5, 0.25 * number))
+        sink.read_back()
+    assert written == ["_solved", "_flat"]
+    sink.present(PanelFrame(5, smooth(3), 4, (), flat, 5, 0.0))
+    sink.present(PanelFrame(6, smooth(3), 4, (), smooth(4), 6, 1.0))  # the solution isn't seen, the flat picture is
+    sink.read_back()
+    assert written == ["_solved", "_flat", "_flat"]
+
+
+class Counting:
+    """A texture array that notes what is written to it."""
+
+    def __init__(self, array, name: str, written: list[str]) -> None:
+        self._array, self._name, self._written = array, name, written
+
+    def write(self, data) -> None:
+        self._written.append(self._name)
+        self._array.write(data)
+
+    def __getattr__(self, name: str):
+        return getattr(self._array, name)
+
+
+def test_a_new_solution_is_shown_where_only_its_version_tells_it_from_the_old(sink):
+    for version in (1, 2):
+        sink.present(PanelFrame(version, smooth(version), version))
+        assert np.array_equal(codes(sink.read_back()), codes(smooth(version)))
+
+
+def test_presenting_touches_no_gl_where_nobody_looks(sink, monkeypatch):
+    monkeypatch.setattr(sink, "_textures", object())
+    matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + 0.01).solved_from_shown
+    assert sink.present(PanelFrame(1, smooth(1), 1, matrices, smooth(2), 1, 0.5)).number == 1
+    monkeypatch.undo()
+
+
+@pytest.mark.parametrize(
+    ("frame", "says"),
+    [
+        (PanelFrame(1, None, 0), "flat"),
+        (PanelFrame(1, smooth(1), 0, flatness=0.5), "flat"),
+        (PanelFrame(1, smooth(1)[:2], 0), "solved layers are"),
+        (PanelFrame(1, smooth(1), 0, (), smooth(1)[:, 1:], 0, 0.5), "flat layers are"),
+        (PanelFrame(1, smooth(1), 0, (np.eye(3),) * 2), "aligns 2 panels of 3"),
+    ],
+)
+def test_a_frame_that_does_not_fit_is_a_mistake_of_the_caller(sink, frame, says):
+    with pytest.raises(ValueError, match=says):
+        sink.present(frame)
 
 
 def test_the_report_tells_frame_time_and_skew(context, layers):

@@ -13,6 +13,7 @@ import pytest
 from runtime.clock import MonotonicClock
 from runtime.config import OutputSettings, PanelSettings
 from runtime.errors import PanelLost
+from runtime.optics.alignment import align, shown_layers
 from runtime.optics.stack import PanelStack
 from runtime.panels import window
 from runtime.panels.display import glfw
@@ -141,6 +142,60 @@ def test_a_closed_window_is_a_lost_panel_and_comes_back(x, opened):
             sink.present(frame(number))
     assert eventually(lambda: presents(sink, 2))
     assert shows(x, 0, picture(2, 1))
+
+
+# A solution that is aligned to where the eyes are now.
+
+HEAD = np.array([[0.6, -0.031, 0.0], [0.6, 0.031, 0.0]])
+
+
+def moved(number: int, *, flatness: float = 0.0) -> PanelFrame:
+    """One solution, seen from elsewhere in every frame."""
+    eyes_m = HEAD + number * np.array([0.01, 0.008, -0.004])
+    solved = np.stack([picture(7, index) for index in range(3)])
+    matrices = align(STACK, solved_for_m=HEAD, eyes_m=eyes_m).solved_from_shown
+    return PanelFrame(number, solved, 7, matrices, solved[::-1], 7, flatness)
+
+
+@pytest.mark.parametrize("kind", ["windows", "span"])
+def test_the_aligned_picture_is_on_all_panels_in_the_same_frame(x, opened, kind):
+    sink = opened(*BY_CONNECTOR, kind=kind)
+    for number in range(6):
+        frame = moved(number, flatness=0.2 * number)
+        assert sink.present(frame).number == number
+        expected = shown_layers(frame)[..., :3].astype(int)
+
+        def difference(expected=expected) -> np.ndarray:
+            screen = x.screenshot()  # one picture of all three monitors
+            panels = [screen[:HEIGHT_PX, WIDTH_PX * monitor : WIDTH_PX * (monitor + 1)] for monitor in (2, 0, 1)]
+            return np.abs(np.stack(panels) - expected)
+
+        assert eventually(lambda: difference().max() <= 2)
+        assert (difference() <= 1).mean() >= 0.999
+
+
+def test_a_solution_that_is_shown_again_is_not_uploaded_again(opened, monkeypatch):
+    sink = opened(*BY_CONNECTOR)
+    sink.present(moved(0))
+    monkeypatch.setattr(sink._textures, "upload", lambda frame: pytest.fail("uploaded again"))
+    for number in range(1, 5):
+        assert sink.present(moved(number)).number == number
+
+
+def test_the_pacer_is_told_when_the_blank_was_and_how_often_one_comes(opened):
+    sink = opened(*BY_CONNECTOR)
+    assert sink.period_ns == pytest.approx(1e9 / 60, rel=1e-3)
+    first, second = sink.present(moved(0)), sink.present(moved(1))
+    assert first.vblank_ns < second.vblank_ns <= second.present_ns
+    assert second.vblank_ns == pytest.approx(second.present_ns - 1e6 * second.skew_ms, abs=2)
+    assert sink.present(moved(1), unchanged=True).vblank_ns is None  # nothing was swapped
+
+
+def test_without_vsync_nothing_is_known_of_blanks(x, context):
+    settings = OutputSettings(kind="windows", panels=BY_CONNECTOR, vsync=False)
+    sink = open_panels(settings, STACK, MonotonicClock(), context)
+    assert sink.present(moved(0)).vblank_ns is None
+    sink.close()
 
 
 def test_a_fault_while_drawing_leaves_the_new_frame_on_no_panel(x, opened, monkeypatch):

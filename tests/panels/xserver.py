@@ -17,6 +17,11 @@ import pytest
 WIDTH_PX, HEIGHT_PX = 320, 180
 MODE = f"{WIDTH_PX}x{HEIGHT_PX}p"
 TIMINGS = ("6.0", "320", "336", "368", "400", "180", "183", "188", "250")  # 60 Hz
+OTHER_MODES = {
+    "slow": ("5.0", *TIMINGS[1:]),  # the same picture 50 times a second
+    "half": ("3.0", "160", "176", "208", "250", "90", "93", "98", "200"),  # the same shape
+    "tall": ("3.0", "160", "176", "208", "250", "180", "183", "188", "200"),  # another one
+}
 CONFIG = """
 Section "ServerFlags"
   Option "AutoAddDevices" "false"
@@ -88,8 +93,11 @@ class XServer:
         self.number = int(answer)
         self.name = f":{self.number}"
         self.xrandr("--newmode", MODE, *TIMINGS)
+        for name, timings in OTHER_MODES.items():
+            self.xrandr("--newmode", name, *timings)
         for index in range(3):
-            self.xrandr("--addmode", f"DUMMY{index}", MODE)
+            for name in (MODE, *OTHER_MODES):
+                self.xrandr("--addmode", f"DUMMY{index}", name)
             self.plug(index)
 
     def xrandr(self, *arguments: str) -> None:
@@ -104,6 +112,17 @@ class XServer:
         """As if its cable had been pulled."""
         self.xrandr("--output", f"DUMMY{index}", "--off")
         self.xrandr("--query")
+
+    def place(self, *indices: int) -> None:
+        """Monitors in this order from left to right, at once, with what was shown on the X screen left in place."""
+        arguments = []
+        for position, index in enumerate(indices):
+            arguments += ["--output", f"DUMMY{index}", "--mode", MODE, "--pos", f"{WIDTH_PX * position}x0"]
+        self.xrandr(*arguments)
+
+    def set_mode(self, index: int, name: str) -> None:
+        """One of OTHER_MODES, at the monitor's place."""
+        self.xrandr("--output", f"DUMMY{index}", "--mode", name, "--pos", f"{WIDTH_PX * index}x0")
 
     def screenshot(self) -> npt.NDArray[np.uint8]:
         """(h, w, 3) RGB of the whole X screen."""
@@ -151,6 +170,14 @@ class XServer:
         client_message, bits = 33, 32
         event = (ctypes.c_ulong * 24)(client_message, 0, 1, display.value, window, protocols, bits, delete)
         x11.XSendEvent(display, ctypes.c_ulong(window), 0, ctypes.c_long(0), event)
+        x11.XCloseDisplay(display)
+
+    def do_to_window(self, request: str, window: int, *arguments: int) -> None:
+        """A request of Xlib about somebody else's window, as another program would make it."""
+        x11 = ctypes.CDLL("libX11.so.6")
+        x11.XOpenDisplay.restype = ctypes.c_void_p
+        display = ctypes.c_void_p(x11.XOpenDisplay(self.name.encode()))
+        getattr(x11, request)(display, ctypes.c_ulong(window), *arguments)
         x11.XCloseDisplay(display)
 
     def stop(self) -> None:

@@ -17,8 +17,10 @@ from runtime.model.predictor import Predictor, load_predictor
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
+from runtime.plan import measure
+from runtime.plan.drawing import raster_views
 from runtime.plan.focus import FocusedPredictor
-from runtime.plan.measure import displayed_psnr, draw
+from runtime.plan.measure import displayed_psnr
 from runtime.plan.planning import focused, planned_predictor
 from runtime.plan.reduced import ladder_predictor
 from runtime.plan.savings import solved_eyes
@@ -49,6 +51,17 @@ def part_of(whole: Predictor) -> FocusedPredictor:
     made = focused(whole, SETTINGS.model.model_copy(update={"name": "fast"}))
     assert made is not None
     return made
+
+
+def draw(source: ProceduralSource, predictor: Predictor, eyes: np.ndarray, *, time_ns: int, aim: bool = True) -> Any:
+    """One frame's layers. aim: the predictor is told where the content lies; else it finds that in the pictures."""
+    if aim:
+        return measure.draw(source, predictor, eyes, time_ns=time_ns)
+    images: list[list[Any]] = [[], []]
+    for raster in predictor.rasters(eyes):
+        for view in raster_views(eyes, raster):
+            images[view.side].append(source.render(view, time_ns=time_ns).copy())
+    return predictor.predict(images, eyes).layers
 
 
 def psnr(layers: np.ndarray, source: ProceduralSource, eyes: np.ndarray = EYES) -> float:

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from runtime.commands.record import record, record_to
 from runtime.config import Settings, validated
-from runtime.errors import FatalError
+from runtime.errors import FatalError, InputError
 from runtime.sensor.recording import Recording
 
 app = typer.Typer()
@@ -81,3 +81,38 @@ def test_pictures_are_kept_only_with_images(tmp_path):
         assert any(f.colour is not None for f in frames) == images
         found = [np.linalg.norm(np.diff(f.eyes.eyes_m, axis=0)) for f in frames if f.eyes is not None]
         assert np.median(found) == pytest.approx(IPD_M, abs=0.004)
+
+
+def test_a_recording_is_not_replaced_unless_told(tmp_path):
+    out = tmp_path / "a.mcap"
+    make = ["--motion", "still", "--seconds", "1", "--out", str(out)]
+    assert CliRunner().invoke(app, make).exit_code == 0
+    before = out.read_bytes()
+    for how in (["--seed", "5", *make], ["--seconds", "1", "--out", str(out)]):
+        answer = CliRunner().invoke(app, how)
+        assert isinstance(answer.exception, InputError) and "--force" in str(answer.exception)
+        assert out.read_bytes() == before
+    assert CliRunner().invoke(app, ["--force", "--seed", "5", *make]).exit_code == 0
+    assert out.read_bytes() != before
+
+
+@pytest.mark.parametrize("name", ["a.txt", "a", "a.mcap.bak", "x" * 5000 + ".mcap"])
+def test_a_name_that_is_not_a_recordings_is_refused_before_anything_is_recorded(tmp_path, name):
+    answer = CliRunner().invoke(app, ["--motion", "still", "--out", f"{tmp_path}/{name}"])
+    assert isinstance(answer.exception, InputError)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_images_of_a_sensor_that_has_none_are_not_claimed(tmp_path):
+    answer = CliRunner().invoke(app, ["--images", "--seconds", "0.5", "--out", str(tmp_path / "a.mcap")])
+    assert answer.exit_code == 0 and "no pictures (this sensor delivers none)" in answer.stdout
+    assert "whoever was there" not in answer.stdout
+
+
+def test_a_fast_sensor_is_recorded_whole(tmp_path):
+    from runtime.commands.motion_recording import write_motion
+
+    write_motion(tmp_path / "fast.mcap", "walk", rate_hz=240, seconds=1.5)
+    source = settings(source=str(tmp_path / "fast.mcap"))
+    summary = record_to(tmp_path / "b.mcap", source, images=False, seconds=5, quiet=True)
+    assert summary["samples"] == 360 and summary["overtaken"] == 0

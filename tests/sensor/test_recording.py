@@ -243,3 +243,132 @@ def test_a_writer_takes_no_longer_for_a_long_recording():
     for k in range(1, 6):
         last = batch(1500 * k)
     assert last < 4 * first
+
+
+def pictures_alone(path, *, pairs, empty=False):
+    """A recording of another program: colour and depth by time stamp, and no eyes."""
+    from mcap.writer import Writer
+
+    from runtime.sensor import recording_format as fmt
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        header = RecordingHeader(driver="other", eye_points=False, colour=True, depth=True)
+        writer.add_metadata(fmt.METADATA_NAME, header.metadata())
+        schema = writer.register_schema("any", "jsonschema", b"{}")
+        channels = {topic: writer.register_channel(topic, "json", schema) for topic in fmt.SCHEMAS}
+        writer.add_message(channels["/camera"], 0, fmt.calibration_message(CAMERA, capture_ns=0), 0)
+        for at, colour, depth in pairs:
+            writer.add_message(channels["/colour"], at, fmt.colour_message(colour, capture_ns=at), at)
+            if depth is not None:
+                writer.add_message(channels["/depth"], at, fmt.depth_message(depth, capture_ns=at), at)
+        writer.finish()
+
+
+def test_a_recording_of_pictures_alone_needs_no_empty_messages(tmp_path):
+    colour, depth = np.full((48, 64, 3), 90, np.uint8), np.full((48, 64), 700, np.uint16)
+    pictures_alone(tmp_path / "p.mcap", pairs=[(10, colour, depth), (20, colour, None), (30, colour, depth)])
+    frames = list(Recording(tmp_path / "p.mcap").samples())
+    assert [(f.sequence, f.capture_ns) for f in frames] == [(1, 10), (2, 20), (3, 30)]
+    assert [f.depth_mm is None for f in frames] == [False, True, False]
+    assert all(f.colour is not None and f.eyes is None and f.intrinsics == CAMERA for f in frames)
+
+
+def test_pictures_alone_are_written_without_eyes_and_come_back(tmp_path):
+    header = RecordingHeader(driver="test", eye_points=False, depth=True)
+    depth = np.full((48, 64), 700, np.uint16)
+    frames = [SensorFrame(k, 1000 * k, depth_mm=depth + np.uint16(k)) for k in range(1, 6)]
+    write(tmp_path / "p.mcap", frames, header)
+    assert b"/eyes" not in (tmp_path / "p.mcap").read_bytes()
+    back = list(Recording(tmp_path / "p.mcap").samples())
+    assert [(f.sequence, f.capture_ns, int(f.depth_mm[0, 0])) for f in back] == [
+        (k, 1000 * k, 700 + k) for k in range(1, 6)
+    ]
+
+
+def bomb(path, *, kind, unpacked, says):
+    """A recording that begins with a chunk which is small, and large when unpacked. Answers the chunk's size."""
+    import lz4.frame
+    import zstandard
+    from mcap.data_stream import RecordBuilder
+    from mcap.records import Chunk
+
+    pack = lz4.frame.compress if kind == "lz4" else zstandard.ZstdCompressor().compress
+    packed = pack(b"\0" * unpacked)
+    builder = RecordBuilder()
+    Chunk(kind, packed, 0, 0, 0, says).write(builder)
+    whole, at = demo_recording_bytes(), 8
+    for _ in range(2):  # the header and the metadata
+        at += 9 + int.from_bytes(whole[at + 1 : at + 9], "little")
+    path.write_bytes(whole[:at] + builder.end() + whole[at:])
+    return len(packed)
+
+
+@pytest.mark.parametrize("kind", ["lz4", "zstd"])
+@pytest.mark.parametrize("says", [300 << 20, 100, 1 << 62])
+def test_a_small_chunk_that_becomes_a_large_one_takes_no_memory(tmp_path, kind, says):
+    size = bomb(tmp_path / "bomb.mcap", kind=kind, unpacked=300 << 20, says=says)
+    assert size < 2 << 20
+    code = f"""
+import pathlib, resource, sys
+from runtime.errors import InputError
+from runtime.sensor.recording import Recording
+base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+try:
+    list(Recording(pathlib.Path({str(tmp_path / "bomb.mcap")!r})).samples())
+except InputError as error:
+    print(error)
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - base) >> 10)
+"""
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    told, grown_mib = answer.stdout.splitlines()
+    assert int(grown_mib) < 120
+    if says == 300 << 20:
+        assert "unpacks to 300.0 MiB; at most 32 (limits.chunk_mib)" in told
+    else:
+        assert "bomb.mcap" in told
+
+
+def test_a_stop_is_heard_while_messages_are_skipped(tmp_path):
+    from mcap.writer import Writer
+
+    from runtime.support.progress import listening
+
+    path, count = tmp_path / "long.mcap", 20_000
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_metadata("phasestack.recording", EYES_ONLY.metadata())
+        channel = writer.register_channel("/else", "json", writer.register_schema("s", "jsonschema", b"{}"))
+        for k in range(count):
+            writer.add_message(channel, k, b"{}", k)
+        writer.finish()
+    told = []
+
+    def listener(what, done, total):
+        told.append(done)
+        if done >= 3000:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), listening(listener):
+        Recording(path)
+    assert told[-1] < 5000
+    with pytest.raises(InputError, match="no whole sample"):
+        Recording(path)
+
+
+@pytest.mark.parametrize("make", ["fifo", "folder", "zero", "nul", "long"])
+def test_only_files_are_opened_and_nothing_waits(tmp_path, make):
+    path = tmp_path / "a.mcap"
+    if make == "fifo":
+        os.mkfifo(path)
+    elif make == "folder":
+        path.mkdir()
+    elif make == "zero":
+        path = path.__class__("/dev/zero")
+    else:
+        path = tmp_path / ("a\0b.mcap" if make == "nul" else "x" * 5000)
+    with pytest.raises(InputError) as caught:
+        Recording(path)
+    assert len(str(caught.value)) < 800 and "\0" not in str(caught.value)

@@ -69,9 +69,33 @@ def raiser(error):
 
 def test_the_newest_sample_wins_and_those_it_overtook_are_counted(started):
     worker, _ = started(lambda: time.sleep(0.002))
-    assert eventually(lambda: worker.stale_inputs >= 5)
+    assert eventually(lambda: worker.state == "running")
+    time.sleep(0.1)
     frame = worker.newest()
-    assert frame.sequence >= 6 and worker.state == "running" and worker.serial == "S7"
+    assert frame.sequence >= 6 and worker.stale_inputs == frame.sequence - 1
+    assert worker.state == "running" and worker.serial == "S7"
+
+
+def test_all_samples_since_the_last_time_are_handed_out_in_order(started):
+    worker, _ = started(lambda: time.sleep(0.002))
+    got = []
+    assert eventually(lambda: got.extend(worker.take()) or len(got) >= 40)
+    assert [frame.sequence for frame in got] == list(range(1, 1 + len(got))) and worker.stale_inputs == 0
+
+
+def test_what_nobody_reads_does_not_pile_up(started, monkeypatch):
+    monkeypatch.setattr("runtime.sensor.worker.QUEUE_MAX", 10)
+    worker, _ = started(lambda: time.sleep(0.001))
+    assert eventually(lambda: worker.stale_inputs >= 20)
+    frames = worker.take()
+    assert len(frames) == 10 and frames[0].sequence > 20
+
+
+def test_a_driver_that_may_pause_is_neither_stalled_nor_reopened(started, monkeypatch):
+    monkeypatch.setattr(Scripted, "capabilities", Capabilities(eye_points=True, may_pause=True))
+    worker, log = started(raiser(SensorTimeout("nothing")))
+    time.sleep(0.5)
+    assert worker.state == "opening" and log == ["open"] and worker.reopened == 0
 
 
 def test_a_sample_is_handed_out_once(started):

@@ -1,0 +1,75 @@
+"""Every command by its name. Only names and options are here; each command imports what it needs when it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated
+
+import typer
+
+from calib.commands import app as calibrate_app
+from model_export.commands import export, train, validate
+from runtime.commands.bench import app as bench_app
+from runtime.commands.config import config
+from runtime.commands.ctl import app as ctl_app
+from runtime.commands.demo import demo
+from runtime.commands.doctor import doctor
+from runtime.commands.identify import identify
+from runtime.commands.plan import plan
+from runtime.commands.record import record
+from runtime.commands.report import report
+from runtime.commands.run import run
+from runtime.commands.solve import solve
+from runtime.commands.stability import stability
+from runtime.commands.status import status
+
+app = typer.Typer(
+    name="phasestack",
+    help="Realtime runtime of a glasses-free 3D display made of stacked LCD panels.\n\n"
+    "Example: phasestack demo --out out/demo",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+COMMANDS: tuple[Callable[..., None] | tuple[str, typer.Typer], ...] = (
+    demo,
+    run,
+    solve,
+    record,
+    ("calibrate", calibrate_app),
+    plan,
+    train,
+    export,
+    validate,
+    report,
+    stability,
+    ("bench", bench_app),
+    doctor,
+    status,
+    ("ctl", ctl_app),
+    identify,
+    config,
+)
+for command in COMMANDS:
+    if isinstance(command, tuple):
+        app.add_typer(command[1], name=command[0])
+    else:
+        app.command()(command)
+
+
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        from runtime.version import version
+
+        typer.echo(f"phasestack {version()}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="print the version and exit")
+    ] = False,
+) -> None:
+    """What holds for all commands; typer shows the app's own help, not this."""

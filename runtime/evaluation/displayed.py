@@ -1,0 +1,83 @@
+"""The one displayed quality of layers against pictures (design 5.5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from runtime.optics.carried import expected_psnrs_db, intensities
+from runtime.optics.quality import Quality, quality
+from runtime.optics.retina import Retina, seen_by
+from runtime.optics.stack import PanelStack
+from runtime.records import F32, F64, U8, U16
+
+Picture = U8 | U16 | F32  # (h, w, 3): code values, or intensities in [0, 1]
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What both eyes see of some layers, beside what they should."""
+
+    seen: tuple[Retina, ...]
+    wanted: tuple[Picture, ...]
+    quality: Quality  # exact, at the eyes that the layers were made (or aligned) for
+    carried: Quality | None = None  # the same eyes, against the pictures that the layers were solved for
+    true: Quality | None = None  # at the true eyes, against their own truth
+    carried_true: Quality | None = None  # at the true eyes, against the pictures that the layers were solved for
+
+
+def displayed(
+    layers: U8,
+    wanted: Sequence[Picture],
+    stack: PanelStack,
+    *,
+    eyes_m: F64,
+    fov_deg: float,
+    similarity: bool = True,
+) -> Look:
+    """What eyes (2, 3), frame `stack`, see of layers (N, H, W, 3 or 4), against a picture for each eye.
+
+    The pictures are `fov_deg` wide. One that has the panels' aspect is compared in their pixels, any other in its own.
+    similarity: SSIM as well, else it is NaN.
+    Raises ValueError for eyes that are not before every panel, or that see nothing of them.
+    """
+    wanted = [on_panels_raster(picture, stack) for picture in wanted]
+    seen = tuple(
+        seen_by(eye_m, layers, stack, fov_deg=fov_deg, width_px=picture.shape[1], height_px=picture.shape[0])
+        for eye_m, picture in zip(eyes_m, wanted, strict=True)
+    )
+    targets = [intensities(picture) for picture in wanted]
+    measured = quality([r.image for r in seen], targets, [r.mask for r in seen], similarity=similarity)
+    return Look(seen, tuple(wanted), measured)
+
+
+def expected_db(
+    look: Look, layers: U8, stack: PanelStack, *, eyes_m: F64, fov_deg: float, sigmas_mm: Sequence[float] = (1.0, 2.0)
+) -> dict[str, float | None]:
+    """Expected PSNR (design 5.5) of a look's layers and pictures, by the eyes' uncertainty in millimetres: "1", "2".
+
+    None where such an error would take an eye to where it sees nothing.
+    """
+    try:
+        values = expected_psnrs_db(layers, look.wanted, stack, eyes_m=eyes_m, fov_deg=fov_deg, sigmas_mm=sigmas_mm)
+    except ValueError:
+        return {f"{sigma_mm:g}": None for sigma_mm in sigmas_mm}
+    return {f"{sigma_mm:g}": value for sigma_mm, value in values.items()}
+
+
+def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:
+    """A picture in the panels' pixels where it has their aspect, as the judge compares it; else as it is.
+
+    A picture of another aspect would be stretched, and then no eye is meant to see it.
+    """
+    import cv2
+
+    height_px, width_px = picture.shape[:2]
+    if (width_px, height_px) == (stack.width_px, stack.height_px):
+        return picture
+    if abs(width_px * stack.height_px / stack.width_px - height_px) > 0.5:
+        return picture
+    resized: Any = cv2.resize(picture, (stack.width_px, stack.height_px), interpolation=cv2.INTER_AREA)
+    result: Picture = resized
+    return result

@@ -1,0 +1,316 @@
+"""Looks at a run's refreshes: the account's lines, sampled quality, kept light. Off the refreshes' own time.
+
+Lines wait until the recording has told where the eyes really were; so do measurements. In simulated time they are
+made at once; in real time the solver's thread draws what is compared and a thread of its own compares, and while one
+measurement is under way no other begins.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from runtime.content.base import ContentSource
+from runtime.evaluation.displayed import Look, displayed
+from runtime.frame.presenter import Refresh
+from runtime.frame.solver_host import SolverHost
+from runtime.frame.truth import TrueEyes, Unknown
+from runtime.optics.alignment import shown_layers
+from runtime.optics.carried import carried_quality
+from runtime.optics.quality import Quality
+from runtime.optics.stack import PanelStack
+from runtime.plan.drawing import retina_pictures
+from runtime.records import F64, U8, RefreshAccount, SensorFrame, State
+from runtime.support.background import Job
+
+log = logging.getLogger("phasestack.quality")
+
+WAITING_MAX = 2048  # lines that wait for the truth; older ones go without
+
+
+class Output(Protocol):
+    """Where a run's files go."""
+
+    def refresh(self, line: dict[str, Any]) -> None:
+        """One line of frames.jsonl."""
+
+    def light(self, frame: int, *, layers: U8, drawn: tuple[U8, U8] | None, info: dict[str, Any]) -> None:
+        """What the panels showed at one refresh."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What eyes saw of one refresh."""
+
+    look: Look  # at the eyes aligned to, against their own truth
+    carried: Quality  # at the eyes aligned to
+    true_look: Look | None = None  # at the true eyes, against their own truth
+    carried_true: Quality | None = None
+
+
+@dataclass(slots=True)
+class Means:
+    """Over the sampled refreshes."""
+
+    values: dict[str, list[float]] = field(default_factory=dict)
+
+    def add(self, measured: Measured) -> None:
+        found: dict[str, float | None] = {
+            "psnr_db": measured.look.quality.psnr_db,
+            "ssim": measured.look.quality.ssim,
+            "carried_db": measured.carried.psnr_db,
+            "psnr_db_true_eyes": measured.true_look.quality.psnr_db if measured.true_look else None,
+            "carried_db_true_eyes": measured.carried_true.psnr_db if measured.carried_true else None,
+        }
+        for name, value in found.items():
+            if value is not None:
+                self.values.setdefault(name, []).append(value)
+
+    def summary(self) -> dict[str, Any]:
+        """The measured part of summary.json; None where nothing was measured."""
+        names = ("psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
+        means = {name: round(float(np.mean(self.values[name])), 3) if self.values.get(name) else None for name in names}
+        return {**means, "quality_frames": len(self.values.get("psnr_db", []))}
+
+
+class ContentHolder(Protocol):
+    """The part of a solver that can draw."""
+
+    @property
+    def content(self) -> ContentSource:
+        """What is drawn at present."""
+
+
+class RunObserver:
+    """Takes in samples and refreshes; `finish` ends it."""
+
+    def __init__(
+        self,
+        stack: PanelStack,
+        solver: SolverHost,
+        *,
+        fov_deg: float,
+        measure: bool = False,
+        evaluate_every: int = 0,
+        keep_light: int = 0,
+        output: Output | None = None,
+        on_account: Callable[[RefreshAccount], None] | None = None,
+        simulated: bool = False,
+    ) -> None:
+        """measure: quality is sampled, every `evaluate_every` refreshes and at the end; keep_light: 0, none."""
+        self._stack, self._solver, self._fov_deg = stack, solver, fov_deg
+        self._measure, self._every, self._keep_light = measure, evaluate_every, keep_light
+        self._output, self._on_account, self._simulated = output, on_account, simulated
+        self.truth = TrueEyes()
+        self.means = Means()
+        self.look: Look | None = None  # of the newest measured refresh
+        self.last: Refresh | None = None
+        self._lines: deque[RefreshAccount] = deque()
+        self._samples: deque[Refresh] = deque()
+        self._job: Job[Measured | None] | None = None
+        self._drawing = False
+
+    def sampled(self, sample: SensorFrame) -> None:
+        if sample.true_eyes_m is not None:
+            self.truth.add(sample.capture_ns, sample.true_eyes_m)
+
+    def refreshed(self, refresh: Refresh) -> None:
+        self.last = refresh
+        if self._on_account is not None:
+            self._on_account(refresh.account)
+        if self._output is not None:
+            self._lines.append(refresh.account)
+        if self._is_sample(refresh.account) and (self._simulated or not self._busy):
+            self._samples.append(refresh)
+        self._advance()
+
+    def finish(self) -> None:
+        """No more refreshes: what waits is written and measured, and the last refresh is looked at."""
+        self.truth.end()
+        self._advance()
+        last = self.last
+        wants_last = self._measure and last is not None and _has_picture(last) and last.account.eyes_m is not None
+        if last is not None and wants_last:
+            measured = self._measured_now(last)
+            if measured is not None:
+                self.look = measured.look
+                if not self.means.values and last.account.state is State.TRACKING:
+                    self.means.add(measured)
+
+    @property
+    def _busy(self) -> bool:
+        return bool(self._samples) or self._drawing or self._job is not None
+
+    def _is_sample(self, account: RefreshAccount) -> bool:
+        every, light = self._every, self._keep_light
+        sampled = self._measure and every and account.frame % every == every - 1
+        return bool(sampled or (light and account.frame % light == light - 1))
+
+    def _advance(self) -> None:
+        while self._lines:
+            true_m = self.truth.at(self._lines[0].photon_ns)
+            if isinstance(true_m, Unknown):
+                if len(self._lines) < WAITING_MAX:
+                    break
+                true_m = None
+            assert self._output is not None
+            self._output.refresh(line_of(replace(self._lines.popleft(), true_eyes_m=true_m)))
+        if self._job is not None and self._job.done:
+            job, self._job = self._job, None
+            self._take(job.take())
+        while self._samples and self._job is None and not self._drawing:
+            true_m = self.truth.at(self._samples[0].account.photon_ns)
+            if isinstance(true_m, Unknown):
+                break
+            self._begin(self._samples.popleft(), true_m)
+
+    def _begin(self, refresh: Refresh, true_m: F64 | None) -> None:
+        """Draw what is compared, on the solver's thread, then compare."""
+        if self._simulated:
+            found: list[Any] = []
+            self._on_solver(lambda content: found.append(self._drawn(content, refresh, true_m)))
+            if found:
+                self._take(self._compared(refresh, true_m, found[0]))
+            return
+        self._drawing = True
+
+        def draw(parts: Any) -> bool:
+            try:
+                drawn = self._drawn(parts.content, refresh, true_m)
+                self._job = Job("quality", lambda: self._compared(refresh, true_m, drawn))
+            finally:
+                self._drawing = False
+            return True
+
+        self._solver.do(draw)
+
+    def _on_solver(self, draw: Callable[[ContentSource], None]) -> None:
+        def task(parts: Any) -> bool:
+            draw(parts.content)
+            return True
+
+        self._solver.do(task)
+
+    def _drawn(self, content: ContentSource, refresh: Refresh, true_m: F64 | None) -> dict[str, tuple[U8, U8]]:
+        """Retina pictures: of the eyes solved for, of those aligned to, of the true ones."""
+        solution, account = refresh.solution, refresh.account
+        if solution is None or solution.solved_for_m is None:
+            return {}
+        wanted: dict[str, F64 | None] = {"solved": solution.solved_for_m}
+        if self._is_measured(refresh):
+            wanted["used"] = account.eyes_m
+            if true_m is not None:
+                wanted["true"] = true_m
+        time_ns = solution.solved_for_ns
+        return {
+            name: retina_pictures(content, eyes_m, self._stack, fov_deg=self._fov_deg, time_ns=time_ns)
+            for name, eyes_m in wanted.items()
+            if eyes_m is not None
+        }
+
+    def _is_measured(self, refresh: Refresh) -> bool:
+        account, every = refresh.account, self._every
+        return (
+            self._measure
+            and account.state is State.TRACKING
+            and _has_picture(refresh)
+            and account.eyes_m is not None
+            and (every == 0 or account.frame % every == every - 1 or refresh is self.last)
+        )
+
+    def _compared(self, refresh: Refresh, true_m: F64 | None, drawn: dict[str, tuple[U8, U8]]) -> Measured | None:
+        account = refresh.account
+        try:
+            layers = shown_layers(refresh.frame)
+        except ValueError:
+            return None
+        if self._keep_light and account.frame % self._keep_light == self._keep_light - 1 and self._output is not None:
+            info = {
+                "solved_for_m": account.solved_for_m,
+                "eyes_m": account.eyes_m,
+                "true_eyes_m": true_m,
+                "fov": self._fov_deg,
+            }
+            self._output.light(account.frame, layers=layers, drawn=drawn.get("solved"), info=info)
+        if "used" not in drawn or account.eyes_m is None or account.solved_for_m is None:
+            return None
+        stack, fov_deg, solved_for_m = self._stack, self._fov_deg, account.solved_for_m
+        try:
+            look = displayed(layers, drawn["used"], stack, eyes_m=account.eyes_m, fov_deg=fov_deg)
+            carried = carried_quality(
+                layers, drawn["solved"], stack, solved_for_m=solved_for_m, eyes_m=account.eyes_m, fov_deg=fov_deg
+            )
+            if true_m is None:
+                return Measured(look, carried)
+            return Measured(
+                look,
+                carried,
+                displayed(layers, drawn["true"], stack, eyes_m=true_m, fov_deg=fov_deg),
+                carried_quality(
+                    layers, drawn["solved"], stack, solved_for_m=solved_for_m, eyes_m=true_m, fov_deg=fov_deg
+                ),
+            )
+        except ValueError as error:
+            log.info("quality: not measured here (%s)", error)
+            return None
+
+    def _take(self, measured: Measured | None) -> None:
+        if measured is not None:
+            self.look = measured.look
+            self.means.add(measured)
+
+    def _measured_now(self, refresh: Refresh) -> Measured | None:
+        """One measurement, waited for: the run is over."""
+        true_m = self.truth.at(refresh.account.photon_ns)
+        known_m = None if isinstance(true_m, Unknown) else true_m
+        self.last = refresh
+        jobs: list[dict[str, tuple[U8, U8]]] = []
+        self._on_solver(lambda content: jobs.append(self._drawn(content, refresh, known_m)))
+        if not self._simulated:
+            from runtime.support.waiting import wait_for
+
+            wait_for(lambda: bool(jobs), timeout_s=10.0)
+        return self._compared(refresh, known_m, jobs[0]) if jobs else None
+
+
+def _has_picture(refresh: Refresh) -> bool:
+    """Whether the panels show a solution for two eyes, and nothing of the flat picture."""
+    solution = refresh.solution
+    return (
+        refresh.account.presented
+        and refresh.frame.flatness == 0.0
+        and solution is not None
+        and solution.solved_for_m is not None
+        and solution.seeing == (True, True)
+    )
+
+
+def line_of(account: RefreshAccount) -> dict[str, Any]:
+    """A line of frames.jsonl (contract 5.2)."""
+    return {
+        "frame": account.frame,
+        "capture_ns": account.capture_ns,
+        "predicted_for_ns": account.predicted_for_ns,
+        "present_ns": account.present_ns,
+        "eyes_m": account.eyes_m,
+        "eyes_label": account.eyes_label,
+        "eye_sigma_mm": _rounded(account.eye_sigma_mm, 4),
+        "state": str(account.state),
+        "solution": account.solution,
+        "solved_for_m": account.solved_for_m,
+        "solution_age_ms": _rounded(account.solution_age_ms, 4),
+        "true_eyes_m": account.true_eyes_m,
+        "inference": account.inference,
+        "presented": account.presented,
+        "stage_ms": {stage: round(value, 4) for stage, value in account.stage_ms.items()},
+        "skew_ms": round(account.skew_ms, 4),
+    }
+
+
+def _rounded(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits)

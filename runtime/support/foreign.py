@@ -1,0 +1,231 @@
+"""What comes from outside (paths, files, JSON, numbers), read in one place and within limits.
+
+Every reader of foreign bytes stands on this. What is wrong is an InputError, one line that names the file and the
+field; what is over a limit is told with its figure and the limit.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any
+
+from runtime.errors import InputError
+
+PATH_CHARACTERS_MAX = 4095  # Linux's PATH_MAX less the terminating zero
+NAME_BYTES_MAX = 255
+JSON_DEPTH_MAX = 64
+JSON_BYTES_MAX = 64 << 20
+DIGITS_MAX = 19  # of a 63-bit number
+MIB = 1 << 20
+
+# A string (also one that never ends) is taken whole and never tried again: hostile ones would take for ever.
+_JSON_TOKEN = re.compile(rb'"(?:[^"\\]++|\\.)*+(?:"|\\?\Z)|[\[{]|[\]}]', re.DOTALL)
+
+
+def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") -> Path:
+    """A path that the system can take: no NUL, not too long. Names nothing that exists. Raises InputError.
+
+    source, field: who gave it, where that is not the path itself.
+    """
+    text = str(path)
+    whence = source or text
+    if "\0" in text:
+        raise InputError(whence, field, "the path holds a NUL character")
+    if len(text.encode(errors="surrogatepass")) > PATH_CHARACTERS_MAX:
+        raise InputError(whence, field, f"the path has {len(text)} characters; at most {PATH_CHARACTERS_MAX}")
+    longest = max((len(part.encode(errors="surrogatepass")) for part in Path(text).parts), default=0)
+    if longest > NAME_BYTES_MAX:
+        raise InputError(whence, field, f"a name in the path has {longest} bytes; at most {NAME_BYTES_MAX}")
+    return Path(text)
+
+
+def open_regular(
+    path: str | Path, *, most_bytes: int | None = None, source: str | Path = "", field: str = ""
+) -> IO[bytes]:
+    """An open regular file, for reading. Raises InputError for a folder, a FIFO, a device, or too large a file.
+
+    Opening never waits (a FIFO without a writer would), and what was opened is what is checked.
+    """
+    whence = source or str(path)
+    checked = checked_path(path, source=source, field=field)
+    try:
+        number = os.open(checked, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
+    except OSError as error:
+        raise InputError(whence, field, f"cannot be read ({error.strerror})") from None
+    try:
+        status = os.fstat(number)
+        if not stat.S_ISREG(status.st_mode):
+            raise InputError(whence, field, f"is {_kind(status.st_mode)}, not a file")
+        if most_bytes is not None and status.st_size > most_bytes:
+            raise InputError(whence, field, f"has {_size(status.st_size)}; at most {_size(most_bytes)}")
+        return os.fdopen(number, "rb")
+    except BaseException:
+        os.close(number)
+        raise
+
+
+def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", field: str = "") -> bytes:
+    """A whole regular file. Raises InputError."""
+    whence = source or str(path)
+    with open_regular(path, most_bytes=most_bytes, source=source, field=field) as file:
+        try:
+            data = file.read(most_bytes + 1)  # it may grow while it is read
+        except OSError as error:
+            raise InputError(whence, field, f"cannot be read ({error.strerror})") from None
+    if len(data) > most_bytes:
+        raise InputError(whence, field, f"is larger than {_size(most_bytes)}")
+    return data
+
+
+def read_text(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX, source: str | Path = "", field: str = "") -> str:
+    """A whole regular file of UTF-8. Raises InputError."""
+    data = read_bytes(path, most_bytes=most_bytes, source=source, field=field)
+    return decoded(data, source=source or str(path), field=field)
+
+
+def decoded(data: bytes, *, source: str | Path, field: str = "") -> str:
+    """UTF-8 as text, without a byte-order mark. Raises InputError."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(source, field, f"is not UTF-8 at byte {error.start}") from None
+
+
+def read_json(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX, most_depth: int = JSON_DEPTH_MAX) -> Any:
+    """A file of JSON. Raises InputError."""
+    return parsed_json(read_bytes(path, most_bytes=most_bytes), source=path, most_depth=most_depth)
+
+
+def parsed_json(text: str | bytes, *, source: str | Path, field: str = "", most_depth: int = JSON_DEPTH_MAX) -> Any:
+    """JSON, nested no deeper than `most_depth`, without NaN and Infinity, which are not JSON. Raises InputError."""
+    data = text if isinstance(text, bytes) else text.encode(errors="surrogatepass")
+    depth = nesting(data, most=most_depth)
+    if depth > most_depth:
+        raise InputError(source, field, f"JSON is nested deeper than {most_depth}")
+    try:
+        return json.loads(decoded(data, source=source, field=field), parse_constant=_no_constant, parse_int=_whole)
+    except ValueError as error:
+        raise InputError(source, field, f"malformed JSON: {error}") from None
+
+
+def nesting(data: bytes, *, most: int) -> int:
+    """How deep brackets nest outside of strings; stops counting once it is more than `most`."""
+    depth = deepest = 0
+    for token in _JSON_TOKEN.finditer(data):
+        first = data[token.start()]
+        if first in b"[{":
+            depth += 1
+            deepest = max(deepest, depth)
+            if deepest > most:
+                break
+        elif first in b"]}":
+            depth -= 1
+    return deepest
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a number of JSON")
+
+
+def _whole(digits: str) -> int | float:
+    # Python refuses more than 4,300 digits with a ValueError of its own, and takes quadratic time below that.
+    return int(digits) if len(digits) <= 400 else float(digits)
+
+
+def whole(
+    value: Any,
+    *,
+    least: int,
+    most: int,
+    source: str | Path = "",
+    field: str = "",
+    problem: Callable[[str], Exception] | None = None,
+) -> int:
+    """A whole number within bounds from JSON: an int, or a float without a fraction. Raises InputError.
+
+    problem: makes another exception of the message.
+    """
+    refuse = problem or (lambda text: InputError(source, field, text))
+    # Infinity has no fraction, and is no whole number either.
+    is_float = isinstance(value, float) and math.isfinite(value) and value.is_integer()
+    if not is_float and (isinstance(value, bool) or not isinstance(value, int)):
+        raise refuse(f"is not a whole number: {shown(value)}")
+    number = int(value)
+    if not least <= number <= most:
+        raise refuse(f"is {shown(value)}; must be {least} to {most}")
+    return number
+
+
+def whole_from_text(text: str, *, least: int, most: int, source: str | Path, field: str) -> int:
+    """The same from decimal digits. Raises InputError."""
+    stripped = text.strip()
+    digits = stripped[1:] if stripped[:1] in ("-", "+") else stripped
+    # `isdigit` is true of a superscript two, and `int` takes other scripts' digits.
+    if not (digits.isascii() and digits.isdigit()):
+        raise InputError(source, field, f"is not a whole number: {shown(text)}")
+    if len(digits) > DIGITS_MAX:
+        raise InputError(source, field, f"is a number of {len(digits)} digits; must be {least} to {most}")
+    return whole(int(stripped), least=least, most=most, source=source, field=field)
+
+
+def real(
+    value: Any,
+    *,
+    least: float,
+    most: float,
+    source: str | Path = "",
+    field: str = "",
+    problem: Callable[[str], Exception] | None = None,
+) -> float:
+    """A finite number within bounds, from JSON. Raises InputError, or what `problem` makes."""
+    refuse = problem or (lambda text: InputError(source, field, text))
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not is_number or (isinstance(value, float) and not math.isfinite(value)):
+        raise refuse(f"is not a finite number: {shown(value)}")
+    if not least <= value <= most:
+        raise refuse(f"is {shown(value)}; must be {least:g} to {most:g}")
+    return float(value)
+
+
+def within(count: int | float, most: int | float, *, source: str | Path, field: str, limit: str) -> None:
+    """Raises InputError where a count is over its limit: told with both figures and the setting's name."""
+    if count > most:
+        raise InputError(source, field, f"{count:,} is over the limit of {most:,} ({limit})")
+
+
+def shown(value: Any, *, most: int = 40) -> str:
+    """A foreign value, printable and short."""
+    if isinstance(value, int) and value.bit_length() > 256:
+        return f"a number of some {int(value.bit_length() * 0.30103) + 1} digits"
+    text = value if isinstance(value, str) else repr(value)
+    safe = "".join(c if c.isprintable() else "?" for c in text[: most + 1])
+    return safe if len(safe) <= most else safe[:most] + "..."
+
+
+def _kind(mode: int) -> str:
+    kinds = {
+        stat.S_IFDIR: "a folder",
+        stat.S_IFIFO: "a FIFO",
+        stat.S_IFCHR: "a device",
+        stat.S_IFBLK: "a device",
+        stat.S_IFSOCK: "a socket",
+    }
+    return kinds.get(stat.S_IFMT(mode), "something else")
+
+
+def _size(count: int) -> str:
+    return f"{count / MIB:.1f} MiB" if count >= MIB else f"{count} bytes"
+
+
+def bounded(file: IO[bytes], *, most_bytes: int, source: str | Path, field: str = "") -> bytes:
+    """What is left in a stream, refused where it is more than `most_bytes`: for what is unpacked."""
+    data = file.read(most_bytes + 1)
+    if len(data) > most_bytes:
+        raise InputError(source, field, f"unpacks to more than {_size(most_bytes)}")
+    return data

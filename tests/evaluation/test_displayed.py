@@ -1,0 +1,219 @@
+"""Displayed quality of pictures as they come in files: of any aspect, of 16 bits, transparent."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from runtime.errors import InputError
+from runtime.evaluation.displayed import displayed, expected_db, on_panels_raster
+from runtime.optics.stack import PanelStack
+from runtime.support.artifacts import in_8_bits, read_image, read_picture
+from tests.optics import reference
+from tests.test_cli import phasestack
+
+STACK = PanelStack(0.4, 0.3, (-0.06, 0.0, 0.06), 80, 60)
+EYES = np.array([[0.8, -0.03, 0.05], [0.8, 0.03, 0.05]])
+FOV = 36.0
+
+
+def smooth(height: int, width: int, *, right_px: float = 0.0) -> np.ndarray:
+    """(h, w, 3) a soft pattern in [0, 1], with values between any two 8-bit codes."""
+    v, u = np.mgrid[0:height, 0:width]
+    return np.stack([0.5 + 0.4 * np.sin((u + right_px) / 9 + k) * np.cos(v / 11 + k) for k in range(3)], -1)
+
+
+def traced_psnr(layers: np.ndarray, wanted: list[np.ndarray], *, moved_m: tuple[float, ...] = (0, 0, 0)) -> float:
+    """PSNR of both eyes' rays, one at a time in plain floats, in the raster of the pictures (intensities).
+
+    moved_m: the eyes are there instead, and look through the same points of the centre panel.
+    """
+    grey = [(layer[..., k] / 255).tolist() for layer in layers for k in range(3)]
+    squares = []
+    for eye, picture in zip(EYES, wanted, strict=True):
+        true = tuple(eye + np.array(moved_m))
+        height, width = picture.shape[:2]
+        for v in range(height):
+            for u in range(width):
+                ray = reference.ray(tuple(eye), u + 0.5, v + 0.5, width=width, height=height, fov_deg=FOV)
+                through = reference.subtract(reference.hit_plane(tuple(eye), ray, 0.0), true)
+                places = [
+                    reference.panel_pixel(
+                        reference.hit_plane(true, through, x), width_m=0.4, height_m=0.3, width=80, height=60
+                    )
+                    for x in STACK.x_m
+                ]
+                if not all(0.5 < a < 79.5 and 0.5 < b < 59.5 for a, b in places):
+                    continue
+                for k in range(3):
+                    phase = sum(reference.bilinear(grey[3 * n + k], a, b) for n, (a, b) in enumerate(places))
+                    squares.append((math.sin(phase * math.pi / 2) ** 2 - picture[v, u, k]) ** 2)
+    return -10 * math.log10(sum(squares) / len(squares))
+
+
+def random_layers(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (3, 60, 80, 4), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("size", [(40, 30), (48, 27), (27, 48)], ids=["same aspect", "wider", "portrait"])
+def test_a_picture_of_another_aspect_is_compared_in_its_own_raster(size: tuple[int, int]) -> None:
+    width, height = size
+    pictures = [(smooth(height, width, right_px=shift) * 255).astype(np.uint8) for shift in (0, 4)]
+    layers = random_layers()
+    if width * 60 == height * 80:
+        pictures_compared = [cv2.resize(p, (80, 60), interpolation=cv2.INTER_AREA) for p in pictures]
+    else:
+        pictures_compared = pictures
+    told = displayed(layers, pictures, STACK, eyes_m=EYES, fov_deg=FOV)
+    expected = traced_psnr(layers, [p / 255 for p in pictures_compared])
+    assert told.quality.psnr_db == pytest.approx(expected, abs=2e-3)
+    assert told.seen[0].image.shape == pictures_compared[0].shape
+
+
+def test_sizes_that_are_only_rounded_have_the_panels_aspect() -> None:
+    stack = PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 1920, 1080)
+    assert on_panels_raster(np.zeros((768, 1366, 3), np.uint8), stack).shape == (1080, 1920, 3)
+    assert on_panels_raster(np.zeros((768, 1360, 3), np.uint8), stack).shape == (768, 1360, 3)
+
+
+def test_an_error_that_would_take_an_eye_behind_the_display_has_no_expected_quality() -> None:
+    picture = (smooth(60, 80) * 255).astype(np.uint8)
+    look = displayed(random_layers(), [picture, picture], STACK, eyes_m=EYES, fov_deg=FOV)
+    wild = expected_db(look, random_layers(), STACK, eyes_m=EYES, fov_deg=FOV, sigmas_mm=(1e6,))
+    assert wild == {"1e+06": None}
+
+
+@pytest.fixture
+def solved(tmp_path: Path):
+    """Runs `solve` on two pictures' files; answers solve.json and the layers."""
+
+    def run(left: Path, right: Path, *more: str) -> tuple[dict, np.ndarray]:
+        panels = {"width_m": 0.4, "height_m": 0.3, "x_m": [-0.06, 0, 0.06], "width_px": 80, "height_px": 60}
+        (tmp_path / "panels.json").write_text(json.dumps(panels))
+        eyes = ("--left-eye", *map(str, EYES[0]), "--right-eye", *map(str, EYES[1]))
+        files = ("--left", left, "--right", right, "--panels", tmp_path / "panels.json", "--out", tmp_path / "out")
+        result = phasestack("solve", *files, *eyes, "--fov", str(FOV), *more)
+        assert result.returncode == 0, result.stderr
+        layers = np.stack([cv2.imread(str(tmp_path / "out" / f"layer-{n}.png"))[..., ::-1] for n in range(3)])
+        return json.loads((tmp_path / "out" / "solve.json").read_text()), layers
+
+    return run
+
+
+@pytest.mark.parametrize("size", [(48, 27), (27, 48)], ids=["wider than the panels", "portrait"])
+def test_solve_tells_what_the_eyes_see_of_pictures_of_another_aspect(solved, tmp_path: Path, size) -> None:
+    width, height = size
+    targets = []
+    for name, shift in (("left", 0), ("right", 2)):
+        codes = (smooth(height, width, right_px=shift) * 255 + 0.5).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / f"{name}.png"), codes[..., ::-1])
+        targets.append(codes / 255)
+    told, layers = solved(tmp_path / "left.png", tmp_path / "right.png")
+    assert told["psnr_db"] == pytest.approx(traced_psnr(layers, targets), abs=5e-3)
+    for sigma in (1, 2):
+        moves = [(0, s * 0.002 * sigma, 0) for s in (-1, 1)] + [(0, 0, s * 0.002 * sigma) for s in (-1, 1)]
+        error = 0.5 * 10 ** (-traced_psnr(layers, targets) / 10)
+        error += sum(10 ** (-traced_psnr(layers, targets, moved_m=move) / 10) for move in moves) / 8
+        assert told["expected_db"][f"{sigma}"] == pytest.approx(-10 * math.log10(error), abs=5e-3)
+    assert told["backend"] == "opencv"
+    assert told["eye_sigma_mm"] == 1
+
+
+def test_solve_scores_16_bit_pictures_with_all_their_bits(solved, tmp_path: Path) -> None:
+    targets = []
+    for name in ("left", "right"):
+        # Half a code above an 8-bit one: cut off to 8 bits, the target would be another by up to 255/256 of a code.
+        codes = np.round(smooth(60, 80) * 255).astype(np.uint16) * 256 + 250
+        cv2.imwrite(str(tmp_path / f"{name}.png"), codes[..., ::-1])
+        targets.append(codes / 65535)
+    told, layers = solved(tmp_path / "left.png", tmp_path / "right.png")
+    assert told["psnr_db"] == pytest.approx(traced_psnr(layers, targets), abs=5e-3)
+    cut_off = traced_psnr(layers, [np.floor(target * 65535 / 256) / 255 for target in targets])
+    assert abs(told["psnr_db"] - cut_off) > 0.05, "this test must be able to fail"
+
+
+def test_solve_composes_transparent_pictures_on_white(solved, tmp_path: Path) -> None:
+    targets = []
+    for name in ("left", "right"):
+        colour = (smooth(60, 80) * 255).astype(np.uint8)
+        alpha = np.tile(np.linspace(0, 255, 80).astype(np.uint8), (60, 1))[..., None]
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.concatenate([colour[..., ::-1], alpha], -1))
+        targets.append(np.round(colour * (alpha / 255) + 255 * (1 - alpha / 255)) / 255)
+    told, layers = solved(tmp_path / "left.png", tmp_path / "right.png")
+    assert told["psnr_db"] == pytest.approx(traced_psnr(layers, targets), abs=5e-3)
+    assert traced_psnr(layers, targets) > 25
+
+
+def test_a_16_bit_file_is_read_with_its_low_byte_and_rounded_to_8(tmp_path: Path) -> None:
+    codes = np.arange(0, 65536, 7, dtype=np.uint16)[: 90 * 100].reshape(90, 100)
+    cv2.imwrite(str(tmp_path / "a.png"), codes)
+    picture = read_picture(tmp_path / "a.png")
+    assert picture.dtype == np.uint16
+    np.testing.assert_array_equal(picture[..., 1], codes)
+    expected = np.array([[round(value * 255 / 65535) for value in row] for row in codes.tolist()])
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png")[..., 2], expected)
+    np.testing.assert_array_equal(in_8_bits(picture)[..., 0], expected)
+
+
+@pytest.mark.parametrize("suffix", ["png", "webp", "tiff"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_transparency_lets_white_through_in_every_format_that_has_it(tmp_path: Path, suffix: str, dtype) -> None:
+    if suffix == "webp" and dtype == np.uint16:
+        pytest.skip("WebP has 8 bits")
+    most = np.iinfo(dtype).max
+    rng = np.random.default_rng(0)
+    bgra = rng.integers(0, most, (6, 7, 4), dtype=dtype, endpoint=True)
+    path = tmp_path / f"a.{suffix}"
+    cv2.imwrite(str(path), bgra, [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == "webp" else [])
+    if suffix == "webp":
+        bgra = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # it may drop what nobody sees
+    expected = [
+        [[round((c * a + most * (most - a)) / most) for c in (r, g, b)] for b, g, r, a in row]
+        for row in bgra.astype(object)
+    ]
+    np.testing.assert_allclose(read_picture(path).astype(int), np.array(expected, dtype=int), atol=1)
+
+
+def test_a_palette_with_a_transparent_colour_is_composed_too(tmp_path: Path) -> None:
+    from PIL import Image
+
+    image = Image.new("P", (4, 2))
+    image.putpalette([10, 20, 30, 200, 100, 50] + [0] * 762)
+    image.putdata([0, 1, 0, 1, 1, 1, 0, 0])
+    image.save(tmp_path / "a.png", transparency=1)
+    read = read_picture(tmp_path / "a.png")
+    assert read[0, 0].tolist() == [10, 20, 30]
+    assert read[0, 1].tolist() == [255, 255, 255]
+
+
+def png_of(width: int, height: int) -> bytes:
+    """A PNG that says to be that large and holds next to nothing."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    parts = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + parts
+
+
+@pytest.mark.parametrize("size", [(32_000, 32_000), (60_000, 60_000)])
+def test_a_picture_that_would_not_fit_is_refused_by_its_header(tmp_path: Path, size: tuple[int, int]) -> None:
+    (tmp_path / "a.png").write_bytes(png_of(*size))
+    with pytest.raises(InputError, match=f"{size[0]} x {size[1]} pixels; at most 134,217,728"):
+        read_picture(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("content", [b"", b"no picture", b"\x89PNG\r\n\x1a\nIHDR", png_of(8, 8)[:60]])
+def test_what_is_no_picture_is_refused_with_its_name(tmp_path: Path, content: bytes, capfd) -> None:
+    (tmp_path / "a.png").write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.png"):
+        read_picture(tmp_path / "a.png")
+    assert capfd.readouterr().err == ""

@@ -1,0 +1,245 @@
+"""The files of a run: what is in them, and what happens when the disk fails."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runtime.errors import InputError
+from runtime.evaluation import run_output
+from runtime.evaluation.displayed import displayed
+from runtime.evaluation.run_output import FIELDS, RunOutput
+from runtime.optics.carried import carried_quality
+from runtime.optics.stack import PanelStack
+from runtime.records import State
+from runtime.support.artifacts import OutputFolder, read_image
+
+STACK = PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 32, 18)
+EYES = np.array([[0.7, -0.03, 0.05], [0.7, 0.03, 0.05]])
+SUMMARY = {"presented": 3, "frames": 3, "model": "balanced", "provider": "cpu", "psnr_db": 30.0, "ssim": 0.9}
+
+
+def line(frame: int, **more: Any) -> dict[str, Any]:
+    """A refresh as a presenter tells it."""
+    return {
+        "frame": frame,
+        "capture_ns": 1,
+        "predicted_for_ns": 2,
+        "present_ns": 3,
+        "eyes_m": EYES,
+        "eyes_label": "predicted",
+        "eye_sigma_mm": 1.23456789,
+        "state": State.TRACKING,
+        "presented": True,
+        "solution": 7,
+        "solved_for_m": EYES + 0.001,
+        "solution_age_ms": 12.3456789,
+        "true_eyes_m": None,
+        "inference": "reused",
+        "stage_ms": {"track": 0.123456},
+        "skew_ms": 0.0,
+    } | more
+
+
+def pictures(seed: int = 0) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    rng = np.random.default_rng(seed)
+    layers = rng.integers(0, 256, (3, 18, 32, 4), dtype=np.uint8)
+    left, right = rng.integers(0, 256, (2, 18, 32, 3), dtype=np.uint8)
+    return layers, (left, right)
+
+
+def test_a_line_a_refresh_holds_every_field_of_the_design(tmp_path: Path) -> None:
+    with RunOutput(tmp_path) as output:
+        output.refresh(line(0))
+        output.refresh(line(1, true_eyes_m=EYES, extra="more"))
+        output.refresh({"frame": 2})
+    told = [json.loads(text) for text in (tmp_path / "frames.jsonl").read_text().splitlines()]
+    assert [entry["frame"] for entry in told] == [0, 1, 2]
+    for entry in told:
+        assert set(FIELDS) <= set(entry)
+    assert told[0]["state"] == "tracking"
+    assert told[0]["solution_age_ms"] == 12.3457
+    assert told[0]["eyes_m"] == EYES.tolist()
+    assert (told[0]["true_eyes_m"], told[1]["true_eyes_m"]) == (None, EYES.tolist())
+    assert told[1]["extra"] == "more"
+    assert told[2]["solution"] is None, "what a run doesn't know is null"
+
+
+def test_a_light_holds_what_is_needed_to_judge_it_without_the_run(tmp_path: Path) -> None:
+    layers, drawn = pictures()
+    info = {
+        "solved_for_m": EYES,
+        "eyes_m": EYES + 0.002,
+        "true_eyes_m": EYES + np.array([0.0, 0.004, 0.0]),
+        "fov": 40.0,
+    }
+    with RunOutput(tmp_path) as output:
+        output.light(20, layers=layers, drawn=drawn, info=info)
+    folder = tmp_path / "light" / "20"
+    told = json.loads((folder / "light.json").read_text())
+    again = np.stack([read_image(folder / f"layer-{n}.png") for n in range(3)])
+    np.testing.assert_array_equal(again, layers[..., :3])
+    judged = carried_quality(
+        again,
+        [read_image(folder / f"drawn-{eye}.png") for eye in ("left", "right")],
+        STACK,
+        solved_for_m=told["solved_for_m"],
+        eyes_m=told["true_eyes_m"],
+        fov_deg=told["fov"],
+    )
+    here = carried_quality(layers, drawn, STACK, solved_for_m=EYES, eyes_m=info["true_eyes_m"], fov_deg=40.0)
+    assert judged.psnr_db == pytest.approx(here.psnr_db, abs=1e-9)
+
+
+def test_the_last_frame_leaves_its_layers_and_what_the_eyes_see(tmp_path: Path) -> None:
+    layers, wanted = pictures()
+    look = displayed(layers, wanted, STACK, eyes_m=EYES, fov_deg=40)
+    with RunOutput(tmp_path / "new" / "folder") as output:
+        output.finish(SUMMARY, layers, look)
+    left = {path.name for path in (tmp_path / "new" / "folder").iterdir()}
+    pairs = {f"{what}-{eye}.png" for what in ("seen", "wanted") for eye in ("left", "right")}
+    layer_names = {f"layer-{n}.png" for n in range(3)}
+    assert left == pairs | layer_names | {"contact-sheet.png", "frames.jsonl", "summary.json"}
+
+
+def test_the_sheet_tells_exact_and_carried_at_the_eyes_used_and_at_the_true_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from dataclasses import replace
+
+    from runtime.evaluation import contact_sheet
+
+    written: list[str] = []
+    monkeypatch.setattr(contact_sheet, "_write", lambda sheet, text, **_: written.append(text))
+    layers, wanted = pictures()
+    look = displayed(layers, wanted, STACK, eyes_m=EYES, fov_deg=40)
+    carried, at_true = (displayed(layers, pictures(seed)[1], STACK, eyes_m=EYES, fov_deg=40).quality for seed in (1, 2))
+    contact_sheet.contact_sheet(layers, replace(look, carried=carried, true=at_true), headline="run")
+    assert any("at the eyes used" in text and f"carried {carried.psnr_db:.1f} dB" in text for text in written)
+    true_line = next(text for text in written if "at the true eyes" in text)
+    assert f"exact {at_true.psnr_db:.1f} dB" in true_line
+    assert "carried" not in true_line, "a figure that was not measured is not told"
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_the_run(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_text("")
+    with pytest.raises(InputError, match="cannot be written"), RunOutput(file / "folder"):
+        pass
+
+
+class FullDisk:
+    """A file on a disk without room."""
+
+    def __init__(self) -> None:
+        self.tried = 0
+
+    def write(self, text: str) -> None:
+        self.tried += 1
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def close(self) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_full_disk_abandons_the_files_once_and_the_run_goes_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    disk = FullDisk()
+    layers, drawn = pictures()
+    with RunOutput(tmp_path) as output:
+        output._lines.close()
+        output._lines = disk
+        for frame in range(200):
+            output.refresh(line(frame))
+        output.light(0, layers=layers, drawn=drawn, info={})
+        output.finish(SUMMARY, layers, None)
+    assert "No space left" in output.problem
+    assert [record.message for record in caplog.records if "abandoned" in record.message] != []
+    assert len([record for record in caplog.records if "abandoned" in record.message]) == 1
+    assert disk.tried == 1
+    assert list(tmp_path.iterdir()) == [], "nothing half-written is left"
+
+
+def test_a_folder_that_vanishes_on_the_way_does_not_end_the_run(tmp_path: Path) -> None:
+    import shutil
+
+    layers, drawn = pictures()
+    target = tmp_path / "out"
+    with RunOutput(target) as output:
+        output.refresh(line(0))
+        shutil.rmtree(target)
+        target.write_text("a file now")
+        output.light(0, layers=layers, drawn=drawn, info={})
+        output.finish(SUMMARY, layers, None)
+    assert output.problem
+    assert target.read_text() == "a file now"
+
+
+def test_a_mistake_in_the_sheet_does_not_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: Any, **__: Any) -> None:
+        raise ValueError("no such tile")
+
+    monkeypatch.setattr(run_output, "contact_sheet", broken)
+    with RunOutput(tmp_path) as output:
+        output.finish(SUMMARY, pictures()[0], None)
+    assert "no such tile" in output.problem
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_where_not_every_line_must_be_kept_a_slow_disk_makes_nobody_wait(tmp_path: Path) -> None:
+    import threading
+
+    go_on = threading.Event()
+    with RunOutput(tmp_path, every_one=False) as output:
+        output._later(lambda: go_on.wait() and None)
+        for frame in range(run_output.WAITING + 50):
+            output.refresh(line(frame))
+        assert output.left_out >= 49
+        go_on.set()
+    assert output.problem == ""
+    assert len((tmp_path / "frames.jsonl").read_text().splitlines()) <= run_output.WAITING + 1
+
+
+def test_an_error_of_the_run_itself_leaves_nothing_new(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError), RunOutput(tmp_path / "out") as output:
+        output.refresh(line(0))
+        raise RuntimeError
+    assert not (tmp_path / "out").exists()
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from runtime.support.artifacts import OutputFolder
+with OutputFolder(Path(sys.argv[1])) as folder:
+    (folder.staging / "half.png").write_bytes(b"half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_a_killed_process_left_is_cleared_away_at_the_next_start(tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False)
+    assert done.returncode == -signal.SIGKILL
+    (left,) = tmp_path.iterdir()
+    assert (left / "half.png").exists()
+    with OutputFolder(tmp_path) as folder:
+        assert list(tmp_path.iterdir()) == [folder.staging]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_living_neighbours_folder_is_left_alone(tmp_path: Path) -> None:
+    with OutputFolder(tmp_path) as one:
+        (one.staging / "one").write_text("1")
+        with OutputFolder(tmp_path) as other:
+            (other.staging / "other").write_text("2")
+    assert {path.name for path in tmp_path.iterdir()} == {"one", "other"}

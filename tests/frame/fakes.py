@@ -1,0 +1,230 @@
+"""Small stand-ins for the presenter's neighbours, driven by a test clock: none of them waits for anything."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from runtime.clock import NS_PER_MS, NS_PER_S, SimulatedClock
+from runtime.config import Settings
+from runtime.errors import EndOfRecording, PanelLost
+from runtime.eyes.calibration import load_calibration
+from runtime.frame.pacing import Pacer
+from runtime.frame.presenter import Presenter, Refresh
+from runtime.frame.run_state import RunCell
+from runtime.frame.samples import Samples
+from runtime.frame.solver import Step
+from runtime.frame.solver_host import News, SolverHost, Task
+from runtime.frame.viewer import Viewer
+from runtime.optics.stack import PanelStack
+from runtime.panels.base import PanelSink
+from runtime.records import EyePoints, PanelFrame, PresentReport, SensorFrame, Solution, SolveRequest
+
+STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 32, 18)
+EYES = np.array([[0.6, -0.031, 0.0], [0.6, 0.031, 0.0]])
+HZ = 60
+PERIOD_NS = round(NS_PER_S / HZ)
+STAGE_MS = {"sensor": 0.1, "track": 0.1, "present": 1.0}
+
+
+def aside(y_m: float = 0.0, *, z_m: float = 0.0, x_m: float = 0.0) -> np.ndarray:
+    """(2, 3) eyes that have moved from `EYES`."""
+    return EYES + np.array([x_m, y_m, z_m])
+
+
+def picture(code: int) -> np.ndarray:
+    """(N, h, w, 4) of one grey."""
+    return np.full((STACK.count, STACK.height_px, STACK.width_px, 4), code, np.uint8)
+
+
+def solution(number: int, eyes_m: Any = EYES, *, time_ns: int = 0, **changes: Any) -> Solution:
+    """Layers for a pair of eyes; None: the flat picture."""
+    return Solution(number, picture(number % 256), eyes_m, time_ns, **changes)
+
+
+class FakeSamples(Samples):
+    """Gives what a test puts in, once it has arrived; raises where the test says so."""
+
+    def __init__(self) -> None:
+        self.waiting: list[SensorFrame] = []
+        self.stale_inputs = 0
+        self.why = ""  # why there is no sensor
+        self.ends_ns: int | None = None
+        self._sequence = 0
+
+    def put(self, eyes_m: Any, capture_ns: int, *, truth: bool = False) -> None:
+        """A sample of eyes (2, 3), frame `stack`; None: no face."""
+        self._sequence += 1
+        points = None if eyes_m is None else EyePoints(np.array(eyes_m, float), np.ones(2))
+        true_m = np.array(eyes_m, float) if truth else None
+        self.waiting.append(SensorFrame(self._sequence, capture_ns, points, true_eyes_m=true_m))
+
+    def arrived(self, now_ns: int) -> list[SensorFrame]:
+        if self.ends_ns is not None and now_ns >= self.ends_ns:
+            raise EndOfRecording("over")
+        there = [frame for frame in self.waiting if frame.capture_ns <= now_ns]
+        self.waiting = [frame for frame in self.waiting if frame.capture_ns > now_ns]
+        return there
+
+    def fault(self) -> str:
+        return self.why
+
+    @property
+    def serial(self) -> str:
+        return "F-1"
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class FakeSolver(SolverHost):
+    """Holds what a test hands over, and remembers what it was asked."""
+
+    def __init__(self, *, cost_ns: int = 20 * NS_PER_MS) -> None:
+        self.solve_cost_ns = cost_ns
+        self.there = News()
+        self.requests: list[SolveRequest] = []
+        self.tasks: list[Task] = []
+
+    def hand_over(self, *, solved: Solution | None = None, flat: Solution | None = None, **missing: str) -> None:
+        self.there = News(solved or self.there.solution, flat or self.there.flat, missing, self.there.solutions + 1)
+
+    def post(self, request: SolveRequest) -> None:
+        self.requests.append(request)
+
+    def news(self) -> News:
+        return self.there
+
+    def do(self, task: Task) -> None:
+        self.tasks.append(task)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class FakePanels(PanelSink):
+    """Keeps what it was given; lost while `lost` says why; tells blanks where it is given a display's period."""
+
+    name = "fake"
+
+    def __init__(self, clock: SimulatedClock) -> None:
+        self._clock, self.lost = clock, ""
+        self.shown: list[tuple[PanelFrame, bool]] = []  # and whether it was vouched to be unchanged
+
+    def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
+        if self.lost:
+            raise PanelLost(self.lost)
+        self.shown.append((frame, unchanged))
+        return PresentReport(frame.number, self._clock.now_ns(), 0.25)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    @property
+    def frame(self) -> PanelFrame:
+        """The newest."""
+        return self.shown[-1][0]
+
+    @property
+    def unchanged(self) -> bool:
+        """What was vouched for the newest."""
+        return self.shown[-1][1]
+
+
+class FakeParts:
+    """`SolverParts` whose steps are a test's own function."""
+
+    def __init__(self, step: Callable[[SolveRequest], Step], stage_ms: dict[str, float] | None = None) -> None:
+        self._step, self.stage_ms = step, stage_ms or {}
+        self.asked: list[SolveRequest] = []
+        self.closed: list[bool] = []  # with `abandoned`, each time
+
+    def step(self, request: SolveRequest) -> Step:
+        self.asked.append(request)
+        return self._step(request)
+
+    def simulated_stage_ms(self) -> dict[str, float]:
+        return self.stage_ms
+
+    def close(self, *, abandoned: bool = False) -> None:
+        self.closed.append(abandoned)
+
+
+class Watching:
+    """An observer that keeps all it is told."""
+
+    def __init__(self) -> None:
+        self.samples: list[SensorFrame] = []
+        self.refreshes: list[Refresh] = []
+
+    def sampled(self, sample: SensorFrame) -> None:
+        self.samples.append(sample)
+
+    def refreshed(self, refresh: Refresh) -> None:
+        self.refreshes.append(refresh)
+
+
+class Stage:
+    """A presenter on a test clock, among fakes; a sensor of `sensor_hz` sees the eyes where `eyes` says."""
+
+    def __init__(self, *, sensor_hz: float = 60.0, **tables: dict[str, Any]) -> None:
+        defaults: dict[str, Any] = {"tracker": {"hold_s": 0.5, "blend_s": 0.3}, "plan": {"reuse": False}}
+        merged = {name: {**defaults.get(name, {}), **tables.get(name, {})} for name in {**defaults, **tables}}
+        self.settings = Settings.model_validate(merged)
+        self.clock = SimulatedClock(NS_PER_S)
+        self.samples, self.solver, self.panels = FakeSamples(), FakeSolver(), FakePanels(self.clock)
+        self.watching = Watching()
+        calibration = load_calibration(None)
+        self.cell = RunCell(self.settings, calibration=calibration, content=Named("content"), predictor=Named("model"))
+        self.viewer = Viewer(self.settings, calibration, front_m=max(STACK.x_m), in_stack_frame=True)
+        self.pacer = Pacer(period_ns=PERIOD_NS, photon_ns=8 * NS_PER_MS, work_ns=round(1.2 * NS_PER_MS))
+        self.presenter = Presenter(
+            self.cell,
+            STACK,
+            clock=self.clock,
+            pacer=self.pacer,
+            samples=self.samples,
+            viewer=self.viewer,
+            solver=self.solver,
+            panels=self.panels,
+            stage_ms=STAGE_MS,
+            observer=self.watching,
+        )
+        self.eyes: Callable[[float], Any] = lambda time_s: EYES  # of seconds since the start; None: no face
+        self._sensor_ns, self._next_ns, self._start_ns = round(NS_PER_S / sensor_hz), NS_PER_S, NS_PER_S
+
+    def refresh(self, count: int = 1) -> list[Refresh]:
+        """So many refreshes; the sensor delivers what it saw up to each."""
+        done = []
+        for _ in range(count):
+            until_ns = self.clock.now_ns() + PERIOD_NS
+            while self._next_ns <= until_ns:
+                self.samples.put(self.eyes((self._next_ns - self._start_ns) / NS_PER_S), self._next_ns, truth=False)
+                self._next_ns += self._sensor_ns
+            self.presenter.refresh()
+            assert self.presenter.last is not None
+            done.append(self.presenter.last)
+        return done
+
+    def change(self, **plan: Any) -> None:
+        """Other settings of the plan hold from the next refresh on."""
+        settings = self.cell.state.settings
+        changed = settings.model_copy(update={"plan": settings.plan.model_copy(update=plan)})
+        self.cell.replace(settings=changed)
+
+
+class Named:
+    """Content or a model of which only the name is asked."""
+
+    provider = "none"
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+
+def renumbered(solved: Solution, number: int) -> Solution:
+    """The same layers as another solution."""
+    return replace(solved, number=number)

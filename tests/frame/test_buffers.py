@@ -1,0 +1,67 @@
+"""Layers that somebody holds never change; a buffer that nobody holds is used again."""
+
+from __future__ import annotations
+
+import gc
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runtime.frame.buffers import LayerBuffers
+
+SHAPE = (3, 4, 5, 4)
+
+
+def layers(value: int) -> np.ndarray:
+    return np.full(SHAPE, value, np.uint8)
+
+
+def test_the_copy_has_the_same_values_and_can_t_be_written_to():
+    copy = LayerBuffers().copy_of(layers(7))
+    assert np.array_equal(copy, layers(7))
+    with pytest.raises(ValueError, match="read-only"):
+        copy[:] = 0
+
+
+def test_the_predictor_s_own_array_may_change_afterwards():
+    own = layers(1)
+    copy = LayerBuffers().copy_of(own)
+    own[:] = 2
+    assert np.array_equal(copy, layers(1))
+
+
+@given(st.lists(st.sets(st.integers(0, 5)), max_size=30))
+def test_whatever_is_held_stays_as_it_was_and_no_more_buffers_are_made_than_are_held_at_once(story):
+    """story: which of the copies that are held are let go before each next one."""
+    buffers, held, most = LayerBuffers(), [], 0
+    for value, letting_go in enumerate(story):
+        held = [entry for index, entry in enumerate(held) if index not in letting_go]
+        held.append((value % 256, buffers.copy_of(layers(value % 256))))
+        most = max(most, len(held))
+        for expected, copy in held:
+            assert (copy == expected).all()
+        assert buffers.count <= most
+        del copy
+
+
+def test_a_solution_written_a_newest_and_a_shown_one_take_three_buffers():
+    buffers = LayerBuffers()
+    shown = newest = None
+    for value in range(20):
+        made = buffers.copy_of(layers(value))
+        shown, newest = newest, made
+        del made
+    gc.collect()
+    assert buffers.count <= 3
+    assert (newest == 19).all()
+    assert (shown == 18).all()
+
+
+def test_a_part_of_it_holds_all_of_it():
+    buffers = LayerBuffers()
+    part = buffers.copy_of(layers(1))[0, :2]
+    buffers.copy_of(layers(2))
+    buffers.copy_of(layers(3))
+    assert (part == 1).all()

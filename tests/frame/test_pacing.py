@@ -1,0 +1,215 @@
+"""Refreshes lie on the display's grid; what comes too late is counted, what is left out on purpose is not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runtime.clock import NS_PER_MS
+from runtime.frame.pacing import LATE_SHARE, MARGIN_LEAST_NS, Pacer
+from runtime.records import FrameTiming
+
+PERIOD_NS = 16 * NS_PER_MS
+PHOTON_NS = 8 * NS_PER_MS
+SHORT_NS = st.integers(0, 4 * PERIOD_NS)
+
+
+def pacer(*, period_ns: int = PERIOD_NS, work_ns: int = 0) -> Pacer:
+    return Pacer(period_ns=period_ns, photon_ns=PHOTON_NS, work_ns=work_ns)
+
+
+@dataclass
+class Display:
+    """Vertical blanks at regular times; a picture that is ready appears at the next one."""
+
+    period_ns: float
+    phase_ns: float = 0.0
+
+    def blank_after(self, time_ns: float) -> int:
+        return round(np.ceil((time_ns - self.phase_ns) / self.period_ns) * self.period_ns + self.phase_ns)
+
+
+def refresh(pacer: Pacer, display: Display, now_ns: int, *, work_ns: int) -> tuple[FrameTiming, int]:
+    """One refresh on a display: its timing, and the blank it was shown at."""
+    timing = pacer.predict(now_ns)
+    woke_ns = max(now_ns, timing.wake_ns)
+    blank_ns = display.blank_after(woke_ns + work_ns)
+    pacer.presented(timing, woke_ns=woke_ns, done_ns=blank_ns, blank_ns=blank_ns)
+    return timing, blank_ns
+
+
+def test_the_first_refresh_comes_at_once_and_its_light_after_the_scan_out():
+    timing = pacer(work_ns=2 * NS_PER_MS).predict(1000)
+    assert timing == FrameTiming(0, 1000, 1000 + 2 * NS_PER_MS, 1000 + 2 * NS_PER_MS + PHOTON_NS)
+
+
+def test_a_period_must_be_positive():
+    with pytest.raises(ValueError, match="period"):
+        pacer(period_ns=0)
+
+
+def test_in_time_every_slot_of_the_grid_is_taken():
+    paced, now_ns, presents = pacer(), 0, []
+    for _ in range(50):
+        timing = paced.predict(now_ns)
+        now_ns = max(now_ns, timing.wake_ns) + NS_PER_MS
+        paced.presented(timing, woke_ns=timing.wake_ns, done_ns=now_ns)
+        presents.append(timing.present_ns)
+    assert np.diff(presents).tolist() == [PERIOD_NS] * 49
+    assert paced.missed == 0
+
+
+@pytest.mark.parametrize(("late_periods", "skipped"), [(0.4, 0), (0.6, 1), (1.4, 1), (1.6, 2), (10.6, 11)])
+def test_who_comes_too_late_for_a_slot_takes_a_later_one_and_every_slot_between_is_missed(late_periods, skipped):
+    paced = pacer()
+    first = paced.predict(0)
+    now_ns = first.wake_ns + PERIOD_NS + round(late_periods * PERIOD_NS)
+    timing = paced.predict(now_ns)
+    assert timing.present_ns == first.present_ns + (1 + skipped) * PERIOD_NS
+    assert paced.missed == skipped
+    assert timing.id == 1  # refreshes are numbered, not slots
+
+
+@given(st.lists(st.tuples(SHORT_NS, st.integers(0, 3 * PERIOD_NS)), max_size=60), st.integers(0, PERIOD_NS))
+def test_whatever_happens_slots_ascend_on_one_grid_none_is_lost_and_none_begins_far_too_late(story, work_ns):
+    """story: for each refresh, how long it worked, and what else held it up."""
+    paced, now_ns = pacer(work_ns=work_ns), 12_345
+    first = last = None
+    for number, (spent_ns, held_up_ns) in enumerate(story):
+        timing = paced.predict(now_ns)
+        first = first or timing
+        assert timing.id == number
+        assert (timing.present_ns - first.present_ns) % PERIOD_NS == 0
+        assert timing.wake_ns <= timing.present_ns < timing.photon_ns == timing.present_ns + PHOTON_NS
+        assert timing.wake_ns >= now_ns - LATE_SHARE * PERIOD_NS - 1
+        if last is not None:
+            assert timing.present_ns > last.present_ns
+        # Every slot since the first was either a refresh's or is counted as missed.
+        assert (timing.present_ns - first.present_ns) // PERIOD_NS == number + paced.missed
+        woke_ns = max(now_ns, timing.wake_ns)
+        now_ns, last = woke_ns + spent_ns, timing
+        paced.presented(timing, woke_ns=woke_ns, done_ns=now_ns)
+        now_ns += held_up_ns
+
+
+def test_without_blanks_the_light_is_told_from_when_presenting_was_done():
+    paced = pacer()
+    timing = paced.predict(0)
+    assert paced.presented(timing, woke_ns=0, done_ns=5 * NS_PER_MS) == 5 * NS_PER_MS + PHOTON_NS
+
+
+def test_the_time_that_a_refresh_works_is_learnt_and_it_wakes_so_much_earlier():
+    paced, now_ns = pacer(), 0
+    for _ in range(40):
+        timing = paced.predict(now_ns)
+        woke_ns = max(now_ns, timing.wake_ns)
+        now_ns = woke_ns + 4 * NS_PER_MS
+        paced.presented(timing, woke_ns=woke_ns, done_ns=now_ns)
+    assert abs(lead(paced) - 4 * NS_PER_MS) < NS_PER_MS / 10
+
+
+def test_one_very_long_refresh_does_not_wake_all_others_early():
+    paced = pacer()
+    timing = paced.predict(0)
+    paced.presented(timing, woke_ns=0, done_ns=100 * PERIOD_NS)
+    after = paced.predict(100 * PERIOD_NS)
+    assert after.present_ns - after.wake_ns <= PERIOD_NS / 4
+
+
+@given(st.floats(0, 1), st.floats(0.998, 1.002))
+def test_refreshes_follow_the_display_s_own_blanks_wherever_they_lie_and_as_they_drift(phase, pace):
+    """The configured period is a nominal one; a monitor's own differs, and its phase is anything."""
+    display = Display(period_ns=pace * PERIOD_NS, phase_ns=phase * PERIOD_NS)
+    paced, now_ns = pacer(), 0
+    errors = []
+    for _ in range(400):
+        timing, now_ns = refresh(paced, display, now_ns, work_ns=NS_PER_MS // 2)
+        errors.append(timing.present_ns - now_ns)
+    # A phase is learnt by a tenth a refresh: a drift of 0.2% a refresh is followed ten times as far behind.
+    assert np.abs(errors[200:]).max() <= 0.025 * PERIOD_NS
+
+
+def test_a_blank_that_was_missed_is_counted_once_and_the_next_refresh_keeps_off_it():
+    display, paced = Display(PERIOD_NS), pacer(work_ns=NS_PER_MS)
+    now_ns, blanks = 0, []
+    for number in range(60):
+        work_ns = 20 * NS_PER_MS if number == 40 else NS_PER_MS
+        _, now_ns = refresh(paced, display, now_ns, work_ns=work_ns)
+        blanks.append(now_ns)
+    intervals = np.diff(blanks) / PERIOD_NS
+    lost = round(float((intervals[20:] - 1).sum()))
+    assert lost >= 1
+    assert (intervals[45:] == 1).all()  # it was one hiccup
+    assert paced.missed >= lost
+
+
+def test_the_margin_grows_with_a_missed_blank_and_shrinks_again_by_and_by():
+    paced = pacer()
+    first = paced.predict(0)
+    paced.presented(first, woke_ns=0, done_ns=first.present_ns, blank_ns=first.present_ns)
+    margin_ns = [lead(paced)]
+    timing = paced.predict(0)
+    paced.presented(timing, woke_ns=0, done_ns=0, blank_ns=timing.present_ns + PERIOD_NS)
+    margin_ns.append(lead(paced))
+    for _ in range(20_000):
+        timing = paced.predict(0)
+        paced.presented(timing, woke_ns=0, done_ns=0, blank_ns=timing.present_ns)
+    margin_ns.append(lead(paced))
+    assert margin_ns[0] == MARGIN_LEAST_NS
+    assert margin_ns[1] > 1.2 * MARGIN_LEAST_NS
+    assert margin_ns[2] == MARGIN_LEAST_NS
+
+
+def lead(paced: Pacer) -> int:
+    timing = paced.predict(0)
+    return timing.present_ns - timing.wake_ns
+
+
+@pytest.mark.parametrize("work_ms", [0.5, 3.0, 6.0])
+def test_a_display_that_is_drawn_for_long_before_its_blank_misses_next_to_none_once_it_is_known(work_ms):
+    display, paced, now_ns = Display(PERIOD_NS, phase_ns=5 * NS_PER_MS), pacer(), 0
+    blanks = []
+    for _ in range(4000):
+        _, now_ns = refresh(paced, display, now_ns, work_ns=round(work_ms * NS_PER_MS))
+        blanks.append(now_ns)
+    intervals = np.diff(blanks[1000:]) / PERIOD_NS
+    assert np.mean(intervals > 1.5) <= 0.004
+
+
+def test_a_refresh_that_was_left_out_on_purpose_keeps_its_slot_and_is_no_missed_blank():
+    display, paced, now_ns = Display(PERIOD_NS), pacer(), 0
+    for _ in range(20):
+        _, now_ns = refresh(paced, display, now_ns, work_ns=NS_PER_MS // 4)
+    missed, last = paced.missed, None
+    for _ in range(200):  # nothing changes: the sink swaps nothing, and tells no blank
+        timing = paced.predict(now_ns)
+        woke_ns = max(now_ns, timing.wake_ns)
+        now_ns = woke_ns + NS_PER_MS // 10
+        photon_ns = paced.presented(timing, woke_ns=woke_ns, done_ns=now_ns)
+        assert photon_ns == timing.present_ns + PHOTON_NS  # the old picture is shown until its slot
+        if last is not None:
+            assert timing.present_ns - last == PERIOD_NS
+        last = timing.present_ns
+    assert paced.missed == missed
+    timing, blank_ns = refresh(paced, display, now_ns, work_ns=NS_PER_MS // 4)
+    assert blank_ns - timing.present_ns < PERIOD_NS / 2
+    assert paced.missed == missed
+
+
+def test_work_is_not_forgotten_while_pictures_are_left_out():
+    """After a rest the first motion must not miss blanks because nothing had to be drawn for a while."""
+    display, paced, now_ns = Display(PERIOD_NS), pacer(), 0
+    for _ in range(600):
+        _, now_ns = refresh(paced, display, now_ns, work_ns=4 * NS_PER_MS)
+    for _ in range(600):
+        timing = paced.predict(now_ns)
+        now_ns = max(now_ns, timing.wake_ns) + NS_PER_MS // 10
+        paced.presented(timing, woke_ns=now_ns - NS_PER_MS // 10, done_ns=now_ns)
+    missed = paced.missed
+    for _ in range(60):
+        _, now_ns = refresh(paced, display, now_ns, work_ns=4 * NS_PER_MS)
+    assert paced.missed <= missed + 1

@@ -1,0 +1,187 @@
+"""What is made next: a solution, the flat picture, or nothing. Decisions alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runtime.clock import NS_PER_MS
+from runtime.frame.policy import Decision, Flatness, FramePolicy, Made, wants_flat
+from runtime.plan.savings import Plan
+from runtime.records import EyesEstimate, SolveRequest
+from tests.frame.fakes import EYES, aside
+
+STILL = Plan(reuse=True, focus=False, eyes=(True, True), dead_band_m=None)
+NONE_LEFT_OUT = Plan(reuse=False, focus=False, eyes=(True, True), dead_band_m=None)
+
+
+def wish(eyes_m: Any = EYES, *, flat: bool = False, paused: bool = False) -> SolveRequest:
+    return SolveRequest(0, eyes_m, "none" if eyes_m is None else "predicted", 0.0, flat_wanted=flat, paused=paused)
+
+
+class Told:
+    """A policy and what was made so far: whatever it decides is done."""
+
+    def __init__(self, *, plan: Plan | None = STILL) -> None:
+        self.policy, self.plan = FramePolicy(), plan
+        self.version = self.revision = 0
+        self.solved: Made | None = None
+        self.flat: Made | None = None
+
+    def asked(self, request: SolveRequest) -> Decision:
+        decision = self.policy.next_job(
+            request,
+            plan=self.plan,
+            state_version=self.version,
+            revision=self.revision,
+            solved=self.solved,
+            flat=self.flat,
+        )
+        if decision.kind == "solve":
+            self.solved = Made(self.version, self.revision, decision.eyes_m)
+        if decision.kind == "flat":
+            self.flat = Made(self.version, self.revision, None, self.policy.episode)
+        return decision
+
+    def kinds(self, *requests: SolveRequest) -> list[str]:
+        return [self.asked(request).kind for request in requests]
+
+
+def test_the_flat_picture_comes_first_since_something_must_be_shown_to_nobody():
+    assert Told().kinds(wish(None, flat=True), wish(None, flat=True)) == ["flat", "nothing"]
+
+
+def test_the_flat_picture_is_there_before_it_is_needed_and_then_eyes_are_solved_for():
+    assert Told().kinds(wish(), wish(), wish()) == ["flat", "solve", "nothing"]
+
+
+def test_eyes_that_are_where_they_were_are_solved_for_once_and_any_others_anew():
+    told = Told()
+    assert told.kinds(wish(), wish(), wish(EYES.copy()), wish(aside(1e-9)), wish(aside(1e-9))) == [
+        "flat", "solve", "nothing", "solve", "nothing",
+    ]  # fmt: skip
+
+
+def test_a_fixed_dead_band_lets_eyes_move_within_it_from_where_they_were_solved_for():
+    told = Told(plan=Plan(True, False, (True, True), dead_band_m=0.002))
+    told.kinds(wish(), wish())
+    steps = [told.asked(wish(aside(k * 0.0009))).kind for k in range(1, 7)]
+    assert steps == ["nothing", "nothing", "solve", "nothing", "nothing", "solve"]  # drift does not add up
+
+
+def test_without_a_plan_for_it_the_band_counts_for_nothing():
+    told = Told(plan=Plan(False, False, (True, True), dead_band_m=0.002))
+    told.kinds(wish(), wish())
+    assert told.asked(wish(aside(0.0001))).kind == "solve"
+
+
+@pytest.mark.parametrize("what", ["version", "revision"])
+def test_other_settings_and_other_content_are_solved_for_though_the_head_rests(what):
+    told = Told()
+    told.kinds(wish(), wish())
+    setattr(told, what, 1)
+    assert told.kinds(wish(), wish()) == ["solve", "nothing"]
+
+
+def test_an_eye_that_can_t_see_gives_way_to_the_other():
+    told = Told(plan=Plan(True, False, (False, True), None))
+    told.asked(wish())
+    assert np.array_equal(told.asked(wish()).eyes_m, EYES[[1, 1]])
+    moved = EYES.copy()
+    moved[0] += 0.1  # the eye that does not count
+    assert told.asked(wish(moved)).kind == "nothing"
+
+
+def test_nobody_is_solved_for_where_nobody_is_seen():
+    told = Told()
+    told.kinds(wish(), wish())
+    told.version = 1
+    assert told.asked(wish(None)).kind == "nothing"
+
+
+def test_paused_makes_nothing_new_whatever_changes_but_the_first_picture():
+    told = Told()
+    assert told.kinds(wish(paused=True), wish(paused=True), wish(aside(0.1), paused=True)) == [
+        "flat", "solve", "nothing",
+    ]  # fmt: skip
+    told.version = told.revision = 1
+    assert told.asked(wish(aside(0.1), paused=True, flat=True)).kind == "nothing"
+    assert told.asked(wish(aside(0.1))).kind == "solve"
+
+
+def test_the_flat_picture_is_drawn_anew_each_time_that_it_comes_to_be_wanted_and_keeps_its_place_until_then():
+    told = Told()
+    told.kinds(wish(), wish())
+    assert told.kinds(wish(None, flat=True), wish(None, flat=True), wish(None, flat=True)) == [
+        "flat", "nothing", "nothing",
+    ]  # fmt: skip
+    told.asked(wish())
+    assert told.kinds(wish(None, flat=True), wish(None, flat=True)) == ["flat", "nothing"]
+
+
+def test_while_both_are_wanted_solutions_and_flat_pictures_of_moving_content_take_turns():
+    told, kinds = Told(), []
+    for revision in range(12):
+        told.revision = revision
+        kinds.append(told.asked(wish(aside(revision / 1000), flat=True)).kind)
+    assert kinds[2:] == ["flat", "solve"] * 5 or kinds[2:] == ["solve", "flat"] * 5
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from([None, 0.0, 0.001, 0.05]), st.booleans(), st.booleans(), st.integers(0, 2)),
+        min_size=1,
+        max_size=40,
+    )
+)
+def test_what_is_asked_for_again_and_again_is_there_soon_and_then_nothing_is_done(story):
+    told = Told()
+    for y_m, flat, paused, revision in story:
+        told.revision = revision
+        told.asked(wish(None if y_m is None else aside(y_m), flat=flat, paused=paused))
+    y_m, flat, _, _ = story[-1]
+    settled = told.kinds(*[wish(None if y_m is None else aside(y_m), flat=flat)] * 5)
+    assert settled[-2:] == ["nothing", "nothing"]
+    assert told.flat is not None
+    if y_m is not None:
+        assert told.solved is not None
+        assert np.array_equal(told.solved.eyes_m, aside(y_m))
+        assert told.solved.revision == told.revision
+
+
+def eyes(label: str) -> EyesEstimate:
+    return EyesEstimate(0, 0, None if label == "none" else EYES, label)
+
+
+def test_the_flat_picture_is_made_before_it_is_needed():
+    assert wants_flat(eyes("held"), flat_asked=False, flatness=0.0)
+    assert wants_flat(eyes("none"), flat_asked=False, flatness=0.0)
+    assert wants_flat(eyes("predicted"), flat_asked=True, flatness=0.0)
+    assert wants_flat(eyes("predicted"), flat_asked=False, flatness=0.3)
+    assert not any(wants_flat(eyes(label), flat_asked=False, flatness=0.0) for label in ("exact", "rested"))
+
+
+def test_the_picture_goes_over_to_the_flat_one_evenly_and_back():
+    flatness = Flatness(0.0)
+    values = [flatness.toward(1.0, blend_s=0.1, now_ns=k * 20 * NS_PER_MS) for k in range(8)]
+    assert values == pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.0, 1.0])
+    assert flatness.toward(0.0, blend_s=0.1, now_ns=190 * NS_PER_MS) == pytest.approx(0.5)
+
+
+def test_without_a_blend_it_goes_over_at_once():
+    assert Flatness(0.0).toward(1.0, blend_s=0.0, now_ns=5) == 1.0
+
+
+@given(st.lists(st.tuples(st.sampled_from([0.0, 1.0]), st.integers(0, 500 * NS_PER_MS)), max_size=30))
+def test_it_never_leaves_its_range_nor_passes_where_it_goes(story):
+    flatness, now_ns = Flatness(), 0
+    for target, passed_ns in story:
+        now_ns += passed_ns
+        before = flatness.value
+        value = flatness.toward(target, blend_s=0.3, now_ns=now_ns)
+        assert 0.0 <= value <= 1.0
+        assert abs(value - target) <= abs(before - target)

@@ -1,0 +1,412 @@
+"""One refresh after the other on a test clock: aligned to the eyes of its light, whatever the solver does."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runtime.clock import NS_PER_MS, NS_PER_S
+from runtime.optics.alignment import align
+from runtime.records import EyesEstimate, State
+from tests.frame.fakes import EYES, HZ, PERIOD_NS, STACK, Stage, aside, picture, solution
+
+
+def moves(time_s: float) -> np.ndarray:
+    """A head that sways by 10 cm."""
+    return aside(0.1 * np.sin(2 * time_s), z_m=0.02 * np.cos(time_s))
+
+
+@pytest.fixture
+def stage() -> Stage:
+    """Tracking, with a solution and a flat picture there."""
+    made = Stage()
+    made.solver.hand_over(flat=solution(1, None))
+    made.solver.hand_over(solved=solution(2))
+    made.refresh(5)
+    return made
+
+
+# --- alignment ---------------------------------------------------------------------------------------------------
+
+
+def test_every_refresh_is_aligned_to_the_eyes_of_its_own_light(stage):
+    stage.eyes = moves
+    for _ in range(40):
+        (done,) = stage.refresh()
+        account = done.account
+        expected = stage.viewer.ahead(account.predicted_for_ns)
+        assert np.array_equal(account.eyes_m, expected.eyes_m)
+        found = align(STACK, solved_for_m=EYES, eyes_m=account.eyes_m)
+        assert len(done.frame.solved_from_shown) == STACK.count
+        for given, wanted in zip(done.frame.solved_from_shown, found.solved_from_shown, strict=True):
+            assert np.array_equal(given, wanted)
+    assert not np.array_equal(done.frame.solved_from_shown[0], np.eye(3))
+
+
+def test_the_alignment_of_a_refresh_is_from_the_eyes_of_the_solution_that_it_shows(stage):
+    stage.eyes = moves
+    stage.refresh(30)
+    solved_for = aside(0.05)
+    stage.solver.hand_over(solved=solution(9, solved_for))
+    (done,) = stage.refresh()
+    wanted = align(STACK, solved_for_m=solved_for, eyes_m=done.account.eyes_m).solved_from_shown
+    assert all(np.array_equal(a, b) for a, b in zip(done.frame.solved_from_shown, wanted, strict=True))
+    assert np.array_equal(done.account.solved_for_m, solved_for)
+    assert (done.frame.solved == picture(9)).all()
+
+
+@pytest.mark.parametrize("plan", [{"align": False}, {"enabled": False}])
+def test_alignment_can_be_switched_off_while_it_runs(stage, plan):
+    stage.eyes = moves
+    stage.change(**plan)
+    (done,) = stage.refresh()
+    assert done.frame.solved_from_shown == ()
+    stage.change(align=True, enabled=True)
+    assert len(stage.refresh()[0].frame.solved_from_shown) == STACK.count
+
+
+def test_eyes_that_are_too_far_from_the_solution_s_are_met_as_far_as_possible_and_that_is_told(stage):
+    stage.eyes = lambda _: aside(3.0)
+    stage.refresh(30)
+    machine = stage.presenter.machine
+    assert machine.state is State.TRACKING
+    assert "alignment at its limit" in machine.reason
+    assert "no longer in line" in machine.reason
+    assert np.isfinite(stage.panels.frame.solved_from_shown[0]).all()
+    stage.solver.hand_over(solved=solution(7, aside(3.0)))
+    stage.refresh()
+    assert "limit" not in machine.reason
+
+
+def test_eyes_behind_the_panels_are_none_and_the_picture_goes_flat(stage):
+    stage.eyes = lambda _: aside(x_m=-0.7)
+    stage.refresh(30)
+    assert stage.presenter.last.account.eyes_label == "none"
+    assert stage.presenter.machine.state is State.FLAT
+    assert stage.viewer.dropped["not in front of the panels"] > 0
+
+
+def test_an_eye_that_the_solution_was_not_made_for_moves_nothing(stage):
+    one = EYES[[0, 0]]
+    stage.solver.hand_over(solved=solution(5, one, seeing=(True, False)))
+    (done,) = stage.refresh()
+    used = done.account.eyes_m[[0, 0]]
+    wanted = align(STACK, solved_for_m=one, eyes_m=used).solved_from_shown
+    assert all(np.array_equal(a, b) for a, b in zip(done.frame.solved_from_shown, wanted, strict=True))
+
+
+def test_codes_never_change_at_rest_under_noise_and_do_when_the_same_head_moves():
+    """A 60 Hz head with 3 mm of noise: nothing shimmers."""
+    from runtime.optics.alignment import shown_layers
+
+    random = np.random.default_rng(3)
+    textured = random.integers(0, 256, (STACK.count, STACK.height_px, STACK.width_px, 4)).astype(np.uint8)
+
+    def changes(aside_m: Any) -> list[bool]:
+        stage = Stage(plan={"reuse": True})
+        stage.eyes = lambda s: aside(aside_m(s)) + random.normal(0.0, 0.003, (2, 3))
+        stage.solver.hand_over(flat=solution(1, None))
+        solved = solution(2, aside(0.01))
+        solved.layers[:] = textured
+        stage.solver.hand_over(solved=solved)
+        stage.refresh(2 * HZ)
+        shown = [shown_layers(done.frame) for done in stage.refresh(2 * HZ)]
+        return [not np.array_equal(a, b) for a, b in pairwise(shown)]
+
+    assert not any(changes(lambda _: 0.0))
+    assert all(changes(lambda s: 0.1 * np.sin(3 * s)))
+
+
+# --- the flat picture --------------------------------------------------------------------------------------------
+
+
+def test_before_the_first_solution_the_flat_picture_is_shown_whole():
+    stage = Stage()
+    stage.solver.hand_over(flat=solution(1, None))
+    (done,) = stage.refresh()
+    assert done.frame.flatness == 1.0
+    assert done.account.inference == "skipped"
+    assert done.account.solution is None
+    assert done.account.presented
+
+
+def test_the_first_picture_is_not_faded_in():
+    stage = Stage()
+    stage.solver.hand_over(flat=solution(1, None))
+    stage.refresh(10)
+    stage.solver.hand_over(solved=solution(2))
+    (done,) = stage.refresh()
+    assert done.frame.flatness == 0.0
+    assert done.account.inference == "ran"
+
+
+def test_before_there_is_anything_nothing_is_presented_and_nothing_is_dropped_by_error():
+    stage = Stage()
+    stage.refresh(3)
+    assert stage.panels.shown == []
+    assert stage.presenter.machine.state is State.STARTING
+
+
+def test_a_lost_viewer_is_held_then_the_picture_goes_flat_evenly_and_comes_back_evenly(stage):
+    stage.eyes = lambda s: EYES if s < 1.0 or s > 3.0 else None
+    states, flatness = [], []
+    for done in stage.refresh(5 * HZ):
+        states.append(done.account.state)
+        flatness.append(done.frame.flatness)
+    seen = [state for state, before in zip(states, [None, *states], strict=False) if state is not before]
+    assert seen == [State.TRACKING, State.HOLDING, State.FLAT, State.TRACKING]
+    assert all(f == 0.0 for f, state in zip(flatness, states, strict=True) if state is State.HOLDING)
+    steps = np.abs(np.diff(flatness))
+    assert steps.max() == pytest.approx(PERIOD_NS / NS_PER_S / 0.3, rel=0.01)  # tracker.blend_s
+    assert max(flatness) == 1.0
+    assert flatness[-1] == 0.0
+    assert all(done.account.presented for done in stage.watching.refreshes)
+
+
+def test_while_eyes_are_lost_the_last_alignment_stays(stage):
+    stage.eyes = lambda s: moves(s) if s < 0.5 else None
+    stage.refresh(HZ)
+    held = [done for done in stage.watching.refreshes if done.account.eyes_m is not None][-1]
+    stage.refresh(HZ)
+    assert stage.presenter.last.account.eyes_m is None
+    for one, other in zip(held.frame.solved_from_shown, stage.panels.frame.solved_from_shown, strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_flat_can_be_asked_for_and_given_up(stage):
+    stage.presenter.flat_asked = True
+    stage.refresh(30)
+    assert stage.panels.frame.flatness == 1.0
+    assert (stage.presenter.machine.state, stage.presenter.machine.reason) == (State.FLAT, "asked for")
+    assert all(request.flat_wanted for request in stage.solver.requests[-29:])
+    assert all(request.eyes_m is not None for request in stage.solver.requests[-29:])  # it is ready to come back
+    stage.presenter.flat_asked = False
+    stage.refresh(30)
+    assert stage.panels.frame.flatness == 0.0
+    assert stage.presenter.machine.state is State.TRACKING
+
+
+def test_the_flat_picture_is_wanted_as_soon_as_eyes_are_held(stage):
+    stage.eyes = lambda s: EYES if s < 0.5 else None
+    stage.refresh(HZ)
+    labels = [done.account.eyes_label for done in stage.watching.refreshes]
+    wanted = [request.flat_wanted for request in stage.solver.requests]
+    assert "held" in labels
+    assert wanted.index(True, 6) == labels.index("held")
+
+
+# --- pause -------------------------------------------------------------------------------------------------------
+
+
+def test_paused_makes_nothing_new_but_stays_aligned(stage):
+    stage.presenter.paused = True
+    stage.eyes = moves
+    matrices = [done.frame.solved_from_shown[0] for done in stage.refresh(HZ)]
+    assert all(request.paused for request in stage.solver.requests[-HZ:])
+    assert "paused" in stage.presenter.machine.reason
+    assert len({matrix.tobytes() for matrix in matrices}) > HZ / 2
+
+
+# --- unchanged ---------------------------------------------------------------------------------------------------
+
+
+def test_a_picture_is_vouched_to_be_unchanged_only_where_nothing_differs():
+    stage = Stage(plan={"reuse": True})
+    stage.solver.hand_over(flat=solution(1, None))
+    stage.solver.hand_over(solved=solution(2))
+    stage.refresh(2 * HZ)  # the head comes to rest
+    assert all(unchanged for _, unchanged in stage.panels.shown[-20:])
+    stage.solver.hand_over(solved=solution(3))
+    stage.refresh()
+    assert not stage.panels.unchanged  # another solution
+    stage.refresh()
+    assert stage.panels.unchanged
+    stage.solver.hand_over(flat=solution(4, None))
+    stage.refresh()
+    assert stage.panels.unchanged  # another flat picture, of which nothing is seen
+    stage.presenter.flat_asked = True
+    stage.refresh()
+    assert not stage.panels.unchanged  # the mixture differs
+    stage.refresh(HZ)
+    assert stage.panels.unchanged  # all flat
+    stage.solver.hand_over(flat=solution(5, None))
+    stage.refresh()
+    assert not stage.panels.unchanged  # and now it is seen
+
+
+def test_moving_eyes_change_the_picture_at_every_refresh(stage):
+    stage.eyes = moves
+    stage.refresh(HZ)
+    assert not any(unchanged for _, unchanged in stage.panels.shown[-HZ // 2 :])
+
+
+def test_after_a_lost_panel_nothing_is_vouched_for(stage):
+    stage.change(align=False)
+    stage.refresh(2)
+    assert stage.panels.unchanged
+    stage.panels.lost = "unplugged"
+    stage.refresh()
+    stage.panels.lost = ""
+    stage.refresh()
+    assert not stage.panels.unchanged
+
+
+# --- faults ------------------------------------------------------------------------------------------------------
+
+
+def test_a_lost_panel_drops_refreshes_says_so_and_comes_back_with_the_newest(stage):
+    stage.panels.lost = "DUMMY1 was disconnected"
+    lost = stage.refresh(3)
+    assert [done.account.presented for done in lost] == [False] * 3
+    assert stage.presenter.machine.name == "degraded: panel"
+    assert "DUMMY1" in stage.presenter.machine.reason
+    assert stage.presenter.stats.dropped == 3
+    assert stage.presenter.stats.faults == {"panel": 3}
+    stage.solver.hand_over(solved=solution(8))
+    stage.panels.lost = ""
+    (back,) = stage.refresh()
+    assert back.account.presented
+    assert stage.panels.frame.solved_version == 8
+    assert stage.presenter.machine.state is State.TRACKING
+
+
+def test_a_solution_that_came_while_the_panel_was_lost_ran_with_the_refresh_that_first_showed_it(stage):
+    stage.panels.lost = "unplugged"
+    stage.solver.hand_over(solved=solution(8))
+    (lost,) = stage.refresh()
+    assert lost.account.inference != "ran"
+    stage.panels.lost = ""
+    (back,) = stage.refresh()
+    assert back.account.inference == "ran"
+
+
+@pytest.mark.parametrize("part", ["content", "model"])
+def test_what_the_solver_lacks_is_named_once_as_a_fault_and_the_last_solution_stays_aligned(stage, part):
+    stage.solver.hand_over(**{part: "out of memory"})
+    stage.eyes = moves
+    done = stage.refresh(30)
+    assert stage.presenter.machine.name == f"degraded: {part}"
+    assert "out of memory" in stage.presenter.machine.reason
+    assert stage.presenter.stats.faults == {part: 1}
+    assert all(entry.account.presented for entry in done)
+    assert len({entry.frame.solved_from_shown[0].tobytes() for entry in done}) > 20
+    stage.solver.hand_over()
+    stage.refresh()
+    assert stage.presenter.machine.state is State.TRACKING
+
+
+def test_a_lost_sensor_is_named(stage):
+    stage.samples.why = "unplugged"
+    stage.refresh()
+    assert stage.presenter.machine.name == "degraded: sensor"
+    stage.samples.why = ""
+    stage.refresh()
+    assert stage.presenter.machine.state is State.TRACKING
+
+
+def test_no_refresh_waits_for_the_solver():
+    """Nothing is handed over for ten seconds: as many refreshes as there are slots, each with its own eyes."""
+    stage = Stage()
+    stage.solver.hand_over(flat=solution(1, None))
+    stage.solver.hand_over(solved=solution(2))
+    stage.eyes = moves
+    done = stage.refresh(10 * HZ)
+    presents = np.array([entry.account.present_ns for entry in done])
+    assert np.abs(np.diff(presents) - PERIOD_NS).max() <= 2
+    assert stage.pacer.missed == 0
+    assert {entry.account.solution for entry in done[5:]} == {2}
+    ages = np.diff([entry.account.solution_age_ms for entry in done[5:]])
+    assert ages == pytest.approx(PERIOD_NS / NS_PER_MS, abs=0.01)  # and it says how old the solution is
+
+
+# --- what the solver is asked ------------------------------------------------------------------------------------
+
+
+def test_the_solver_is_asked_for_the_eyes_in_the_middle_of_the_time_that_its_solution_will_be_shown(stage):
+    stage.eyes = moves
+    for cost_ms in (1, 20, 60):
+        stage.solver.solve_cost_ns = cost_ms * NS_PER_MS
+        (done,) = stage.refresh()
+        request = stage.solver.requests[-1]
+        shown_from_ns = done.account.predicted_for_ns + stage.solver.solve_cost_ns + PERIOD_NS // 2
+        shown_for_ns = max(stage.solver.solve_cost_ns, PERIOD_NS)
+        assert request.time_ns == pytest.approx(shown_from_ns + shown_for_ns // 2, abs=2)
+        assert np.array_equal(request.eyes_m, stage.viewer.ahead(request.time_ns).eyes_m)
+        assert request.sigma_m * 1000 == pytest.approx(done.account.eye_sigma_mm)
+
+
+def test_asking_for_eyes_ahead_changes_nothing_of_the_eyes_that_are_shown(monkeypatch):
+    def shown(*, ask: bool) -> list[np.ndarray]:
+        stage = Stage()
+        if not ask:
+            unasked = EyesEstimate(0, 0, None, "none")
+            monkeypatch.setattr(stage.viewer, "ahead", lambda time_ns: unasked)
+        stage.eyes = lambda s: None if 0.8 < s < 1.1 else moves(s)
+        return [done.account.eyes_m for done in stage.refresh(2 * HZ)]
+
+    for one, other in zip(shown(ask=True), shown(ask=False), strict=True):
+        assert (one is None and other is None) or np.array_equal(one, other)
+
+
+# --- accounts ----------------------------------------------------------------------------------------------------
+
+
+def test_a_solution_ran_with_the_refresh_that_first_shows_it_and_is_reused_after_that(stage):
+    stage.solver.hand_over(solved=solution(3, stage_ms={"render": 8.0, "inference": 3.0}))
+    told = [done.account for done in stage.refresh(3)]
+    assert [account.inference for account in told] == ["ran", "reused", "reused"]
+    assert {name: told[0].stage_ms[name] for name in ("render", "prepare", "inference", "finish")} == {
+        "render": 8.0, "prepare": 0.0, "inference": 3.0, "finish": 0.0,
+    }  # fmt: skip
+    assert set(told[1].stage_ms) == {"wait", "sensor", "track", "present"}
+
+
+def test_the_light_is_that_of_the_refresh_and_the_age_of_its_solution_is_told(stage):
+    stage.solver.hand_over(solved=solution(3, time_ns=stage.clock.now_ns()))
+    made_ns = stage.clock.now_ns()
+    (done,) = stage.refresh()
+    account = done.account
+    assert account.photon_ns == pytest.approx(account.predicted_for_ns, abs=NS_PER_MS)
+    assert account.photon_ns > account.present_ns
+    assert account.solution_age_ms == pytest.approx((account.photon_ns - made_ns) / NS_PER_MS)
+
+
+def test_on_a_simulated_clock_a_refresh_is_presented_when_presenting_is_paid_for(stage):
+    """The scan-out is what lies between presenting and light (5.2: `predicted_for_ns` is the light)."""
+    (done,) = stage.refresh()
+    account = done.account
+    assert account.photon_ns - account.present_ns == 8 * NS_PER_MS
+
+
+def test_frames_are_numbered_and_counted_and_a_run_ends_after_so_many(stage):
+    begun = stage.presenter.stats.frames
+    assert stage.presenter.run(frames=begun + 5) == f"{begun + 5} frames done"
+    assert [done.account.frame for done in stage.watching.refreshes] == list(range(begun + 5))
+    assert stage.presenter.machine.state is State.STOPPING
+
+
+def test_a_recording_that_ends_ends_the_run(stage):
+    stage.samples.ends_ns = stage.clock.now_ns() + NS_PER_S
+    assert stage.presenter.run() == "the recording has ended"
+
+
+def test_every_sample_reaches_the_viewer_and_the_observer_in_order():
+    stage = Stage(sensor_hz=240.0)
+    stage.refresh(HZ)
+    numbers = [sample.sequence for sample in stage.watching.samples]
+    assert numbers == list(range(1, len(numbers) + 1))
+    assert len(numbers) >= 230
+    assert stage.viewer.rate_hz == pytest.approx(240.0, rel=0.01)
+
+
+def test_other_settings_reach_the_viewer_with_the_next_refresh(stage):
+    settings = stage.cell.state.settings
+    tracker = settings.tracker.model_copy(update={"hold_s": 0.0, "blend_s": 0.0})
+    stage.cell.replace(settings=settings.model_copy(update={"tracker": tracker}))
+    stage.eyes = lambda _: None
+    stage.refresh(10)
+    assert stage.presenter.machine.state is State.FLAT
+    assert stage.panels.frame.flatness == 1.0

@@ -1,0 +1,64 @@
+"""What a run is made with is one value: it changes as a whole or not at all."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+
+import pytest
+
+from runtime.config import Settings
+from runtime.eyes.calibration import load_calibration
+from runtime.frame.run_state import RunCell
+
+
+class Part:
+    """Stands for content or a model: only which one it is counts here."""
+
+
+@pytest.fixture
+def cell() -> RunCell:
+    return RunCell(Settings(), calibration=load_calibration(None), content=Part(), predictor=Part())
+
+
+def test_a_change_is_another_value_with_another_version_and_the_one_before_is_handed_back(cell):
+    before, content = cell.state, Part()
+    answered = cell.replace(content=content)
+    assert answered is before
+    assert cell.state.content is content
+    assert cell.state.predictor is before.predictor
+    assert cell.state.version == before.version + 1
+
+
+def test_what_a_reader_holds_does_not_change(cell):
+    held = cell.state
+    cell.replace(settings=Settings())
+    assert held.version == 0
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        held.content = Part()
+
+
+def test_a_part_that_there_is_not_changes_nothing(cell):
+    before = cell.state
+    with pytest.raises(TypeError):
+        cell.replace(colour="red")
+    assert cell.state is before
+
+
+def test_changes_from_many_threads_are_all_made_and_each_part_is_handed_back_once(cell):
+    handed_back = []
+    mine = [[Part() for _ in range(50)] for _ in range(4)]
+
+    def change(parts):
+        handed_back.extend(cell.replace(content=part).content for part in parts)
+
+    first = cell.state.content
+    threads = [threading.Thread(target=change, args=(parts,)) for parts in mine]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert cell.state.version == 200
+    everything = {id(part) for parts in mine for part in parts} | {id(first)}
+    assert {id(part) for part in handed_back} | {id(cell.state.content)} == everything
+    assert len(handed_back) == len(set(map(id, handed_back)))

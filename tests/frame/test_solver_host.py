@@ -1,0 +1,180 @@
+"""The solver in simulated time: handed over when its configured cost has passed, and the newest wish wins."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runtime.clock import NS_PER_MS, SimulatedClock
+from runtime.frame.solver import Step
+from runtime.frame.solver_host import FIRST_REQUEST, SimulatedSolver
+from runtime.records import SolveRequest
+from tests.frame.fakes import EYES, FakeParts, aside, solution
+
+COST_MS = {"render": 8.0, "prepare": 4.0, "inference": 3.0, "finish": 8.0, "sensor": 100.0, "present": 100.0}
+SUM_NS = 23 * NS_PER_MS
+
+
+def wish(number: int = 0) -> SolveRequest:
+    """Another one for each number."""
+    return SolveRequest(number, aside(number / 1000), "predicted", 0.001, flat_wanted=False)
+
+
+class Solving:
+    """Solves whatever it is asked, and draws the flat picture for nobody."""
+
+    def __init__(self) -> None:
+        self.number = 0
+
+    def __call__(self, request: SolveRequest) -> Step:
+        self.number += 1
+        if request.eyes_m is None:
+            return Step(flat=solution(self.number, None, time_ns=request.time_ns))
+        return Step(solution=solution(self.number, request.eyes_m, time_ns=request.time_ns))
+
+
+@pytest.fixture
+def clock() -> SimulatedClock:
+    return SimulatedClock(1_000_000)
+
+
+@pytest.fixture
+def parts() -> FakeParts:
+    return FakeParts(Solving(), COST_MS)
+
+
+@pytest.fixture
+def host(parts, clock) -> SimulatedSolver:
+    return SimulatedSolver(parts, clock)
+
+
+def test_the_flat_picture_is_there_before_the_first_refresh_and_no_solution(host, parts):
+    assert parts.asked == [FIRST_REQUEST]
+    assert host.news().flat is not None
+    assert host.news().solution is None
+    assert host.news().solutions == 0
+
+
+def test_what_a_solution_costs_is_the_sum_of_the_solver_s_stages_alone(host):
+    assert host.solve_cost_ns == SUM_NS
+
+
+def test_a_solution_is_handed_over_when_its_cost_has_passed_and_not_before(host, clock):
+    host.post(wish(5))
+    clock.advance_ns(SUM_NS - 1)
+    assert host.news().solution is None
+    clock.advance_ns(1)
+    made = host.news().solution
+    assert made.solved_for_ns == 5
+    assert made.stage_ms == {"render": 8.0, "prepare": 4.0, "inference": 3.0, "finish": 8.0}
+    assert host.news().solutions == 1
+
+
+def test_of_several_wishes_while_it_is_busy_the_newest_is_solved_next_and_begins_where_the_last_one_ended(host, clock):
+    begun_ns = clock.now_ns()
+    host.post(wish(1))
+    for number in (2, 3, 4):
+        clock.advance_ns(5 * NS_PER_MS)
+        host.post(wish(number))
+    clock.sleep_until_ns(begun_ns + 2 * SUM_NS - 1)
+    assert host.news().solution.solved_for_ns == 1
+    clock.advance_ns(1)
+    assert host.news().solution.solved_for_ns == 4
+    clock.advance_ns(10 * SUM_NS)
+    assert host.news().solutions == 2  # what was overtaken is never made
+
+
+def test_a_wish_that_comes_while_it_is_idle_begins_at_once(host, clock):
+    clock.advance_ns(5 * SUM_NS)
+    host.post(wish(1))
+    clock.advance_ns(SUM_NS)
+    assert host.news().solution.solved_for_ns == 1
+
+
+def test_nothing_depends_on_when_it_is_looked_at(clock):
+    """Looking more often passes no time and changes no result."""
+
+    def run(looks: int) -> list[tuple[int, int]]:
+        time = SimulatedClock()
+        solver = SimulatedSolver(FakeParts(Solving(), COST_MS), time)
+        told = []
+        for number in range(40):
+            solver.post(wish(number))
+            for _ in range(looks):
+                solver.news()
+            time.advance_ns(16 * NS_PER_MS)
+            made = solver.news().solution
+            told.append((0, 0) if made is None else (made.number, made.solved_for_ns))
+        return told
+
+    assert run(0) == run(1) == run(7)
+
+
+def test_a_flat_picture_costs_its_drawing_alone(host, clock):
+    first = host.news().flat
+    host.post(replace(wish(7), eyes_m=None))
+    clock.advance_ns(8 * NS_PER_MS - 1)
+    assert host.news().flat is first
+    clock.advance_ns(1)
+    assert host.news().flat.solved_for_ns == 7
+
+
+def test_where_there_is_nothing_to_do_no_time_passes(clock):
+    parts = FakeParts(lambda request: Step(), COST_MS)
+    host = SimulatedSolver(parts, clock)
+    host.post(wish(1))
+    host.post(wish(2))
+    assert [request.time_ns for request in parts.asked] == [0, 1, 2]
+    assert host.news().solution is None
+
+
+def test_what_failed_is_told_and_the_last_solution_stays(parts, host, clock):
+    host.post(wish(1))
+    clock.advance_ns(SUM_NS)
+    good = host.news().solution
+    parts._step = lambda request: Step(missing={"model": "out of memory"})
+    host.post(wish(2))
+    assert host.news().missing == {"model": "out of memory"}
+    assert host.news().solution is good
+    parts._step = Solving()
+    host.post(wish(3))
+    clock.advance_ns(SUM_NS)
+    assert host.news().missing == {}
+
+
+def test_a_task_is_done_at_once_and_where_it_is_not_done_again_at_every_step(host, parts):
+    seen: list[Any] = []
+
+    def task(given: Any) -> bool:
+        seen.append(given)
+        return len(seen) == 3
+
+    host.do(task)
+    assert seen == [parts]
+    for number in range(4):
+        host.post(wish(number))
+    assert seen == [parts] * 3
+
+
+def test_a_cost_that_changes_is_told(host, parts, clock):
+    """The budget has chosen a lighter level."""
+    parts.stage_ms = {"render": 2.0, "inference": 1.0}
+    host.post(wish(1))
+    clock.advance_ns(3 * NS_PER_MS)
+    assert host.news().solution is not None
+    assert host.solve_cost_ns == 3 * NS_PER_MS
+
+
+def test_it_is_closed_once(host, parts):
+    host.close()
+    host.close()
+    assert parts.closed == [False]
+
+
+def test_the_eyes_of_a_solution_are_those_that_it_was_asked_for(host, clock):
+    host.post(SolveRequest(3, EYES, "rested", 0.0, flat_wanted=False))
+    clock.advance_ns(SUM_NS)
+    assert np.array_equal(host.news().solution.solved_for_m, EYES)

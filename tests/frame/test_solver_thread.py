@@ -1,0 +1,371 @@
+"""The solver beside the presenter: what raises, hangs or is late is told, left behind and made anew; nobody waits."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from runtime.clock import NS_PER_MS, NS_PER_S, SimulatedClock
+from runtime.errors import InputError
+from runtime.frame.solver import Step
+from runtime.frame.solver_thread import ABANDONED_MAX, SolverThread
+from runtime.records import SolveRequest
+from tests.frame.fakes import FakeParts, aside, solution
+
+LATE_S, ABANDON_S = 0.5, 10.0
+PATIENCE_S = 20.0  # of a test with another thread, on a busy machine
+
+Behaviour = Callable[[SolveRequest], Step]
+
+
+def wish(number: int) -> SolveRequest:
+    return SolveRequest(number, aside(number / 1000), "predicted", 0.001, flat_wanted=False)
+
+
+def solves(request: SolveRequest) -> Step:
+    made = solution(request.time_ns + 1, request.eyes_m, time_ns=request.time_ns, stage_ms={"inference": 20.0})
+    return Step(solution=made)
+
+
+class Workshop:
+    """A solver thread, whose parts do at every step what the test says; every step is announced."""
+
+    def __init__(self) -> None:
+        self.clock = SimulatedClock(NS_PER_S)
+        self.behave: Behaviour = solves
+        self.refuse: Exception | None = None  # making parts raises this
+        self.open = threading.Event()  # set: making parts returns
+        self.open.set()
+        self.made: queue.Queue[FakeParts] = queue.Queue()
+        self.all: list[FakeParts] = []
+        self.begun: queue.Queue[SolveRequest] = queue.Queue()
+        self.gates: list[threading.Event] = []  # of steps that hang
+        self.closed: queue.Queue[str] = queue.Queue()  # names of the threads that closed parts
+        self.host = SolverThread(self._make, self.clock, late_s=LATE_S, abandon_s=ABANDON_S, first_cost_ns=7)
+
+    def _make(self) -> FakeParts:
+        assert self.open.wait(PATIENCE_S)
+        if self.refuse is not None:
+            raise self.refuse
+        parts = _Announced(self._step, self.closed)
+        self.all.append(parts)
+        self.made.put(parts)
+        return parts
+
+    def _step(self, request: SolveRequest) -> Step:
+        if request.eyes_m is None:
+            return Step(flat=solution(1, None))
+        self.begun.put(request)
+        return self.behave(request)
+
+    def hang(self, request: SolveRequest) -> Step:
+        """A step that returns when its gate is opened; what it made is number 99."""
+        gate = threading.Event()
+        self.gates.append(gate)
+        assert gate.wait(PATIENCE_S)
+        return Step(solution=solution(99))
+
+    def post(self, number: int) -> None:
+        """Ask, and wait until the step has begun."""
+        self.host.post(wish(number))
+        while self.begun.get(timeout=PATIENCE_S).time_ns != number:
+            pass
+
+    def settle(self) -> None:
+        """Wait until what is under way is complete."""
+        done = threading.Event()
+        self.host.do(lambda parts: bool(done.set()) or True)
+        assert done.wait(PATIENCE_S)
+
+    def solve(self, number: int) -> None:
+        self.post(number)
+        self.settle()
+
+    def pass_s(self, seconds: float) -> None:
+        self.clock.advance_ns(round(seconds * NS_PER_S))
+
+    def left(self) -> None:
+        """Pass the time after which a hung step is left behind; wait for the parts that are made anew."""
+        while not self.made.empty():
+            self.made.get()
+        self.pass_s(ABANDON_S + 0.1)
+        self.host.news()
+        self.made.get(timeout=PATIENCE_S)
+        assert self.host._attempt.ready.wait(PATIENCE_S)
+
+    def close(self) -> None:
+        self.open.set()
+        for gate in self.gates:
+            gate.set()
+        self.host.close(PATIENCE_S)
+        for gate in self.gates:
+            gate.set()
+
+
+class _Announced(FakeParts):
+    """Tells which thread closes it."""
+
+    def __init__(self, step: Behaviour, closed: queue.Queue[str]) -> None:
+        super().__init__(step)
+        self._announce = closed
+
+    def close(self, *, abandoned: bool = False) -> None:
+        super().close(abandoned=abandoned)
+        self._announce.put(threading.current_thread().name)
+
+
+@pytest.fixture
+def shop() -> Iterator[Workshop]:
+    made = Workshop()
+    made.host.wait_ready()
+    yield made
+    made.close()
+
+
+def test_the_flat_picture_is_there_when_it_is_ready_and_no_solution(shop):
+    assert shop.host.news().flat is not None
+    assert shop.host.news().solution is None
+    assert shop.host.solve_cost_ns == 7
+
+
+def test_parts_are_made_used_and_closed_on_one_thread_that_is_not_the_presenter_s(shop):
+    threads = []
+    shop.behave = lambda request: (threads.append(threading.current_thread().name), solves(request))[1]
+    shop.solve(1)
+    shop.host.close(PATIENCE_S)
+    shop.host.close(PATIENCE_S)
+    assert [*threads, shop.closed.get(timeout=PATIENCE_S)] == ["solver-1", "solver-1"]
+    assert shop.all[0].closed == [False]
+    assert shop.host.left_behind == 0
+
+
+def test_a_solution_is_handed_over_and_counted(shop):
+    shop.solve(1)
+    assert shop.host.news().solution.solved_for_ns == 1
+    assert shop.host.news().solutions == 1
+    assert shop.host.news().missing == {}
+
+
+def test_what_a_solution_costs_is_a_running_mean_whose_first_is_believed_by_a_part(shop):
+    for number in range(1, 60):
+        shop.solve(number)
+    assert shop.host.solve_cost_ns == pytest.approx(20 * NS_PER_MS, rel=0.01)
+
+
+def test_what_can_t_be_made_is_raised_to_who_waits_for_it():
+    shop = Workshop.__new__(Workshop)
+
+    def refuse() -> Any:
+        raise InputError("model", "name", "is unknown")
+
+    shop.host = SolverThread(refuse, SimulatedClock(1), late_s=LATE_S, abandon_s=ABANDON_S)
+    with pytest.raises(InputError, match="is unknown"):
+        shop.host.wait_ready()
+    shop.host.close(PATIENCE_S)
+
+
+def test_who_waits_for_it_may_stop_waiting():
+    gate = threading.Event()
+    host = SolverThread(
+        lambda: FakeParts(lambda _: Step()) if gate.wait(PATIENCE_S) else None,
+        SimulatedClock(1),
+        late_s=LATE_S,
+        abandon_s=ABANDON_S,
+    )
+    told = []
+    host.wait_ready(lambda: bool(told.append(None)))  # answers False
+    assert len(told) == 1
+    gate.set()
+    host.close(PATIENCE_S)
+
+
+def test_asking_and_looking_never_wait_for_a_step_that_does_not_return(shop):
+    shop.solve(1)
+    shop.behave = shop.hang
+    shop.post(2)
+    for number in range(3, 500):  # these calls would hang, if they waited
+        shop.host.post(wish(number))
+        assert shop.host.news().solution.solved_for_ns == 1
+        shop.host.do(lambda parts: True)
+
+
+def test_of_the_wishes_that_came_meanwhile_only_the_newest_is_solved(shop):
+    shop.behave = shop.hang
+    shop.post(1)
+    shop.behave = solves
+    for number in range(2, 10):
+        shop.host.post(wish(number))
+    shop.gates[0].set()
+    assert shop.begun.get(timeout=PATIENCE_S).time_ns == 9
+    shop.settle()
+    assert shop.host.news().solution.solved_for_ns == 9
+    assert shop.begun.empty()
+
+
+def test_what_is_late_is_told_with_its_seconds_while_the_last_solution_stays(shop):
+    shop.solve(1)
+    shop.behave = shop.hang
+    shop.post(2)
+    shop.pass_s(LATE_S)
+    assert shop.host.news().missing == {}
+    shop.pass_s(2.0)
+    assert shop.host.news().missing == {"model": "the solver has not answered for 2 s"}
+    assert shop.host.news().solution.solved_for_ns == 1
+
+
+def test_late_is_told_until_a_step_is_in_time_again(shop):
+    shop.behave = shop.hang
+    shop.post(1)
+    shop.pass_s(2.0)
+    shop.behave = solves
+    shop.gates[0].set()
+    shop.settle()
+    assert shop.host.news().missing == {"model": "the last solution took 2.0 s"}
+    shop.solve(2)
+    assert shop.host.news().missing == {}
+
+
+def test_where_nothing_is_to_be_done_nothing_is_late(shop):
+    """A head that came to rest after one slow solution is not told of it for ever."""
+    shop.behave = shop.hang
+    shop.post(1)
+    shop.pass_s(2.0)
+    shop.behave = lambda request: Step()
+    shop.gates[0].set()
+    shop.settle()
+    shop.solve(2)
+    assert shop.host.news().missing == {}
+
+
+def test_a_step_that_does_not_return_is_left_behind_and_the_solver_made_anew_serves(shop):
+    shop.solve(1)
+    shop.behave = shop.hang
+    shop.post(2)
+    shop.left()
+    assert shop.host.restarts == 1
+    assert shop.host.left_behind == 1
+    assert shop.host.news().solution.solved_for_ns == 1  # until there is another
+    shop.behave = solves
+    shop.solve(3)
+    assert shop.host.news().solution.solved_for_ns == 3
+    assert shop.host.news().missing == {}
+
+
+def test_what_a_step_that_was_left_behind_makes_after_all_counts_no_more(shop):
+    shop.behave = shop.hang
+    shop.post(1)
+    shop.left()
+    shop.behave = solves
+    shop.solve(2)
+    shop.gates[0].set()
+    assert shop.closed.get(timeout=PATIENCE_S) == "solver-1"
+    assert shop.all[0].closed == [True]  # and only what no other solver uses is closed
+    assert shop.host.news().solution.solved_for_ns == 2
+    assert shop.host.news().solutions == 1
+
+
+def test_a_solver_that_hangs_again_and_again_leaves_no_more_than_a_few_threads(shop):
+    shop.behave = shop.hang
+    for number in range(1, ABANDONED_MAX + 1):
+        shop.post(number)
+        shop.left()
+    shop.post(ABANDONED_MAX + 1)
+    for _ in range(5):
+        shop.pass_s(ABANDON_S + 0.1)
+        assert "has not answered" in shop.host.news().missing["model"]
+    assert shop.host.restarts == ABANDONED_MAX
+    assert len(shop.all) == ABANDONED_MAX + 1
+    shop.gates[-1].set()  # the last one returns after all, and serves again
+    shop.behave = solves
+    shop.settle()
+    shop.solve(50)
+    assert shop.host.news().solution.solved_for_ns == 50
+
+
+def test_those_that_returned_after_all_count_no_more(shop):
+    shop.behave = shop.hang
+    for number in range(1, ABANDONED_MAX + 1):
+        shop.post(number)
+        shop.left()
+    hung = [attempt.thread for attempt in shop.host._hung]
+    for gate in shop.gates:
+        gate.set()
+    for thread in hung:
+        thread.join(PATIENCE_S)
+    shop.post(ABANDONED_MAX + 1)
+    shop.left()
+    assert shop.host.restarts == ABANDONED_MAX + 1
+
+
+def test_a_step_that_raises_is_told_at_once_and_the_solver_made_anew(shop):
+    """`Solver.step` answers with what is missing; what is raised beside it must not end solving silently."""
+    shop.solve(1)
+
+    def fail(request: SolveRequest) -> Step:
+        raise RuntimeError("a bug in the budget")
+
+    shop.behave = fail
+    shop.post(2)
+    assert shop.closed.get(timeout=PATIENCE_S) == "solver-1"
+    assert "a bug in the budget" in shop.host.news().missing["model"]
+    assert shop.host.news().solution.solved_for_ns == 1
+    shop.behave = solves
+    shop.left()
+    shop.solve(3)
+    assert shop.host.news().solution.solved_for_ns == 3
+    assert shop.host.news().missing == {}
+
+
+def test_where_it_can_t_be_made_anew_that_is_told_and_tried_again(shop):
+    shop.behave = shop.hang
+    shop.post(1)
+    shop.refuse = RuntimeError("no memory")
+    shop.pass_s(ABANDON_S + 0.1)
+    shop.host.news()
+    assert shop.host._attempt.ready.wait(PATIENCE_S)
+    assert "no memory" in shop.host.news().missing["model"]
+    shop.refuse, shop.behave = None, solves
+    shop.left()
+    shop.solve(2)
+    assert shop.host.news().missing == {}
+
+
+def test_a_task_that_raises_is_done_and_nothing_else_is_lost(shop, caplog):
+    def fail(parts: Any) -> bool:
+        raise RuntimeError("in a task")
+
+    shop.host.do(fail)
+    shop.settle()
+    shop.solve(1)
+    assert shop.host.news().solution.solved_for_ns == 1
+    assert sum("a task failed" in record.getMessage() for record in caplog.records) == 1
+
+
+def test_a_task_is_asked_again_after_every_step_until_it_is_done(shop):
+    asked = []
+    shop.host.do(lambda parts: bool(asked.append(parts)) or len(asked) >= 3)
+    for number in range(1, 6):
+        shop.solve(number)
+    assert asked == [shop.all[0]] * 3
+
+
+def test_tasks_that_wait_behind_a_hung_step_are_done_by_the_solver_made_anew(shop):
+    shop.behave = shop.hang
+    shop.post(1)
+    done: queue.Queue[Any] = queue.Queue()
+    shop.host.do(lambda parts: bool(done.put(parts)) or True)
+    shop.left()
+    assert done.get(timeout=PATIENCE_S) is shop.all[1]
+
+
+def test_closing_does_not_wait_for_ever_for_a_step_that_hangs(shop):
+    shop.behave = shop.hang
+    shop.post(1)
+    shop.host.close(0.01)
+    assert shop.host.left_behind == 1
+    shop.gates[0].set()
+    assert shop.closed.get(timeout=PATIENCE_S) == "solver-1"

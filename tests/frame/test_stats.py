@@ -1,0 +1,108 @@
+"""A run's figures: counted as the contract says, now and since the start; None where nothing was measured."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from runtime.clock import NS_PER_MS, NS_PER_S
+from runtime.frame.stats import WINDOW, Ring, RunStats
+from runtime.records import RefreshAccount, State
+
+PERIOD_NS = NS_PER_S // 50
+
+
+def account(number: int, **changes: Any) -> RefreshAccount:
+    """Fifty refreshes a second."""
+    values: dict[str, Any] = {
+        "frame": number, "capture_ns": 1 + number * PERIOD_NS, "predicted_for_ns": 0, "eyes_m": None,
+        "present_ns": NS_PER_S + number * PERIOD_NS, "eyes_label": "predicted", "eye_sigma_mm": 2.0,
+        "state": State.TRACKING, "solution": 1, "solved_for_m": None, "solution_age_ms": 30.0, "inference": "reused",
+        "presented": True, "skew_ms": 0.5, "stage_ms": {"sensor": 0.1, "track": 0.2, "present": 1.0},
+    }  # fmt: skip
+    values |= changes
+    values.setdefault("photon_ns", values["present_ns"] + 8 * NS_PER_MS)
+    return RefreshAccount(**values)
+
+
+def told(accounts: list[RefreshAccount], *, overhead_ms: float = 0.5) -> RunStats:
+    stats = RunStats()
+    for entry in accounts:
+        stats.add(entry, overhead_ms=overhead_ms)
+    return stats
+
+
+def test_refreshes_and_solutions_are_counted_apart():
+    ran = {"inference": "ran", "stage_ms": {"render": 8.0, "inference": 3.0}}
+    stats = told([account(k, **(ran if k % 5 == 0 else {})) for k in range(51)])
+    summary = stats.summary(stale_inputs=7)
+    assert (summary["frames"], summary["presented"], summary["dropped"], summary["stale_inputs"]) == (51, 51, 0, 7)
+    assert summary["inferences"] == 11
+    assert summary["seconds"] == 1.0
+    assert (summary["fps"], summary["solutions_per_s"]) == (50.0, 11.0)
+    assert summary["interval_ms"] == {"p50": 20.0, "p99": 20.0}
+    assert summary["stage_ms"]["render"] == {"p50": 8.0, "p95": 8.0, "p99": 8.0, "max": 8.0}
+    assert summary["solution_age_ms"] == {"p50": 30.0, "p99": 30.0}
+    assert summary["eye_sigma_mm"] == {"p50": 2.0, "p99": 2.0}
+    assert stats.reuse_saves_ms() == 11.0
+
+
+def test_what_was_not_measured_is_none():
+    summary = told([]).summary(stale_inputs=0)
+    for name in ("fps", "solutions_per_s", "interval_ms", "photon_ms", "overhead_ms", "skew_ms", "solution_age_ms"):
+        assert summary[name] is None, name
+    assert set(summary["stage_ms"].values()) == {None}
+    assert told([]).rates_now() == {"fps_now": None, "solutions_per_s_now": None}
+    assert told([account(0)]).reuse_saves_ms() is None
+    alone = told([account(0, capture_ns=0, solution_age_ms=None, eye_sigma_mm=None)]).summary(stale_inputs=0)
+    assert (alone["fps"], alone["photon_ms"], alone["solution_age_ms"], alone["eye_sigma_mm"]) == (None,) * 4
+
+
+def test_a_refresh_that_should_have_shown_a_picture_and_did_not_is_dropped_and_parts_two_intervals():
+    stats = told([account(k, presented=k != 5) for k in range(11)])
+    summary = stats.summary(stale_inputs=0)
+    assert (summary["presented"], summary["dropped"]) == (10, 1)
+    assert summary["interval_ms"]["p99"] == 20.0  # none of 40 ms is made up
+
+
+def test_overhead_leaves_out_the_first_refresh_which_pays_for_what_is_made_once():
+    stats = RunStats()
+    stats.add(account(0), overhead_ms=500.0)
+    assert stats.summary(stale_inputs=0)["overhead_ms"] is None
+    stats.add(account(1), overhead_ms=0.25)
+    assert stats.summary(stale_inputs=0)["overhead_ms"] == {"p50": 0.25, "p99": 0.25}
+
+
+def test_in_simulated_time_every_figure_is_the_run_s_clock_s():
+    stats = told([account(k) for k in range(5)], overhead_ms=123.456)
+    assert stats.summary(stale_inputs=0, simulated=True)["overhead_ms"]["p50"] == pytest.approx(0.3)
+
+
+def test_rates_now_are_of_the_last_second_and_those_of_the_run_are_not():
+    slow = [account(k, present_ns=k * NS_PER_S // 5) for k in range(100)]
+    fast = [account(k, present_ns=20 * NS_PER_S + k * PERIOD_NS, inference="ran") for k in range(200)]
+    stats = told(slow + fast)
+    assert stats.rates_now() == {"fps_now": 50.0, "solutions_per_s_now": 50.0}
+    assert stats.summary(stale_inputs=0)["fps"] < 15
+
+
+def test_faults_are_counted_by_part():
+    stats = told([])
+    for part in ("model", "panel", "model"):
+        stats.fault(part)
+    assert stats.summary(stale_inputs=0)["faults"] == {"model": 2, "panel": 1}
+
+
+def test_memory_is_bounded_and_quantiles_are_of_the_newest():
+    ring = Ring(4)
+    assert ring.quantiles(("p50",)) is None
+    for value in range(100):
+        ring.add(float(value))
+    assert ring.quantiles(("p50", "max")) == {"p50": 97.5, "max": 99.0}
+    assert WINDOW >= 60 * 60  # a minute of refreshes
+
+
+def test_the_capture_to_light_is_of_the_light_as_it_was_presented():
+    late = [account(k, photon_ns=1 + k * PERIOD_NS + 70 * NS_PER_MS) for k in range(3)]
+    assert told(late).summary(stale_inputs=0)["photon_ms"] == {"p50": 70.0, "p99": 70.0}

@@ -1,0 +1,168 @@
+"""From samples to the eyes at any instant: rested where the head rests, none where none could see the display."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runtime.clock import NS_PER_MS, NS_PER_S
+from runtime.config import Settings
+from runtime.eyes.calibration import load_calibration
+from runtime.frame.viewer import Viewer
+from runtime.records import EyePoints, EyesEstimate, SensorFrame
+from tests.frame.fakes import EYES, aside
+
+SENSOR_HZ, DISPLAY_HZ = 30, 60
+FRONT_M = 0.06
+LATENCY_NS = 15 * NS_PER_MS
+
+
+def viewer(**tables: dict[str, Any]) -> Viewer:
+    return Viewer(Settings.model_validate(tables), load_calibration(None), front_m=FRONT_M, in_stack_frame=True)
+
+
+def watched(
+    seen: Viewer,
+    seconds: float,
+    *,
+    noise_m: float,
+    y_m: Callable[[float], float] = lambda _: 0.0,
+    lost: Callable[[float], bool] = lambda _: False,
+    look: Callable[[Viewer], None] = lambda _: None,
+) -> list[EyesEstimate]:
+    """What it answers at every refresh of a display, from a sensor with noise."""
+    random, estimates, number = np.random.default_rng(5), [], 0
+    for refresh in range(round(seconds * DISPLAY_HZ)):
+        now_ns = NS_PER_S + refresh * NS_PER_S // DISPLAY_HZ
+        while (capture_ns := NS_PER_S + number * NS_PER_S // SENSOR_HZ) + LATENCY_NS <= now_ns:
+            time_s = number / SENSOR_HZ
+            points = EyePoints(aside(y_m(time_s)) + random.normal(0.0, noise_m, (2, 3)), np.ones(2))
+            seen.take(SensorFrame(number, capture_ns, None if lost(time_s) else points), serial="F-1")
+            number += 1
+        look(seen)
+        estimates.append(seen.at(now_ns + 10 * NS_PER_MS))
+    return estimates
+
+
+@pytest.mark.parametrize("noise_mm", [0.0, 1.0, 3.0])
+def test_a_head_at_rest_is_rested_and_its_eyes_stay_to_the_last_bit_whatever_the_noise(noise_mm):
+    told = watched(viewer(), 6.0, noise_m=noise_mm / 1000)[2 * DISPLAY_HZ :]
+    assert {estimate.label for estimate in told} == {"rested"}
+    assert len({estimate.eyes_m.tobytes() for estimate in told}) == 1
+    assert np.abs(told[0].eyes_m - EYES)[:, 1:].max() <= 0.002
+    assert all(0.0 < estimate.sigma_m < 0.003 for estimate in told)
+
+
+def test_a_moving_head_is_predicted_and_its_eyes_differ_from_refresh_to_refresh():
+    told = watched(viewer(), 3.0, noise_m=0.003, y_m=lambda s: 0.1 * np.sin(2 * s))[DISPLAY_HZ:]
+    assert {estimate.label for estimate in told} == {"predicted"}
+    assert all((a.eyes_m != b.eyes_m).any() for a, b in pairwise(told))
+
+
+def test_a_head_that_sets_off_is_let_go():
+    told = watched(viewer(), 4.0, noise_m=0.001, y_m=lambda s: 0.2 * max(0.0, s - 2.5))
+    labels = [estimate.label for estimate in told]
+    assert labels[round(2.4 * DISPLAY_HZ)] == "rested"
+    assert set(labels[round(2.8 * DISPLAY_HZ) :]) == {"predicted"}
+
+
+@pytest.mark.parametrize("plan", [{"reuse": False}, {"enabled": False}, {"most_band_mm": 0.0}])
+def test_where_the_plan_may_not_let_it_rest_every_refresh_is_predicted_anew(plan):
+    told = watched(viewer(plan=plan), 3.0, noise_m=0.003)[2 * DISPLAY_HZ :]
+    assert {estimate.label for estimate in told} == {"predicted"}
+    assert len({estimate.eyes_m.tobytes() for estimate in told}) == len(told)
+
+
+def test_eyes_that_are_lost_while_they_rest_are_held_where_they_rested_and_then_none():
+    seen = viewer(tracker={"hold_s": 0.4})
+    told = watched(seen, 3.0, noise_m=0.003, lost=lambda s: s > 2.0)
+    held = [estimate for estimate in told if estimate.label == "held"]
+    assert held
+    assert {estimate.eyes_m.tobytes() for estimate in held} == {told[2 * DISPLAY_HZ - 3].eyes_m.tobytes()}
+    assert told[-1].label == "none"
+    assert told[-1].eyes_m is None
+
+
+@pytest.mark.parametrize("x_m", [0.065, 0.0, -0.5])
+def test_eyes_behind_or_in_the_panels_are_none_counted_by_reason(x_m):
+    seen = viewer()
+    for number in range(5):
+        place = aside(x_m=x_m - EYES[0, 0])
+        seen.take(SensorFrame(number, NS_PER_S + number * NS_PER_S // 30, EyePoints(place, np.ones(2))), serial="")
+        told = seen.at(NS_PER_S + number * NS_PER_S // 30 + NS_PER_MS)
+        assert (told.label, told.eyes_m) == ("none", None)
+    assert seen.dropped == {"not in front of the panels": 5}
+
+
+def test_one_eye_behind_the_front_panel_is_enough():
+    seen = viewer()
+    place = np.array([[0.03, -0.03, 0.0], [0.083, 0.0, 0.0]])
+    seen.take(SensorFrame(0, NS_PER_S, EyePoints(place, np.ones(2))), serial="")
+    assert seen.at(NS_PER_S).eyes_m is None
+
+
+def test_what_the_tracker_refuses_is_counted_apart():
+    seen = viewer()
+    for number, place in enumerate([EYES, EYES, aside(0.5), EYES, EYES * 10]):
+        frame = SensorFrame(number, NS_PER_S + number * NS_PER_S // 30, EyePoints(place, np.ones(2)))
+        seen.take(frame, serial="")
+    assert seen.outliers == 2
+    assert not seen.dropped
+
+
+def test_looking_ahead_for_the_solver_changes_nothing_of_what_is_shown():
+    """Eyes return after a loss: they fade from where they were *shown* last, however far ahead the solver asked."""
+    story: dict[str, Any] = {
+        "noise_m": 0.001, "y_m": lambda s: 0.2 * np.sin(3 * s), "lost": lambda s: 1.0 < s < 1.3,
+    }  # fmt: skip
+    plain = watched(viewer(), 3.0, **story)
+    asked = watched(viewer(), 3.0, **story, look=lambda seen: [seen.ahead(t * NS_PER_S // 100) for t in (250, 900)])
+    for one, other in zip(plain, asked, strict=True):
+        assert one.label == other.label
+        assert one.eyes_m is None or (one.eyes_m == other.eyes_m).all()
+
+
+def test_looking_ahead_counts_no_dropped_eyes():
+    seen = viewer()
+    seen.take(SensorFrame(0, NS_PER_S, EyePoints(aside(x_m=-1.0), np.ones(2))), serial="")
+    seen.ahead(NS_PER_S)
+    assert not seen.dropped
+
+
+def test_the_sensor_s_rate_is_that_of_its_captures():
+    seen = viewer()
+    assert seen.rate_hz is None
+    watched(seen, 3.0, noise_m=0.001)
+    assert seen.rate_hz == pytest.approx(SENSOR_HZ, rel=0.01)
+
+
+def test_other_settings_of_the_plan_keep_what_the_tracker_knows_and_other_ones_of_its_own_do_not():
+    seen = viewer()
+    watched(seen, 1.0, noise_m=0.001)
+    calibration = load_calibration(None)
+    seen.adopt(Settings.model_validate({"plan": {"reuse": False}}), calibration)
+    assert seen.at(2 * NS_PER_S).eyes_m is not None
+    seen.adopt(Settings.model_validate({"plan": {"reuse": False}, "tracker": {"hold_s": 2.0}}), calibration)
+    assert seen.at(2 * NS_PER_S).eyes_m is None
+
+
+def test_samples_of_a_sensor_in_its_own_frame_go_through_the_calibration():
+    calibration = load_calibration(None)
+    seen = Viewer(Settings(), calibration, front_m=FRONT_M)
+    sensor_m = (np.linalg.inv(calibration.stack_from_sensor) @ np.c_[EYES, np.ones(2)].T).T[:, :3]
+    seen.take(SensorFrame(0, NS_PER_S, EyePoints(sensor_m, np.ones(2))), serial="demo")
+    assert seen.at(NS_PER_S).eyes_m == pytest.approx(EYES, abs=1e-9)
+
+
+def test_another_sensor_than_the_calibrated_one_is_told_once(caplog):
+    calibration = load_calibration(None)
+    seen = Viewer(Settings(), calibration, front_m=FRONT_M)
+    for number in range(3):
+        frame = SensorFrame(number, NS_PER_S + number * NS_PER_S // 30, EyePoints(EYES, np.ones(2)))
+        seen.take(frame, serial="another")
+    warnings = [record for record in caplog.records if "another" in record.getMessage()]
+    assert len(warnings) == bool(calibration.serial_warning("another"))

@@ -1,0 +1,279 @@
+"""Layers aligned to eyes that have moved: every ray of the middle meets on each panel what the old one met."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import assume, example, given
+from hypothesis import strategies as st
+
+from runtime.model.level import EVEN
+from runtime.optics.alignment import (
+    EVEN_CODE,
+    FARTHEST_M,
+    MOST_SCALE,
+    MOST_SHIFT,
+    NEAREST_M,
+    Alignment,
+    align,
+    is_identity,
+    reference_x_m,
+    scale_and_shift,
+    shown_layers,
+)
+from runtime.optics.stack import PanelStack
+from runtime.records import PanelFrame
+from tests.optics import reference
+from tests.optics.strategies import eyes, floats, stacks
+
+STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 1920, 1080)
+HEAD = np.array([[0.6, -0.031, 0.0], [0.6, 0.031, 0.0]])
+ANY_STACK = stacks(panels=(2, 8))
+
+
+@st.composite
+def heads(draw: st.DrawFn) -> np.ndarray:
+    """Two eyes (2, 3) of a head before the panels, rolled and turned."""
+    middle = draw(eyes(nearest_m=0.2, farthest_m=2.0, off_axis_deg=50.0))
+    half = np.array([draw(floats(-0.02, 0.02)), draw(floats(-0.04, 0.04)), draw(floats(-0.04, 0.04))])
+    return np.array([middle - half, middle + half])
+
+
+def pixel_of(stack: PanelStack, point: tuple[float, float, float]) -> np.ndarray:
+    size = {"width": stack.width_px, "height": stack.height_px}
+    return np.array(reference.panel_pixel(point, width_m=stack.width_m, height_m=stack.height_m, **size))
+
+
+def hit_px(stack: PanelStack, eye_m: np.ndarray, through: tuple[float, float, float], *, panel: int) -> np.ndarray:
+    """Where the ray from an eye through a point meets a panel, in its pixels; by plain geometry."""
+    eye = tuple(map(float, eye_m))
+    return pixel_of(stack, reference.hit_plane(eye, reference.subtract(through, eye), stack.x_m[panel]))
+
+
+def moved_px(matrix: np.ndarray, px: np.ndarray) -> np.ndarray:
+    return (matrix @ [*px, 1.0])[:2]
+
+
+@given(stack=ANY_STACK, old=heads(), new=heads(), y=floats(-0.5, 0.5), z=floats(-0.5, 0.5))
+def test_the_ray_from_the_new_middle_through_any_reference_point_meets_what_the_old_one_met(stack, old, new, y, z):
+    aligned = align(stack, solved_for_m=old, eyes_m=new)
+    assume(not aligned.limited)
+    point = (reference_x_m(stack), y * stack.width_m, z * stack.height_m)
+    for panel, matrix in enumerate(aligned.solved_from_shown):
+        shown = hit_px(stack, new.mean(axis=0), point, panel=panel)
+        met = hit_px(stack, old.mean(axis=0), point, panel=panel)
+        assert moved_px(matrix, shown) == pytest.approx(met, rel=1e-9, abs=1e-6)
+
+
+@given(
+    stack=ANY_STACK, middle=eyes(), half_m=floats(0.0, 0.04), step=st.tuples(floats(-0.05, 0.05), floats(-0.05, 0.05))
+)
+def test_a_head_that_moves_parallel_to_the_panels_is_aligned_exactly_for_each_of_its_eyes(stack, middle, half_m, step):
+    old = middle + np.array([[0.0, -half_m, 0.0], [0.0, half_m, 0.0]])
+    new = old + np.array([0.0, *step])
+    aligned = align(stack, solved_for_m=old, eyes_m=new)
+    assume(not aligned.limited)
+    for panel, matrix in enumerate(aligned.solved_from_shown):
+        for before, after in zip(old, new, strict=True):
+            point = (reference_x_m(stack), 0.1 * stack.width_m, -0.2 * stack.height_m)
+            shown, met = (hit_px(stack, eye, point, panel=panel) for eye in (after, before))
+            assert moved_px(matrix, shown) == pytest.approx(met, rel=1e-9, abs=1e-6)
+
+
+@given(stack=ANY_STACK, first=heads(), second=heads(), third=heads())
+def test_two_steps_one_after_the_other_are_one_step(stack, first, second, third):
+    """Solved from shown at third, by way of what would be shown at second."""
+    to_second = align(stack, solved_for_m=first, eyes_m=second)
+    to_third = align(stack, solved_for_m=second, eyes_m=third)
+    at_once = align(stack, solved_for_m=first, eyes_m=third)
+    assume(not (to_second.limited or to_third.limited or at_once.limited))
+    for a, b, both in zip(*(x.solved_from_shown for x in (to_second, to_third, at_once)), strict=True):
+        assert a @ b == pytest.approx(both, rel=1e-9, abs=1e-6)
+
+
+@given(stack=ANY_STACK, head=heads())
+def test_eyes_that_have_not_moved_change_no_bit(stack, head):
+    aligned = align(stack, solved_for_m=head, eyes_m=head.copy())
+    assert aligned.limited == ""
+    for matrix in aligned.solved_from_shown:
+        assert matrix.tobytes() == np.eye(3).tobytes()
+
+
+@given(stack=ANY_STACK, old=heads(), new=heads())
+def test_a_panel_in_the_reference_plane_never_moves(stack, old, new):
+    if stack.count % 2 == 0:
+        stack = replace(stack, x_m=stack.x_m[1:])
+    matrices = align(stack, solved_for_m=old, eyes_m=new).solved_from_shown
+    assert matrices[stack.count // 2].tobytes() == np.eye(3).tobytes()
+
+
+def test_two_panels_meet_midway():
+    stack = replace(STACK, x_m=(-0.06, 0.06))
+    assert reference_x_m(stack) == 0.0
+    rear, front = align(stack, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 0.008, 0.0])).solved_from_shown
+    assert rear[0, 2] == pytest.approx(-front[0, 2]) and rear[0, 2] > 1.0
+
+
+def test_a_step_to_the_right_moves_the_outer_panels_by_their_parallax():
+    aligned = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 0.01, 0.0]))
+    parallax_px = 0.01 * 0.06 / 0.6 * 1920 / 0.5184
+    for panel, sign in ((0, 1.0), (2, -1.0)):
+        expected = (1.0, 1.0, sign * parallax_px, 0.0)
+        assert scale_and_shift(aligned.solved_from_shown[panel]) == pytest.approx(expected, abs=1e-9)
+
+
+# Limits.
+
+
+@given(stack=ANY_STACK, old=heads(), new=st.lists(st.floats(), min_size=6, max_size=6))
+@example(stack=STACK, old=HEAD, new=[1e308] * 6)
+@example(stack=STACK, old=HEAD, new=[FARTHEST_M, 0.0, 0.0] * 2)
+@example(stack=STACK, old=HEAD, new=[0.06, 0.0, 0.0] * 2)
+def test_no_eyes_whatever_give_more_than_the_limits(stack, old, new):
+    aligned = align(stack, solved_for_m=old, eyes_m=np.array(new).reshape(2, 3))
+    centre = np.array([stack.width_px / 2, stack.height_px / 2])
+    for matrix in aligned.solved_from_shown:
+        assert np.isfinite(matrix).all()
+        assert 1 / MOST_SCALE - 1e-9 <= matrix[0, 0] == matrix[1, 1] <= MOST_SCALE + 1e-9
+        assert (np.abs(moved_px(matrix, centre) - centre) <= 2 * (MOST_SHIFT + 1e-9) * centre).all()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])
+def test_eyes_that_are_nowhere_leave_the_layers_as_they_are(bad):
+    new = HEAD.copy()
+    new[1, 2] = bad
+    aligned = align(STACK, solved_for_m=HEAD, eyes_m=new)
+    assert all(is_identity(matrix) for matrix in aligned.solved_from_shown)
+    assert "not finite" in aligned.limited
+    assert "not finite" in align(STACK, solved_for_m=new, eyes_m=HEAD).limited
+
+
+@pytest.mark.parametrize("x_m", [-1.0, 0.0, 0.06, 0.06 + 0.9 * NEAREST_M])
+def test_an_eye_at_or_behind_the_front_panel_holds_the_nearest_place_on_its_way(x_m):
+    new = HEAD.copy()
+    new[0, 0] = x_m
+    aligned = align(STACK, solved_for_m=HEAD, eyes_m=new)
+    assert "left eye" in aligned.limited and "front panel" in aligned.limited
+    share = (0.6 - 0.06 - NEAREST_M) / (0.6 - x_m)
+    nearest = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + share * (1 - 1e-12) * (new - HEAD))
+    assert nearest.limited == ""
+    assert same(aligned, nearest)
+
+
+def test_eyes_far_from_those_solved_for_hold_where_an_outer_panel_would_leave_the_line():
+    beyond = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 4.0, 0.0]))
+    assert "panel 0 is no longer in line" in beyond.limited and "4 m from where" in beyond.limited
+    assert beyond.solved_from_shown[0][0, 2] == pytest.approx(MOST_SHIFT * 1920)
+    assert same(beyond, align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 8.0, 0.0])))
+
+
+def test_a_solution_for_eyes_that_see_no_panel_is_shown_as_it_is():
+    behind = HEAD - np.array([0.7, 0.0, 0.0])
+    aligned = align(STACK, solved_for_m=behind, eyes_m=HEAD)
+    assert all(is_identity(matrix) for matrix in aligned.solved_from_shown) and aligned.limited
+
+
+@given(stack=ANY_STACK, old=heads(), direction=st.tuples(*[floats(-1.0, 1.0)] * 3), turn=floats(-0.02, 0.02))
+def test_at_a_limit_nothing_jumps(stack, old, direction, turn):
+    """Along a straight way, out to far beyond any limit: a small step of the eyes is a small step of the panels."""
+    assume(np.linalg.norm(direction) > 0.1)
+
+    def at(share: float) -> Alignment:
+        return align(stack, solved_for_m=old, eyes_m=old + 20.0 * share * np.array([direction, direction]) + turn)
+
+    low, high = 0.0, 1.0
+    assume(not at(low).limited and at(high).limited)
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (low, middle) if at(middle).limited else (middle, high)
+    for inside, outside in zip(at(low).solved_from_shown, at(high).solved_from_shown, strict=True):
+        assert inside == pytest.approx(outside, abs=1e-6 * stack.width_px)
+
+
+def same(a: Alignment, b: Alignment) -> bool:
+    return bool(np.allclose(a.solved_from_shown, b.solved_from_shown, rtol=1e-9, atol=1e-6))
+
+
+# What the panels show.
+
+
+@pytest.fixture(scope="module")
+def layers() -> np.ndarray:
+    return np.random.default_rng(5).integers(0, 256, (3, 90, 70, 4), dtype=np.uint8)
+
+
+def matrix(scale_u: float = 1.0, scale_v: float = 1.0, shift_u: float = 0.0, shift_v: float = 0.0) -> np.ndarray:
+    return np.array([[scale_u, 0.0, shift_u], [0.0, scale_v, shift_v], [0.0, 0.0, 1.0]])
+
+
+def slow_sample(layer: np.ndarray, m: np.ndarray, row: int, column: int) -> np.ndarray:
+    """One pixel, read as it is said: linear between four texels, those beside the layer even."""
+    u, v = m[0, 0] * (column + 0.5) + m[0, 2] - 0.5, m[1, 1] * (row + 0.5) + m[1, 2] - 0.5
+    total = np.zeros(3)
+    for y in (int(np.floor(v)), int(np.floor(v)) + 1):
+        for x in (int(np.floor(u)), int(np.floor(u)) + 1):
+            inside = 0 <= y < layer.shape[0] and 0 <= x < layer.shape[1]
+            value = layer[y, x, :3].astype(float) if inside else np.full(3, 128.0)
+            total += max(0.0, 1 - abs(u - x)) * max(0.0, 1 - abs(v - y)) * value
+    return total
+
+
+@pytest.mark.parametrize(
+    "m",
+    [
+        matrix(shift_u=3.3, shift_v=-0.7),
+        matrix(1.013, 1.013, -2.2, 0.4),
+        matrix(0.9, 0.95, 5.1, 3.0),
+        matrix(2.0, 2.0, -35.0, -45.0),
+        matrix(0.5, 0.5, 10.0, 10.0),
+        matrix(shift_u=-500.0),
+        matrix(shift_v=500.0),
+    ],
+)
+def test_a_shown_pixel_is_the_bilinear_sample_of_the_solution_and_even_beside_it(layers, m):
+    shown = shown_layers(PanelFrame(1, layers, 1, (np.eye(3), np.eye(3), m)))
+    assert np.array_equal(shown[:2], layers[:2])
+    expected = np.array([[slow_sample(layers[2], m, row, column) for column in range(70)] for row in range(90)])
+    assert np.abs(shown[2, ..., :3] - expected).max() <= 0.501
+
+
+def test_whole_pixels_are_moved_to_the_bit(layers):
+    shown = shown_layers(PanelFrame(1, layers, 1, (matrix(shift_u=4.0, shift_v=-2.0),) * 3))
+    assert np.array_equal(shown[:, 2:, :-4, :3], layers[:, :-2, 4:, :3])
+    assert (shown[:, :2, :, :3] == EVEN_CODE).all() and (shown[:, :, -4:, :3] == EVEN_CODE).all()
+
+
+def test_even_is_where_the_solver_starts_its_outer_panels():
+    assert EVEN_CODE == EVEN
+
+
+def test_where_nothing_moves_nothing_is_resampled_or_copied(layers):
+    assert shown_layers(PanelFrame(1, layers, 1)) is layers
+    assert shown_layers(PanelFrame(1, layers, 1, (np.eye(3),) * 3, layers[::-1], 1, 0.0)) is layers
+
+
+def test_the_flat_picture_alone_or_without_a_solution_is_itself(layers):
+    assert shown_layers(PanelFrame(1, layers, 1, (matrix(shift_u=1.5),) * 3, layers[::-1], 1, 1.0)).base is layers
+    flat = layers.copy()
+    assert shown_layers(PanelFrame(1, None, 0, (), flat, 1, 0.0)) is flat
+
+
+def test_the_aligned_solution_is_mixed_with_the_flat_picture_that_never_moves(layers):
+    flat = layers[::-1].copy()
+    m = matrix(1.01, 1.01, 2.25, -1.5)
+    aligned = shown_layers(PanelFrame(1, layers, 1, (m,) * 3)).astype(float)
+    shown = shown_layers(PanelFrame(1, layers, 1, (m,) * 3, flat, 1, 0.25))
+    assert np.abs(shown - (0.75 * aligned + 0.25 * flat))[..., :3].max() <= 0.5 + 0.75 * 0.5
+
+
+def test_a_frame_that_has_nothing_to_show_or_more_than_scale_and_shift_is_refused(layers):
+    with pytest.raises(ValueError, match="flat"):
+        shown_layers(PanelFrame(1, None, 0))
+    with pytest.raises(ValueError, match="flat"):
+        shown_layers(PanelFrame(1, layers, 0, flatness=0.5))
+    sheared = np.eye(3)
+    sheared[0, 1] = 0.1
+    with pytest.raises(ValueError, match="scale and a shift"):
+        shown_layers(PanelFrame(1, layers, 0, (sheared,) * 3))

@@ -1,0 +1,155 @@
+"""Carried and expected quality against a ray tracer in plain Python floats."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from runtime.optics.carried import CarriedView, carried_quality, expected_psnr_db, expected_psnrs_db
+from runtime.optics.quality import quality
+from runtime.optics.retina import seen_by
+from runtime.optics.stack import PanelStack
+from runtime.records import U8
+from tests.optics import reference
+from tests.optics.strategies import floats
+
+SIZE = (17, 11)  # of the pictures, pixels
+STACKS = (
+    PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 32, 20),
+    PanelStack(0.5, 0.3, (-0.05, 0.02), 24, 16),
+    PanelStack(0.4, 0.4, (-0.07, -0.03, 0.01, 0.03), 20, 20),
+)
+
+
+def traced_error(
+    nominal: np.ndarray, true: np.ndarray, layers: U8, picture: U8, stack: PanelStack, *, fov_deg: float
+) -> list[float]:
+    """Squared differences of the rays that count, one ray at a time: through the centre panel's points."""
+    width, height = picture.shape[1::-1]
+    centre_x = stack.x_m[len(stack.x_m) // 2]
+    grey = [(layer[..., channel] / 255).tolist() for layer in layers for channel in range(3)]
+    found = []
+    for v in range(height):
+        for u in range(width):
+            ray = reference.ray(tuple(nominal), u + 0.5, v + 0.5, width=width, height=height, fov_deg=fov_deg)
+            centre = reference.hit_plane(tuple(nominal), ray, centre_x)
+            direction = reference.subtract(centre, tuple(true))
+            places = [
+                reference.panel_pixel(
+                    reference.hit_plane(tuple(true), direction, x),
+                    width_m=stack.width_m,
+                    height_m=stack.height_m,
+                    width=stack.width_px,
+                    height=stack.height_px,
+                )
+                for x in stack.x_m
+            ]
+            if any(not (0.5 < a < stack.width_px - 0.5 and 0.5 < b < stack.height_px - 0.5) for a, b in places):
+                continue
+            for channel in range(3):
+                phase = sum(reference.bilinear(grey[3 * n + channel], a, b) for n, (a, b) in enumerate(places))
+                found.append((math.sin(phase * math.pi / 2) ** 2 - picture[v, u, channel] / 255) ** 2)
+    return found
+
+
+def case(stack: PanelStack, seed: int) -> tuple[U8, list[U8], np.ndarray]:
+    """Layers, pictures and two eyes."""
+    rng = np.random.default_rng(seed)
+    layers = rng.integers(0, 256, (stack.count, stack.height_px, stack.width_px, 4), dtype=np.uint8)
+    pictures = [rng.integers(0, 256, (SIZE[1], SIZE[0], 3), dtype=np.uint8) for _ in range(2)]
+    middle = np.array([rng.uniform(0.5, 1.0), rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.3)])
+    return layers, pictures, middle + np.array([[0, -0.03, 0], [0.01, 0.03, 0]])
+
+
+@settings(max_examples=15)
+@given(st.sampled_from(STACKS), st.integers(0, 2**31), floats(-0.05, 0.05), floats(-0.05, 0.05))
+def test_carried_quality_is_what_the_true_eyes_rays_cross(
+    stack: PanelStack, seed: int, right_m: float, away_m: float
+) -> None:
+    layers, pictures, eyes = case(stack, seed)
+    true = eyes + np.array([away_m, right_m, 0.02])
+    ours = carried_quality(layers, pictures, stack, solved_for_m=eyes, eyes_m=true, fov_deg=30)
+    by_eye = [
+        traced_error(*places, layers, picture, stack, fov_deg=30)
+        for places, picture in zip(zip(eyes, true, strict=True), pictures, strict=True)
+    ]
+    everything = by_eye[0] + by_eye[1]
+    assert ours.psnr_db == pytest.approx(-10 * math.log10(sum(everything) / len(everything)), abs=1e-3)
+    for told, errors in zip(ours.eye_psnr_db, by_eye, strict=True):
+        assert told == pytest.approx(-10 * math.log10(sum(errors) / len(errors)), abs=1e-3)
+
+
+@settings(max_examples=5)
+@given(st.sampled_from(STACKS), st.integers(0, 2**31), st.sampled_from([0.5, 1.0, 2.0, 7.0]))
+def test_expected_psnr_is_five_points_of_the_eyes_common_place(stack: PanelStack, seed: int, sigma_mm: float) -> None:
+    layers, pictures, eyes = case(stack, seed)
+    middle = (eyes[0] + eyes[1]) / 2
+    right = np.array([-middle[1], middle[0], 0.0]) / math.hypot(middle[0], middle[1])
+    moves = [(0.5, np.zeros(3))]
+    for axis in (right, np.array([0.0, 0.0, 1.0])):
+        moves += [(0.125, side * 0.002 * sigma_mm * axis) for side in (-1, 1)]
+    total = 0.0
+    for weight, move in moves:
+        errors = [
+            error
+            for eye, picture in zip(eyes, pictures, strict=True)
+            for error in traced_error(eye, eye + move, layers, picture, stack, fov_deg=30)
+        ]
+        total += weight * sum(errors) / len(errors)
+    told = expected_psnr_db(layers, pictures, stack, eyes_m=eyes, fov_deg=30, sigma_mm=sigma_mm)
+    assert told == pytest.approx(-10 * math.log10(total), abs=1e-3)
+
+
+def test_eyes_that_are_where_the_layers_were_solved_for_see_the_exact_quality() -> None:
+    layers, pictures, eyes = case(STACKS[0], 1)
+    exact = [seen_by(eye, layers, STACKS[0], fov_deg=30, width_px=SIZE[0], height_px=SIZE[1]) for eye in eyes]
+    wanted = [picture.astype(np.float32) / np.float32(255) for picture in pictures]
+    expected = quality([r.image for r in exact], wanted, [r.mask for r in exact])
+    told = carried_quality(layers, pictures, STACKS[0], solved_for_m=eyes, eyes_m=eyes, fov_deg=30)
+    assert told.psnr_db == pytest.approx(expected.psnr_db, abs=1e-4)
+    assert told.ssim == pytest.approx(expected.ssim, abs=1e-5)
+    sure = expected_psnr_db(layers, pictures, STACKS[0], eyes_m=eyes, fov_deg=30, sigma_mm=0.0)
+    assert sure == pytest.approx(expected.psnr_db, abs=1e-4)
+
+
+def test_several_uncertainties_at_once_are_each_what_they_are_alone() -> None:
+    layers, pictures, eyes = case(STACKS[0], 2)
+    together = expected_psnrs_db(layers, pictures, STACKS[0], eyes_m=eyes, fov_deg=30, sigmas_mm=(0.0, 1.0, 3.0))
+    for sigma_mm, told in together.items():
+        alone = expected_psnr_db(layers, pictures, STACKS[0], eyes_m=eyes, fov_deg=30, sigma_mm=sigma_mm)
+        assert told == pytest.approx(alone, abs=1e-9)
+
+
+def test_every_second_ray_is_a_part_of_all_of_them() -> None:
+    layers, _, eyes = case(STACKS[0], 3)
+    view = {"width_px": 33, "height_px": 21, "fov_deg": 30}
+    true = eyes[0] + np.array([0.0, 0.01, 0.0])
+    whole = CarriedView(eyes[0], STACKS[0], **view).seen_from(true, layers)
+    part = CarriedView(eyes[0], STACKS[0], step=2, **view).seen_from(true, layers)
+    np.testing.assert_allclose(part.image, whole.image[::2, ::2], atol=1e-6)
+    np.testing.assert_array_equal(part.mask, whole.mask[::2, ::2])
+
+
+def test_what_is_compared_with_every_second_ray_only_has_no_similarity() -> None:
+    layers, pictures, eyes = case(STACKS[0], 4)
+    told = carried_quality(layers, pictures, STACKS[0], solved_for_m=eyes, eyes_m=eyes, fov_deg=30, step=2)
+    assert math.isnan(told.ssim)
+    assert math.isfinite(told.psnr_db)
+
+
+@pytest.mark.parametrize("bad", [[0.06, 0.0, 0.0], [-1.0, 0.0, 0.0], [math.nan, 0.0, 0.0]])
+def test_a_true_eye_behind_a_panel_is_refused(bad: list[float]) -> None:
+    layers, pictures, eyes = case(STACKS[0], 5)
+    with pytest.raises(ValueError, match="in front of every panel"):
+        carried_quality(layers, pictures, STACKS[0], solved_for_m=eyes, eyes_m=[bad, bad], fov_deg=30)
+
+
+def test_eyes_that_see_nothing_of_the_panels_are_refused() -> None:
+    layers, pictures, eyes = case(STACKS[0], 6)
+    aside = eyes + np.array([0.0, 50.0, 0.0])
+    with pytest.raises(ValueError, match="crosses every panel"):
+        carried_quality(layers, pictures, STACKS[0], solved_for_m=eyes, eyes_m=aside, fov_deg=30)

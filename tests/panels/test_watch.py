@@ -1,0 +1,185 @@
+"""What others do to the panels' windows and monitors behind GLFW's back, on a real X server."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
+from runtime.config import OutputSettings, PanelSettings
+from runtime.errors import PanelLost
+from runtime.panels import xlib
+from runtime.panels.display import glfw
+from runtime.panels.registry import open_panels
+from runtime.panels.watch import PlacementWatch
+from tests.panels.edids import block
+from tests.panels.test_windows import BY_CONNECTOR, STACK, frame, picture, presents, shows
+from tests.waiting import eventually
+
+pytestmark = pytest.mark.windows
+
+
+@pytest.fixture
+def x(screen, monkeypatch):
+    monkeypatch.setenv("DISPLAY", screen.name)
+    yield screen
+    screen.place(0, 1, 2)
+    screen.xrandr("--query")
+
+
+@pytest.fixture
+def opened(x, context):
+    sinks = []
+
+    def open_(*panels: PanelSettings, **settings):
+        output = OutputSettings(**{"kind": "windows", "panels": panels, **settings})
+        sinks.append(open_panels(output, STACK, MonotonicClock(), context))
+        return sinks[-1]
+
+    yield open_
+    for sink in sinks:
+        sink.close()
+
+
+def lost(sink, *, unchanged: bool = False, within_s: float = 3.0) -> str:
+    """How the loss of a panel is told while the same sixty refreshes a second go on; empty: never."""
+    deadline = time.monotonic() + within_s
+    number = 1000
+    while time.monotonic() < deadline:
+        try:
+            sink.present(frame(number), unchanged=unchanged)
+        except PanelLost as error:
+            return str(error)
+        time.sleep(1 / 60)
+    return ""
+
+
+def x11_window(sink, surface: int) -> int:
+    return glfw.get_x11_window(sink._surfaces[surface].window.handle)
+
+
+def comes_back(x, sink, *monitors: int) -> bool:
+    return eventually(lambda: presents(sink, 7)) and all(
+        shows(x, monitor, picture(7, index)) for index, monitor in enumerate(monitors)
+    )
+
+
+@pytest.mark.parametrize("unchanged", [False, True])
+def test_a_window_that_somebody_destroyed_is_a_lost_panel_and_comes_back(x, opened, unchanged):
+    sink = opened(*BY_CONNECTOR)
+    assert presents(sink, 0)
+    x.do_to_window("XDestroyWindow", x11_window(sink, 1))
+    assert "panel 1: the window was destroyed" in lost(sink, unchanged=unchanged)
+    assert comes_back(x, sink, 2, 0, 1)
+
+
+@pytest.mark.parametrize("kind", ["windows", "span"])
+def test_a_window_that_somebody_unmapped_is_a_lost_panel_and_comes_back(x, opened, kind):
+    sink = opened(*BY_CONNECTOR, kind=kind)
+    assert presents(sink, 0)
+    x.do_to_window("XUnmapWindow", x11_window(sink, -1))
+    assert {"windows": "panel 2: the window was unmapped", "span": "the panels: the window was unmapped"}[kind] in lost(
+        sink
+    )
+    assert comes_back(x, sink, 2, 0, 1)
+
+
+def test_a_window_that_somebody_moved_is_a_lost_panel_and_comes_back(x, opened):
+    sink = opened(*BY_CONNECTOR)
+    assert presents(sink, 0)
+    x.do_to_window("XMoveWindow", x11_window(sink, 0), 600, 7)
+    assert "panel 0: the window is 320x180+600+7, not 320x180+640+0" in lost(sink)
+    assert comes_back(x, sink, 2, 0, 1)
+
+
+@pytest.mark.parametrize("kind", ["windows", "span"])
+def test_layers_follow_monitors_that_change_places(x, opened, kind):
+    sink = opened(*BY_CONNECTOR, kind=kind)
+    assert presents(sink, 0)
+    x.place(1, 0, 2)
+    assert "320x180+320+0, it was 320x180+0+0" in lost(sink)
+    assert comes_back(x, sink, 2, 1, 0)  # panel 1 is on DUMMY0, which is in the middle now
+    assert [monitor.connector for monitor in sink.monitors] == ["DUMMY2", "DUMMY0", "DUMMY1"]
+
+
+def test_a_monitor_in_another_mode_of_the_same_shape_is_bound_anew_where_that_is_allowed(x, opened):
+    sink = opened(*BY_CONNECTOR, allow_rescaling=True)
+    assert presents(sink, 0)
+    x.set_mode(2, "half")
+    assert "160x90" in lost(sink)
+    assert eventually(lambda: presents(sink, 7))
+    assert (sink.monitors[0].width_px, sink.monitors[0].height_px) == (160, 90)
+    halved = picture(7, 0)[..., :3].reshape(90, 2, 160, 2, 3).mean(axis=(1, 3))
+    assert eventually(lambda: np.abs(x.screenshot()[:90, 640:800] - halved).max() <= 1.0)
+
+
+@pytest.mark.parametrize(("mode", "size"), [("tall", "160x180"), ("half", "160x90")])
+def test_a_monitor_in_a_mode_that_does_not_fit_is_held_and_named_until_it_is_put_right(x, opened, mode, size):
+    sink = opened(*BY_CONNECTOR)
+    assert presents(sink, 0)
+    x.set_mode(0, mode)
+    assert size in lost(sink)
+    assert eventually(lambda: f"panel 1: DUMMY0 shows {size}" in lost(sink, within_s=0.1))
+    x.plug(0)
+    assert comes_back(x, sink, 2, 0, 1)
+
+
+def test_another_rate_is_another_pace(x, opened):
+    sink = opened(*BY_CONNECTOR)
+    assert presents(sink, 0)
+    x.set_mode(2, "slow")
+    assert "50.000 frames a second, it was 60.000" in lost(sink)
+    assert eventually(lambda: presents(sink, 7))
+    assert sink.period_ns == pytest.approx(NS_PER_S / 50, rel=1e-3)
+
+
+def test_another_monitor_at_the_same_connector_is_noticed(x, opened):
+    x.set_edid(0, block(serial_text="ONE"))
+    sink = opened(*BY_CONNECTOR)
+    assert presents(sink, 0)
+    x.set_edid(0, block(serial_text="OTHER"))
+    assert "panel 1: DUMMY0 has another monitor" in lost(sink)
+    assert eventually(lambda: presents(sink, 7))
+    assert sink.monitors[1].serial == "OTHER"
+
+
+@pytest.mark.parametrize("kind", ["windows", "span"])
+def test_where_nothing_happens_nothing_is_lost(opened, kind):
+    sink = opened(*BY_CONNECTOR, kind=kind)
+    assert lost(sink, within_s=2.5) == ""
+
+
+def test_every_window_and_monitor_is_asked_about_once_a_second_one_a_refresh(opened):
+    sink = opened(*BY_CONNECTOR)
+    clock = SimulatedClock(5 * NS_PER_S)
+    asked = []
+
+    class Listening:
+        def window_state(self, window):
+            asked.append(clock.now_ns())
+            return sink._display.window_state(window)
+
+        def output_state(self, connector):
+            asked.append(clock.now_ns())
+            return sink._display.output_state(connector)
+
+    watch = PlacementWatch(Listening(), sink.monitors, sink._places(), clock)
+    asked.clear()
+    for refresh in range(4 * 60):
+        clock.sleep_until_ns(5 * NS_PER_S + refresh * NS_PER_S // 60)
+        assert watch.look() == ""
+    assert len(asked) == len(set(asked))  # never two in one refresh
+    assert 3 * 6 - 3 <= len(asked) <= 3 * 6  # three windows, three monitors; nothing in the first second
+    assert min(asked) >= 6 * NS_PER_S
+
+
+def test_a_refused_request_makes_it_look_at_everything_at_once(x, opened):
+    sink = opened(*BY_CONNECTOR)
+    watch = PlacementWatch(sink._display, sink.monitors, sink._places(), SimulatedClock())  # whose time never comes
+    x.do_to_window("XDestroyWindow", x11_window(sink, 2))
+    x.xrandr("--query")
+    assert watch.look() == ""
+    assert xlib.window_state(sink._display._pointer, x11_window(sink, 2)) is None  # refused
+    assert watch.look() == "panel 2: the window was destroyed"

@@ -1,0 +1,161 @@
+"""A recording of any rate and with any gap plays through once, at its own times; what is no sample is told."""
+
+import json
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
+from runtime.config import LimitSettings, SensorSettings
+from runtime.errors import EndOfRecording, InputError
+from runtime.records import EyePoints, SensorFrame
+from runtime.sensor.recording import recording_to
+from runtime.sensor.recording_format import RecordingHeader
+from runtime.sensor.replay import OLDER, SAME_INSTANT, ReplayDriver
+from runtime.sensor.worker import SensorWorker
+from tests.waiting import eventually
+
+HEADER = RecordingHeader(driver="test", serial="S")
+EYES = EyePoints(np.array([[0.03, 0.0, 0.6], [-0.03, 0.0, 0.6]]), np.ones(2))
+
+
+def recorded(path, times_s):
+    with recording_to(path, HEADER) as writer:
+        for k, t in enumerate(times_s, start=1):
+            assert writer.write(SensorFrame(k, round(t * NS_PER_S), EYES))
+    return path
+
+
+def evenly(rate_hz, seconds, start_s=1.0):
+    return start_s + np.arange(round(rate_hz * seconds)) / rate_hz
+
+
+def play(path, *, timeout_s=0.1, loop=False, latency_ms=0.0, busy_s=0.002, at_most_s=8.0):
+    """Every sample that a worker hands out, with the time at which the reader got it, and the worker."""
+    clock = MonotonicClock()
+    settings = SensorSettings(timeout_s=timeout_s, reopen_backoff_s=0.02)
+    worker = SensorWorker(lambda: ReplayDriver(str(path), clock, loop=loop, latency_ms=latency_ms), settings, clock)
+    worker.start()
+    got, states, end = [], set(), time.monotonic() + at_most_s
+    while time.monotonic() < end:
+        is_over = worker.state == "ended"
+        frames = worker.take()
+        got += [(frame, clock.now_ns()) for frame in frames]
+        states.add(str(worker.state))
+        if is_over and not frames:
+            break
+        time.sleep(busy_s)
+    worker.stop()
+    return got, states, worker
+
+
+def test_a_gap_longer_than_the_time_out_is_waited_for_once_and_nothing_is_reopened(tmp_path):
+    times = [*evenly(30, 0.5), *evenly(30, 0.5, start_s=3.0)]
+    got, states, worker = play(recorded(tmp_path / "gap.mcap", times), latency_ms=20.0)
+    assert [frame.sequence for frame, _ in got] == list(range(1, 31))
+    assert worker.reopened == 0 and not states & {"stalled", "lost", "hung"}
+    arrived = np.array([at for _, at in got]) - got[0][0].capture_ns
+    late = (arrived - np.array(times) * NS_PER_S + NS_PER_S) / NS_PER_S - 0.020
+    assert late.min() > -1e-3 and np.median(late) < 0.015
+
+
+@pytest.mark.parametrize("rate_hz", [60, 120, 240])
+def test_fast_recordings_are_delivered_whole_in_order_and_do_not_slip(tmp_path, rate_hz):
+    path = recorded(tmp_path / "fast.mcap", evenly(rate_hz, 1.5))
+    got, _, worker = play(path, busy_s=1 / 30)  # a reader that is slower than the recording
+    assert [frame.sequence for frame, _ in got] == list(range(1, 1 + round(1.5 * rate_hz)))
+    assert worker.stale_inputs == 0
+    age = np.array([at - frame.capture_ns for frame, at in got]) / NS_PER_S
+    assert np.median(age[-30:]) < np.median(age[:30]) + 0.03  # no slip: late samples do not get later
+
+
+def test_who_asks_for_the_newest_gets_it_and_the_others_are_counted(tmp_path):
+    clock = MonotonicClock()
+    path = recorded(tmp_path / "a.mcap", evenly(240, 1.0))
+    worker = SensorWorker(lambda: ReplayDriver(str(path), clock), SensorSettings(), clock)
+    worker.start()
+    assert eventually(lambda: worker.state == "ended")
+    assert worker.newest().sequence == 240 and worker.stale_inputs == 239 and worker.newest() is None
+    worker.stop()
+
+
+def test_in_simulated_time_a_sample_has_arrived_by_its_capture_and_latency(tmp_path):
+    driver = ReplayDriver(
+        str(recorded(tmp_path / "a.mcap", [0.0, 0.01, 0.02, 3.02, 3.03])), SimulatedClock(7), latency_ms=15.0
+    )
+    driver.open()
+    assert driver.peek().sequence == 1 and driver.peek().sequence == 1
+    assert driver.take_until(7 + 14_999_999) == []
+    arrived = {t: [f.sequence for f in driver.take_until(7 + t)] for t in (25_000_000, 2 * NS_PER_S, 4 * NS_PER_S)}
+    assert arrived == {25_000_000: [1, 2], 2 * NS_PER_S: [3], 4 * NS_PER_S: [4, 5]}
+    assert driver.peek() is None and driver.take_until(9 * NS_PER_S) == []
+    with pytest.raises(EndOfRecording):
+        driver.next_sample()
+
+
+def test_samples_whose_time_goes_backwards_are_left_out_counted_by_reason_and_told_once(tmp_path, caplog):
+    times = [1.0, 1.1, 1.05, 1.1, 1.2, 0.2, 0.3, 1.2, 1.3]
+    driver = ReplayDriver(str(recorded(tmp_path / "a.mcap", times)), SimulatedClock())
+    driver.open()
+    frames = driver.take_until(10 * NS_PER_S)
+    assert [f.sequence for f in frames] == [1, 2, 5, 9]
+    assert driver.refused == {OLDER: 3, SAME_INSTANT: 2}
+    assert len(caplog.records) == 2
+
+
+def test_mixed_rates_are_played_by_their_own_times(tmp_path):
+    times = np.cumsum([0.0, *[1 / 240] * 24, *[1 / 15] * 6, *[1 / 60] * 12]) + 5
+    driver = ReplayDriver(str(recorded(tmp_path / "a.mcap", times)), SimulatedClock())
+    driver.open()
+    shown = [f.capture_ns for f in driver.take_until(10 * NS_PER_S)]
+    np.testing.assert_allclose(shown, (times - 5) * NS_PER_S, atol=2)
+
+
+def test_a_looped_recording_of_equal_times_leaves_no_thread_behind(tmp_path):
+    path, before = recorded(tmp_path / "a.mcap", [1.0] * 50), threading.active_count()
+    got, states, worker = play(path, loop=True, timeout_s=0.05, at_most_s=2.0)
+    assert "hung" not in states and worker.reopened == 0 and len(got) > 10
+    assert eventually(lambda: threading.active_count() <= before)
+    assert [frame.sequence for frame, _ in got[:3]] == [1, 2, 3]
+
+
+def test_a_recording_longer_than_the_limit_is_refused_with_both_figures(tmp_path):
+    driver = ReplayDriver(
+        str(recorded(tmp_path / "a.mcap", [0.0, 1.0, 500.0])), SimulatedClock(), limits=LimitSettings(recording_s=60)
+    )
+    with pytest.raises(InputError, match=r"500 s.*60.*limits.recording_s"):
+        driver.open()
+        driver.take_until(10**15)
+
+
+@pytest.mark.parametrize("start_s", [1e300, 1e9, -1.0])
+def test_an_absurd_start_is_refused(start_s):
+    with pytest.raises(InputError, match="start_s"):
+        ReplayDriver("demo", SimulatedClock(), start_s=start_s)
+
+
+HOSTILE_TIMES = ["Infinity", "-Infinity", "NaN", "1e999", str(2**70), "1e300", "-1", "1.5", '"12"', "true", "9" * 5000]
+
+
+@pytest.mark.parametrize("text", HOSTILE_TIMES, ids=lambda text: text[:12])
+def test_a_capture_time_that_is_none_is_refused_in_one_line(tmp_path, text):
+    from mcap.writer import Writer
+
+    path = tmp_path / "time.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_metadata("phasestack.recording", HEADER.metadata())
+        schema = writer.register_schema("s", "jsonschema", b"{}")
+        channel = writer.register_channel("/eyes", "json", schema)
+        good = {"sequence": 1, "capture_ns": 1, "eyes_m": None}
+        writer.add_message(channel, 0, json.dumps(good).encode(), 0)
+        writer.add_message(channel, 0, f'{{"sequence":2,"eyes_m":null,"capture_ns":{text}}}'.encode(), 0)
+        writer.finish()
+    driver = ReplayDriver(str(path), SimulatedClock())
+    with pytest.raises(InputError, match="time") as caught:
+        driver.open()
+        driver.take_until(10**12)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 400

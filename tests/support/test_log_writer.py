@@ -1,0 +1,243 @@
+"""Logging never holds up who logs, loses nothing silently, and can't be made to say what it was not told."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import os
+import re
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from runtime.clock import NS_PER_S, SimulatedClock
+from runtime.config import ServiceSettings
+from runtime.support import logs
+from runtime.support.log_writer import LINE_MAX_BYTES, QUEUED_MAX
+from runtime.support.logs import BURST, ROOTS, configure
+
+ROOT = Path(__file__).parents[2]
+log = logging.getLogger("phasestack.test")
+
+
+@pytest.fixture(autouse=True)
+def restored():
+    loggers = [logging.getLogger(name) for name in ROOTS]
+    before = [(logger.handlers[:], logger.level, logger.propagate) for logger in loggers]
+    yield
+    for handler in logging.getLogger(ROOTS[0]).handlers:
+        handler.close()
+    for logger, (handlers, level, propagate) in zip(loggers, before, strict=True):
+        logger.handlers[:], logger.level, logger.propagate = handlers, level, propagate
+
+
+class Pipe:
+    """A reader that reads when it is told to."""
+
+    def __init__(self) -> None:
+        self.out, self._in = os.pipe()
+        self.stream = open(self._in, "w", encoding="utf-8")  # noqa: SIM115, PTH123
+        self.text = ""
+        self._stop = threading.Event()
+
+    def read_until(self, pattern: str, *, within_s: float = 20.0) -> re.Match[str]:
+        deadline_s = time.monotonic() + within_s
+        os.set_blocking(self.out, False)
+        while not (found := re.search(pattern, self.text)):
+            assert time.monotonic() < deadline_s, self.text[-500:]
+            try:
+                self.text += os.read(self.out, 1 << 20).decode()
+            except BlockingIOError:
+                time.sleep(0.005)
+        return found
+
+    def close(self) -> None:
+        self.stream.close()
+        os.close(self.out)
+
+
+@pytest.fixture
+def pipe():
+    made = Pipe()
+    yield made
+    logs.flush()
+    made.close()
+
+
+def configured(stream, clock=None, **settings):
+    configure(ServiceSettings(**settings), stream=stream, clock=clock or SimulatedClock(), environment={})
+
+
+def say(text: str) -> None:
+    """Past the rate limit."""
+    log.info("%s", text, extra={"always": True})
+
+
+def test_a_reader_that_never_reads_holds_up_nobody_and_what_was_lost_is_told_when_it_reads(pipe):
+    configured(pipe.stream)
+    count = 2 * QUEUED_MAX
+    longest_s = 0.0
+    for number in range(count):
+        begin_s = time.monotonic()
+        say(f"line {number} " + "x" * 100)
+        longest_s = max(longest_s, time.monotonic() - begin_s)
+    assert longest_s < 2.0  # without the thread the first full pipe would hold it for ever
+    assert logs.lost() > 0
+    lost = int(pipe.read_until(r"(\d+) log lines were lost")[1])
+    assert lost == logs.lost()
+    assert len(re.findall(r"line \d+ x", pipe.text)) + lost == count
+    say("and on")
+    pipe.read_until("and on")
+
+
+def test_a_reader_that_is_gone_is_survived_and_counted():
+    out, descriptor = os.pipe()
+    with open(descriptor, "w", encoding="utf-8") as stream:  # noqa: PTH123
+        configured(stream)
+        os.close(out)
+        say("nobody hears this")
+        logs.flush()
+        assert logs.lost() == 1
+
+
+def test_a_closed_descriptor_is_survived_and_counted():
+    with open(os.devnull, "w", encoding="utf-8") as stream:  # noqa: PTH123
+        pass
+    configured(stream)
+    say("nobody hears this")
+    logs.flush()
+    assert logs.lost() == 1
+
+
+def test_a_full_device_is_survived_and_counted():
+    with open("/dev/full", "w", encoding="utf-8") as stream:  # noqa: PTH123
+        configured(stream)
+        say("no room for this")
+        logs.flush()
+        assert logs.lost() == 1
+
+
+def test_a_descriptor_that_is_closed_and_used_anew_gets_no_log_lines(tmp_path):
+    first = open(tmp_path / "log", "w", encoding="utf-8")  # noqa: SIM115, PTH123
+    number = first.fileno()
+    configured(first)
+    first.close()
+    with open(tmp_path / "precious", "w", encoding="utf-8") as other:  # noqa: PTH123
+        os.dup2(other.fileno(), number) if other.fileno() != number else None
+        say("to the log")
+        logs.flush()
+        assert (tmp_path / "precious").read_text() == ""
+    assert "to the log" in (tmp_path / "log").read_text()
+
+
+def test_a_process_whose_log_nobody_reads_ends_all_the_same():
+    """Python's own clean-up waits for no thread that is stuck in a full pipe."""
+    code = (
+        "import logging; from runtime.config import ServiceSettings; from runtime.support.logs import configure;"
+        "configure(ServiceSettings(), environment={});"
+        "[logging.getLogger('phasestack').info('%s', 'x' * 1000, extra={'always': True}) for _ in range(1000)];"
+        "print('done')"
+    )
+    out, descriptor = os.pipe()
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=descriptor, timeout=60, check=False
+        )
+    finally:
+        os.close(out)
+        os.close(descriptor)
+    assert (done.returncode, done.stdout) == (0, b"done\n")
+
+
+def test_the_last_lines_before_the_end_are_written():
+    code = (
+        "import logging; from runtime.config import ServiceSettings; from runtime.support.logs import configure;"
+        "configure(ServiceSettings(), environment={});"
+        "[logging.getLogger('phasestack').info('%d', n, extra={'always': True}) for n in range(500)]"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert [int(line.split()[-1]) for line in done.stderr.splitlines()] == list(range(500))
+
+
+def test_a_line_that_is_too_long_is_cut_and_does_not_swallow_the_next(pipe):
+    configured(pipe.stream, log_format="json")
+    say("x" * (LINE_MAX_BYTES * 2))
+    say("after it")
+    found = pipe.read_until(r"(x+) \.\.\.\n(.*after it.*)\n")
+    assert len(found[1]) < LINE_MAX_BYTES
+    assert "xx" not in found[2]
+
+
+FORGERIES = [
+    "lego\n12:00:00 error   state: tracking -> stopping (forged)",
+    "lego\r12:00:00 error   forged",
+    "lego\x1b[2K\x1b[1Aforged",
+    "lego\u2028forged",
+    "lego\x85forged",
+    "lego\u202edegrof",
+    "lego\0forged",
+    "lego\udcffforged",
+]
+
+
+@pytest.mark.parametrize("text", FORGERIES)
+@pytest.mark.parametrize("form", ["text", "json"])
+def test_a_message_can_not_forge_a_line(text, form):
+    stream = io.StringIO()
+    configured(stream, log_format=form)
+    log.info("asked for: scene %s", text)
+    log.error(text)
+    logs.event(log, logging.INFO, "asked", scene=text)
+    lines = stream.getvalue().removesuffix("\n").split("\n")
+    assert len(lines) == 3
+    assert all(line.isprintable() for line in lines)
+    assert all("lego" in line for line in lines)
+
+
+def test_an_exception_is_written_down_by_the_writers_thread(pipe, tmp_path, monkeypatch):
+    monkeypatch.setenv("LOGS_DIRECTORY", str(tmp_path))
+    threads = []
+    monkeypatch.setattr(logs, "written", lambda error: threads.append(threading.current_thread().name) or str(error))
+    configured(pipe.stream)
+    try:
+        raise ValueError("boom")
+    except ValueError:
+        log.exception("failed")
+    pipe.read_until("failed: boom\n")
+    assert threads == ["log"]
+
+
+def test_transitions_of_state_are_never_rate_limited():
+    stream = io.StringIO()
+    configured(stream)
+    for number in range(10 * BURST):
+        log.info("state: %s -> %s (%s)", "tracking", "holding", number, extra={"always": True})
+        log.info("chatter %d", number)
+    lines = stream.getvalue().splitlines()
+    assert sum("state:" in line for line in lines) == 10 * BURST
+    assert sum("chatter" in line for line in lines) == BURST
+
+
+def test_lines_that_pass_always_use_up_nothing_of_the_others_share():
+    clock = SimulatedClock()
+    stream = io.StringIO()
+    configured(stream, clock=clock)
+    for _ in range(10 * BURST):
+        log.info("news", extra={"always": True})
+    log.info("news")
+    assert stream.getvalue().count("news") == 10 * BURST + 1
+    clock.advance_ns(60 * NS_PER_S)
+    log.info("news")
+    assert "not shown" not in stream.getvalue()
+
+
+def test_a_line_that_can_not_be_made_is_told():
+    stream = io.StringIO()
+    configured(stream, log_format="json")
+    log.info("%d", "three")
+    assert "could not be made" in json.loads(stream.getvalue())["message"]

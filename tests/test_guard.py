@@ -1,0 +1,165 @@
+"""Whatever happens in a command ends in an exit code and at most one line on stderr, never in a traceback."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+MAIN = "from runtime.cli import main; main()"
+# A command that is broken in one of many ways, in place of `config`.
+BROKEN = """
+import sys, runtime.commands.app as commands, runtime.commands.config as module
+def broken():
+    {body}
+commands.app.registered_commands = [c for c in commands.app.registered_commands if c.callback.__name__ != "config"]
+commands.app.command("config")(broken)
+from runtime.cli import main
+main()
+"""
+
+
+def run(*arguments: str, code: str = MAIN, home: Path | None = None, **how) -> subprocess.CompletedProcess[str]:
+    environment = dict(os.environ)
+    if home is not None:
+        environment = {k: v for k, v in environment.items() if not k.startswith("XDG_")} | {"HOME": str(home)}
+    how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | how
+    return subprocess.run([sys.executable, "-c", code, *arguments], text=True, timeout=120, env=environment, **how)
+
+
+def broken(body: str, home: Path, **how) -> subprocess.CompletedProcess[str]:
+    return run("config", code=BROKEN.format(body=body), home=home, **how)
+
+
+def test_the_version_is_told() -> None:
+    answer = run("--version")
+    assert answer.returncode == 0 and answer.stdout.startswith("phasestack ") and answer.stdout.split()[1][0].isdigit()
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "{}['key']",
+        "1 / 0",
+        "raise MemoryError",
+        "raise OSError(24, 'Too many open files')",
+        "raise ValueError('two\\nlines\\0')",
+        "raise ExceptionGroup('several', [ValueError('one'), OSError('two')])",
+        "(lambda f: f(f))(lambda f: f(f))",
+        "assert False, 'x' * 10000",
+    ],
+)
+def test_an_error_that_nobody_expected_is_one_line_a_file_and_70(tmp_path: Path, body: str) -> None:
+    answer = broken(body, tmp_path)
+    assert answer.returncode == 70, answer.stderr
+    assert answer.stderr.count("\n") == 1 and "Traceback" not in answer.stderr and len(answer.stderr) < 800
+    (file,) = (tmp_path / ".local/state/phasestack").iterdir()
+    assert str(file) in answer.stderr
+    assert "Traceback" in file.read_text() and file.stat().st_mode & 0o777 == 0o600
+
+
+def test_without_a_home_the_file_is_in_the_temporary_folder(tmp_path: Path) -> None:
+    environment = {"HOME": "/nonexistent/home", "TMPDIR": str(tmp_path), "PATH": os.environ["PATH"]}
+    if "PYTHONPATH" in os.environ:
+        environment["PYTHONPATH"] = os.environ["PYTHONPATH"]
+    home = tmp_path / "file"
+    home.write_text("not a folder")  # also where the tests' user may write anywhere
+    environment["HOME"] = str(home)
+    code = BROKEN.format(body="1 / 0")
+    answer = subprocess.run(
+        [sys.executable, "-c", code, "config"], text=True, capture_output=True, env=environment, timeout=60
+    )
+    assert answer.returncode == 70 and f"{tmp_path}/phasestack-error-" in answer.stderr
+
+
+def test_the_files_do_not_fill_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from runtime.support import crash
+
+    monkeypatch.setenv("LOGS_DIRECTORY", str(tmp_path))
+    for _ in range(crash.KEPT + 5):
+        crash.written(ValueError("again"))
+    assert len(list(tmp_path.iterdir())) == crash.KEPT
+
+
+def test_an_error_in_a_thread_is_told_so_too(tmp_path: Path) -> None:
+    body = "import threading; t = threading.Thread(target=lambda: 1 / 0); t.start(); t.join()"
+    answer = broken(body, tmp_path)
+    assert answer.returncode == 0 and "ZeroDivisionError" in answer.stderr and "Traceback" not in answer.stderr
+
+
+def test_an_interrupt_that_a_library_turned_into_something_else_is_still_one(tmp_path: Path) -> None:
+    body = """
+    try:
+        raise KeyboardInterrupt
+    except KeyboardInterrupt as error:
+        raise ImportError("numpy failed") from error"""
+    answer = broken(body, tmp_path)
+    assert (answer.returncode, answer.stderr) == (130, "")
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [("FatalError", 2), ("TransientError", 75), ("SensorLost", 75), ("PanelLost", 75)]
+)
+def test_what_may_pass_is_not_a_users_mistake(tmp_path: Path, error: str, code: int) -> None:
+    answer = broken(f"from runtime import errors; raise errors.{error}('why')", tmp_path)
+    assert (answer.returncode, answer.stderr) == (code, "phasestack: why\n")
+
+
+def test_a_reader_that_goes_away_ends_it_silently(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", MAIN, "config"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    process.stdout.close()
+    told = process.stderr.read()
+    assert (process.wait(60), told) == (141, "")
+    process.stderr.close()
+
+
+def test_a_broken_pipe_that_is_not_the_output_is_an_error_of_ours(tmp_path: Path) -> None:
+    answer = broken("raise BrokenPipeError(32, 'a socket')", tmp_path)
+    assert answer.returncode == 70 and "BrokenPipeError" in answer.stderr
+
+
+def test_a_full_disk_behind_the_output_is_told() -> None:
+    with open("/dev/full", "w") as full:  # noqa: PTH123
+        answer = run("config", stdout=full)
+    assert answer.returncode == 2
+    assert answer.stderr == "phasestack: stdout: cannot be written (No space left on device)\n"
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&-", ">&- 2>&- <&-"])
+def test_closed_descriptors_are_no_error_and_no_file_takes_their_place(tmp_path: Path, closed: str) -> None:
+    out = tmp_path / "a.mcap"
+    command = f"{sys.executable} -c '{MAIN}' record --motion still --seconds 1 --out {out} {closed}"
+    assert subprocess.run(["sh", "-c", command], capture_output=True, timeout=60).returncode == 0
+    assert out.read_bytes()[:5] == b"\x89MCAP" and out.read_bytes()[-8:] == b"\x89MCAP0\r\n"
+
+
+def test_interrupts_during_the_imports_end_it_with_130_and_not_a_word() -> None:
+    """Forty of them, spread over the start: before the commands are there, and while one loads numpy and others."""
+    waits_s = [0.01 + 0.02 * k for k in range(40)]
+    for wait_s in waits_s:
+        process = subprocess.Popen(
+            [sys.executable, "-X", "importtime", "-c", MAIN, "doctor"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        told = []
+        while line := process.stderr.readline():
+            told.append(line)
+            if "typer" in line or "click" in line:  # our own code is running
+                break
+        time.sleep(wait_s)
+        process.send_signal(signal.SIGINT)
+        told += process.stderr.read().splitlines(keepends=True)
+        code = process.wait(60)
+        process.stderr.close()
+        ours = [line for line in told if not line.startswith("import time:")]
+        assert ours == [] or code in (0, 1), (wait_s, ours)
+        assert code in (130, 0, 1), (wait_s, code, ours)
