@@ -20,7 +20,7 @@ ABOUT = {
     "phase": "From intensity to phase and back. The arcsine's slope is infinite at white, so the phase there loses "
     "half its digits; the intensity, which is what is seen, loses none (seed 1-7).",
     "Jones optics": "sin² of the summed phase against the product of the panels' Jones matrices.",
-    "retina": "What eyes see, and PSNR, against a tracer of 50 digits: every ray of small pictures, and which count.",
+    "retina": "What eyes see, and PSNR, against a tracer of 50 digits: every ray of small pictures.",
     "solve": "The stiff part of the two-eye problem is the lowest frequency of the difference between the eyes. "
     "Its condition grows as 1/gap², and values between 0 and 1 can show only so much of it: the note says what no "
     "panel values can do better, by exact least squares. A method may be no worse than recorded by more than 5%.",
