@@ -1,4 +1,4 @@
-"""Who looks at refreshes: lines that wait for the truth, sampled quality, kept light; null where nothing was measured."""
+"""Who looks at refreshes: lines that wait for the truth, sampled quality, kept light; null where none was measured."""
 
 from __future__ import annotations
 
