@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 app = typer.Typer(
     no_args_is_help=True,
     help="Register the panels with each other and measure their grey curves.\n\n"
-    "First the verniers, then what follows from them.\n\n"
+    "With a camera: `board`, a dozen photographs of it, `photo`. Without one: the verniers, then `fit`.\n\n"
+    "Example: phasestack calibrate panels photo --photos photos --config phasestack.toml --write --out panels\n\n"
     "Example: phasestack calibrate panels vernier --config phasestack.toml --eye 0.5 0 0 --out vernier.csv\n\n"
     "Example: phasestack calibrate panels fit --config phasestack.toml --vernier vernier.csv --write --out panels",
 )
@@ -96,6 +97,108 @@ def fit(
     summary, text = fit_registration(
         vernier, out, settings, stack, reference=_reference(reference, stack), config=config if write else None
     )
+    tell(summary, as_json, text)
+
+
+@app.command("board")
+def board_command(
+    out: Annotated[Path | None, typer.Option(help="folder for the boards as PNGs, one a panel")] = None,
+    show: Annotated[bool, typer.Option("--show", help="show them on the panels until Enter or q")] = False,
+    panels: PanelsOption = None,
+    config: ConfigOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Draw or show the coded boards that `photo` wants photographs of: all panels at once, their marks side by side.
+
+    Take 8 to 20 photographs by hand (12 are plenty) with one camera, without zooming between them, the display
+    filling most of the picture, the room dim: from the middle, the left, the right, above and below, up to 40 degrees
+    aside, a few with the camera on its side. Nothing else need be done between them.
+
+    Example: phasestack calibrate panels board --config phasestack.toml --show
+    """
+    if out is None and not show:
+        raise InputError("calibrate panels board", "--out", "is missing (or give --show)")
+    from calib.photo_run import show_board, write_board
+
+    settings, stack = settings_and_stack(config, panels)
+    if out is not None:
+        summary = write_board(out, stack)
+        tell(summary, as_json, f"{len(summary['files'])} boards in {out}")
+    if show:
+        show_board(settings, stack)
+
+
+@app.command()
+def photo(
+    out: Annotated[Path, typer.Option(help="folder for registration.json, panels.toml, index.html")],
+    photos: Annotated[Path | None, typer.Option(help="folder of photographs of the boards")] = None,
+    device: Annotated[str | None, typer.Option(help="a video device (number or path) instead of photographs")] = None,
+    count: Annotated[int, typer.Option(help="with --device: photographs to take", min=5, max=40)] = 12,
+    spacing: Annotated[
+        str, typer.Option(help="even or true distances; auto: even ones where the configured model serves no others")
+    ] = "auto",
+    write: Annotated[bool, typer.Option("--write", help="put distances and homographies into --config")] = False,
+    model: Annotated[
+        str, typer.Option(help="model that tells what the registration gains in dB; configured; empty: none")
+    ] = "configured",
+    panels: PanelsOption = None,
+    config: ConfigOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find where every panel is from photographs of the boards: distances, homographies, tilts, and how sure.
+
+    With --device the boards are shown, and a photograph is taken whenever the camera is held still somewhere new.
+
+    Example: phasestack calibrate panels photo --photos photos --config phasestack.toml --write --out registration
+    """
+    from calib.photo_run import register_folder, register_live, wants_even
+
+    if (photos is None) == (device is None):
+        raise InputError("calibrate panels photo", "--photos", "or --device is needed, one of them")
+    if spacing not in ("auto", "even", "true"):
+        raise InputError("calibrate panels photo", "--spacing", f"must be auto, even or true, not {spacing}")
+    if write and config is None:
+        raise InputError("calibrate panels photo", "--write", "needs --config")
+    settings, stack = settings_and_stack(config, panels)
+    chosen = {
+        "even": wants_even(settings, stack) if spacing == "auto" else spacing == "even",
+        "model": settings.model.name if model == "configured" else model,
+        "config": config if write else None,
+    }
+    if photos is not None:
+        summary, text = register_folder(photos, out, settings, stack, **chosen)
+    else:
+        assert device is not None
+        summary, text = register_live(device, out, settings, stack, wanted=count, **chosen)
+    tell(summary, as_json, text)
+
+
+@app.command("photo-trial")
+def photo_trial(
+    out: Annotated[Path, typer.Option(help="folder for trial.json and, with --photos, the photographs")],
+    stacks: Annotated[int, typer.Option(help="random stacks", min=1, max=1000)] = 3,
+    count: Annotated[int, typer.Option("--count", help="photographs of each, by hand", min=1, max=40)] = 12,
+    seed: Annotated[int, typer.Option(help="of the first stack")] = 0,
+    megapixels: Annotated[float, typer.Option(help="of the phone's camera", min=0.5, max=50)] = 12.0,
+    off_mm: Annotated[float, typer.Option(help="panels and gaps are off by up to this", min=0)] = 2.0,
+    turn_deg: Annotated[float, typer.Option(help="and turned about a random axis by up to this", min=0)] = 1.0,
+    model: Annotated[str, typer.Option(help="model whose layers are judged; empty: geometry only")] = "",
+    keep: Annotated[bool, typer.Option("--photos", help="keep the photographs: what `photo --photos` reads")] = False,
+    panels: PanelsOption = None,
+    config: ConfigOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Try the registration on simulated stacks: photographs with noise, distortion and moire, and the truth.
+
+    Example: phasestack calibrate panels photo-trial --stacks 3 --out trial
+    """
+    from calib.photo_trial import run_trial
+
+    settings, stack = settings_and_stack(config, panels)
+    summary, text = run_trial(
+        out, settings, stack, stacks=stacks, count=count, seed=seed, megapixels=megapixels, off_m=off_mm / 1000,
+        turn_deg=turn_deg, model=model, keep=keep,
+    )  # fmt: skip
     tell(summary, as_json, text)
 
 

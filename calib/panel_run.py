@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
+from calib.config_file import put_homographies, read_document, save_document
 from calib.keys import Key, TerminalKeys, WindowKeys, first_of
 from calib.page import Picture, page
 from calib.panel_figures import registration_figure
 from calib.registration import Setting, StackRegistration, parts, register
-from calib.store import save
 from calib.vernier import STEPS_PX, Nudging, chart, nominal, read_settings, resumed, write_settings
 from runtime.clock import NS_PER_MS, MonotonicClock
-from runtime.config import Settings, load_settings
+from runtime.config import Settings
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
-from runtime.records import U8, PanelFrame
+from runtime.records import F64, U8, PanelFrame
 from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_png, write_text
 
 POLL_NS = 30 * NS_PER_MS
@@ -226,13 +226,20 @@ def _plain(rows: list[list[str]]) -> str:
 
 def panels_text(registration: StackRegistration) -> str:
     """`[[output.panels]]` tables with the homographies, to paste into a configuration."""
+    return panels_document(np.stack([panel.true_from_ideal for panel in registration.panels]))
+
+
+def panels_document(matrices: F64, *, x_m: Sequence[float] | None = None) -> str:
+    """The same from (N, 3, 3) homographies; with distances also `[stack]`."""
     import tomlkit
 
     document = tomlkit.document()
+    if x_m is not None:
+        document["stack"] = {"x_m": [round(float(x), 7) for x in x_m]}
     tables = tomlkit.aot()
-    for panel in registration.panels:
+    for matrix in matrices:
         table = tomlkit.table()
-        table["homography"] = panel.true_from_ideal.tolist()
+        table["homography"] = matrix.tolist()
         tables.append(table)
     document["output"] = {"panels": tables}
     return tomlkit.dumps(document)
@@ -243,21 +250,6 @@ def write_homographies(config: Path, registration: StackRegistration) -> Path | 
 
     The new text is checked as a configuration before it takes the old one's place. Raises InputError.
     """
-    import tempfile
-
-    import tomlkit
-
-    document = tomlkit.parse(config.read_text(encoding="utf-8"))
-    output = document.setdefault("output", tomlkit.table())
-    if "panels" not in output:
-        output["panels"] = tomlkit.aot()
-        for _ in registration.panels:
-            output["panels"].append(tomlkit.table())
-    for table, panel in zip(output["panels"], registration.panels, strict=True):
-        table["homography"] = panel.true_from_ideal.tolist()
-    text = tomlkit.dumps(document)
-    with tempfile.TemporaryDirectory() as folder:
-        trial = Path(folder) / config.name
-        write_text(trial, text)
-        load_settings(trial)
-    return save(config, text)
+    document = read_document(config)
+    put_homographies(document, np.stack([panel.true_from_ideal for panel in registration.panels]))
+    return save_document(config, document)

@@ -10,6 +10,7 @@ import numpy as np
 
 from runtime.content.camera import PixelBox
 from runtime.records import U8
+from runtime.support.gl import finish
 
 SIDES = 2
 SIZES_KEPT = 8
@@ -58,6 +59,7 @@ class Canvas:
                 target.plain.use()
                 self._context.copy_framebuffer(target.plain, target.smooth)
                 target.plain.scissor = None
+        finish()
         picture = target.pictures[side]
         target.plain.read_into(picture, components=4)
         return picture

@@ -25,7 +25,7 @@ class LayerBuffers:
         buffer = self._buffers[index][0]
         np.copyto(buffer, layers)
         # Not `buffer.view()`: a part of that would hold the buffer, and not the view that is asked about.
-        view: U8 = np.asarray(memoryview(buffer).toreadonly())
+        view: U8 = np.asarray(buffer.data.toreadonly())
         self._buffers[index] = buffer, weakref.ref(view)
         return view
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import queue
 import threading
 from collections.abc import Callable
@@ -12,10 +11,10 @@ from runtime.clock import NS_PER_S, Clock
 from runtime.errors import PhasestackError
 from runtime.frame.solver_host import COST_GAIN, FIRST_REQUEST, News, SolverHost, SolverParts, Task, taken_in, total_ns
 from runtime.records import SolveRequest
+from runtime.support.priority import SOLVER_NICENESS, set_niceness
 
 log = logging.getLogger("phasestack.solver")
 
-NICENESS = 5  # of the solver's threads: the presenter's turn comes first
 IDLE_S = 0.02  # between two looks at tasks while nothing is asked
 ABANDONED_MAX = 4  # hung threads that are left behind; with more, the solver stays as it is
 
@@ -124,7 +123,7 @@ class SolverThread(SolverHost):
         return attempt
 
     def _run(self, attempt: _Attempt) -> None:
-        _be_nice()
+        set_niceness(SOLVER_NICENESS)
         try:
             parts = self._make()
             first = parts.step(FIRST_REQUEST)
@@ -187,11 +186,3 @@ class SolverThread(SolverHost):
 
 def _line(error: BaseException) -> str:
     return str(error).splitlines()[0] if str(error) else type(error).__name__
-
-
-def _be_nice() -> None:
-    """This thread, and those that it starts, give way to the presenter; where the system has no such thing, not."""
-    try:
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
-    except (OSError, AttributeError):
-        log.debug("solver: its priority can't be lowered here")

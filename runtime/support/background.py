@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from runtime.errors import PhasestackError
+from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
 
 log = logging.getLogger("phasestack.background")
 
@@ -44,6 +45,7 @@ class Job(Generic[T]):
 
     def _run(self) -> None:
         result: T | None = None
+        set_niceness(BACKGROUND_NICENESS)
         try:
             result = self._work()
         except PhasestackError as error:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+from functools import cache
 from typing import Any
 
 import moderngl
@@ -26,6 +28,23 @@ def offscreen_context() -> moderngl.Context:
             f"no OpenGL without a screen ({str(error).strip() or 'EGL failed'}): "
             f"install Debian's packages {DEBIAN_PACKAGES}"
         ) from None
+
+
+@cache
+def _gl_finish() -> Any:
+    try:
+        return ctypes.CDLL(EGL["libgl"]).glFinish
+    except (OSError, AttributeError):  # a driver without that library: reading waits then, as it always did
+        return lambda: None
+
+
+def finish() -> None:
+    """Wait until what was drawn in this thread's context is complete, letting other Python threads run meanwhile.
+
+    moderngl's own calls keep the interpreter's lock: reading a picture that a software rasteriser still draws would
+    hold every other thread up for tens of milliseconds.
+    """
+    _gl_finish()()
 
 
 def describe(context: moderngl.Context) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -113,7 +114,7 @@ def test_codes_never_change_at_rest_under_noise_and_do_when_the_same_head_moves(
         stage.solver.hand_over(solved=solved)
         stage.refresh(2 * HZ)
         shown = [shown_layers(done.frame) for done in stage.refresh(2 * HZ)]
-        return [not np.array_equal(a, b) for a, b in zip(shown, shown[1:], strict=False)]
+        return [not np.array_equal(a, b) for a, b in pairwise(shown)]
 
     assert not any(changes(lambda _: 0.0))
     assert all(changes(lambda s: 0.1 * np.sin(3 * s)))

@@ -50,8 +50,7 @@ def test_changes_from_many_threads_are_all_made_and_each_part_is_handed_back_onc
     mine = [[Part() for _ in range(50)] for _ in range(4)]
 
     def change(parts):
-        for part in parts:
-            handed_back.append(cell.replace(content=part).content)
+        handed_back.extend(cell.replace(content=part).content for part in parts)
 
     first = cell.state.content
     threads = [threading.Thread(target=change, args=(parts,)) for parts in mine]

@@ -1,4 +1,4 @@
-"""A run's figures: counted as the contract says, now as well as since the start, and None where nothing was measured."""
+"""A run's figures: counted as the contract says, now and since the start; None where nothing was measured."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,7 @@ def test_a_head_at_rest_is_rested_and_its_eyes_stay_to_the_last_bit_whatever_the
 def test_a_moving_head_is_predicted_and_its_eyes_differ_from_refresh_to_refresh():
     told = watched(viewer(), 3.0, noise_m=0.003, y_m=lambda s: 0.1 * np.sin(2 * s))[DISPLAY_HZ:]
     assert {estimate.label for estimate in told} == {"predicted"}
-    assert all((a.eyes_m != b.eyes_m).any() for a, b in zip(told, told[1:], strict=False))
+    assert all((a.eyes_m != b.eyes_m).any() for a, b in pairwise(told))
 
 
 def test_a_head_that_sets_off_is_let_go():

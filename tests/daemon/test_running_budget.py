@@ -1,4 +1,4 @@
-"""A time budget in the running loop: lighter when frames really take longer, back again when they don't."""
+"""A time budget in a running solver: lighter when solutions really take longer, back again when they don't."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from runtime.frame.timing import SOLVING_STAGES
 from runtime.model.unrolled import UnrolledPredictor
 from runtime.plan.ladder import rungs
 from runtime.plan.levels import Level, useful
 from runtime.plan.planning import LADDER
+from runtime.records import RefreshAccount
 from tests.daemon.rig import Rig
 from tests.daemon.test_changes import Served, configuration
 from tests.test_cli import phasestack
@@ -30,16 +32,20 @@ MOVING = {
 ROOM = 4.0  # of the budget over what the best level takes: the machine may be busy with other things
 
 
+def levels_of(served: Served) -> Any:
+    """Those that were measured; none before the solver has taken over that there is a budget."""
+    return (served.budget.describe() or {"levels": []})["levels"]
+
+
 def lightest(levels: list[dict[str, Any]]) -> str:
     """The last of what `useful` leaves."""
     return useful([Level(**level) for level in levels])[-1].label
 
 
-def turn_until(rig: Rig, condition: Any, *, within_s: float = 60.0) -> None:
-    deadline = time.monotonic() + within_s
-    while not condition():
-        rig.loop.turn()
-        assert time.monotonic() < deadline, rig.loop.budget.describe()
+def solving_ms(accounts: list[RefreshAccount]) -> list[float]:
+    """What each solution took, of those that were first shown by these refreshes."""
+    ran = [account for account in accounts if account.inference == "ran"]
+    return [sum(account.stage_ms[stage] for stage in SOLVING_STAGES) for account in ran]
 
 
 @pytest.fixture
@@ -48,7 +54,7 @@ def slowness(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
     real, added = UnrolledPredictor.predict, {"s": 0.0}
 
     def predict(self: UnrolledPredictor, images: Any, eyes_m: Any, **how: Any) -> Any:
-        if threading.current_thread() is threading.main_thread():  # levels are measured beside the loop
+        if threading.current_thread().name.startswith("solver"):  # levels are measured beside it
             time.sleep(added["s"])
         return real(self, images, eyes_m, **how)
 
@@ -68,94 +74,94 @@ def test_it_goes_lighter_while_frames_are_slow_and_back_when_they_are_not(
     for name, frames in (("PATIENCE", 20), ("SLOW_FRAMES", 3), ("LOOK_BACK", 4)):
         monkeypatch.setattr(f"runtime.plan.levels.{name}", frames)
     caplog.set_level(logging.INFO, logger="phasestack.budget")
-    rig, budget = served.rig, served.loop.budget
+    rig, budget = served.rig, served.budget
     assert served.status()["budget"] is None
-    rig.turns(10)
+    rig.refresh_until_solved(times=5)
     assert served.asked("budget", 5000.0) == {"ok": True}
-    turn_until(rig, lambda: served.loop.budget.describe()["levels"])
+    rig.refresh_until(lambda: levels_of(served))
     levels = budget.describe()["levels"]
     assert [level["model"] for level in levels] == [name for name, _ in LADDER]
     # In a budget with room for everything the best level is shown, which may be none of the configured model.
     best = max(levels, key=lambda level: level["psnr_db"])
-    turn_until(rig, lambda: budget.describe()["level"] == best["model"])
+    rig.refresh_until(lambda: budget.describe()["level"] == best["model"])
     room_ms = ROOM * max(level["expected_ms"] for level in levels)
     assert served.asked("budget", room_ms) == {"ok": True}
     assert budget.describe()["levels"] == levels  # known already: nothing is measured again
-    rig.turns(20)
+    rig.refresh_until_solved(times=20)
     assert budget.describe()["level"] == best["model"]
 
     slowness["s"] = 1.2 * room_ms / 1000
     before = len(rig.accounts)
-    turn_until(rig, lambda: budget.describe()["level"] == lightest(levels))
-    rig.turns(3)
-    slow = [sum(account.measured_ms.values()) for account in rig.accounts[before:]]
+    rig.refresh_until(lambda: budget.describe()["level"] == lightest(levels))
+    rig.refresh_until_solved(times=3)
+    slow = solving_ms(rig.accounts[before:])
     status = budget.describe()
     assert not status["held"]
     assert status["saves_ms"] > 0
     assert status["costs_db"] > 0
-    (item,) = [item for item in served.loop.summary()["plan"] if item["what"] == "model or resolution"]
+    (item,) = [item for item in served.run.summary()["plan"] if item["what"] == "model or resolution"]
     assert status["level"] in item["why"]
     assert (item["saves_ms"], item["costs_db"]) == (round(status["saves_ms"], 2), round(status["costs_db"], 3))
-    # The switches themselves stall nothing: no turn took as long as two of the slow ones.
+    # The switches themselves stall nothing: no solution took as long as two of the slow ones.
     assert max(slow) < 2 * np.median(slow)
 
     slowness["s"] = 0.0
-    turn_until(rig, lambda: budget.describe()["level"] == best["model"])
-    rig.turns(10)
+    rig.refresh_until(lambda: budget.describe()["level"] == best["model"])
+    rig.refresh_until_solved(times=10)
     assert budget.describe()["held"]
     assert all(account.presented for account in rig.accounts)
     told = [record.getMessage() for record in caplog.records]
     assert any("frames took longer" in line for line in told)
     assert any("there has been room" in line for line in told)
     assert served.asked("budget", 0.0) == {"ok": True}
-    turn_until(rig, lambda: served.loop.pipeline.predictor.name == "best")
-    assert served.status()["budget"] is None
+    rig.refresh_until(lambda: served.rig.predictor.name == "best" and budget.describe() is None)
+    rig.refresh_until(lambda: served.status()["budget"] is None)
 
 
 def test_without_a_reason_it_does_not_swing(served: Served) -> None:
-    rig, budget = served.rig, served.loop.budget
+    rig, budget = served.rig, served.budget
     served.asked("budget", 5000.0)
-    turn_until(rig, lambda: budget.describe()["levels"])
+    rig.refresh_until(lambda: levels_of(served))
     served.asked("budget", ROOM * max(level["expected_ms"] for level in budget.describe()["levels"]))
-    rig.turns(100)  # more than it waits before it tries a better level
+    rig.refresh_until_solved(times=100)  # more than it waits before it tries a better level
     assert budget.describe()["switches"] == 0
 
 
 def test_the_levels_are_measured_anew_for_another_scene(served: Served) -> None:
-    budget = served.loop.budget
+    budget = served.budget
     served.asked("budget", 5000.0)
-    turn_until(served.rig, lambda: budget.describe()["levels"])
+    served.rig.refresh_until(lambda: levels_of(served))
     first = budget.describe()["levels"]
     assert served.asked("scene", "sparse") == {"ok": True}
-    turn_until(served.rig, lambda: budget.describe()["levels"] != first)
+    served.rig.refresh_until(lambda: levels_of(served) not in ([], first))
     assert not budget.describe()["problem"]
 
 
 def test_a_reload_with_another_model_and_budget_leaves_nothing_of_the_old(served: Served) -> None:
     served.asked("budget", 5000.0)
-    turn_until(served.rig, lambda: served.loop.budget.describe()["levels"])
+    served.rig.refresh_until(lambda: levels_of(served))
     served.config.write_text(
         configuration(name="sart", budget_ms=0.001).replace("rate_hz", "evaluate_every = 0\nrate_hz")
     )
     assert served.asked("reload") == {"ok": True}
-    turn_until(served.rig, lambda: served.loop.budget.describe()["levels"])
-    assert {level["model"] for level in served.loop.budget.describe()["levels"]} == {"sart"}
-    wanted = lightest(served.loop.budget.describe()["levels"])
-    turn_until(served.rig, lambda: served.loop.budget.describe()["level"] == wanted)
+    served.rig.refresh_until(lambda: levels_of(served))
+    assert {level["model"] for level in served.budget.describe()["levels"]} == {"sart"}
+    wanted = lightest(served.budget.describe()["levels"])
+    served.rig.refresh_until(lambda: served.budget.describe()["level"] == wanted)
 
 
 def test_a_budget_in_the_settings_is_chosen_before_the_first_frame() -> None:
     with Rig(model={"name": "best", "budget_ms": 0.001}) as rig:
-        account = rig.turn_until("tracking")
-        assert account.frame < 50
-        assert rig.loop.budget.describe()["level"] == lightest(rig.loop.budget.describe()["levels"])
-        (item,) = [item for item in rig.loop.summary()["plan"] if item["what"] == "model or resolution"]
+        rig.refresh_until("tracking")
+        rig.refresh_until_solved()
+        assert rig.run.parts.budget.describe()["level"] == lightest(rig.run.parts.budget.describe()["levels"])
+        (item,) = [item for item in rig.run.summary()["plan"] if item["what"] == "model or resolution"]
         assert item["costs_db"] > 0
 
 
 def test_what_can_t_be_cut_is_offered_at_fewer_pixels() -> None:
     with Rig(stack={"width_px": 64, "height_px": 36, "x_m": (-0.06, 0.0, 0.02)}) as rig:
-        names = rungs(rig.settings, rig.loop.pipeline.stack)
+        names = rungs(rig.settings, rig.presenter.stack)
         assert names == (("fast", 1.0), ("fast", 0.75), ("fast", 0.5))
 
 

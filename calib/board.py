@@ -1,0 +1,114 @@
+"""Coded boards for the panels: small marks that tell a camera which panel it sees, and where on it.
+
+A mark is a white square with an ArUco marker inside and a smaller white square at each of its corners: where the
+two touch there is a saddle, which is found to a few hundredths of a pixel whatever the blur and the camera's tone
+curve (it looks the same turned by half a turn). Everything else is black, so that the other panels' marks show
+through: where phase 0 lies on phase v, v is seen. One photograph so shows the marks of all panels at once, and no
+tripod is needed. Marks are scattered: those that cover each other from one place do not from another.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from runtime.errors import InputError
+from runtime.optics.stack import PanelStack
+from runtime.records import F64, U8
+
+MARKER_BITS = 4
+DICTIONARY_SIZE = 100
+ACROSS, DOWN = 5, 4  # marks on a panel
+PER_PANEL = ACROSS * DOWN
+BITS_ON_SHORT_SIDE = 216  # a bit is 5 pixels at 1080 rows
+# In bits: marker (its black border counts), quiet zone on each side, corner squares.
+MARKER, QUIET, CORNER = MARKER_BITS + 2, 2, 3
+SQUARE = MARKER + 2 * QUIET
+TILE = SQUARE + 2 * CORNER
+
+
+def dictionary() -> Any:
+    """The markers' code."""
+    import cv2
+
+    return cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """One mark of a board."""
+
+    number: int  # the marker's id
+    panel: int
+    left_px: int  # of the white square
+    top_px: int
+    unit_px: int  # one bit of the marker
+
+    @property
+    def side_px(self) -> int:
+        """Of the white square."""
+        return SQUARE * self.unit_px
+
+    @property
+    def saddles_px(self) -> F64:
+        """(4, 2) corners of the white square, pixels of the panel: top left, top right, bottom right, bottom left."""
+        u, v, side = self.left_px, self.top_px, self.side_px
+        return np.array([[u, v], [u + side, v], [u + side, v + side], [u, v + side]], dtype=np.float64)
+
+    @property
+    def marker_px(self) -> F64:
+        """(4, 2) corners of the marker itself, in the same order."""
+        inset = QUIET * self.unit_px
+        return self.saddles_px + inset * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+
+
+@lru_cache(maxsize=8)
+def marks(stack: PanelStack) -> tuple[Mark, ...]:
+    """Every mark of every panel. Raises InputError for panels that are too many or too small."""
+    if stack.count * PER_PANEL > DICTIONARY_SIZE:
+        raise InputError("stack", "x_m", f"boards are for {DICTIONARY_SIZE // PER_PANEL} panels at most")
+    unit = max(2, round(min(stack.width_px * 9 / 16, stack.height_px) / BITS_ON_SHORT_SIDE))
+    tile = TILE * unit
+    cell = np.array([stack.width_px / ACROSS, stack.height_px / DOWN])
+    room = cell - tile - 2
+    if room.min() < 0:
+        raise InputError("stack", "width_px", f"boards need panels of at least {ACROSS * tile}x{DOWN * tile} pixels")
+    found = []
+    random = np.random.default_rng(16)  # the board is always the same: photographs are compared with it
+    for panel in range(stack.count):
+        for place in range(PER_PANEL):
+            corner = np.array([place % ACROSS, place // ACROSS]) * cell + 1 + random.uniform(size=2) * room
+            left, top = np.rint(corner).astype(int) + CORNER * unit
+            found.append(Mark(panel * PER_PANEL + place, panel, int(left), int(top), unit))
+    return tuple(found)
+
+
+def board(stack: PanelStack, panel: int) -> U8:
+    """(H, W) what a panel shows, 0 or 255."""
+    import cv2
+
+    picture = np.zeros((stack.height_px, stack.width_px), np.uint8)
+    for mark in marks(stack):
+        if mark.panel != panel:
+            continue
+        side, corner, unit = mark.side_px, CORNER * mark.unit_px, mark.unit_px
+        u, v = mark.left_px, mark.top_px
+        picture[v : v + side, u : u + side] = 255
+        for du, dv in ((-corner, -corner), (side, -corner), (side, side), (-corner, side)):
+            picture[v + dv : v + dv + corner, u + du : u + du + corner] = 255
+        inset = QUIET * unit
+        marker = cv2.aruco.generateImageMarker(dictionary(), mark.number, MARKER * unit, borderBits=1)
+        picture[v + inset : v + inset + MARKER * unit, u + inset : u + inset + MARKER * unit] = marker
+    return picture
+
+
+def board_layers(stack: PanelStack) -> U8:
+    """(N, H, W, 4) all panels' boards together."""
+    layers = np.zeros((stack.count, stack.height_px, stack.width_px, 4), np.uint8)
+    layers[..., 3] = 255
+    for index in range(stack.count):
+        layers[index, ..., :3] = board(stack, index)[..., None]
+    return layers

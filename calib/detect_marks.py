@@ -1,0 +1,200 @@
+"""The boards' saddles in a photograph, each to a few hundredths of a pixel; or what is wrong with the photograph."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from calib.board import Mark, dictionary, marks
+from runtime.optics.stack import PanelStack
+from runtime.records import F64, U8
+
+DETECTION_PX = 2400  # photographs are searched at this size; corners are found in their own
+LEAST_MARKS = 3  # of a panel: twelve points, to place it
+LEAST_EXTENT = 0.3  # of a panel: a corner of it tells little about the others
+LEAST_UNIT_PX = 1.7  # photograph's pixels in one bit of a marker: below this nothing is read reliably
+BLURRED_BITS = 1.1  # an edge that is wider than this many bits is not worth its noise
+LEAST_CONTRAST = 0.35  # of a saddle against its mark's own
+LEAST_DYNAMIC = 24  # code values between black and white
+
+
+@dataclass(frozen=True, slots=True)
+class SeenMarks:
+    """One photograph's saddles."""
+
+    name: str
+    width_px: int
+    height_px: int
+    panel: Any  # (K,) index of the panel
+    panel_px: F64  # (K, 2) where the saddle is on the panel
+    image_px: F64  # (K, 2) where it is in the photograph; pixel centres at whole numbers
+    marks: tuple[int, ...]  # how many of each panel's marks were found
+    edge_bits: float  # width of an edge in bits of a marker, median; infinite without marks
+    unit_px: float  # photograph's pixels in one bit, median; 0 without marks
+    extents: tuple[float, ...]  # how much of each panel's width or height, the lesser, lies between its marks seen
+    mirrored: tuple[int, ...]  # how many of each panel's marks are found in the mirrored photograph
+
+    @property
+    def fault(self) -> str:
+        """Why it cannot be used; empty: it can."""
+        least = min(self.marks)
+        for panel, (straight, turned) in enumerate(zip(self.marks, self.mirrored, strict=True)):
+            if turned >= LEAST_MARKS and straight < LEAST_MARKS:
+                if sum(self.marks) == 0 or max(self.marks) < LEAST_MARKS:
+                    return "is mirrored (a selfie camera's habit; or the panels' `mirror` is wrong)"
+                return f"shows panel {panel} mirrored: its `mirror` in the configuration is wrong"
+        if sum(self.marks) == 0:
+            return "shows no mark of the board: blurred, too dark, or of something else"
+        if self.edge_bits > BLURRED_BITS:
+            return f"is blurred: its edges are {self.edge_bits * self.unit_px:.1f} px wide"
+        if self.unit_px < LEAST_UNIT_PX:
+            return f"is too small: {self.unit_px:.1f} px for one bit of a mark; go nearer or use more pixels"
+        if least < LEAST_MARKS:
+            panel = self.marks.index(least)
+            return f"shows {least} marks of panel {panel}, less than {LEAST_MARKS}: covered, cut off or too oblique"
+        for panel, share in enumerate(self.extents):
+            if share < LEAST_EXTENT:
+                return f"is covered or cut off: of panel {panel} {100 * share:.0f}% of its width or height are seen"
+        return ""
+
+
+def _detector() -> Any:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = 11, 43
+    parameters.adaptiveThreshWinSizeStep = 16
+    parameters.minMarkerPerimeterRate = 0.008
+    parameters.errorCorrectionRate = 0.3  # marks that cover each other must not become others
+    parameters.minDistanceToBorder = 2
+    return cv2.aruco.ArucoDetector(dictionary(), parameters)
+
+
+def _markers(picture: U8, known: dict[int, Mark]) -> list[tuple[Mark, F64]]:
+    """Marks whose code is read, with the marker's (4, 2) corners in the picture; a code read twice is not trusted."""
+    scale = min(2.0, DETECTION_PX / max(picture.shape))
+    kind = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=kind)
+    corners, numbers, _ = _detector().detectMarkers(small)
+    if numbers is None:
+        return []
+    ids = [int(number) for number in np.ravel(numbers)]
+    return [
+        (known[number], (np.asarray(quad, dtype=np.float64).reshape(4, 2) + 0.5) / scale - 0.5)
+        for number, quad in zip(ids, corners, strict=True)
+        if number in known and ids.count(number) == 1
+    ]
+
+
+def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
+    """The saddles of all panels' boards in a grey photograph (h, w)."""
+    known = {mark.number: mark for mark in marks(stack)}
+    found = _markers(picture, known)
+    mirrored = [0] * stack.count
+    if len(found) < LEAST_MARKS * stack.count:
+        for mark, _ in _markers(np.ascontiguousarray(picture[:, ::-1]), known):
+            mirrored[mark.panel] += 1
+    height, width = picture.shape
+    panel, panel_px, image_px, edges, units = [], [], [], [], []
+    counts = [0] * stack.count
+    unit_px = float(np.median([_unit_px(mark, quad) for mark, quad in found])) if found else 0.0
+    window = int(np.clip(round(1.3 * unit_px), 2, 15))
+    for mark, quad in found:
+        image_from_panel = cv2.findHomography(mark.marker_px, quad)[0]
+        if image_from_panel is None:
+            continue
+        guess = cv2.perspectiveTransform(mark.saddles_px[None], image_from_panel)[0]
+        good, refined = _refined(picture, guess, quad, window=window)
+        if not good.any():
+            continue
+        counts[mark.panel] += 1
+        panel += [mark.panel] * int(good.sum())
+        panel_px.append(mark.saddles_px[good])
+        image_px.append(refined[good])
+        units.append(_unit_px(mark, quad))
+        edges.append(_edge_px(picture, quad) / units[-1])
+    places = np.concatenate(panel_px) / [stack.width_px, stack.height_px] if panel_px else np.zeros((0, 2))
+    owners = np.array(panel, dtype=np.intp)
+    return SeenMarks(
+        name=name,
+        width_px=width,
+        height_px=height,
+        panel=owners,
+        panel_px=np.concatenate(panel_px) if panel_px else np.zeros((0, 2)),
+        image_px=np.concatenate(image_px) if image_px else np.zeros((0, 2)),
+        marks=tuple(counts),
+        edge_bits=float(np.median(edges)) if edges else float("inf"),
+        unit_px=unit_px,
+        extents=tuple(
+            float(np.ptp(places[owners == index], axis=0).min()) if (owners == index).any() else 0.0
+            for index in range(stack.count)
+        ),
+        mirrored=tuple(mirrored),
+    )
+
+
+def _unit_px(mark: Mark, quad: F64) -> float:
+    """Photograph's pixels in a bit of a marker, along its shorter side."""
+    sides = np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1)
+    return float(sides.min()) / 6
+
+
+def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F64]:
+    """Saddles to sub-pixels, and which of them look like one: white inside and outside, black to both sides."""
+    height, width = picture.shape
+    inside = (
+        (guess[:, 0] > window + 2) & (guess[:, 0] < width - window - 3)
+        & (guess[:, 1] > window + 2) & (guess[:, 1] < height - window - 3)
+    )  # fmt: skip
+    if not inside.all():
+        return inside & False, guess
+    points = guess.astype(np.float32).reshape(-1, 1, 2).copy()
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-3)
+    cv2.cornerSubPix(picture, points, (window, window), (-1, -1), criteria)
+    refined = points.reshape(-1, 2).astype(np.float64)
+    near = np.linalg.norm(refined - guess, axis=1) < 0.8 * window
+    # A step of one bit along the diagonals of the mark, and across them.
+    out = (guess - guess.mean(axis=0)) / 5 * 0.9
+    arms = np.stack([refined + out, refined - out, refined + _quarter(out, guess), refined - _quarter(out, guess)])
+    values = _samples(picture, arms)
+    white, black = values[:2].min(axis=0), values[2:].max(axis=0)
+    whole = float(np.ptp(_samples(picture, np.stack([guess.mean(axis=0)[None] + (quad - guess.mean(axis=0)) * s
+                                                      for s in (0.9, 1.3)]))))  # fmt: skip
+    return near & (white - black > max(LEAST_CONTRAST * whole, LEAST_DYNAMIC)), refined
+
+
+def _quarter(out: F64, guess: F64) -> F64:
+    """The other diagonal of each corner: from its two neighbours, so that perspective is followed."""
+    following, before = np.roll(guess, -1, axis=0) - guess, np.roll(guess, 1, axis=0) - guess
+    return np.asarray((following - before) / 10 * 0.9, dtype=np.float64)
+
+
+def _samples(picture: U8, points: F64) -> F64:
+    """Bilinear samples of a picture at (..., 2)."""
+    flat = np.ascontiguousarray(points.reshape(-1, 1, 2).astype(np.float32))
+    values = cv2.remap(picture, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values, dtype=np.float64).reshape(points.shape[:-1])
+
+
+def _edge_px(picture: U8, quad: F64) -> float:
+    """Width of the marker's outer edge, photograph's pixels: contrast over the steepest slope, median of its sides."""
+    widths = []
+    centre = quad.mean(axis=0)
+    for first, second in zip(quad, np.roll(quad, -1, axis=0), strict=True):
+        middle = (first + second) / 2
+        outward = (middle - centre) / 3  # one bit
+        length = float(np.linalg.norm(outward))
+        steps = np.linspace(-0.9, 1.6, 51)
+        along = np.linspace(-0.25, 0.25, 9)[:, None, None] * (second - first)
+        profile = _samples(picture, middle + along + steps[:, None] * outward).mean(axis=0)
+        step_px = length * (steps[1] - steps[0])
+        steepest = float(np.abs(np.gradient(profile)).max()) / step_px
+        widths.append(float(np.ptp(profile)) / max(steepest, 1e-9))
+    return float(np.median(widths))
+
+
+def usable(photographs: Sequence[SeenMarks]) -> list[SeenMarks]:
+    """Those without a fault."""
+    return [photograph for photograph in photographs if not photograph.fault]

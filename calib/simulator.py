@@ -1,0 +1,261 @@
+"""What a camera sees of a stack whose panels are not where they should be.
+
+Every ray of the camera crosses every panel where that panel truly is; the panels' phases along it add up and
+sin² of the sum is what is seen (seed 7). The lens distorts (Brown), darkens the corners and is out of focus; the
+panels' pixel grids beat with each other and with the sensor's (moiré); the sensor adds shot and read noise; the
+picture has a tone curve, eight bits and JPEG's losses. Glass shifts what lies behind it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.placed import PlacedPanel, panel_from_pixels, stack_from_pixels
+from runtime.optics.malus import intensity_from_phase
+from runtime.optics.stack import PanelStack
+from runtime.records import F32, F64, U8
+
+APERTURE_PX = 0.5  # of the sensor's pixels, on the panels: standard deviation
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """A camera's picture: size, intrinsics and distortion as OpenCV has them (pixel centres at whole numbers)."""
+
+    width_px: int
+    height_px: int
+    focal_px: float
+    centre_px: tuple[float, float]
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1 k2 p1 p2 k3
+
+    @property
+    def matrix(self) -> F64:
+        """(3, 3) intrinsic matrix."""
+        return np.array(
+            [[self.focal_px, 0.0, self.centre_px[0]], [0.0, self.focal_px, self.centre_px[1]], [0.0, 0.0, 1.0]]
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """How a photograph comes out."""
+
+    blur_px: float = 0.7  # standard deviation: lens, focus and the sensor's own pixels
+    motion_px: tuple[float, float] = (0.0, 0.0)  # smear along (u, v) during the exposure
+    gain: float = 0.8  # of full scale, white in the middle of the picture
+    dark: float = 0.01  # light through crossed polarizers, of full scale
+    electrons: float = 4000.0  # at full scale: shot noise
+    read_noise: float = 0.003  # of full scale
+    vignetting: float = 0.3  # loss of light in the corners
+    grid: float = 0.05  # depth to which the grid between a panel's pixels still modulates the light that is sampled
+    gamma: float = 2.2  # of the camera's tone curve
+    jpeg_quality: int = 92  # 0: not compressed
+
+
+@dataclass(frozen=True, slots=True)
+class Glass:
+    """The plates that every panel is made of: what lies behind is seen nearer, the more so at an angle."""
+
+    thickness_m: float = 0.0
+    index: float = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A stack that hands built, and what each panel shows."""
+
+    stack: PanelStack  # the geometry that is believed
+    panels: tuple[PlacedPanel, ...]  # the true one
+    layers: U8  # (N, H, W) phases of one channel, 255 is a phase of 1
+    glass: Glass = field(default_factory=Glass)
+
+
+def phone(*, random: np.random.Generator, width_px: int = 4000, height_px: int = 3000) -> Lens:
+    """A phone's main camera, one of many: 26 to 28 mm equivalent, a few per cent of distortion."""
+    focal = width_px * random.uniform(0.72, 0.80)
+    centre = (width_px / 2 + random.normal() * 0.004 * width_px, height_px / 2 + random.normal() * 0.004 * width_px)
+    k1, k2 = random.uniform(-0.06, 0.10), random.uniform(-0.12, 0.05)
+    p1, p2 = random.normal(scale=4e-4, size=2)
+    return Lens(width_px, height_px, focal, centre, (k1, k2, float(p1), float(p2), float(random.uniform(-0.02, 0.04))))
+
+
+def camera_from_stack(place_m: F64, *, towards_m: F64, roll_rad: float = 0.0) -> F64:
+    """(4, 4) pose of a camera (x right, y down, z away) at a place of `stack` that looks towards a point."""
+    away = np.asarray(towards_m, dtype=np.float64) - place_m
+    away /= np.linalg.norm(away)
+    right = np.cross(away, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(away, right), away])
+    rotation = Rotation.from_rotvec([0.0, 0.0, roll_rad]).as_matrix() @ rotation
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ place_m
+    return pose
+
+
+def by_hand(
+    count: int, stack: PanelStack, *, random: np.random.Generator, distance_m: tuple[float, float] | None = None
+) -> list[F64]:
+    """`count` poses (4, 4) of a camera that is held by hand round a display, as `docs/setup.md` asks for.
+
+    In turn from the middle, the left, the right, above and below; some with the camera on its side. Without a
+    distance, so near that the panel fills most of the picture.
+    """
+    width = stack.width_m
+    near, far = distance_m or (0.95 * width, 1.35 * width)
+    directions = [(0, 0), (-32, 4), (32, 4), (0, 24), (0, -22), (-22, 20), (22, 20), (-22, -18), (22, -18), (-38, 0),
+                  (38, 0), (12, -26)]  # fmt: skip
+    poses = []
+    for number in range(count):
+        aside, up = np.array(directions[number % len(directions)]) + random.normal(scale=4.0, size=2)
+        aside, up = np.radians(aside), np.radians(up)
+        toward = np.array([np.cos(up) * np.cos(aside), np.cos(up) * np.sin(aside), np.sin(up)])
+        target = np.array([0.0, *random.normal(scale=0.04 * width, size=2)])
+        roll = random.normal(scale=np.radians(4.0)) + (np.pi / 2 if number % 4 == 3 else 0.0)
+        poses.append(camera_from_stack(toward * random.uniform(near, far), towards_m=target, roll_rad=roll))
+    return poses
+
+
+def _directions(lens: Lens) -> tuple[F32, F32]:
+    """(h, w) x/z and y/z of the ray of every picture element, its lens's distortion undone."""
+    step = 16  # distortion is smooth: undone on a grid, between it interpolated
+    columns, rows = lens.width_px // step + 3, lens.height_px // step + 3
+    u, v = np.meshgrid(np.arange(columns) * step - step, np.arange(rows) * step - step)
+    points = np.stack([u, v], axis=-1).reshape(-1, 1, 2).astype(np.float64)
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-12)
+    undone = cv2.undistortPointsIter(
+        points, lens.matrix, np.array(lens.distortion), np.eye(3), np.eye(3), criteria
+    ).reshape(rows, columns, 2)
+    # By matrices of weights: OpenCV's own warps would round the places to a 32nd of a step.
+    across, down = _weights(lens.width_px, columns, step), _weights(lens.height_px, rows, step)
+    x, y = (down @ np.ascontiguousarray(undone[..., axis].astype(np.float32)) @ across.T for axis in (0, 1))
+    return x, y
+
+
+def _weights(length_px: int, nodes: int, step: int) -> F32:
+    """(length, nodes) linear interpolation between nodes at -step, 0, step, ..."""
+    place = np.arange(length_px) / step + 1
+    node = np.minimum(place.astype(int), nodes - 2)
+    weights = np.zeros((length_px, nodes), np.float32)
+    weights[np.arange(length_px), node] = 1 - (place - node)
+    weights[np.arange(length_px), node + 1] = place - node
+    return weights
+
+
+def photograph(
+    scene: Scene, lens: Lens, pose: F64, exposure: Exposure, *, random: np.random.Generator, rays: object = None
+) -> U8:
+    """(h, w) the photograph from a camera at `pose` (4, 4; camera_from_stack).
+
+    rays: what `camera_rays` of the same lens gave, to save the time.
+    """
+    x, y = rays if isinstance(rays, tuple) else _directions(lens)
+    # A sensor's pixel is an area: sampled in its middle alone, edges would be jagged.
+    soft = [cv2.GaussianBlur(layer, (0, 0), APERTURE_PX) for layer in scene.layers]
+    total = np.zeros(x.shape, np.float32)
+    passes = np.ones(x.shape, np.float32)
+    inside = np.ones(x.shape, bool)
+    for index, panel in enumerate(scene.panels):
+        u, v = _crossing(scene, index, panel, pose, x, y)
+        total += cv2.remap(soft[index], u - np.float32(0.5), v - np.float32(0.5), cv2.INTER_LINEAR).astype(np.float32)
+        inside &= (u > 0) & (u < scene.stack.width_px) & (v > 0) & (v < scene.stack.height_px)
+        if exposure.grid:
+            passes *= _grid(u, exposure.grid) * _grid(v, exposure.grid)
+    light = exposure.dark + intensity_from_phase(total * np.float32(1 / 255)) * passes
+    light *= inside
+    light = _softened(light, exposure)
+    return _developed(light, lens, exposure, random)
+
+
+def camera_rays(lens: Lens) -> tuple[F32, F32]:
+    """What `photograph` needs of a lens, once for many photographs."""
+    return _directions(lens)
+
+
+def _crossing(scene: Scene, index: int, panel: PlacedPanel, pose: F64, x: F32, y: F32) -> tuple[F32, F32]:
+    """(h, w) true pixels of a panel where the camera's rays cross it."""
+    if scene.glass.thickness_m:
+        return _crossing_through_glass(scene, index, panel, pose, x, y)
+    camera_from_pixels = pose[:3, :3] @ stack_from_pixels(panel, scene.stack) + np.outer(pose[:3, 3], [0, 0, 1])
+    h = np.linalg.inv(camera_from_pixels).astype(np.float64)
+    h = (h / h[2, 2]).astype(np.float32)
+    weight = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+    return (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / weight, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / weight
+
+
+def _crossing_through_glass(scene: Scene, index: int, panel: PlacedPanel, pose: F64, x: F32, y: F32) -> tuple[F32, F32]:
+    """The same behind as many parallel plates as stand before the panel, and half of its own (Snell)."""
+    turn = panel.rotation.T @ pose[:3, :3].T  # panel_from_camera
+    camera_m = panel.rotation.T @ (-pose[:3, :3].T @ pose[:3, 3] - panel.centre_m)
+    d = [turn[row, 0] * x + turn[row, 1] * y + turn[row, 2] for row in range(3)]
+    tan2 = (d[1] ** 2 + d[2] ** 2) / d[0] ** 2
+    sin2 = tan2 / (1 + tan2)
+    # tan in the glass over tan in the air: what a plate of thickness t lets the ray go aside is t·tan of this.
+    share = np.sqrt((1 - sin2) / (scene.glass.index**2 - sin2))
+    plates = scene.stack.count - 1 - index + 0.5
+    path = np.float32(camera_m[0]) - np.float32(plates * scene.glass.thickness_m) * (1 - share)
+    across = [np.float32(camera_m[axis]) - d[axis] / d[0] * path for axis in (1, 2)]
+    m = panel_from_pixels(scene.stack)
+    return (
+        ((across[0] - m[1, 2]) / m[1, 0]).astype(np.float32),
+        ((across[1] - m[2, 2]) / m[2, 1]).astype(np.float32),
+    )
+
+
+def _grid(position: F32, depth: float) -> F32:
+    """Light that a panel's pixels let through along one axis: least between two pixels."""
+    return np.float32(1 - depth / 2) - np.float32(depth / 2) * np.cos(np.float32(2 * np.pi) * position)
+
+
+def _softened(light: F32, exposure: Exposure) -> F32:
+    smear = np.array(exposure.motion_px)
+    if np.abs(smear).max() > 0:
+        length = int(np.ceil(np.linalg.norm(smear))) | 1
+        kernel = np.zeros((length, length), np.float32)
+        half = smear / 2
+        centre = np.array([length // 2] * 2)
+        for share in np.linspace(-1, 1, 8 * length):
+            u, v = np.rint(centre + share * half).astype(int)
+            kernel[v, u] += 1
+        light = np.asarray(cv2.filter2D(light, -1, kernel / kernel.sum()))
+    if exposure.blur_px:
+        light = np.asarray(cv2.GaussianBlur(light, (0, 0), exposure.blur_px))
+    return light
+
+
+def _developed(light: F32, lens: Lens, exposure: Exposure, random: np.random.Generator) -> U8:
+    u = (np.arange(lens.width_px, dtype=np.float32) - lens.centre_px[0]) / lens.width_px
+    v = (np.arange(lens.height_px, dtype=np.float32) - lens.centre_px[1])[:, None] / lens.width_px
+    light = light * (np.float32(exposure.gain) * (1 - np.float32(exposure.vignetting * 2.56) * (u * u + v * v)))
+    noise = random.standard_normal(light.shape, dtype=np.float32)
+    light = light + noise * np.sqrt(np.maximum(light, 0) / np.float32(exposure.electrons) + exposure.read_noise**2)
+    # The tone curve by table: a power of twelve million numbers takes longer than all else.
+    codes = np.rint(255 * np.linspace(0, 1, 4096) ** (1 / exposure.gamma)).astype(np.uint8)
+    picture = codes[(np.clip(light, 0.0, 1.0) * 4095).astype(np.int32)]
+    if exposure.jpeg_quality:
+        coded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, exposure.jpeg_quality])[1]
+        picture = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE))
+    return picture
+
+
+def photographs(
+    scene: Scene, lens: Lens, poses: Sequence[F64], exposure: Exposure, *, random: np.random.Generator
+) -> list[U8]:
+    """A photograph from every pose."""
+    rays = camera_rays(lens)
+    return [photograph(scene, lens, pose, exposure, random=random, rays=rays) for pose in poses]
+
+
+def smaller(lens: Lens, factor: float) -> Lens:
+    """The same lens with fewer picture elements."""
+    return replace(
+        lens,
+        width_px=round(lens.width_px * factor),
+        height_px=round(lens.height_px * factor),
+        focal_px=lens.focal_px * factor,
+        centre_px=((lens.centre_px[0] + 0.5) * factor - 0.5, (lens.centre_px[1] + 0.5) * factor - 0.5),
+    )

@@ -1,0 +1,23 @@
+"""Whose turn comes first where threads compete for too few cores: the presenter's, then the solver's, then the rest."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+
+log = logging.getLogger("phasestack.priority")
+
+PRESENTER_NICENESS = -10
+SOLVER_NICENESS = 5
+BACKGROUND_NICENESS = 10
+
+
+def set_niceness(niceness: int) -> bool:
+    """Of the calling thread, and of those that it starts from now on. False where the system does not allow it."""
+    try:
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
+    except (OSError, AttributeError):
+        log.debug("this thread's niceness can't become %d here", niceness)
+        return False
+    return True

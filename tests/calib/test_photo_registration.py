@@ -1,0 +1,135 @@
+"""Registration by photographs, on points alone: what is found, how sure, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.bundle import Undetermined, adjust
+from calib.photo_registration import evenly_spaced, register_photographs
+from calib.photo_trial import errors_of
+from calib.placed import PlacedPanel, ideal_panel, in_frame_of, misplaced
+from calib.simulator import camera_from_stack
+from runtime.config import StackGeometry
+from runtime.optics.stack import PanelStack
+from tests.calib.photo_scenes import photographed
+
+STACK = StackGeometry().stack()
+EYE = np.array([0.5, 0.0, 0.05])
+
+
+def hands(seed: int, stack: PanelStack = STACK) -> tuple[tuple[PlacedPanel, ...], np.random.Generator]:
+    random = np.random.default_rng(seed)
+    return misplaced(stack, shift_m=0.002, turn_deg=1.0, gap_m=0.002, random=random), random
+
+
+def register(seen, *, stack: PanelStack = STACK, even: bool = False):
+    return register_photographs(seen, stack, eye_m=EYE, even=even)
+
+
+def test_without_noise_the_panels_are_found_exactly() -> None:
+    truth, random = hands(0)
+    seen, lens = photographed(STACK, truth, count=8, noise_px=0.0, random=random)
+    found = adjust(seen, STACK, reference=1)
+    true = in_frame_of(truth, reference=1, reference_x_m=0.0)
+    for panel, expected in zip(found.panels, true, strict=True):
+        assert np.allclose(panel.centre_m, expected.centre_m, atol=2e-6)
+        assert np.allclose(panel.rotation, expected.rotation, atol=1e-5)
+    assert found.lens[0] == pytest.approx(lens.focal_px, rel=1e-4)
+
+
+def test_a_dozen_stacks_are_found_within_a_tenth_of_a_pixel_and_the_intervals_hold_the_truth() -> None:
+    errors, inside = [], []
+    for seed in range(12):  # `calibrate panels photo-trial --stacks 30` tries thirty, with pictures
+        truth, random = hands(seed)
+        seen, _ = photographed(STACK, truth, count=12, noise_px=0.15, random=random)
+        error = errors_of(register(seen), truth)
+        errors.append(error)
+        inside.append(error.inside_95)
+    pixels = np.concatenate([error.pixels for error in errors])
+    assert np.sqrt((pixels**2).mean()) < 0.1
+    assert pixels.max() < 0.3
+    assert np.abs([error.gap_m for error in errors]).max() < 0.2e-3
+    assert 0.90 <= np.concatenate(inside).mean() <= 0.99
+
+
+def test_gross_errors_among_the_points_do_no_harm() -> None:
+    truth, random = hands(1)
+    seen, _ = photographed(STACK, truth, count=10, noise_px=0.1, random=random)
+    for photograph in seen:
+        wrong = random.choice(len(photograph.panel), size=len(photograph.panel) // 20, replace=False)
+        photograph.image_px[wrong] += random.normal(scale=20.0, size=(len(wrong), 2))
+    assert errors_of(register(seen), truth).pixels.max() < 0.3
+
+
+def test_even_distances_lie_nearest_to_the_true_ones_and_keep_the_reference() -> None:
+    uneven = replace(STACK, x_m=(-0.058, 0.0, 0.062))
+    assert evenly_spaced(uneven, reference=1).x_m == pytest.approx((-0.06, 0.0, 0.06))
+    truth, random = hands(2)
+    seen, _ = photographed(STACK, truth, count=8, noise_px=0.05, random=random)
+    even, true = register(seen, even=True), register(seen)
+    assert even.stack.is_evenly_spaced
+    assert not true.stack.is_evenly_spaced
+    assert np.allclose(even.true_x_m, true.stack.x_m)
+
+
+def test_a_stack_of_two_and_one_of_four_panels() -> None:
+    for x_m in ((-0.03, 0.03), (-0.06, -0.02, 0.02, 0.06)):
+        stack = replace(STACK, x_m=x_m)
+        truth, random = hands(3, stack)
+        seen, _ = photographed(stack, truth, count=8, noise_px=0.05, random=random)
+        assert errors_of(register(seen, stack=stack), truth).pixels.max() < 0.3
+
+
+def test_too_few_photographs_are_refused_with_what_is_wrong_with_the_others() -> None:
+    truth, random = hands(0)
+    seen, _ = photographed(STACK, truth, count=6, noise_px=0.1, random=random)
+    blurred = [replace(s, edge_bits=2.0) for s in seen[:3]]
+    with pytest.raises(Undetermined, match=r"3 of 6 photographs.*1\.jpg is blurred.*2\.jpg is blurred"):
+        register([*blurred, *seen[3:]])
+
+
+def test_photographs_from_one_place_are_refused() -> None:
+    truth, random = hands(0)
+    poses = [
+        camera_from_stack(np.array([0.6, *random.normal(scale=0.02, size=2)]), towards_m=np.zeros(3)) for _ in range(8)
+    ]
+    seen, _ = photographed(STACK, truth, count=8, noise_px=0.05, random=random, poses=poses)
+    with pytest.raises(Undetermined, match="all from one place"):
+        register(seen)
+
+
+def test_a_photograph_of_another_stack_is_named_and_left_out() -> None:
+    truth, random = hands(0)
+    seen, _ = photographed(STACK, truth, count=9, noise_px=0.05, random=random)
+    stranger, _ = photographed(STACK, hands(8)[0], count=9, noise_px=0.05, random=hands(0)[1])
+    found = register([*seen[:4], stranger[4], *seen[5:]])
+    left_out = [v for v in found.verdicts if not v.used]
+    assert [v.name for v in left_out] == ["5.jpg"]
+    assert "does not agree" in left_out[0].reason
+    assert errors_of(found, truth).pixels.max() < 0.3
+
+
+def test_photographs_that_are_all_of_another_stack_are_refused() -> None:
+    other = replace(STACK, x_m=(-0.03, 0.0, 0.03))
+    seen, _ = photographed(other, hands(0, other)[0], count=9, noise_px=0.05, random=np.random.default_rng(0))
+    with pytest.raises(Undetermined, match=r"panel 0 stands .* mm from panel 1, the configuration says 60\.0"):
+        register(seen)
+
+
+def test_a_photograph_of_another_size_is_left_out() -> None:
+    truth, random = hands(0)
+    seen, _ = photographed(STACK, truth, count=8, noise_px=0.05, random=random)
+    found = register([replace(seen[0], width_px=1000), *seen[1:]])
+    assert [v.reason for v in found.verdicts if not v.used] == [
+        "has another size than the others (4000x3000): one camera, one setting"
+    ]
+
+
+def test_panels_in_another_order_are_refused() -> None:
+    panels = [ideal_panel(STACK, index) for index in (2, 1, 0)]
+    seen, _ = photographed(STACK, tuple(panels), count=8, noise_px=0.05, random=np.random.default_rng(0))
+    with pytest.raises(Undetermined, match="reverse of the configuration's order"):
+        register(seen)
