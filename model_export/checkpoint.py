@@ -16,7 +16,10 @@ from model_export.network import SpectralSolver
 from model_export.recipe import Recipe
 from runtime.config import validated
 from runtime.errors import InputError
+from runtime.support import foreign
 from runtime.support.artifacts import write_bytes
+
+FILE_BYTES_MAX = 4 << 30
 
 WIDTH_KEY = "subnets.in_conv.0.weight"
 FAMILIES = {"subnets.": "eyereal", "log_floor": "spectral"}
@@ -28,10 +31,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     Plain values, tensors, and the `args` of an argparse command line, which is a table of plain values again: the
     published code saves its own. Nothing else is made, and no code of the file is run.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, "", f"cannot be read ({error.strerror})") from None
+    data = foreign.read_bytes(path, most_bytes=FILE_BYTES_MAX)
     try:
         with torch.serialization.safe_globals([argparse.Namespace]):
             table = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)

@@ -13,6 +13,7 @@ from runtime.config import Section, validated
 from runtime.errors import InputError
 from runtime.model.contract import Steps, TrainedFor
 from runtime.model.predictor import SHIPPED
+from runtime.support import foreign
 
 RECIPES = Path(__file__).parent / "recipes"
 DESIGN_RANGE = TrainedFor(
@@ -82,12 +83,7 @@ def recipe_path(name: str) -> Path:
 def read_recipe(name: str) -> Recipe:
     """A recipe by name or file. Raises InputError."""
     path = recipe_path(name)
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(path, "", f"cannot be read ({error.strerror})") from None
-    except ValueError as error:
-        raise InputError(path, "", f"malformed: {error}") from None
+    table = foreign.read_json(path)
     if not isinstance(table, dict):
         raise InputError(path, "", "must be one JSON object")
     return validated(Recipe, table, source=path)

@@ -21,6 +21,9 @@ from model_export.stress import ORDINARY, eyereal_cases, spectral_cases
 from runtime.errors import InputError
 from runtime.model.contract import Contract, parse_contract
 from runtime.model.transfer import FULL
+from runtime.support import foreign
+
+FILE_BYTES_MAX = 4 << 30
 
 OPSETS = range(17, 21)
 # Largest difference from torch in panel values: a quarter, two and ten codes of 8 bits; int8 is judged by its mean.
@@ -66,10 +69,7 @@ class Report:
 
 def validate_file(path: Path) -> Report:
     """Checks of a file against the torch module that its own weights make. Raises InputError: no model of ours."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, "", f"cannot be read ({error.strerror})") from None
+    data = foreign.read_bytes(path, most_bytes=FILE_BYTES_MAX)
     return check_model(data, source=str(path))
 
 
