@@ -63,8 +63,11 @@ def node_multiply_adds(kind: str, inputs: Sequence[Shape], output: Shape) -> int
 
 
 def graph_multiply_adds(path: Path, shapes: Sequence[Shape]) -> int:
-    """Of one run of an ONNX file on float32 inputs of these shapes, in its order. Raises InputError: no such run."""
-    import onnxruntime as ort
+    """Of one run of an ONNX file on inputs of these shapes, in its order. Raises InputError: no such run."""
+    from runtime.model.onnx_runtime import onnxruntime
+    from runtime.model.session import TYPES
+
+    ort = onnxruntime()
 
     options = ort.SessionOptions()
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
@@ -75,8 +78,8 @@ def graph_multiply_adds(path: Path, shapes: Sequence[Shape]) -> int:
         options.profile_file_prefix = str(Path(folder) / "run")
         try:
             session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-            names = [item.name for item in session.get_inputs()]
-            session.run(None, {name: np.zeros(shape, np.float32) for name, shape in zip(names, shapes, strict=True)})
+            inputs = zip(session.get_inputs(), shapes, strict=True)
+            session.run(None, {item.name: np.zeros(shape, TYPES[item.type]) for item, shape in inputs})
         except Exception as error:  # onnxruntime raises its own hierarchy of undocumented exceptions
             raise InputError(path, "", f"does not run ({(str(error).splitlines() or [''])[0][:120]})") from None
         events = json.loads(Path(session.end_profiling()).read_text(encoding="utf-8"))
