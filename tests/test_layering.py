@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 STAGES = {"sensor", "eyes", "content", "model", "panels"}
 SHARED = {"records", "config", "clock", "errors", "support", "optics"}
 FLOORS: tuple[tuple[str, ...], ...] = (  # from the ground up; what stands beside each other may be used by each other
-    ("errors", "clock", "records", "config", "support", "optics"),
+    ("version", "errors", "clock", "records", "config", "support", "optics"),
     ("sensor", "eyes", "content", "model", "panels"),
     ("evaluation",),
     ("plan",),
