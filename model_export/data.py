@@ -35,7 +35,7 @@ class TrainingPair:
     stack: PanelStack
     eyes_m: F64  # (2, 3) left, right; frame `stack`
     images: tuple[U8, U8]  # (h, w, 3) on the centre panel's raster
-    tolerance_mm: float
+    eye_sigma_mm: float
     off: tuple[Place, ...] = ()
 
 
@@ -101,37 +101,37 @@ def beside(random: Random, eye_m: F64, mm: float) -> F64:
 
 
 def views(
-    scene: Scene, eyes_m: F64, stack: PanelStack, *, tolerance_mm: float, random: Random, off_each: int = 1
+    scene: Scene, eyes_m: F64, stack: PanelStack, *, eye_sigma_mm: float, random: Random, off_each: int = 1
 ) -> TrainingPair:
     """A scene from both eyes and, where there is a tolerance, from `off_each` places so far beside each."""
     raster = stack.panel(CENTRE)
     left, right = (draw(scene, eye, raster) for eye in eyes_m)
     off = []
-    if tolerance_mm > 0:
+    if eye_sigma_mm > 0:
         for side in (0, 1):
             for _ in range(off_each):
-                place = beside(random, eyes_m[side], tolerance_mm)
+                place = beside(random, eyes_m[side], eye_sigma_mm)
                 off.append(Place(side, place, draw(scene, place, raster)))
-    return TrainingPair(stack, eyes_m, (left, right), tolerance_mm, tuple(off))
+    return TrainingPair(stack, eyes_m, (left, right), eye_sigma_mm, tuple(off))
 
 
 def random_pair(
-    random: Random, *, width_px: int, height_px: int, tolerance_mm: tuple[float, float] = (0.0, 4.0)
+    random: Random, *, width_px: int, height_px: int, eye_sigma_mm: tuple[float, float] = (0.0, 4.0)
 ) -> TrainingPair:
     """One pair of the endless stream. A quarter of them has no tolerance at all: exact eyes."""
     stack, eyes = random_place(random, width_px=width_px, height_px=height_px)
     scene = random_scene(random, stack, eyes.mean(axis=0))
-    low, high = tolerance_mm
+    low, high = eye_sigma_mm
     tolerance = low if random.random() < 0.25 else random.uniform(low, high)
-    return views(scene, eyes, stack, tolerance_mm=tolerance, random=random)
+    return views(scene, eyes, stack, eye_sigma_mm=tolerance, random=random)
 
 
 def endless_pairs(
-    seed: int, *, first: int = 0, step: int = 1, width_px: int, height_px: int, tolerance_mm: tuple[float, float]
+    seed: int, *, first: int = 0, step: int = 1, width_px: int, height_px: int, eye_sigma_mm: tuple[float, float]
 ) -> Iterator[TrainingPair]:
     """Pairs number `first`, `first + step`, ..: each is made from (seed, number) alone, so any can be resumed at."""
     number = first
     while True:
         random = np.random.default_rng([seed, number])
-        yield random_pair(random, width_px=width_px, height_px=height_px, tolerance_mm=tolerance_mm)
+        yield random_pair(random, width_px=width_px, height_px=height_px, eye_sigma_mm=eye_sigma_mm)
         number += step

@@ -35,7 +35,9 @@ def main() -> None:
     try:
         from runtime.commands.app import app
         from runtime.support.crash import watch_threads
+        from runtime.support.privacy import keep_quiet
 
+        keep_quiet()
         watch_threads()
         signal.signal(signal.SIGINT, before)
         code = _code_of(app, output)

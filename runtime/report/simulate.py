@@ -49,6 +49,12 @@ class Simulation:
         except ModelFailure:
             return None
 
+    def pictures(self, eyes_m: F64) -> tuple[list[U8], float]:
+        """What eyes (2, 3) should see, and the field of view of these pictures: both eyes' own, filled by the panel."""
+        fov_deg = max(self.fov_deg(eye) for eye in eyes_m)
+        size = {"width_px": self.stack.width_px, "height_px": self.stack.height_px}
+        return [self.painter.image(eye, **size, fov_deg=fov_deg) for eye in eyes_m], fov_deg
+
     def psnr_db(self, eye_m: ArrayLike, layers: U8) -> float:
         """Displayed PSNR of one eye over the panel. NaN where no ray crosses every panel."""
         fov_deg = self.fov_deg(eye_m)

@@ -6,6 +6,7 @@ listener raises ends the work: so a signal is heard within one step.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -20,6 +21,21 @@ def tell(what: str, done: int, total: int | None = None) -> None:
     listener = _LISTENER.get()
     if listener is not None:
         listener(what, done, total)
+
+
+@contextmanager
+def within(seconds: float, too_slow: Exception) -> Iterator[None]:
+    """Within this block a `tell` that comes after the time is up raises `too_slow`; whoever listens goes on hearing."""
+    end, outer = time.monotonic() + seconds, _LISTENER.get()
+
+    def check(what: str, done: int, total: int | None) -> None:
+        if time.monotonic() > end:
+            raise too_slow
+        if outer is not None:
+            outer(what, done, total)
+
+    with listening(check):
+        yield
 
 
 @contextmanager
