@@ -22,7 +22,7 @@ from runtime.support.artifacts import write_bytes
 FILE_BYTES_MAX = 4 << 30
 
 WIDTH_KEY = "subnets.in_conv.0.weight"
-FAMILIES = {"subnets.": "eyereal", "lambda_net.": "spectral"}
+FAMILIES = {"subnets.": "eyereal", "log_floor": "spectral"}
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
@@ -67,7 +67,7 @@ def load_spectral(path: Path, *, name: str) -> tuple[SpectralSolver, Recipe]:
     recipe = validated(Recipe, table["recipe"], source=f"{path}: recipe")
     if recipe.name != name:
         raise InputError(path, "recipe.name", f"is a checkpoint of {recipe.name}, not of {name}")
-    net = SpectralSolver(recipe.hidden)
+    net = SpectralSolver(recipe.cell_px, recipe.iterations)
     fill(net, table["model"], source=path, arch=name)
     return net.eval(), recipe.model_copy(update={"weights": plain_weights(net)})
 
@@ -75,7 +75,7 @@ def load_spectral(path: Path, *, name: str) -> tuple[SpectralSolver, Recipe]:
 def solver_of(recipe: Recipe, *, source: str) -> SpectralSolver:
     """The network with a recipe's own weights, or the analytic start. Raises InputError."""
     torch.manual_seed(recipe.training.seed)
-    net = SpectralSolver(recipe.hidden)
+    net = SpectralSolver(recipe.cell_px, recipe.iterations)
     if recipe.weights is not None:
         try:
             state = {key: torch.tensor(value, dtype=torch.float32) for key, value in recipe.weights.items()}

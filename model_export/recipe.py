@@ -29,10 +29,9 @@ class Training(Section):
     seed: Annotated[int, Field(ge=0)] = 1
     width_px: Annotated[int, Field(ge=64)] = Field(480, description="raster of the training pairs")
     height_px: Annotated[int, Field(ge=64)] = 270
-    tolerance_mm: tuple[float, float] = Field((0.0, 4.0), description="range of the tolerances that are drawn")
+    eye_sigma_mm: tuple[float, float] = Field((0.0, 4.0), description="range of the uncertainties that are drawn")
     validate_every: Annotated[int, Field(ge=1)] = 50
     validation_pairs: Annotated[int, Field(ge=1)] = 12
-    learn_steps: bool = Field(True, description="also the sizes of the correction steps")
 
 
 class Recipe(Section):
@@ -40,7 +39,7 @@ class Recipe(Section):
 
     name: str
     arch: Literal["spectral"] = "spectral"
-    hidden: Annotated[int, Field(ge=1, le=256)] = 16
+    iterations: Annotated[int, Field(ge=0, le=32)] = Field(4, description="of the box, within the network")
     cell_px: Annotated[int, Field(ge=1, le=64)] = 4
     reduction: Literal[1, 2, 4] = 2
     emphasis: Annotated[float, Field(ge=0, le=0.5)] = Field(

@@ -269,6 +269,9 @@ class ModelSettings(Section):
 
     name: str = Field("balanced", description="fast, balanced, best, sart, or an ONNX file with our contract")
     provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = Field("cpu", description="execution provider")
+    backend: Literal["auto", "opencv"] = Field(
+        "auto", description="what does all that surrounds the network; auto: the one there is"
+    )
     threads: Annotated[int, Field(ge=0, le=256)] = Field(2, description="inference threads; 0: all cores")
     eye_sigma_mm: Literal["auto"] | NonNegative = Field(
         "auto",
@@ -449,6 +452,7 @@ class Overrides(BaseModel):
     scene: str | None = None
     model: str | None = None
     budget_ms: float | None = None
+    backend: str | None = None
 
     def applied(self, settings: Settings) -> Settings:
         """The settings with these in force. Raises InputError, naming the option."""
@@ -462,6 +466,8 @@ class Overrides(BaseModel):
             settings = changed(settings, "model", {"name": self.model}, source="--model")
         if self.budget_ms is not None:
             settings = changed(settings, "model", {"budget_ms": self.budget_ms}, source="--budget-ms")
+        if self.backend is not None:
+            settings = changed(settings, "model", {"backend": self.backend}, source="--backend")
         return settings
 
 

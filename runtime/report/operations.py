@@ -130,9 +130,9 @@ class _Noting:
         self._session = session
         self.shapes: list[tuple[Shape, ...]] = []
 
-    def run(self, *inputs: NDArray[Any], output_shape: Shape) -> NDArray[np.float32]:
-        self.shapes.append(tuple(array.shape for array in inputs))
-        return self._session.run(*inputs, output_shape=output_shape)
+    def run(self, feeds: Mapping[str, NDArray[Any]], shapes: Mapping[str, Shape]) -> dict[str, NDArray[Any]]:
+        self.shapes.append(tuple(feeds[name].shape for name in self._session.input_shapes))
+        return self._session.run(feeds, shapes)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._session, name)
