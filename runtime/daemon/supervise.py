@@ -19,7 +19,7 @@ from runtime.daemon.server import StatusServer, open_status_server
 from runtime.daemon.signals import Signals
 from runtime.errors import InputError, PhasestackError, Stopped, TransientError
 from runtime.frame.presenter import Presenter
-from runtime.records import RefreshAccount
+from runtime.records import RefreshAccount, State
 from runtime.support import logs
 from runtime.support.transient import MayPass, may_pass
 
@@ -97,15 +97,21 @@ class Daemon:
             return False
         log.warning("waiting for a panel: %s", why)
         self._notifier.extend_start(START_EXTENSION_S)
-        self._notifier.status(f"starting (waiting for a panel: {why})")
+        self._tell_start(f"waiting for a panel: {why}")
         time.sleep(PANEL_RETRY_S)
         return not self._signals.stop
 
     def starting(self, doing: str) -> bool:
         """Something before the first frame takes long: ask for more time. False: told to stop."""
         self._notifier.extend_start(START_EXTENSION_S)
-        self._notifier.status(f"starting ({doing})")
+        self._tell_start(doing)
         return not self._signals.stop
+
+    def _tell_start(self, doing: str) -> None:
+        """Before the first refresh there is no account yet, but a reason."""
+        self._notifier.status(f"starting ({doing})")
+        if self._server is not None:
+            self._server.publish(lambda: {"state": str(State.STARTING), "reason": doing})
 
     def _loading(self) -> dict[str, str]:
         """What is being loaded, and why the last change was refused; for the status."""
