@@ -15,7 +15,7 @@ from runtime.eyes.calibration import load_calibration
 from runtime.frame.run_state import RunCell
 from runtime.frame.solver import Solver
 from runtime.plan.drawing import drawn_for
-from runtime.plan.planning import planned_predictor
+from runtime.plan.predictors import planned_predictor
 from runtime.records import SolveRequest
 from tests.frame.conftest import SMALL
 from tests.frame.fakes import EYES, aside
