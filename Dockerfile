@@ -46,7 +46,6 @@ RUN apt-get update \
  && install -d -o phasestack -g phasestack -m 0750 /run/phasestack
 COPY --from=build /opt/phasestack /opt/phasestack
 COPY THIRD_PARTY.md /usr/share/doc/phasestack/THIRD_PARTY.md
-ENV ORT_DISABLE_TELEMETRY=1
 ENV PATH=/opt/phasestack/bin:$PATH \
     PYTHONUNBUFFERED=1 \
     ORT_DISABLE_TELEMETRY=1

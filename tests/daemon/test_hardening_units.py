@@ -35,6 +35,12 @@ def test_what_the_daemon_may_take_of_the_machine_is_bounded(unit):
     assert int(found["CPUWeight"][0]) > 100  # the default: the picture goes first
 
 
+def test_the_presenters_thread_may_take_the_niceness_that_it_wants():
+    from runtime.support.priority import PRESENTER_NICENESS
+
+    assert int(keys("phasestack.service")["LimitNICE"][0]) <= PRESENTER_NICENESS
+
+
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze here")
 @pytest.mark.parametrize("unit", DAEMONS)
 def test_systemd_knows_every_key_and_value(unit, tmp_path):
