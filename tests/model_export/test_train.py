@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
+from model_export.sight import displayed_mse, sight_of  # noqa: E402
+
 import model_export.train as training  # noqa: E402
 from model_export.checkpoint import load_spectral, solver_of  # noqa: E402
 from model_export.data import TrainingPair, endless_pairs  # noqa: E402
 from model_export.recipe import Recipe, read_recipe  # noqa: E402
 from model_export.scene import Plane, draw  # noqa: E402
 from model_export.train import TrainRequest, held_out_pairs, pair_loss, run_training  # noqa: E402
-from model_export.sight import displayed_mse, sight_of  # noqa: E402
 from runtime.config import ModelSettings  # noqa: E402
 from runtime.errors import InputError  # noqa: E402
 from runtime.model.predictor import load_predictor  # noqa: E402
