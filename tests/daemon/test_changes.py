@@ -23,6 +23,7 @@ from runtime.daemon.notify import Notifier
 from runtime.daemon.server import StatusServer
 from runtime.daemon.signals import Signals
 from runtime.daemon.supervise import Daemon
+from runtime.support import progress
 from tests.daemon.rig import SMALL, TRACKING, Rig
 
 STEADY = {"sensor": {"timeout_s": 5.0, "open_timeout_s": 20.0}, "tracker": {"hold_s": 20.0}}  # on a busy machine too
@@ -90,10 +91,10 @@ def gate(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
     """Content comes to be loaded when it is set."""
     real, opened = loader.prepare_content, threading.Event()
 
-    def prepare(settings: Any, stack: Any, *, progress: Any = lambda _: None, **how: Any) -> Any:
-        progress(f"reading {settings.scene}")
+    def prepare(settings: Any, stack: Any, **how: Any) -> Any:
+        progress.tell(f"reading {settings.scene}", 1, 2)
         assert opened.wait(60.0)
-        return real(settings, stack, progress=progress, **how)
+        return real(settings, stack, **how)
 
     monkeypatch.setattr(loader, "prepare_content", prepare)
     yield opened
@@ -116,7 +117,7 @@ def test_the_present_scene_goes_on_while_another_is_loaded(served: Served, gate:
     accounts = served.rig.accounts[before:]
     assert len(accounts) > 50
     assert all(account.presented and account.solution is not None for account in accounts)
-    assert ("demo", "reading sparse") in told
+    assert ("demo", "reading sparse: 1 of 2") in told
     served.rig.refreshes(2)
     status = served.status()
     assert (status["scene"], status.get("loading")) == ("sparse", None)

@@ -34,7 +34,9 @@ def rig() -> Iterator[Rig]:
 def steady() -> Iterator[Rig]:
     """The same, on a machine however busy: nothing is late, lost or left behind unless the test says so."""
     patient = {"solver_late_s": 60.0, "solver_abandon_s": 600.0}
-    with Rig(loop=patient, sensor={"timeout_s": 5.0, "open_timeout_s": 20.0}, tracker={"hold_s": 20.0}) as made:
+    with Rig(
+        loop=patient, sensor={"timeout_s": 5.0, "open_timeout_s": 20.0}, tracker={"hold_s": 20.0}, plan={"reuse": False}
+    ) as made:
         made.refresh_until(TRACKING)
         made.refresh_until_solved()
         yield made

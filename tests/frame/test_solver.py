@@ -72,6 +72,14 @@ def test_solutions_and_flat_pictures_are_numbered_together_and_upwards(solver):
     assert numbers[0] == 2  # the flat picture was the first
 
 
+def test_a_solver_that_is_made_anew_gives_no_number_a_second_time(solver, cell):
+    """Sinks know layers by their number: the same one for other layers would leave the old ones on the panels."""
+    numbers = [solver.step(wish(aside(k / 100))).solution.number for k in range(3)]
+    anew = Solver(cell, SMALL)
+    first = [anew.step(wish(None, flat=True)).flat.number, anew.step(wish()).solution.number]
+    assert min(first) > max(numbers)
+
+
 def test_a_solution_that_is_held_never_changes_whatever_is_solved_after_it(solver):
     held = [solver.step(wish(aside(k / 50))).solution for k in range(3)]
     copies = [solution.layers.copy() for solution in held]
