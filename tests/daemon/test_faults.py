@@ -198,9 +198,9 @@ def test_a_model_that_never_returns_is_left_behind_and_the_solver_is_made_anew(s
     try:
         asleep(steady, solver)
         before = steady.predictor
-        solver._abandon_ns = 1
+        solver._late_ns = solver._abandon_ns = 1
         steady.presenter.refresh()
-        solver._abandon_ns = 600 * NS_PER_S
+        solver._late_ns, solver._abandon_ns = 60 * NS_PER_S, 600 * NS_PER_S
         steady.refresh_until_solved(times=2)
         steady.refresh_until(TRACKING)
         assert (solver.restarts, steady.presenter.stats.dropped) == (1, 0)
