@@ -230,9 +230,11 @@ def _softened(light: F32, exposure: Exposure) -> F32:
 def _developed(light: F32, lens: Lens, exposure: Exposure, random: np.random.Generator) -> U8:
     u = (np.arange(lens.width_px, dtype=np.float32) - lens.centre_px[0]) / lens.width_px
     v = (np.arange(lens.height_px, dtype=np.float32) - lens.centre_px[1])[:, None] / lens.width_px
-    light = light * (np.float32(exposure.gain) * (1 - np.float32(exposure.vignetting * 2.56) * (u * u + v * v)))
+    corners = 1 - np.float32(exposure.vignetting * 2.56) * (u * u + v * v)
+    light = np.asarray(light * (np.float32(exposure.gain) * corners), dtype=np.float32)
     noise = random.standard_normal(light.shape, dtype=np.float32)
-    light = light + noise * np.sqrt(np.maximum(light, 0) / np.float32(exposure.electrons) + exposure.read_noise**2)
+    spread = np.sqrt(np.maximum(light, 0) / np.float32(exposure.electrons) + np.float32(exposure.read_noise**2))
+    light = light + noise * spread.astype(np.float32)
     # The tone curve by table: a power of twelve million numbers takes longer than all else.
     codes = np.rint(255 * np.linspace(0, 1, 4096) ** (1 / exposure.gamma)).astype(np.uint8)
     picture = codes[(np.clip(light, 0.0, 1.0) * 4095).astype(np.int32)]

@@ -67,6 +67,11 @@ class Walk:
         self._guide = ""
         self.finished = not self._left
 
+    @property
+    def current(self) -> Viewpoint:
+        """The viewpoint that is shown."""
+        return self._left[self._index]
+
     def begin(self) -> None:
         """Announce the first viewpoint."""
         if self.finished:

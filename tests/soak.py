@@ -1,4 +1,6 @@
-"""A long run with faults: python tests/soak.py --frames 100000 [--changes 200]. Fails where something piles up.
+"""A long run with faults: python tests/soak.py --frames 100000 --changes 400.
+
+Fails where memory, files or threads pile up, or a refresh is lost.
 
 A real run with real content, network, panels and status socket, small; every so often the sensor is lost, a panel
 is lost, the model fails, the picture is paused, another scene or configuration is taken over, and somebody asks for

@@ -1,6 +1,6 @@
 """One direction of imports: every module has its room, every room its place, and nothing imports in a circle.
 
-The stages do not know each other; plan, evaluation, frame, daemon and commands stand on them, in this order.
+The stages do not know each other; evaluation, plan, frame, daemon and commands stand on them, in this order.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ ROOT = Path(__file__).resolve().parents[1]
 STAGES = {"sensor", "eyes", "content", "model", "panels"}
 SHARED = {"records", "config", "clock", "errors", "support", "optics"}
 FLOORS: tuple[tuple[str, ...], ...] = (  # from the ground up; what stands beside each other may be used by each other
-    ("errors", "clock", "records", "config", "support", "optics"),
+    ("version", "errors", "clock", "records", "config", "support", "optics"),
     ("sensor", "eyes", "content", "model", "panels"),
-    ("plan",),
     ("evaluation",),
+    ("plan",),
     ("frame",),
     ("daemon",),
     ("report", "commands", "cli"),

@@ -19,6 +19,7 @@ from runtime.commands.plan import plan
 from runtime.commands.record import record
 from runtime.commands.report import report
 from runtime.commands.run import run
+from runtime.commands.setup import setup
 from runtime.commands.solve import solve
 from runtime.commands.stability import stability
 from runtime.commands.status import status
@@ -35,6 +36,7 @@ app = typer.Typer(
 COMMANDS: tuple[Callable[..., None] | tuple[str, typer.Typer], ...] = (
     demo,
     run,
+    setup,
     solve,
     record,
     ("calibrate", calibrate_app),

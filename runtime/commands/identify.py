@@ -119,7 +119,7 @@ def _show(settings: Settings, seconds: float, panel: int, all_at_once: bool) -> 
     if settings.output.panels:
         _check_panel(panel, len(settings.output.panels))
     try:
-        panels, cards, _ = _bound(settings) if settings.output.panels else _every_monitor()
+        panels, cards, _ = _bound(settings) if settings.output.panels else every_monitor()
     except PanelLost as error:
         raise InputError("output", "panels", str(error)) from None
     keys = TerminalKeys(quit_at_end=False)
@@ -141,7 +141,7 @@ def _ask(settings: Settings, config: Path) -> None:
 
     document = read_document(config)
     try:
-        panels, cards, monitors = _every_monitor()
+        panels, cards, monitors = every_monitor()
     except PanelLost as error:
         raise InputError("output", "panels", str(error)) from None
     keys = TerminalKeys()
@@ -193,7 +193,8 @@ def _bound(settings: Settings) -> tuple[PanelSink, list[U8], tuple[Monitor, ...]
     return panels, _cards(settings, panels.monitors), panels.monitors
 
 
-def _every_monitor() -> tuple[PanelSink, list[U8], tuple[Monitor, ...]]:
+def every_monitor() -> tuple[PanelSink, list[U8], tuple[Monitor, ...]]:
+    """Windows on all monitors whatever they are, their cards, and what they are called. Raises PanelLost."""
     from runtime.clock import MonotonicClock
     from runtime.config import OutputSettings, PanelSettings
     from runtime.optics.stack import PanelStack
