@@ -17,7 +17,7 @@ from runtime.daemon.notify import Notifier
 from runtime.daemon.reconfigure import Reconfiguration
 from runtime.daemon.server import StatusServer, open_status_server
 from runtime.daemon.signals import Signals
-from runtime.errors import InputError, PhasestackError, Stopped, TransientError
+from runtime.errors import InputError, PanelLost, PhasestackError, Stopped, TransientError
 from runtime.frame.presenter import Presenter
 from runtime.records import RefreshAccount, State
 from runtime.support import logs
@@ -296,6 +296,10 @@ def _lived(
             )
         except Stopped as reason:
             summary = {"stopped": str(reason)}
+        except PanelLost:
+            if not signals.stop:
+                raise
+            summary = {"stopped": daemon.stop_reason()}  # told so while it waited for a panel
         notifier.stopping(summary["stopped"])
     log.info("stopped: %s", summary["stopped"])
     if not quiet and not notifier.supervised and "frames" in summary:
