@@ -9,6 +9,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from runtime.blackbox.recorder import Recorder
     from runtime.config import Settings
     from runtime.daemon.build import Run, RunOptions
     from runtime.frame.presenter import Supervisor
@@ -26,6 +27,7 @@ def drive(
     wait_for_panels: Any = None,
     on_start: Callable[[str], bool] = lambda _: True,
     on_built: Callable[[Run], None] = lambda _: None,
+    recorder: Recorder | None = None,
 ) -> dict[str, Any]:
     """Run to the end and answer the summary. `total`: refreshes that the progress bar counts to, where it is known."""
     from runtime.daemon.build import build_run
@@ -44,6 +46,7 @@ def drive(
             on_account=advance,
             wait_for_panels=wait_for_panels,
             on_start=on_start,
+            recorder=recorder,
         )
         on_built(run)
         begin_s = perf_counter()
