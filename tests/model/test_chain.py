@@ -41,8 +41,8 @@ def test_doubt_is_how_far_the_outer_panels_move_for_an_eye_that_is_off() -> None
         return raster_from_plane @ np.append((at[:2] * here + shift) * there + back, 1.0)
 
     columns, rows, own = frame.doubt(STACK, eye_sigma_mm=2.0)
-    aside = on(frame.middle_m + [0, 2e-3, 0], STACK.x_m[2]) - on(frame.middle_m, STACK.x_m[2])
-    above = on(frame.middle_m + [0, 0, 2e-3], STACK.x_m[2]) - on(frame.middle_m, STACK.x_m[2])
+    aside = on(frame.middle_m + np.array([0, 2e-3, 0]), STACK.x_m[2]) - on(frame.middle_m, STACK.x_m[2])
+    above = on(frame.middle_m + np.array([0, 0, 2e-3]), STACK.x_m[2]) - on(frame.middle_m, STACK.x_m[2])
     assert abs(aside[0]) == pytest.approx(columns, rel=1e-4) and abs(above[0]) < 1e-6
     assert np.hypot(aside[1], above[1]) == pytest.approx(rows, rel=1e-4)
     beside = on(pair[1], STACK.x_m[1]) - on(frame.middle_m, STACK.x_m[1])

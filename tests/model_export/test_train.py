@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
-from model_export.sight import displayed_mse, sight_of  # noqa: E402
-
 import model_export.train as training  # noqa: E402
 from model_export.checkpoint import load_spectral, solver_of  # noqa: E402
 from model_export.data import TrainingPair, endless_pairs  # noqa: E402
 from model_export.recipe import Recipe, read_recipe  # noqa: E402
 from model_export.scene import Plane, draw  # noqa: E402
+from model_export.sight import displayed_mse, sight_of  # noqa: E402
 from model_export.train import TrainRequest, held_out_pairs, pair_loss, run_training  # noqa: E402
 from runtime.config import ModelSettings  # noqa: E402
 from runtime.errors import InputError  # noqa: E402
@@ -85,7 +84,10 @@ def test_the_raster_s_own_sight_is_what_eyes_see_of_panels_that_are_drawn_on_it(
     """Against the runtime's rays: the network's answer, drawn on the panels, no correction."""
     recipe = read_recipe("balanced").model_copy(update={"emphasis": 0.0})
     net = solver_of(recipe, source="test")
-    pair = replace(first_pairs(1, seed=3, width_px=480, height_px=270)[0], eye_sigma_mm=1.0)
+    pair = first_pairs(1, seed=3, width_px=480, height_px=270)[0]
+    # Detail that the raster, half as fine as the panels, can't hold is none of its business.
+    smooth = tuple(cv2.GaussianBlur(picture, (0, 0), 3.0) for picture in pair.images)
+    pair = replace(pair, images=smooth, eye_sigma_mm=4.0)
     with torch.no_grad():
         ours = displayed_mse(net, sight_of(pair, recipe, device=torch.device("cpu")))
     predictor = load_predictor("balanced", pair.stack, ModelSettings(threads=1))
@@ -93,7 +95,7 @@ def test_the_raster_s_own_sight_is_what_eyes_see_of_panels_that_are_drawn_on_it(
     alone = {"steps": session.contract.steps[:1], "emphasis": 0.0}
     session.contract = session.contract.model_copy(update=alone)
     rgba = [[cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA)] for picture in pair.images]
-    layers = predictor.predict(rgba, pair.eyes_m, eye_sigma_mm=1.0).layers[..., :3].astype(np.float64) / 255
+    layers = predictor.predict(rgba, pair.eyes_m, eye_sigma_mm=4.0).layers[..., :3].astype(np.float64) / 255
     predictor.close()
     errors = []
     for eye, picture in zip(pair.eyes_m, pair.images, strict=True):
@@ -106,8 +108,7 @@ def test_the_raster_s_own_sight_is_what_eyes_see_of_panels_that_are_drawn_on_it(
             phase += sample_bilinear(layers[n].astype(np.float32), u=x, v=y)
         errors.append(np.square(np.sin(phase * np.pi / 2) ** 2 - picture / 255)[counts].mean())
     theirs_db, ours_db = -10 * np.log10(np.mean(errors)), -10 * np.log10(float(ours[0]))
-    # The panels' pixels are half as large as the raster's: what lies between them is what differs.
-    assert theirs_db - 1 < ours_db < theirs_db + 6
+    assert ours_db == pytest.approx(theirs_db, abs=3.0), "half of the error would be another geometry"
     assert float(ours[1]) > float(ours[0])
 
 
