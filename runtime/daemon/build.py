@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock, SimulatedClock
 from runtime.config import Settings
 from runtime.records import RefreshAccount
-from runtime.support.priority import PRESENTER_NICENESS, set_niceness
+from runtime.support.priority import PRESENTER_NICENESS, niceness
 
 if TYPE_CHECKING:
     from runtime.daemon.solver_parts import RunningSolver
@@ -186,7 +186,7 @@ def build_run(
         observer=observer,
     )
     if not simulated:
-        set_niceness(PRESENTER_NICENESS)  # this thread's, once all others have been started
+        cleanup.enter_context(niceness(PRESENTER_NICENESS))  # this thread's, once all others have been started
     return Run(presenter, observer, solver, lambda: _newest(maker), simulated)
 
 

@@ -81,7 +81,9 @@ class Solver:
         if job.kind == "solve":
             assert job.eyes_m is not None
             return self._solve(state, request, job.eyes_m, revision=revision)
-        return Step(missing=self._missing)
+        if request.eyes_m is not None and not request.paused:
+            self._missing = {}  # what there is is what was asked for
+        return Step(missing=dict(self._missing))
 
     def _solve(self, state: RunState, request: SolveRequest, eyes_m: F64, *, revision: int) -> Step:
         settings, watch = state.settings.model, Stopwatch()

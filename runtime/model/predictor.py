@@ -16,6 +16,7 @@ from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
 
 SHIPPED = ("fast", "balanced", "best")
+SUMS = "SHA256SUMS"  # of the files beside it, as sha256sum writes and checks them
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +93,18 @@ def model_path(name: str) -> Path | None:
     return path
 
 
+def shipped_sha256(name: str) -> str:
+    """What a shipped model's file must be, from the table beside it; empty for another. Raises InputError."""
+    if name not in SHIPPED:
+        return ""
+    table = Path(str(resources.files("runtime.model") / "data" / SUMS))
+    try:
+        rows = [line.split() for line in table.read_text(encoding="ascii").splitlines()]
+        return {file: digest for digest, file in rows}[f"{name}.onnx"]
+    except (OSError, ValueError, KeyError):
+        raise InputError(table, f"{name}.onnx", "is not listed: install phasestack again") from None
+
+
 def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None = None) -> Predictor:
     """The model `name` (shipped name, `sart` or an ONNX file) for a stack.
 
@@ -107,7 +120,7 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
         return SartPredictor(stack, why="" if path is None else f"instead of {name}: needs three even panels")
     from runtime.model.session import ModelSession
 
-    session = ModelSession(path, provider=settings.provider, threads=settings.threads)
+    session = ModelSession(path, provider=settings.provider, threads=settings.threads, sha256=shipped_sha256(name))
     if session.contract.panels != stack.count:
         raise InputError(path, "contract.panels", f"{session.contract.panels}, but the stack has {stack.count}")
     if session.contract.input_frame == "chain":

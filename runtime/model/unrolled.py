@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.errors import ModelFailure
 from runtime.model.bench import Bench
@@ -179,7 +180,7 @@ class UnrolledPredictor(Predictor):
             resample(needs[side], image_from_result=matrix, out=seen[side])
         waves, shifted_waves, spectrum, modes_in = chain_modes(frame.cells)
         left, right = (image.reshape(frame.rows, frame.cells, -1) for image in seen)
-        feeds = {
+        feeds: dict[str, NDArray[Any]] = {
             "left": left,
             "right": right,
             "waves": waves,

@@ -126,7 +126,9 @@ def test_a_model_that_raises_keeps_the_last_solution_aligned_to_the_eyes(rig, fa
 
 def test_a_model_that_answers_nan_is_a_model_that_failed(rig, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(ModelSession, "run", lambda *_, output_shape: np.full(output_shape, np.nan, np.float32))
+        patch.setattr(
+            ModelSession, "run", lambda *_: dict.fromkeys(("rear", "front", "check"), np.full(1, np.nan, np.float32))
+        )
         account = rig.refresh_until("degraded: model")
         assert account.presented
         number, _ = held_as_it_was(rig)
