@@ -40,7 +40,7 @@ def test_sigterm_ends_the_skipping_of_a_long_recording(tmp_path: Path) -> None:
         header = {"schema_version": "1", "driver": "test", "eye_points": "1"}
         writer.add_metadata("phasestack.recording", header)
         channel = writer.register_channel("/eyes", "json", writer.register_schema("s", "jsonschema", b"{}"))
-        for k in range(150_000):
+        for k in range(400_000):
             data = b'{"sequence":%d,"capture_ns":%d,"eyes_m":null}' % (k + 1, 1000 * k)
             writer.add_message(channel, k, data, k)
         writer.finish()
@@ -52,6 +52,6 @@ def test_sigterm_ends_the_skipping_of_a_long_recording(tmp_path: Path) -> None:
     process.send_signal(signal.SIGTERM)
     told = process.stderr.read()
     assert process.wait(60) == 1 and told == "stopped by SIGTERM\n"
-    assert time.monotonic() - start < 2
+    assert time.monotonic() - start < 20  # all of it takes minutes
     process.stdout.close()
     process.stderr.close()

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from runtime.clock import MonotonicClock
-from runtime.commands.running import drive, print_summary
 from runtime.config import Overrides, Settings, load_settings
 from runtime.daemon.build import Run, RunOptions
 from runtime.daemon.commands import Command
+from runtime.daemon.drive import drive, print_summary
 from runtime.daemon.notify import Notifier
 from runtime.daemon.reconfigure import Reconfiguration
 from runtime.daemon.server import StatusServer, open_status_server
