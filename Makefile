@@ -68,7 +68,7 @@ $(VENV)/.runtime: $(VENV)/.created requirements/runtime.lock pyproject.toml | sy
 $(VENV)/.test: $(VENV)/.runtime requirements/test.lock requirements/torch.lock
 	@sh systemd/packages.sh test
 	$(BIN)/python -m pip install --quiet -r requirements/test.lock
-	$(BIN)/python -m pip install --quiet --no-deps -r requirements/torch.lock
+	$(BIN)/python -m pip install --quiet -r requirements/torch.lock
 	@touch $@
 
 clean:

@@ -70,8 +70,8 @@ def tolerance_section(tolerance: Tolerance, *, model: str, distance_m: float) ->
 def _ring(axes: Any, radius_mm: float, name: str, colour: str) -> None:
     angle = np.linspace(0, 2 * np.pi, 100)
     x, y = radius_mm * np.cos(angle), radius_mm * np.sin(angle)
-    axes.plot(x, y, color="#1d2433", linewidth=3.4)
-    axes.plot(x, y, color=colour, linewidth=2.0, label=name)
+    axes.plot(x, y, color="#1d2433", linewidth=2.6)
+    axes.plot(x, y, color=colour, linewidth=1.5, label=name)
 
 
 def _map(axes: Any, table: Any, *, extent: Any = None, x: Any = None, y: Any = None) -> Any:
