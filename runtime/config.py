@@ -423,6 +423,18 @@ class ServiceSettings(Section):
     metrics_port: Annotated[int, Field(ge=0, le=65535)] = Field(0, description="Prometheus on loopback; 0: off")
     log_format: Literal["text", "json"] = Field("text", description="log lines for people or for machines")
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="least level that is logged")
+    blackbox_minutes: Annotated[float, within(0.0, 60.0, "min")] = Field(
+        2.0, description="what the black box keeps in memory, to be written at a fault or by `ctl blackbox`; 0: none"
+    )
+    blackbox_mib: Annotated[float, within(1.0, 4096.0, "MiB")] = Field(
+        32.0, description="the black box keeps no more than this in memory"
+    )
+    blackbox_folder: str = Field(
+        "", description="where black boxes are written; empty: `blackbox` in the service's or the person's state folder"
+    )
+    blackbox_files: Annotated[int, Field(ge=1, le=1000)] = Field(
+        10, description="black boxes that stay in the folder; the oldest make way"
+    )
 
 
 class Settings(Section):
@@ -532,7 +544,7 @@ def _fields(model: type[BaseModel], place: tuple[int | str, ...]) -> list[str]:
 # What is always a path, and what is one where it has a slash or a suffix: a bare word is a name (`demo`, `balanced`).
 PATHS = (
     ("sensor", "openni2_folder"), ("detector", "yunet_model"), ("calibration", "file"), ("content", "file"),
-    ("content", "external"), ("service", "socket"),
+    ("content", "external"), ("service", "socket"), ("service", "blackbox_folder"),
 )  # fmt: skip
 NAMES_OR_PATHS = (("content", "scene"), ("model", "name"))
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from runtime.commands.names import check_names, scene_from_here, scene_names
 from runtime.config import Overrides, Settings, load_settings, load_stack
+from runtime.daemon.names import check_names, scene_from_here, scene_names
 from runtime.errors import InputError
 from runtime.support.artifacts import write_png
 

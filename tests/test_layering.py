@@ -22,6 +22,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (  # from the ground up; what stands besid
     ("evaluation",),
     ("plan",),
     ("frame",),
+    ("blackbox",),
     ("daemon",),
     ("report", "commands", "cli"),
 )

@@ -28,7 +28,7 @@ def config(
 
     settings = load_settings(check)
     if check is not None:
-        from runtime.commands.names import check_names
+        from runtime.daemon.names import check_names
 
         check_names(settings, source=check)
         typer.echo(f"{check}: valid")
