@@ -15,7 +15,8 @@
 #     phasestack run --config /etc/phasestack/phasestack.toml
 # NVIDIA: --gpus all -e NVIDIA_DRIVER_CAPABILITIES=all in place of --device /dev/dri.
 
-# To pin to the byte: --build-arg BASE=python@sha256:...
+# To pin to the byte: --build-arg BASE=python@sha256:... (where this was written no image registry could be asked for
+# the digest; `docker buildx imagetools inspect python:3.11.9-slim-bookworm` tells it).
 ARG BASE=python:3.11.9-slim-bookworm
 
 FROM ${BASE} AS build
@@ -46,7 +47,8 @@ RUN apt-get update \
 COPY --from=build /opt/phasestack /opt/phasestack
 COPY THIRD_PARTY.md /usr/share/doc/phasestack/THIRD_PARTY.md
 ENV PATH=/opt/phasestack/bin:$PATH \
-    PYTHONUNBUFFERED=1
+    PYTHONUNBUFFERED=1 \
+    ORT_DISABLE_TELEMETRY=1
 USER phasestack
 WORKDIR /var/lib/phasestack
 STOPSIGNAL SIGTERM

@@ -4,9 +4,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
+FUZZ_ARGS ?=
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test test-slow lint types bench soak install uninstall system docs gallery clean
+.PHONY: demo test test-slow lint types bench fuzz soak install uninstall system docs gallery hashes clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/phasestack demo $(DEMO_ARGS)
@@ -27,6 +28,10 @@ types: $(VENV)/.test
 bench: $(VENV)/.test
 	$(BIN)/phasestack bench --out out/bench.json
 
+# Every reader of foreign bytes, a minute each; FUZZ_ARGS="--seconds 3600 --target gltf" for more of one.
+fuzz: $(VENV)/.test
+	$(BIN)/python -m tests.fuzz $(FUZZ_ARGS)
+
 soak: $(VENV)/.test
 	$(BIN)/python -m tests.soak
 
@@ -43,6 +48,10 @@ docs: $(VENV)/.runtime
 gallery: $(VENV)/.test
 	$(BIN)/python docs/make_gallery.py
 
+# The locks' hashes anew from their pins, as the registry tells them.
+hashes:
+	sh requirements/make_hashes.sh
+
 # Debian's packages: OpenGL without a screen, the USB and OpenNI2 libraries. Only root can install them.
 system:
 	@sh systemd/packages.sh
@@ -56,9 +65,10 @@ $(VENV)/.runtime: $(VENV)/.created requirements/runtime.lock pyproject.toml | sy
 	$(BIN)/python -m pip install --quiet --no-deps --editable .
 	@touch $@
 
-$(VENV)/.test: $(VENV)/.runtime requirements/test.lock
+$(VENV)/.test: $(VENV)/.runtime requirements/test.lock requirements/torch.lock
 	@sh systemd/packages.sh test
 	$(BIN)/python -m pip install --quiet -r requirements/test.lock
+	$(BIN)/python -m pip install --quiet -r requirements/torch.lock
 	@touch $@
 
 clean:

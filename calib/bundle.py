@@ -135,7 +135,7 @@ class _Problem:
         pose = x[self.pose_part(photograph)]
         camera = np.array([[x[0], 0.0, x[2]], [0.0, x[1], x[3]], [0.0, 0.0, 1.0]])
         projected, slopes = cv2.projectPoints(points, pose[:3], pose[3:], camera, x[4:9])
-        return projected.reshape(-1, 2), np.asarray(slopes)
+        return np.asarray(projected, dtype=np.float64).reshape(-1, 2), np.asarray(slopes, dtype=np.float64)
 
     def residuals(self, x: F64) -> F64:
         """(2K + priors,) found minus seen, pixels; what is known of any camera in units of its spread."""

@@ -47,7 +47,13 @@ def capture_recording(
         frames = list(_all_samples(driver))
         pairs: Iterator[CapturedPair | str]
         if marks is not None:
-            pairs = _marked(frames, find, read_marks(marks), window_s=window_s, max_spread_m=max_spread_m)
+            pairs = _marked(
+                frames,
+                find,
+                read_marks(marks, grid(settings.calibration)),
+                window_s=window_s,
+                max_spread_m=max_spread_m,
+            )
         elif any(frame.true_eyes_m is not None for frame in frames):
             pairs = _from_truth(frames, find, window_s=window_s, max_spread_m=max_spread_m)
         else:
@@ -86,9 +92,9 @@ def _all_samples(driver: SteppedDriver) -> Iterator[SensorFrame]:
             return
 
 
-def read_marks(path: Path) -> list[tuple[float, Viewpoint]]:
+def read_marks(path: Path, viewpoints: Sequence[Viewpoint]) -> list[tuple[float, Viewpoint]]:
     """`seconds,viewpoint` rows: when each chart was accepted. Raises InputError, naming the row and the column."""
-    known = {viewpoint.name: viewpoint for viewpoint in grid()}
+    known = {viewpoint.name: viewpoint for viewpoint in viewpoints}
     found = []
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from calib.charts import FOV_DEG, Kind, alone, eye_chart, line_picture
+from calib.charts import Kind, alone, chart_fov_deg, eye_chart, line_picture
 from calib.keys import Key, TerminalKeys, WindowKeys, first_of
 from calib.viewpoints import Viewpoint
 from runtime.clock import NS_PER_MS, MonotonicClock
@@ -25,6 +25,8 @@ from runtime.support.artifacts import OutputFolder, write_json, write_png
 if TYPE_CHECKING:
     from runtime.model.predictor import Predictor
 
+CAPTION_SHARE = 0.07  # of the height, for words
+UNFUSED_M = 0.03
 EYE_NAMES = ("left", "right")
 THUMBNAIL_PX = 320
 SHOW_AGAIN_NS = 100 * NS_PER_MS
@@ -66,7 +68,8 @@ class Drawer:
             self._predictor = load_predictor(self.model, self.stack, self._settings)
         picture = line_picture(width_px=self.stack.width_px, height_px=self.stack.height_px)
         eyes_m = viewpoint.eyes_m(self.ipd_m)
-        prediction = solve_still(picture, picture, eyes_m=eyes_m, fov_deg=FOV_DEG, predictor=self._predictor)
+        fov_deg = chart_fov_deg(viewpoint, self.stack)
+        prediction = solve_still(picture, picture, eyes_m=eyes_m, fov_deg=fov_deg, predictor=self._predictor)
         return np.array(prediction.layers)  # a copy: the predictor uses its own again
 
     def close(self) -> None:
@@ -79,8 +82,33 @@ class Drawer:
 def fused_psnr_db(layers: U8, viewpoint: Viewpoint, *, stack: PanelStack, ipd_m: float) -> float:
     """How well both eyes see the line picture from the viewpoint (design 5.5)."""
     wanted = line_picture(width_px=stack.width_px, height_px=stack.height_px).astype(np.float32) / np.float32(255)
-    seen = [seen_by(eye, layers, stack, fov_deg=FOV_DEG) for eye in viewpoint.eyes_m(ipd_m)]
+    seen = [seen_by(eye, layers, stack, fov_deg=chart_fov_deg(viewpoint, stack)) for eye in viewpoint.eyes_m(ipd_m)]
     return quality([r.image for r in seen], [wanted, wanted], [r.mask for r in seen]).psnr_db
+
+
+def captioned(layers: U8, text: str) -> U8:
+    """(N, H, W, 4) layers with a line of words at the bottom: on the middle panel, the others clear there."""
+    shown = layers.copy()
+    height, width = layers.shape[1:3]
+    top = round(height * (1 - CAPTION_SHARE))
+    shown[:, top:, :, :3] = 0
+    (long, tall), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 1.0, 2)
+    scale = min(0.6 * (height - top) / tall, 0.9 * width / max(long, 1))
+    strip = np.zeros((height - top, width), np.uint8)
+    place = (round((width - scale * long) / 2), round((height - top + scale * (tall - below)) / 2))
+    cv2.putText(strip, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, 255, max(1, round(2 * scale)), cv2.LINE_AA)
+    shown[len(shown) // 2, top:, :, :3] = strip[..., None]
+    return shown
+
+
+def reference_pictures(layers: U8, viewpoint: Viewpoint, *, stack: PanelStack, ipd_m: float) -> dict[str, U8]:
+    """What the right eye sees of a solved chart at its viewpoint (fused), and 3 cm beside it (not)."""
+    eye_m, fov_deg = viewpoint.eyes_m(ipd_m)[1], chart_fov_deg(viewpoint, stack)
+    found = {}
+    for name, aside_m in (("fused", 0.0), ("unfused", UNFUSED_M)):
+        seen = seen_by(eye_m + np.array([0.0, aside_m, 0.0]), layers, stack, fov_deg=fov_deg).image
+        found[f"reference-{name}.png"] = np.rint(255 * np.clip(seen, 0, 1)).astype(np.uint8)
+    return found
 
 
 def make_charts(out: Path, viewpoints: Sequence[Viewpoint], drawer: Drawer, *, check: bool) -> dict[str, Any]:
@@ -94,6 +122,7 @@ def make_charts(out: Path, viewpoints: Sequence[Viewpoint], drawer: Drawer, *, c
 
     entries: list[dict[str, Any]] = []
     sheet: list[U8] = []
+    references: dict[str, U8] = {}
     with OutputFolder(out) as folder:
         for viewpoint in track(viewpoints, "charts", console=Console(stderr=True), transient=True):
             files = []
@@ -101,20 +130,25 @@ def make_charts(out: Path, viewpoints: Sequence[Viewpoint], drawer: Drawer, *, c
                 "viewpoint": viewpoint.name,
                 "midpoint_m": viewpoint.midpoint_m,
                 "eyes_m": viewpoint.eyes_m(ipd_m),
+                "fov_deg": chart_fov_deg(viewpoint, stack),
             }
             for chart in drawer.charts(viewpoint):
                 for name, picture in _pictures(chart):
                     write_png(folder.staging / name, picture)
                     files.append(name)
+                if not chart.label and not references:
+                    references = reference_pictures(chart.layers, viewpoint, stack=stack, ipd_m=ipd_m)
                 if check and not chart.label:
                     entry["psnr_db"] = fused_psnr_db(chart.layers, viewpoint, stack=stack, ipd_m=ipd_m)
                 if chart.label in ("", f"layer-{stack.count - 1}-right"):
                     sheet.append(_thumbnail(chart.layers[-1], viewpoint.name))
             entries.append(entry | {"files": files})
         write_png(folder.staging / "contact-sheet.png", _tiled(sheet))
+        for name, picture in references.items():
+            write_png(folder.staging / name, picture)
         write_json(
             folder.staging / "charts.json",
-            {"kind": drawer.kind, "ipd_m": ipd_m, "fov_deg": FOV_DEG, "model": drawer.model, "charts": entries},
+            {"kind": drawer.kind, "ipd_m": ipd_m, "model": drawer.model, "charts": entries},
         )
     return {
         "out": str(out),
@@ -163,6 +197,7 @@ class ChartDisplay:
         self._sink = open_panels(settings.output, drawer.stack, MonotonicClock(), offscreen_context())
         self._number = 0
         self._shown: Chart | None = None
+        self._caption = ""
         self.keys = WindowKeys(self._sink)
         self._kept = lru_cache(maxsize=2)(lambda viewpoint: list(drawer.charts(viewpoint)))
 
@@ -178,7 +213,13 @@ class ChartDisplay:
         """A chart on all panels. Raises PanelLost."""
         self._number += 1
         self._shown = chart
-        self._sink.present(PanelFrame(self._number, chart.layers, self._number))
+        layers = captioned(chart.layers, self._caption) if self._caption else chart.layers
+        self._sink.present(PanelFrame(self._number, layers, self._number))
+
+    def caption(self, text: str) -> None:
+        """A line of words below the chart; empty: none. Raises PanelLost."""
+        self._caption = text
+        self.again()
 
     def again(self) -> None:
         """The same chart once more: it takes in the windows' events and keeps them alive. Raises PanelLost."""

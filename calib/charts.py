@@ -14,7 +14,15 @@ from runtime.records import F64, U8
 
 Kind = Literal["solved", "seed"]
 LINE_PX = 10.0
-FOV_DEG = 40.0  # horizontal, of the eyes' images, as the published code has it
+WIDEST_FOV_DEG = 40.0  # horizontal, of the eyes' images, as the published code has it
+
+
+def chart_fov_deg(viewpoint: Viewpoint, stack: PanelStack) -> float:
+    """Horizontal field of view of a viewpoint's eye images: the published one, or, from afar, the display's width.
+
+    The lines so stay on the panels wherever the viewer stands.
+    """
+    return min(WIDEST_FOV_DEG, float(np.degrees(2 * np.arctan(stack.width_m / 2 / (viewpoint.radius_cm / 100)))))
 
 
 def line_picture(*, width_px: int, height_px: int) -> U8:
@@ -33,7 +41,10 @@ def eye_chart(viewpoint: Viewpoint, stack: PanelStack, *, side: int, index: int,
     """
     raster = stack.panel(index)
     projection = image_from_stack(
-        viewpoint.eyes_m(ipd_m)[side], width_px=stack.width_px, height_px=stack.height_px, fov_deg=FOV_DEG
+        viewpoint.eyes_m(ipd_m)[side],
+        width_px=stack.width_px,
+        height_px=stack.height_px,
+        fov_deg=chart_fov_deg(viewpoint, stack),
     )
     if not corners_in_front(projection, raster):
         raise ValueError(f"panel {index} is not before the eye at {viewpoint.name}")

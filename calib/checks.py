@@ -10,7 +10,6 @@ from calib.pairs import Pairs
 from calib.robust import fit_robust
 from calib.similarity import Degenerate, Similarity, extents, fit
 from calib.solution import Solution
-from calib.viewpoints import viewing_volume_m
 from runtime.errors import InputError
 from runtime.records import F64
 
@@ -65,8 +64,8 @@ _MIRRORED = (
 )
 
 
-def check_solution(pairs: Pairs, solution: Solution) -> tuple[str, ...]:
-    """Warnings about a solution. Raises InputError where it must not be used."""
+def check_solution(pairs: Pairs, solution: Solution, volume_m: F64) -> tuple[str, ...]:
+    """Warnings about a solution; `volume_m` (..., 3): where viewers are. Raises InputError: not to be used."""
     warnings = []
     axis = "xyz"[int(np.argmax(solution.axis_rms_m))]
     if solution.axis_rms_m.max() > RESIDUAL_LIMIT_M:
@@ -78,7 +77,7 @@ def check_solution(pairs: Pairs, solution: Solution) -> tuple[str, ...]:
             f"more than {RESIDUAL_LIMIT_M * 1e3:.0f} mm{hint}",
         )
     noise_m = max(solution.noise_m, SENSOR_NOISE_FLOOR_M)
-    error_m = float(solution.eye_error_m(viewing_volume_m(), noise_m=noise_m).mean())
+    error_m = float(solution.eye_error_m(volume_m, noise_m=noise_m).mean())
     if not error_m <= REFUSE_EYE_ERROR_M:
         raise InputError(
             pairs.source,

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from calib.options import ConfigOption, JsonOption, PanelsOption, settings_and_stack, tell
 from calib.panel_commands import app as panels_app
 from runtime.errors import InputError
+
+if TYPE_CHECKING:
+    from runtime.config import Settings
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -48,7 +51,7 @@ def charts(
     if not 5.0 <= ipd_mm <= 100.0:
         raise InputError("calibrate charts", "--ipd-mm", "must lie between 5 and 100")
     settings, stack = settings_and_stack(config, panels)
-    chosen = _viewpoints("calibrate charts", viewpoint)
+    chosen = _viewpoints("calibrate charts", viewpoint, settings)
     drawer = Drawer(stack, kind=kind, ipd_m=ipd_mm / 1000, model=model, settings=settings.model)  # type: ignore[arg-type]
     try:
         if out is not None:
@@ -95,7 +98,7 @@ def capture(
     if replay is not None:
         summary = capture_recording(out, settings, source=replay, marks=marks, **limits)
     else:
-        chosen = _viewpoints("calibrate capture", viewpoint)
+        chosen = _viewpoints("calibrate capture", viewpoint, settings)
         summary = capture_live(out, settings, chosen, stack=stack, show=show, again=again, **limits)
     tell(summary, as_json, f"{summary['pairs']} pairs in {out} ({summary['accepted']} new)")
 
@@ -154,8 +157,8 @@ def report(
     """
     from calib.report import write_report
 
-    _, stack = settings_and_stack(config)
-    summary = write_report(file, out, pairs_path=pairs, stack=stack)
+    settings, stack = settings_and_stack(config)
+    summary = write_report(file, out, pairs_path=pairs, stack=stack, viewing=settings.calibration)
     tell(summary, as_json, f"{out / 'index.html'}")
 
 
@@ -176,13 +179,13 @@ def methods(
     tell(summary, as_json, text)
 
 
-def _viewpoints(command: str, names: list[str] | None) -> tuple[Any, ...]:
+def _viewpoints(command: str, names: list[str] | None, settings: Settings) -> tuple[Any, ...]:
     from calib.viewpoints import grid
 
-    known = {viewpoint.name: viewpoint for viewpoint in grid()}
+    known = {viewpoint.name: viewpoint for viewpoint in grid(settings.calibration)}
     if not names:
         return tuple(known.values())
     for name in names:
         if name not in known:
-            raise InputError(command, "--viewpoint", f"unknown: {name}; known: R40-phi70-theta80 .. R60-phi90-theta100")
+            raise InputError(command, "--viewpoint", f"unknown: {name}; known: {min(known)} .. {max(known)}")
     return tuple(known[name] for name in dict.fromkeys(names))

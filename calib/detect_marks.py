@@ -102,7 +102,7 @@ def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
     unit_px = float(np.median([_unit_px(mark, quad) for mark, quad in found])) if found else 0.0
     window = int(np.clip(round(1.3 * unit_px), 2, 15))
     for mark, quad in found:
-        image_from_panel = cv2.findHomography(mark.marker_px, quad)[0]
+        image_from_panel: Any = cv2.findHomography(mark.marker_px, quad)[0]
         if image_from_panel is None:
             continue
         guess = cv2.perspectiveTransform(mark.saddles_px[None], image_from_panel)[0]

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib.robust import fit_robust
+from calib.scale_prior import posterior_scale
 from calib.similarity import ScaleRule, Similarity, fit, fit_batch
-from calib.solution import METHODS, design_covariance, scale_is_one
+from calib.solution import METHODS, SCALE_SIGMA, design_covariance
 from calib.viewpoints import grid, viewing_volume_m
 from runtime.records import F64
 
@@ -101,13 +102,17 @@ def _default(fits: dict[str, Similarity], sensor_m: F64, stack_m: F64, rejects: 
     _, unit, _ = design_covariance(stack_m[0], fixed_scale=False)
     freedom = 3 * stack_m.shape[-2] - 7
     squares = ((inverse.points(sensor_m) - stack_m) ** 2).sum((-1, -2)) / freedom
-    one = scale_is_one(inverse.scale, sigma=np.sqrt(unit[6, 6] * squares), freedom=freedom)
-    names = np.where(rejects, "robust", np.where(one, "fixed-scale", "inverse"))
-    return _stacked(
-        [
-            Similarity(fits[n].scale[i], fits[n].rotation[i], fits[n].translation_m[i])
-            for i, n in enumerate(names.tolist())
-        ]
+    believed = posterior_scale(
+        np.log(inverse.scale), sigma=np.sqrt(unit[6, 6] * squares), freedom=freedom, prior_sigma=SCALE_SIGMA
+    )
+    scale = np.exp(believed.log_scale)
+    turned = (inverse.rotation @ sensor_m.mean(axis=-2)[..., None])[..., 0]
+    posterior = Similarity(scale, inverse.rotation, stack_m.mean(axis=-2) - scale[..., None] * turned)
+    robust = fits["robust"]
+    return Similarity(
+        np.where(rejects, robust.scale, posterior.scale),
+        np.where(rejects[:, None, None], robust.rotation, posterior.rotation),
+        np.where(rejects[:, None], robust.translation_m, posterior.translation_m),
     )
 
 

@@ -22,6 +22,7 @@ class Key(Enum):
     DOWN = auto()
     FINER = auto()
     COARSER = auto()
+    UNDO = auto()
     QUIT = auto()
 
 
@@ -37,6 +38,9 @@ _MEANINGS = {
     b"p": Key.PREVIOUS,
     b"f": Key.FINER,
     b"c": Key.COARSER,
+    b"u": Key.UNDO,
+    b"\x7f": Key.UNDO,
+    b"\x08": Key.UNDO,
     b"q": Key.QUIT,
     b"\x04": Key.QUIT,
 }
@@ -59,7 +63,9 @@ def parse(data: bytes) -> tuple[list[Key], bytes]:
 class TerminalKeys:
     """Keys from standard input; a terminal is put into character mode until `close`. The end of input quits."""
 
-    def __init__(self, descriptor: int | None = None) -> None:
+    def __init__(self, descriptor: int | None = None, *, quit_at_end: bool = True) -> None:
+        """quit_at_end False: without an input (a service, `< /dev/null`) there are no keys, and that is all."""
+        self._quit_at_end = quit_at_end
         self._descriptor = _standard_input() if descriptor is None else descriptor
         self._pending: list[Key] = []
         self._rest = b""
@@ -76,7 +82,10 @@ class TerminalKeys:
         if self._descriptor >= 0 and select.select([self._descriptor], [], [], 0)[0]:
             data = os.read(self._descriptor, 64)
             keys, self._rest = parse(self._rest + data)
-            self._pending += keys if data else [Key.QUIT]
+            self._pending += keys
+            if not data:
+                self._descriptor = -1 if not self._quit_at_end else self._descriptor
+                self._pending += [Key.QUIT] if self._quit_at_end else []
         return self._pending.pop(0) if self._pending else None
 
     def close(self) -> None:
@@ -132,6 +141,8 @@ class WindowKeys:
             glfw.KEY_P: Key.PREVIOUS,
             glfw.KEY_F: Key.FINER,
             glfw.KEY_C: Key.COARSER,
+            glfw.KEY_U: Key.UNDO,
+            glfw.KEY_BACKSPACE: Key.UNDO,
             glfw.KEY_Q: Key.QUIT,
             glfw.KEY_ESCAPE: Key.QUIT,
         }

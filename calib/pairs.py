@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -15,6 +14,7 @@ import numpy as np
 
 from runtime.errors import InputError
 from runtime.records import F64
+from runtime.support import foreign
 from runtime.support.artifacts import write_text
 
 COLUMNS = ("sensor_x", "sensor_y", "sensor_z", "stack_x", "stack_y", "stack_z")
@@ -70,10 +70,7 @@ def read_pairs(path: Path) -> Pairs:
 
     Raises InputError, naming the file and the row and column: unreadable, columns missing, not a finite number.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, "", f"cannot be read ({getattr(error, 'strerror', None) or error})") from None
+    text = foreign.read_text(path)
     rows = _json_rows(path, text) if path.suffix.lower() == ".json" else _csv_rows(path, text)
     if len(rows) > MAXIMUM_PAIRS:
         raise InputError(path, "", f"holds {len(rows)} pairs, more than {MAXIMUM_PAIRS}")
@@ -102,10 +99,7 @@ def _csv_rows(path: Path, text: str) -> list[tuple[str, Mapping[str, Any]]]:
 
 
 def _json_rows(path: Path, text: str) -> list[tuple[str, Mapping[str, Any]]]:
-    try:
-        value = json.loads(text)
-    except ValueError as error:
-        raise InputError(path, "", f"malformed: {error}") from None
+    value = foreign.parsed_json(text, source=path)
     items = value.get("pairs") if isinstance(value, dict) else value
     if not isinstance(items, list):
         raise InputError(path, "pairs", "must be a list of objects")
@@ -122,7 +116,7 @@ def _number(path: Path, label: str, name: str, value: Any) -> float:
         raise InputError(path, f"{label}, {name}", "is not a number")
     try:
         number = float(value)
-    except ValueError:
+    except (ValueError, OverflowError):
         raise InputError(path, f"{label}, {name}", f"is not a number: {str(value)[:40]}") from None
     if not math.isfinite(number):
         raise InputError(path, f"{label}, {name}", f"is not finite: {number}")
@@ -155,6 +149,19 @@ class PairsFile:
     def __len__(self) -> int:
         return len(self._rows)
 
+    def points(self) -> tuple[F64, F64]:
+        """(K, 3) in `sensor` and (K, 3) in `stack` of all pairs so far."""
+        table = np.array([[float(row[name]) for name in COLUMNS] for row in self._rows]).reshape(-1, 6)
+        return table[:, :3], table[:, 3:]
+
+    def undo(self) -> str:
+        """Take the newest pair out again; answers its viewpoint, empty where there is none. On disk when it returns."""
+        if not self._rows:
+            return ""
+        name = self._rows.pop()["viewpoint"]
+        self._write()
+        return name
+
     def accept(self, pair: CapturedPair) -> None:
         """Add a pair; one of the same viewpoint is replaced. On disk when this returns.
 
@@ -169,6 +176,9 @@ class PairsFile:
             )
         self._rows = [row for row in self._rows if not pair.viewpoint or row["viewpoint"] != pair.viewpoint]
         self._rows.append(pair.row())
+        self._write()
+
+    def _write(self) -> None:
         text = io.StringIO()
         writer = csv.DictWriter(text, (*COLUMNS, *NOTES), lineterminator="\n")
         writer.writeheader()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -160,7 +160,7 @@ def photo(
     if write and config is None:
         raise InputError("calibrate panels photo", "--write", "needs --config")
     settings, stack = settings_and_stack(config, panels)
-    chosen = {
+    chosen: dict[str, Any] = {
         "even": wants_even(settings, stack) if spacing == "auto" else spacing == "even",
         "model": settings.model.name if model == "configured" else model,
         "config": config if write else None,

@@ -5,25 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from calib.config_file import put_homographies, read_document, save_document
 from calib.keys import Key, TerminalKeys, WindowKeys, first_of
 from calib.page import Picture, page
 from calib.panel_figures import registration_figure
 from calib.registration import Setting, StackRegistration, parts, register
-from calib.store import save
 from calib.vernier import STEPS_PX, Nudging, chart, nominal, read_settings, resumed, write_settings
 from runtime.clock import NS_PER_MS, MonotonicClock
-from runtime.config import Settings, load_settings
+from runtime.config import Settings
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8, PanelFrame
 from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_png, write_text
-
-if TYPE_CHECKING:
-    from tomlkit import TOMLDocument
 
 POLL_NS = 30 * NS_PER_MS
 SHOW_AGAIN_POLLS = 5
@@ -248,34 +245,11 @@ def panels_document(matrices: F64, *, x_m: Sequence[float] | None = None) -> str
     return tomlkit.dumps(document)
 
 
-def with_homographies(config: Path, matrices: F64) -> TOMLDocument:
-    """A configuration with other homographies, its comments kept; nothing is written."""
-    import tomlkit
-
-    document = tomlkit.parse(config.read_text(encoding="utf-8"))
-    output: Any = document.setdefault("output", tomlkit.table())
-    if "panels" not in output:
-        output["panels"] = tomlkit.aot()
-        for _ in matrices:
-            output["panels"].append(tomlkit.table())
-    for table, matrix in zip(output["panels"], matrices, strict=True):
-        table["homography"] = matrix.tolist()
-    return document
-
-
 def write_homographies(config: Path, registration: StackRegistration) -> Path | None:
     """Put the homographies into a configuration, its comments kept; answers where the old one is kept.
 
     The new text is checked as a configuration before it takes the old one's place. Raises InputError.
     """
-    import tempfile
-
-    import tomlkit
-
-    matrices = np.stack([panel.true_from_ideal for panel in registration.panels])
-    text = tomlkit.dumps(with_homographies(config, matrices))
-    with tempfile.TemporaryDirectory() as folder:
-        trial = Path(folder) / config.name
-        write_text(trial, text)
-        load_settings(trial)
-    return save(config, text)
+    document = read_document(config)
+    put_homographies(document, np.stack([panel.true_from_ideal for panel in registration.panels]))
+    return save_document(config, document)

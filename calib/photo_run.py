@@ -11,6 +11,7 @@ import numpy as np
 
 from calib.board import board, board_layers
 from calib.bundle import Undetermined
+from calib.config_file import put, put_homographies, read_document, save_document
 from calib.detect_marks import SeenMarks, find_marks
 from calib.keys import Key, TerminalKeys, first_of
 from calib.page import Picture, page
@@ -18,9 +19,8 @@ from calib.panel_run import panels_document
 from calib.photo_figures import photo_figure
 from calib.photo_registration import PhotoRegistration, register_photographs
 from calib.registration import through
-from calib.store import save
 from calib.viewpoints import viewing_place_m
-from runtime.config import Settings, load_settings
+from runtime.config import Settings
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
@@ -284,25 +284,10 @@ def write_registration(config: Path, matrices: F64, *, x_m: Sequence[float]) -> 
 
     The new text is checked as a configuration before it takes the old one's place. Raises InputError.
     """
-    from calib.panel_run import with_homographies
-
-    document = with_homographies(config, matrices)
-    import tomlkit
-
-    geometry = document.setdefault("stack", tomlkit.table())
-    geometry["x_m"] = [round(float(x), 7) for x in x_m]
-    return save_checked(config, tomlkit.dumps(document))
-
-
-def save_checked(config: Path, text: str) -> Path | None:
-    """Write a configuration that is valid, and only then; answers where the old one is kept. Raises InputError."""
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as folder:
-        trial = Path(folder) / config.name
-        write_text(trial, text)
-        load_settings(trial)
-    return save(config, text)
+    document = read_document(config)
+    put_homographies(document, matrices)
+    put(document, "stack", {"x_m": [round(float(x), 7) for x in x_m]})
+    return save_document(config, document)
 
 
 def show_board(settings: Settings, stack: PanelStack) -> None:

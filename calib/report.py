@@ -14,7 +14,7 @@ from calib.figures import eye_error_figure, geometry_figure, residual_figure
 from calib.page import Picture, page
 from calib.pairs import Pairs, read_pairs
 from calib.viewpoints import spherical_m, viewing_volume_m
-from runtime.config import read_table
+from runtime.config import CalibrationSettings, read_table
 from runtime.errors import InputError
 from runtime.eyes.calibration import Calibration, load_calibration, similarity_defect
 from runtime.optics.stack import PanelStack
@@ -53,7 +53,9 @@ def stored_points(path: Path, calibration: Calibration) -> Points | None:
     return Points(pairs, used, calibration.points(sensor_m) - stack_m)
 
 
-def write_report(file: Path, out: Path, *, pairs_path: Path | None, stack: PanelStack) -> dict[str, Any]:
+def write_report(
+    file: Path, out: Path, *, pairs_path: Path | None, stack: PanelStack, viewing: CalibrationSettings
+) -> dict[str, Any]:
     """Write `index.html`, its PNGs and `report.json`. Raises InputError."""
     calibration = load_calibration(file)
     points = stored_points(file, calibration)
@@ -62,8 +64,8 @@ def write_report(file: Path, out: Path, *, pairs_path: Path | None, stack: Panel
         if not len(pairs):
             raise InputError(pairs_path, "pairs", "there are none")
         points = Points(pairs, np.ones(len(pairs), bool), calibration.points(pairs.sensor_m) - pairs.stack_m)
-    pictures = list(_pictures(calibration, points, stack))
-    summary = _summary(calibration, points)
+    pictures = list(_pictures(calibration, points, stack, viewing))
+    summary = _summary(calibration, points, viewing_volume_m(viewing))
     tables = [("Numbers", _numbers(calibration, summary)), ("stack_from_sensor", _matrix(calibration))]
     if points is not None:
         heading = "Points" if len(points.pairs) <= LISTED_POINTS else f"The {LISTED_POINTS} worst points"
@@ -83,7 +85,9 @@ def write_report(file: Path, out: Path, *, pairs_path: Path | None, stack: Panel
     return summary | {"out": str(out), "pictures": [picture.name for picture in pictures]}
 
 
-def _pictures(calibration: Calibration, points: Points | None, stack: PanelStack) -> list[Picture]:
+def _pictures(
+    calibration: Calibration, points: Points | None, stack: PanelStack, viewing: CalibrationSettings
+) -> list[Picture]:
     matrix = calibration.stack_from_sensor
     gaze = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
     found = []
@@ -109,7 +113,7 @@ def _pictures(calibration: Calibration, points: Points | None, stack: PanelStack
             "Camera, panels and points; the arrow is the camera's line of sight",
         )
     )
-    distances_m = np.linspace(0.2, 1.5, 40)
+    distances_m = np.linspace(0.2, max(1.5, 1.5 * viewing.viewing_m[1]), 40)
     straight, aside = (
         calibration.position_error_m(np.array([spherical_m(r, phi_deg=90, theta_deg=t) for r in distances_m]))
         for t in (90, 65)
@@ -125,8 +129,8 @@ def _pictures(calibration: Calibration, points: Points | None, stack: PanelStack
     return found
 
 
-def _summary(calibration: Calibration, points: Points | None) -> dict[str, Any]:
-    eye_error = calibration.position_error_m(viewing_volume_m())
+def _summary(calibration: Calibration, points: Points | None, volume_m: F64) -> dict[str, Any]:
+    eye_error = calibration.position_error_m(volume_m)
     found: dict[str, Any] = {
         "file": calibration.source,
         "method": calibration.method,

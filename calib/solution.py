@@ -7,17 +7,16 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
 from calib.robust import fit_robust
+from calib.scale_prior import posterior_scale
 from calib.similarity import Similarity, fit
 from runtime.eyes.calibration import position_jacobian
 from runtime.records import F64
 
 Method = Literal["seed", "least-squares", "inverse", "robust", "fixed-scale"]
 METHODS: tuple[Method, ...] = get_args(Method)
-SCALE_DOUBT = 0.0027  # how often a scale of 1 may be taken for another: three standard deviations of many pairs
-EXACT_SCALE = 1e-9
+SCALE_SIGMA = 0.02  # of a sensor's metre, unless configured
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,29 +138,34 @@ def solve(sensor_m: F64, stack_m: F64, *, method: Method, known_scale: float = 1
     )
 
 
-def scale_is_one(scale: F64 | float, *, sigma: F64 | float, freedom: int) -> NDArray[np.bool_]:
-    """True where a fitted scale cannot be told from 1 (Student's test).
-
-    sigma: the estimated standard deviation of its logarithm; freedom: of that estimate.
-    """
-    limit = float(student.ppf(1 - SCALE_DOUBT / 2, freedom)) * np.asarray(sigma)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.abs(np.log(scale)) <= np.maximum(limit, EXACT_SCALE)
-
-
-def solve_default(sensor_m: F64, stack_m: F64) -> Solution:
+def solve_default(sensor_m: F64, stack_m: F64, *, scale_sigma: float = SCALE_SIGMA) -> Solution:
     """The method that the error table (docs/calibration.md) shows to be best at the eye for pairs like these.
 
-    `robust` where pairs are grossly wrong; else `fixed-scale` at 1 (both frames are in metres) unless the data
-    tell another scale with confidence; then `inverse`. Raises `similarity.Degenerate`.
+    `robust` where pairs are grossly wrong; else `fixed-scale` at what is believed of the scale after the pairs
+    (`scale_prior`): 1 unless they tell another. scale_sigma: how far off a sensor's metre may be; 0: it is exact.
+    Raises `similarity.Degenerate`.
     """
     robust = solve(sensor_m, stack_m, method="robust")
     rejected = int((~robust.used).sum())
     if rejected:
         return replace(robust, reason=f"{rejected} of {len(sensor_m)} pairs do not agree with the others")
+    if scale_sigma == 0.0:
+        return solve(sensor_m, stack_m, method="fixed-scale", reason="the sensor's metre is exact, as configured")
     inverse = solve(sensor_m, stack_m, method="inverse")
-    scale = float(inverse.similarity.scale)
-    text = f"the fitted scale, {scale:.5g} ± {inverse.scale_sigma * scale:.2g},"
-    if scale_is_one(scale, sigma=inverse.scale_sigma, freedom=3 * len(sensor_m) - 7):
-        return solve(sensor_m, stack_m, method="fixed-scale", reason=f"{text} cannot be told from 1")
-    return replace(inverse, reason=f"{text} is not 1, and the noise is on the sensor's side")
+    fitted = float(inverse.similarity.scale)
+    believed = posterior_scale(
+        np.log(fitted), sigma=inverse.scale_sigma, freedom=3 * len(sensor_m) - 7, prior_sigma=scale_sigma
+    )
+    scale, sigma = float(np.exp(believed.log_scale)), float(believed.sigma)
+    found = solve(
+        sensor_m,
+        stack_m,
+        method="fixed-scale",
+        known_scale=scale,
+        reason=f"scale {scale:.5g} ± {sigma * scale:.2g}: fitted {fitted:.5g} ± {inverse.scale_sigma * fitted:.2g}, "
+        f"beforehand 1 or off by some {100 * scale_sigma:g}%",
+    )
+    unit = found.unit_covariance.copy()
+    # About the pairs' centre the scale is independent of rotation and shift.
+    unit[6, 6] = (sigma / found.noise_m) ** 2 if found.noise_m > 0 else 0.0
+    return replace(found, unit_covariance=unit)

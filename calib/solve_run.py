@@ -17,6 +17,7 @@ from calib.store import Origin, calibration_text, save
 from calib.viewpoints import viewing_volume_m
 from runtime.config import Settings
 from runtime.errors import InputError
+from runtime.records import F64
 
 
 def solve_file(
@@ -41,20 +42,21 @@ def solve_file(
         chosen = (
             solve(pairs.sensor_m, pairs.stack_m, method=method, known_scale=known_scale, reason="asked for")
             if method
-            else solve_default(pairs.sensor_m, pairs.stack_m)
+            else solve_default(pairs.sensor_m, pairs.stack_m, scale_sigma=settings.calibration.scale_sigma)
         )
     except Degenerate as problem:
         raise InputError(pairs.source, "pairs", str(problem)) from None
-    warnings = checked.warnings + check_solution(pairs, chosen)
+    volume_m = viewing_volume_m(settings.calibration)
+    warnings = checked.warnings + check_solution(pairs, chosen, volume_m)
     origin = Origin(
         date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         sensor_driver=settings.sensor.driver,
         sensor_serial=serial or pairs.sensor_serial,
         panel_ids=tuple(panel.edid_serial for panel in settings.output.panels),
     )
-    kept = save(out, calibration_text(chosen, pairs, origin=origin, warnings=warnings))
-    table = [_figures(other) for other in _all_methods(pairs, chosen, known_scale=known_scale)]
-    summary = _summary(pairs, chosen, warnings) | {
+    kept = save(out, calibration_text(chosen, pairs, origin=origin, warnings=warnings, volume_m=volume_m))
+    table = [_figures(other, volume_m) for other in _all_methods(pairs, chosen, known_scale=known_scale)]
+    summary = _summary(pairs, chosen, warnings, volume_m) | {
         "file": str(out),
         "kept_version": str(kept) if kept else None,
         "methods": table,
@@ -76,8 +78,8 @@ def _all_methods(pairs: Pairs, chosen: Solution, *, known_scale: float) -> list[
     return found
 
 
-def _figures(solution: Solution) -> dict[str, Any]:
-    error_m = solution.eye_error_m(viewing_volume_m())
+def _figures(solution: Solution, volume_m: F64) -> dict[str, Any]:
+    error_m = solution.eye_error_m(volume_m)
     return {
         "method": solution.method,
         "scale": float(solution.similarity.scale),
@@ -91,8 +93,8 @@ def _figures(solution: Solution) -> dict[str, Any]:
     }
 
 
-def _summary(pairs: Pairs, solution: Solution, warnings: tuple[str, ...]) -> dict[str, Any]:
-    return _figures(solution) | {
+def _summary(pairs: Pairs, solution: Solution, warnings: tuple[str, ...], volume_m: F64) -> dict[str, Any]:
+    return _figures(solution, volume_m) | {
         "reason": solution.reason,
         "stack_from_sensor": solution.similarity.matrix,
         "pairs": len(pairs),

@@ -11,7 +11,6 @@ import numpy as np
 
 from calib.pairs import Pairs
 from calib.solution import Solution
-from calib.viewpoints import viewing_volume_m
 from runtime.errors import InputError
 from runtime.eyes.calibration import load_calibration
 from runtime.records import F64
@@ -34,7 +33,9 @@ class Origin:
     panel_ids: tuple[str, ...] = ()
 
 
-def calibration_text(solution: Solution, pairs: Pairs, *, origin: Origin, warnings: tuple[str, ...]) -> str:
+def calibration_text(
+    solution: Solution, pairs: Pairs, *, origin: Origin, warnings: tuple[str, ...], volume_m: F64
+) -> str:
     """The TOML of a solution; `runtime.eyes.calibration` reads it, `[data]` is the report's."""
     import tomlkit
 
@@ -57,7 +58,7 @@ def calibration_text(solution: Solution, pairs: Pairs, *, origin: Origin, warnin
     residuals["axis_rms_m"] = solution.axis_rms_m.tolist()
     if np.isfinite(solution.leave_one_out_rms_m):
         residuals["leave_one_out_rms_m"] = solution.leave_one_out_rms_m
-    residuals["eye_error_m"] = float(solution.eye_error_m(viewing_volume_m()).mean())
+    residuals["eye_error_m"] = float(solution.eye_error_m(volume_m).mean())
     document["residuals"] = residuals
     covariance = tomlkit.table()
     covariance.add(tomlkit.comment("of rotation vector, shift and log scale about the pivot, in the stack's axes"))

@@ -1,4 +1,4 @@
-"""The seed's grid of calibration viewpoints (section 2.3), and the volume in which the error is judged."""
+"""Where viewers stand: the grid of calibration viewpoints (seed 2.3, for any distance), and the volume of errors."""
 
 from __future__ import annotations
 
@@ -11,9 +11,7 @@ from runtime.config import CalibrationSettings
 from runtime.optics.views import stack_from_eye
 from runtime.records import F64
 
-RADII_CM = (40, 50, 60)
-PHI_DEG = (70, 80, 90)  # from the vertical
-THETA_DEG = (80, 90, 100)  # around it, 90: straight before the display
+USUAL = CalibrationSettings()  # R 40 to 60 cm, phi 70 to 90 degrees from the vertical, theta 80 to 100 round it
 IPD_M = 0.060
 
 
@@ -57,12 +55,23 @@ def viewing_place_m(viewing: CalibrationSettings) -> F64:
     return spherical_m(sum(viewing.viewing_m) / 2, phi_deg=90 - up_deg, theta_deg=90)
 
 
-def grid() -> tuple[Viewpoint, ...]:
-    """The 27 viewpoints, nearest first, row by row."""
-    return tuple(Viewpoint(*values) for values in product(RADII_CM, PHI_DEG, THETA_DEG))
+def grid(viewing: CalibrationSettings = USUAL) -> tuple[Viewpoint, ...]:
+    """The 27 viewpoints of a configured viewing range, nearest first, row by row; the seed's for the usual one."""
+    low_deg, high_deg = viewing.viewing_up_deg
+    radii_cm = np.rint(100 * np.linspace(*viewing.viewing_m, 3)).astype(int)
+    phi_deg = np.rint(90 - np.linspace(high_deg, low_deg, 3)).astype(int)
+    theta_deg = np.rint(90 + viewing.viewing_side_deg * np.array([-1, 0, 1])).astype(int)
+    return tuple(Viewpoint(*values) for values in product(radii_cm.tolist(), phi_deg.tolist(), theta_deg.tolist()))
 
 
-def viewing_volume_m() -> F64:
-    """(125, 3) points in `stack` that stand for where viewers are: 0.3 to 0.9 m away, 25 degrees to each side."""
-    radii, phis, thetas = np.linspace(0.3, 0.9, 5), np.linspace(60, 100, 5), np.linspace(65, 115, 5)
+def viewing_volume_m(viewing: CalibrationSettings = USUAL) -> F64:
+    """(125, 3) points in `stack` that stand for where viewers are: beyond the grid by a quarter of its nearest
+    distance and half of its farthest, by 15 degrees to each side and 10 up and down.
+
+    For the usual range 0.3 to 0.9 m away, 25 degrees to each side.
+    """
+    (near_m, far_m), (low_deg, high_deg) = viewing.viewing_m, viewing.viewing_up_deg
+    side_deg = viewing.viewing_side_deg + 15
+    radii, thetas = np.linspace(0.75 * near_m, 1.5 * far_m, 5), np.linspace(90 - side_deg, 90 + side_deg, 5)
+    phis = np.linspace(80 - high_deg, 100 - low_deg, 5)
     return np.array([spherical_m(r, phi_deg=p, theta_deg=t) for r, p, t in product(radii, phis, thetas)])

@@ -16,10 +16,13 @@ from model_export.network import SpectralSolver
 from model_export.recipe import Recipe
 from runtime.config import validated
 from runtime.errors import InputError
+from runtime.support import foreign
 from runtime.support.artifacts import write_bytes
 
+FILE_BYTES_MAX = 4 << 30
+
 WIDTH_KEY = "subnets.in_conv.0.weight"
-FAMILIES = {"subnets.": "eyereal", "lambda_net.": "spectral"}
+FAMILIES = {"subnets.": "eyereal", "log_floor": "spectral"}
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
@@ -28,10 +31,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     Plain values, tensors, and the `args` of an argparse command line, which is a table of plain values again: the
     published code saves its own. Nothing else is made, and no code of the file is run.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, "", f"cannot be read ({error.strerror})") from None
+    data = foreign.read_bytes(path, most_bytes=FILE_BYTES_MAX)
     try:
         with torch.serialization.safe_globals([argparse.Namespace]):
             table = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
@@ -67,7 +67,7 @@ def load_spectral(path: Path, *, name: str) -> tuple[SpectralSolver, Recipe]:
     recipe = validated(Recipe, table["recipe"], source=f"{path}: recipe")
     if recipe.name != name:
         raise InputError(path, "recipe.name", f"is a checkpoint of {recipe.name}, not of {name}")
-    net = SpectralSolver(recipe.hidden)
+    net = SpectralSolver(recipe.cell_px, recipe.iterations)
     fill(net, table["model"], source=path, arch=name)
     return net.eval(), recipe.model_copy(update={"weights": plain_weights(net)})
 
@@ -75,7 +75,7 @@ def load_spectral(path: Path, *, name: str) -> tuple[SpectralSolver, Recipe]:
 def solver_of(recipe: Recipe, *, source: str) -> SpectralSolver:
     """The network with a recipe's own weights, or the analytic start. Raises InputError."""
     torch.manual_seed(recipe.training.seed)
-    net = SpectralSolver(recipe.hidden)
+    net = SpectralSolver(recipe.cell_px, recipe.iterations)
     if recipe.weights is not None:
         try:
             state = {key: torch.tensor(value, dtype=torch.float32) for key, value in recipe.weights.items()}

@@ -10,10 +10,11 @@ from typing import Literal
 import torch
 from torch import nn
 
+from model_export import eyereal, network
 from model_export.checkpoint import load_eyereal, load_spectral, solver_of
 from model_export.eyereal import LEAST_PX, OFFSET, PICTURE_FOV_DEG, EyeRealNet
 from model_export.network import SpectralSolver
-from model_export.onnx_files import eyereal_bytes, half_precision, quantised, spectral_bytes, with_contract
+from model_export.onnx_files import eyereal_bytes, half_precision, ports, quantised, spectral_bytes, with_contract
 from model_export.recipe import DESIGN_RANGE, Recipe, read_recipe
 from model_export.stress import eyereal_feeds, ordinary_pictures
 from model_export.validate import OPSETS, Report, check_model
@@ -82,7 +83,7 @@ def spectral_file(
     if precision == "fp16":
         data = half_precision(data)
     contract = Contract(
-        version=1,
+        version=2,
         arch="spectral",
         name=recipe.name,
         panels=3,
@@ -96,6 +97,8 @@ def spectral_file(
         value_range=(0.0, 1.0),
         trained_for=DESIGN_RANGE if trained else None,
         recipe_sha256=recipe.sha256(),
+        inputs=ports(network.INPUTS),
+        outputs=ports(network.OUTPUTS),
         precision=precision,
         parameters=_parameters(net),
         cell_px=recipe.cell_px,
@@ -125,7 +128,7 @@ def eyereal_model(request: ExportRequest) -> tuple[bytes, nn.Module]:
         samples = [eyereal_feeds(ordinary_pictures(*CALIBRATION_SIZE, number=k)) for k in range(CALIBRATION_PAIRS)]
         data = quantised(data, samples, size=None if request.dynamic else (request.height_px, request.width_px))
     contract = Contract(
-        version=1,
+        version=2,
         arch="eyereal",
         name="eyereal",
         panels=3,
@@ -142,6 +145,8 @@ def eyereal_model(request: ExportRequest) -> tuple[bytes, nn.Module]:
         recipe_sha256=origin.hexdigest(),
         width_px=0 if request.dynamic else request.width_px,
         height_px=0 if request.dynamic else request.height_px,
+        inputs=ports((eyereal.INPUT,)),
+        outputs=ports((eyereal.OUTPUT,)),
         precision=request.precision,
         parameters=_parameters(net),
     )

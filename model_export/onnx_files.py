@@ -7,7 +7,7 @@ import io
 import logging
 import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,37 +17,52 @@ import torch
 from torch import nn
 
 from model_export import eyereal, network
-from runtime.model.contract import METADATA_KEY, Contract
+from runtime.model.chain import chain_modes
+from runtime.model.contract import METADATA_KEY, Contract, Port
+from runtime.model.onnx_bytes import digest
 
 CELL_AXES = {
-    "difference": {0: "rows", 1: "cells", 2: "columns"},
-    "modes_out": {0: "cells_and_one", 1: "cells"},
-    "spectrum": {0: "cells"},
-    "modes_in": {0: "cells", 1: "cells"},
-    network.OUTPUT: {0: "rows", 1: "cells_and_one", 2: "columns"},
+    "left": ("rows", "cells", "columns"),
+    "right": ("rows", "cells", "columns"),
+    "waves": ("cells_and_one", "modes"),
+    "shifted_waves": ("cells_and_one", "modes"),
+    "spectrum": ("modes",),
+    "modes_in": ("modes", "cells"),
+    "doubt": ("doubts",),
+    "rear": ("rows", "cells_and_one", "columns"),
+    "front": ("rows", "cells_and_one", "columns"),
+    "check": ("one",),
 }
-PICTURE_AXES = {name: {2: "height", 3: "width"} for name in (eyereal.INPUT, eyereal.OUTPUT)}
+PICTURE_AXES = {name: ("one", "channels", "height", "width") for name in (eyereal.INPUT, eyereal.OUTPUT)}
+FIXED = {"one", "channels", "doubts"}
 Feeds = dict[str, np.ndarray]
 
 
 def spectral_bytes(net: nn.Module, *, cell_px: int, opset: int) -> bytes:
     """The solver along the eyes' line: rows, cells and columns are whatever a pose asks for."""
-    n, rows = 8, 6
-    example = (torch.zeros(rows, n, 6 * cell_px), torch.zeros(n + 1, n), torch.ones(n), torch.zeros(n, n))
-    return _exported(net, (*example, torch.ones(1)), network.INPUTS, network.OUTPUT, CELL_AXES, opset)
+    sides = (torch.zeros(16, 8, 6 * cell_px, dtype=torch.int16),) * 2
+    modes = tuple(torch.from_numpy(part) for part in chain_modes(8))
+    return _exported(net, (*sides, *modes, torch.ones(3)), network.INPUTS, network.OUTPUTS, CELL_AXES, opset)
+
+
+def ports(names: Sequence[str]) -> tuple[Port, ...]:
+    """Inputs or outputs as a contract declares them."""
+    return tuple(Port(name=name, axes=(CELL_AXES | PICTURE_AXES)[name]) for name in names)
 
 
 def eyereal_bytes(net: nn.Module, *, width_px: int, height_px: int, dynamic: bool, opset: int) -> bytes:
     """The published network, of one picture size or of any."""
     example = torch.zeros(1, 18, *((64, 96) if dynamic else (height_px, width_px)))
     axes = PICTURE_AXES if dynamic else {}
-    return _exported(net, (example,), (eyereal.INPUT,), eyereal.OUTPUT, axes, opset)
+    return _exported(net, (example,), (eyereal.INPUT,), (eyereal.OUTPUT,), axes, opset)
 
 
 def with_contract(data: bytes, contract: Contract) -> bytes:
     """The same model with the metadata entry that the runtime asks for."""
     model = onnx.load_from_string(data)
     del model.metadata_props[:]
+    known = digest(model.SerializeToString(deterministic=True))
+    contract = contract.model_copy(update={"graph_sha256": known})
     # Only a network of whole pictures has a view of its own; the others' contracts don't speak of one.
     text = contract.model_dump_json(exclude=None if contract.picture_fov_deg else {"picture_fov_deg"})
     onnx.helper.set_model_props(model, {METADATA_KEY: text})
@@ -103,8 +118,8 @@ def _exported(
     net: nn.Module,
     example: tuple[Any, ...],
     inputs: Sequence[str],
-    output: str,
-    axes: dict[str, dict[int, str]],
+    outputs: Sequence[str],
+    axes: Mapping[str, tuple[str, ...]],
     opset: int,
 ) -> bytes:
     buffer = io.BytesIO()
@@ -115,8 +130,11 @@ def _exported(
             buffer,  # type: ignore[arg-type]
             opset_version=opset,
             input_names=list(inputs),
-            output_names=[output],
-            dynamic_axes=axes,
+            output_names=list(outputs),
+            dynamic_axes={
+                name: {at: axis for at, axis in enumerate(named) if axis not in FIXED} for name, named in axes.items()
+            },
+            do_constant_folding=False,  # so that weights keep their names; onnxruntime folds as it loads
             dynamo=False,
         )
     return buffer.getvalue()

@@ -13,6 +13,7 @@ from torch import nn
 from model_export.eyereal import EyeRealNet
 from model_export.network import SpectralSolver
 from runtime.errors import InputError
+from runtime.model.contract import Contract
 
 
 class Weights:
@@ -36,6 +37,17 @@ class Weights:
                     found.append(parts)
         return found
 
+    def kinds(self) -> list[str]:
+        """The operator of every node, in order."""
+        return [node.op_type for node in self._graph.node]
+
+    def named(self, name: str) -> np.ndarray:
+        """A constant by its name. Raises ValueError where there is none."""
+        value = self._constant(name)
+        if value is None:
+            raise ValueError(f"{name} is missing")
+        return value
+
     def _constant(self, name: str) -> np.ndarray | None:
         if name in self._held:
             return self._held[name].astype(np.float32)
@@ -58,12 +70,12 @@ class Weights:
         return ((value.astype(np.float64) - zero) * scale).astype(np.float32)
 
 
-def rebuilt(model: onnx.ModelProto, arch: str, *, source: str) -> nn.Module:
+def rebuilt(model: onnx.ModelProto, contract: Contract, *, source: str) -> nn.Module:
     """The torch module whose weights a file holds. Raises InputError where its graph is not of that architecture."""
-    weights = Weights(model.graph)
+    weights, arch = Weights(model.graph), contract.arch
     try:
         if arch == "spectral":
-            return _spectral(weights)
+            return _spectral(weights, contract)
         if arch == "eyereal":
             return _eyereal(weights)
     except (IndexError, ValueError, RuntimeError) as error:
@@ -71,12 +83,14 @@ def rebuilt(model: onnx.ModelProto, arch: str, *, source: str) -> nn.Module:
     raise InputError(source, "contract.arch", f"{arch!r} is neither spectral nor eyereal: nothing to check it against")
 
 
-def _spectral(weights: Weights) -> nn.Module:
-    layers = weights.of({"Gemm"})
-    if len(layers) != 2:
-        raise ValueError(f"{len(layers)} layers of regularisation instead of 2")
-    net = SpectralSolver(layers[0][0].shape[0])
-    _put([net.lambda_net[0], net.lambda_net[2]], layers)
+def _spectral(weights: Weights, contract: Contract) -> nn.Module:
+    cell_px, iterations = contract.cell_px, sum(name == "Clip" for name in weights.kinds()) - 2
+    net = SpectralSolver(cell_px, max(iterations, 0))
+    for name, parameter in net.named_parameters():
+        value = weights.named(name)
+        if value.shape != tuple(parameter.shape):
+            raise ValueError(f"{name}: {value.shape} instead of {tuple(parameter.shape)}")
+        parameter.data = torch.from_numpy(value.copy())
     return net.eval()
 
 

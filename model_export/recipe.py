@@ -13,6 +13,7 @@ from runtime.config import Section, validated
 from runtime.errors import InputError
 from runtime.model.contract import Steps, TrainedFor
 from runtime.model.predictor import SHIPPED
+from runtime.support import foreign
 
 RECIPES = Path(__file__).parent / "recipes"
 DESIGN_RANGE = TrainedFor(
@@ -28,10 +29,9 @@ class Training(Section):
     seed: Annotated[int, Field(ge=0)] = 1
     width_px: Annotated[int, Field(ge=64)] = Field(480, description="raster of the training pairs")
     height_px: Annotated[int, Field(ge=64)] = 270
-    tolerance_mm: tuple[float, float] = Field((0.0, 4.0), description="range of the tolerances that are drawn")
+    eye_sigma_mm: tuple[float, float] = Field((0.0, 4.0), description="range of the uncertainties that are drawn")
     validate_every: Annotated[int, Field(ge=1)] = 50
     validation_pairs: Annotated[int, Field(ge=1)] = 12
-    learn_steps: bool = Field(True, description="also the sizes of the correction steps")
 
 
 class Recipe(Section):
@@ -39,7 +39,7 @@ class Recipe(Section):
 
     name: str
     arch: Literal["spectral"] = "spectral"
-    hidden: Annotated[int, Field(ge=1, le=256)] = 16
+    iterations: Annotated[int, Field(ge=0, le=32)] = Field(4, description="of the box, within the network")
     cell_px: Annotated[int, Field(ge=1, le=64)] = 4
     reduction: Literal[1, 2, 4] = 2
     emphasis: Annotated[float, Field(ge=0, le=0.5)] = Field(
@@ -83,12 +83,7 @@ def recipe_path(name: str) -> Path:
 def read_recipe(name: str) -> Recipe:
     """A recipe by name or file. Raises InputError."""
     path = recipe_path(name)
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(path, "", f"cannot be read ({error.strerror})") from None
-    except ValueError as error:
-        raise InputError(path, "", f"malformed: {error}") from None
+    table = foreign.read_json(path)
     if not isinstance(table, dict):
         raise InputError(path, "", "must be one JSON object")
     return validated(Recipe, table, source=path)

@@ -7,6 +7,7 @@ import numpy as np
 from model_export.data import endless_pairs
 from model_export.onnx_files import Feeds
 from runtime.model.chain import chain_modes
+from runtime.model.transfer import FULL
 from runtime.optics.malus import phase_from_intensity
 from runtime.records import F32
 
@@ -40,25 +41,25 @@ def stress_pictures(height: int, width: int) -> dict[str, tuple[F32, F32]]:
 
 def ordinary_pictures(height: int, width: int, *, number: int = 0) -> tuple[F32, F32]:
     """A procedural pair of that size."""
-    pair = next(endless_pairs(77, first=number, width_px=width, height_px=height, tolerance_mm=(0.0, 0.0)))
+    pair = next(endless_pairs(77, first=number, width_px=width, height_px=height, eye_sigma_mm=(0.0, 0.0)))
     left, right = (image.astype(np.float32) / np.float32(255) for image in pair.images)
     return left, right
 
 
 def spectral_cases(cell_px: int) -> dict[str, Feeds]:
-    """Inputs of the solver along the eyes' line: short and long chains, exact and tolerant."""
+    """Inputs of the solver along the eyes' line: short and long chains, for points and for unsure eyes."""
     cases = {}
-    for cells, tolerance in ((16, 0.0), (112, 1.0), (400, 4.0)):
+    for cells, doubt in ((16, (0.0, 0.0, 0.5)), (112, (0.13, 0.15, 0.3)), (400, (0.5, 0.6, 0.1))):
         size = (64, cells * 2 * cell_px)
         for name, pictures in {ORDINARY: ordinary_pictures(*size), **stress_pictures(*size)}.items():
             left, right = (phase_from_intensity(picture) for picture in pictures)
-            modes_out, spectrum, modes_in = chain_modes(cells)
+            half = np.rint((right - left).reshape(64, cells, -1) * (FULL / 2)).astype(np.int16)
+            modes = dict(zip(("waves", "shifted_waves", "spectrum", "modes_in"), chain_modes(cells), strict=True))
             cases[f"{name}, {cells} cells"] = {
-                "difference": np.ascontiguousarray((right - left).reshape(64, cells, -1), np.float32),
-                "modes_out": modes_out,
-                "spectrum": spectrum,
-                "modes_in": modes_in,
-                "tolerance_mm": np.array([tolerance], np.float32),
+                "left": -half,
+                "right": half,
+                **modes,
+                "doubt": np.array(doubt, np.float32),
             }
     return cases
 

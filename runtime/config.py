@@ -14,7 +14,10 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
+from runtime.support import foreign
 from runtime.support.plausible import check_text, nearest, socket_path, within
+
+TABLE_BYTES_MAX = 4 << 20
 
 
 class Section(BaseModel):
@@ -202,7 +205,7 @@ class CalibrationSettings(Section):
     viewing_m: tuple[Positive, Positive] = Field(
         (0.4, 0.6), description="nearest and farthest viewer: charts and registration are for there"
     )
-    viewing_side_deg: Annotated[float, Field(gt=0, le=40)] = Field(
+    viewing_side_deg: Annotated[float, Field(ge=2, le=40)] = Field(
         10.0, description="how far to either side viewers stand, seen from the display's middle"
     )
     viewing_up_deg: tuple[float, float] = Field((0.0, 20.0), description="how far up their eyes are: lowest, highest")
@@ -266,6 +269,9 @@ class ModelSettings(Section):
 
     name: str = Field("balanced", description="fast, balanced, best, sart, or an ONNX file with our contract")
     provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = Field("cpu", description="execution provider")
+    backend: Literal["auto", "opencv"] = Field(
+        "auto", description="what does all that surrounds the network; auto: the one there is"
+    )
     threads: Annotated[int, Field(ge=0, le=256)] = Field(2, description="inference threads; 0: all cores")
     eye_sigma_mm: Literal["auto"] | NonNegative = Field(
         "auto",
@@ -385,12 +391,12 @@ class LimitSettings(Section):
     """What a file from outside may hold: more is refused with its figure, before memory is taken for it."""
 
     file_mib: Annotated[float, Field(gt=0, le=1_000_000)] = Field(
-        2048.0, description="bytes of one file of content or of a recording, MiB"
+        1024.0, description="one file of content or of a recording, MiB"
     )
-    pixels: Annotated[int, Field(ge=1)] = Field(67_108_864, description="pixels of one picture")
+    pixels: Annotated[int, Field(ge=1)] = Field(134_217_728, description="pixels of one picture; 16384 x 8192")
     triangles: Annotated[int, Field(ge=1)] = Field(2_000_000, description="triangles of a mesh, all instances together")
     splats: Annotated[int, Field(ge=1)] = Field(3_000_000, description="Gaussians of a splat file")
-    instances: Annotated[int, Field(ge=1)] = Field(4096, description="times that meshes stand in a glTF scene")
+    instances: Annotated[int, Field(ge=1)] = Field(2000, description="times that meshes stand in a glTF scene")
     depth: Annotated[int, Field(ge=1, le=512)] = Field(64, description="how deep JSON or a glTF scene may nest")
     load_s: Positive = Field(120.0, description="loading of one piece of content is given up after this")
     recording_s: Annotated[float, Field(gt=0, le=1_000_000)] = Field(
@@ -458,6 +464,7 @@ class Overrides(BaseModel):
     scene: str | None = None
     model: str | None = None
     budget_ms: float | None = None
+    backend: str | None = None
 
     def applied(self, settings: Settings) -> Settings:
         """The settings with these in force. Raises InputError, naming the option."""
@@ -471,6 +478,8 @@ class Overrides(BaseModel):
             settings = changed(settings, "model", {"name": self.model}, source="--model")
         if self.budget_ms is not None:
             settings = changed(settings, "model", {"budget_ms": self.budget_ms}, source="--budget-ms")
+        if self.backend is not None:
+            settings = changed(settings, "model", {"backend": self.backend}, source="--backend")
         return settings
 
 
@@ -483,19 +492,16 @@ def changed(settings: Settings, section: str, values: dict[str, Any], *, source:
 
 def read_table(path: Path) -> dict[str, Any]:
     """A TOML or JSON file as a table. Raises InputError, naming the file and the line of the mistake."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(path, "", f"cannot be read ({getattr(error, 'strerror', None) or error})") from None
-    try:
-        if path.suffix.lower() == ".json":
-            import json
-
-            table = json.loads(text)
-        else:
+    text = foreign.read_text(path, most_bytes=TABLE_BYTES_MAX)
+    if path.suffix.lower() == ".json":
+        table = foreign.parsed_json(text, source=path)
+    else:
+        try:
             table = tomllib.loads(text)
-    except ValueError as error:
-        raise InputError(path, "", f"malformed: {error}") from None
+        except ValueError as error:
+            raise InputError(path, "", f"malformed: {error}") from None
+        except RecursionError:
+            raise InputError(path, "", "malformed: nested too deep") from None
     if not isinstance(table, dict):
         raise InputError(path, "", "must hold one table")
     return table

@@ -1,9 +1,24 @@
 #!/bin/sh
-# Installs phasestack for the whole machine: sh systemd/install.sh (as root), or `make install`.
-#   DESTDIR=/some/root  build a package's tree there; nothing on this machine is started or reloaded
-#   PYTHON=python3.11   the Python that will run it (3.11 or later)
-#   APP=no              only units, rules and configuration: the program comes from elsewhere
+# Installs phasestack for the whole machine; `sh systemd/install.sh --help` says how.
 set -eu
+usage() {
+  cat <<'HELP'
+Installs phasestack for the whole machine: sh systemd/install.sh (as root), or `make install`.
+
+  DESTDIR=/some/root  build a package's tree there; nothing on this machine is started or reloaded
+  PYTHON=python3.11   the Python that will run it (3.11 or later)
+  APP=no              only units, rules and configuration: the program comes from elsewhere
+
+Example: DESTDIR=/tmp/tree PYTHON=python3.12 sh systemd/install.sh
+HELP
+}
+case "${1:-}" in
+  '') ;;
+  -h | --help) usage; exit 0 ;;
+  *) echo "install: unknown argument $1 (see --help)" >&2; exit 2 ;;
+esac
+# Whatever the caller's mask is: the service's user reads what root installs.
+umask 022
 here=$(CDPATH='' cd -- "$(dirname -- "$0")" && pwd)
 source=$(dirname -- "$here")
 DESTDIR=${DESTDIR:-}
@@ -19,6 +34,8 @@ library=/opt/phasestack/lib
 put() { install -D -m "$1" "$here/$2" "$DESTDIR$3"; }
 
 if [ "${APP:-yes}" != no ]; then
+  # An earlier installation may have made it for root alone.
+  install -d -m 755 "$DESTDIR/opt/phasestack"
   rm -rf "$DESTDIR$library.new"
   "$python" -m pip install --quiet --no-compile --target "$DESTDIR$library.new" -r "$source/requirements/runtime.lock" \
     -r "$source/requirements/page.lock"
@@ -35,6 +52,7 @@ fi
 mkdir -p "$DESTDIR/usr/bin"
 cat > "$DESTDIR/usr/bin/phasestack" <<LAUNCHER
 #!/bin/sh
+export ORT_DISABLE_TELEMETRY=1
 PYTHONPATH=$library exec $python -sP -c 'import sys; sys.argv[0] = "phasestack"; from runtime.cli import main; main()' "\$@"
 LAUNCHER
 chmod 755 "$DESTDIR/usr/bin/phasestack"

@@ -1,8 +1,21 @@
 #!/bin/sh
-# Removes what install.sh has put there: sh systemd/uninstall.sh (as root), or `make uninstall`.
-#   DESTDIR=/some/root  the tree that it was installed in
-#   PURGE=yes           also the configuration, the state and the cache
+# Removes what install.sh has put there; `sh systemd/uninstall.sh --help` says how.
 set -eu
+usage() {
+  cat <<'HELP'
+Removes what install.sh has put there: sh systemd/uninstall.sh (as root), or `make uninstall`.
+
+  DESTDIR=/some/root  the tree that it was installed in
+  PURGE=yes           also the configuration, the state and the cache
+
+Example: PURGE=yes sh systemd/uninstall.sh
+HELP
+}
+case "${1:-}" in
+  '') ;;
+  -h | --help) usage; exit 0 ;;
+  *) echo "uninstall: unknown argument $1 (see --help)" >&2; exit 2 ;;
+esac
 DESTDIR=${DESTDIR:-}
 if [ -z "$DESTDIR" ] && [ "$(id -u)" != 0 ]; then
   echo "uninstall: run as root, or set DESTDIR" >&2

@@ -1,7 +1,10 @@
-"""A long run with faults: python tests/soak.py --frames 100000. Fails where memory, files or threads pile up.
+"""A long run with faults: python tests/soak.py --frames 100000 --changes 400.
 
-The real loop with real content, network, panels and status socket, small; every so often the sensor is lost, a
-panel is lost, the scene is frozen and thawed, and somebody asks for the status.
+Fails where memory, files or threads pile up, or a refresh is lost.
+
+A real run with real content, network, panels and status socket, small; every so often the sensor is lost, a panel
+is lost, the model fails, the picture is paused, another scene or configuration is taken over, and somebody asks for
+the status. No refresh is lost but those without a panel.
 """
 
 from __future__ import annotations
@@ -21,9 +24,10 @@ if __name__ == "__main__":
 
 from runtime.clock import MonotonicClock
 from runtime.daemon.client import ask
+from runtime.daemon.reconfigure import Reconfiguration
 from runtime.daemon.server import StatusServer
 from runtime.errors import SensorLost
-from tests.daemon.rig import TRACKING, BreakablePanels, Rig
+from tests.daemon.rig import TRACKING, Rig
 
 SIZE = {"width_px": 64, "height_px": 36}
 GROWTH_MAX = 0.01
@@ -50,6 +54,9 @@ class Soak:
 
     frames: int
     presented: int
+    without_a_panel: int
+    changes: int  # of scene and of model, that were taken over
+    solutions: int
     faults: dict[str, int]
     seconds: float
     before: Usage
@@ -63,6 +70,8 @@ class Soak:
     def problems(self) -> list[str]:
         """Empty: passed."""
         found = []
+        if self.presented + self.without_a_panel < self.frames:
+            found.append(f"{self.frames - self.presented - self.without_a_panel} refreshes lost")
         if self.growth > GROWTH_MAX:
             found.append(f"memory grew by {self.growth:.2%}")
         if self.after.files > self.before.files:
@@ -72,21 +81,54 @@ class Soak:
         return found
 
 
-def soak(frames: int, *, warm: int, fault_every: int, report: bool = False) -> Soak:
-    """Run it. `warm` turns come before the first look at memory."""
+class Changes:
+    """Another scene, then another model, and so on: one after the other, while refreshes go on."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig, self._change, self.done, self.refused = rig, None, 0, ""
+
+    def begin(self) -> None:
+        """The next one, if the last one is over."""
+        presenter = self._rig.presenter
+        if self._change is not None:
+            return
+        old = presenter.run_cell.state.settings
+        number = self.done // 2
+        if self.done % 2:
+            model = old.model.model_copy(update={"name": ("balanced", "fast")[number % 2]})
+            new = old.model_copy(update={"model": model})
+        else:
+            content = old.content.model_copy(update={"scene": ("sparse", "demo")[number % 2]})
+            new = old.model_copy(update={"content": content})
+        self._change = Reconfiguration(new, old, presenter.stack, reload_content=self.done % 2 == 0)
+        presenter.solver.do(self._change.advance)
+
+    def look(self) -> None:
+        """Whether it is over."""
+        if self._change is not None and self._change.finished:
+            self.refused = self.refused or self._change.problem
+            self._change, self.done = None, self.done + 1
+
+
+def soak(frames: int, *, warm: int, fault_every: int, change_every: int, report: bool = False) -> Soak:
+    """Run it. `warm` refreshes come before the first look at memory."""
+    quick = {"rate_hz": 1000.0, "solver_late_s": 30.0, "solver_abandon_s": 600.0}
     with (
         tempfile.TemporaryDirectory() as folder,
-        Rig(stack=SIZE, loop={"rate_hz": 1000.0}, tracker={"hold_s": 1.0}) as rig,
+        Rig(stack=SIZE, loop=quick, tracker={"hold_s": 1.0}) as rig,
     ):
         server = StatusServer(Path(folder) / "status.sock", group="root", clock=MonotonicClock())
-        rig.loop._on_account = None  # the rig keeps every account: that alone would be a leak
-        rig.loop.panels = panels = BreakablePanels(rig.loop.panels, keep=False)
-        rig.turn_until(TRACKING)
+        rig.run.observer._on_account = None  # the rig keeps every account: that alone would be a leak
+        panels = rig.break_panels(keep=False)
+        presenter, changes, without = rig.presenter, Changes(rig), 0
 
-        def cycle(turns: int) -> None:
-            for number in range(turns):
-                account = rig.loop.turn()
+        def cycle(refreshes: int) -> None:
+            nonlocal without
+            for number in range(refreshes):
+                account = presenter.refresh()
+                without += bool(panels.lost)
                 server.publish(lambda account=account: {"state": str(account.state)})
+                changes.look()
                 phase = number % fault_every
                 if phase == fault_every // 4:
                     rig.plan.fault = SensorLost("soaked")
@@ -98,12 +140,29 @@ def soak(frames: int, *, warm: int, fault_every: int, report: bool = False) -> S
                     panels.lost = ""
                 elif phase == 3 * fault_every // 4:
                     assert ask([server.path], {"command": "status"})["ok"]
-            rig.plan.fault, panels.lost = None, ""
-            rig.turn_until(TRACKING)
+                    presenter.paused = True
+                elif phase == 3 * fault_every // 4 + 20:
+                    presenter.paused = False
+                if number % change_every == change_every - 1:
+                    changes.begin()
+            rig.plan.fault, panels.lost, presenter.paused = None, "", False
+            settle(1)
 
+        def settle(at_least: int) -> None:
+            """Until all is well again, and so many changes were made."""
+            nonlocal without
+            while not (presenter.machine.name == TRACKING and changes.done >= at_least):
+                presenter.refresh()
+                changes.look()
+
+        changes.begin()
         cycle(warm)
+        while changes.done < 4:  # each scene and each model has been there once
+            changes.begin()
+            cycle(20)
         before, started = Usage.now(), time.perf_counter()
-        counted = rig.loop.stats.frames, rig.loop.stats.presented
+        stats = presenter.stats
+        counted = stats.frames, stats.presented, without, changes.done, stats.solutions
         done = 0
         while done < frames:
             part = min(max(frames // 10, fault_every), frames - done)
@@ -112,25 +171,31 @@ def soak(frames: int, *, warm: int, fault_every: int, report: bool = False) -> S
             if report:
                 now = Usage.now()
                 print(
-                    f"{done:8} frames  {now.resident_bytes / 2**20:7.1f} MiB  {now.files} files  "
-                    f"{now.threads} threads  {time.perf_counter() - started:6.0f} s",
+                    f"{done:8} refreshes  {now.resident_bytes / 2**20:7.1f} MiB  {now.files} files  "
+                    f"{now.threads} threads  {changes.done} changes  {time.perf_counter() - started:6.0f} s",
                     flush=True,
                 )
+        while changes._change is not None:
+            cycle(1)
         after = Usage.now()
-        stats = rig.loop.stats
         server.close()
+        assert not changes.refused, changes.refused
         return Soak(
-            stats.frames - counted[0], stats.presented - counted[1], dict(stats.faults),
-            time.perf_counter() - started, before, after,
+            stats.frames - counted[0], stats.presented - counted[1], without - counted[2], changes.done - counted[3],
+            stats.solutions - counted[4], dict(stats.faults), time.perf_counter() - started, before, after,
         )  # fmt: skip
 
 
 def main() -> int:
-    """The command line; exit 1 where something piled up."""
+    """The command line; exit 1 where something piled up or was lost."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=100_000)
-    result = soak(parser.parse_args().frames, warm=2000, fault_every=500, report=True)
-    print(f"{result.frames} frames, {result.presented} presented, faults {result.faults}, {result.seconds:.0f} s")
+    parser.add_argument("--changes", type=int, default=400, help="of scene and of model in turns")
+    chosen = parser.parse_args()
+    every = max(20, chosen.frames // max(1, chosen.changes))
+    result = soak(chosen.frames, warm=2000, fault_every=500, change_every=every, report=True)
+    print(f"{result.frames} refreshes, {result.presented} presented, {result.without_a_panel} without a panel")
+    print(f"{result.solutions} solutions, {result.changes} changes, faults {result.faults}, {result.seconds:.0f} s")
     print(f"memory {result.before.resident_bytes / 2**20:.1f} MiB, growth {result.growth:+.3%}")
     for problem in result.problems():
         print(f"FAILED: {problem}")

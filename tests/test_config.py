@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from runtime.commands.names import check_names, scene_from_here, scene_names
 from runtime.config import Overrides, Settings, load_settings, load_stack
+from runtime.daemon.names import check_names, scene_from_here, scene_names
 from runtime.errors import InputError
 from runtime.support.artifacts import write_png
 
@@ -111,6 +111,21 @@ def test_a_panels_file_takes_its_pixels_from_the_pictures_whatever_their_shape(t
     file.write_text(json.dumps({"width_m": 518.4, "height_m": 291.6, "x_m": [-60, 0, 60]}))
     with pytest.raises(InputError, match=r"panels\.json: width_m: .*millimetres \(0\.5184\)"):
         load_stack(file, width_px=600, height_px=800)
+
+
+@pytest.mark.parametrize("width", [1e-30, 1e-300, 1e308])
+def test_panels_of_no_size_are_one_line_for_solve_too(tmp_path: Path, width: float) -> None:
+    file = tmp_path / "panels.json"
+    file.write_text(json.dumps({"width_m": width, "height_m": width * 0.5625, "x_m": [-width / 9, 0, width / 9]}))
+    with pytest.raises(InputError, match=r"panels\.json: width_m: "):
+        load_stack(file, width_px=192, height_px=108)
+
+
+def test_what_config_prints_is_a_configuration_and_says_where_paths_start(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "runtime.cli", "config"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.startswith("# Paths are relative to this file's folder.\n")
+    assert loaded(tmp_path, done.stdout) == Settings()
 
 
 def test_one_serial_on_two_monitors_is_told_apart_by_connector(tmp_path: Path) -> None:

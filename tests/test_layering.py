@@ -1,4 +1,7 @@
-"""One direction of imports: sensor -> eyes -> optics -> content -> model -> panels, and only the top sees them all."""
+"""One direction of imports: every module has its room, every room its place, and nothing imports in a circle.
+
+The stages do not know each other; evaluation, plan, frame, daemon and commands stand on them, in this order.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,15 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 STAGES = {"sensor", "eyes", "content", "model", "panels"}
 SHARED = {"records", "config", "clock", "errors", "support", "optics"}
+FLOORS: tuple[tuple[str, ...], ...] = (  # from the ground up; what stands beside each other may be used by each other
+    ("version", "errors", "clock", "records", "config", "support", "optics"),
+    ("sensor", "eyes", "content", "model", "panels"),
+    ("evaluation",),
+    ("plan",),
+    ("frame",),
+    ("daemon",),
+    ("report", "commands", "cli"),
+)
 HEAVY = ("torch", "cv2", "onnxruntime", "scipy", "numpy")
 
 
@@ -57,6 +69,82 @@ def broken(path: Path, allowed: set[str]) -> list[str]:
         if name.split(".")[0] in {"model_export", "calib", "tests"}
         or (name.split(".")[0] == "runtime" and part_of(name) not in allowed)
     ]
+
+
+def every_module() -> dict[str, Path]:
+    """Dotted name and file of all of runtime."""
+    return {dotted(path): path for path in modules_of("runtime")}
+
+
+def imported_modules(name: str, modules: dict[str, Path]) -> set[str]:
+    """The modules of runtime that one imports, anywhere in it."""
+    found = set()
+    for imported, _ in imports_of(modules[name]):
+        while imported and imported not in modules:  # a name in a module
+            imported = imported.rpartition(".")[0]
+        found.add(imported)
+    return found - {"", "runtime", name}
+
+
+def room_of(name: str) -> str:
+    """`frame` of `runtime.frame.solver`, `config` of `runtime.config`."""
+    return [*name.split("."), ""][1]
+
+
+def circles(edges: dict[str, set[str]]) -> list[list[str]]:
+    """Groups of modules that import each other, by whatever way (Tarjan's strongly connected components)."""
+    number: dict[str, int] = {}
+    low: dict[str, int] = {}
+    path: list[str] = []
+    found: list[list[str]] = []
+
+    def visit(node: str) -> None:
+        number[node] = low[node] = len(number)
+        path.append(node)
+        for other in sorted(edges.get(node, ())):
+            if other not in number:
+                visit(other)
+                low[node] = min(low[node], low[other])
+            elif other in path:
+                low[node] = min(low[node], number[other])
+        if low[node] == number[node]:
+            group = path[path.index(node) :]
+            del path[path.index(node) :]
+            if len(group) > 1:
+                found.append(sorted(group))
+
+    for node in sorted(edges):
+        if node not in number:
+            visit(node)
+    return found
+
+
+def test_every_module_belongs_to_a_room() -> None:
+    rooms = {room for floor in FLOORS for room in floor}
+    assert [name for name in every_module() if name != "runtime" and room_of(name) not in rooms] == []
+
+
+def test_a_room_stands_on_those_below_it() -> None:
+    floor_of = {room: number for number, floor in enumerate(FLOORS) for room in floor}
+    modules = every_module()
+    upwards = [
+        f"{name} imports {imported}"
+        for name in modules
+        if name != "runtime"
+        for imported in sorted(imported_modules(name, modules))
+        if floor_of[room_of(imported)] > floor_of[room_of(name)]
+    ]
+    assert upwards == []
+
+
+def test_nothing_imports_in_a_circle_not_even_inside_a_function() -> None:
+    modules = every_module()
+    assert circles({name: imported_modules(name, modules) for name in modules}) == []
+
+
+def test_a_circle_is_found_wherever_it_is() -> None:
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b", "d"}, "d": set()}) == [["b", "c"]]
+    assert circles({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
 
 
 @pytest.mark.parametrize("stage", sorted(STAGES))

@@ -20,6 +20,7 @@ from runtime.commands.plan import plan
 from runtime.commands.record import record
 from runtime.commands.report import report
 from runtime.commands.run import run
+from runtime.commands.setup import setup
 from runtime.commands.solve import solve
 from runtime.commands.stability import stability
 from runtime.commands.status import status
@@ -36,6 +37,7 @@ app = typer.Typer(
 COMMANDS: tuple[Callable[..., None] | tuple[str, typer.Typer], ...] = (
     demo,
     run,
+    setup,
     solve,
     record,
     ("calibrate", calibrate_app),
@@ -62,7 +64,7 @@ for command in COMMANDS:
 
 def _tell_version(wanted: bool) -> None:
     if wanted:
-        from runtime.version import version
+        from runtime.support.version import version
 
         typer.echo(f"phasestack {version()}")
         raise typer.Exit

@@ -144,7 +144,8 @@ def robust(
     else:
         console = Console(highlight=False)
         for one in verdicts:
-            text = f"median {one.median_db:.1f}, 5th percentile {one.p5_db:.1f}, least {one.least_db:.1f} dB; above"
+            text = f"exact: median {one.median_db:.1f}, 5th percentile {one.p5_db:.1f}, least {one.least_db:.1f} dB; "
+            text += f"a pupil (1 mm): {one.expected_median_db:.1f}, {one.expected_p5_db:.1f} dB; above"
             text += f" {check.REFERENCE.name} on {one.beats_reference:.0%}; {len(one.failing)} fail"
             console.print(f"{Path(one.model).stem:12}{text}", style="red" if one.failing else None, soft_wrap=True)
             for outcome in (outcome for outcome in found if outcome.number in one.failing):
@@ -177,11 +178,11 @@ def _pairs_cache(seed: int) -> Path:
 
 def _print(record: dict[str, Any], out: Path | None) -> None:
     names = list(dict.fromkeys(name for entry in record["stages"] for name in entry["stage_ms"]))
-    columns = [*names, "frame ms", "PSNR dB", "2 mm off", "MiB"]
+    columns = [*names, "frame ms", "exact dB", "1 mm dB", "2 mm dB", "MiB"]
     print(f"{'':19}" + "".join(f"{column:>11}" for column in columns))
     for stages, method in zip(record["stages"], record["methods"], strict=True):
         numbers = [stages["stage_ms"].get(name, 0.0) for name in names]
-        numbers += [stages["total_ms"], method["psnr_db"], method["psnr_db_off_eye"]["2mm"], method["memory_mib"]]
+        numbers += [stages["total_ms"], method["psnr_db"], *method["expected_db"].values(), method["memory_mib"]]
         name = f"{stages['name']} {stages['width_px']}x{stages['height_px']}"
         print(f"{name:19}" + "".join(f"{number:11.1f}" for number in numbers))
     written = f"; written to {out}" if out else ""

@@ -31,7 +31,7 @@ def scene(
 
     Example: phasestack ctl scene demo
     """
-    from runtime.commands.names import scene_from_here
+    from runtime.daemon.names import scene_from_here
 
     tell({"command": "scene", "value": scene_from_here(name)}, config, socket)
 

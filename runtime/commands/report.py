@@ -61,10 +61,11 @@ def report(
     console.print(done.page.lead, soft_wrap=True)
     for result in sorted(done.record["methods"], key=lambda r: r["ms_p50"]):
         size = f"{result['width_px']}x{result['height_px']}"
-        shown = f"{result['psnr_db']:8.2f} dB{result['worst_eye_psnr_db']:8.2f} dB worst eye"
+        expected = "".join(f"{value:8.2f} dB at {sigma} mm" for sigma, value in result["expected_db"].items())
+        shown = f"{result['psnr_db']:8.2f} dB exact{expected}{result['worst_eye_psnr_db']:8.2f} dB worst eye"
         console.print(
             f"{result['name']:18}{size:>11}{result['ms_p50']:10.1f} ms"
-            f"{shown if result['trained'] else '  untrained: no picture':31}{result['memory_mib']:7.0f} MiB",
+            f"{shown if result['trained'] else '  untrained: no picture':73}{result['memory_mib']:7.0f} MiB",
             soft_wrap=True,
         )
     console.print(f"see {out / 'index.html'}")

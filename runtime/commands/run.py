@@ -2,11 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+
+def leave_at_once() -> None:
+    """End the process though a solver's call never returned: waiting for its thread would never end."""
+    import logging
+    import os
+    import sys
+
+    from runtime.support import logs
+
+    logging.getLogger("phasestack.run").warning("a call that never returned is left to the system")
+    logs.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(0)
 
 
 def run(
@@ -22,6 +39,7 @@ def run(
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
     scale: Annotated[float, typer.Option(min=0.05, max=2.0, help="panel resolution, times the configured one")] = 1.0,
     budget_ms: Annotated[float | None, typer.Option(min=0, help="time for a frame; picks model and size")] = None,
+    backend: Annotated[str | None, typer.Option(help="what surrounds the network: auto or opencv")] = None,
     keep_light: Annotated[
         int, typer.Option(min=0, help="with --out: every so many refreshes leave what the panels show; 0: none")
     ] = 0,
@@ -55,7 +73,9 @@ def run(
         from runtime.commands.record import refuse_target
 
         refuse_target(record, force=True, source="run", field="--record")
-    overrides = Overrides(replay=replay, headless=headless, scene=scene, model=model, budget_ms=budget_ms)
+    overrides = Overrides(
+        replay=replay, headless=headless, scene=scene, model=model, budget_ms=budget_ms, backend=backend
+    )
     summary = run_daemon(
         config,
         overrides,
@@ -68,5 +88,8 @@ def run(
         record=record,
         record_images=record_images,
     )
+    left_behind = summary.pop("left_behind", 0)
     if as_json:
         typer.echo(json.dumps(summary))
+    if left_behind:
+        leave_at_once()

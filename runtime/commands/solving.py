@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from runtime.config import ModelSettings, load_settings, load_stack
+from runtime.config import ModelSettings, Overrides, changed, load_settings, load_stack
 from runtime.content.base import ContentInfo
 from runtime.errors import InputError
 from runtime.evaluation.displayed import Look, Picture, displayed, expected_db
@@ -22,7 +22,7 @@ from runtime.optics.carried import intensities
 from runtime.optics.retina import as_codes
 from runtime.optics.stack import PanelStack
 from runtime.plan.planner import focused_part, observed
-from runtime.plan.planning import planned_predictor
+from runtime.plan.predictors import planned_predictor
 from runtime.plan.savings import Measured, Saving, network_items
 from runtime.records import F64, U8, PlanItem
 from runtime.support.artifacts import OutputFolder, in_8_bits, read_picture, write_json, write_png
@@ -46,11 +46,15 @@ class SolveRequest:
     repeat: int
     eye_sigma_mm: float
     config: Path | None
+    backend: str | None = None
+    no_plan: bool = False
 
 
 def solve_pair(request: SolveRequest) -> dict[str, Any]:
     """Layers, what the eyes see of them, and solve.json (design 5.2). Raises InputError."""
-    settings = load_settings(request.config)
+    settings = Overrides(backend=request.backend).applied(load_settings(request.config))
+    if request.no_plan:
+        settings = changed(settings, "plan", {"enabled": False}, source="--no-plan")
     model_settings = settings.model
     cv2.setNumThreads(model_settings.threads or -1)
     stored = [read_picture(path) for path in (request.left, request.right)]

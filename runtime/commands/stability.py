@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from runtime.records import F64
     from runtime.report.stability.calibration import Fit
 
 
@@ -15,10 +16,15 @@ def stability(
     out: Annotated[Path | None, typer.Option(help="folder for stability.json, the plots and index.html")] = None,
     full: Annotated[bool, typer.Option("--full", help="the long cases as well: minutes instead of seconds")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
+    record: Annotated[
+        Path | None,
+        typer.Option(help="write what cases come to as their limits: after a model changed"),
+    ] = None,
 ) -> None:
     """Try every numerical step on stiff and extreme cases, against references of 50 digits.
 
-    Exits with 1 where a case fails. Needs mpmath: pip install phasestack[test]
+    No case may be more than 5% worse than recorded, and impostors that solve nothing must fail most cases of their
+    stage. Exits with 1 where a case fails. Needs mpmath: pip install phasestack[test]
 
     Example: phasestack stability --out stability
     """
@@ -31,27 +37,31 @@ def stability(
     from runtime.report.machine import describe
     from runtime.report.progress import progress_bar
     from runtime.report.stability import suite
+    from runtime.report.stability.limits import load_limits, recorded
     from runtime.report.stability.page import stability_page, stages_of
     from runtime.support.artifacts import OutputFolder, to_json, write_json, write_text
 
     started = time.perf_counter()
-    trials = list(suite.every_trial(_fit(), checked_eyes, full=full))
+    limits = load_limits()
+    trials = list(suite.every_trial(_fits(), checked_eyes, full=full, limits=limits))
     with progress_bar("stability") as tell:
-        cases = suite.run(trials, progress=tell)
+        cases = suite.run(trials, limits=limits, progress=tell)
+    if record is not None:
+        write_text(record, recorded(trials, cases, limits))
     seconds = time.perf_counter() - started
     failed = [case for case in cases if not case.passed]
     machine = describe(seed=0, packages=("mpmath",))
-    record = {"cases": [asdict(case) for case in cases], "machine": machine, "seconds": round(seconds, 1)}
+    result = {"cases": [asdict(case) for case in cases], "machine": machine, "seconds": round(seconds, 1)}
     if out is not None:
         command = "phasestack stability" + (" --full" if full else "")
         page = stability_page(cases, machine=machine, seconds=seconds, command=command)
         with OutputFolder(out) as folder:
-            write_json(folder.staging / "stability.json", record)
+            write_json(folder.staging / "stability.json", result)
             write_text(folder.staging / "index.html", page.html())
             for figure in page.figures():
                 (folder.staging / f"{figure.name}.png").write_bytes(figure.png)
     if as_json:
-        print(to_json(record))
+        print(to_json(result))
     else:
         console = Console(highlight=False)
         for stage in stages_of(cases):
@@ -72,8 +82,20 @@ def stability(
         raise typer.Exit(1)
 
 
-def _fit() -> Fit:
-    """The calibration's closed form, with the scale of least squares."""
-    from calib.similarity import fit
+def _fits() -> dict[str, Fit]:
+    """The calibration's solvers, by their rules."""
+    from functools import partial
 
-    return lambda sensor_m, stack_m: fit(sensor_m, stack_m, rule="least-squares").matrix
+    from calib.robust import fit_robust
+    from calib.similarity import ScaleRule, fit
+
+    def matrix(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> F64:
+        return fit(sensor_m, stack_m, rule=rule).matrix
+
+    return {
+        "seed": partial(matrix, rule="seed"),
+        "least-squares": partial(matrix, rule="least-squares"),
+        "inverse": partial(matrix, rule="inverse"),
+        "fixed-scale": partial(matrix, rule=1.0),
+        "robust": lambda sensor_m, stack_m: fit_robust(sensor_m, stack_m).similarity.matrix,
+    }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
+from runtime.config import LimitSettings
 from runtime.content.ply import Table, read_vertices
 from runtime.errors import InputError
 from runtime.records import F32, F64
@@ -47,13 +47,12 @@ class Splats:
     opacities: F32  # (m,)
 
 
-def load_gaussians(path: Path, *, progress: Callable[[str], None] = lambda _: None) -> Gaussians:
+def load_gaussians(path: Path, *, limits: LimitSettings | None = None) -> Gaussians:
     """Read a splat file as the reference implementation writes it.
 
     Raises InputError: unreadable, a property missing, values that aren't finite, absurd scales.
     """
-    progress(f"reading {path.name}")
-    table = read_vertices(path)
+    table = read_vertices(path, limits=limits)
     names = set(table.dtype.names or ())
     rest = [name for name in names if name.startswith("f_rest_")]
     needed = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
@@ -72,7 +71,6 @@ def load_gaussians(path: Path, *, progress: Callable[[str], None] = lambda _: No
     def columns(prefix: str, count: int) -> F32:
         return _numbers(table, [f"{prefix}{index}" for index in range(count)], path, prefix.rstrip("_"))
 
-    progress(f"{len(table)} splats")
     centres = _numbers(table, ["x", "y", "z"], path, "x, y, z")
     away = np.abs(centres.astype(np.float64) - np.median(centres, axis=0)).max(1)
     stray = int((away > FARTHEST_RELATIVE * np.median(away)).sum()) if np.median(away) > 0 else 0

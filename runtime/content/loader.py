@@ -6,11 +6,13 @@ import threading
 from dataclasses import dataclass
 from typing import Any
 
-from runtime.config import ContentSettings
+from runtime.config import ContentSettings, LimitSettings
 from runtime.content.base import ContentSource
 from runtime.content.registry import Opener, prepare_content
 from runtime.errors import PhasestackError
 from runtime.optics.stack import PanelStack
+from runtime.support import progress
+from runtime.support.crash import written
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,11 +24,16 @@ class Loaded:
     problem: str = ""
 
 
+class _Overtaken(Exception):
+    """A newer request made this one needless."""
+
+
 class ContentLoader:
     """One request at a time; a newer one overtakes an older. `poll` belongs to the thread with the GL context."""
 
-    def __init__(self, stack: PanelStack) -> None:
-        self._stack = stack
+    def __init__(self, stack: PanelStack, *, limits: LimitSettings | None = None) -> None:
+        """limits: of what files may hold; None: the defaults."""
+        self._stack, self._limits = stack, limits
         self._lock = threading.Lock()
         self._wanted = 0
         self._result: tuple[int, str, Opener | None, str] | None = None
@@ -54,23 +61,27 @@ class ContentLoader:
         except PhasestackError as error:
             return Loaded(scene, None, str(error))
         except Exception as error:  # a GL driver's or a library's own: the present scene goes on
-            return Loaded(scene, None, f"{scene}: {type(error).__name__}: {error}")
+            return Loaded(scene, None, f"{scene}: {written(error)}")
 
     def _load(self, number: int, settings: ContentSettings) -> None:
         opener: Opener | None = None
         problem = ""
 
-        def tell(text: str) -> None:
+        def tell(what: str, done: int, total: int | None) -> None:
             with self._lock:
-                if number == self._wanted:
-                    self.progress = text
+                if number != self._wanted:
+                    raise _Overtaken
+                self.progress = f"{what}: {done} of {total}" if total else f"{what}: {done}" if done else what
 
         try:
-            opener = prepare_content(settings, self._stack, progress=tell)
+            with progress.listening(tell):
+                opener = prepare_content(settings, self._stack, limits=self._limits)
+        except _Overtaken:
+            return
         except PhasestackError as error:
             problem = str(error)
         except Exception as error:  # whatever a file provokes in a loader, the loop goes on
-            problem = f"{settings.scene}: {type(error).__name__}: {error}"
+            problem = f"{settings.scene}: {written(error)}"
         with self._lock:
             if number == self._wanted:
                 self._result = (number, settings.scene, opener, problem)

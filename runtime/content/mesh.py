@@ -4,25 +4,28 @@ from __future__ import annotations
 
 import importlib.util
 import io
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
-from PIL import Image
 
+from runtime.config import LimitSettings
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.camera import PixelBox
+from runtime.content.gltf_header import check_gltf, file_of
+from runtime.content.ply import check_counts
 from runtime.content.shapes import Shape
 from runtime.content.triangles import Part, ReadyPart, TrianglePainter
-from runtime.errors import InputError, MissingPart
+from runtime.errors import InputError, MissingPart, one_line
 from runtime.records import F64, U8
+from runtime.support import foreign, progress
+from runtime.support.picture_header import check_picture
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
 LARGEST_TEXTURE_PX = 4096
+LIBRARY_BYTES_MAX = 16 << 20  # of an OBJ's materials
 LARGEST_COORDINATE = 1e15  # products of three still fit in float32's range
 
 
@@ -36,38 +39,72 @@ class MeshData:
     high: F64
 
 
-def load_mesh(path: Path) -> MeshData:
-    """Read a file. Raises InputError: unreadable, no faces, NaN vertices, a texture missing."""
+def load_mesh(path: Path, *, limits: LimitSettings | None = None) -> MeshData:
+    """Read a file. Raises InputError: unreadable, over a limit, no faces, NaN vertices, a texture missing."""
     if importlib.util.find_spec("trimesh") is None:
         raise MissingPart("meshes need trimesh: pip install trimesh")
-    if not path.is_file():
-        raise InputError(path, "", "is not there")
-    _refuse_what_loaders_hide(path)
+    limits = limits or LimitSettings()
+    progress.tell(f"reading {path.name}", 0)
+    data = foreign.read_bytes(path, most_bytes=round(limits.file_mib * foreign.MIB))
+    _refuse_what_loaders_hide(path, data, limits)
+    progress.tell(f"{path.name}: triangles", 0)
     try:
         with np.errstate(all="ignore"):  # coordinates beyond any scene overflow in the loader; they are told below
-            geometries: list[Any] = list(_scene(path).dump())
+            geometries: list[Any] = list(_scene(path, data, limits).dump())
+    except InputError:
+        raise
     except Exception as error:  # loaders raise whatever their parsers do
-        raise InputError(path, "", f"cannot be read as a mesh ({type(error).__name__}: {str(error)[:120]})") from None
+        problem = one_line(str(error), most=120)
+        raise InputError(path, "", f"cannot be read as a mesh ({type(error).__name__}: {problem})") from None
     meshes = [item for item in geometries if getattr(item, "faces", None) is not None and len(item.faces)]
     if not meshes:
         raise InputError(path, "faces", "there are none")
     pictures: dict[int, U8] = {}
-    parts = tuple(_part(mesh, path, pictures) for mesh in meshes)
+    parts = []
+    for number, mesh in enumerate(meshes):
+        progress.tell(f"{path.name}: parts", number, len(meshes))
+        parts.append(_part(mesh, path, pictures))
     if not any(_has_area(part.shape) for part in parts):
         raise InputError(path, "faces", "none has an area")
     corners = np.array([bound(part.shape.positions_m, axis=0) for part in parts for bound in (np.min, np.max)])
-    return MeshData(path.stem, parts, corners.min(0).astype(np.float64), corners.max(0).astype(np.float64))
+    return MeshData(path.stem, tuple(parts), corners.min(0).astype(np.float64), corners.max(0).astype(np.float64))
 
 
-def _scene(path: Path) -> Any:
+def _scene(path: Path, data: bytes, limits: LimitSettings) -> Any:
     import trimesh
 
-    if path.suffix.lower() != ".obj":
-        return trimesh.load_scene(path, process=False)
+    kind = path.suffix.lower().removeprefix(".")
     # Of an OBJ only names and comments can be other than ASCII, and exporters differ in how they write them.
-    text = path.read_text(encoding="utf-8", errors="replace")
-    resolver = trimesh.resolvers.FilePathResolver(str(path))
-    return trimesh.load_scene(io.StringIO(text), file_type="obj", resolver=resolver, process=False)
+    file = io.StringIO(data.decode("utf-8", errors="replace")) if kind == "obj" else io.BytesIO(data)
+    return trimesh.load_scene(file, file_type=kind, resolver=_resolver(path, limits), process=False)
+
+
+def _resolver(path: Path, limits: LimitSettings) -> Any:
+    """What a loader reads beside a file: regular files there, within the limit."""
+    import trimesh
+
+    class Beside(trimesh.resolvers.Resolver):
+        def __init__(self) -> None:
+            pass
+
+        def get(self, name: str) -> bytes:
+            beside = file_of(name, source=path, field="texture")
+            if beside is None:
+                raise InputError(path, "texture", "data in place of a name")
+            return foreign.read_bytes(
+                beside, most_bytes=round(limits.file_mib * foreign.MIB), source=path, field="texture"
+            )
+
+        def write(self, name: str, data: Any) -> None:
+            raise NotImplementedError  # only exporters do
+
+        def namespaced(self, namespace: str) -> Any:
+            return self
+
+        def keys(self) -> list[str]:
+            return []
+
+    return Beside()
 
 
 def _has_area(shape: Shape) -> bool:
@@ -77,13 +114,15 @@ def _has_area(shape: Shape) -> bool:
 
 def _part(mesh: Any, path: Path, pictures: dict[int, U8]) -> Part:
     vertices = np.asarray(mesh.vertices)
+    faces = np.asarray(mesh.faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise InputError(path, "vertices", f"have {vertices.shape[-1]} coordinates and faces {faces.shape[-1]} corners")
     if not np.isfinite(vertices).all():
         broken = int((~np.isfinite(vertices).all(1)).sum())
         raise InputError(path, "vertices", f"{broken} of {len(vertices)} are not finite")
     huge = int((np.abs(vertices) > LARGEST_COORDINATE).any(1).sum())
     if huge:
         raise InputError(path, "vertices", f"{huge} of {len(vertices)} are beyond {LARGEST_COORDINATE:g}")
-    faces = np.asarray(mesh.faces)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(path, "faces", "refer to vertices that are not there")
     uv, picture, colour, colours = None, None, (1.0, 1.0, 1.0), None
@@ -139,72 +178,51 @@ def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, tuple[
     return pictures[id(image)], colour  # type: ignore[return-value]
 
 
-def _refuse_what_loaders_hide(path: Path) -> None:
+def _refuse_what_loaders_hide(path: Path, data: bytes, limits: LimitSettings) -> None:
     """The loader passes over textures that aren't there or aren't pictures, and over an OBJ's broken numbers."""
     suffix = path.suffix.lower()
-    wanted = _of_gltf(path) if suffix == ".gltf" else _of_obj(path) if suffix == ".obj" else []
-    for name in wanted:
-        picture = path.parent / name
-        if not picture.is_file():
-            raise InputError(path, "texture", f"{name} is not there")
-        try:
-            with Image.open(picture) as image:
-                image.load()
-        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
-            raise InputError(path, "texture", f"{name} is not an image that can be decoded") from None
-
-
-def _of_gltf(path: Path) -> list[str]:
-    """Names of the picture files; the buffers' are checked. Raises InputError."""
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(path, "", f"malformed: {error}") from None
-    if not isinstance(table, dict):
-        raise InputError(path, "", "malformed: a glTF file is a JSON object")
-    for index, buffer in enumerate(_objects(table, "buffers", path)):
-        name, wanted = _file_of(buffer), buffer.get("byteLength", 0)
-        held = path.parent / name
-        if name and not held.is_file():
-            raise InputError(path, f"buffers[{index}].uri", f"{name} is not there")
-        if name and isinstance(wanted, int) and held.stat().st_size < wanted:
-            raise InputError(
-                path, f"buffers[{index}].byteLength", f"{name} holds {held.stat().st_size} bytes, not {wanted}"
+    if suffix in (".gltf", ".glb"):
+        check_gltf(path, data, limits=limits)
+    elif suffix == ".ply":
+        check_counts(path, data, limits=limits)
+    elif suffix == ".obj":
+        for name in _of_obj(path, data, limits):
+            picture = file_of(name, source=path, field="texture")
+            if picture is None or not picture.is_file():
+                raise InputError(path, "texture", f"{foreign.shown(name, most=200)} is not there")
+            held = foreign.read_bytes(
+                picture, most_bytes=round(limits.file_mib * foreign.MIB), source=path, field="texture"
             )
-    return [name for image in _objects(table, "images", path) if (name := _file_of(image))]
+            check_picture(held, source=path, field="texture", name=foreign.shown(name, most=200), limits=limits)
 
 
-def _objects(table: dict[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
-    items = table.get(key, [])
-    if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
-        raise InputError(path, key, "must be a list of objects")
-    return items
-
-
-def _file_of(item: dict[str, Any]) -> str:
-    """The file that a glTF object refers to; empty where its data are inside."""
-    uri = str(item.get("uri", ""))
-    return "" if uri.startswith("data:") else unquote(uri)
-
-
-def _of_obj(path: Path) -> list[str]:
+def _of_obj(path: Path, data: bytes, limits: LimitSettings) -> list[str]:
     """Names of the picture files of its materials. Raises InputError."""
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = data.decode("utf-8", errors="replace").splitlines()
     positions = [line for line in lines if line.startswith("v ")]
     broken = sum("nan" in line.lower() or "inf" in line.lower() for line in positions)
     if broken:
         raise InputError(path, "vertices", f"{broken} of {len(positions)} are not finite")
+    foreign.within(len(positions), 3 * limits.triangles, source=path, field="v", limit="3 for each of limits.triangles")
+    triangles = 0
     for line in lines:
+        if not line.startswith("f "):
+            continue
+        corners = line.split()[1:]
+        triangles += max(len(corners) - 2, 0)
         # The loader takes a 0 for the last vertex; the format counts from 1, or from -1 backwards.
-        if line.startswith("f ") and any(corner.split("/")[0] == "0" for corner in line.split()[1:]):
+        if any(corner.split("/")[0] == "0" for corner in corners):
             raise InputError(path, "faces", "refer to vertex 0; the first is 1")
+    foreign.within(triangles, limits.triangles, source=path, field="f", limit="limits.triangles")
     wanted = []
     for line in lines:
         if line.startswith("mtllib "):
-            library = path.parent / line.split(maxsplit=1)[1].strip()
-            if not library.is_file():
-                raise InputError(path, "mtllib", f"{library.name} is not there")
-            text = library.read_text(encoding="utf-8", errors="replace").splitlines()
+            name = line.split(maxsplit=1)[1].strip()
+            library = file_of(name, source=path, field="mtllib")
+            if library is None or not library.exists():
+                raise InputError(path, "mtllib", f"{foreign.shown(name, most=200)} is not there")
+            held = foreign.read_bytes(library, most_bytes=LIBRARY_BYTES_MAX, source=path, field="mtllib")
+            text = held.decode("utf-8", errors="replace").splitlines()
             wanted += [item.split(maxsplit=1)[1].strip() for item in map(str.strip, text) if _names_texture(item)]
     return wanted
 

@@ -10,21 +10,31 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from PIL import Image
 
 from runtime.clock import NS_PER_S
-from runtime.config import ContentSettings
+from runtime.config import ContentSettings, LimitSettings
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.images import WarpedPicture, rgba_from_rgb
 from runtime.errors import ContentFailure, InputError
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import U8
+from runtime.support import foreign, progress
 from runtime.support.artifacts import read_image
+from runtime.support.picture_header import check_size, size_of_file
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEOS = (".mp4", ".mkv", ".avi", ".mov", ".webm", ".m4v")
-QUILT_NAME = re.compile(r"_qs(\d+)x(\d+)")
+QUILT_NAME = re.compile(r"_qs([0-9]+)x([0-9]+)")
+TELL_EVERY = 64
+CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
+VIDEO_FRAMES_MAX = 1e8
+VIDEO_PROPERTIES = (
+    cv2.CAP_PROP_FRAME_COUNT,
+    cv2.CAP_PROP_FPS,
+    cv2.CAP_PROP_FRAME_WIDTH,
+    cv2.CAP_PROP_FRAME_HEIGHT,
+)
 
 
 def layout_of(path: Path, settings: ContentSettings) -> str:
@@ -91,13 +101,16 @@ class Picture(Frames):
 
 
 class PictureFolder(Frames):
-    """The pictures of a folder in the order of their names."""
+    """The pictures of a folder in the order of their names, turned as their EXIF says."""
 
-    def __init__(self, paths: Sequence[Path], *, rate_hz: float) -> None:
+    def __init__(self, paths: Sequence[Path], *, rate_hz: float, limits: LimitSettings) -> None:
         self._paths = list(paths)
+        size_of_file(self._paths[0], limits=limits)  # before it is unpacked
         self._shape = read_image(self._paths[0]).shape
-        for path in self._paths[1:]:
-            _refuse_other_size(path, self._shape)
+        for number, path in enumerate(self._paths[1:], start=1):
+            if number % TELL_EVERY == 0:
+                progress.tell(f"{path.parent.name}: pictures", number, len(self._paths))
+            _refuse_other_size(path, self._shape, limits)
         self.count, self.rate_hz = len(self._paths), rate_hz
 
     def frame(self, index: int) -> U8:
@@ -110,13 +123,9 @@ class PictureFolder(Frames):
         return picture
 
 
-def _refuse_other_size(path: Path, shape: tuple[int, ...]) -> None:
+def _refuse_other_size(path: Path, shape: tuple[int, ...], limits: LimitSettings) -> None:
     """Reads the header alone: a long sequence opens quickly. Raises InputError."""
-    try:
-        with Image.open(path) as image:
-            width, height = image.size
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
-        raise InputError(path, "", "is not an image that can be decoded") from None
+    width, height = size_of_file(path, limits=limits)
     if (height, width) != shape[:2]:
         raise InputError(
             path, "size", f"{width} x {height} pixels; the folder's first picture has {shape[1]} x {shape[0]}"
@@ -126,6 +135,8 @@ def _refuse_other_size(path: Path, shape: tuple[int, ...]) -> None:
 def _opened(path: Path) -> cv2.VideoCapture:
     """A video by FFmpeg alone, whose complaints and OpenCV's stay off stderr: our own line names the file."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    # A playlist under a video's name would make FFmpeg open other files, and connections.
+    os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", f"protocol_whitelist;file|format_whitelist;{CONTAINERS}")
     level = cv2.utils.logging.setLogLevel(0)
     try:
         return cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
@@ -136,16 +147,21 @@ def _opened(path: Path) -> cv2.VideoCapture:
 class Video(Frames):
     """A video file, read by OpenCV as it goes."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, limits: LimitSettings) -> None:
         self._path = path
+        foreign.open_regular(path).close()
         self._capture = _opened(path)
         if not self._capture.isOpened():
             raise InputError(path, "", "is not a video that can be decoded")
-        self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        self.rate_hz = float(self._capture.get(cv2.CAP_PROP_FPS))
-        if self.count < 1 or not 0.1 < self.rate_hz < 1000:
+        try:
+            count, self.rate_hz, width, height = (float(self._capture.get(key)) for key in VIDEO_PROPERTIES)
+            if not (1 <= count <= VIDEO_FRAMES_MAX and 0.1 < self.rate_hz < 1000):
+                raise InputError(path, "frames", f"{count:g} at {self.rate_hz:g} Hz cannot be played")
+            check_size(round(width), round(height), source=path, limits=limits)
+        except BaseException:
             self._capture.release()
-            raise InputError(path, "frames", f"{self.count} at {self.rate_hz:g} Hz cannot be played")
+            raise
+        self.count = int(count)
         self._next = 0
         self._last: U8 = np.empty((0, 0, 3), np.uint8)
         self.frame(0)
@@ -173,16 +189,18 @@ class Video(Frames):
         self._capture.release()
 
 
-def open_frames(path: Path, settings: ContentSettings) -> Frames:
+def open_frames(path: Path, settings: ContentSettings, *, limits: LimitSettings | None = None) -> Frames:
     """A picture, a video, or a folder of pictures. Raises InputError."""
+    limits = limits or LimitSettings()
     if path.is_dir():
         paths = sorted(item for item in path.iterdir() if item.suffix.lower() in PICTURES)
         if not paths:
             raise InputError(path, "", "the folder holds no pictures")
-        return PictureFolder(paths, rate_hz=settings.picture_rate_hz)
-    if not path.is_file():
-        raise InputError(path, "", "is not there")
-    return Video(path) if path.suffix.lower() in VIDEOS else Picture(read_image(path))
+        return PictureFolder(paths, rate_hz=settings.picture_rate_hz, limits=limits)
+    if path.suffix.lower() in VIDEOS:
+        return Video(path, limits=limits)
+    size_of_file(path, limits=limits)
+    return Picture(read_image(path))
 
 
 def split(rgb: U8, layout: str, quilt: tuple[int, int] = (1, 1)) -> list[U8]:

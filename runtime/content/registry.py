@@ -7,31 +7,44 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from runtime.config import ContentSettings
+from runtime.config import ContentSettings, LimitSettings
 from runtime.content.base import ContentSource
 from runtime.content.presets import Preset, preset, preset_names
 from runtime.content.scenes import SCENES
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
+from runtime.support import foreign, progress
 
 MESHES = (".glb", ".gltf", ".obj")
 Opener = Callable[[Any], ContentSource]
-Progress = Callable[[str], None]
 
 
-def open_content(settings: ContentSettings, stack: PanelStack, context: Any) -> ContentSource:
+def open_content(
+    settings: ContentSettings, stack: PanelStack, context: Any, *, limits: LimitSettings | None = None
+) -> ContentSource:
     """The source of `settings.scene`: a built-in scene, a preset, `external`, a file or a folder.
 
     context: the moderngl context of the thread that will call `render`. Raises InputError, naming file and field.
     """
-    return prepare_content(settings, stack)(context)
+    return prepare_content(settings, stack, limits=limits)(context)
 
 
-def prepare_content(settings: ContentSettings, stack: PanelStack, *, progress: Progress = lambda _: None) -> Opener:
+def prepare_content(settings: ContentSettings, stack: PanelStack, *, limits: LimitSettings | None = None) -> Opener:
     """Read and check what `settings.scene` names; the answer makes the source on the thread that has the context.
 
-    This is the slow part and needs no GL: it may run on any thread. Raises InputError, naming file and field.
+    This is the slow part and needs no GL: it may run on any thread. It tells `runtime.support.progress` how far it is.
+    limits: of what files may hold; None: the defaults. Raises InputError, naming file and field.
     """
+    limits = limits or LimitSettings()
+    with progress.task(f"loading {settings.scene}", seconds=limits.load_s, too_slow=_too_slow(settings.scene, limits)):
+        return _prepared(settings, stack, limits)
+
+
+def _too_slow(scene: str, limits: LimitSettings) -> InputError:
+    return InputError(scene, "", f"takes longer to load than {limits.load_s:g} s (limits.load_s)")
+
+
+def _prepared(settings: ContentSettings, stack: PanelStack, limits: LimitSettings) -> Opener:
     name = settings.scene
     if name in SCENES:
         return _built_in(name, settings, stack)
@@ -40,35 +53,36 @@ def prepare_content(settings: ContentSettings, stack: PanelStack, *, progress: P
     if name in preset_names():
         chosen = preset(name, settings.reading)
         if settings.file:
-            return _from_path(Path(settings.file), settings, stack, chosen, progress)
+            return _from_path(Path(settings.file), settings, stack, chosen, limits)
         return _stand_in(name, settings, stack)
-    path = Path(name)
+    path = foreign.checked_path(name, source="content", field="scene")
     if not path.exists():
         known = ", ".join((*SCENES, *preset_names(), "external"))
         raise InputError("content", "scene", f"`{name}` is neither a file or folder nor one of {known}")
-    return _from_path(path, settings, stack, None, progress)
+    return _from_path(path, settings, stack, None, limits)
 
 
 def _from_path(
-    path: Path, settings: ContentSettings, stack: PanelStack, chosen: Preset | None, progress: Progress
+    path: Path, settings: ContentSettings, stack: PanelStack, chosen: Preset | None, limits: LimitSettings
 ) -> Opener:
+    foreign.checked_path(path, source="content", field="file")
     if not path.exists():
         raise InputError(path, "", "is not there")
-    progress(f"loading {path.name}")
+    progress.tell(f"loading {path.name}", 0)
     suffix = path.suffix.lower()
     if path.is_dir():
         from runtime.content.eyereal import is_data_set
 
         if is_data_set(path):
             return _eyereal(path, settings, chosen)
-        return _pictures(path, settings, stack)
+        return _pictures(path, settings, stack, limits)
     if suffix in MESHES:
-        return _mesh(path, settings, stack, chosen)
+        return _mesh(path, settings, stack, chosen, limits)
     if suffix == ".ply":
         if _holds_splats(path):
-            return _splat(path, settings, stack, chosen, progress)
-        return _mesh(path, settings, stack, chosen)
-    return _pictures(path, settings, stack)
+            return _splat(path, settings, stack, chosen, limits)
+        return _mesh(path, settings, stack, chosen, limits)
+    return _pictures(path, settings, stack, limits)
 
 
 def _built_in(name: str, settings: ContentSettings, stack: PanelStack) -> Opener:
@@ -118,11 +132,11 @@ def _eyereal(path: Path, settings: ContentSettings, chosen: Preset | None) -> Op
     return lambda context: source
 
 
-def _pictures(path: Path, settings: ContentSettings, stack: PanelStack) -> Opener:
+def _pictures(path: Path, settings: ContentSettings, stack: PanelStack, limits: LimitSettings) -> Opener:
     from runtime.content.pictures import ScreenPictures, layout_of, open_frames, quilt_size
 
     layout = layout_of(path, settings)
-    frames = open_frames(path, settings)
+    frames = open_frames(path, settings, limits=limits)
     if layout == "rgbd":
         first = frames.frame(0)
 
@@ -144,13 +158,18 @@ def _pictures(path: Path, settings: ContentSettings, stack: PanelStack) -> Opene
     return lambda context: source
 
 
-def _mesh(path: Path, settings: ContentSettings, stack: PanelStack, chosen: Preset | None) -> Opener:
+def _mesh(
+    path: Path, settings: ContentSettings, stack: PanelStack, chosen: Preset | None, limits: LimitSettings
+) -> Opener:
     from runtime.content.mesh import MeshSource, load_mesh
     from runtime.content.placing import stack_from_scene
     from runtime.content.triangles import ready
 
-    data = load_mesh(path)
-    parts = [ready(part, samples=settings.samples) for part in data.parts]
+    data = load_mesh(path, limits=limits)
+    parts = []
+    for number, part in enumerate(data.parts):
+        progress.tell(f"{path.name}: outlines", number, len(data.parts))
+        parts.append(ready(part, samples=settings.samples))
     matrix = stack_from_scene(
         data.low,
         data.high,
@@ -170,7 +189,7 @@ def _mesh(path: Path, settings: ContentSettings, stack: PanelStack, chosen: Pres
 
 
 def _splat(
-    path: Path, settings: ContentSettings, stack: PanelStack, chosen: Preset | None, progress: Progress
+    path: Path, settings: ContentSettings, stack: PanelStack, chosen: Preset | None, limits: LimitSettings
 ) -> Opener:
     import numpy as np
 
@@ -178,7 +197,7 @@ def _splat(
     from runtime.content.placing import stack_from_scene
     from runtime.content.splat import SplatSource
 
-    gaussians = load_gaussians(path, progress=progress)
+    gaussians = load_gaussians(path, limits=limits)
     # A few stray splats must not decide the scale.
     low, high = np.percentile(gaussians.centres.astype(np.float64), [1, 99], axis=0)
     matrix = stack_from_scene(
@@ -196,6 +215,6 @@ def _splat(
 
 def _holds_splats(path: Path) -> bool:
     """True where a PLY's header has a splat's properties."""
-    with path.open("rb") as file:
+    with foreign.open_regular(path) as file:
         head = file.read(8192)
     return any(mark in head for mark in (b" f_dc_0", b" scale_0", b" rot_0"))

@@ -63,10 +63,11 @@ class SplatSource(ContentSource):
         self._corners = np.empty((count, 4, FLOATS), np.float32)
         self._buffer = context.buffer(reserve=max(self._corners.nbytes, 1), dynamic=True)
         quads = np.arange(count, dtype=np.int32)[:, None] * 4 + np.array([0, 1, 2, 2, 1, 3], np.int32)
+        self._quads = context.buffer(np.ascontiguousarray(quads).tobytes())
         self._vertices = context.vertex_array(
             self._program,
             [(self._buffer, "2f 2f 4f", "in_place", "in_deviations", "in_colour")],
-            index_buffer=context.buffer(np.ascontiguousarray(quads).tobytes()),
+            index_buffer=self._quads,
         )
         x = np.percentile(self._gaussians.centres[:, 0], [1, 99])
         self.info = ContentInfo(
@@ -92,7 +93,7 @@ class SplatSource(ContentSource):
 
     def close(self) -> None:
         self._canvas.close()
-        for held in (self._vertices, self._buffer, self._program):
+        for held in (self._vertices, self._buffer, self._quads, self._program):
             held.release()
 
     def _prepare(self, view: View) -> int:

@@ -142,6 +142,7 @@ def ready(part: Part, *, samples: int = 0) -> ReadyPart:
 class _Uploaded:
     part: Part
     surface: Any
+    surface_buffers: tuple[Any, ...]  # vertices, triangles: a vertex array does not release them
     outline: Any
     outline_buffer: Any
     edges: Edges | None
@@ -218,7 +219,7 @@ class TrianglePainter:
         """Release every GL object. May be called twice."""
         self._canvas.close()
         for item in self._parts:
-            for held in (item.surface, item.outline, item.outline_buffer):
+            for held in (item.surface, *item.surface_buffers, item.outline, item.outline_buffer):
                 held.release()
         for shared in (*self._textures.values(), *self._programs.values()):
             shared.release()
@@ -228,10 +229,11 @@ class TrianglePainter:
         part, features, context = prepared.part, prepared.features, self._context
         surface_program, outline_program = self._program(features), self._program((*features, "OUTLINE"))
         triangles = context.buffer(np.ascontiguousarray(part.shape.triangles, np.int32))
+        vertices = context.buffer(prepared.packed)
         names = ("in_normal", "in_uv", "in_colour")
         surface = context.vertex_array(
             surface_program,
-            [_layout(surface_program, context.buffer(prepared.packed), ("in_position", *names), (3, 3, 2, 3))],
+            [_layout(surface_program, vertices, ("in_position", *names), (3, 3, 2, 3))],
             index_buffer=triangles,
         )
         edges = prepared.edges
@@ -240,6 +242,7 @@ class TrianglePainter:
         return _Uploaded(
             part=part,
             surface=surface,
+            surface_buffers=(vertices, triangles),
             outline=context.vertex_array(outline_program, [layout]),
             outline_buffer=buffer,
             edges=edges,

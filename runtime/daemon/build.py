@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock, SimulatedClock
 from runtime.config import Settings
 from runtime.records import RefreshAccount
-from runtime.support.priority import PRESENTER_NICENESS, set_niceness
+from runtime.support.priority import PRESENTER_NICENESS, niceness
 
 if TYPE_CHECKING:
     from runtime.blackbox.recorder import Recorder
@@ -192,7 +192,7 @@ def build_run(
         in_stack_frame = driver.capabilities.in_stack_frame
         recorder.watches(presenter, stack=stack, simulated=simulated, in_stack_frame=in_stack_frame)
     if not simulated:
-        set_niceness(PRESENTER_NICENESS)  # this thread's, once all others have been started
+        cleanup.enter_context(niceness(PRESENTER_NICENESS))  # this thread's, once all others have been started
     return Run(presenter, observer, solver, lambda: _newest(maker), simulated)
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from runtime.clock import NS_PER_S, MonotonicClock
+from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
 
 log = logging.getLogger("phasestack.service")
 
@@ -118,6 +119,7 @@ class RequestServer:
             self._thread.join(timeout=2.0)
 
     def _run(self) -> None:
+        set_niceness(BACKGROUND_NICENESS)
         try:
             while not self._stopping.is_set():
                 try:

@@ -12,19 +12,20 @@ from typing import Any
 from runtime.blackbox.location import black_box_folder
 from runtime.blackbox.recorder import MIB, Plan, Recorder
 from runtime.clock import NS_PER_MS, MonotonicClock
-from runtime.commands.names import scene_names
-from runtime.commands.running import drive, print_summary
 from runtime.config import Overrides, Settings, load_settings
 from runtime.daemon.build import Run, RunOptions
 from runtime.daemon.commands import Command
+from runtime.daemon.drive import drive, print_summary
+from runtime.daemon.names import scene_names
 from runtime.daemon.notify import Notifier
 from runtime.daemon.reconfigure import Reconfiguration
 from runtime.daemon.server import StatusServer, open_status_server
 from runtime.daemon.signals import Signals
-from runtime.errors import PhasestackError, Stopped, one_line
+from runtime.errors import InputError, PanelLost, PhasestackError, Stopped, TransientError, one_line
 from runtime.frame.presenter import Presenter
-from runtime.records import RefreshAccount
+from runtime.records import RefreshAccount, State
 from runtime.support import logs
+from runtime.support.transient import MayPass, may_pass
 from runtime.version import version
 
 log = logging.getLogger("phasestack.daemon")
@@ -103,15 +104,21 @@ class Daemon:
             return False
         log.warning("waiting for a panel: %s", why)
         self._notifier.extend_start(START_EXTENSION_S)
-        self._notifier.status(f"starting (waiting for a panel: {why})")
+        self._tell_start(f"waiting for a panel: {why}")
         time.sleep(PANEL_RETRY_S)
         return not self._signals.stop
 
     def starting(self, doing: str) -> bool:
         """Something before the first frame takes long: ask for more time. False: told to stop."""
         self._notifier.extend_start(START_EXTENSION_S)
-        self._notifier.status(f"starting ({doing})")
+        self._tell_start(doing)
         return not self._signals.stop
+
+    def _tell_start(self, doing: str) -> None:
+        """Before the first refresh there is no account yet, but a reason."""
+        self._notifier.status(f"starting ({doing})")
+        if self._server is not None:
+            self._server.publish(lambda: {"state": str(State.STARTING), "reason": doing})
 
     def _loading(self) -> dict[str, str]:
         """What is being loaded, and why the last change was refused; for the status."""
@@ -318,7 +325,30 @@ def run_daemon(
     record: Path | None = None,
     record_images: bool = False,
 ) -> dict[str, Any]:
-    """The whole life of `phasestack run`; answers the summary. Raises FatalError."""
+    """The whole life of `phasestack run`; answers the summary.
+
+    Raises FatalError where the configuration or a file is wrong, TransientError where starting again may help.
+    """
+    try:
+        options = RunOptions(max_speed, out is not None, scale, keep_light)
+        return _lived(config, overrides, frames, options, out, quiet, record=record, record_images=record_images)
+    except Exception as error:
+        if isinstance(error, TransientError) or not may_pass(error):
+            raise
+        raise MayPass(f"{error or type(error).__name__} (this may pass: start again)") from error
+
+
+def _lived(
+    config: Path | None,
+    overrides: Overrides,
+    frames: int | None,
+    options: RunOptions,
+    out: Path | None,
+    quiet: bool,
+    *,
+    record: Path | None,
+    record_images: bool,
+) -> dict[str, Any]:
     settings = overrides.applied(load_settings(config))
     logs.configure(settings.service)
     clock = MonotonicClock()
@@ -327,18 +357,16 @@ def run_daemon(
         notifier = Notifier(clock)
         cleanup.callback(notifier.close)
         server = (
-            None if max_speed else open_status_server(settings.service, clock=clock, supervised=notifier.supervised)
+            None
+            if options.max_speed
+            else open_status_server(settings.service, clock=clock, supervised=notifier.supervised)
         )
         if server is not None:
             cleanup.callback(server.close)
-        metrics = None
-        if settings.service.metrics_port:
-            from runtime.daemon.metrics import Metrics
-
-            metrics = Metrics()
-            metrics.serve(settings.service.metrics_port)
-            cleanup.callback(metrics.close)
-        recorder = cleanup.enter_context(_recorder(settings, simulated=max_speed, record=record, images=record_images))
+        metrics = _metrics(settings.service.metrics_port, cleanup)
+        recorder = cleanup.enter_context(
+            _recorder(settings, simulated=options.max_speed, record=record, images=record_images)
+        )
         daemon = Daemon(
             config, overrides, signals=signals, notifier=notifier, server=server, metrics=metrics, recorder=recorder
         )
@@ -351,11 +379,11 @@ def run_daemon(
         try:
             summary = drive(
                 settings,
-                RunOptions(max_speed=max_speed, measure=out is not None, scale=scale, keep_light=keep_light),
+                options,
                 out=out,
                 frames=frames,
                 total=frames,
-                progress=max_speed and not quiet,
+                progress=options.max_speed and not quiet,
                 supervisor=daemon,
                 wait_for_panels=daemon.wait_for_panels,
                 on_start=daemon.starting,
@@ -364,8 +392,28 @@ def run_daemon(
             )
         except Stopped as reason:
             summary = {"stopped": str(reason)}
+        except PanelLost:
+            if not signals.stop:
+                raise
+            summary = {"stopped": daemon.stop_reason()}  # told so while it waited for a panel
         notifier.stopping(summary["stopped"])
     log.info("stopped: %s", summary["stopped"])
     if not quiet and not notifier.supervised and "frames" in summary:
         print_summary(summary, out)
     return summary
+
+
+def _metrics(port: int, cleanup: ExitStack) -> Any | None:
+    """None where they are off, or can't be served: the display does not go dark for its figures."""
+    if not port:
+        return None
+    from runtime.daemon.metrics import Metrics
+
+    metrics = Metrics()
+    try:
+        metrics.serve(port)
+    except InputError as error:
+        log.error("no metrics: %s", error)
+        return None
+    cleanup.callback(metrics.close)
+    return metrics

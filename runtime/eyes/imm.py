@@ -130,17 +130,14 @@ def deviation(models: tuple[Model, ...], ahead_s: float, *, acceleration: Sequen
 
     The mixture's: each model's own variance carried on, and the spread of what they predict (shared among the axes).
     """
-    x, y, z = (
-        sum(m.weight * (place + speed * ahead_s) for m, place, speed in zip(models, places, speeds))
-        for places, speeds in (
-            ([m.x for m in models], [m.u for m in models]),
-            ([m.y for m in models], [m.v for m in models]),
-            ([m.z for m in models], [m.w for m in models]),
-        )
-    )
-    variance = 0.0
-    for m, q in zip(models, acceleration):
+    x = y = z = 0.0
+    ahead = []
+    for m in models:
+        place = m.x + m.u * ahead_s, m.y + m.v * ahead_s, m.z + m.w * ahead_s
+        ahead.append(place)
+        x, y, z = x + m.weight * place[0], y + m.weight * place[1], z + m.weight * place[2]
+    variance = VARIANCE_FLOOR
+    for m, q, (px, py, pz) in zip(models, acceleration, ahead):
         own = m.var_position + ahead_s * (2 * m.covariance + ahead_s * (m.var_velocity + q * ahead_s / 3))
-        dx, dy, dz = m.x + m.u * ahead_s - x, m.y + m.v * ahead_s - y, m.z + m.w * ahead_s - z
-        variance += m.weight * (own + (dx * dx + dy * dy + dz * dz) / 3)
-    return math.sqrt(max(variance, VARIANCE_FLOOR))
+        variance += m.weight * (own + ((px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2) / 3)
+    return math.sqrt(variance)

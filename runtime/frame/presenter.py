@@ -14,6 +14,7 @@ import numpy as np
 
 from runtime.clock import NS_PER_MS, Clock
 from runtime.errors import EndOfRecording, PanelLost
+from runtime.frame.lateness import Lateness
 from runtime.frame.pacing import Pacer
 from runtime.frame.policy import Flatness, wants_flat
 from runtime.frame.run_state import RunCell
@@ -124,6 +125,7 @@ class Presenter:
         self._adopted = run.state.version
         self.stats = RunStats()
         self.machine = StateMachine(now_ns=clock.now_ns())
+        self._lateness = Lateness(pacer.period_ns)
         self.flat_asked = False
         self.paused = False
         self.missing: dict[str, str] = {}  # parts that don't work at present, and why
@@ -170,7 +172,7 @@ class Presenter:
         photon_ns = self._presented_at(timing, report, woke_ns=woke_ns)
         self.solver.post(self._request(timing, eyes))
         self.missing = self._missing(news, lost)
-        state = self._judge(eyes, limited)
+        state = self._judge(eyes, limited, shown=report is not None)
         account = self._account(timing, eyes, news, frame, report, photon_ns, state, times)
         self._tell(account, frame, news.solution, times)
         return account
@@ -280,7 +282,7 @@ class Presenter:
                 self.fault(part)
         return missing
 
-    def _judge(self, eyes: EyesEstimate, limited: str) -> State:
+    def _judge(self, eyes: EyesEstimate, limited: str, *, shown: bool) -> State:
         parts: dict[Part, str] = {part: why for part, why in self.missing.items()}  # type: ignore[misc]
         conditions = Conditions(
             eyes.label,
@@ -288,6 +290,7 @@ class Presenter:
             presented=self._presented,
             flat_wanted=self.flat_asked,
             limited=limited,
+            late=self._lateness.update(presented=shown, now_ns=self.clock.now_ns()),
             paused=self.paused,
         )
         transition = self.machine.update(conditions, now_ns=self.clock.now_ns())

@@ -52,7 +52,6 @@ class Solver:
         self._seeing = (True, True)
         self._policy = FramePolicy()
         self._buffers = LayerBuffers()
-        self._number = 0
         self._solved: Made | None = None
         self._flat: Made | None = None
         self._middle_m: F64 = np.array(FLAT_EYE_M)
@@ -81,7 +80,9 @@ class Solver:
         if job.kind == "solve":
             assert job.eyes_m is not None
             return self._solve(state, request, job.eyes_m, revision=revision)
-        return Step(missing=self._missing)
+        if request.eyes_m is not None and not request.paused:
+            self._missing = {}  # what there is is what was asked for
+        return Step(missing=dict(self._missing))
 
     def _solve(self, state: RunState, request: SolveRequest, eyes_m: F64, *, revision: int) -> Step:
         settings, watch = state.settings.model, Stopwatch()
@@ -105,9 +106,8 @@ class Solver:
         self._missing = {}
         self._solved = Made(state.version, revision, eyes_m)
         self._middle_m = eyes_m.mean(axis=0)
-        self._number += 1
         solution = Solution(
-            self._number,
+            self.run.next_number(),
             layers,
             eyes_m,
             request.time_ns,
@@ -135,9 +135,8 @@ class Solver:
         if not missing:
             self._missing.pop("content", None)
             self._flat = Made(state.version, revision, None, self._policy.episode)
-        self._number += 1
         stages = {"render": watch.lap_ms()}
-        flat = Solution(self._number, layers, None, time_ns, stage_ms=stages, machine_ms=stages)
+        flat = Solution(self.run.next_number(), layers, None, time_ns, stage_ms=stages, machine_ms=stages)
         return Step(flat=flat, missing=missing)
 
     def plan_items(self, measured: Measured | None = None) -> tuple[PlanItem, ...]:

@@ -22,6 +22,7 @@ class Conditions:
     flat_wanted: bool = False  # the operator asked for the 2D picture
     stopping: str = ""  # why the daemon stops; empty: it does not
     limited: str = ""  # why the alignment to the eyes is at its limit; empty: it is not
+    late: str = ""  # why fewer refreshes are shown than the display has; empty: all are
     paused: bool = False  # the operator froze the picture; it is still aligned to the eyes
 
 
@@ -45,11 +46,12 @@ def judge(conditions: Conditions) -> tuple[State, str]:
         return State.STARTING, f"waiting for {why}" if why else "no frame has been presented yet"
     if missing:
         return State.DEGRADED, why
+    late = [conditions.late] if conditions.late else []
     if conditions.flat_wanted:
-        return State.FLAT, "asked for"
+        return State.FLAT, "; ".join(["asked for", *late])
     if conditions.eyes == "none":
-        return State.FLAT, "no viewer"
-    remarks = ["the picture is paused"] if conditions.paused else []
+        return State.FLAT, "; ".join(["no viewer", *late])
+    remarks = [*late, *(["the picture is paused"] if conditions.paused else [])]
     if conditions.limited:
         remarks.append(f"alignment at its limit until the next solution: {conditions.limited}")
     if conditions.eyes == "held":

@@ -12,7 +12,6 @@ from functools import lru_cache
 from math import ceil
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64
@@ -20,8 +19,7 @@ from runtime.records import F32, F64
 CELLS_STEP = 8  # chains' lengths are rounded up to this, so that a moving viewer meets few shapes
 ROWS_STEP = 64
 CELLS_MAX = 1024
-ORDINARY_SEPARATION_M = 0.062
-RELATIVE_TOLERANCE_MAX_MM = 8.0
+BLOCK_ROWS = 8  # that the network transforms together: the raster has whole blocks
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +56,17 @@ class ChainFrame:
         inverse[:2, :2], inverse[:2, 2] = linear, -linear @ p[:2, 2]
         return inverse @ back
 
+    def doubt(self, stack: PanelStack, *, eye_sigma_mm: float) -> F32:
+        """(3,): how far the outer panels' pictures move, columns and rows, for eyes off by one standard deviation to
+        the right and up; and the centre panel's own parallax beside this raster's plane, in columns."""
+        reach = (stack.x_m[-1] - self.x_m) / (self.middle_m[0] - stack.x_m[-1])
+        centre = (self.x_m - stack.x_m[1]) / (self.middle_m[0] - stack.x_m[1])
+        moved_m = eye_sigma_mm / 1e3 * reach
+        (across_m, _), (along_m, down_m) = self.plane_from_raster[:2, :2]
+        columns = moved_m / abs(across_m)
+        rows = moved_m * np.hypot(1.0, along_m / across_m) / abs(down_m)
+        return np.array([columns, rows, self.cell_px * centre / reach], np.float32)
+
 
 def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int) -> ChainFrame:
     """The raster for two eyes (2, 3), left and right, frame `stack`.
@@ -82,9 +91,8 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
     bottom, top = _panel_extent(middle, stack, plane_m=plane_m)
     pitch_v_m = (top - bottom) / (stack.height_px / reduction)
     rise_m = abs(step_z_m) * width
-    rows = ceil(stack.height_px / reduction + rise_m / pitch_v_m)
-    if rise_m / pitch_v_m > 0.01:
-        rows = ROWS_STEP * ceil(rows / ROWS_STEP)
+    step = ROWS_STEP if rise_m / pitch_v_m > 0.01 else BLOCK_ROWS
+    rows = step * ceil((stack.height_px / reduction + rise_m / pitch_v_m) / step)
     middle_z = (bottom + top) / 2
     plane_from_raster = np.array(
         [
@@ -118,33 +126,21 @@ def _panel_extent(middle: F64, stack: PanelStack, *, plane_m: float) -> tuple[fl
     return (-half_m - middle[2] * t) / (1 - t), (half_m - middle[2] * t) / (1 - t)
 
 
-def relative_tolerance_mm(tolerance_mm: float, eyes_m: F64) -> float:
-    """A tolerance as it weighs on an ordinary viewer: beside eyes half as far apart, a millimetre counts twice.
-
-    An eye that is off by d sees the difference between the eyes change by d over their separation.
-    """
-    separation_m = float(np.linalg.norm(eyes_m[1] - eyes_m[0]))
-    # numpy's minimum, unlike min, hands a NaN on to be refused.
-    relative = tolerance_mm * ORDINARY_SEPARATION_M / np.maximum(separation_m, 1e-6)
-    return float(np.minimum(RELATIVE_TOLERANCE_MAX_MM, relative))
-
-
 @lru_cache(maxsize=8)
-def chain_modes(cells: int) -> tuple[F32, F32, F32]:
-    """Singular value decomposition of A, in closed form: A = U·diag(s)·V^T for `cells` equations.
+def chain_modes(cells: int) -> tuple[F32, F32, F32, F32]:
+    """Modes of the chain operators, in closed form, for `cells` equations.
 
-    A is (cells, cells + 1) with rows [.. -2 2 ..]; A·A^T is tridiagonal and Toeplitz, so U is the sine transform.
-    Returns V (cells + 1, cells), s (cells,) and U^T (cells, cells), float32.
+    The difference A (cells, cells + 1), rows [.. -2 2 ..], is U·diag(s)·V^T; the mean B, rows [.. 1/2 1/2 ..], is
+    U·diag(cos)·Ũ^T with cos = sqrt(1 - s²/16): sines and cosines of the same frequencies. Returns V and Ũ
+    (cells + 1, cells + 1), s (cells + 1,) and U^T (cells + 1, cells), float32; the first mode of V is what A can't see.
     """
-    index = np.arange(1, cells + 1)
-    angle = np.pi * index / (cells + 1)
-    u = np.sqrt(2 / (cells + 1)) * np.sin(np.outer(index, angle))
-    s = 4 * np.sin(angle / 2)
-    padded = np.vstack([np.zeros(cells), u, np.zeros(cells)])
-    v = 2 * (padded[:-1] - padded[1:]) / s
-    return v.astype(np.float32), s.astype(np.float32), np.ascontiguousarray(u.T, dtype=np.float32)
-
-
-def cells_of(image: NDArray[np.float32], frame: ChainFrame) -> NDArray[np.float32]:
-    """(rows, cells, 2K·C) view of an image (rows, width, C)."""
-    return image.reshape(frame.rows, frame.cells, -1)
+    angle = np.pi * np.arange(cells + 1) / (cells + 1)
+    size = np.sqrt(2 / (cells + 1))
+    between = np.outer(np.arange(cells + 1) + 0.5, angle)
+    v, shifted = -size * np.cos(between), size * np.sin(between)
+    v[:, 0] /= np.sqrt(2)
+    u_transposed = size * np.sin(np.outer(angle, np.arange(1, cells + 1)))
+    v, shifted, s, u_transposed = (
+        np.ascontiguousarray(x, np.float32) for x in (v, shifted, 4 * np.sin(angle / 2), u_transposed)
+    )
+    return v, shifted, s, u_transposed

@@ -7,29 +7,29 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from runtime.config import Section, validated
 from runtime.errors import InputError
 
 METADATA_KEY = "phasestack.contract"
-VERSION = 1
+VERSION = 2
 
 
 class Step(Section):
-    """One unrolled correction step of a `chain` model."""
+    """One step of a `chain` model."""
 
     kind: Literal["chain", "front", "rear"] = Field(
         description="the network along the eyes' line, or a local correction of one outer panel"
     )
-    size: Annotated[float, Field(gt=0, le=2)] = Field(1.0, description="learned step size")
+    size: Annotated[float, Field(gt=0, le=2)] = Field(1.0, description="of a correction, for two points")
     reduction: Literal[1, 2, 4] = Field(1, description="the step works on a raster so much coarser than a panel")
 
 
 def checked_steps(steps: tuple[Step, ...]) -> tuple[Step, ...]:
-    """Steps that can be carried out: a chain first, never back to a coarser raster. Raises ValueError."""
-    if steps and steps[0].kind != "chain":
-        raise ValueError("must begin with a chain step")
+    """Steps that can be carried out: one chain, first; never back to a coarser raster. Raises ValueError."""
+    if steps and [index for index, step in enumerate(steps) if step.kind == "chain"] != [0]:
+        raise ValueError("must begin with a chain step, the only one")
     if any(after.reduction > before.reduction for before, after in pairwise(steps)):
         raise ValueError("reduction must not grow from step to step")
     return steps
@@ -47,10 +47,17 @@ class TrainedFor(Section):
     spacing_m: tuple[float, float]
 
 
+class Port(Section):
+    """An input or output of the network."""
+
+    name: Annotated[str, Field(min_length=1)]
+    axes: Annotated[tuple[str, ...], Field(max_length=8)] = Field(description="what each dimension counts")
+
+
 class Contract(Section):
     """The metadata entry `phasestack.contract`."""
 
-    version: Literal[1]
+    version: Literal[2]
     arch: str
     name: str
     panels: Annotated[int, Field(ge=2, le=8)]
@@ -64,11 +71,16 @@ class Contract(Section):
     value_range: tuple[float, float]
     trained_for: TrainedFor | None = Field(description="null: not known, or not trained")
     recipe_sha256: str
-    width_px: int = Field(0, description="fixed input width; 0: any")
-    height_px: int = Field(0, description="fixed input height; 0: any")
+    width_px: Annotated[int, Field(ge=0, le=16384)] = Field(0, description="fixed input width; 0: any")
+    height_px: Annotated[int, Field(ge=0, le=16384)] = Field(0, description="fixed input height; 0: any")
+    inputs: Annotated[tuple[Port, ...], Field(min_length=1, max_length=32)]
+    outputs: Annotated[tuple[Port, ...], Field(min_length=1, max_length=32)]
+    graph_sha256: str = Field("", description="of the file but for its metadata; empty: not told")
     precision: Literal["fp32", "fp16", "int8"] = "fp32"
-    parameters: int = 0
-    cell_px: int = Field(4, description="chain: parallax of the outer panels in columns of the network's raster")
+    parameters: Annotated[int, Field(ge=0)] = 0
+    cell_px: Annotated[int, Field(ge=1, le=64)] = Field(
+        4, description="chain: parallax of the outer panels in columns of the network's raster"
+    )
     reduction: Literal[1, 2, 4] = Field(2, description="chain: the network's raster is so much coarser than a panel")
     emphasis: Annotated[float, Field(ge=0, le=0.5)] = Field(
         0.0,
@@ -80,6 +92,12 @@ class Contract(Section):
     interpolation: Literal["linear", "cubic"] = Field("linear", description="how still pictures are warped")
     steps: Steps = ()
 
+    @model_validator(mode="after")
+    def _has_steps(self) -> Contract:
+        if self.input_frame == "chain" and not self.steps:
+            raise ValueError("steps: a chain model needs one at least")
+        return self
+
 
 def parse_contract(metadata: dict[str, str], *, source: str | Path) -> Contract:
     """The contract in an ONNX file's metadata. Raises InputError where it is missing, unknown or does not fit."""
@@ -88,6 +106,8 @@ def parse_contract(metadata: dict[str, str], *, source: str | Path) -> Contract:
         raise InputError(source, METADATA_KEY, "the model carries no contract: it is not one of phasestack's")
     try:
         table: Any = json.loads(text)
+    except RecursionError:
+        raise InputError(source, METADATA_KEY, "malformed: nested too deep") from None
     except ValueError as error:
         raise InputError(source, METADATA_KEY, f"malformed: {error}") from None
     if not isinstance(table, dict):

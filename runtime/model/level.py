@@ -96,20 +96,11 @@ class Level:
 
         self._each(panel, work)
 
-    def drive(self, panel: int, wave: I16, wave_from_raster: F64, *, first: bool, shown: bool) -> None:
-        """Add a wave, drawn on a raster of its own, to an outer panel; the first one takes its place."""
+    def drive(self, panel: int, codes: I16, codes_from_raster: F64, *, shown: bool) -> None:
+        """An outer panel as it was drawn on a raster of its own."""
         outer = self.outer[panel]
-        target = outer if first else self._back[panel][0]
-        resample(wave, image_from_result=wave_from_raster, out=target, outside=START if first else 0, cubic=True)
-
-        def work(rows: slice, codes: I16) -> None:
-            if first:
-                codes = outer[rows]
-            else:
-                np.add(outer[rows], target[rows], out=codes)
-            _settle(codes, outer[rows], shown=shown)
-
-        self._each(panel, work)
+        resample(codes, image_from_result=codes_from_raster, out=outer, outside=START, cubic=True)
+        self._each(panel, lambda rows, _: _settle(outer[rows], outer[rows], shown=shown))
 
     def refine(self, coarser: Level, *, shown: bool) -> None:
         """Take the outer panels over from a coarser raster of the same boxes."""

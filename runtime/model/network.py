@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from runtime.errors import InputError, ModelFailure
-from runtime.model.predictor import Prediction, Predictor
+from runtime.model.base import Prediction, Predictor
 from runtime.model.resample import buffer, resample, target_from_source
 from runtime.model.session import ModelSession
 from runtime.model.timing import Stopwatch
@@ -72,7 +72,10 @@ class NetworkPredictor(Predictor):
         watch.lap("prepare")
         answered = self.stack.count if self.session.contract.output == "panels" else self.stack.count - 1
         shape = (1, answered * 3, self.stack.height_px, self.stack.width_px)
-        answer = self.session.run(self._input, output_shape=shape)
+        contract = self.session.contract
+        answer = self.session.run({contract.inputs[0].name: self._input}, {contract.outputs[0].name: shape})[
+            contract.outputs[0].name
+        ]
         if not np.isfinite(answer.sum()):
             raise ModelFailure("the network answered with numbers that are not finite")
         watch.lap("inference")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,8 @@ from numpy.typing import NDArray
 
 from runtime.errors import InputError, MissingPart, ModelFailure
 from runtime.model.contract import Contract, parse_contract
+from runtime.model.onnx_bytes import digest, has_external_data
+from runtime.model.onnx_runtime import onnxruntime
 
 log = logging.getLogger("phasestack.model")
 
@@ -20,15 +24,19 @@ PROVIDERS = {
     "tensorrt": ("TensorrtExecutionProvider", "onnxruntime-gpu and TensorRT"),
     "openvino": ("OpenVINOExecutionProvider", "onnxruntime-openvino"),
 }
+TYPES = {"tensor(float)": np.float32, "tensor(int16)": np.int16}
+Shape = tuple[int, ...]
 
 
 class ModelSession:
     """One loaded model. `run` binds a set of buffers for each input shape once and reuses it."""
 
-    def __init__(self, path: Path, *, provider: str = "cpu", threads: int = 2) -> None:
-        """Raises InputError (no ONNX, no contract), MissingPart (provider not installed)."""
-        import onnxruntime as ort
+    def __init__(self, path: Path, *, provider: str = "cpu", threads: int = 2, sha256: str = "") -> None:
+        """sha256: of the whole file; empty: not known.
 
+        Raises InputError (no ONNX, other bytes than promised, no contract), MissingPart (provider not installed).
+        """
+        ort = onnxruntime()
         name, package = PROVIDERS[provider]
         if name not in ort.get_available_providers():
             raise MissingPart(f"model.provider: {provider} is not installed: pip install {package}")
@@ -37,48 +45,86 @@ class ModelSession:
         # A spinning pool eats the cores that the camera and the renderer need.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 3
-        try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise InputError(path, "", f"cannot be read ({error.strerror})") from None
+        data = _checked(path, sha256)
         try:
             self._session = ort.InferenceSession(data, options, providers=[name])
+            metadata = self._session.get_modelmeta().custom_metadata_map
+        except UnicodeDecodeError:
+            raise InputError(path, "metadata", "is no UTF-8 text") from None
         except Exception as error:  # onnxruntime raises its own hierarchy of undocumented exceptions
             raise InputError(path, "", f"is no model that onnxruntime can load ({_first_line(error)})") from None
         self.provider: str = provider
-        self.contract: Contract = parse_contract(self._session.get_modelmeta().custom_metadata_map, source=path)
-        self.input_names = [item.name for item in self._session.get_inputs()]
-        self.output_names = [item.name for item in self._session.get_outputs()]
-        self.input_shapes = [item.shape for item in self._session.get_inputs()]
-        self._bound: dict[tuple[tuple[int, ...], ...], tuple[Any, list[Any], list[Any]]] = {}
+        self.contract: Contract = parse_contract(metadata, source=path)
+        if self.contract.graph_sha256 and self.contract.graph_sha256 != digest(data):
+            raise InputError(path, "contract.graph_sha256", "does not fit: the file was changed after its export")
+        self.input_shapes = {item.name: item.shape for item in self._session.get_inputs()}
+        self._types = {item.name: TYPES.get(item.type, np.float32) for item in self._session.get_outputs()}
+        self._check_ports(path)
+        self._bound: dict[tuple[Any, ...], tuple[Any, dict[str, Any], dict[str, Any]]] = {}
 
-    def run(self, *inputs: NDArray[Any], output_shape: tuple[int, ...]) -> NDArray[np.float32]:
-        """The only output. It is the session's own buffer: it holds until the next run of the same shapes.
+    def run(self, feeds: Mapping[str, NDArray[Any]], shapes: Mapping[str, Shape]) -> dict[str, NDArray[Any]]:
+        """Outputs by name, of the given shapes, from inputs by name.
 
-        Raises ModelFailure where onnxruntime fails.
+        They are the session's own buffers: they hold until the next run of the same shapes. Raises ModelFailure where
+        onnxruntime fails.
         """
-        import onnxruntime as ort
-
-        key = (*(array.shape for array in inputs), output_shape)
+        key = (*((name, array.shape) for name, array in feeds.items()), *shapes.items())
         try:
             if key not in self._bound:
-                values = [ort.OrtValue.ortvalue_from_numpy(np.ascontiguousarray(array)) for array in inputs]
-                result = ort.OrtValue.ortvalue_from_shape_and_type(output_shape, np.float32)
-                binding = self._session.io_binding()
-                for name, value in zip(self.input_names, values, strict=True):
-                    binding.bind_ortvalue_input(name, value)
-                binding.bind_ortvalue_output(self.output_names[0], result)
                 if len(self._bound) > 8:  # a viewer who walks about meets a few shapes, not hundreds
                     self._bound.clear()
-                self._bound[key] = (binding, values, [result])
+                self._bound[key] = self._bind(feeds, shapes)
             binding, values, results = self._bound[key]
-            for value, array in zip(values, inputs, strict=True):
-                value.update_inplace(np.ascontiguousarray(array))
+            for name, array in feeds.items():
+                values[name].update_inplace(np.ascontiguousarray(array))
             self._session.run_with_iobinding(binding)
-            output: NDArray[np.float32] = results[0].numpy()
+            return {name: value.numpy() for name, value in results.items()}
         except Exception as error:
             raise ModelFailure(f"inference failed: {_first_line(error)}") from error
-        return output
+
+    def _bind(self, feeds: Mapping[str, NDArray[Any]], shapes: Mapping[str, Shape]) -> Any:
+        value_of = onnxruntime().OrtValue
+        values = {name: value_of.ortvalue_from_numpy(np.ascontiguousarray(array)) for name, array in feeds.items()}
+        results = {
+            name: value_of.ortvalue_from_shape_and_type(shape, self._types[name]) for name, shape in shapes.items()
+        }
+        binding = self._session.io_binding()
+        for name, value in values.items():
+            binding.bind_ortvalue_input(name, value)
+        for name, value in results.items():
+            binding.bind_ortvalue_output(name, value)
+        return binding, values, results
+
+    def _check_ports(self, path: Path) -> None:
+        """The graph has the inputs and outputs that its contract declares."""
+        for field, ports, items in (
+            ("inputs", self.contract.inputs, self._session.get_inputs()),
+            ("outputs", self.contract.outputs, self._session.get_outputs()),
+        ):
+            declared = {port.name: len(port.axes) for port in ports}
+            found = {item.name: len(item.shape) for item in items}
+            if declared != found:
+                raise InputError(path, f"contract.{field}", f"declares {_named(declared)}, the graph {_named(found)}")
+
+
+def _checked(path: Path, sha256: str) -> bytes:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(path, "", f"cannot be read ({error.strerror})") from None
+    if sha256 and hashlib.sha256(data).hexdigest() != sha256:
+        raise InputError(path, "", "is not the model that was shipped (SHA-256 differs): install phasestack again")
+    try:
+        external = has_external_data(data)
+    except ValueError as error:
+        raise InputError(path, "", f"is no ONNX model ({error})") from None
+    if external:
+        raise InputError(path, "external_data", "is refused: a model must be one file, with its weights in it")
+    return data
+
+
+def _named(ranks: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} ({rank} axes)" for name, rank in ranks.items())
 
 
 def _first_line(error: Exception) -> str:

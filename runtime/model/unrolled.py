@@ -7,29 +7,30 @@ correction changes one panel, rear and front in turn: twice as much for the time
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.errors import ModelFailure
+from runtime.model.base import Prediction, Predictor
 from runtime.model.bench import Bench
-from runtime.model.chain import ChainFrame, chain_frame, chain_modes, relative_tolerance_mm
+from runtime.model.chain import ChainFrame, chain_frame, chain_modes
 from runtime.model.channels import RGBA_FROM, is_grey, without_alpha
 from runtime.model.contract import Step
 from runtime.model.fade import Fade
 from runtime.model.level import CENTRE, EVEN, FRONT, I16, OUTER, REAR, START, Level
-from runtime.model.predictor import Prediction, Predictor
 from runtime.model.resample import resample
 from runtime.model.rows import RowPool
 from runtime.model.session import ModelSession
 from runtime.model.timing import Stopwatch
-from runtime.model.transfer import FULL, SUBCODE, emphasised, phase_codes
+from runtime.model.transfer import SUBCODE, emphasised, phase_codes
 from runtime.model.visible import Box, visible_boxes
 from runtime.optics.pupil import POINT_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
-from runtime.records import F32, F64, U8
+from runtime.records import F64, U8
 
 
 class UnrolledPredictor(Predictor):
@@ -99,9 +100,9 @@ class UnrolledPredictor(Predictor):
                     self.fade.soften(level, self._centre_from(level.rasters[CENTRE].plane_from_raster()))
             shown = {n: index == last[n] for n in OUTER}
             if step.kind == "chain":
-                needs = self._later_needs(level) if index else self._first_needs(pictures, bench)
-                wave = self._wave(needs, frame, eyes_m, watch, bench=bench, eye_sigma_mm=eye_sigma_mm)
-                _drive(level, wave, frame, size=step.size, first=not index, shown=shown)
+                needs = self._needs(pictures, bench)
+                panels = self._network(needs, frame, eyes_m, watch, bench=bench, eye_sigma_mm=eye_sigma_mm)
+                _drive(level, panels, frame, shown=shown)
                 changed: tuple[int, ...] = OUTER
             else:
                 changed = (FRONT if step.kind == "front" else REAR,)
@@ -145,7 +146,7 @@ class UnrolledPredictor(Predictor):
                 cv2.convertScaleAbs(whole.outer[n], dst=bench.shown[n], alpha=1 / SUBCODE)
             self._layers[n][box.slices] = cv2.cvtColor(bench.shown[n], RGBA_FROM[self.channels])
 
-    def _first_needs(self, pictures: Sequence[U8], bench: Bench) -> list[I16]:
+    def _needs(self, pictures: Sequence[U8], bench: Bench) -> list[I16]:
         """What each eye lacks while the outer panels are even, at the network's coarser raster."""
         size = self._reduced_size()
         known = (level.wanted for level in bench.levels.values() if level.size == size)
@@ -153,17 +154,11 @@ class UnrolledPredictor(Predictor):
         half = (np.asarray(right, np.int16) - np.asarray(left, np.int16)) >> 1
         return [-half, half]
 
-    def _later_needs(self, level: Level) -> list[I16]:
-        size = self._reduced_size()
-        if level.size == size:
-            return list(level.residual)
-        return [np.asarray(cv2.resize(r, size, interpolation=cv2.INTER_AREA), np.int16) for r in level.residual]
-
     def _reduced_size(self) -> tuple[int, int]:
         reduction, box = self.session.contract.reduction, self._boxes[CENTRE]
         return max(1, box.width_px // reduction), max(1, box.height_px // reduction)
 
-    def _wave(
+    def _network(
         self,
         needs: Sequence[I16],
         frame: ChainFrame,
@@ -172,11 +167,9 @@ class UnrolledPredictor(Predictor):
         *,
         bench: Bench,
         eye_sigma_mm: float,
-    ) -> F32:
-        """The network's answer: what the outer panels must carry for the eyes to differ as they should.
-
-        On the chain frame's raster, from one parallax before its first column.
-        """
+    ) -> dict[int, I16]:
+        """The network's answer: both outer panels on the chain frame's raster, from one parallax before its first
+        column, in fixed-point codes."""
         width, height = self._reduced_size()
         centre = self._boxes[CENTRE].cut(self.stack.panel(CENTRE))
         reduced_from_full = np.diag([width / centre.width_px, height / centre.height_px, 1.0])
@@ -185,45 +178,48 @@ class UnrolledPredictor(Predictor):
         for side, eye_m in enumerate(eyes_m):
             matrix = reduced_from_plane @ frame.plane_from_frame(eye_m, x_m=self.stack.x_m[CENTRE])
             resample(needs[side], image_from_result=matrix, out=seen[side])
-        difference = np.subtract(seen[1], seen[0], dtype=np.float32)
-        difference *= 1 / FULL
+        waves, shifted_waves, spectrum, modes_in = chain_modes(frame.cells)
+        left, right = (image.reshape(frame.rows, frame.cells, -1) for image in seen)
+        feeds: dict[str, NDArray[Any]] = {
+            "left": left,
+            "right": right,
+            "waves": waves,
+            "shifted_waves": shifted_waves,
+            "spectrum": spectrum,
+            "modes_in": modes_in,
+            "doubt": frame.doubt(self.stack, eye_sigma_mm=eye_sigma_mm),
+        }
+        shape = (frame.rows, frame.cells + 1, left.shape[2])
         watch.lap("prepare")
-        answer = self.session.run(
-            difference.reshape(frame.rows, frame.cells, -1),
-            *chain_modes(frame.cells),
-            np.array([relative_tolerance_mm(eye_sigma_mm, eyes_m)], np.float32),
-            output_shape=(frame.rows, frame.cells + 1, 2 * frame.cell_px * self.channels),
-        )
-        if not np.isfinite(answer.sum()):
+        answer = self.session.run(feeds, {"rear": shape, "front": shape, "check": (1,)})
+        if not np.isfinite(answer["check"]).all():
             raise ModelFailure("the network answered with numbers that are not finite")
         watch.lap("inference")
-        wave = answer.reshape(frame.rows, -1, *difference.shape[2:])
-        if self.fade is not None:
-            self._fade_out(wave, frame)
-        return wave
+        tail = seen[0].shape[2:]
+        panels = {n: answer[name].reshape(frame.rows, -1, *tail) for n, name in ((REAR, "rear"), (FRONT, "front"))}
+        return panels if self.fade is None else {n: self._faded(panel, frame) for n, panel in panels.items()}
 
-    def _fade_out(self, wave: F32, frame: ChainFrame) -> None:
-        """Let a wave end within this part of the panels."""
+    def _faded(self, panel: I16, frame: ChainFrame) -> I16:
+        """A panel that ends, even, within this part of the panels."""
         assert self.fade is not None
         plane_from_wave = frame.plane_from_frame(frame.middle_m, x_m=self.stack.x_m[CENTRE])
         plane_from_wave = plane_from_wave @ np.array([[1.0, 0.0, -frame.cell_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-        rows, columns = wave.shape[:2]
+        rows, columns = panel.shape[:2]
         weights = self.fade.wave_weights(self._centre_from(plane_from_wave), rows=rows, columns=columns)
-        np.multiply(wave, weights if wave.ndim == 3 else weights[..., 0], out=wave)
+        return np.asarray((panel - START) * (weights if panel.ndim == 3 else weights[..., 0]) + START, np.int16)
 
     def _centre_from(self, plane_from_raster: F64) -> F64:
         """3x3: the centre panel's pixels from a raster's on its plane."""
         return self.stack.panel(CENTRE).raster_from_plane() @ plane_from_raster
 
 
-def _drive(level: Level, wave: F32, frame: ChainFrame, *, size: float, first: bool, shown: dict[int, bool]) -> None:
-    """The wave on both outer panels, with opposite signs."""
-    for n, sign in ((REAR, -1.0), (FRONT, 1.0)):
+def _drive(level: Level, panels: Mapping[int, I16], frame: ChainFrame, *, shown: dict[int, bool]) -> None:
+    """Both outer panels as the network wants them."""
+    for n, codes in panels.items():
         panel = level.rasters[n]
         matrix = frame.frame_from_plane(x_m=panel.x_m) @ panel.plane_from_raster()
         matrix[0, 2] += frame.cell_px  # the answer begins one parallax before the first column
-        codes = cv2.addWeighted(wave, sign * FULL * size, wave, 0.0, START if first else 0.0, dtype=cv2.CV_16S)
-        level.drive(n, np.asarray(codes, np.int16), matrix, first=first, shown=shown[n])
+        level.drive(n, codes, matrix, shown=shown[n])
 
 
 def _last_change(steps: Sequence[Step], panel: int) -> int:

@@ -133,6 +133,10 @@ def compare(old: dict[str, Any], new: dict[str, Any]) -> list[Change]:
             gain = after[key] - before[key]
             if abs(gain) > WORSE_DB:
                 changes.append(Change(_name(after), gain < 0, f"{gain:+.2f} dB {label}"))
+        for sigma in sorted(before.get("expected_db", {}).keys() & after.get("expected_db", {}).keys()):
+            gain = after["expected_db"][sigma] - before["expected_db"][sigma]
+            if abs(gain) > WORSE_DB:
+                changes.append(Change(_name(after), gain < 0, f"{gain:+.2f} dB expected of eyes unsure by {sigma} mm"))
         gain = after["psnr_db_off_eye"].get("2mm", 0.0) - before["psnr_db_off_eye"].get("2mm", 0.0)
         if abs(gain) > WORSE_DB:
             changes.append(Change(_name(after), gain < 0, f"{gain:+.2f} dB 2 mm off the eyes"))
@@ -184,6 +188,9 @@ def read(path: Path) -> dict[str, Any]:
                 raise InputError(path, f"{name}[{index}].name", "must be a name")
             if name == "methods" and not isinstance(entry.get("psnr_db_off_eye"), dict):
                 raise InputError(path, f"{name}[{index}].psnr_db_off_eye", "must be a table")
+            expected = entry.get("expected_db", {})  # files of earlier versions have none
+            if not isinstance(expected, dict) or not all(isinstance(db, int | float) for db in expected.values()):
+                raise InputError(path, f"{name}[{index}].expected_db", "must be a table of numbers")
     return table
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from runtime.evaluation.displayed import displayed
+from runtime.evaluation.displayed import Picture, displayed, expected_db
 from runtime.optics.carried import intensities
 from runtime.optics.quality import Quality, psnr_db
 from runtime.optics.retina import Mask, seen_by
@@ -16,6 +16,7 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, U8
 from runtime.report.pairs import OffView, StillPair
 
+SIGMAS_MM = (1.0, 2.0)  # a pupil alone, a pupil and a good tracker
 OFF_STEP = 3  # beside the eyes, every third ray of every third row is enough for a mean squared error
 
 
@@ -23,18 +24,21 @@ OFF_STEP = 3  # beside the eyes, every third ray of every third row is enough fo
 class Seen:
     """What a pair's eyes see of some layers, in numbers."""
 
-    quality: Quality
+    quality: Quality  # exactly at the eyes
+    expected_db: dict[str, float]  # "1": of eyes that are 1 mm unsure; without those that would see nothing
     off_db: dict[str, float]  # "2mm": mean over eyes and directions; empty where the pair has no such views
 
 
-def as_intensity(image: U8) -> F32:
+def as_intensity(image: Picture) -> F32:
     return intensities(image)
 
 
 def judged(pair: StillPair, layers: U8) -> Seen:
-    """Displayed quality at the eyes (design 5.5), and beside them."""
-    exact = displayed(layers, pair.images, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg).quality
-    return Seen(exact, off_eye_db(pair.off, layers, pair.stack, fov_deg=pair.fov_deg))
+    """Displayed quality at the eyes, expected of eyes that are not quite there (design 5.5), and beside them."""
+    look = displayed(layers, pair.wanted, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg)
+    expected = expected_db(look, layers, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, sigmas_mm=SIGMAS_MM)
+    known = {sigma: value for sigma, value in expected.items() if value is not None}
+    return Seen(look.quality, known, off_eye_db(pair.off, layers, pair.stack, fov_deg=pair.fov_deg))
 
 
 def off_eye_db(views: Iterable[OffView], layers: U8, stack: PanelStack, *, fov_deg: float) -> dict[str, float]:
@@ -47,7 +51,7 @@ def off_eye_db(views: Iterable[OffView], layers: U8, stack: PanelStack, *, fov_d
 
 
 def single_psnr_db(
-    eye_m: ArrayLike, layers: U8, stack: PanelStack, *, wanted: U8, fov_deg: float, step: int = 1
+    eye_m: ArrayLike, layers: U8, stack: PanelStack, *, wanted: Picture, fov_deg: float, step: int = 1
 ) -> float:
     """Displayed PSNR of one eye over every `step`-th ray of every `step`-th row. NaN where no ray counts."""
     image, mask = seen_rays(

@@ -40,11 +40,12 @@ class PairResult:
     """One method on one pair."""
 
     pair: str
-    psnr_db: float
+    psnr_db: float  # exact
     ssim: float
     eye_psnr_db: tuple[float, ...]
     psnr_db_off_eye: dict[str, float]
     ms_p50: float
+    expected_db: dict[str, float]  # by the eyes' uncertainty in millimetres: "1", "2"
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +62,12 @@ class MethodResult:
     runs: int
     memory_mib: float
     parameters: int
-    psnr_db: float  # mean over pairs
+    psnr_db: float  # exact; mean over pairs
     ssim: float
     worst_eye_psnr_db: float  # least of all eyes and pairs
     psnr_db_off_eye: dict[str, float]
     multiply_adds: float  # of one prediction, mean over pairs
+    expected_db: dict[str, float] = field(default_factory=dict)  # by the eyes' uncertainty in mm; mean over pairs
     scale: float = 1.0  # of the panels' columns and rows that a network works at
     trained: bool = True  # where not, the picture is nobody's: time, memory and sizes count, the error does not
     pairs: list[PairResult] = field(default_factory=list)
@@ -135,6 +137,7 @@ def _together(method: Method, runs: Sequence[tuple[StillPair, MethodRun, Seen]])
             seen.quality.eye_psnr_db,
             seen.off_db,
             float(np.median(run.run_ms)),
+            seen.expected_db,
         )
         for pair, run, seen in runs
     ]
@@ -157,6 +160,10 @@ def _together(method: Method, runs: Sequence[tuple[StillPair, MethodRun, Seen]])
         psnr_db_off_eye={
             name: float(np.mean([r.psnr_db_off_eye[name] for r in pairs if name in r.psnr_db_off_eye]))
             for name in distances
+        },
+        expected_db={
+            name: float(np.mean([r.expected_db[name] for r in pairs if name in r.expected_db]))
+            for name in dict.fromkeys(name for result in pairs for name in result.expected_db)
         },
         multiply_adds=float(np.mean([run.multiply_adds for _, run, _ in runs])),
         scale=method.scale,

@@ -13,10 +13,11 @@ from numpy.typing import ArrayLike
 
 from runtime.config import StackGeometry, read_table, validated
 from runtime.errors import InputError
+from runtime.evaluation.displayed import Picture
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, stack_from_eye
 from runtime.records import F64, U8
-from runtime.support.artifacts import read_image
+from runtime.support.artifacts import in_8_bits, read_picture
 
 if TYPE_CHECKING:
     from runtime.content.scenes import Scene
@@ -31,7 +32,7 @@ class OffView:
 
     mm: float
     eye_m: F64  # (3,) frame `stack`
-    image: U8  # (h, w, 3)
+    image: Picture  # (h, w, 3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +45,12 @@ class StillPair:
     images: tuple[U8, U8]  # (h, w, 3)
     fov_deg: float  # horizontal
     off: tuple[OffView, ...] = ()
+    stored: tuple[Picture, Picture] | None = None  # `images` in their files' own bits, where those are more than 8
+
+    @property
+    def wanted(self) -> tuple[Picture, Picture]:
+        """What the eyes should see, in all the bits that are known of it."""
+        return self.stored or self.images
 
 
 def read_pairs(folder: Path) -> list[StillPair]:
@@ -67,7 +74,7 @@ def _case(path: Path, table: dict[str, Any]) -> StillPair:
     names = table["images"]
     if not (isinstance(names, list) and len(names) == 2 and all(isinstance(name, str) for name in names)):
         raise InputError(path, "images", "must name the left and the right picture")
-    left, right = (read_image(path.parent / name) for name in names)
+    left, right = (read_picture(path.parent / name) for name in names)
     if left.shape != right.shape:
         raise InputError(path, "images", f"differ in size: {left.shape[1::-1]} and {right.shape[1::-1]}")
     if not isinstance(table["panels"], dict):
@@ -83,7 +90,8 @@ def _case(path: Path, table: dict[str, Any]) -> StillPair:
     if not (isinstance(fov_deg, int | float) and 0 < fov_deg < 180):
         raise InputError(path, "fov", "must be the pictures' horizontal field of view in degrees")
     off = tuple(_off_view(item, path, left.shape) for item in _items(table.get("off", []), path, "off"))
-    return StillPair(path.stem, stack, eyes, (left, right), float(fov_deg), off)
+    images = (in_8_bits(left), in_8_bits(right))
+    return StillPair(path.stem, stack, eyes, images, float(fov_deg), off, (left, right))
 
 
 def _items(value: Any, path: Path, field: str) -> list[Any]:
@@ -104,7 +112,7 @@ def _off_view(item: Any, path: Path, shape: tuple[int, ...]) -> OffView:
         raise InputError(path, "off", "entries need mm, eye and image")
     if not isinstance(item["mm"], int | float) or not isinstance(item["image"], str):
         raise InputError(path, "off", "mm must be a number and image a file name")
-    image = read_image(path.parent / item["image"])
+    image = read_picture(path.parent / item["image"])
     if image.shape != shape:
         raise InputError(path.parent / item["image"], "", "differs in size from the pair")
     return OffView(float(item["mm"]), _place(item["eye"], path, "off.eye"), image)

@@ -35,6 +35,7 @@ class Shown:
 
     psnr_db: float  # both eyes
     worst_eye_db: float
+    expected_db: float = float("nan")  # of a pupil: eyes unsure by 1 mm
     problem: str = ""
 
 
@@ -68,6 +69,7 @@ class Outcome:
             "fov_deg": self.fov_deg,
             "reference_db": self.reference.psnr_db,
             "psnr_db": {name: shown.psnr_db for name, shown in self.models.items()},
+            "expected_1mm_db": {name: shown.expected_db for name, shown in self.models.items()},
             "worst_eye_db": {name: shown.worst_eye_db for name, shown in self.models.items()},
             "problems": {name: shown.problem for name, shown in self.models.items() if shown.problem},
         }
@@ -81,6 +83,8 @@ class Verdict:
     median_db: float
     p5_db: float
     least_db: float
+    expected_median_db: float  # of a pupil: eyes unsure by 1 mm
+    expected_p5_db: float
     beats_reference: float  # the fraction of pairs
     refused: int  # or no number
     failing: list[int]  # numbers of pairs
@@ -117,11 +121,16 @@ def verdict(found: Sequence[Outcome], model: str) -> Verdict:
     reference = np.array([outcome.reference.psnr_db for outcome in found])
     finite = np.isfinite(values)
     median, p5, least = np.percentile(values[finite], (50, 5, 0)) if finite.any() else (np.nan,) * 3
+    expected = np.array([outcome.models[model].expected_db for outcome in found])
+    expected = expected[np.isfinite(expected)]
+    expected_median, expected_p5 = np.percentile(expected, (50, 5)) if expected.size else (np.nan,) * 2
     return Verdict(
         model=model,
         median_db=float(median),
         p5_db=float(p5),
         least_db=float(least),
+        expected_median_db=float(expected_median),
+        expected_p5_db=float(expected_p5),
         beats_reference=float(np.mean(values > reference)),
         refused=int((~finite).sum()),
         failing=[outcome.number for outcome in found if outcome.fails(model)],
@@ -131,10 +140,10 @@ def verdict(found: Sequence[Outcome], model: str) -> Verdict:
 def _shown(method: Method, pair: StillPair, threads: int) -> Shown:
     try:
         layers = opened(method, pair, threads=threads).solve(pair)
-        quality = judged(pair, layers).quality
+        seen = judged(pair, layers)
     except ModelFailure as error:
-        return Shown(float("nan"), float("nan"), str(error))
-    return Shown(quality.psnr_db, min(quality.eye_psnr_db))
+        return Shown(float("nan"), float("nan"), problem=str(error))
+    return Shown(seen.quality.psnr_db, min(seen.quality.eye_psnr_db), seen.expected_db.get("1", float("nan")))
 
 
 def _kept(make: Maker, number: int, cache: Path, threads: int) -> tuple[StillPair, Shown]:
@@ -159,7 +168,7 @@ def _write(path: Path, pair: StillPair, reference: Shown) -> None:
         size_m=(stack.width_m, stack.height_m),
         x_m=stack.x_m,
         fov_deg=pair.fov_deg,
-        reference_db=(reference.psnr_db, reference.worst_eye_db),
+        reference_db=(reference.psnr_db, reference.worst_eye_db, reference.expected_db),
         name=pair.name,
     )
     write_bytes(path, buffer.getvalue())
@@ -171,5 +180,5 @@ def _read(path: Path) -> tuple[StillPair, Shown]:
         width_m, height_m = map(float, file["size_m"])
         stack = PanelStack(width_m, height_m, tuple(map(float, file["x_m"])), left.shape[1], left.shape[0])
         pair = StillPair(str(file["name"]), stack, file["eyes_m"], (left, right), float(file["fov_deg"]))
-        psnr_db, worst_eye_db = map(float, file["reference_db"])
-        return pair, Shown(psnr_db, worst_eye_db)
+        told = [float(value) for value in file["reference_db"]]
+        return pair, Shown(told[0], told[1], told[2] if len(told) > 2 else float("nan"))  # an earlier version kept two

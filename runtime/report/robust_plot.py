@@ -30,15 +30,20 @@ def robust_plot(found: Sequence[Outcome]) -> Figure:
             axes.scatter(reference[~failing], own[~failing], s=9, color=colour, alpha=0.55, linewidth=0)
             axes.scatter(reference[failing], own[failing], s=22, marker="x", color=FAILING)
             axes.axhline(one.p5_db, color=colour, linestyle="--", linewidth=1.0)
-            axes.annotate(
-                f"5th percentile {one.p5_db:.1f} dB",
-                (high, one.p5_db),
-                xytext=(-4, 4),
-                textcoords="offset points",
-                ha="right",
-                fontsize=8.5,
-                color=colour,
-            )
+            lines = [(one.p5_db, f"5th percentile {one.p5_db:.1f} dB", 4)]
+            if np.isfinite(one.expected_p5_db):
+                axes.axhline(one.expected_p5_db, color=colour, linestyle=":", linewidth=1.0)
+                lines.append((one.expected_p5_db, f"of what a pupil (1 mm) sees {one.expected_p5_db:.1f} dB", -11))
+            for value, said, up in lines:
+                axes.annotate(
+                    said,
+                    (high, value),
+                    xytext=(-4, up),
+                    textcoords="offset points",
+                    ha="right",
+                    fontsize=8.5,
+                    color=colour,
+                )
             axes.set_title(f"{name}: {one.beats_reference:.0%} above {REFERENCE.name}, {len(one.failing)} fail")
             axes.set(xlabel=f"{REFERENCE.name}, displayed PSNR, dB", xlim=(low, high), ylim=(low, high))
         panels[0].set_ylabel("model, displayed PSNR, dB")

@@ -13,6 +13,7 @@ from runtime.config import SensorSettings
 from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout, TransientError
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, SensorDriver
+from runtime.support.transient import may_pass
 
 TIMEOUTS_TO_REOPEN = 2
 HANG_MARGIN_S = 0.5
@@ -196,10 +197,12 @@ class SensorWorker:
                 self._set(attempt, SensorState.ENDED, str(error))
                 return
             except FatalError as error:
-                if not attempt.abandoned.is_set():
-                    self.error = error
-                self._set(attempt, SensorState.FAILED, str(error))
-                return
+                if not may_pass(error):
+                    if not attempt.abandoned.is_set():
+                        self.error = error
+                    self._set(attempt, SensorState.FAILED, str(error))
+                    return
+                self._set(attempt, SensorState.LOST, str(error))  # no descriptor, no memory: there may be later
             except TransientError as error:
                 self._set(attempt, SensorState.LOST, str(error))
             except Exception as error:

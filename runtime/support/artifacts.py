@@ -17,12 +17,9 @@ import numpy as np
 
 from runtime.errors import InputError
 from runtime.records import U8, U16
-from runtime.support.foreign import read_bytes
-from runtime.support.picture_header import picture_size
+from runtime.support.picture_header import read_coded
 
 STAGING = ".phasestack-"
-PICTURE_BYTES_MAX = 512 << 20
-PICTURE_PIXELS_MAX = 134_000_000  # 16 thousand columns by 8 thousand rows: 0.8 GB in 16 bits
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 
 
@@ -110,15 +107,8 @@ def read_picture(path: Path) -> U8 | U16:
     """
     import cv2
 
-    data = read_bytes(path, most_bytes=PICTURE_BYTES_MAX)
+    data = read_coded(path)
     unreadable = InputError(path, "", "is not an image that can be decoded")
-    try:
-        width_px, height_px = picture_size(data)
-    except ValueError:
-        raise unreadable from None
-    if width_px * height_px > PICTURE_PIXELS_MAX:
-        pixels = f"{width_px}x{height_px} pixels; at most {PICTURE_PIXELS_MAX // 10**6} million"
-        raise InputError(path, "size", pixels)
     # libpng would write a line of its own to stderr about a file that is cut off.
     if data.startswith(PNG) and b"IEND" not in data:
         raise unreadable

@@ -9,6 +9,8 @@ import threading
 import time
 from collections.abc import Callable
 
+from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
+
 QUEUED_MAX = 4096  # lines that wait for a reader
 LINE_MAX_BYTES = 16384  # a longer line is cut
 PIECE_BYTES = select.PIPE_BUF  # a pipe that is ready takes so much without waiting
@@ -65,6 +67,7 @@ class LogWriter:
             self._thread.join(timeout_s)
 
     def _run(self) -> None:
+        set_niceness(BACKGROUND_NICENESS)
         while True:
             line = self._queue.get()
             if line is not None:

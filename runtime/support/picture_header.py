@@ -1,13 +1,24 @@
-"""How large a picture is, by its header alone: nothing is unpacked."""
+"""How large a picture is, by its header alone, and whether that is within the limits: nothing is unpacked before."""
 
 from __future__ import annotations
 
 import io
 import warnings
+from pathlib import Path
+from typing import Any
+
+from runtime.config import LimitSettings
+from runtime.errors import InputError
+from runtime.support import foreign
+
+SIDE_MAX_PX = 1 << 16
+ORIENTATION = 0x0112  # EXIF's tag
+TURNED = (5, 6, 7, 8)  # by a quarter: width and height are exchanged
+SNIFFED_BYTES = 1 << 20  # of a file: headers, EXIF and colour profiles end before
 
 
-def picture_size(coded: bytes) -> tuple[int, int]:
-    """Width and height of a coded picture, as stored (before any turning by EXIF). Raises ValueError."""
+def picture_size(coded: bytes, *, turned: bool = False) -> tuple[int, int]:
+    """Width and height of a coded picture; turned: after its EXIF orientation. Raises ValueError."""
     from PIL import Image
 
     with warnings.catch_warnings():
@@ -15,8 +26,75 @@ def picture_size(coded: bytes) -> tuple[int, int]:
         most, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
             with Image.open(io.BytesIO(coded)) as image:
-                return image.size
+                width, height = image.size
+                is_turned = turned and _orientation(image) in TURNED
         except Exception as error:  # each of Pillow's formats raises its own
             raise ValueError(f"not a picture that can be read ({type(error).__name__})") from None
         finally:
             Image.MAX_IMAGE_PIXELS = most
+    return (height, width) if is_turned else (width, height)
+
+
+def _orientation(image: Any) -> int:
+    """By what stands before the pixels: Pillow's own `getexif` unpacks a PNG. Of a TIFF it tells the turned size."""
+    from PIL import Image
+
+    coded = image.info.get("exif")
+    if image.format == "TIFF" or not isinstance(coded, bytes):
+        return 1
+    exif = Image.Exif()
+    exif.load(coded)
+    found = exif.get(ORIENTATION)
+    return found if isinstance(found, int) else 1
+
+
+def check_size(
+    width_px: int, height_px: int, *, source: str | Path, field: str = "", name: str = "", limits: LimitSettings
+) -> None:
+    """Raises InputError for more pixels than the limit, with both figures. name: of a picture within `source`."""
+    if max(width_px, height_px) > SIDE_MAX_PX or width_px * height_px > limits.pixels:
+        problem = f"has {width_px} x {height_px} pixels; at most {limits.pixels:,} (limits.pixels)"
+        raise InputError(source, field, f"{name} {problem}".strip())
+
+
+def check_picture(coded: bytes, *, source: str | Path, field: str, name: str, limits: LimitSettings) -> None:
+    """A picture that is whole and within the limit. Raises InputError."""
+    from PIL import Image
+
+    try:
+        width, height = picture_size(coded)
+        check_size(width, height, source=source, field=field, name=name, limits=limits)
+        with Image.open(io.BytesIO(coded)) as image:
+            image.load()
+    except InputError:
+        raise
+    except Exception:  # each of Pillow's decoders raises its own
+        raise InputError(source, field, f"{name} is not an image that can be decoded") from None
+
+
+def read_coded(path: Path, *, limits: LimitSettings | None = None) -> bytes:
+    """A picture file's bytes, undecoded; refused by its header where it has too many pixels. Raises InputError."""
+    limits = limits or LimitSettings()
+    data = foreign.read_bytes(path, most_bytes=round(limits.file_mib * foreign.MIB))
+    try:
+        width, height = picture_size(data)
+    except ValueError:
+        raise InputError(path, "", "is not an image that can be decoded") from None
+    check_size(width, height, source=path, limits=limits)
+    return data
+
+
+def size_of_file(path: Path, *, limits: LimitSettings | None = None) -> tuple[int, int]:
+    """Width and height as a decoder shows them, from the file's beginning. Raises InputError."""
+    limits = limits or LimitSettings()
+    with foreign.open_regular(path, most_bytes=round(limits.file_mib * foreign.MIB)) as file:
+        head = file.read(SNIFFED_BYTES)
+        try:
+            width, height = picture_size(head, turned=True)
+        except ValueError:
+            try:
+                width, height = picture_size(head + file.read(), turned=True)
+            except ValueError:
+                raise InputError(path, "", "is not an image that can be decoded") from None
+    check_size(width, height, source=path, limits=limits)
+    return width, height

@@ -151,6 +151,36 @@ def test_it_resumes_where_it_stopped(tmp_path: Path) -> None:
     assert said[-1].startswith(grid()[0].name)
 
 
+def test_a_sample_is_taken_back_and_its_viewpoint_shown_again(tmp_path: Path) -> None:
+    said: list[str] = []
+    person = walk(tmp_path / "pairs.csv", said)
+    person.press(Key.UNDO)
+    assert said[-1] == "nothing to undo"
+    stand(person, grid()[0].midpoint_m)
+    person.press(Key.ACCEPT)
+    person.press(Key.UNDO)
+    assert len(read_pairs(tmp_path / "pairs.csv")) == 0
+    assert f"{grid()[0].name}: taken back, 0 pairs in all" in said
+    assert said[-1].startswith(grid()[0].name)
+    assert person.summary()["accepted"] == 0
+
+
+def test_after_three_pairs_a_person_is_told_where_to_go(tmp_path: Path) -> None:
+    said: list[str] = []
+    chosen = [grid()[number] for number in (0, 2, 6, 13)]
+    person = Walk(PairsFile(tmp_path / "p.csv"), chosen, again=False, window_s=0.5, max_spread_m=0.01,
+                  say=said.append)  # fmt: skip
+    for number, viewpoint in enumerate(chosen[:3]):
+        stand(person, viewpoint.midpoint_m, start_ns=number * NS_PER_S)
+        assert not any("cm to the" in text and "Enter" not in text for text in said)
+        person.press(Key.ACCEPT)
+    wanted = chosen[3].midpoint_m
+    stand(person, wanted + np.array([0.03, -0.07, 0.0]), start_ns=10 * NS_PER_S)
+    assert said[-1] == "7 cm to the right, 3 cm nearer"
+    stand(person, wanted, start_ns=12 * NS_PER_S)
+    assert said[-1].startswith("here")
+
+
 def test_next_and_previous_do_not_run_off_the_ends(tmp_path: Path) -> None:
     said: list[str] = []
     person = walk(tmp_path / "pairs.csv", said)

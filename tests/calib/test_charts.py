@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from calib.chart_files import Chart, steps
-from calib.charts import FOV_DEG, alone, eye_chart, line_picture
+from calib.charts import alone, chart_fov_deg, eye_chart, line_picture
 from calib.commands import app
 from calib.keys import Key
 from calib.viewpoints import grid
@@ -35,7 +35,7 @@ def test_the_picture_has_ten_pixel_lines_at_the_thirds() -> None:
 def seen_error_db(stack: PanelStack, viewpoint, *, side: int, index: int, moved_m: float) -> float:
     layers = alone(eye_chart(viewpoint, stack, side=side, index=index, ipd_m=0.06), stack, index=index)
     eye = viewpoint.eyes_m(0.06)[side] + [0.0, moved_m, 0.0]
-    seen = seen_by(eye, layers, stack, fov_deg=FOV_DEG)
+    seen = seen_by(eye, layers, stack, fov_deg=chart_fov_deg(viewpoint, stack))
     wanted = line_picture(width_px=stack.width_px, height_px=stack.height_px).astype(np.float32) / 255
     return psnr_db(float(((seen.image - wanted)[seen.mask] ** 2).mean()))
 
@@ -53,7 +53,7 @@ def test_the_lines_are_in_the_middle_of_their_pixels(small_stack) -> None:
     """Half a pixel of misplacement would be seen: the centre of the ink against the thirds, in the eye's image."""
     viewpoint = grid()[0]
     layers = alone(eye_chart(viewpoint, small_stack, side=1, index=2, ipd_m=0.06), small_stack, index=2)
-    seen = seen_by(viewpoint.eyes_m(0.06)[1], layers, small_stack, fov_deg=FOV_DEG)
+    seen = seen_by(viewpoint.eyes_m(0.06)[1], layers, small_stack, fov_deg=chart_fov_deg(viewpoint, small_stack))
     u = np.arange(small_stack.width_px) + 0.5
     for row in range(20, small_stack.height_px - 20, 37):
         ink = 1 - seen.image[row, :, 0]
@@ -109,7 +109,7 @@ def test_a_solved_chart_shows_both_eyes_the_picture_from_its_viewpoint_alone(tmp
     def seen_db(moved_m: float) -> float:
         errors = []
         for eye in viewpoint.eyes_m():
-            seen = seen_by(eye + np.array([0.0, moved_m, 0.0]), layers, stack, fov_deg=FOV_DEG)
+            seen = seen_by(eye + np.array([0.0, moved_m, 0.0]), layers, stack, fov_deg=chart_fov_deg(viewpoint, stack))
             errors.append(((seen.image - wanted)[seen.mask] ** 2).ravel())
         return psnr_db(float(np.concatenate(errors).mean()))
 

@@ -48,6 +48,13 @@ def test_robust_with_a_fifth_of_gross_errors_is_within_half_again_of_the_default
     assert dirty.mean_m["inverse"] > 2 * dirty.mean_m["robust"]
 
 
+@pytest.mark.parametrize("true_scale", [1.0, 0.95, 1.1])
+@pytest.mark.parametrize("sigma_m", [0.001, 0.003])
+def test_the_default_is_within_one_percent_of_the_best_whatever_the_sensors_metre(true_scale, sigma_m) -> None:
+    case = run_case(sigma_m=sigma_m, sensor_scale=true_scale, seeds=200)
+    assert case.mean_m[DEFAULT] <= 1.01 * min(case.mean_m[method] for method in METHODS)
+
+
 def test_a_sensor_with_a_metre_of_its_own_is_not_forced_to_ours() -> None:
     case = run_case(sigma_m=0.001, sensor_scale=1.03, seeds=20)
     assert case.mean_m[DEFAULT] < 1.02 * case.mean_m["inverse"]

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.viewpoints import grid, viewing_volume_m
+from calib.solution import solve_default
+from calib.viewpoints import grid, viewing_place_m, viewing_volume_m
+from runtime.config import CalibrationSettings
 
 
 def test_the_grid_has_27_viewpoints_with_names_of_their_own() -> None:
@@ -36,6 +38,29 @@ def test_the_eyes_are_level_apart_by_the_ipd_and_equally_far(viewpoint) -> None:
     assert left[2] == pytest.approx(right[2])
     assert left[1] < right[1]
     assert np.linalg.norm(left) == pytest.approx(np.linalg.norm(right))
+
+
+def test_the_grid_and_the_volume_follow_the_configured_viewing_range() -> None:
+    far = CalibrationSettings(viewing_m=(1.0, 2.0), viewing_side_deg=20, viewing_up_deg=(-10, 10))
+    assert {viewpoint.radius_cm for viewpoint in grid(far)} == {100, 150, 200}
+    assert {viewpoint.phi_deg for viewpoint in grid(far)} == {80, 90, 100}
+    assert {viewpoint.theta_deg for viewpoint in grid(far)} == {70, 90, 110}
+    distance = np.linalg.norm(viewing_volume_m(far), axis=1)
+    assert (distance.min(), distance.max()) == (pytest.approx(0.75), pytest.approx(3.0))
+    assert viewing_place_m(far)[0] == pytest.approx(1.5)
+
+
+def test_for_people_who_stand_a_metre_and_a_half_away_two_millimetres_are_predicted_and_kept(measured) -> None:
+    standing = CalibrationSettings(viewing_m=(1.2, 1.8))
+    known = np.array([viewpoint.midpoint_m for viewpoint in grid(standing)])
+    exact = measured(known)
+    predicted, real = [], []
+    for seed in range(100):
+        found = solve_default(measured(known, sigma_m=0.003, seed=seed), known)
+        predicted.append(found.eye_error_m(known).mean())
+        real.append(np.linalg.norm(found.similarity.points(exact) - known, axis=1).mean())
+    assert np.mean(predicted) < 0.002
+    assert np.mean(real) < 0.002
 
 
 def test_the_viewing_volume_lies_before_every_panel() -> None:

@@ -156,7 +156,7 @@ def gltf_of_a_box(folder: Path) -> dict[str, Any]:
         ({"images": [{"uri": "skin.png"}]}, "texture: skin.png is not there"),
         ({"images": [{"uri": "short.bin"}]}, "texture: short.bin is not an image"),
         ({"images": [3]}, "images: must be a list of objects"),
-        ({"accessors": []}, "cannot be read as a mesh"),
+        ({"accessors": []}, "meshes[0].primitives[0]: names accessors[0], which is not there"),
         ({"meshes": [], "nodes": [], "scenes": []}, ""),
     ],
 )

@@ -138,6 +138,13 @@ class Rig:
             ran = self.refresh_until(lambda: self.accounts[-1].inference == "ran")
         return ran
 
+    def settle(self) -> None:
+        """Refreshes until the solver has completed what it was at, and a refresh has shown it."""
+        done = threading.Event()
+        self.presenter.solver.do(lambda parts: bool(done.set()) or True)
+        self.refresh_until(done.is_set)
+        self.presenter.refresh()
+
     def refreshes(self, count: int) -> list[RefreshAccount]:
         return [self.presenter.refresh() for _ in range(count)]
 

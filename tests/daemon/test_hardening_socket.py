@@ -113,6 +113,20 @@ def test_the_daemon_leaves_a_command_that_was_given_up(server, path, monkeypatch
     assert timely.wait(1.0) == ""
 
 
+def test_while_it_starts_the_status_says_what_it_waits_for(server, path):
+    from runtime.clock import MonotonicClock
+    from runtime.config import Overrides
+    from runtime.daemon.notify import Notifier
+    from runtime.daemon.signals import Signals
+    from runtime.daemon.supervise import Daemon
+
+    notifier = Notifier(MonotonicClock(), {})
+    daemon = Daemon(None, Overrides(), signals=Signals(), notifier=notifier, server=server, metrics=None)
+    assert daemon.starting("loading content and model")
+    answer = ask([path], STATUS)
+    assert (answer["state"], answer["reason"]) == ("starting", "loading content and model")
+
+
 def test_when_the_daemon_stops_who_waits_is_told_and_nothing_is_done_later(server, path):
     with ThreadPoolExecutor(1) as pool:
         asked = pool.submit(ask, [path], {"command": "pause"})

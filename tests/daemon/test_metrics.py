@@ -87,8 +87,7 @@ def test_a_refresh_that_reached_no_panel_parts_two_intervals(metrics):
 
 def test_it_listens_on_loopback_only(metrics):
     metrics.serve(free_port())
-    server, _ = metrics._server
-    assert server.server_address[0] == LOOPBACK
+    assert metrics.address[0] == LOOPBACK
 
 
 def test_a_port_that_is_taken_is_named(metrics):

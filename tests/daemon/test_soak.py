@@ -1,13 +1,15 @@
-"""A short soak with every fault in it; the long one is `make soak`."""
+"""A short soak with every fault and change in it; the long one is `make soak`."""
 
 from __future__ import annotations
 
 from tests.soak import soak
 
 
-def test_nothing_piles_up_while_parts_are_lost_and_come_back():
-    result = soak(400, warm=200, fault_every=100)
-    assert result.frames >= 400
+def test_nothing_piles_up_and_no_refresh_is_lost_while_parts_are_lost_and_changed():
+    result = soak(1200, warm=400, fault_every=100, change_every=60)
+    assert result.frames >= 1200
     assert result.faults["panel"] >= 4
-    assert result.presented < result.frames
+    assert result.changes >= 4
+    assert result.without_a_panel > 0
+    assert result.solutions > 0
     assert result.problems() == []

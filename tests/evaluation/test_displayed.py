@@ -207,7 +207,7 @@ def png_of(width: int, height: int) -> bytes:
 @pytest.mark.parametrize("size", [(32_000, 32_000), (60_000, 60_000)])
 def test_a_picture_that_would_not_fit_is_refused_by_its_header(tmp_path: Path, size: tuple[int, int]) -> None:
     (tmp_path / "a.png").write_bytes(png_of(*size))
-    with pytest.raises(InputError, match=f"{size[0]}x{size[1]} pixels; at most 134 million"):
+    with pytest.raises(InputError, match=f"{size[0]} x {size[1]} pixels; at most 134,217,728"):
         read_picture(tmp_path / "a.png")
 
 

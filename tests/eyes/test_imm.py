@@ -87,3 +87,24 @@ def test_a_still_head_is_believed_calm_and_a_hasty_one_hasty():
     still = np.zeros((120, 3))
     hasty = np.stack([0.15 * np.sin(8 * times), 0 * times, 0 * times], 1)
     assert np.argmax(weights(still)) == 0 and np.argmax(weights(hasty)) == 2
+
+
+def test_how_sure_a_prediction_is_grows_with_the_horizon_and_is_the_mixture_s() -> None:
+    """The reference draws from the mixture: model by weight, Gaussian position and velocity, noise on the way."""
+    random = np.random.default_rng(3)
+    acceleration = (0.01, 0.5)
+    models = (
+        imm.Model(0.0, 0.0, 0.6, 0.1, 0.0, 0.0, 4e-6, 1e-5, 1e-3, 0.7),
+        imm.Model(0.004, 0.0, 0.6, 0.3, 0.1, 0.0, 9e-6, 2e-5, 4e-2, 0.3),
+    )
+    for ahead_s in (0.0, 0.05, 0.12):
+        drawn = []
+        for m, q in zip(models, acceleration, strict=True):
+            covariance = [[m.var_position, m.covariance], [m.covariance, m.var_velocity]]
+            states = random.multivariate_normal([0.0, 0.0], covariance, size=(round(200_000 * m.weight), 3))
+            mean = np.array([m.x + m.u * ahead_s, m.y + m.v * ahead_s, m.z + m.w * ahead_s])
+            noise = random.normal(0.0, (q * ahead_s**3 / 3) ** 0.5, states.shape[:2])
+            drawn.append(mean + states[..., 0] + states[..., 1] * ahead_s + noise)
+        axes = np.concatenate(drawn)
+        expected = float(np.sqrt(axes.var(axis=0).mean()))
+        assert imm.deviation(models, ahead_s, acceleration=acceleration) == pytest.approx(expected, rel=0.01)

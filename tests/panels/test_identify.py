@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -10,10 +13,16 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from calib.interview import Interview, identity
+from calib.keys import Key
 from runtime.commands.doctor import doctor
 from runtime.commands.identify import identify
+from runtime.config import load_settings
 from runtime.errors import InputError
 from runtime.panels.card import BARS, identity_card
+from runtime.panels.geometry import panel_from_screen
+from runtime.panels.monitors import Monitor
+from runtime.panels.mounting import mounting_of
 from runtime.support.artifacts import read_image
 from tests.panels.edids import block
 from tests.panels.xserver import HEIGHT_PX, WIDTH_PX
@@ -94,7 +103,7 @@ def shown_during(command, *arguments, when):
 @pytest.mark.windows
 def test_without_a_configuration_every_monitor_tells_how_to_name_it(x):
     result, seen = shown_during(
-        identify, "--seconds", 1.5, when=lambda: all((x.panel(index)[0] == 255).all() for index in range(3))
+        identify, "--all", "--seconds", 4, when=lambda: all((x.panel(index)[0] == 255).all() for index in range(3))
     )
     assert result.exit_code == 0
     assert seen
@@ -111,10 +120,128 @@ def test_with_a_configuration_panels_are_shown_as_they_will_be(x, config):
         turned, upright = x.panel(2), x.panel(0)
         return tuple(upright[bars, 12]) == BARS[0] and tuple(turned[HEIGHT_PX - 1 - bars, -13]) == BARS[0]
 
-    result, seen = shown_during(identify, "--seconds", 1.5, "--config", config, when=upright_but_for_the_turned_one)
+    result, seen = shown_during(
+        identify, "--all", "--seconds", 1.5, "--config", config, when=upright_but_for_the_turned_one
+    )
     assert result.exit_code == 0
     assert seen
     assert "panel 0: DUMMY2" in result.stdout
+
+
+@pytest.mark.windows
+def test_one_panel_shows_its_card_and_the_others_are_clear(x, config):
+    def only_the_middle() -> bool:
+        return x.panel(1).any() and not x.panel(0).any() and not x.panel(2).any()
+
+    result, seen = shown_during(identify, "--panel", 1, "--seconds", 1.5, "--config", config, when=only_the_middle)
+    assert result.exit_code == 0
+    assert seen
+
+
+def started(x, *arguments):
+    """The command in a process of its own, its keys in our hands."""
+    command = [sys.executable, "-m", "runtime.cli", "identify", *map(str, arguments)]
+    environment = os.environ | {"DISPLAY": x.name, "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+def lit(x) -> list[bool]:
+    screen = x.screenshot()
+    return [bool(screen[:HEIGHT_PX, WIDTH_PX * n : WIDTH_PX * (n + 1)].any()) for n in range(3)]
+
+
+@pytest.mark.windows
+def test_keys_go_from_panel_to_panel(x, config):
+    with started(x, "--config", config) as running:
+        try:
+            # Rear to front lie on monitors 2, 1, 0.
+            for monitor, key in ((2, "n"), (1, "n"), (0, "p"), (1, "q")):
+                assert eventually(lambda monitor=monitor: lit(x) == [n == monitor for n in range(3)], within_s=20.0)
+                running.stdin.write(key)
+                running.stdin.flush()
+            assert running.wait(timeout=20) == 0
+        finally:
+            running.kill()
+
+
+@pytest.mark.windows
+def test_answers_write_the_configuration(x, tmp_path):
+    config = tmp_path / "new.toml"
+    config.write_text(
+        f"# mine\n[stack]\nwidth_px = {WIDTH_PX}\nheight_px = {HEIGHT_PX}\n"
+        '[[output.panels]]\nconnector = "DUMMY0"\nlut = "kept.csv"\n'
+        '[[output.panels]]\nconnector = "A"\n[[output.panels]]\nconnector = "B"\n'
+    )
+    up, left, right = "\x1b[A", "\x1b[D", "\x1b[C"
+    with started(x, "--config", config, "--ask") as running:
+        # The rear is the third monitor, on its side; the middle one the second, mirrored; the front the first.
+        answers = ["n", "n", "\n", left, "\n", "n", "\n", right, "n", "\n", up, "\n"]
+        output, _ = running.communicate("".join(answers), timeout=60)
+        assert running.returncode == 0
+    assert "Which way does its arrow point" in output
+    settings = load_settings(config)
+    rear, middle, front = settings.output.panels
+    assert config.read_text().startswith("# mine")
+    assert (rear.connector, rear.rotation_deg, rear.mirror) == ("DUMMY2", 90, "none")
+    assert (middle.edid_serial, middle.rotation_deg, middle.mirror) == ("A1B2-0003", 90, "horizontal")
+    assert (front.connector, front.rotation_deg, front.mirror, front.lut) == ("DUMMY0", 0, "none", "kept.csv")
+    assert settings.output.kind == "windows"
+
+
+@pytest.mark.windows
+def test_who_stops_before_the_last_answer_changes_nothing(x, config):
+    with started(x, "--config", config, "--ask") as running:
+        running.communicate("n\nq", timeout=60)
+        assert running.returncode == 0
+    assert config.read_text() == BOUND
+
+
+MONITORS = [Monitor(f"HDMI-{n}", serial, "", 100 * n, 0, 100, 50, 60.0) for n, serial in enumerate(("S", "T", "T", ""))]
+
+
+def test_a_monitor_is_named_by_a_serial_of_its_own_or_else_by_its_connector():
+    named = [identity(monitor, MONITORS) for monitor in MONITORS]
+    assert named == [{"edid_serial": "S"}, {"connector": "HDMI-1"}, {"connector": "HDMI-2"}, {"connector": "HDMI-3"}]
+
+
+def test_a_monitor_that_is_taken_is_not_offered_again_and_an_answer_can_be_taken_back():
+    said: list[str] = []
+    interview = Interview(MONITORS, panels=2, say=said.append)
+    for key in (Key.NEXT, Key.ACCEPT, Key.UP, Key.ACCEPT):
+        interview.press(key)
+    assert interview.shown != 1
+    shown = {interview.shown}
+    for _ in range(5):
+        interview.press(Key.NEXT)
+        shown.add(interview.shown)
+    assert shown == {0, 2, 3}
+    interview.press(Key.UNDO)
+    assert interview.shown == 1
+    assert not interview.tables
+    with pytest.raises(ValueError, match="4 monitors for 5 panels"):
+        Interview(MONITORS, panels=5, say=said.append)
+
+
+@pytest.mark.parametrize("rotation_deg", [0, 90, 180, 270])
+@pytest.mark.parametrize("mirror", ["none", "horizontal"])
+def test_the_mounting_that_is_answered_shows_the_card_upright(rotation_deg, mirror):
+    """A card sent bare to a panel that is so mounted, and what the arrow on it does: the answer gives the mounting."""
+    card_points_up = np.array([0.0, -1.0])
+    seen = panel_from_screen(screen_width_px=4, screen_height_px=3, rotation_deg=rotation_deg, mirror=mirror)
+    direction = tuple(np.rint(seen[:2, :2] @ card_points_up).astype(int))
+    arrow = {(0, -1): "up", (0, 1): "down", (-1, 0): "left", (1, 0): "right"}[direction]
+    assert mounting_of(arrow, mirrored=mirror == "horizontal") == (rotation_deg, mirror)
+
+
+@pytest.mark.parametrize(
+    "options", [["--ask"], ["--panel", "3", "--out", "cards"], ["--panel", "-2", "--out", "cards"]]
+)
+def test_wrong_requests_are_refused(tmp_path, config, monkeypatch, options):
+    monkeypatch.chdir(tmp_path)
+    chosen = [] if "--ask" in options else ["--config", config]
+    result = invoke(identify, *chosen, *options)
+    assert isinstance(result.exception, InputError)
+    assert not (tmp_path / "cards").exists()
 
 
 def test_it_can_write_pictures_where_there_is_no_screen(tmp_path, config, monkeypatch):

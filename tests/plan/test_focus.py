@@ -21,9 +21,9 @@ from runtime.plan import measure
 from runtime.plan.drawing import raster_views
 from runtime.plan.focus import FocusedPredictor
 from runtime.plan.measure import displayed_psnr
-from runtime.plan.planning import focused, planned_predictor
+from runtime.plan.predictors import focused, planned_predictor
 from runtime.plan.reduced import ladder_predictor
-from runtime.plan.savings import solved_eyes
+from runtime.plan.savings import selected_eyes
 from runtime.support.gl import offscreen_context
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 960, 540)
@@ -170,7 +170,7 @@ def test_one_eye_alone_costs_no_inference(context: Any, whole: Predictor) -> Non
     plan = make_plan(source.info, STACK, SETTINGS, eyes_m=aside)
     assert plan.eyes == (True, False)
     part = part_of(whole)
-    eyes = solved_eyes(aside, plan)
+    eyes = selected_eyes(aside, plan.eyes)
     layers = draw(source, part, eyes, time_ns=0, aim=False)
     assert part.active_fraction == 0.0
     assert psnr(layers, source, eyes) > 25

@@ -17,12 +17,14 @@ from runtime.report.frontier import MethodResult
 from runtime.report.horizon import Horizon, horizon_section, psnr_at
 from runtime.report.latency import Run, latency_section
 from runtime.report.machine import describe
+from runtime.report.moving import Moving, Strip
+from runtime.report.moving_page import moving_section
 from runtime.report.page import Figure, Page, Section, Table, Tile
 from runtime.report.plan_section import plan_section
 from runtime.report.plots import drawing, label_points, png
 from runtime.report.stability.page import stability_page
 from runtime.report.stability.trial import Answer, Trial, settle
-from runtime.report.sweeps import Curve, Size, Tolerance, Volume
+from runtime.report.sweeps import Curve, Size, Tolerance, Trade, Volume
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = (
@@ -33,7 +35,19 @@ FLAGS = (
 
 def method(name: str, kind: str, ms: float, psnr: float) -> MethodResult:
     off = {"2mm": psnr - 6, "4mm": psnr - 9, "6mm": psnr - 11}
-    return MethodResult(name, kind, "fp32", 960, 540, ms, ms * 1.3, 9, 200.0, 81, psnr, 0.97, psnr - 1, off, 2e9)  # type: ignore[arg-type]
+    told = (960, 540, ms, ms * 1.3, 9, 200.0, 81, psnr, 0.97, psnr - 1, off, 2e9, {"1": psnr - 3, "2": psnr - 6})
+    return MethodResult(name, kind, "fp32", *told)  # type: ignore[arg-type]
+
+
+def moving_runs_made_up() -> tuple[list[Moving], Strip]:
+    found = [
+        Moving(motion, solver_ms, aligned, 27.0 if aligned else 27.0 - solver_ms / 20, 9, (3.0, 7.0), solver_ms / 4)
+        for motion in ("still", "lean")
+        for solver_ms in (33.0, 150.0)
+        for aligned in (False, True)
+    ]
+    picture = np.random.default_rng(0).integers(0, 256, (3, 27, 48, 3), dtype=np.uint8)
+    return found, Strip("lean", 150.0, [1.0, 1.2, 1.4], picture, picture, [18, 19, 20], picture, [26, 27, 28])
 
 
 def report_page() -> Page:
@@ -59,11 +73,17 @@ def report_page() -> Page:
     ]  # fmt: skip
     sections = [
         frontier_page.frontier_section(methods, pairs="a pair", title="Frontier", name="test"),
-        sweep_page.volume_section(Volume(range(9), range(9), holed), model="balanced", scene="demo"),
+        sweep_page.volume_section(Volume(range(9), range(9), holed, holed - 2), model="balanced", scene="demo"),
         sweep_page.tolerance_section(tolerance, model="balanced", distance_m=0.6),
-        sweep_page.knob_section([Curve("balanced", [40, 41, 42], [30, 29, 27], ["4", "2", "0"])], where="a scene"),
-        sweep_page.gap_section([Curve("balanced", [5, 30, 60], [30, 35, 36])]),
-        sweep_page.resolution_section([Size("balanced", 480, 270, 9.0, 30.0), Size("balanced", 960, 540, 30.0, 35.0)]),
+        sweep_page.trade_section(
+            [Trade("balanced", [0.0, 1.0, 2.0], {0.0: [42, 41, 40], 1.0: [35, 38, 37.0], 2.0: [30, 32, 36.0]})],
+            where="a scene",
+        ),
+        moving_section(*moving_runs_made_up()),
+        sweep_page.gap_section([Curve("balanced", [5, 30, 60], [30, 35, 36], [29, 33, 32])]),
+        sweep_page.resolution_section(
+            [Size("balanced", 480, 270, 9.0, 30.0, 29.0), Size("balanced", 960, 540, 30.0, 35.0, 31.0)]
+        ),
         horizon_section([Horizon(name, percentiles, 2 * percentiles) for name in ("still", "walk")], tolerance),
         latency_section(runs),
     ]
@@ -149,6 +169,26 @@ def test_a_times_table_shows_ratios_beside_milliseconds() -> None:
     column = list(table.headings).index("× fastest")
     assert [row[column] for row in table.rows] == ["1.0", "2.0", "45.0"]
     assert list(table.styles) == ["good", "good", ""]
+
+
+def test_exact_and_expected_stand_side_by_side_in_the_frontiers_table() -> None:
+    section = report_page().sections[0]
+    table = section.tables[0]
+    columns = [list(table.headings).index(name) for name in ("PSNR dB", "expected 1 mm dB", "expected 2 mm dB")]
+    assert columns == list(range(columns[0], columns[0] + 3))
+    assert [table.rows[0][column] for column in columns] == ["36.00", "33.00", "30.00"]
+    assert [figure.name for figure in section.figures][:2] == ["frontier-test", "expected-test"]
+
+
+def test_held_and_aligned_stand_side_by_side_over_the_solvers_time() -> None:
+    (section,) = [section for section in report_page().sections if "moving" in section.title]
+    (table,) = section.tables
+    assert [list(row[:4]) for row in table.rows] == [
+        ["still", "33", "25.4", "27.0"],
+        ["still", "150", "19.5", "27.0"],
+        ["lean", "33", "25.4", "27.0"],
+        ["lean", "150", "19.5", "27.0"],
+    ]
 
 
 def test_an_untrained_network_has_a_time_and_no_error() -> None:

@@ -1,4 +1,4 @@
-"""`phasestack stability`: enough cases, all of them pass, and a case can fail."""
+"""`phasestack stability`: enough cases, all of them pass, and a case can fail: impostors do."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from typer.testing import CliRunner
 
 from runtime.commands.stability import stability
 from runtime.errors import InputError
-from runtime.report.stability import poses, suite
+from runtime.report.stability import controls, poses, solve, suite
+from runtime.report.stability.controls import Control
+from runtime.report.stability.limits import load_limits, recorded
 from runtime.report.stability.page import heat_map, row, spare_digits, stability_page
 from runtime.report.stability.trial import Answer, Case, Trial, refusal, settle
 
@@ -39,7 +41,7 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, Path]:
 def test_there_are_at_least_120_cases_over_six_stages_and_all_pass(record: tuple[dict, Path]) -> None:
     cases = record[0]["cases"]
     assert len(cases) >= 120
-    assert len({case["stage"] for case in cases}) >= 6
+    assert {case["stage"] for case in cases} == STAGES | {"controls"}
     assert [case["name"] for case in cases if not case["passed"]] == []
     assert len({(case["stage"], case["name"]) for case in cases}) == len(cases), "a name is used twice"
 
@@ -61,22 +63,123 @@ def test_json_plots_and_page_lie_in_the_folder(record: tuple[dict, Path]) -> Non
     assert "http" not in page.replace("http-equiv", ""), "the page must need nothing from elsewhere"
 
 
+STAGES = {
+    "eye pose", "RPU", "phase", "Jones optics", "retina", "solve", "network", "tracker", "calibration",
+}  # fmt: skip
+
+
+def test_every_stage_has_its_impostors_and_they_fail_most_of_its_cases(record: tuple[dict, Path]) -> None:
+    """Seen in the issue: an operator of zeros, grey layers, the mean of the targets, a tracker that repeats itself, one
+    eye alone: each passed all there was."""
+    found = {case["name"]: case for case in record[0]["cases"] if case["stage"] == "controls"}
+    assert {name.partition(":")[0] for name in found} == STAGES
+    for name in (
+        "solve: an operator of zeros", "solve: grey layers", "solve: one eye alone", "solve: mean of targets",
+        "network: mean of targets", "network: grey layers", "tracker: repeats its first sample",
+        "calibration: no shift", "retina: grey, and 30 dB",
+    ):  # fmt: skip
+        assert found[name]["forward_error"] <= 0.5, found[name]["note"]
+
+
+def test_the_code_itself_in_an_impostors_place_fails_the_control() -> None:
+    """A control measures something: what is right passes its stage, and so is no impostor."""
+    done, count = controls.passed(Control(poses.STAGE, "itself", poses.trials), {})
+    assert done == count > 20
+
+
+@pytest.mark.parametrize("defect", ["operator off by a tenth of a pixel", "eyes exchanged"])
+def test_a_small_defect_of_the_operator_is_found_too(defect: str) -> None:
+    real = solve.eye_operator
+
+    def bent(eye: object, stack: object, **size: object) -> object:
+        moved = np.asarray(eye) * [1, -1, 1] if defect == "eyes exchanged" else np.add(eye, [0, 0.01, 0])
+        return real(moved, stack, **size)  # type: ignore[arg-type]
+
+    code = solve.Solvers(make_operator=bent)
+    trials = [trial for trial in solve.trials(code) if trial.name in ("spectrum, gap 0.06 m", "spectrum, gap 0.1 m")]
+    assert len(trials) == 2 and not any(settle(trial).passed for trial in trials)
+
+
 def test_a_failing_case_makes_the_command_exit_with_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A pose that is wrong by a millionth: the command, on the poses alone, with one defect put into the optics."""
-    true_pose = poses.stack_from_eye
 
     def bent(eye: object) -> np.ndarray:
-        pose = true_pose(eye)  # type: ignore[arg-type]
+        pose = poses.stack_from_eye(eye)  # type: ignore[arg-type]
         pose[0, 0] += 1e-6
         return pose
 
-    monkeypatch.setattr(poses, "stack_from_eye", bent)
-    monkeypatch.setattr(suite, "every_trial", lambda fit, check, full: poses.trials())
+    code = poses.Poses(pose=bent)
+    monkeypatch.setattr(suite, "every_trial", lambda fits, check, full, limits: poses.trials(code))
     done = command("--out", str(tmp_path))
     assert done.exit_code == 1
     assert "FAILS eye pose" in done.output
     cases = json.loads((tmp_path / "stability.json").read_text())["cases"]
     assert any(case["passed"] for case in cases), "what does not use the bent pose still passes"
+
+
+def test_a_case_that_crashes_fails_by_its_name_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def crashes() -> Answer:
+        raise ZeroDivisionError("somewhere deep inside")
+
+    def trials(fits: object, check: object, full: bool, limits: object) -> list[Trial]:
+        good = Trial("solve", "a good one", lambda: Answer(0.0, 1.0), measure="of the wanted")
+        bad = Trial("solve", "a bad one", crashes, measure="of the wanted", recorded=True)
+        return [bad, good]
+
+    monkeypatch.setattr(suite, "every_trial", trials)
+    done = command("--out", str(tmp_path))
+    assert done.exit_code == 1
+    assert "FAILS solve: a bad one" in done.output and "ZeroDivisionError" in done.output
+    cases = {case["name"]: case for case in json.loads((tmp_path / "stability.json").read_text())["cases"]}
+    assert cases["a good one"]["passed"] and not cases["a bad one"]["passed"]
+    assert "a bad one" in (tmp_path / "index.html").read_text()
+
+
+def test_a_stage_whose_cases_cannot_be_made_is_one_failed_case(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object, **__: object) -> list[Trial]:
+        raise KeyError("no such preset")
+
+    for name in ("networks", "solve", "controls", "calibration"):
+        monkeypatch.setattr(getattr(suite, name), "trials", broken)
+    limits: dict[str, float] = {}
+    cases = suite.run(list(suite.every_trial({}, lambda *_: None, full=False, limits=limits)), limits=limits)
+    failed = {case.stage: case for case in cases if case.name == "its cases"}
+    assert failed.keys() == {"network", "solve", "controls", "calibration"}
+    assert all(not case.passed and "KeyError" in case.note for case in failed.values())
+    assert sum(case.stage == "eye pose" and case.passed for case in cases) > 20
+
+
+def held(forward: float, limit: float | None, *, tolerance: float = 1.0, floor: float = 0.0) -> Case:
+    trial = Trial("stage", "name", lambda: Answer(forward, tolerance), recorded=True, floor=floor)
+    return settle(trial, limit=limit)
+
+
+def test_a_case_is_held_to_what_was_recorded_and_five_per_cent() -> None:
+    assert held(0.104, 0.1).passed
+    assert not held(0.106, 0.1).passed
+    assert held(0.106, 0.1, floor=0.002).passed
+    assert not held(0.5, 1.0, tolerance=0.4).passed, "a record does not loosen a tolerance"
+    without = held(0.0, None)
+    assert not without.passed and "no limit is recorded" in without.note
+
+
+def test_a_record_holds_what_is_held_to_one_and_keeps_what_was_not_run() -> None:
+    trials = [
+        Trial("stage", "held", lambda: Answer(0.12345678, 1.0), recorded=True),
+        Trial("stage", "crashed", lambda: Answer(math.nan, 1.0), recorded=True),
+        Trial("stage", "free", lambda: Answer(0.5, 1.0)),
+    ]
+    text = recorded(trials, [settle(trial) for trial in trials], {"stage: long": 3.0})
+    assert json.loads(text) == {"stage: held": 0.1235, "stage: long": 3.0}
+
+
+def test_a_broken_record_is_one_line(tmp_path: Path) -> None:
+    for content in ("not JSON", "[1]", '{"a": "b"}'):
+        (tmp_path / "limits.json").write_text(content)
+        with pytest.raises(InputError, match=r"limits\.json: is no record"):
+            load_limits(tmp_path / "limits.json")
 
 
 def answer(forward: float, tolerance: float = 1e-9, *, warned: bool = False) -> Trial:
@@ -130,7 +233,7 @@ def test_without_mpmath_the_command_says_what_to_install() -> None:
         "import sys; sys.modules['mpmath'] = None\n"
         "from runtime.commands.stability import stability\n"
         "from runtime.errors import MissingPart\n"
-        "try: stability(out=None, full=False, as_json=False)\n"
+        "try: stability(out=None, full=False, as_json=False, record=None)\n"
         "except MissingPart as error: print(error)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

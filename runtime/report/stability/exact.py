@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, TypedDict
 
 from runtime.errors import MissingPart
@@ -48,6 +49,7 @@ def unit(a: Vector) -> Vector:
     return (a[0] / length, a[1] / length, a[2] / length)
 
 
+@lru_cache(maxsize=256)
 def axes(eye: Vector) -> tuple[Vector, Vector, Vector]:
     """Right, up and back of an eye that looks at the origin (seed 10-13); on the vertical axis the limit from +x."""
     back = unit(eye)

@@ -2,31 +2,55 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 
-from runtime.report.stability import calibration, networks, phases, poses, rpu, solve, tracking
+from runtime.report.stability import calibration, controls, networks, phases, poses, retina, rpu, solve, tracking
 from runtime.report.stability.calibration import Fit
+from runtime.report.stability.limits import key_of
 from runtime.report.stability.networks import Check
-from runtime.report.stability.trial import Case, Trial, settle
+from runtime.report.stability.trial import Answer, Case, Trial, settle
 
 SOLVERS = (*networks.MODELS, "sart")
 
 
-def every_trial(fit: Fit, check: Check, *, full: bool) -> Iterator[Trial]:
-    """What there is to try. `fit` is the calibration's solver, `check` the check of eyes before a network."""
-    yield from poses.trials()
-    yield from rpu.trials()
-    yield from phases.trials()
-    yield from solve.trials({name: networks.solver(name) for name in SOLVERS})
-    yield from networks.trials(check, full=full)
-    yield from tracking.trials(full=full)
-    yield from calibration.trials(fit)
+def every_trial(fits: Mapping[str, Fit], check: Check, *, full: bool, limits: Mapping[str, float]) -> Iterator[Trial]:
+    """What there is to try. `fits` are the calibration's solvers by rule, `check` the check of eyes before a network.
+
+    A stage whose cases can't be made is one case, which fails.
+    """
+    methods = (*solve.OURS, *((name, networks.solver(name)) for name in SOLVERS))
+    stages: dict[str, Callable[[], Iterable[Trial]]] = {
+        poses.STAGE: poses.trials,
+        rpu.STAGE: rpu.trials,
+        phases.PHASE: phases.trials,
+        retina.STAGE: retina.trials,
+        solve.STAGE: partial(solve.trials, solve.Solvers(methods=methods)),
+        networks.STAGE: partial(networks.trials, check, full=full),
+        tracking.STAGE: partial(tracking.trials, full=full),
+        calibration.STAGE: partial(calibration.trials, fits),
+        controls.STAGE: partial(controls.trials, limits, fits),
+    }
+    for stage, make in stages.items():
+        try:
+            yield from make()
+        except Exception as error:  # one stage's fault is not the end of the others
+            yield Trial(stage, "its cases", partial(_raise, error))
 
 
-def run(trials: list[Trial], *, progress: Callable[[int, int], None] = lambda done, of: None) -> list[Case]:
+def _raise(error: Exception) -> Answer:
+    raise RuntimeError(f"{type(error).__name__}: {error}") from error
+
+
+def run(
+    trials: list[Trial],
+    *,
+    limits: Mapping[str, float],
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> list[Case]:
     """Settle every trial, telling how far it is."""
     cases = []
     for index, trial in enumerate(trials):
-        cases.append(settle(trial))
+        cases.append(settle(trial, limit=limits.get(key_of(trial))))
         progress(index + 1, len(trials))
     return cases

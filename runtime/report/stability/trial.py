@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from runtime.errors import PhasestackError
@@ -12,6 +12,7 @@ from runtime.errors import PhasestackError
 Behaviour = Literal["answers", "warns", "refuses"]
 EPS64 = 2.0**-52
 EPS32 = 2.0**-23
+WORSE = 1.05  # than recorded a case may be at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,8 @@ class Trial:
     run: Callable[[], Answer | None]  # None: it answered where it must refuse
     expected: Behaviour = "answers"
     measure: str = "relative"  # unit of the forward error
+    recorded: bool = False  # held to what was recorded (`limits`), beside the tolerance that the answer states
+    floor: float = 0.0  # of a recorded limit: what another machine's rounding may add, in the measure
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +66,11 @@ def refusal(stage: str, name: str, call: Callable[[], object]) -> Trial:
     return Trial(stage, name, run, expected="refuses", measure="-")
 
 
-def settle(trial: Trial) -> Case:
-    """Run a trial. Nothing that the code under trial raises escapes; only its own errors count as a refusal."""
+def settle(trial: Trial, *, limit: float | None = None) -> Case:
+    """Run a trial. Nothing that the code under trial raises escapes; only its own errors count as a refusal.
+
+    limit: the forward error that was recorded of it; a trial that is held to one fails without it.
+    """
     nothing = float("nan")
     try:
         with warnings.catch_warnings():
@@ -88,6 +94,8 @@ def settle(trial: Trial) -> Case:
             trial.name, trial.stage, float("inf"), nothing, nothing, "answers", 0.0, False, trial.expected,
             trial.measure, "it answered where no answer exists",
         )  # fmt: skip
+    if trial.recorded:
+        answer = _held_to(answer, limit, trial.floor)
     behaviour: Behaviour = "warns" if answer.warned else "answers"
     backward = answer.forward_error if answer.backward_error is None else answer.backward_error
     # A NaN compares false with everything: it fails.
@@ -96,3 +104,11 @@ def settle(trial: Trial) -> Case:
         trial.name, trial.stage, answer.condition, answer.forward_error, backward, behaviour, answer.tolerance,
         passed, trial.expected, trial.measure, answer.note,
     )  # fmt: skip
+
+
+def _held_to(answer: Answer, limit: float | None, floor: float) -> Answer:
+    """The answer with the tighter of its own tolerance and the recorded limit."""
+    if limit is None:
+        note = "; ".join(filter(None, (answer.note, "no limit is recorded: phasestack stability --record")))
+        return replace(answer, tolerance=-1.0, note=note)
+    return replace(answer, tolerance=min(answer.tolerance, WORSE * limit + floor))

@@ -59,7 +59,7 @@ def drive(
             has_picture = last is not None and (last.frame.solved is not None or last.frame.flat is not None)
             layers = shown_layers(last.frame) if last is not None and has_picture else None
             output.finish(summary, layers, run.observer.look)
-    return summary | {"machine_s": round(machine_s, 3)}
+    return summary | {"machine_s": round(machine_s, 3), "left_behind": run.solver.left_behind}
 
 
 def _progress(total: int | None) -> Any:

@@ -1,0 +1,91 @@
+"""Writing into a configuration: its comments stay, what it was is kept beside it, and only what is valid is written."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from calib.store import save
+from runtime.config import load_settings
+from runtime.errors import InputError
+from runtime.records import F64
+from runtime.support.artifacts import write_text
+
+if TYPE_CHECKING:
+    from tomlkit import TOMLDocument
+
+
+def read_document(config: Path) -> TOMLDocument:
+    """A configuration to be changed; an empty one where the file is not there yet. Raises InputError."""
+    import tomlkit
+    from tomlkit.exceptions import ParseError
+
+    if not config.exists():
+        return tomlkit.document()
+    load_settings(config)
+    try:
+        return tomlkit.parse(config.read_text(encoding="utf-8"))
+    except ParseError as error:
+        raise InputError(config, "", f"malformed: {error}") from None
+
+
+def put(document: TOMLDocument, section: str, values: Mapping[str, Any]) -> None:
+    """Set keys of a table, which is made where there is none."""
+    import tomlkit
+
+    table: Any = document.setdefault(section, tomlkit.table())
+    for key, value in values.items():
+        table[key] = value
+
+
+def put_homographies(document: TOMLDocument, matrices: F64) -> None:
+    """Set every panel's homography (N, 3, 3), making the tables where there are none."""
+    import tomlkit
+
+    output: Any = document.setdefault("output", tomlkit.table())
+    if "panels" not in output:
+        output["panels"] = tomlkit.aot()
+        for _ in matrices:
+            output["panels"].append(tomlkit.table())
+    for table, matrix in zip(output["panels"], matrices, strict=True):
+        table["homography"] = matrix.tolist()
+
+
+def put_monitors(document: TOMLDocument, tables: Sequence[Mapping[str, Any]]) -> None:
+    """Set which monitor is which panel, rear to front, and how it is mounted.
+
+    A panel whose monitor and mounting are as they were keeps what else is known of it (registration, grey curve).
+    """
+    import tomlkit
+
+    output: Any = document.setdefault("output", tomlkit.table())
+    past = [dict(table.unwrap()) for table in output.get("panels", ())]
+    found = tomlkit.aot()
+    for values in tables:
+        same = next((old for old in past if all(old.get(k, _DEFAULTS.get(k)) == v for k, v in values.items())), {})
+        table = tomlkit.table()
+        for key, value in ({**same, **values}).items():
+            table[key] = value
+        found.append(table)
+    if "panels" in output:
+        del output["panels"]
+    output["panels"] = found
+    if output.get("kind", "offscreen") == "offscreen":
+        output["kind"] = "windows"
+
+
+_DEFAULTS: dict[str, Any] = {"rotation_deg": 0, "mirror": "none"}
+
+
+def save_document(config: Path, document: TOMLDocument) -> Path | None:
+    """Write it if it is valid, and only then; answers where the one it replaces is kept. Raises InputError."""
+    import tomlkit
+
+    text = tomlkit.dumps(document)
+    with tempfile.TemporaryDirectory() as folder:
+        trial = Path(folder) / config.name
+        write_text(trial, text)
+        load_settings(trial)
+    return save(config, text)

@@ -1,0 +1,46 @@
+"""`phasestack setup`: from the box to a picture, step by step."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def setup(
+    config: Annotated[
+        Path, typer.Option(help="configuration to write; one that is there is changed, the old one kept")
+    ] = Path("phasestack.toml"),
+    out: Annotated[Path, typer.Option(help="folder for pairs, calibration, reports and the page of figures")] = Path(
+        "setup"
+    ),
+    photos: Annotated[Path | None, typer.Option(help="folder in which the photographs of the boards will lie")] = None,
+    device: Annotated[str | None, typer.Option(help="a video device (number or path) instead of photographs")] = None,
+    simulate: Annotated[bool, typer.Option("--simulate", help="a display that is not there, to try it out")] = False,
+    seed: Annotated[int, typer.Option(help="of the simulated display")] = 0,
+    again: Annotated[bool, typer.Option("--again", help="begin at the first step, whatever is done")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout, at the end")] = False,
+) -> None:
+    """Set a display up: which monitor is which panel, sizes, registration by photographs, sensor, calibration.
+
+    Driven by keys alone, in the terminal or on a panel's window; what is asked stands on the panels too. Every step
+    can be skipped and repeated; q stops, and the same command goes on there. At the end: a page of figures, and a
+    configuration that is valid.
+
+    Example: phasestack setup --simulate --config try.toml --out try
+    """
+    from calib.setup_run import run_setup
+    from runtime.errors import InputError
+
+    if photos is not None and device is not None:
+        raise InputError("setup", "--photos", "or --device, not both")
+    summary, text = run_setup(
+        config, out=out, simulate=simulate, seed=seed, photos=photos, device=device, again=again, to_stderr=as_json
+    )
+    if as_json:
+        from runtime.support.artifacts import to_json
+
+        typer.echo(to_json(summary))
+    else:
+        typer.echo("\n" + text)

@@ -1,0 +1,161 @@
+"""What an eye sees, and how good that is: simulated retinas and PSNR against a tracer of 50 digits (design 5.5)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from runtime.optics.quality import psnr_db, quality
+from runtime.optics.retina import seen_by
+from runtime.optics.stack import PanelStack
+from runtime.records import U8
+from runtime.report.stability import exact
+from runtime.report.stability.trial import EPS32, EPS64, Answer, Trial, refusal
+
+STAGE = "retina"
+SIZE = (32, 18)  # of the pictures and panels: every ray of a small picture is traced
+FOV_DEG = 40.0
+THREE = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), *SIZE)
+EDGE_PX = 1e-4  # a ray so near to where it begins to count may count or not
+
+
+@dataclass(frozen=True, slots=True)
+class Eyesight:
+    """The code under trial; `controls` puts impostors in its place."""
+
+    seen: Callable[..., Any] = seen_by
+    quality: Callable[..., Any] = quality
+    psnr: Callable[[float], float] = psnr_db
+
+
+def layers_of(kind: str, stack: PanelStack) -> U8:
+    """(N, h, w, 3) grey levels that show every mistake of sampling, or none."""
+    shape = (stack.count, stack.height_px, stack.width_px, 3)
+    if kind == "noise":
+        return np.random.default_rng(6).integers(0, 256, shape, dtype=np.uint8)
+    if kind == "checkerboard":
+        board = np.indices(shape[1:3]).sum(0) % 2 * 255
+        return np.broadcast_to(board[None, :, :, None], shape).astype(np.uint8).copy()
+    return np.full(shape, 255, np.uint8)
+
+
+def traced(eye: Any, stack: PanelStack, layers: U8, column: int, row: int, channel: int) -> tuple[Any, float]:
+    """The intensity that a ray of the picture sees, and by how many pixels it crosses the panels inside what counts.
+
+    Bilinear between a panel's pixel centres, summed, sin² of pi/2 of it.
+    """
+    u, v = exact.mpf(column) + exact.mpf("0.5"), exact.mpf(row) + exact.mpf("0.5")
+    direction = exact.ray(eye, u, v, width_px=SIZE[0], height_px=SIZE[1], fov_deg=FOV_DEG)
+    if direction[0] >= 0:
+        return exact.mpf(0), -math.inf
+    total, inside = exact.mpf(0), math.inf
+    for layer, x_m in zip(layers, stack.x_m, strict=True):
+        x, y = exact.panel_position(
+            exact.hit(eye, direction, x_m), width_m=stack.width_m, height_m=stack.height_m,
+            size=(stack.width_px, stack.height_px),
+        )  # fmt: skip
+        half = exact.mpf("0.5")
+        margins = (x - half, stack.width_px - half - x, y - half, stack.height_px - half - y)
+        inside = min(inside, *(float(margin) for margin in margins))
+        if inside <= 0:
+            continue
+        left, top = int(exact.mp.floor(x - half)), int(exact.mp.floor(y - half))
+        fx, fy = x - half - left, y - half - top
+        for dy, wy in ((0, 1 - fy), (1, fy)):
+            for dx, wx in ((0, 1 - fx), (1, fx)):
+                if wx and wy:
+                    total += wx * wy * int(layer[top + dy, left + dx, channel])
+    return exact.mp.sin(exact.mp.pi / 2 * total / 255) ** 2, inside
+
+
+def seen_rays(code: Eyesight, eye: Sequence[float], stack: PanelStack, kind: str) -> Answer:
+    """Every ray's intensity, and whether it counts."""
+    layers = layers_of(kind, stack)
+    retina = code.seen(eye, layers, stack, fov_deg=FOV_DEG, width_px=SIZE[0], height_px=SIZE[1])
+    if retina.image.shape != (SIZE[1], SIZE[0], 3):
+        return Answer(1.0, 0.0, note=f"a picture of {retina.image.shape}")
+    e, error, counted, wrong = exact.vector(eye), 0.0, 0, 0
+    for row in range(SIZE[1]):
+        for column in range(SIZE[0]):
+            channel = (row + column) % 3
+            truth, inside = traced(e, stack, layers, column, row, channel)
+            if abs(inside) > EDGE_PX and bool(retina.mask[row, column]) != (inside > 0):
+                wrong += 1
+            if inside > EDGE_PX and retina.mask[row, column]:
+                counted += 1
+                error = max(error, exact.distance(retina.image[row, column, channel], truth))
+    if wrong or not counted:
+        return Answer(1.0, 0.0, note=f"{wrong} rays count that do not, or the other way round; {counted} compared")
+    # Positions are single precision: half a rounding of the width, a grey step of the range a pixel and panel.
+    return Answer(error, 8 * EPS32 * SIZE[0] * stack.count, float(stack.count), note=f"{counted} rays")
+
+
+def displayed(code: Eyesight, eyes: Sequence[Sequence[float]], kind: str) -> Answer:
+    """PSNR of one mean squared error over both eyes, all rays that count and all channels, in dB."""
+    layers = layers_of("noise", THREE)
+    random = np.random.default_rng(9)
+    seen = [code.seen(eye, layers, THREE, fov_deg=FOV_DEG) for eye in eyes]
+    total, count = exact.mpf(0), 0
+    wanted = []
+    for eye, retina in zip(eyes, seen, strict=True):
+        if kind == "nearly right":
+            target = np.clip(retina.image + random.normal(0, 1e-3, retina.image.shape), 0, 1).astype(np.float32)
+        else:
+            target = random.random(retina.image.shape, dtype=np.float32)
+        wanted.append(target)
+        e = exact.vector(eye)
+        for row in range(SIZE[1]):
+            for column in range(SIZE[0]):
+                for channel in range(3):
+                    truth, inside = traced(e, THREE, layers, column, row, channel)
+                    if inside > 0:
+                        total += (truth - exact.mpf(float(target[row, column, channel]))) ** 2
+                        count += 1
+    truth_db = -10 * exact.mp.log10(total / count)
+    found = code.quality([r.image for r in seen], wanted, [r.mask for r in seen])
+    note = f"{float(truth_db):.3f} dB of {count} values"
+    return Answer(exact.distance(found.psnr_db, truth_db), 0.002, note=note)
+
+
+def decibels(code: Eyesight, squared: float) -> Answer:
+    """-10·log10 of a mean squared error, down to where nothing is left of it."""
+    truth = -10 * exact.mp.log10(exact.mpf(squared))
+    return Answer(exact.distance(code.psnr(squared), truth), 16 * EPS64 * max(abs(float(truth)), 1.0))
+
+
+def trials(code: Eyesight = Eyesight()) -> Iterator[Trial]:
+    """Every case of what eyes see."""
+    two = PanelStack(0.5184, 0.2916, (-0.02, 0.03), *SIZE)
+    four = PanelStack(0.3, 0.2, (-0.09, -0.02, 0.01, 0.06), 17, 31)
+    for name, eye in (
+        ("straight ahead", [0.7, 0.0, 0.0]),
+        ("aside and above", [0.55, 0.2, 0.15]),
+        ("60 degrees aside", [0.35, 0.6, -0.1]),
+        ("5 cm before the front panel", [0.11, 0.05, 0.02]),
+        ("4 m away", [4.0, -0.3, 0.2]),
+    ):
+        for kind in ("noise", "checkerboard"):
+            run = partial(seen_rays, code, eye, THREE, kind)
+            yield Trial(STAGE, f"rays, {name}, {kind}", run, measure="intensity")
+    for name, stack in (("two panels", two), ("four uneven panels of 17x31", four)):
+        run = partial(seen_rays, code, [0.6, 0.04, 0.03], stack, "noise")
+        yield Trial(STAGE, f"rays, {name}", run, measure="intensity")
+    yield Trial(STAGE, "rays, all white", partial(seen_rays, code, [0.6, 0, 0], THREE, "white"), measure="intensity")
+    eyes = [[0.7, -0.03, 0.05], [0.7, 0.03, 0.05]]
+    for kind in ("nearly right", "all wrong"):
+        yield Trial(STAGE, f"PSNR, {kind}", partial(displayed, code, eyes, kind), measure="dB")
+    for squared in (1.0, 0.5, 1e-3, 1e-6, 1e-10):
+        yield Trial(STAGE, f"PSNR of a squared error of {squared:g}", partial(decibels, code, squared), measure="dB")
+    layers = layers_of("noise", THREE)
+
+    def nobody() -> object:
+        away = code.seen([0.07, 30.0, 0.0], layers, THREE, fov_deg=FOV_DEG)
+        return code.quality([away.image], [away.image], [away.mask])
+
+    yield refusal(STAGE, "PSNR where no ray crosses every panel", nobody)
+    yield refusal(STAGE, "an eye behind the panels", partial(code.seen, [-0.5, 0, 0], layers, THREE, fov_deg=FOV_DEG))

@@ -1,0 +1,254 @@
+"""`phasestack setup`: every key of a scripted terminal, from nothing to a configuration that a run is right with."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.keys import Key
+from calib.message import message_layers
+from calib.misregistration import corrected
+from calib.placed import ideal_panel, true_from_ideal_seen
+from calib.registration import through
+from calib.setup_run import progress_path, read_progress, walk_through
+from calib.setup_steps import STEPS, Setup, geometry, identify
+from calib.setup_world import SimulatedWorld
+from calib.viewpoints import eyes_at, grid, viewing_place_m
+from runtime.config import Settings, load_settings
+from runtime.errors import InputError
+from runtime.eyes.calibration import load_calibration
+from runtime.eyes.demo_geometry import demo_stack_from_sensor
+from runtime.optics.carried import CarriedView
+from runtime.optics.quality import psnr_db
+from runtime.support.artifacts import read_image
+
+STACK = Settings().stack.stack()
+UP, DOWN, RIGHT, LEFT = "\x1b[A", "\x1b[B", "\x1b[C", "\x1b[D"
+
+
+def answers_of(world: SimulatedWorld) -> str:
+    """The keys of a person who looks at a simulated display's cards, rear to front."""
+    keys, shown, taken = "", 0, []
+    for panel in range(len(world.order)):
+        wanted = world.order.index(panel)
+        while shown != wanted:
+            keys += "n"
+            shown = (shown + 1) % len(world.order)
+            while shown in taken:
+                shown = (shown + 1) % len(world.order)
+        rotation_deg, mirror = world.mounted[wanted]
+        keys += "\n" + (DOWN if rotation_deg else UP) + ("n" if mirror != "none" else "\n")
+        taken.append(wanted)
+        while len(taken) < len(world.order) and shown in taken:
+            shown = (shown + 1) % len(world.order)
+    return keys
+
+
+def every_key(seed: int) -> str:
+    world = SimulatedWorld(STACK, seed=seed)
+    steps = [
+        "\n" + answers_of(world),
+        "\n" + DOWN + RIGHT + LEFT + "\n",
+        "\n",
+        "\n\n",
+        "\n" + "\n" * len(grid()),
+    ]
+    return "".join(steps)
+
+
+def setup_command(folder: Path, keys: str, *options: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "runtime.cli", "setup", "--config", "new.toml", "--out", "out", *options]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+    return subprocess.run(
+        command, input=keys, cwd=folder, env=environment, capture_output=True, text=True, timeout=500, check=False
+    )
+
+
+@pytest.fixture(scope="module")
+def set_up(tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess[str], SimulatedWorld]:
+    folder = tmp_path_factory.mktemp("setup")
+    done = setup_command(folder, every_key(5), "--simulate", "--seed", "5")
+    return folder, done, SimulatedWorld(STACK, seed=5)
+
+
+@pytest.mark.slow
+def test_keys_alone_lead_from_nothing_to_a_configuration_that_is_valid(set_up) -> None:
+    folder, done, _ = set_up
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "step calibration: done" in done.stdout
+    assert "not done:" not in done.stdout
+    command = [sys.executable, "-m", "runtime.cli", "config", "--check", str(folder / "new.toml")]
+    assert subprocess.run(command, capture_output=True, check=False).returncode == 0
+    told = json.loads((folder / "out" / "setup.json").read_text())
+    assert told["finished"]
+    assert set(told["done"]) == {step.name for step in STEPS}
+    assert "eyes see" in (folder / "out" / "index.html").read_text()
+
+
+@pytest.mark.slow
+def test_every_panel_is_bound_to_its_monitor_as_it_is_mounted(set_up) -> None:
+    folder, _, world = set_up
+    for index, panel in enumerate(load_settings(folder / "new.toml").output.panels):
+        monitor = world.order.index(index)
+        assert panel.edid_serial == f"S{monitor}"
+        assert (panel.rotation_deg, panel.mirror) == world.mounted[monitor]
+
+
+@pytest.mark.slow
+def test_the_sensor_is_found_where_it_stands(set_up) -> None:
+    folder, _, _ = set_up
+    settings = load_settings(folder / "new.toml")
+    found = load_calibration(Path(settings.calibration.file)).stack_from_sensor
+    eyes = np.array([viewpoint.midpoint_m for viewpoint in grid()])
+    sensor = np.column_stack([eyes, np.ones(27)]) @ np.linalg.inv(demo_stack_from_sensor()).T
+    assert np.linalg.norm((sensor @ found.T)[:, :3] - eyes, axis=1).mean() < 0.002
+
+
+class TrueStackView(CarriedView):
+    """What an eye sees along the carried rays through panels that truly stand elsewhere."""
+
+    def __init__(self, nominal_m, stack, panels, **view) -> None:
+        super().__init__(nominal_m, stack, **view)
+        self._panels = panels
+
+    def _positions(self, true_m, rows):
+        for index, (u, v) in enumerate(super()._positions(true_m, rows)):
+            matrix = true_from_ideal_seen(self._panels[index], true_m, self._stack, index)
+            places = through(matrix, np.column_stack([u.ravel(), v.ravel()]))
+            yield places[:, 0].reshape(u.shape), places[:, 1].reshape(v.shape)
+
+
+def carried_db(light: Path, settings: Settings, panels, *, registered: bool) -> float:
+    """Displayed dB (design 5.5) of what a run left of a refresh's light, on panels that stand where they do."""
+    told = json.loads((light / "light.json").read_text())
+    stack = settings.stack.stack()
+    layers = np.stack([read_image(light / f"layer-{index}.png") for index in range(stack.count)])
+    if registered:
+        layers = corrected(layers, [np.array(panel.homography) for panel in settings.output.panels])
+    errors = []
+    for side, name in enumerate(("left", "right")):
+        drawn = read_image(light / f"drawn-{name}.png")
+        view = TrueStackView(
+            told["solved_for_m"][side], stack, panels, width_px=drawn.shape[1], height_px=drawn.shape[0],
+            fov_deg=told["fov"],
+        )  # fmt: skip
+        seen = view.seen_from(told["eyes_m"][side], layers)
+        errors.append(((seen.image - drawn / np.float32(255))[seen.mask] ** 2).ravel())
+    return psnr_db(float(np.concatenate(errors).mean()))
+
+
+@pytest.mark.slow
+def test_a_run_of_it_shows_the_eyes_within_a_decibel_of_a_perfect_stack(set_up, tmp_path) -> None:
+    """The run's own light, sent through the registration to the panels where they truly are."""
+    folder, _, world = set_up
+    command = [sys.executable, "-m", "runtime.cli", "run", "--config", str(folder / "new.toml"), "--replay", "demo",
+               "--headless", "--max-speed", "--frames", "31", "--keep-light", "15",
+               "--out", str(tmp_path / "run")]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "calibrated for sensor" not in done.stderr
+    settings = load_settings(folder / "new.toml")
+    light = max((tmp_path / "run" / "light").iterdir(), key=lambda path: int(path.name))
+    ideal = tuple(ideal_panel(settings.stack.stack(), index) for index in range(3))
+    perfect = carried_db(light, settings, ideal, registered=False)
+    assert perfect > 28.0
+    assert perfect - carried_db(light, settings, world.true_panels(), registered=True) < 1.0
+    assert perfect - carried_db(light, settings, world.true_panels(), registered=False) > 5.0
+
+
+class Scripted:
+    """A setup whose keys are given, without a terminal."""
+
+    def __init__(self, tmp_path: Path, keys: list[Key]) -> None:
+        self.said: list[str] = []
+        self.world = SimulatedWorld(STACK, seed=1)
+        self.world.listen(self.said.append)
+        pressed = iter(keys)
+        self.setup = Setup(
+            tmp_path / "c.toml", tmp_path / "out", self.world, lambda: next(pressed, Key.QUIT), self.said.append
+        )
+
+
+def test_a_step_that_is_done_is_where_it_goes_on_after(tmp_path) -> None:
+    first = Scripted(tmp_path, [Key.NEXT, Key.ACCEPT, Key.ACCEPT, Key.QUIT])
+    assert not walk_through(first.setup)
+    done = read_progress(progress_path(tmp_path / "c.toml"))
+    assert list(done) == ["geometry"]
+    second = Scripted(tmp_path, [Key.NEXT, Key.NEXT, Key.PREVIOUS, Key.QUIT])
+    second.setup.done.update(done)
+    walk_through(second.setup)
+    shown = [text.splitlines()[1][:11] for text in second.said if text.startswith("\nStep")]
+    assert shown == ["Step 1 of 5", "Step 2 of 5", "Step 3 of 5", "Step 2 of 5"]
+    assert "(done before)" in second.said[1]
+
+
+def test_a_step_that_is_stopped_writes_nothing_and_is_offered_again(tmp_path) -> None:
+    scripted = Scripted(tmp_path, [Key.ACCEPT, Key.ACCEPT, Key.QUIT, Key.QUIT])
+    assert not walk_through(scripted.setup)
+    assert not (tmp_path / "c.toml").exists()
+    assert any("nothing of this step" in text for text in scripted.said)
+    assert len([text for text in scripted.said if text.startswith("\nStep 1")]) == 2
+
+
+def test_sizes_are_set_with_arrows_and_measured_distances_stay(tmp_path) -> None:
+    config = tmp_path / "c.toml"
+    config.write_text("[stack]\nx_m = [-0.0601, 0.0, 0.0593]  # measured\n")
+    keys = [Key.COARSER, Key.RIGHT, Key.DOWN, Key.FINER, Key.LEFT, Key.ACCEPT]
+    geometry(Scripted(tmp_path, keys).setup)
+    found = load_settings(config).stack
+    assert (found.width_m, found.height_m) == (pytest.approx(0.5194), pytest.approx(0.2915))
+    assert found.x_m == (-0.0601, 0.0, 0.0593)
+    geometry(Scripted(tmp_path, [Key.DOWN, Key.DOWN, Key.LEFT, Key.ACCEPT]).setup)
+    assert load_settings(config).stack.x_m == pytest.approx((-0.0587, 0.0, 0.0587))
+
+
+def test_panels_already_known_keep_their_registration_when_they_are_identified_again(tmp_path) -> None:
+    world = SimulatedWorld(STACK, seed=1)
+    meanings = {"\n": Key.ACCEPT, "n": Key.NEXT, UP: Key.UP, DOWN: Key.DOWN}
+    keys, rest = [], answers_of(world)
+    while rest:
+        piece = rest[:3] if rest.startswith("\x1b") else rest[:1]
+        keys, rest = [*keys, meanings[piece]], rest[len(piece) :]
+    identify(Scripted(tmp_path, keys).setup)
+    config = tmp_path / "c.toml"
+    text = config.read_text().replace('mirror = "', 'gamma = 2.0\nmirror = "')
+    config.write_text(text)
+    identify(Scripted(tmp_path, keys).setup)
+    assert [panel.gamma for panel in load_settings(config).output.panels] == [2.0, 2.0, 2.0]
+
+
+def test_progress_that_is_not_ours_is_refused(tmp_path) -> None:
+    (tmp_path / "c.setup.json").write_text("[]")
+    with pytest.raises(InputError, match=r"c\.setup\.json: done"):
+        read_progress(progress_path(tmp_path / "c.toml"))
+
+
+def test_words_stand_on_one_panel_and_the_others_are_clear() -> None:
+    layers = message_layers(STACK, ["Step 1 of 5: ä long line " * 6, "Enter: do it"])
+    assert not layers[0, ..., :3].any()
+    assert not layers[2, ..., :3].any()
+    assert 0.002 < (layers[1, ..., 0] > 128).mean() < 0.2
+
+
+def test_nothing_is_asked_of_a_terminal_that_is_closed(tmp_path) -> None:
+    done = setup_command(tmp_path, "", "--simulate")
+    assert done.returncode == 0
+    assert "not done: identify" in done.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_photographs_and_a_device_are_one_or_the_other(tmp_path) -> None:
+    done = setup_command(tmp_path, "", "--photos", "a", "--device", "0")
+    assert done.returncode == 2
+    assert done.stderr.startswith("phasestack: setup: --photos")
+
+
+def test_viewing_place_is_before_the_display() -> None:
+    eyes = eyes_at(viewing_place_m(Settings().calibration))
+    assert eyes[0, 1] < 0 < eyes[1, 1]

@@ -1,0 +1,256 @@
+"""One change of settings: taken over as a whole between two steps, or refused and nothing has happened."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runtime.config import Settings
+from runtime.content import loader
+from runtime.daemon import reconfigure
+from runtime.daemon.reconfigure import Reconfiguration
+from runtime.daemon.solver_parts import RunningSolver, SolverMaker, ready_predictor
+from runtime.errors import InputError
+from runtime.eyes.calibration import load_calibration
+from runtime.frame.run_state import RunState
+from runtime.records import SolveRequest
+from runtime.support.gl import offscreen_context
+from tests.daemon.rig import SMALL
+from tests.waiting import eventually
+
+EYES = np.array([[0.7, -0.031, 0.0], [0.7, 0.031, 0.0]])
+PATIENCE_S = 30.0
+
+
+def settings(**changes: dict[str, Any]) -> Settings:
+    tables = {**{name: SMALL[name] for name in ("stack", "model")}, "content": {"scene": "demo"}}
+    return Settings.model_validate({n: {**tables.get(n, {}), **changes.get(n, {})} for n in {**tables, **changes}})
+
+
+class Lent:
+    """Content or a model that remembers whether it was closed."""
+
+    def __init__(self, whole: Any) -> None:
+        self._whole, self.closed = whole, 0
+
+    def close(self) -> None:
+        self.closed += 1
+        self._whole.close()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._whole, name)
+
+
+class Bench:
+    """A solver's parts on this thread, and everything that is loaded for them."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.gate = threading.Event()  # set: models come to be ready
+        self.gate.set()
+        self.models: list[Lent] = []
+        self.contents: list[Lent] = []
+        prepare = loader.prepare_content
+
+        def ready(chosen: Settings, stack: Any) -> Any:
+            made = Lent(ready_predictor(chosen, stack))
+            self.models.append(made)
+            assert self.gate.wait(PATIENCE_S)
+            return made
+
+        def prepared(chosen: Any, stack: Any, **how: Any) -> Any:
+            opener = prepare(chosen, stack, **how)
+
+            def make(context: Any) -> Any:
+                self.contents.append(Lent(opener(context)))
+                return self.contents[-1]
+
+            return make
+
+        monkeypatch.setattr(reconfigure, "ready_predictor", ready)
+        monkeypatch.setattr(loader, "prepare_content", prepared)
+        self.settings = settings()
+        self.stack = self.settings.stack.stack()
+        self.context = offscreen_context()
+        maker = SolverMaker(self.settings, self.stack, load_calibration(None), on_start=lambda _: True)
+        self.parts: RunningSolver = maker(context=self.context, simulated=True)
+        state = self.parts.run.state
+        self.first_content, self.first_model = Lent(state.content), Lent(state.predictor)
+        self.parts.run.replace(content=self.first_content, predictor=self.first_model)
+
+    @property
+    def state(self) -> RunState:
+        return self.parts.run.state
+
+    def change(self, new: Settings, **how: Any) -> Reconfiguration:
+        return Reconfiguration(new, self.state.settings, self.stack, **how)
+
+    def advance(self, change: Reconfiguration) -> None:
+        """Until it is over."""
+        assert eventually(lambda: change.advance(self.parts), within_s=PATIENCE_S)
+        assert change.finished
+
+    def solve(self) -> Any:
+        """Two steps, without a fault: the flat picture, where there is none, and the solution, where it is another."""
+        request = SolveRequest(0, EYES, "predicted", 0.001, flat_wanted=False)
+        steps = [self.parts.step(request), self.parts.step(request)]
+        assert not any(step.missing for step in steps)
+        return next((step.solution for step in steps if step.solution is not None), None)
+
+    def close(self) -> None:
+        self.gate.set()
+        self.parts.close()
+        self.context.release()
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    made = Bench(monkeypatch)
+    yield made
+    made.close()
+
+
+SCENE, MODEL = {"content": {"scene": "sparse"}}, {"model": {"name": "balanced"}}
+
+
+def test_a_scene_is_taken_over_and_the_one_before_is_closed(bench):
+    before = bench.state
+    change = bench.change(settings(**SCENE))
+    assert not change.finished
+    bench.advance(change)
+    assert change.problem == ""
+    assert bench.state.content.info.name == "sparse"
+    assert bench.state.settings.content.scene == "sparse"
+    assert bench.state.predictor is before.predictor
+    assert (bench.first_content.closed, bench.contents[0].closed, bench.first_model.closed) == (1, 0, 0)
+    bench.solve()
+
+
+def test_a_model_is_taken_over_and_the_one_before_is_closed(bench):
+    before = bench.state
+    change = bench.change(settings(**MODEL))
+    bench.advance(change)
+    assert bench.state.predictor.name == "balanced"
+    assert bench.state.content is before.content
+    assert (bench.first_model.closed, bench.models[0].closed) == (1, 0)
+    bench.solve()
+
+
+def test_settings_alone_load_nothing_and_are_taken_over_at_the_next_step(bench):
+    before = bench.state
+    change = bench.change(settings(tracker={"hold_s": 2.0}))
+    assert change.advance(bench.parts) is True
+    assert bench.state.settings.tracker.hold_s == 2.0
+    assert (bench.state.content, bench.state.predictor) == (before.content, before.predictor)
+    assert (bench.models, bench.contents) == ([], [])
+
+
+def test_all_of_a_change_is_one_new_state(bench, tmp_path):
+    before = bench.state
+    change = bench.change(settings(**SCENE, **MODEL, tracker={"hold_s": 2.0}))
+    bench.advance(change)
+    assert bench.state.version == before.version + 1
+    assert (bench.state.content.info.name, bench.state.predictor.name) == ("sparse", "balanced")
+    assert bench.state.settings.tracker.hold_s == 2.0
+
+
+def test_nothing_changes_until_all_of_it_is_ready(bench):
+    bench.gate.clear()
+    before = bench.state
+    change = bench.change(settings(**SCENE, **MODEL))
+    assert eventually(lambda: change.advance(bench.parts) or bool(bench.contents), within_s=PATIENCE_S)
+    for _ in range(5):
+        assert change.advance(bench.parts) is False
+        bench.solve()
+    assert bench.state is before
+    assert change.progress == "loading model balanced"
+    bench.gate.set()
+    bench.advance(change)
+    assert bench.state.content.info.name == "sparse"
+
+
+BAD = {"content": {"scene": "no-such-scene"}}
+
+
+def test_where_a_part_can_t_be_had_everything_stays_and_what_was_loaded_is_closed(bench):
+    before = bench.state
+    change = bench.change(settings(**BAD, **MODEL))
+    bench.advance(change)
+    assert "no-such-scene" in change.problem
+    assert "\n" not in change.problem
+    assert bench.state is before
+    assert eventually(lambda: [model.closed for model in bench.models] == [1], within_s=PATIENCE_S)
+    assert (bench.first_content.closed, bench.first_model.closed) == (0, 0)
+    bench.solve()
+
+
+def test_a_model_that_can_t_be_had_leaves_the_scene_as_it_was_and_closes_the_new_one(bench):
+    before = bench.state
+    change = bench.change(settings(**SCENE, model={"name": "nothing.onnx"}))
+    bench.advance(change)
+    assert "nothing.onnx" in change.problem
+    assert bench.state is before
+    assert all(content.closed == 1 for content in bench.contents)
+    bench.solve()
+
+
+def test_a_bad_calibration_is_refused_before_anything_is_loaded(bench, tmp_path):
+    path = Path(tmp_path / "bad.toml")
+    path.write_text("stack_from_sensor = 3\n")
+    with pytest.raises(InputError, match="stack_from_sensor"):
+        bench.change(settings(**SCENE, calibration={"file": str(path)}))
+    assert (bench.models, bench.contents) == ([], [])
+
+
+def test_another_calibration_is_part_of_the_new_state(bench, tmp_path):
+    path = tmp_path / "calibration.toml"
+    path.write_text("stack_from_sensor = [[1.0,0.0,0.0,0.5],[0.0,1.0,0.0,0.0],[0.0,0.0,1.0,0.0],[0.0,0.0,0.0,1.0]]\n")
+    bench.advance(bench.change(settings(calibration={"file": str(path)})))
+    assert bench.state.calibration.stack_from_sensor[0, 3] == 0.5
+
+
+@pytest.mark.parametrize("when", ["at once", "when the scene is there", "when all is there"])
+def test_what_is_no_longer_wanted_is_closed_and_changes_nothing(bench, when):
+    before = bench.state
+    bench.gate.clear()
+    change = bench.change(settings(**SCENE, **MODEL))
+    if when != "at once":
+        assert eventually(lambda: change.advance(bench.parts) or bool(bench.contents), within_s=PATIENCE_S)
+    if when == "when all is there":
+        bench.gate.set()
+        assert eventually(lambda: change._model.done, within_s=PATIENCE_S)
+    change.abandon()
+    assert change.advance(bench.parts) is True
+    assert change.finished
+    bench.gate.set()
+    assert bench.state is before
+    assert eventually(lambda: [model.closed for model in bench.models] in ([], [1]), within_s=PATIENCE_S)
+    assert all(content.closed == 1 for content in bench.contents)
+    assert (bench.first_content.closed, bench.first_model.closed) == (0, 0)
+    bench.solve()
+
+
+def test_the_same_scene_is_read_again_where_that_is_asked_for(bench):
+    bench.advance(bench.change(settings(), reload_content=True))
+    assert bench.state.content is bench.contents[0]
+    assert bench.first_content.closed == 1
+
+
+def test_what_is_decided_anew_for_every_solution_loads_no_model(bench):
+    before = bench.state
+    change = bench.change(settings(model={"eye_sigma_mm": 2.0}))
+    assert change.advance(bench.parts) is True
+    assert bench.state.predictor is before.predictor
+    assert bench.models == []
+
+
+def test_after_a_change_the_next_step_solves_with_it(bench):
+    first = bench.solve()
+    bench.advance(bench.change(settings(**SCENE)))
+    second = bench.solve()
+    assert second.number > first.number
+    assert not np.array_equal(first.layers, second.layers)

@@ -1,0 +1,297 @@
+"""Who looks at refreshes: lines that wait for the truth, sampled quality, kept light; null where none was measured."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runtime.clock import NS_PER_MS, NS_PER_S
+from runtime.evaluation.displayed import displayed
+from runtime.frame import observer as observer_module
+from runtime.frame.observer import RunObserver
+from runtime.frame.presenter import Refresh
+from runtime.frame.solver_host import Task
+from runtime.model.predictor import Predictor
+from runtime.optics.alignment import align, shown_layers
+from runtime.optics.carried import carried_quality
+from runtime.plan.drawing import drawn_for, retina_pictures
+from runtime.records import PanelFrame, RefreshAccount, SensorFrame, Solution, State
+from tests.frame.conftest import SMALL
+from tests.frame.fakes import EYES, FakeSolver, aside
+
+PERIOD_NS = 20 * NS_PER_MS
+FOV_DEG = 40.0
+CONTRACT = {
+    "frame", "capture_ns", "predicted_for_ns", "present_ns", "eyes_m", "eyes_label", "eye_sigma_mm", "state",
+    "solution", "solved_for_m", "solution_age_ms", "true_eyes_m", "inference", "presented", "stage_ms", "skew_ms",
+}  # fmt: skip
+
+
+class Kept:
+    """Output that keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.lines: list[dict[str, Any]] = []
+        self.lights: dict[int, dict[str, Any]] = {}
+
+    def refresh(self, line: dict[str, Any]) -> None:
+        self.lines.append(line)
+
+    def light(self, frame: int, **what: Any) -> None:
+        self.lights[frame] = what
+
+
+class Drawing(FakeSolver):
+    """A solver whose thread does tasks at once, or when the test says."""
+
+    def __init__(self, content: Any, *, at_once: bool = True) -> None:
+        super().__init__()
+        self.content, self._at_once = content, at_once
+
+    def do(self, task: Task) -> None:
+        if self._at_once:
+            task(self)  # type: ignore[arg-type]
+        else:
+            self.tasks.append(task)
+
+
+@pytest.fixture
+def solved(predictor: Predictor, content: Any) -> Solution:
+    """A real solution for `EYES`."""
+    layers = predictor.predict(drawn_for(predictor, content, EYES, time_ns=0), EYES).layers.copy()
+    return Solution(1, layers, EYES, 0)
+
+
+def refresh(number: int, solution: Solution | None, *, eyes_m: Any = EYES, **changes: Any) -> Refresh:
+    """One refresh at number · 20 ms, aligned to eyes."""
+    light_ns = NS_PER_S + number * PERIOD_NS
+    solved = solution.layers if solution is not None else None
+    matrices = () if solution is None else align(SMALL, solved_for_m=EYES, eyes_m=eyes_m).solved_from_shown
+    values: dict[str, Any] = {
+        "frame": number, "capture_ns": light_ns - PERIOD_NS, "predicted_for_ns": light_ns,
+        "present_ns": light_ns - 8 * NS_PER_MS, "eyes_m": eyes_m, "eyes_label": "predicted", "eye_sigma_mm": 2.0,
+        "state": State.TRACKING, "solution": None if solution is None else solution.number,
+        "solved_for_m": None if solution is None else EYES, "solution_age_ms": 10.0, "inference": "reused",
+        "presented": True, "skew_ms": 0.0, "photon_ns": light_ns,
+    }  # fmt: skip
+    frame = PanelFrame(number, solved, 1, matrices, flatness=0.0 if solution is not None else 1.0)
+    return Refresh(RefreshAccount(**(values | changes)), frame, solution)
+
+
+def sample(time_ns: int, *, y_m: float | None = 0.0) -> SensorFrame:
+    """One that knows the truth: a head that is aside by so much."""
+    return SensorFrame(1, time_ns, true_eyes_m=None if y_m is None else aside(y_m))
+
+
+def looking(content: Any, *, at_once: bool = True, simulated: bool = True, **how: Any) -> tuple[RunObserver, Kept]:
+    kept = Kept()
+    solver = Drawing(content, at_once=at_once)
+    return RunObserver(SMALL, solver, fov_deg=FOV_DEG, output=kept, simulated=simulated, **how), kept
+
+
+# --- lines -------------------------------------------------------------------------------------------------------
+
+
+def test_a_line_waits_until_the_recording_has_told_where_the_eyes_were_at_its_light_and_tells_it(content):
+    observer, kept = looking(content)
+    observer.sampled(sample(NS_PER_S))
+    observer.refreshed(refresh(1, None))
+    assert kept.lines == []
+    observer.sampled(sample(NS_PER_S + 40 * NS_PER_MS, y_m=0.004))
+    assert kept.lines == []  # written between refreshes, not when a sample arrives
+    observer.refreshed(refresh(3, None))
+    assert [line["frame"] for line in kept.lines] == [1]
+    assert kept.lines[0]["true_eyes_m"] == pytest.approx(aside(0.002))
+    assert set(kept.lines[0]) == CONTRACT
+
+
+def test_lines_come_in_order_each_once_whatever_they_wait_for(content):
+    observer, kept = looking(content)
+    random = np.random.default_rng(1)
+    next_ns = NS_PER_S
+    for number in range(60):
+        observer.refreshed(refresh(number, None))
+        if random.random() < 0.3:
+            next_ns += int(random.integers(1, 100)) * NS_PER_MS
+            observer.sampled(sample(next_ns))
+    observer.finish()
+    assert [line["frame"] for line in kept.lines] == list(range(60))
+
+
+def test_a_recording_without_truth_holds_nothing_up(content):
+    observer, kept = looking(content)
+    observer.sampled(sample(NS_PER_S, y_m=None))
+    observer.refreshed(refresh(1, None))
+    assert [line["true_eyes_m"] for line in kept.lines] == [None]
+
+
+def test_what_the_recording_never_told_is_null_at_the_end(content):
+    observer, kept = looking(content)
+    observer.sampled(sample(NS_PER_S))
+    observer.refreshed(refresh(0, None))
+    observer.refreshed(refresh(1, None))
+    observer.finish()
+    assert [line["true_eyes_m"] is None for line in kept.lines] == [False, True]
+
+
+def test_lines_that_wait_are_bounded(content, monkeypatch):
+    monkeypatch.setattr(observer_module, "WAITING_MAX", 16)
+    observer, kept = looking(content)
+    observer.sampled(sample(NS_PER_S))
+    for number in range(1, 101):
+        observer.refreshed(refresh(number, None))
+    assert len(kept.lines) >= 100 - 16
+    assert {line["true_eyes_m"] for line in kept.lines} == {None}
+
+
+def test_every_account_is_told_at_once_to_who_shows_progress(content):
+    told = []
+    observer, _ = looking(content, on_account=told.append)
+    observer.sampled(sample(NS_PER_S))
+    observer.refreshed(refresh(5, None))
+    assert [account.frame for account in told] == [5]
+
+
+# --- sampled quality ---------------------------------------------------------------------------------------------
+
+
+def test_nothing_measured_is_null(content, solved):
+    observer, _ = looking(content)
+    observer.refreshed(refresh(1, solved))
+    observer.finish()
+    assert observer.means.summary() == {
+        "psnr_db": None, "ssim": None, "carried_db": None, "psnr_db_true_eyes": None, "carried_db_true_eyes": None,
+        "quality_frames": 0,
+    }  # fmt: skip
+    assert observer.look is None
+
+
+def test_without_truth_the_true_eyes_quality_is_null_and_the_other_is_not(content, solved):
+    observer, _ = looking(content, measure=True, evaluate_every=1)
+    observer.refreshed(refresh(1, solved))
+    summary = observer.means.summary()
+    assert summary["psnr_db"] > 15
+    assert summary["carried_db"] > 20
+    assert summary["psnr_db_true_eyes"] is None
+    assert summary["carried_db_true_eyes"] is None
+
+
+def test_quality_is_of_what_the_panels_show_at_the_eyes_used_and_at_the_true_ones(content, solved):
+    observer, _ = looking(content, measure=True, evaluate_every=1)
+    used, true = aside(0.015), aside(0.012)
+    seen = refresh(1, solved, eyes_m=used)
+    observer.sampled(sample(NS_PER_S + PERIOD_NS, y_m=0.012))
+    observer.refreshed(seen)
+    layers = shown_layers(seen.frame)
+    how = {"fov_deg": FOV_DEG}
+
+    def psnr(eyes_m: Any) -> tuple[float, float]:
+        wanted = retina_pictures(content, eyes_m, SMALL, time_ns=0, **how)
+        exact = displayed(layers, wanted, SMALL, eyes_m=eyes_m, **how).quality.psnr_db
+        drawn = retina_pictures(content, EYES, SMALL, time_ns=0, **how)
+        return exact, carried_quality(layers, drawn, SMALL, solved_for_m=EYES, eyes_m=eyes_m, **how).psnr_db
+
+    summary = observer.means.summary()
+    assert (summary["psnr_db"], summary["carried_db"]) == pytest.approx(psnr(used), abs=0.001)
+    assert (summary["psnr_db_true_eyes"], summary["carried_db_true_eyes"]) == pytest.approx(psnr(true), abs=0.001)
+    assert summary["quality_frames"] == 1
+
+
+def test_every_so_many_refreshes_are_sampled_while_tracking_and_no_others(content, solved):
+    observer, _ = looking(content, measure=True, evaluate_every=5)
+    for number in range(30):
+        state = State.TRACKING if number < 15 else State.HOLDING
+        observer.refreshed(refresh(number, solved, state=state))
+    assert observer.means.summary()["quality_frames"] == 3
+    observer.finish()
+    assert observer.means.summary()["quality_frames"] == 3
+
+
+@pytest.mark.parametrize("change", [{"presented": False}, {"eyes_m": None}])
+def test_what_no_eye_saw_is_not_measured(content, solved, change):
+    observer, _ = looking(content, measure=True, evaluate_every=1)
+    seen = refresh(1, solved)
+    observer.refreshed(replace(seen, account=replace(seen.account, **change)))
+    observer.finish()
+    assert observer.means.summary()["psnr_db"] is None
+
+
+def test_a_mixture_with_the_flat_picture_is_not_measured(content, solved):
+    observer, _ = looking(content, measure=True, evaluate_every=1)
+    seen = refresh(1, solved)
+    mixed = replace(seen.frame, flatness=0.5, flat=solved.layers, flat_version=2)
+    observer.refreshed(replace(seen, frame=mixed))
+    assert observer.means.summary()["psnr_db"] is None
+
+
+def test_a_short_run_measures_its_last_refresh(content, solved):
+    observer, _ = looking(content, measure=True, evaluate_every=50)
+    observer.refreshed(refresh(1, solved))
+    observer.finish()
+    assert observer.means.summary()["quality_frames"] == 1
+    assert observer.look is not None
+
+
+def test_in_real_time_one_measurement_is_under_way_at_a_time_and_no_refresh_waits_for_it(content, solved):
+    observer, _ = looking(content, at_once=False, simulated=False, measure=True, evaluate_every=1)
+    for number in range(10):
+        observer.refreshed(refresh(number, solved))
+    tasks = observer._solver.tasks
+    assert len(tasks) == 1  # the solver's thread draws when it comes to it
+    assert tasks[0](observer._solver) is True
+    job = observer._job
+    assert job is not None
+    job._thread.join(20.0)
+    observer.refreshed(refresh(10, solved))
+    assert observer.means.summary()["quality_frames"] == 1
+
+
+def test_comparing_is_not_the_presenter_s_nor_the_solver_s_work(content, solved, monkeypatch):
+    threads = []
+    real = observer_module.displayed
+    monkeypatch.setattr(
+        observer_module,
+        "displayed",
+        lambda *a, **k: (threads.append(threading.current_thread().name), real(*a, **k))[1],
+    )
+    observer, _ = looking(content, simulated=False, measure=True, evaluate_every=1)
+    observer.refreshed(refresh(0, solved))
+    observer._job._thread.join(20.0)
+    assert threads == ["quality"]
+
+
+# --- kept light --------------------------------------------------------------------------------------------------
+
+
+def test_every_nth_refresh_leaves_what_the_panels_show_and_what_the_judge_needs(content, solved):
+    observer, kept = looking(content, keep_light=4)
+    shown = {}
+    for number in range(12):
+        seen = refresh(number, solved, eyes_m=aside(number / 500))
+        shown[number] = shown_layers(seen.frame)
+        observer.sampled(sample(seen.account.photon_ns, y_m=number / 400))
+        observer.refreshed(seen)
+    assert list(kept.lights) == [3, 7, 11]
+    drawn = retina_pictures(content, EYES, SMALL, fov_deg=FOV_DEG, time_ns=0)
+    for number, light in kept.lights.items():
+        assert np.array_equal(light["layers"], shown[number])
+        assert all(np.array_equal(a, b) for a, b in zip(light["drawn"], drawn, strict=True))
+        info = light["info"]
+        assert set(info) == {"solved_for_m", "eyes_m", "true_eyes_m", "fov"}
+        assert np.array_equal(info["eyes_m"], aside(number / 500))
+        assert np.array_equal(info["solved_for_m"], EYES)
+        assert info["true_eyes_m"] == pytest.approx(aside(number / 400))
+        assert info["fov"] == FOV_DEG
+
+
+def test_light_without_a_solution_has_no_drawn_pictures(content):
+    observer, kept = looking(content, keep_light=1)
+    flat = np.full((3, 108, 192, 4), 200, np.uint8)
+    seen = refresh(0, None)
+    observer.refreshed(replace(seen, frame=replace(seen.frame, flat=flat, flat_version=1)))
+    assert kept.lights[0]["drawn"] is None
+    assert (kept.lights[0]["layers"] == 200).all()

@@ -1,0 +1,111 @@
+"""A run leaves no file but in --out and opens no connection: seen from outside, by tracing every system call."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from runtime.support.privacy import QUIET
+
+ROOT = Path(__file__).resolve().parents[1]
+CALLS = (
+    "socket,connect,bind,sendto,sendmsg,open,openat,creat,mkdir,mkdirat,rename,renameat,renameat2,symlink,link,linkat"
+)
+LINE = re.compile(r"^\d+\s+(\w+)\((.*)\)\s+= (-?\d+)")
+QUOTED = re.compile(r'"((?:[^"\\]|\\.)*)"')
+WRITES = re.compile(r"O_WRONLY|O_RDWR|O_CREAT|O_TRUNC|O_APPEND")
+NAME_SERVICE = "/var/run/nscd/socket"  # the C library asks it for users and groups
+
+
+def run_traced(folder: Path, *arguments: str) -> tuple[list[str], list[str]]:
+    """Run a command with a fresh home; answers what it wrote outside `out`, and the sockets that lead elsewhere."""
+    home, scratch, trace = folder / "home", folder / "tmp", folder / "trace"
+    for path in (home, scratch):
+        path.mkdir()
+    environment = {
+        "PATH": os.environ["PATH"],
+        "HOME": str(home),
+        "TMPDIR": str(scratch),
+        "PYTHONPATH": str(ROOT),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    command = [sys.executable, "-m", "runtime.cli", *arguments]
+    traced = ["strace", "-f", "-qq", "-s", "4096", "-e", f"trace={CALLS}", "-o", str(trace), *command]
+    done = subprocess.run(traced, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    written, sockets = [], []
+    for line in trace.read_text(errors="replace").splitlines():
+        match = LINE.match(line)
+        if match is None or int(match[3]) < 0:
+            continue
+        call, given = match[1], match[2]
+        if call in ("socket", "connect", "bind", "sendto", "sendmsg"):
+            local = "AF_UNIX" in given or "AF_LOCAL" in given
+            if (call == "socket" and not local) or (call != "socket" and NAME_SERVICE not in given):
+                sockets.append(line)
+        elif call not in ("open", "openat") or WRITES.search(given):
+            name = next(iter(reversed(QUOTED.findall(given))), "")
+            if not name.startswith((f"{folder}/out", "/dev/", "/proc/")):
+                written.append(line)
+    left = [str(path) for place in (home, scratch) for path in place.rglob("*")]
+    return written + left, sockets
+
+
+@pytest.mark.skipif(shutil.which("strace") is None, reason="needs strace")
+@pytest.mark.parametrize(
+    "command",
+    [
+        "run --replay demo --headless --max-speed --frames 3 --scale 0.1 --out {out}",
+        "record --seconds 0.5 --out {out}/a.mcap",
+        "record --motion walk --seconds 1 --out {out}/a.mcap",
+        "config",
+        "plan --scale 0.1",
+    ],
+    ids=lambda command: " ".join(command.split()[:3]),
+)
+def test_a_command_writes_only_where_it_is_told_and_opens_no_connection(tmp_path: Path, command: str) -> None:
+    written, sockets = run_traced(tmp_path, *command.format(out=tmp_path / "out").split())
+    assert written == [] and sockets == []
+
+
+@pytest.mark.skipif(shutil.which("strace") is None, reason="needs strace")
+def test_the_trace_sees_what_it_looks_for(tmp_path: Path) -> None:
+    """Without the switches onnxruntime and Mesa are caught at it: so the test above can fail."""
+    code = (
+        "import os, sys, socket, pathlib, runtime.support.privacy as p; p.QUIET.clear();"
+        "pathlib.Path.home().joinpath('.left').write_text('x'); socket.socket().close();"
+        "sys.argv[1:] = ['config']; from runtime.cli import main; main()"
+    )
+    sitecustomize = tmp_path / "code.py"
+    sitecustomize.write_text(code)
+    home = tmp_path / "home"
+    home.mkdir()
+    trace = tmp_path / "trace"
+    traced = ["strace", "-f", "-qq", "-e", f"trace={CALLS}", "-o", str(trace), sys.executable, str(sitecustomize)]
+    environment = {"PATH": os.environ["PATH"], "HOME": str(home), "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(traced, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    text = trace.read_text(errors="replace")
+    assert "AF_INET" in text and "/.left" in text
+
+
+def test_the_switches_are_set_before_anything_is_loaded() -> None:
+    code = (
+        "import os, sys, runtime.commands.app as a, runtime.support.privacy as p;"
+        "a.app = lambda: print({k: os.environ.get(k) for k in p.QUIET},"
+        " [m for m in ('onnxruntime', 'moderngl') if m in sys.modules]); from runtime.cli import main; main()"
+    )
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert answer.stdout.strip() == f"{QUIET} []"
+
+
+@pytest.mark.parametrize("name", ["systemd/phasestack.service", "systemd/phasestack-user.service", "Dockerfile"])
+def test_units_and_image_have_the_switch_too(name: str) -> None:
+    text = (ROOT / name).read_text(encoding="utf-8")
+    assert "ORT_DISABLE_TELEMETRY=1" in text
