@@ -12,7 +12,7 @@ from runtime.blackbox.schemas import schema_of
 from runtime.errors import InputError
 from runtime.sensor import recording_format as fmt
 from runtime.sensor.recording_format import RecordingHeader
-from runtime.version import version
+from runtime.support.version import version
 
 CHUNK_BYTES = 1 << 18  # a crash loses at most one: some two seconds
 METADATA_NAME = "phasestack.blackbox"

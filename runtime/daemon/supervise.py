@@ -26,7 +26,7 @@ from runtime.frame.presenter import Presenter
 from runtime.records import RefreshAccount, State
 from runtime.support import logs
 from runtime.support.transient import MayPass, may_pass
-from runtime.version import version
+from runtime.support.version import version
 
 log = logging.getLogger("phasestack.daemon")
 
