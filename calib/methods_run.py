@@ -12,7 +12,7 @@ from calib.page import Picture, page
 from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_text
 
 COUNTS = (3, 10, 27, 100, 1000, 10_000, 100_000, 1_000_000)
-SENSOR_SCALE_OFF = 1.03
+SENSOR_SCALES_OFF = (0.95, 1.03, 1.1)
 
 
 def compare_methods(out: Path, *, seeds: int, pairs_max: int) -> tuple[dict[str, Any], str]:
@@ -22,7 +22,10 @@ def compare_methods(out: Path, *, seeds: int, pairs_max: int) -> tuple[dict[str,
 
     setups: dict[str, tuple[str, dict[str, Any]]] = {
         "clean": ("Noise alone; both frames truly in metres", {}),
-        "scale": (f"The sensor's metre is off: true scale {SENSOR_SCALE_OFF}", {"sensor_scale": SENSOR_SCALE_OFF}),
+        **{
+            f"scale-{scale:g}": (f"The sensor's metre is off: true scale {scale:g}", {"sensor_scale": scale})
+            for scale in SENSOR_SCALES_OFF
+        },
         "outliers": ("Every fifth pair grossly wrong (10 to 50 cm)", {"outliers": True}),
     }
     work = [(name, sigma) for name in setups for sigma in SIGMAS_M]

@@ -333,7 +333,7 @@ class SimulatedWorld(World):
         seen = eyes_m @ to_sensor[:3, :3].T + to_sensor[:3, 3]
         seen = seen + self._random.normal(scale=self.built.sensor_noise_m, size=(2, 3))
         self._now_ns += round(NS_PER_S / 30)
-        return Sample(self._now_ns, EyePoints(seen, np.ones(2)), "simulated")
+        return Sample(self._now_ns, EyePoints(seen, np.ones(2)), "demo")
 
     def chart(self, settings: Settings) -> Any:
         return None

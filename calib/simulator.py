@@ -159,8 +159,8 @@ def photograph(
     total = np.zeros(x.shape, np.float32)
     passes = np.ones(x.shape, np.float32)
     inside = np.ones(x.shape, bool)
-    for index, panel in enumerate(scene.panels):
-        u, v = _crossing(scene, index, panel, pose, x, y)
+    for index in range(len(scene.panels)):
+        u, v = crossing(scene, index, pose, x, y)
         total += cv2.remap(soft[index], u - np.float32(0.5), v - np.float32(0.5), cv2.INTER_LINEAR).astype(np.float32)
         inside &= (u > 0) & (u < scene.stack.width_px) & (v > 0) & (v < scene.stack.height_px)
         if exposure.grid:
@@ -176,8 +176,12 @@ def camera_rays(lens: Lens) -> tuple[F32, F32]:
     return _directions(lens)
 
 
-def _crossing(scene: Scene, index: int, panel: PlacedPanel, pose: F64, x: F32, y: F32) -> tuple[F32, F32]:
-    """(h, w) true pixels of a panel where the camera's rays cross it."""
+def crossing(scene: Scene, index: int, pose: F64, x: F32, y: F32) -> tuple[F32, F32]:
+    """(h, w) true pixels u, v of a panel where a camera's rays cross it; x, y: (h, w) the rays' x/z and y/z.
+
+    pose: (4, 4) camera_from_stack.
+    """
+    panel = scene.panels[index]
     if scene.glass.thickness_m:
         return _crossing_through_glass(scene, index, panel, pose, x, y)
     camera_from_pixels = pose[:3, :3] @ stack_from_pixels(panel, scene.stack) + np.outer(pose[:3, 3], [0, 0, 1])

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.errors import ModelFailure
+from runtime.model.base import Prediction, Predictor
 from runtime.model.bench import Bench
 from runtime.model.chain import ChainFrame, chain_frame, chain_modes
 from runtime.model.channels import RGBA_FROM, is_grey, without_alpha
 from runtime.model.contract import Step
 from runtime.model.fade import Fade
 from runtime.model.level import CENTRE, EVEN, FRONT, I16, OUTER, REAR, START, Level
-from runtime.model.predictor import Prediction, Predictor
 from runtime.model.resample import resample
 from runtime.model.rows import RowPool
 from runtime.model.session import ModelSession
