@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock, SimulatedClock
-from runtime.config import Settings
+from runtime.config import OutputSettings, Settings
 from runtime.records import RefreshAccount
 from runtime.support.priority import PRESENTER_NICENESS, niceness
 
@@ -137,7 +137,10 @@ def build_run(
         cleanup.callback(samples.close)
     context = offscreen_context()
     cleanup.callback(context.release)
-    panels = _open_panels(settings, stack, clock, context, wait_for_panels)
+    output_settings = settings.output
+    if options.scale != 1.0:  # asked for: no monitor's mode fits such a stack
+        output_settings = output_settings.model_copy(update={"allow_rescaling": True})
+    panels = _open_panels(output_settings, stack, clock, context, wait_for_panels)
     cleanup.callback(panels.close)
     maker = SolverMaker(settings, stack, calibration, on_start=on_start)
     solver: SolverHost
@@ -218,14 +221,14 @@ def _refresh_ms(stage_ms: Mapping[str, float]) -> float:
 
 
 def _open_panels(
-    settings: Settings, stack: PanelStack, clock: Clock, context: Any, wait: Callable[[str], bool] | None
+    settings: OutputSettings, stack: PanelStack, clock: Clock, context: Any, wait: Callable[[str], bool] | None
 ) -> PanelSink:
     from runtime.errors import PanelLost
     from runtime.panels.registry import open_panels
 
     while True:
         try:
-            return open_panels(settings.output, stack, clock, context)
+            return open_panels(settings, stack, clock, context)
         except PanelLost as error:
             if wait is None or not wait(str(error)):
                 raise
