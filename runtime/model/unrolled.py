@@ -88,6 +88,8 @@ class UnrolledPredictor(Predictor):
         for level in bench.levels.values():
             level.wanted = [np.asarray(phases, np.int16) for phases in self._phases(pictures, level.size)]
         last = {n: _last_change(contract.steps, n) for n in OUTER}
+        for level in bench.levels.values():
+            level.be_unsure(eyes_m, eye_sigma_mm=eye_sigma_mm)
         level = bench.levels[contract.steps[0].reduction]
         for index, step in enumerate(contract.steps):
             if step.reduction != level.reduction:
