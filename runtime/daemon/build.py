@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from runtime.optics.stack import PanelStack
     from runtime.panels.base import PanelSink
     from runtime.sensor.base import SensorDriver
+    from runtime.support.progress import Listener
 
 log = logging.getLogger("phasestack.build")
 
@@ -85,6 +86,18 @@ def scaled_stack(settings: Settings, scale: float) -> PanelStack:
     )
 
 
+def _heard(on_start: Callable[[str], bool]) -> Listener:
+    """A listener to what is read before the first refresh, which ends it when it is told to stop."""
+
+    def heard(what: str, done: int, total: int | None) -> None:
+        from runtime.errors import Stopped
+
+        if not on_start("reading the recording"):
+            raise Stopped("told to stop while starting")
+
+    return heard
+
+
 def build_run(
     settings: Settings,
     options: RunOptions,
@@ -117,6 +130,7 @@ def build_run(
     from runtime.sensor.detecting import DetectingDriver
     from runtime.sensor.registry import open_sensor
     from runtime.support.gl import offscreen_context
+    from runtime.support.progress import listening
 
     cv2.setNumThreads(settings.model.threads or -1)
     simulated = options.max_speed
@@ -127,13 +141,15 @@ def build_run(
         log.warning("%s", warning)
 
     def make_driver() -> SensorDriver:
-        driver = open_sensor(settings.sensor, clock, latency_ms=settings.loop.sensor_latency_ms)
+        latency_ms = settings.loop.sensor_latency_ms
+        driver = open_sensor(settings.sensor, clock, latency_ms=latency_ms, limits=settings.limits)
         return DetectingDriver(driver, lambda: EyeFinder(settings.detector).find)
 
     driver = make_driver()
     samples: Samples
     if simulated:
-        samples = RecordedSamples(driver)
+        with listening(_heard(on_start)):  # a recording may be long to skip through
+            samples = RecordedSamples(driver)
         cleanup.callback(samples.close)
     context = offscreen_context()
     cleanup.callback(context.release)
