@@ -4,9 +4,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
+FUZZ_ARGS ?=
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test test-slow lint types bench soak install uninstall system docs gallery hashes clean
+.PHONY: demo test test-slow lint types bench fuzz soak install uninstall system docs gallery hashes clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/phasestack demo $(DEMO_ARGS)
@@ -26,6 +27,10 @@ types: $(VENV)/.test
 
 bench: $(VENV)/.test
 	$(BIN)/phasestack bench --out out/bench.json
+
+# Every reader of foreign bytes, a minute each; FUZZ_ARGS="--seconds 3600 --target gltf" for more of one.
+fuzz: $(VENV)/.test
+	$(BIN)/python -m tests.fuzz $(FUZZ_ARGS)
 
 soak: $(VENV)/.test
 	$(BIN)/python -m tests.soak
@@ -63,7 +68,7 @@ $(VENV)/.runtime: $(VENV)/.created requirements/runtime.lock pyproject.toml | sy
 $(VENV)/.test: $(VENV)/.runtime requirements/test.lock requirements/torch.lock
 	@sh systemd/packages.sh test
 	$(BIN)/python -m pip install --quiet -r requirements/test.lock
-	$(BIN)/python -m pip install --quiet --no-deps -r requirements/torch.lock
+	$(BIN)/python -m pip install --quiet -r requirements/torch.lock
 	@touch $@
 
 clean:

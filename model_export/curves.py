@@ -10,7 +10,7 @@ from pathlib import Path
 
 from runtime.support.artifacts import write_bytes, write_text
 
-COLUMNS = ("iteration", "training_loss_db", "held_out_exact_db", "held_out_off_db", "held_out_loss_db")
+COLUMNS = ("iteration", "training_loss_db", "held_out_exact_db", "held_out_expected_db", "held_out_loss_db")
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,12 +20,12 @@ class Point:
     iteration: int
     training_loss_db: float  # mean since the last point; NaN before the first step
     exact_db: float  # displayed PSNR at the eyes, mean over held-out pairs
-    off_db: float  # as far beside them as each pair's tolerance
-    loss_db: float  # error at the eyes and beside them together: lower is better
+    expected_db: float  # over each pair's uncertainty, of those that have one
+    loss_db: float  # minus what is expected, of all pairs: lower is better
 
     def row(self) -> tuple[float, ...]:
         """In the order of COLUMNS."""
-        return (self.iteration, self.training_loss_db, self.exact_db, self.off_db, self.loss_db)
+        return (self.iteration, self.training_loss_db, self.exact_db, self.expected_db, self.loss_db)
 
 
 def write_curves(out: Path, points: Sequence[Point], *, name: str) -> None:
@@ -47,11 +47,11 @@ def _picture(points: Sequence[Point], name: str) -> bytes:
     axes.plot(steps, [point.exact_db for point in points], "o-", label="at the eyes")
     axes.plot(
         steps,
-        [point.off_db for point in points],
+        [point.expected_db for point in points],
         "s-",
-        label="beside them, by each pair's tolerance (other pairs: those with one)",
+        label="expected, by each pair's uncertainty (pairs that have one)",
     )
-    axes.plot(steps, [-point.loss_db for point in points], "^--", label="both together (minus the loss)")
+    axes.plot(steps, [-point.loss_db for point in points], "^--", label="expected, all pairs (minus the loss)")
     axes.set(xlabel="steps of the optimiser", ylabel="displayed PSNR, dB (higher is better)")
     axes.set_title(f"Training {name}: mean over held-out procedural pairs")
     axes.grid(alpha=0.3)

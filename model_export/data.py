@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model_export.scene import Scene, draw, random_scene
+from model_export.scene import draw, random_scene
 from model_export.textures import Random
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
@@ -20,23 +20,13 @@ LEAST_COMMON = 0.4  # of the centre panel's width that both eyes must see throug
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """An eye's place beside (or at) the nominal one, and what it should see on the centre panel's raster."""
-
-    side: int  # 0 left, 1 right
-    eye_m: F64  # (3,) frame `stack`
-    image: U8  # (h, w, 3)
-
-
-@dataclass(frozen=True, slots=True)
 class TrainingPair:
-    """Two pictures, and the same scene from beside the eyes."""
+    """Two pictures, and how unsure the eyes that should see them are."""
 
     stack: PanelStack
     eyes_m: F64  # (2, 3) left, right; frame `stack`
     images: tuple[U8, U8]  # (h, w, 3) on the centre panel's raster
     eye_sigma_mm: float
-    off: tuple[Place, ...] = ()
 
 
 def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack:
@@ -93,37 +83,16 @@ def random_place(random: Random, *, width_px: int, height_px: int) -> tuple[Pane
             return stack, eyes
 
 
-def beside(random: Random, eye_m: F64, mm: float) -> F64:
-    """A place in a random direction across the gaze."""
-    pose = stack_from_eye(eye_m)
-    angle = random.uniform(0, 2 * math.pi)
-    return np.asarray(eye_m + mm / 1000 * (math.cos(angle) * pose[:3, 0] + math.sin(angle) * pose[:3, 1]))
-
-
-def views(
-    scene: Scene, eyes_m: F64, stack: PanelStack, *, eye_sigma_mm: float, random: Random, off_each: int = 1
-) -> TrainingPair:
-    """A scene from both eyes and, where there is a tolerance, from `off_each` places so far beside each."""
-    raster = stack.panel(CENTRE)
-    left, right = (draw(scene, eye, raster) for eye in eyes_m)
-    off = []
-    if eye_sigma_mm > 0:
-        for side in (0, 1):
-            for _ in range(off_each):
-                place = beside(random, eyes_m[side], eye_sigma_mm)
-                off.append(Place(side, place, draw(scene, place, raster)))
-    return TrainingPair(stack, eyes_m, (left, right), eye_sigma_mm, tuple(off))
-
-
 def random_pair(
     random: Random, *, width_px: int, height_px: int, eye_sigma_mm: tuple[float, float] = (0.0, 4.0)
 ) -> TrainingPair:
-    """One pair of the endless stream. A quarter of them has no tolerance at all: exact eyes."""
+    """One pair of the endless stream. A quarter of them has no uncertainty at all: two points."""
     stack, eyes = random_place(random, width_px=width_px, height_px=height_px)
     scene = random_scene(random, stack, eyes.mean(axis=0))
     low, high = eye_sigma_mm
-    tolerance = low if random.random() < 0.25 else random.uniform(low, high)
-    return views(scene, eyes, stack, eye_sigma_mm=tolerance, random=random)
+    sigma_mm = low if random.random() < 0.25 else random.uniform(low, high)
+    left, right = (draw(scene, eye, stack.panel(CENTRE)) for eye in eyes)
+    return TrainingPair(stack, eyes, (left, right), sigma_mm)
 
 
 def endless_pairs(

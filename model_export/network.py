@@ -11,8 +11,7 @@ INPUTS = ("left", "right", "waves", "shifted_waves", "spectrum", "modes_in", "do
 OUTPUTS = ("rear", "front", "check")
 BLOCK_ROWS = 8  # rows that are transformed together; the raster has whole blocks
 FULL = 255 * 16  # one panel's range in the units of inputs and outputs: sixteenths of an 8-bit code
-START = FULL // 2  # of every outer panel
-BOX = 0.5  # how far an outer panel can go from there
+BOX = 0.5  # every outer panel starts in the middle of its range, and can go so far from there
 
 
 class SpectralSolver(nn.Module):
@@ -33,6 +32,9 @@ class SpectralSolver(nn.Module):
         columns, w = _fourier(2 * cell_px)
         rows, v = _cosines(BLOCK_ROWS)
         # Row by row of the block, then column by column of the cell.
+        self.patterns: Tensor
+        self.w: Tensor
+        self.v: Tensor
         self.register_buffer("patterns", torch.kron(rows, columns), persistent=False)
         self.register_buffer("w", w.repeat(BLOCK_ROWS), persistent=False)
         self.register_buffer("v", v.repeat_interleave(2 * cell_px), persistent=False)
@@ -69,44 +71,57 @@ class SpectralSolver(nn.Module):
         modes_in: Tensor,
         doubt: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Rear and front panel (rows, cells + 1, 2K·C), from one parallax before the first column, in 16-bit codes;
-        and one number, finite where all that was worked out is.
+        """`panels` in 16-bit codes, and one number that is finite where all that was worked out is."""
+        rear, front = self.panels(left, right, waves, shifted_waves, spectrum, modes_in, doubt)
+        check = (rear.mean() + front.mean()).reshape(1)
+        codes = (torch.clamp(torch.round(x * FULL), 0, FULL).to(torch.int16) for x in (rear, front))
+        return (*codes, check)  # type: ignore[return-value]
+
+    def panels(
+        self,
+        left: Tensor,
+        right: Tensor,
+        waves: Tensor,
+        shifted_waves: Tensor,
+        spectrum: Tensor,
+        modes_in: Tensor,
+        doubt: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Rear and front panel (rows, cells + 1, 2K·C), from one parallax before the first column; not clamped.
 
         left, right (rows, cells, 2K·C), 16-bit codes: what each eye lacks along its rays through the raster; waves
         (cells + 1, cells + 1) V, shifted_waves Ũ, spectrum (cells + 1,) s and modes_in (cells + 1, cells) U^T
         (`runtime.model.chain.chain_modes`); doubt (3,): c columns, r rows, e columns.
         """
         channels = left.shape[2] // (2 * self.cell_px)
-        scale = 1.0 / FULL
-        sides = [self._packed(side.to(torch.float32) * scale, channels) for side in (left, right)]
+        sides = [self._packed(side.to(torch.float32) * (1.0 / FULL), channels) for side in (left, right)]
         numerator, denominator, gain_h = self.gains(spectrum, doubt)
-        # Where the eyes' difference and its counterpart by the centre's parallax are frequencies of chain and block.
+        # The eyes' difference, and its counterpart by the centre's parallax, as waves of chain and block.
         difference = torch.matmul(modes_in, self._to_patterns(sides[1] - sides[0]))
         counterpart = torch.matmul(modes_in, self._to_patterns(sides[1] + sides[0]))
         wanted = numerator[..., None] * difference
         h = self._to_pixels(torch.matmul(shifted_waves, gain_h[..., None] * counterpart))
         if self.iterations == 0:
-            g = u = self._to_pixels(torch.matmul(waves, wanted / denominator[..., None]))
+            g = self._to_pixels(torch.matmul(waves, wanted / denominator[..., None]))
         else:
-            g, u = self._boxed(wanted, denominator, waves)
-        rear, front = (self._unpacked(x, channels) for x in (h - g, h + g))
-        return rear, front, (u.mean() + h.mean()).reshape(1)
+            g = self._boxed(wanted, denominator, waves)
+        return self._unpacked(BOX + h - g, channels), self._unpacked(BOX + h + g, channels)
 
-    def _boxed(self, wanted: Tensor, denominator: Tensor, waves: Tensor) -> tuple[Tensor, Tensor]:
+    def _boxed(self, wanted: Tensor, denominator: Tensor, waves: Tensor) -> Tensor:
         """Alternating directions: the quadratic in the modes, the panels' range in the pixels."""
         back = waves.transpose(0, 1)
-        # The first step starts from nothing: it is the regularised solution.
-        z = u = None
+        # It starts from nothing: the first turn is the regularised solution.
+        z = u = torch.zeros(())
         for k in range(self.iterations):
-            penalty = torch.exp(self.log_penalty[k])
-            target = wanted if z is None else wanted + penalty * torch.matmul(back, self._to_patterns(z - u))
+            penalty, relaxation = torch.exp(self.log_penalty[k]), self.relaxation[k]
+            target = wanted
+            if k:
+                target = wanted + penalty * torch.matmul(back, self._to_patterns(z - u))
             x = self._to_pixels(torch.matmul(waves, target / (denominator + penalty)[..., None]))
-            x = x * self.relaxation[k] if z is None else x * self.relaxation[k] + z * (1 - self.relaxation[k])
-            moved = x if u is None else x + u
+            moved = relaxation * x + ((1 - relaxation) * z + u if k else 0.0)
             z = torch.clamp(moved, -BOX, BOX)
             u = moved - z
-        assert z is not None and u is not None
-        return z, u
+        return z + 0.0 * u  # no number that is not finite is lost in the clamp
 
     def _packed(self, image: Tensor, channels: int) -> Tensor:
         """(rows, cells, 2K·C) to (block's pixels, cells, blocks·C)."""
@@ -115,10 +130,9 @@ class SpectralSolver(nn.Module):
         return x.reshape(BLOCK_ROWS * columns, cells, -1)
 
     def _unpacked(self, x: Tensor, channels: int) -> Tensor:
-        """The other way round, in codes."""
+        """The other way round."""
         cells, columns = x.shape[1], 2 * self.cell_px
-        codes = torch.clamp(torch.round(x * FULL + START), 0, FULL).to(torch.int16)
-        image = codes.reshape(BLOCK_ROWS, columns, cells, -1, channels).permute(3, 0, 2, 1, 4)
+        image = x.reshape(BLOCK_ROWS, columns, cells, -1, channels).permute(3, 0, 2, 1, 4)
         return image.reshape(-1, cells, columns * channels)
 
     def _to_patterns(self, x: Tensor) -> Tensor:

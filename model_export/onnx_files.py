@@ -7,7 +7,7 @@ import io
 import logging
 import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -119,7 +119,7 @@ def _exported(
     example: tuple[Any, ...],
     inputs: Sequence[str],
     outputs: Sequence[str],
-    axes: dict[str, tuple[str, ...]],
+    axes: Mapping[str, tuple[str, ...]],
     opset: int,
 ) -> bytes:
     buffer = io.BytesIO()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import sys
 from pathlib import Path
 
@@ -9,8 +10,8 @@ from model_export.checkpoint import solver_of
 from model_export.export import spectral_file
 from model_export.recipe import read_recipe
 from model_export.validate import check_model
-from runtime.model.predictor import SHIPPED, model_path
-from runtime.support.artifacts import write_bytes
+from runtime.model.predictor import SHIPPED, SUMS, model_path
+from runtime.support.artifacts import write_bytes, write_text
 
 
 def shipped_bytes(name: str) -> bytes:
@@ -21,6 +22,7 @@ def shipped_bytes(name: str) -> bytes:
 
 def main() -> int:
     """Write them where the runtime finds them; 1 where one fails its checks."""
+    rows: list[str] = []
     for name in SHIPPED:
         path = Path(str(model_path(name)))
         data = shipped_bytes(name)
@@ -29,6 +31,8 @@ def main() -> int:
         if not report.passed:
             return 1
         write_bytes(path, data)
+        rows.append(f"{hashlib.sha256(data).hexdigest()}  {path.name}\n")
+    write_text(path.parent / SUMS, "".join(sorted(rows, key=lambda row: row.split()[1])))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""`phasestack train`: the network's weights and the sizes of its steps, by what the eyes see."""
+"""`phasestack train`: the network's weights, by what unsure eyes see."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ from model_export.curves import Point, write_curves
 from model_export.data import TrainingPair, endless_pairs
 from model_export.distributed import World, together
 from model_export.folders import folder_pairs, mixed
+from model_export.network import SpectralSolver
 from model_export.recipe import Recipe, Training, read_recipe
-from model_export.unroll import UnrolledSolver, displayed_mse
+from model_export.sight import displayed_mse, sight_of
 from runtime.config import validated
 from runtime.errors import InputError
 from runtime.report.progress import progress_bar
@@ -52,9 +53,10 @@ def run_training(request: TrainRequest) -> dict[str, Any] | None:
     torch.set_num_threads(request.threads)
     with together(request.device) as world:
         device = world.device
-        model = UnrolledSolver(solver_of(recipe, source=request.recipe), recipe).to(device)
+        model = solver_of(recipe, source=request.recipe).to(device)
         training = recipe.training
-        optimiser = torch.optim.Adam(_groups(model, training.learning_rate))
+        rate = training.learning_rate
+        optimiser = torch.optim.Adam([{"params": list(model.parameters()), "lr": rate, "base": rate}])
         size = {"width_px": training.width_px, "height_px": training.height_px}
         own = folder_pairs(request.data, scene=request.scene, **size)
         held_out = held_out_pairs(training.validation_pairs, **size)
@@ -63,7 +65,7 @@ def run_training(request: TrainRequest) -> dict[str, Any] | None:
         first, points, before_s = _resumed(path, model, optimiser, recipe, data) if request.resume else (0, [], 0.0)
         start = time.monotonic()
         if not points:
-            points = [Point(0, math.nan, *validate(model, held_out))]
+            points = [Point(0, math.nan, *validate(model, held_out, recipe))]
         # What a process has taken in the steps before: with folders, every other pair is one of theirs.
         taken = first * PAIRS_A_STEP
         own_taken = taken // 2 if own else 0
@@ -73,11 +75,11 @@ def run_training(request: TrainRequest) -> dict[str, Any] | None:
             for iteration in range(first, training.iterations):
                 for group in optimiser.param_groups:
                     group["lr"] = group["base"] * _annealed(iteration / training.iterations)
-                losses.append(_step(model, optimiser, stream, world))
+                losses.append(_step(model, optimiser, stream, world, recipe))
                 done = iteration + 1
                 progress(done, training.iterations)
                 if done % training.validate_every == 0 or done == training.iterations:
-                    points.append(Point(done, float(np.mean(losses)), *validate(model, held_out)))
+                    points.append(Point(done, float(np.mean(losses)), *validate(model, held_out, recipe)))
                     losses = []
                     if world.rank == 0:
                         seconds = before_s + time.monotonic() - start
@@ -92,44 +94,41 @@ def run_training(request: TrainRequest) -> dict[str, Any] | None:
             "seconds": round(seconds, 1),
             "start_db": round(points[0].exact_db, 3),
             "held_out_db": round(last.exact_db, 3),
-            "start_off_db": round(points[0].off_db, 3),
-            "held_out_off_db": round(last.off_db, 3),
+            "start_expected_db": round(points[0].expected_db, 3),
+            "held_out_expected_db": round(last.expected_db, 3),
             "checkpoint": str(path),
         }
 
 
-def pair_loss(model: UnrolledSolver, pair: TrainingPair) -> Tensor:
-    """Displayed error in dB over the eyes and, with equal weight, over the places `tolerance_mm` beside them."""
-    exact, off = displayed_mse(model(pair.images, pair.eyes_m, pair.stack, pair.tolerance_mm), pair)
-    return 10 * torch.log10((exact + off) / 2 + FLOOR)
+def pair_loss(model: SpectralSolver, pair: TrainingPair, recipe: Recipe) -> Tensor:
+    """Displayed error in dB, expected over the eyes' uncertainty."""
+    _, expected = displayed_mse(model, sight_of(pair, recipe, device=model.log_floor.device))
+    return 10 * torch.log10(expected + FLOOR)
 
 
 def held_out_pairs(count: int, *, width_px: int, height_px: int) -> list[TrainingPair]:
     """Pairs that no training sees, the same every time."""
-    stream = endless_pairs(HELD_OUT_SEED, width_px=width_px, height_px=height_px, tolerance_mm=(0.0, 4.0))
+    stream = endless_pairs(HELD_OUT_SEED, width_px=width_px, height_px=height_px, eye_sigma_mm=(0.0, 4.0))
     return [pair for pair, _ in zip(stream, range(count), strict=False)]
 
 
 @torch.no_grad()
-def validate(model: UnrolledSolver, pairs: Sequence[TrainingPair]) -> tuple[float, float, float]:
-    """Mean dB at the eyes, mean dB beside them (of the pairs that have a tolerance), and mean loss."""
-    exact_db, off_db, losses = [], [], []
+def validate(model: SpectralSolver, pairs: Sequence[TrainingPair], recipe: Recipe) -> tuple[float, float, float]:
+    """Mean dB at the eyes, mean dB expected (of the pairs with unsure eyes), and mean loss."""
+    exact_db, expected_db, losses = [], [], []
     for pair in pairs:
-        exact, off = displayed_mse(model(pair.images, pair.eyes_m, pair.stack, pair.tolerance_mm), pair)
-        exact_db.append(-10 * math.log10(float(exact) + FLOOR))
-        if pair.off:
-            off_db.append(-10 * math.log10(float(off) + FLOOR))
-        losses.append(10 * math.log10((float(exact) + float(off)) / 2 + FLOOR))
-    return float(np.mean(exact_db)), float(np.mean(off_db)) if off_db else math.nan, float(np.mean(losses))
+        errors = displayed_mse(model, sight_of(pair, recipe, device=model.log_floor.device))
+        exact, expected = (-10 * math.log10(float(error) + FLOOR) for error in errors)
+        exact_db.append(exact)
+        if pair.eye_sigma_mm > 0:
+            expected_db.append(expected)
+        losses.append(-expected)
+    return float(np.mean(exact_db)), float(np.mean(expected_db)) if expected_db else math.nan, float(np.mean(losses))
 
 
-def trained_recipe(model: UnrolledSolver, recipe: Recipe) -> Recipe:
-    """The recipe with what was found: weights, and sizes as the runtime applies them (eighths)."""
-    steps = [
-        step.model_copy(update={"size": round(min(max(round(float(size) * 8) / 8, 0.125), 2.0), 4)})
-        for step, size in zip(recipe.steps, model.sizes.detach(), strict=True)
-    ]
-    return recipe.model_copy(update={"steps": tuple(steps), "weights": plain_weights(model.net)})
+def trained_recipe(model: SpectralSolver, recipe: Recipe) -> Recipe:
+    """The recipe with the weights that were found."""
+    return recipe.model_copy(update={"weights": plain_weights(model)})
 
 
 def _asked(recipe: Recipe, request: TrainRequest) -> Recipe:
@@ -139,27 +138,24 @@ def _asked(recipe: Recipe, request: TrainRequest) -> Recipe:
     return recipe.model_copy(update={"training": recipe.training.model_copy(update=changes)})
 
 
-def _groups(model: UnrolledSolver, rate: float) -> list[dict[str, Any]]:
-    groups = [{"params": list(model.net.parameters()), "lr": rate, "base": rate}]
-    if model.recipe.training.learn_steps:
-        groups.append({"params": [model.sizes], "lr": rate / 2, "base": rate / 2})
-    return groups
-
-
 def _annealed(done: float) -> float:
     """Of the learning rate: a short warm-up, then half a cosine down to a twentieth."""
     return min(1.0, 0.1 + done * 20) * (0.05 + 0.95 * (1 + math.cos(math.pi * done)) / 2)
 
 
 def _step(
-    model: UnrolledSolver, optimiser: torch.optim.Optimizer, stream: Iterator[TrainingPair], world: World
+    model: SpectralSolver,
+    optimiser: torch.optim.Optimizer,
+    stream: Iterator[TrainingPair],
+    world: World,
+    recipe: Recipe,
 ) -> float:
     """One step of the optimiser over all processes' pairs. A pair that nobody can see is passed over."""
     optimiser.zero_grad()
     total, used = 0.0, 0
     for _ in range(PAIRS_A_STEP):
         try:
-            loss = pair_loss(model, next(stream))
+            loss = pair_loss(model, next(stream), recipe)
         except ValueError:
             continue
         if bool(torch.isfinite(loss)):
@@ -179,13 +175,13 @@ def _share(training: Training, taken: int, world: World) -> Iterator[TrainingPai
         step=world.size,
         width_px=training.width_px,
         height_px=training.height_px,
-        tolerance_mm=training.tolerance_mm,
+        eye_sigma_mm=training.eye_sigma_mm,
     )
 
 
 def _save(
     out: Path,
-    model: UnrolledSolver,
+    model: SpectralSolver,
     optimiser: torch.optim.Optimizer,
     recipe: Recipe,
     iteration: int,
@@ -198,9 +194,8 @@ def _save(
     save_checkpoint(
         out / "checkpoint.pth",
         {
-            "model": {key: value.cpu() for key, value in model.net.state_dict().items()},
+            "model": {key: value.cpu() for key, value in model.state_dict().items()},
             "recipe": found.model_copy(update={"weights": None}).model_dump(mode="json"),
-            "sizes": model.sizes.detach().cpu(),
             "optimiser": optimiser.state_dict(),
             "iteration": iteration,
             "points": [list(point.row()) for point in points],
@@ -212,7 +207,7 @@ def _save(
 
 
 def _resumed(
-    path: Path, model: UnrolledSolver, optimiser: torch.optim.Optimizer, recipe: Recipe, data: dict[str, Any]
+    path: Path, model: SpectralSolver, optimiser: torch.optim.Optimizer, recipe: Recipe, data: dict[str, Any]
 ) -> tuple[int, list[Point], float]:
     """(iteration, curve, seconds) that a checkpoint had reached; fills model and optimiser. Raises InputError.
 
@@ -231,9 +226,8 @@ def _resumed(
     if not isinstance(iteration, int) or isinstance(iteration, bool) or iteration < 0:
         raise InputError(path, "iteration", f"{iteration!r} is no number of steps")
     try:
-        fill(model.net, table["model"], source=path, arch=recipe.name)
+        fill(model, table["model"], source=path, arch=recipe.name)
         _check_optimiser(table["optimiser"], optimiser)
-        model.sizes.data.copy_(table["sizes"])
         optimiser.load_state_dict(table["optimiser"])
         points = [Point(int(row[0]), *row[1:]) for row in table["points"]]
         return iteration, points, float(table["seconds"])

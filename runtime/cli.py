@@ -36,11 +36,13 @@ def main() -> None:
         from runtime.commands.app import app
         from runtime.support.crash import watch_threads
         from runtime.support.privacy import keep_quiet
+        from runtime.support.progress import TerminalLine, listening
 
         keep_quiet()
         watch_threads()
         signal.signal(signal.SIGINT, before)
-        code = _code_of(app, output)
+        with listening(TerminalLine(sys.stderr)):
+            code = _code_of(app, output)
     except BaseException as error:
         code = _told(error, output)
     sys.exit(_flushed(code, output))

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from runtime.commands.names import check_names, scene_from_here, scene_names
 from runtime.config import Overrides, Settings, load_settings, load_stack
+from runtime.daemon.names import check_names, scene_from_here, scene_names
 from runtime.errors import InputError
 from runtime.support.artifacts import write_png
 
@@ -39,6 +39,10 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         ("[stack]\nheight_m = 0.5", "stack.height_m", "did you mean height_m = 0.2916? (or set stack.pixel_aspect)"),
         ("[calibration]\nipd_m = 63", "calibration.ipd_m", "did you mean millimetres (0.063)?"),
         ("[calibration]\nipd_m = 6.3", "calibration.ipd_m", "did you mean centimetres (0.063)?"),
+        ("[calibration]\nviewing_m = [400, 600]", "calibration.viewing_m.0", "did you mean millimetres (0.4)?"),
+        ("[tracker]\nspeed_max = 2000", "tracker.speed_max", "may be 0.05 to 50 m/s"),
+        ("[content]\npicture_rate_hz = 1e-300", "content.picture_rate_hz", "may be 0.01 to 1000 Hz"),
+        ("[model]\npupil_mm = 4000", "model.pupil_mm", "may be 0 to 20 mm"),
         ("[tracker]\nipd_max_m = 75", "tracker.ipd_max_m", "did you mean millimetres (0.075)?"),
         ("[tracker]\nipd_min_m = 0.08", "tracker.ipd_min_m", "is not below ipd_max_m"),
         ("[tracker]\nhorizon_max_s = 120", "tracker.horizon_max_s", "did you mean milliseconds (0.12)?"),
@@ -111,6 +115,21 @@ def test_a_panels_file_takes_its_pixels_from_the_pictures_whatever_their_shape(t
     file.write_text(json.dumps({"width_m": 518.4, "height_m": 291.6, "x_m": [-60, 0, 60]}))
     with pytest.raises(InputError, match=r"panels\.json: width_m: .*millimetres \(0\.5184\)"):
         load_stack(file, width_px=600, height_px=800)
+
+
+@pytest.mark.parametrize("width", [1e-30, 1e-300, 1e308])
+def test_panels_of_no_size_are_one_line_for_solve_too(tmp_path: Path, width: float) -> None:
+    file = tmp_path / "panels.json"
+    file.write_text(json.dumps({"width_m": width, "height_m": width * 0.5625, "x_m": [-width / 9, 0, width / 9]}))
+    with pytest.raises(InputError, match=r"panels\.json: width_m: "):
+        load_stack(file, width_px=192, height_px=108)
+
+
+def test_what_config_prints_is_a_configuration_and_says_where_paths_start(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "runtime.cli", "config"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.startswith("# Paths are relative to this file's folder.\n")
+    assert loaded(tmp_path, done.stdout) == Settings()
 
 
 def test_one_serial_on_two_monitors_is_told_apart_by_connector(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ for command in COMMANDS:
 
 def _tell_version(wanted: bool) -> None:
     if wanted:
-        from runtime.version import version
+        from runtime.support.version import version
 
         typer.echo(f"phasestack {version()}")
         raise typer.Exit

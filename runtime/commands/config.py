@@ -17,6 +17,9 @@ def config(
 ) -> None:
     """Print a complete configuration: every setting, its default and what it means. It is valid TOML.
 
+    Paths in a configuration are relative to its folder. --check refuses values that make no sense, names that nobody
+    knows and files that are not there.
+
     Example: phasestack config > phasestack.toml
 
     Example: phasestack config --check phasestack.toml
@@ -25,13 +28,14 @@ def config(
 
     settings = load_settings(check)
     if check is not None:
-        from runtime.commands.names import check_names
+        from runtime.daemon.names import check_names
 
         check_names(settings, source=check)
         typer.echo(f"{check}: valid")
     elif as_json:
         typer.echo(json.dumps(settings.model_dump(mode="json")))
     else:
+        print("# Paths are relative to this file's folder.")
         typer.echo("\n".join(_lines(type(settings), settings, "")))
 
 

@@ -31,7 +31,7 @@ def scene(
 
     Example: phasestack ctl scene demo
     """
-    from runtime.commands.names import scene_from_here
+    from runtime.daemon.names import scene_from_here
 
     tell({"command": "scene", "value": scene_from_here(name)}, config, socket)
 
@@ -85,8 +85,17 @@ def reload(config: Config = None, socket: Socket = None) -> None:
     tell({"command": "reload"}, config, socket)
 
 
-def tell(request: dict[str, Any], config: Path | None, socket: Path | None) -> None:
-    """Send one request. Exits with 1 where no daemon answers, 2 where it refuses."""
+@app.command()
+def blackbox(config: Config = None, socket: Socket = None) -> None:
+    """Write the last minutes to a file (MCAP), and print its name: eyes, states, times, pictures, log.
+
+    Example: phasestack ctl blackbox
+    """
+    typer.echo(tell({"command": "blackbox"}, config, socket).get("file", ""))
+
+
+def tell(request: dict[str, Any], config: Path | None, socket: Path | None) -> dict[str, Any]:
+    """Send one request; the daemon's answer. Exits with 1 where no daemon answers, 2 where it refuses."""
     from runtime.commands.status import sockets
     from runtime.daemon.client import NotRunning, ask
     from runtime.errors import InputError
@@ -100,3 +109,4 @@ def tell(request: dict[str, Any], config: Path | None, socket: Path | None) -> N
         raise InputError(f"ctl {request['command']}", "", str(answer.get("error", "refused")))
     if answer.get("note"):
         typer.echo(answer["note"], err=True)
+    return answer

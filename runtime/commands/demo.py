@@ -21,9 +21,9 @@ def demo(
     Example: phasestack demo --out out/demo
     """
     from runtime.clock import NS_PER_S
-    from runtime.commands.running import drive, print_summary
     from runtime.config import Settings
     from runtime.daemon.build import RunOptions
+    from runtime.daemon.drive import drive, print_summary
     from runtime.sensor.recording import Recording
     from runtime.sensor.replay import demo_recording_path
 

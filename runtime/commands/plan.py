@@ -58,7 +58,7 @@ def _survey(
     as_json: bool,
 ) -> None:
     from runtime.errors import InputError
-    from runtime.plan.planning import survey as survey_to
+    from runtime.report.survey_run import survey as survey_to
 
     if not survey:
         raise InputError("plan", "--survey", "--out and --quick belong to it")

@@ -63,16 +63,16 @@ def record(
         typer.echo(f"{out}: {length}, {_contents(summary)} ({summary['stopped']})")
 
 
-def refuse_target(out: Path, *, force: bool) -> None:
+def refuse_target(out: Path, *, force: bool, source: str = "record", field: str = "--out") -> None:
     """Raises InputError for a name that is not a recording's, or one that is taken."""
     from runtime.errors import InputError
     from runtime.support.foreign import checked_path
 
-    checked_path(out, source="record", field="--out")
+    checked_path(out, source=source, field=field)
     if out.suffix.lower() != SUFFIX:
-        raise InputError(out, "--out", f"must end in {SUFFIX}: recordings are MCAP files")
+        raise InputError(out, field, f"must end in {SUFFIX}: recordings are MCAP files")
     if out.is_dir():
-        raise InputError(out, "--out", "is a folder")
+        raise InputError(out, field, "is a folder")
     if (out.exists() or out.is_symlink()) and not force:
         raise InputError(out, "--out", "is there already: take another name, or --force to replace it")
 

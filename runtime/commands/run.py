@@ -43,6 +43,12 @@ def run(
     keep_light: Annotated[
         int, typer.Option(min=0, help="with --out: every so many refreshes leave what the panels show; 0: none")
     ] = 0,
+    record: Annotated[
+        Path | None, typer.Option(help="everything into this MCAP file, for Foxglove and for --replay")
+    ] = None,
+    record_images: Annotated[
+        bool, typer.Option("--record-images", help="with --record: the sensor's pictures too, faces among them")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="the summary as one JSON object on stdout")] = False,
 ) -> None:
     """Run the display: eyes in, layers out, until SIGTERM. SIGHUP reads the configuration again.
@@ -52,6 +58,8 @@ def run(
     Example: phasestack run --config /etc/phasestack/phasestack.toml
 
     Example: phasestack run --replay demo --headless --max-speed --frames 30 --out out/run
+
+    Example: phasestack run --replay demo --headless --record out/run.mcap
     """
     from runtime.config import Overrides
     from runtime.daemon.supervise import run_daemon
@@ -59,6 +67,12 @@ def run(
 
     if keep_light and out is None:
         raise InputError("run", "--keep-light", "needs --out")
+    if record_images and record is None:
+        raise InputError("run", "--record-images", "needs --record")
+    if record is not None:
+        from runtime.commands.record import refuse_target
+
+        refuse_target(record, force=True, source="run", field="--record")
     overrides = Overrides(
         replay=replay, headless=headless, scene=scene, model=model, budget_ms=budget_ms, backend=backend
     )
@@ -71,6 +85,8 @@ def run(
         scale=scale,
         quiet=as_json,
         keep_light=keep_light,
+        record=record,
+        record_images=record_images,
     )
     left_behind = summary.pop("left_behind", 0)
     if as_json:

@@ -22,7 +22,7 @@ from runtime.optics.carried import intensities
 from runtime.optics.retina import as_codes
 from runtime.optics.stack import PanelStack
 from runtime.plan.planner import focused_part, observed
-from runtime.plan.planning import planned_predictor
+from runtime.plan.predictors import planned_predictor
 from runtime.plan.savings import Measured, Saving, network_items
 from runtime.records import F64, U8, PlanItem
 from runtime.support.artifacts import OutputFolder, in_8_bits, read_picture, write_json, write_png

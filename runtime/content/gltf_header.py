@@ -47,13 +47,16 @@ class _File:
             self.checked[key] = _objects(self.table, key, self)
         return self.checked[key]
 
+    def index(self, key: str, index: Any, field: str) -> int:
+        """The index of an object that is there. Raises InputError."""
+        number = foreign.whole(index, least=0, most=MOST_INDEX, source=self.path, field=field)
+        if number >= len(self.objects(key)):
+            raise self.refuse(field, f"names {key}[{number}], which is not there")
+        return number
+
     def at(self, key: str, index: Any, field: str) -> dict[str, Any]:
         """The object that an index names. Raises InputError where it isn't there."""
-        items = self.objects(key)
-        number = foreign.whole(index, least=0, most=MOST_INDEX, source=self.path, field=field)
-        if number >= len(items):
-            raise self.refuse(field, f"names {key}[{number}], which is not there")
-        return items[number]
+        return self.objects(key)[self.index(key, index, field)]
 
 
 def check_gltf(path: Path, data: bytes, *, limits: LimitSettings) -> None:
@@ -168,9 +171,9 @@ def _check_views(file: _File, buffers: list[bytes]) -> None:
             foreign.whole(view.get(key, 0), least=0, most=1 << 40, source=file.path, field=f"{field}.{key}")
             for key in ("byteOffset", "byteLength")
         )
-        file.at("buffers", view.get("buffer"), f"{field}.buffer")
-        if start + length > len(buffers[view["buffer"]]):
-            raise file.refuse(field, f"ends at byte {start + length} of {len(buffers[view['buffer']])}")
+        held = len(buffers[file.index("buffers", view.get("buffer"), f"{field}.buffer")])
+        if start + length > held:
+            raise file.refuse(field, f"ends at byte {start + length} of {held}")
 
 
 def _check_counts(file: _File) -> None:
@@ -205,8 +208,7 @@ def _triangles(file: _File, index: int, mesh: dict[str, Any], counts: list[int])
         if accessor is None:
             result.append(0)
             continue
-        file.at("accessors", accessor, field)
-        corners = counts[accessor]
+        corners = counts[file.index("accessors", accessor, field)]
         result.append(max(corners - 2, 0) if primitive.get("mode", TRIANGLES) in (STRIP, FAN) else corners // 3)
     return result
 
@@ -222,16 +224,17 @@ def _instances(file: _File, meshes: int) -> dict[int, int]:
     seen: set[tuple[int, int]] = set()
     queue = [(-1, root, 1) for root in _list(file, roots, "scenes.nodes")]
     while queue:
-        parent, number, depth = queue.pop()
-        node = file.at("nodes", number, f"nodes[{parent}].children" if parent >= 0 else "scenes.nodes")
+        parent, child, depth = queue.pop()
+        number = file.index("nodes", child, f"nodes[{parent}].children" if parent >= 0 else "scenes.nodes")
+        node = file.objects("nodes")[number]
         if depth > file.limits.depth:
             raise file.refuse("nodes", f"are nested deeper than {file.limits.depth} (limits.depth)")
         if (parent, number) in seen:  # as the loader does: each edge once
             continue
         seen.add((parent, number))
         if node.get("mesh") is not None:
-            file.at("meshes", node["mesh"], f"nodes[{number}].mesh")
-            stands[node["mesh"]] = stands.get(node["mesh"], 0) + 1
+            mesh = file.index("meshes", node["mesh"], f"nodes[{number}].mesh")
+            stands[mesh] = stands.get(mesh, 0) + 1
         children = _list(file, node.get("children", []), f"nodes[{number}].children")
         queue += [(number, child, depth + 1) for child in children]
     return stands
@@ -254,8 +257,8 @@ def _check_pictures(file: _File, buffers: list[bytes]) -> None:
             if "bufferView" not in image:
                 raise file.refuse("texture", f"{field} has neither a file nor data")
             view = file.at("bufferViews", image["bufferView"], f"{field}.bufferView")
-            start = view.get("byteOffset", 0)
-            data = buffers[view["buffer"]][start : start + view.get("byteLength", 0)]
+            start, length = int(view.get("byteOffset", 0)), int(view.get("byteLength", 0))  # known to be whole
+            data = buffers[int(view["buffer"])][start : start + length]
         name = _name(image).rstrip() or field
         check_picture(data, source=file.path, field="texture", name=name, limits=file.limits)
     for index, material in enumerate(file.objects("materials")):

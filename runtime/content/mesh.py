@@ -114,13 +114,15 @@ def _has_area(shape: Shape) -> bool:
 
 def _part(mesh: Any, path: Path, pictures: dict[int, U8]) -> Part:
     vertices = np.asarray(mesh.vertices)
+    faces = np.asarray(mesh.faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise InputError(path, "vertices", f"have {vertices.shape[-1]} coordinates and faces {faces.shape[-1]} corners")
     if not np.isfinite(vertices).all():
         broken = int((~np.isfinite(vertices).all(1)).sum())
         raise InputError(path, "vertices", f"{broken} of {len(vertices)} are not finite")
     huge = int((np.abs(vertices) > LARGEST_COORDINATE).any(1).sum())
     if huge:
         raise InputError(path, "vertices", f"{huge} of {len(vertices)} are beyond {LARGEST_COORDINATE:g}")
-    faces = np.asarray(mesh.faces)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(path, "faces", "refer to vertices that are not there")
     uv, picture, colour, colours = None, None, (1.0, 1.0, 1.0), None

@@ -36,7 +36,7 @@ def prepare_content(settings: ContentSettings, stack: PanelStack, *, limits: Lim
     limits: of what files may hold; None: the defaults. Raises InputError, naming file and field.
     """
     limits = limits or LimitSettings()
-    with progress.within(limits.load_s, _too_slow(settings.scene, limits)):
+    with progress.task(f"loading {settings.scene}", seconds=limits.load_s, too_slow=_too_slow(settings.scene, limits)):
         return _prepared(settings, stack, limits)
 
 

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock, SimulatedClock
 from runtime.config import Settings
 from runtime.records import RefreshAccount
-from runtime.support.priority import PRESENTER_NICENESS, set_niceness
+from runtime.support.priority import PRESENTER_NICENESS, niceness
 
 if TYPE_CHECKING:
+    from runtime.blackbox.recorder import Recorder
     from runtime.daemon.solver_parts import RunningSolver
     from runtime.frame.observer import Output, RunObserver
     from runtime.frame.presenter import Presenter, Supervisor
@@ -94,11 +95,12 @@ def build_run(
     on_account: Callable[[RefreshAccount], None] | None = None,
     wait_for_panels: Callable[[str], bool] | None = None,
     on_start: Callable[[str], bool] = lambda _: True,
+    recorder: Recorder | None = None,
 ) -> Run:
     """A run ready for its first refresh; whatever it holds is closed by `cleanup`.
 
     wait_for_panels: asked when a panel is not there yet; True: try again. on_start: told what takes long before the
-    first refresh; False: leave it. Raises FatalError, PanelLost.
+    first refresh; False: leave it. recorder: begins to watch; who gives it closes it. Raises FatalError, PanelLost.
     """
     import cv2
 
@@ -106,6 +108,7 @@ def build_run(
     from runtime.eyes.calibration import load_calibration
     from runtime.eyes.detect import EyeFinder
     from runtime.frame.observer import RunObserver
+    from runtime.frame.observers import Observers
     from runtime.frame.presenter import Presenter
     from runtime.frame.samples import LiveSamples, RecordedSamples, Samples
     from runtime.frame.solver_host import SimulatedSolver, total_ns
@@ -183,10 +186,13 @@ def build_run(
         panels=panels,
         stage_ms=settings.loop.simulated_stage_ms,
         supervisor=supervisor,
-        observer=observer,
+        observer=observer if recorder is None else Observers(observer, recorder),
     )
+    if recorder is not None:
+        in_stack_frame = driver.capabilities.in_stack_frame
+        recorder.watches(presenter, stack=stack, simulated=simulated, in_stack_frame=in_stack_frame)
     if not simulated:
-        set_niceness(PRESENTER_NICENESS)  # this thread's, once all others have been started
+        cleanup.enter_context(niceness(PRESENTER_NICENESS))  # this thread's, once all others have been started
     return Run(presenter, observer, solver, lambda: _newest(maker), simulated)
 
 

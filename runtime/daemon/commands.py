@@ -8,7 +8,7 @@ import threading
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
-Name = Literal["scene", "pause", "resume", "flat", "budget", "reload"]
+Name = Literal["scene", "pause", "resume", "flat", "budget", "reload", "blackbox"]
 NAMES: tuple[Name, ...] = get_args(Name)
 BUDGET_MAX_MS = 10_000.0
 
@@ -23,6 +23,7 @@ class Command:
 
     name: Name
     value: Any = None  # scene: str; budget: milliseconds, 0 for none; the others: None
+    told: dict[str, Any] = field(default_factory=dict)  # beside `ok`, once it is done: what came of it
     _answers: queue.SimpleQueue[str] = field(default_factory=queue.SimpleQueue)
     _decided: threading.Lock = field(default_factory=threading.Lock)  # who has it says whether it is carried out
 

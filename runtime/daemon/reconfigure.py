@@ -13,6 +13,7 @@ from runtime.eyes.calibration import load_calibration
 from runtime.model.predictor import Predictor
 from runtime.optics.stack import PanelStack
 from runtime.support.background import Job
+from runtime.support.memory import give_back_later
 
 
 class Reconfiguration:
@@ -85,6 +86,7 @@ class Reconfiguration:
         if predictor is not None:
             before.predictor.close()
         parts.budget.changed(content=self._source is not None, model=predictor is not None)
+        give_back_later()
 
     def _discard(self) -> None:
         if self._source is not None:
@@ -92,6 +94,7 @@ class Reconfiguration:
         if self._model is not None:
             self._model.abandon()
         self._loader = self._source = self._model = None
+        give_back_later()
 
 
 def _model_part(settings: Settings) -> Any:

@@ -50,6 +50,7 @@ class StatusServer:
         """Raises SocketInUse where the socket belongs to a running daemon, InputError where it can't be made."""
         self.path = path
         self.commands: queue.SimpleQueue[Command] = queue.SimpleQueue()
+        self.lookups: dict[str, Callable[[], dict[str, Any]]] = {}  # answered at once, on the server's thread
         self._clock = clock
         self._started_ns = clock.now_ns()
         self._snapshot: tuple[int, Callable[[], dict[str, Any]]] = (self._started_ns, dict)
@@ -90,6 +91,9 @@ class StatusServer:
             return {"ok": False, "error": "a request is one JSON object on one line"}
         if isinstance(request, dict) and request.get("command") == "status":
             return self._status()
+        looked_up = self.lookups.get(str(request.get("command"))) if isinstance(request, dict) else None
+        if looked_up is not None:
+            return {"ok": True, **looked_up()}
         try:
             command = parse(request)
         except ValueError as error:
@@ -141,7 +145,7 @@ class Waiting:
         """The answer, once there is one. A command that nobody has taken in time is given up: it is never done."""
         refused = self._command.wait(0.0)
         if refused is not None:
-            return _line({"ok": not refused} | ({"error": refused} if refused else {}))
+            return _line({"ok": False, "error": refused} if refused else {"ok": True, **self._command.told})
         waited_s = (self._clock.now_ns() - self._asked_ns) / NS_PER_S
         if waited_s > LOOP_ANSWERS_WITHIN_S and self._command.give_up():
             problem = f"the loop did not answer within {LOOP_ANSWERS_WITHIN_S:g} s: nothing was done"

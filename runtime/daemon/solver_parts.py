@@ -18,7 +18,7 @@ from runtime.frame.timing import SOLVING_STAGES
 from runtime.model.predictor import Predictor
 from runtime.optics.stack import PanelStack
 from runtime.plan.budget import BudgetControl
-from runtime.plan.planning import planned_predictor
+from runtime.plan.predictors import planned_predictor
 from runtime.plan.savings import Saving
 from runtime.records import SolveRequest
 from runtime.support.gl import offscreen_context

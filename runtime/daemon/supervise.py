@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import logging
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from runtime.clock import MonotonicClock
-from runtime.commands.running import drive, print_summary
+from runtime.blackbox.location import black_box_folder
+from runtime.blackbox.recorder import MIB, Plan, Recorder
+from runtime.clock import NS_PER_MS, MonotonicClock
 from runtime.config import Overrides, Settings, load_settings
 from runtime.daemon.build import Run, RunOptions
 from runtime.daemon.commands import Command
+from runtime.daemon.drive import drive, print_summary
+from runtime.daemon.names import scene_names
 from runtime.daemon.notify import Notifier
 from runtime.daemon.reconfigure import Reconfiguration
 from runtime.daemon.server import StatusServer, open_status_server
 from runtime.daemon.signals import Signals
-from runtime.errors import InputError, PhasestackError, Stopped, TransientError
+from runtime.errors import InputError, PanelLost, PhasestackError, Stopped, TransientError, one_line
 from runtime.frame.presenter import Presenter
 from runtime.records import RefreshAccount, State
 from runtime.support import logs
 from runtime.support.transient import MayPass, may_pass
+from runtime.support.version import version
 
 log = logging.getLogger("phasestack.daemon")
 
@@ -42,7 +47,9 @@ class Daemon:
         notifier: Notifier,
         server: StatusServer | None,
         metrics: Any | None,
+        recorder: Recorder | None = None,
     ) -> None:
+        self._recorder = recorder
         self._config, self._overrides = config, overrides
         self._signals, self._notifier, self._server, self._metrics = signals, notifier, server, metrics
         self.run: Run | None = None  # set when it has been put together
@@ -77,7 +84,7 @@ class Daemon:
         self._notifier.status(f"{machine.name} ({machine.reason})")
         self._notifier.refreshed(machine.state, machine.missing, presented=account.presented)
         if self._server is not None:
-            self._server.publish(lambda: snapshot(self.run, presenter, account) | self._loading())
+            self._server.publish(lambda: snapshot(self.run, presenter, account) | self._loading() | self._box())
         if self._metrics is not None:
             self._metrics.refresh(account)
             self._metrics.missed_blanks(presenter.stats.missed_blanks - self._missed_told)
@@ -86,6 +93,12 @@ class Daemon:
                 for _ in range(count - self._faults_told.get(part, 0)):
                     self._metrics.fault(part)
                 self._faults_told[part] = count
+
+    def abandon_change(self) -> None:
+        """The run is over: what is being loaded is no longer wanted."""
+        if self._change is not None:
+            self._change.abandon()
+            self._change = None
 
     def watches(self, run: Run) -> None:
         """The run that it supervises."""
@@ -122,6 +135,10 @@ class Daemon:
             told["refused"] = self._refused
         return told
 
+    def _box(self) -> dict[str, Any]:
+        """The black box; for the status."""
+        return {"blackbox": self._recorder.describe()} if self._recorder is not None else {}
+
     def _carry_out(self, command: Command, presenter: Presenter) -> None:
         match command.name:
             case "pause":
@@ -143,6 +160,23 @@ class Daemon:
             case "budget":
                 self._set_budget(presenter, command.value)
                 command.done()
+            case "blackbox":
+                self._write_black_box(command)
+
+    def _write_black_box(self, command: Command) -> None:
+        """What the black box keeps, to a file; the answer comes once it is there."""
+
+        def tell(problem: str, path: Path | None) -> None:
+            if problem:
+                command.refuse(problem)
+            else:
+                command.told["file"] = str(path)
+                command.done()
+
+        if self._recorder is None:
+            command.refuse("this run has no black box")
+        else:
+            self._recorder.save("asked for", tell)
 
     def _set_budget(self, presenter: Presenter, budget_ms: float) -> None:
         """In force at once; which level holds it is measured beside the solver, where it isn't known yet."""
@@ -227,6 +261,7 @@ def snapshot(run: Run | None, presenter: Presenter, account: RefreshAccount) -> 
         "eye_sigma_now_mm": account.eye_sigma_mm,
         "solution": account.solution,
         "solution_age_now_ms": account.solution_age_ms,
+        "photon_now_ms": (account.photon_ns - account.capture_ns) / NS_PER_MS if account.capture_ns else None,
         "rejected_samples": {
             "outlier": presenter.viewer.outliers,
             **presenter.viewer.dropped,
@@ -239,6 +274,50 @@ def snapshot(run: Run | None, presenter: Presenter, account: RefreshAccount) -> 
     }
 
 
+def about(run: Run | None) -> dict[str, Any]:
+    """What does not change while it runs, and which scenes there are: for the page."""
+    if run is None:
+        return {}
+    settings, stack = run.presenter.run_cell.state.settings, run.presenter.stack
+    return {
+        "version": version(),
+        "stack": {"width_m": stack.width_m, "height_m": stack.height_m, "x_m": stack.x_m},
+        "viewing_m": settings.calibration.viewing_m,
+        "viewing_side_deg": settings.calibration.viewing_side_deg,
+        "viewing_up_deg": settings.calibration.viewing_up_deg,
+        "scenes": scene_names(),
+    }
+
+
+@contextmanager
+def _recorder(settings: Settings, *, simulated: bool, record: Path | None, images: bool) -> Iterator[Recorder | None]:
+    """The run's black box; None where nobody wants one. Where the run ends with an error, it is written."""
+    service = settings.service
+    if simulated and record is None:
+        yield None
+        return
+    plan = Plan(
+        minutes=0.0 if simulated else service.blackbox_minutes,
+        most_bytes=round(service.blackbox_mib * MIB),
+        folder=black_box_folder(service.blackbox_folder),
+        files=service.blackbox_files,
+        record=record,
+        record_bytes=round(settings.sensor.record_max_mib * MIB),
+        images=images,
+    )
+    recorder = Recorder(plan)
+    try:
+        yield recorder
+    except Stopped:
+        recorder.close()
+        raise
+    except Exception as error:
+        recorder.close(crashed=one_line(f"{type(error).__name__}: {error}"))
+        raise
+    finally:
+        recorder.close()
+
+
 def run_daemon(
     config: Path | None,
     overrides: Overrides,
@@ -249,13 +328,16 @@ def run_daemon(
     scale: float,
     quiet: bool,
     keep_light: int = 0,
+    record: Path | None = None,
+    record_images: bool = False,
 ) -> dict[str, Any]:
     """The whole life of `phasestack run`; answers the summary.
 
     Raises FatalError where the configuration or a file is wrong, TransientError where starting again may help.
     """
     try:
-        return _lived(config, overrides, frames, RunOptions(max_speed, out is not None, scale, keep_light), out, quiet)
+        options = RunOptions(max_speed, out is not None, scale, keep_light)
+        return _lived(config, overrides, frames, options, out, quiet, record=record, record_images=record_images)
     except Exception as error:
         if isinstance(error, TransientError) or not may_pass(error):
             raise
@@ -263,7 +345,15 @@ def run_daemon(
 
 
 def _lived(
-    config: Path | None, overrides: Overrides, frames: int | None, options: RunOptions, out: Path | None, quiet: bool
+    config: Path | None,
+    overrides: Overrides,
+    frames: int | None,
+    options: RunOptions,
+    out: Path | None,
+    quiet: bool,
+    *,
+    record: Path | None,
+    record_images: bool,
 ) -> dict[str, Any]:
     settings = overrides.applied(load_settings(config))
     logs.configure(settings.service)
@@ -280,7 +370,18 @@ def _lived(
         if server is not None:
             cleanup.callback(server.close)
         metrics = _metrics(settings.service.metrics_port, cleanup)
-        daemon = Daemon(config, overrides, signals=signals, notifier=notifier, server=server, metrics=metrics)
+        recorder = cleanup.enter_context(
+            _recorder(settings, simulated=options.max_speed, record=record, images=record_images)
+        )
+        daemon = Daemon(
+            config, overrides, signals=signals, notifier=notifier, server=server, metrics=metrics, recorder=recorder
+        )
+        if server is not None and recorder is not None:
+            server.lookups |= {
+                "pictures": recorder.look_at_pictures,
+                "log": recorder.look_at_log,
+                "about": lambda: about(daemon.run),
+            }
         try:
             summary = drive(
                 settings,
@@ -293,9 +394,15 @@ def _lived(
                 wait_for_panels=daemon.wait_for_panels,
                 on_start=daemon.starting,
                 on_built=daemon.watches,
+                recorder=recorder,
             )
         except Stopped as reason:
             summary = {"stopped": str(reason)}
+        except PanelLost:
+            if not signals.stop:
+                raise
+            summary = {"stopped": daemon.stop_reason()}  # told so while it waited for a panel
+        daemon.abandon_change()
         notifier.stopping(summary["stopped"])
     log.info("stopped: %s", summary["stopped"])
     if not quiet and not notifier.supervised and "frames" in summary:

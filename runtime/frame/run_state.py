@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Any
 
 from runtime.config import Settings
@@ -30,7 +31,13 @@ class RunCell:
         self, settings: Settings, *, calibration: Calibration, content: ContentSource, predictor: Predictor
     ) -> None:
         self._lock = threading.Lock()
+        self._numbers = count(1)
         self.state = RunState(0, settings, calibration, content, predictor)
+
+    def next_number(self) -> int:
+        """Of a solution or a flat picture; none is given twice in a run, whichever solver makes it."""
+        with self._lock:
+            return next(self._numbers)
 
     def replace(self, **changes: Any) -> RunState:
         """Fields of RunState that change; answers the state before, whose parts are the caller's to close."""

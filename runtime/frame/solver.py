@@ -52,7 +52,6 @@ class Solver:
         self._seeing = (True, True)
         self._policy = FramePolicy()
         self._buffers = LayerBuffers()
-        self._number = 0
         self._solved: Made | None = None
         self._flat: Made | None = None
         self._middle_m: F64 = np.array(FLAT_EYE_M)
@@ -107,9 +106,8 @@ class Solver:
         self._missing = {}
         self._solved = Made(state.version, revision, eyes_m)
         self._middle_m = eyes_m.mean(axis=0)
-        self._number += 1
         solution = Solution(
-            self._number,
+            self.run.next_number(),
             layers,
             eyes_m,
             request.time_ns,
@@ -137,9 +135,8 @@ class Solver:
         if not missing:
             self._missing.pop("content", None)
             self._flat = Made(state.version, revision, None, self._policy.episode)
-        self._number += 1
         stages = {"render": watch.lap_ms()}
-        flat = Solution(self._number, layers, None, time_ns, stage_ms=stages, machine_ms=stages)
+        flat = Solution(self.run.next_number(), layers, None, time_ns, stage_ms=stages, machine_ms=stages)
         return Step(flat=flat, missing=missing)
 
     def plan_items(self, measured: Measured | None = None) -> tuple[PlanItem, ...]:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from runtime.errors import InputError, ModelFailure
-from runtime.model.predictor import Prediction, Predictor
+from runtime.model.base import Prediction, Predictor
 from runtime.model.resample import buffer, resample, target_from_source
 from runtime.model.session import ModelSession
 from runtime.model.timing import Stopwatch

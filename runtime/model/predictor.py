@@ -1,83 +1,20 @@
-"""Models behind one interface: which pictures a model wants drawn, and the layers it makes of them."""
+"""Which model a name means, and its loading; what models are is told in `base`."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 
 from runtime.config import ModelSettings
 from runtime.errors import InputError
 from runtime.model.allocator import keep_freed_memory
-from runtime.optics.pupil import POINT_MM
-from runtime.optics.stack import PanelStack, PlaneRaster
-from runtime.records import F64, U8
+from runtime.model.base import Prediction, Predictor
+from runtime.optics.stack import PanelStack
+
+__all__ = ["SHIPPED", "Prediction", "Predictor", "load_predictor", "model_path"]
 
 SHIPPED = ("fast", "balanced", "best")
-
-
-@dataclass(frozen=True, slots=True)
-class Prediction:
-    """The layers for two eyes, and what they took."""
-
-    layers: U8  # (N, height_px, width_px, 4) RGBA, rear to front; the predictor's own until its next call
-    stage_ms: dict[str, float] = field(default_factory=dict)  # prepare, inference (the network alone), finish
-
-
-class Predictor(ABC):
-    """Two pictures in, N layers out. One thread uses it."""
-
-    name: str
-    provider: str
-    parameters: int
-    stack: PanelStack
-    channels: int = 3  # that the last pictures were solved in: one, where grey ones may be
-
-    @abstractmethod
-    def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
-        """The rasters that each eye's picture must be drawn on, for eyes (2, 3), frame `stack`."""
-
-    @property
-    def interpolation(self) -> str:
-        """How still pictures are to be warped for it: `linear` or `cubic`."""
-        return "linear"
-
-    @property
-    def emphasis(self) -> float:
-        """How strongly it sharpens pictures against the blur of interpolation (`transfer.emphasised`)."""
-        return 0.0
-
-    @property
-    def black_beside(self) -> bool:
-        """Whether still pictures end in black, not in their repeated edge."""
-        return False
-
-    def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
-        """Rows and columns of each raster that `predict` will look at: all of them, where it doesn't know better."""
-        return tuple((slice(0, raster.height_px), slice(0, raster.width_px)) for raster in self.rasters(eyes_m))
-
-    @abstractmethod
-    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> Prediction:
-        """Layers for `images[eye][raster]`, (h, w, 4) RGBA, left eye first, drawn on `rasters(eyes_m)`.
-
-        eye_sigma_mm: standard deviation, an axis, of where light enters the eyes, common to both, to the right and
-        up; 0 asks for two points.
-
-        Raises ModelFailure where inference fails or does not answer with finite numbers.
-        """
-
-    def warm_up(self, eyes_m: F64) -> None:
-        """Run once on grey pictures, so that the first frame does not pay for allocation."""
-        import numpy as np
-
-        rasters = self.rasters(eyes_m)
-        grey = [np.full((raster.height_px, raster.width_px, 4), 128, np.uint8) for raster in rasters]
-        self.predict([grey, grey], eyes_m)
-
-    def close(self) -> None:  # noqa: B027 - most hold nothing
-        """Release threads and sessions. May be called twice."""
+SUMS = "SHA256SUMS"  # of the files beside it, as sha256sum writes and checks them
 
 
 def model_path(name: str) -> Path | None:
@@ -90,6 +27,18 @@ def model_path(name: str) -> Path | None:
     if path.suffix != ".onnx" and not path.exists():
         raise InputError("model", "name", f"{name!r} is neither {', '.join(SHIPPED)}, sart nor an ONNX file")
     return path
+
+
+def shipped_sha256(name: str) -> str:
+    """What a shipped model's file must be, from the table beside it; empty for another. Raises InputError."""
+    if name not in SHIPPED:
+        return ""
+    table = Path(str(resources.files("runtime.model") / "data" / SUMS))
+    try:
+        rows = [line.split() for line in table.read_text(encoding="ascii").splitlines()]
+        return {file: digest for digest, file in rows}[f"{name}.onnx"]
+    except (OSError, ValueError, KeyError):
+        raise InputError(table, f"{name}.onnx", "is not listed: install phasestack again") from None
 
 
 def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None = None) -> Predictor:
@@ -107,7 +56,7 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
         return SartPredictor(stack, why="" if path is None else f"instead of {name}: needs three even panels")
     from runtime.model.session import ModelSession
 
-    session = ModelSession(path, provider=settings.provider, threads=settings.threads)
+    session = ModelSession(path, provider=settings.provider, threads=settings.threads, sha256=shipped_sha256(name))
     if session.contract.panels != stack.count:
         raise InputError(path, "contract.panels", f"{session.contract.panels}, but the stack has {stack.count}")
     if session.contract.input_frame == "chain":

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.errors import ModelFailure
-from runtime.model.predictor import Prediction, Predictor
+from runtime.model.base import Prediction, Predictor
 from runtime.model.resample import target_from_source
 from runtime.model.timing import Stopwatch
 from runtime.optics.malus import phase_from_intensity

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from runtime.model.predictor import Prediction, Predictor
+from runtime.model.base import Prediction, Predictor
 from runtime.optics.pupil import POINT_MM
 from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack

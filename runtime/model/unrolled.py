@@ -12,15 +12,16 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.errors import ModelFailure
+from runtime.model.base import Prediction, Predictor
 from runtime.model.bench import Bench
 from runtime.model.chain import ChainFrame, chain_frame, chain_modes
 from runtime.model.channels import RGBA_FROM, is_grey, without_alpha
 from runtime.model.contract import Step
 from runtime.model.fade import Fade
 from runtime.model.level import CENTRE, EVEN, FRONT, I16, OUTER, REAR, START, Level
-from runtime.model.predictor import Prediction, Predictor
 from runtime.model.resample import resample
 from runtime.model.rows import RowPool
 from runtime.model.session import ModelSession
@@ -179,7 +180,7 @@ class UnrolledPredictor(Predictor):
             resample(needs[side], image_from_result=matrix, out=seen[side])
         waves, shifted_waves, spectrum, modes_in = chain_modes(frame.cells)
         left, right = (image.reshape(frame.rows, frame.cells, -1) for image in seen)
-        feeds = {
+        feeds: dict[str, NDArray[Any]] = {
             "left": left,
             "right": right,
             "waves": waves,

@@ -20,7 +20,7 @@ from runtime.model.predictor import SHIPPED, Predictor
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import drawn_for, retina_view
 from runtime.plan.levels import Level
-from runtime.plan.planning import LADDER
+from runtime.plan.predictors import LADDER
 from runtime.plan.reduced import ladder_predictor
 from runtime.records import F32, F64, U8
 

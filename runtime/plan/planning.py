@@ -1,4 +1,4 @@
-"""Puts content and models together to measure a plan, and builds what a plan asks for."""
+"""Puts content and models together to measure a plan."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from runtime.config import ModelSettings, Settings, load_settings, validated
+from runtime.config import Settings, load_settings, validated
 from runtime.errors import FatalError, InputError
 
 if TYPE_CHECKING:
     from runtime.content.base import ContentSource
-    from runtime.model.predictor import Predictor
     from runtime.optics.stack import PanelStack
-    from runtime.plan.focus import FocusedPredictor
     from runtime.plan.levels import Level
     from runtime.plan.measure import Trial
     from runtime.records import F64
@@ -24,41 +22,6 @@ if TYPE_CHECKING:
 MIDDLE_M = (0.6, 0.0, 0.05)
 HALF_IPD_M = 0.031
 FARTHEST_M = 100.0  # of a viewer
-SURVEY_REPEATS = 15
-LADDER = (("best", 1.0), ("balanced", 1.0), ("fast", 1.0), ("fast", 0.75), ("fast", 0.5))
-
-
-def focused(predictor: Predictor, settings: ModelSettings) -> FocusedPredictor | None:
-    """The predictor made to run on windows, where its kind can; None for others (`sart`, whole-picture networks)."""
-    from runtime.model.unrolled import UnrolledPredictor
-    from runtime.plan.focus import FocusedPredictor
-
-    if not isinstance(predictor, UnrolledPredictor):
-        return None
-
-    def make(part: PanelStack) -> UnrolledPredictor:
-        # One session serves every size: loading another for a new window would cost as much as solving it.
-        return UnrolledPredictor(
-            predictor.session,
-            part,
-            threads=settings.threads,
-            one_channel=predictor.one_channel,
-        )
-
-    return FocusedPredictor(predictor, make)
-
-
-def planned_predictor(settings: Settings, stack: PanelStack) -> Predictor:
-    """The configured model with the savings that the plan allows. Raises InputError, MissingPart."""
-    from runtime.model.predictor import load_predictor
-    from runtime.model.unrolled import UnrolledPredictor
-
-    predictor = load_predictor(settings.model.name, stack, settings.model)
-    if isinstance(predictor, UnrolledPredictor):
-        predictor.one_channel = settings.plan.enabled and settings.plan.one_channel
-    if settings.plan.enabled and settings.plan.focus:
-        return focused(predictor, settings.model) or predictor
-    return predictor
 
 
 def plan_for(
@@ -79,10 +42,11 @@ def plan_for(
     from runtime.model.predictor import load_predictor
     from runtime.plan.measure import measure
     from runtime.plan.planner import focused_part
+    from runtime.plan.predictors import planned_predictor
     from runtime.plan.savings import make_plan
     from runtime.support.gl import offscreen_context
 
-    settings = _overridden(load_settings(config), scene=scene, model=model, budget_ms=budget_ms)
+    settings = overridden(load_settings(config), scene=scene, model=model, budget_ms=budget_ms)
     cv2.setNumThreads(settings.model.threads or -1)
     stack = settings.stack.stack()
     stack = replace(
@@ -96,7 +60,7 @@ def plan_for(
         eyes_m, where = np.array(settings.sensor.fixed_eyes_m), "sensor.fixed_eyes_m"
     _check_viewer(eyes_m, stack, fov_deg=settings.content.fov_deg, source=where)
     with ExitStack() as cleanup:
-        tell = _teller(cleanup, quiet)
+        tell = teller(cleanup, quiet)
         context = offscreen_context()
         cleanup.callback(context.release)
         content = open_content(settings.content, stack, context)
@@ -139,58 +103,6 @@ def plan_for(
                 for level in levels
             ],
         }
-
-
-def survey(
-    config: Path | None, *, out: Path, model: str | None, scale: float, quick: bool, quiet: bool
-) -> dict[str, Any]:
-    """Six kinds of scenes, other small objects and growing regions, with the plan and without; files in `out`.
-
-    Raises PhasestackError; leaves nothing new then.
-    """
-    from datetime import UTC, datetime
-
-    import cv2
-    import numpy as np
-
-    from runtime.plan.survey import QUICK_REGIONS, REGIONS, survey_regions, survey_scenes
-    from runtime.report.survey_page import write_survey
-    from runtime.support.artifacts import OutputFolder
-    from runtime.support.gl import offscreen_context
-
-    settings = _overridden(load_settings(config), scene=None, model=model, budget_ms=None)
-    cv2.setNumThreads(settings.model.threads or -1)
-    stack = settings.stack.stack()
-    scale *= 0.5 if quick else 1.0
-    stack = replace(
-        stack, width_px=max(16, round(stack.width_px * scale)), height_px=max(16, round(stack.height_px * scale))
-    )
-    half = np.array([0.0, HALF_IPD_M, 0.0])
-    eyes_m = np.array([np.array(MIDDLE_M) - half, np.array(MIDDLE_M) + half])
-    with ExitStack() as cleanup, OutputFolder(out) as folder:
-        tell = _teller(cleanup, quiet)
-        context = offscreen_context()
-        cleanup.callback(context.release)
-        repeats = SURVEY_REPEATS // 3 if quick else SURVEY_REPEATS
-        scenes, others = survey_scenes(settings, stack, context, eyes_m, repeats=repeats, progress=tell)
-        regions = survey_regions(
-            settings,
-            stack,
-            context,
-            eyes_m,
-            regions=QUICK_REGIONS if quick else REGIONS,
-            repeats=max(3, repeats // 3),
-            progress=tell,
-        )
-        facts = {
-            "model": settings.model.name,
-            "width_px": stack.width_px,
-            "height_px": stack.height_px,
-            "threads": settings.model.threads,
-            "eyes_m": eyes_m.tolist(),
-            "date": datetime.now(UTC).strftime("%Y-%m-%d"),
-        }
-        return write_survey(folder.staging, scenes, others, regions, facts)
 
 
 def _budget(
@@ -258,7 +170,7 @@ def _band_m(settings: Settings) -> float:
     return (settings.plan.dead_band_mm or settings.plan.most_band_mm) / 1000
 
 
-def _overridden(settings: Settings, *, scene: str | None, model: str | None, budget_ms: float | None) -> Settings:
+def overridden(settings: Settings, *, scene: str | None, model: str | None, budget_ms: float | None) -> Settings:
     """Settings with what the command line says."""
     table = settings.model_dump()
     for section, name, value, option in (
@@ -272,7 +184,7 @@ def _overridden(settings: Settings, *, scene: str | None, model: str | None, bud
     return validated(Settings, table, source="settings")
 
 
-def _teller(cleanup: ExitStack, quiet: bool) -> Callable[[str], None]:
+def teller(cleanup: ExitStack, quiet: bool) -> Callable[[str], None]:
     """Shows what is being measured, on stderr."""
     if quiet or not sys.stderr.isatty():
         return lambda text: None

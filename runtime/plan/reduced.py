@@ -13,6 +13,7 @@ from runtime.config import Settings
 from runtime.model.predictor import Prediction, Predictor
 from runtime.optics.pupil import POINT_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.plan.predictors import planned_predictor
 from runtime.records import F64, U8
 
 
@@ -51,8 +52,6 @@ class ReducedPredictor(Predictor):
 
 def ladder_predictor(name: str, scale: float, stack: PanelStack, settings: Settings) -> Predictor:
     """One level of the ladder: a model at a share of the panels' columns and rows, focused where the plan says so."""
-    from runtime.plan.planning import planned_predictor
-
     chosen = settings.model_copy(update={"model": settings.model.model_copy(update={"name": name})})
     if scale == 1.0:
         return planned_predictor(chosen, stack)

@@ -21,7 +21,7 @@ from runtime.model.predictor import load_predictor
 from runtime.optics.stack import PanelStack
 from runtime.plan.measure import Trial, measure, trials
 from runtime.plan.planner import focused_part
-from runtime.plan.planning import planned_predictor
+from runtime.plan.predictors import planned_predictor
 from runtime.plan.savings import network_items
 from runtime.records import F64
 

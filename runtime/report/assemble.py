@@ -147,6 +147,7 @@ def _sweeps(record: dict[str, Any], *, stack: Any, small: Any, progress: Progres
         "angles_deg": volume.angles_deg,
         "distances_m": volume.distances_m,
         "psnr_db": volume.psnr_db,
+        "expected_1mm_db": volume.expected_db,
     }
     record["tolerance"] = {"offsets_mm": tolerance.offsets_mm, "psnr_db": tolerance.psnr_db}
     record["horizon"] = [
@@ -166,9 +167,16 @@ def _sweeps(record: dict[str, Any], *, stack: Any, small: Any, progress: Progres
         }
         for trade in trades
     ]
-    record["gaps"] = [{"model": c.name, "gap_mm": c.x, "psnr_db": c.y} for c in gaps]
+    record["gaps"] = [{"model": c.name, "gap_mm": c.x, "psnr_db": c.y, "expected_1mm_db": c.expected} for c in gaps]
     record["resolutions"] = [
-        {"model": s.model, "width_px": s.width_px, "height_px": s.height_px, "ms": s.ms, "psnr_db": s.psnr_db}
+        {
+            "model": s.model,
+            "width_px": s.width_px,
+            "height_px": s.height_px,
+            "ms": s.ms,
+            "psnr_db": s.psnr_db,
+            "expected_1mm_db": s.expected_db,
+        }
         for s in sizes
     ]
     return [

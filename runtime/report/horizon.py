@@ -98,5 +98,7 @@ def horizon_section(horizons: Sequence[Horizon], tolerance: Tolerance) -> Sectio
         "sample taken as it is, cut off above 60 mm.",
     ]
     caption = "Heads at 0.6 m, 30 samples a second, 3 mm of noise, 5% outliers, dropouts of 200 ms."
-    table = Table(headings, rows, "60 ms ahead. The PSNR is what an error of that size leaves of the picture.")
+    table = Table(
+        headings, rows, "60 ms ahead. The PSNR (carried) is what an error of that size leaves of the picture."
+    )
     return Section("Tracker horizon", text, [Figure("tracker-horizon", png(figure), caption)], [table])

@@ -17,7 +17,7 @@ CAPTIONS = {
 
 def surveyed(*, quick: bool) -> tuple[Section, dict[str, Any]]:
     """Measure it in a process of its own. The section, and what report.json has of it. Raises FatalError."""
-    from runtime.plan.planning import survey
+    from runtime.report.survey_run import survey
 
     with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
         out = Path(folder) / "plan"

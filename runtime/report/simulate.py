@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Self
 
@@ -12,14 +13,11 @@ from numpy.typing import ArrayLike
 from runtime.config import ModelSettings
 from runtime.errors import ModelFailure
 from runtime.model.predictor import Predictor, load_predictor
-from runtime.optics.carried import intensities
+from runtime.optics.carried import expected_psnrs_db
 from runtime.optics.pupil import POINT_MM
-from runtime.optics.quality import psnr_db, squared_error
-from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import drawn_for
 from runtime.records import F64, U8
-from runtime.report.eyesight import single_psnr_db
 from runtime.report.pairs import Painter
 
 
@@ -55,25 +53,16 @@ class Simulation:
         size = {"width_px": self.stack.width_px, "height_px": self.stack.height_px}
         return [self.painter.image(eye, **size, fov_deg=fov_deg) for eye in eyes_m], fov_deg
 
-    def psnr_db(self, eye_m: ArrayLike, layers: U8) -> float:
-        """Displayed PSNR of one eye over the panel. NaN where no ray crosses every panel."""
-        fov_deg = self.fov_deg(eye_m)
-        wanted = self.painter.image(
-            eye_m, width_px=self.stack.width_px, height_px=self.stack.height_px, fov_deg=fov_deg
-        )
-        return single_psnr_db(eye_m, layers, self.stack, wanted=wanted, fov_deg=fov_deg)
+    def seen_db(self, eyes_m: F64, layers: U8, *, sigmas_mm: Sequence[float] = (0.0, 1.0)) -> dict[float, float]:
+        """Displayed PSNR of both eyes, expected for each uncertainty of theirs in millimetres; 0: exact.
 
-    def pooled_db(self, eyes_m: F64, layers: U8) -> float:
-        """One mean squared error over both eyes' counted rays. NaN where there is none."""
-        total, count = 0.0, 0
-        for eye in eyes_m:
-            fov_deg = self.fov_deg(eye)
-            size = {"width_px": self.stack.width_px, "height_px": self.stack.height_px}
-            wanted = self.painter.image(eye, **size, fov_deg=fov_deg)
-            retina = seen_by(eye, layers, self.stack, fov_deg=fov_deg)
-            squared, counted = squared_error(retina.image, intensities(wanted), retina.mask)
-            total, count = total + squared, count + counted
-        return psnr_db(total / count) if count else math.nan
+        NaN where an eye sees nothing of the panels, or would with such an error.
+        """
+        drawn, fov_deg = self.pictures(eyes_m)
+        try:
+            return expected_psnrs_db(layers, drawn, self.stack, eyes_m=eyes_m, fov_deg=fov_deg, sigmas_mm=sigmas_mm)
+        except ValueError:
+            return dict.fromkeys(sigmas_mm, math.nan)
 
     def fov_deg(self, eye_m: ArrayLike) -> float:
         """A field of view that the panels fill, so that every distance is judged at the panels' own resolution."""

@@ -16,22 +16,23 @@ SEEN_BY = {0.0: "exact", 1.0: "1 mm: a pupil", 2.0: "2 mm: and a tracker", 4.0: 
 
 def volume_section(volume: Volume, *, model: str, scene: str) -> Section:
     """Where one may stand and sit."""
-    with drawing(9.6, 4.4) as figure:
-        axes = figure.add_subplot()
-        image = _map(axes, volume.psnr_db)
-        axes.set_xticks(range(len(volume.angles_deg)), [f"{a:g}" for a in volume.angles_deg])
-        axes.set_yticks(range(len(volume.distances_m)), [f"{d:g}" for d in volume.distances_m])
-        axes.set(
-            xlabel="angle off the axis, degrees",
-            ylabel="distance, m",
-            title="Displayed PSNR, dB, over the viewer's place",
-        )
-        figure.colorbar(image, ax=axes, shrink=0.9, pad=0.01)
-    counted = volume.psnr_db[np.isfinite(volume.psnr_db)]
+    with drawing(9.6, 7.8) as figure:
+        maps = figure.subplots(2, 1)
+        tables = (("exact: two points", volume.psnr_db), ("of a pupil (1 mm)", volume.expected_db))
+        for axes, (name, table) in zip(maps, tables, strict=True):
+            image = _map(axes, table)
+            axes.set_xticks(range(len(volume.angles_deg)), [f"{a:g}" for a in volume.angles_deg])
+            axes.set_yticks(range(len(volume.distances_m)), [f"{d:g}" for d in volume.distances_m])
+            axes.set(ylabel="distance, m", title=f"Displayed PSNR, dB, {name}, over the viewer's place")
+            figure.colorbar(image, ax=axes, shrink=0.9, pad=0.01)
+        maps[1].set_xlabel("angle off the axis, degrees")
+    exact, expected = (table[np.isfinite(table)] for table in (volume.psnr_db, volume.expected_db))
     text = [
         f"The scene “{scene}” through the model {model}, with the layers made for each place, both eyes pooled. Blank: "
         "so near and so far aside that an eye would be less than 3 cm before the front panel.",
-        f"Over the {counted.size} places: median {np.median(counted):.1f} dB, worst {counted.min():.1f} dB.",
+        f"Over the {exact.size} places: exact, median {np.median(exact):.1f} dB, worst {exact.min():.1f} dB; of a "
+        f"pupil, median {np.median(expected):.1f} dB, worst {expected.min():.1f} dB. These panels are small: their "
+        "pixels are wide, and a pupil loses less by them than on large ones.",
     ]
     caption = "From straight ahead to 70 degrees aside, from 0.1 to 4 m."
     return Section("Across the viewing volume", text, [Figure("viewing-volume", png(figure), caption)])
@@ -69,8 +70,8 @@ def tolerance_section(tolerance: Tolerance, *, model: str, distance_m: float) ->
 def _ring(axes: Any, radius_mm: float, name: str, colour: str) -> None:
     angle = np.linspace(0, 2 * np.pi, 100)
     x, y = radius_mm * np.cos(angle), radius_mm * np.sin(angle)
-    axes.plot(x, y, color="#1d2433", linewidth=3.4)
-    axes.plot(x, y, color=colour, linewidth=2.0, label=name)
+    axes.plot(x, y, color="#1d2433", linewidth=2.6)
+    axes.plot(x, y, color=colour, linewidth=1.5, label=name)
 
 
 def _map(axes: Any, table: Any, *, extent: Any = None, x: Any = None, y: Any = None) -> Any:
@@ -135,8 +136,11 @@ def trade_section(trades: Sequence[Trade], *, where: str) -> Section:
 def _curves(curves: Sequence[Curve], name: str, labels: tuple[str, str], caption: str) -> Figure:
     with drawing(9.6, 4.0) as figure:
         axes = figure.add_subplot()
-        for curve in curves:
-            axes.plot(curve.x, curve.y, marker="o", markersize=4.5, label=curve.name)
+        for curve, colour in zip(curves, COLOURS, strict=False):
+            axes.plot(curve.x, curve.y, marker="o", markersize=4.5, color=colour, label=curve.name)
+            if len(curve.expected):
+                label = "dashed: of a pupil (1 mm)" if curve is curves[-1] else None
+                axes.plot(curve.x, curve.expected, color=colour, linestyle="--", linewidth=1.2, label=label)
         axes.set_xscale("log")
         axes.set_xticks(curves[0].x, [f"{x:g}" for x in curves[0].x], minor=False)
         axes.minorticks_off()
@@ -155,10 +159,21 @@ def resolution_section(sizes: Sequence[Size]) -> Section:
             pixels = [size.width_px * size.height_px / 1e6 for size in own]
             time_axes.plot(pixels, [size.ms for size in own], marker="o", markersize=4.5, color=colour, label=model)
             quality_axes.plot(pixels, [size.psnr_db for size in own], marker="o", markersize=4.5, color=colour)
+            quality_axes.plot(pixels, [size.expected_db for size in own], linestyle="--", linewidth=1.2, color=colour)
         time_axes.set(xlabel="megapixels a panel", ylabel="ms a prediction", ylim=(0, None), title="Time")
-        quality_axes.set(xlabel="megapixels a panel", ylabel="displayed PSNR, dB", title="Quality")
+        quality_axes.set(
+            xlabel="megapixels a panel", ylabel="displayed PSNR, dB", title="Quality: exact; dashed: of a pupil (1 mm)"
+        )
         time_axes.legend()
-    rows = [[s.model, f"{s.width_px}x{s.height_px}", f"{s.ms:.1f}", f"{s.psnr_db:.2f}"] for s in sizes]
+    rows = [
+        [s.model, f"{s.width_px}x{s.height_px}", f"{s.ms:.1f}", f"{s.psnr_db:.2f}", f"{s.expected_db:.2f}"]
+        for s in sizes
+    ]
     text = ["The same scene on panels of fewer pixels, each judged at its own resolution."]
     figures = [Figure("resolution", png(figure), "Time and quality over the panels' pixels.")]
-    return Section("Resolution", text, figures, [Table(["model", "panels", "ms", "PSNR dB"], rows, folded=True)])
+    return Section(
+        "Resolution",
+        text,
+        figures,
+        [Table(["model", "panels", "ms", "exact dB", "expected 1 mm dB"], rows, folded=True)],
+    )

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from runtime.evaluation.trials import timed
-from runtime.optics.carried import carried_quality, expected_psnrs_db
+from runtime.optics.carried import carried_quality
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
 from runtime.records import F64
@@ -28,16 +28,17 @@ NEAREST_M = 0.03  # before the front panel; nearer eyes are left blank
 
 @dataclass(frozen=True, slots=True)
 class Volume:
-    """Displayed PSNR over where the viewer is."""
+    """Displayed PSNR over where the viewer is: exact, and what a pupil (1 mm) sees."""
 
     angles_deg: Sequence[float]
     distances_m: Sequence[float]
     psnr_db: F64  # (distances, angles), NaN where there is no picture
+    expected_db: F64  # the same, of eyes unsure by 1 mm
 
 
 def viewing_volume(simulation: Simulation) -> Volume:
     """Both eyes' pooled PSNR with the eyes' own layers, at every place."""
-    table = np.full((len(DISTANCES_M), len(ANGLES_DEG)), np.nan)
+    exact, expected = np.full((2, len(DISTANCES_M), len(ANGLES_DEG)), np.nan)
     front_m = max(simulation.stack.x_m)
     for row, distance_m in enumerate(DISTANCES_M):
         for column, angle_deg in enumerate(ANGLES_DEG):
@@ -46,8 +47,8 @@ def viewing_volume(simulation: Simulation) -> Volume:
                 continue
             layers = simulation.layers(eyes)
             if layers is not None:
-                table[row, column] = simulation.pooled_db(eyes, layers)
-    return Volume(ANGLES_DEG, DISTANCES_M, table)
+                exact[row, column], expected[row, column] = simulation.seen_db(eyes, layers).values()
+    return Volume(ANGLES_DEG, DISTANCES_M, exact, expected)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,21 +88,23 @@ class Curve:
     name: str
     x: Sequence[float]
     y: Sequence[float]
-    marks: Sequence[str] = ()  # what stands beside each dot
+    expected: Sequence[float] = ()  # the same as y, of eyes unsure by 1 mm
 
 
 def over_gaps(scene: str, stack: PanelStack, models: Sequence[str], *, distance_m: float) -> list[Curve]:
     """Pooled PSNR over the distance between neighbouring panels; the viewer stays as far from the front one."""
     curves = []
     for model in models:
-        values = []
+        exact, expected = [], []
         for gap_m in GAPS_M:
             spread = replace(stack, x_m=(-gap_m, 0.0, gap_m))
             eyes = eyes_at(distance_m=gap_m + distance_m)
             with Simulation(scene, spread, model=model) as simulation:
                 layers = simulation.layers(eyes)
-                values.append(math.nan if layers is None else simulation.pooled_db(eyes, layers))
-        curves.append(Curve(model, [1000 * gap for gap in GAPS_M], values))
+                seen = {0.0: math.nan, 1.0: math.nan} if layers is None else simulation.seen_db(eyes, layers)
+                exact.append(seen[0.0])
+                expected.append(seen[1.0])
+        curves.append(Curve(model, [1000 * gap for gap in GAPS_M], exact, expected))
     return curves
 
 
@@ -113,7 +116,8 @@ class Size:
     width_px: int
     height_px: int
     ms: float
-    psnr_db: float
+    psnr_db: float  # exact
+    expected_db: float  # of eyes unsure by 1 mm
 
 
 def over_resolutions(scene: str, stack: PanelStack, models: Sequence[str], *, distance_m: float) -> list[Size]:
@@ -130,15 +134,8 @@ def over_resolutions(scene: str, stack: PanelStack, models: Sequence[str], *, di
                 rasters = simulation.predictor.rasters(eyes)
                 blank = [np.full((r.height_px, r.width_px, 4), 128, np.uint8) for r in rasters]
                 done = timed(partial(simulation.predictor.predict, [blank, blank], eyes), runs=7)
-                sizes.append(
-                    Size(
-                        model,
-                        small.width_px,
-                        small.height_px,
-                        done.median_ms,
-                        simulation.pooled_db(eyes, layers),
-                    )
-                )
+                seen = simulation.seen_db(eyes, layers)
+                sizes.append(Size(model, small.width_px, small.height_px, done.median_ms, seen[0.0], seen[1.0]))
     return sizes
 
 
@@ -159,13 +156,12 @@ def over_uncertainty(scene: str, stack: PanelStack, models: Sequence[str], *, di
         solved_for: list[float] = []
         told: dict[float, list[float]] = {sigma_mm: [] for sigma_mm in SEEN_WITH_MM}
         with Simulation(scene, stack, model=model) as simulation:
-            drawn, fov_deg = simulation.pictures(eyes)
             for eye_sigma_mm in SOLVED_FOR_MM:
                 layers = simulation.layers(eyes, eye_sigma_mm=eye_sigma_mm)
                 if layers is None:
                     continue
                 solved_for.append(eye_sigma_mm)
-                values = expected_psnrs_db(layers, drawn, stack, eyes_m=eyes, fov_deg=fov_deg, sigmas_mm=SEEN_WITH_MM)
+                values = simulation.seen_db(eyes, layers, sigmas_mm=SEEN_WITH_MM)
                 for sigma_mm, value in values.items():
                     told[sigma_mm].append(value)
         trades.append(Trade(model, solved_for, told))

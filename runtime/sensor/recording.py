@@ -194,7 +194,7 @@ class Recording:
     def _records(self) -> Iterator[tuple[str, Any]]:
         """Metadata, and messages as pairs of topic and record, until the end or the break."""
         for number, record in enumerate(self._to_the_break()):
-            if number % TELL_EVERY == 0:
+            if number and number % TELL_EVERY == 0:
                 progress.tell(f"{self.path.name}: records read", number)
             yield record
 

@@ -15,11 +15,9 @@ from runtime.errors import EndOfRecording, InputError, SensorLost, SensorTimeout
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, SteppedDriver
 from runtime.sensor.recording import Recording
-from runtime.support import progress
 
 ROUND_INTERVAL_MIN_NS = NS_PER_S // 240  # between the rounds of a looped recording: the fastest sensor's period
 ARRIVED_MAX = 1024  # samples in one answer: who was away for long gets them in several
-TELL_EVERY = 1024
 OLDER, SAME_INSTANT = "older than the sample before", "of the same instant as the sample before"
 
 log = logging.getLogger(__name__)
@@ -92,8 +90,6 @@ class ReplayDriver(SteppedDriver):
         start_ns = recording.first.capture_ns + self._start_ns
         last_ns = -1
         for number, frame in enumerate(recording.samples()):
-            if number % TELL_EVERY == 0:
-                progress.tell("samples read", number)
             if frame.capture_ns <= last_ns:
                 self._refuse(OLDER if frame.capture_ns < last_ns else SAME_INSTANT, frame)
                 continue

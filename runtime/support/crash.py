@@ -33,7 +33,7 @@ def written(error: BaseException) -> str:
 
 
 def _report(error: BaseException) -> str:
-    from runtime.version import version
+    from runtime.support.version import version
 
     return (
         f"phasestack {version()}, Python {platform.python_version()}, {platform.platform()}\n"

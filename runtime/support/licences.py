@@ -25,6 +25,9 @@ Wheels of binary packages bundle further libraries, each under the licence in th
 OpenBLAS and the GCC runtime (numpy, scipy), FFmpeg under LGPL-2.1 (opencv), GLFW under Zlib (glfw).
 opencv's wheel also carries the Haar cascades that find faces (Intel License Agreement, BSD-like, in the files).
 
+The schemas of black boxes (`runtime/blackbox/schemas/foxglove.*.json`) are those of the npm package @foxglove/schemas
+2.1.0 (MIT, Foxglove Technologies Inc; its text is beside them).
+
 At run time phasestack loads, and does not ship, the system's OpenGL and EGL (Mesa: MIT), Xlib and RandR (MIT),
 libusb (LGPL-2.1) and OpenNI2 (Apache-2.0).
 """

@@ -5,12 +5,25 @@ from __future__ import annotations
 import logging
 import os
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 log = logging.getLogger("phasestack.priority")
 
 PRESENTER_NICENESS = -10
 SOLVER_NICENESS = 5
 BACKGROUND_NICENESS = 10
+
+
+@contextmanager
+def niceness(value: int) -> Iterator[None]:
+    """The calling thread's niceness within a block; as it was afterwards."""
+    before = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+    set_niceness(value)
+    try:
+        yield
+    finally:
+        set_niceness(before)
 
 
 def set_niceness(niceness: int) -> bool:

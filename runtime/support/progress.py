@@ -6,10 +6,12 @@ listener raises ends the work: so a signal is heard within one step.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from typing import TextIO
 
 Listener = Callable[[str, int, int | None], None]  # what is done, how many of them, of how many (None: not known)
 
@@ -24,18 +26,25 @@ def tell(what: str, done: int, total: int | None = None) -> None:
 
 
 @contextmanager
-def within(seconds: float, too_slow: Exception) -> Iterator[None]:
-    """Within this block a `tell` that comes after the time is up raises `too_slow`; whoever listens goes on hearing."""
+def task(what: str, *, seconds: float, too_slow: Exception) -> Iterator[None]:
+    """One piece of work, told as begun (0 done) and as ended (no name).
+
+    A `tell` within it that comes after the time is up raises `too_slow`; whoever listens goes on hearing.
+    """
     end, outer = time.monotonic() + seconds, _LISTENER.get()
 
-    def check(what: str, done: int, total: int | None) -> None:
+    def check(told: str, done: int, total: int | None) -> None:
         if time.monotonic() > end:
             raise too_slow
         if outer is not None:
-            outer(what, done, total)
+            outer(told, done, total)
 
-    with listening(check):
-        yield
+    tell(what, 0)
+    try:
+        with listening(check):
+            yield
+    finally:
+        tell("", 0)
 
 
 @contextmanager
@@ -46,3 +55,35 @@ def listening(listener: Listener) -> Iterator[None]:
         yield
     finally:
         _LISTENER.reset(token)
+
+
+class TerminalLine:
+    """A listener that shows a task which takes long on one line of a terminal, and takes the line away at its end."""
+
+    def __init__(self, stream: TextIO, *, after_s: float = 1.0, every_s: float = 0.25) -> None:
+        """Shows nothing where the stream is no terminal."""
+        self._stream, self._after_s, self._every_s = stream, after_s, every_s
+        self._told: tuple[str, int, int | None] = ("", 0, None)
+        self._ended: threading.Event | None = None  # of the task under way
+
+    def __call__(self, what: str, done: int, total: int | None) -> None:
+        self._told = (what, done, total)
+        if not what:
+            if self._ended is not None:
+                self._ended.set()
+                self._ended = None
+        elif self._ended is None and done == 0 and self._stream.isatty():
+            self._ended = threading.Event()
+            threading.Thread(target=self._show, args=(self._ended,), name="progress", daemon=True).start()
+
+    def _show(self, ended: threading.Event) -> None:
+        if ended.wait(self._after_s):
+            return
+        with suppress(OSError, ValueError):
+            while not ended.wait(self._every_s):
+                what, done, total = self._told
+                count = f" {done} of {total}" if total else f" {done}" if done else ""
+                self._stream.write(f"\r\x1b[K{what}{count}")
+                self._stream.flush()
+            self._stream.write("\r\x1b[K")
+            self._stream.flush()

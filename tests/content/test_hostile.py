@@ -34,6 +34,7 @@ from tests.waiting import eventually
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
 # What a reader may take, on top of what it had: the file, and little more.
 LEAST_MIB = 150
+HANG_S = 30  # what took minutes, or for ever
 
 
 def png(width: int, height: int) -> bytes:
@@ -127,7 +128,7 @@ def test_only_files_are_read_and_nothing_waits(tmp_path: Path, suffix: str, what
         path.symlink_to("/dev/zero")
     start = time.monotonic()
     line = refused(path)
-    assert time.monotonic() - start < 5
+    assert time.monotonic() - start < HANG_S
     assert {"fifo": "is a FIFO", "folder": "the folder holds no pictures", "zero": "is a device"}[what] in line
 
 
@@ -215,7 +216,7 @@ def test_a_ply_that_promises_too_much_is_refused(
 ) -> None:
     start = time.monotonic()
     assert told in refused(ply(tmp_path, vertices, faces, form))
-    assert time.monotonic() - start < 5
+    assert time.monotonic() - start < HANG_S
 
 
 def test_an_obj_of_too_many_triangles_is_refused(tmp_path: Path) -> None:
@@ -332,7 +333,7 @@ def test_a_gltf_is_refused_by_what_it_says_of_itself(tmp_path: Path, name: str, 
         assert told in refused(path)
     else:  # strange, and bounded
         load_mesh(path)
-    assert time.monotonic() - start < 5
+    assert time.monotonic() - start < HANG_S
 
 
 def test_the_triangle_itself_is_read(tmp_path: Path) -> None:

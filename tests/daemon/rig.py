@@ -80,12 +80,12 @@ class FragileDriver(SensorDriver):
 class Rig:
     """A run and the means to break it. Use as a context manager."""
 
-    def __init__(self, *, supervisor: Any = None, **changes: dict[str, Any]) -> None:
+    def __init__(self, *, supervisor: Any = None, recorder: Any = None, **changes: dict[str, Any]) -> None:
         self.plan = Plan()
         register_driver("fragile", lambda settings, clock, latency_ms: FragileDriver(self.plan, clock))
         tables = {name: {**SMALL.get(name, {}), **changes.get(name, {})} for name in {**SMALL, **changes}}
         self.settings = Settings.model_validate(tables)
-        self.supervisor = supervisor
+        self.supervisor, self.recorder = supervisor, recorder
         self._cleanup = ExitStack()
         self.accounts: list[RefreshAccount] = []
 
@@ -97,6 +97,7 @@ class Rig:
                 self._cleanup,
                 supervisor=self.supervisor,
                 on_account=self.accounts.append,
+                recorder=self.recorder,
             )
         except BaseException:
             self._cleanup.close()
@@ -136,6 +137,13 @@ class Rig:
         for _ in range(times):
             ran = self.refresh_until(lambda: self.accounts[-1].inference == "ran")
         return ran
+
+    def settle(self) -> None:
+        """Refreshes until the solver has completed what it was at, and a refresh has shown it."""
+        done = threading.Event()
+        self.presenter.solver.do(lambda parts: bool(done.set()) or True)
+        self.refresh_until(done.is_set)
+        self.presenter.refresh()
 
     def refreshes(self, count: int) -> list[RefreshAccount]:
         return [self.presenter.refresh() for _ in range(count)]

@@ -174,7 +174,7 @@ def test_the_status_socket_in_use_is_refused_in_one_line_and_the_other_goes_on(s
     assert first.hears("READY=1")
     second = started(config=CONFIG.replace("{folder}", str(tmp_path / "0")))
     code, errors = second.ends()
-    assert code == 2
+    assert code == 75  # the other may be gone at the next start
     assert "is in use by another phasestack" in errors.splitlines()[-1]
     assert "Traceback" not in errors
     assert first.status()["ok"]
@@ -201,7 +201,7 @@ def test_a_panel_that_is_missing_at_the_start_is_waited_for_and_more_time_asked_
     daemon.process.send_signal(signal.SIGTERM)
     code, errors = daemon.ends()
     assert "Traceback" not in errors
-    assert code in (0, 2)
+    assert code == 0
 
 
 def test_by_hand_a_missing_panel_is_refused_in_one_line(tmp_path, monkeypatch):
@@ -211,7 +211,7 @@ def test_by_hand_a_missing_panel_is_refused_in_one_line(tmp_path, monkeypatch):
     environment = {name: value for name, value in os.environ.items() if name != "NOTIFY_SOCKET"}
     command = [*PHASESTACK, "run", "--config", str(config), "--replay", "demo"]
     result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
-    assert result.returncode == 2
+    assert result.returncode == 75  # there may be one later
     assert "no X server" in result.stderr.splitlines()[-1]
     assert "Traceback" not in result.stderr
 

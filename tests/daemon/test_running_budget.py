@@ -17,7 +17,7 @@ from runtime.frame.timing import SOLVING_STAGES
 from runtime.model.unrolled import UnrolledPredictor
 from runtime.plan.ladder import rungs
 from runtime.plan.levels import Level, useful
-from runtime.plan.planning import LADDER
+from runtime.plan.predictors import LADDER
 from runtime.records import RefreshAccount
 from tests.daemon.rig import Rig
 from tests.daemon.test_changes import Served, configuration

@@ -15,7 +15,7 @@ from runtime.eyes.calibration import load_calibration
 from runtime.frame.run_state import RunCell
 from runtime.frame.solver import Solver
 from runtime.plan.drawing import drawn_for
-from runtime.plan.planning import planned_predictor
+from runtime.plan.predictors import planned_predictor
 from runtime.records import SolveRequest
 from tests.frame.conftest import SMALL
 from tests.frame.fakes import EYES, aside
@@ -70,6 +70,14 @@ def test_solutions_and_flat_pictures_are_numbered_together_and_upwards(solver):
     numbers = [(step.solution or step.flat).number for step in made]
     assert numbers == sorted(set(numbers))
     assert numbers[0] == 2  # the flat picture was the first
+
+
+def test_a_solver_that_is_made_anew_gives_no_number_a_second_time(solver, cell):
+    """Sinks know layers by their number: the same one for other layers would leave the old ones on the panels."""
+    numbers = [solver.step(wish(aside(k / 100))).solution.number for k in range(3)]
+    anew = Solver(cell, SMALL)
+    first = [anew.step(wish(None, flat=True)).flat.number, anew.step(wish()).solution.number]
+    assert min(first) > max(numbers)
 
 
 def test_a_solution_that_is_held_never_changes_whatever_is_solved_after_it(solver):

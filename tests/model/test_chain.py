@@ -20,10 +20,33 @@ def chain_operator(cells: int) -> np.ndarray:
 
 @given(st.integers(1, 300))
 def test_modes_are_the_singular_value_decomposition_of_the_chain_operator(cells: int) -> None:
-    v, s, ut = (part.astype(np.float64) for part in chain_modes(cells))
+    v, shifted, s, ut = (part.astype(np.float64) for part in chain_modes(cells))
     assert np.allclose(ut.T @ np.diag(s) @ v.T, chain_operator(cells), atol=1e-4)
-    assert np.allclose(v.T @ v, np.eye(cells), atol=1e-4)
-    assert np.allclose(ut @ ut.T, np.eye(cells), atol=1e-4)
+    assert np.allclose(v.T @ v, np.eye(cells + 1), atol=1e-4)
+    assert np.allclose(ut[1:] @ ut[1:].T, np.eye(cells), atol=1e-4)
+    mean = (np.eye(cells, cells + 1, k=1) + np.eye(cells, cells + 1)) / 2
+    assert np.allclose(ut.T @ np.diag(np.sqrt(1 - s**2 / 16)) @ shifted.T, mean, atol=1e-4)
+
+
+def test_doubt_is_how_far_the_outer_panels_move_for_an_eye_that_is_off() -> None:
+    pair = eyes(0.6, 0.1, 0.05, roll_deg=10)
+    frame = chain_frame(pair, STACK, cell_px=4, reduction=2)
+    raster_from_plane = np.linalg.inv(frame.plane_from_raster)
+    at = frame.plane_from_raster @ np.array([frame.width_px / 3, frame.rows / 2, 1.0])
+
+    def on(eye: np.ndarray, x_m: float) -> np.ndarray:
+        """Where the eye's ray through `at` meets a panel, in line as seen from between the eyes."""
+        here, shift = relative_scale_shift(eye, from_x_m=frame.x_m, to_x_m=x_m)
+        there, back = relative_scale_shift(frame.middle_m, from_x_m=x_m, to_x_m=frame.x_m)
+        return raster_from_plane @ np.append((at[:2] * here + shift) * there + back, 1.0)
+
+    columns, rows, own = frame.doubt(STACK, eye_sigma_mm=2.0)
+    aside = on(frame.middle_m + np.array([0, 2e-3, 0]), STACK.x_m[2]) - on(frame.middle_m, STACK.x_m[2])
+    above = on(frame.middle_m + np.array([0, 0, 2e-3]), STACK.x_m[2]) - on(frame.middle_m, STACK.x_m[2])
+    assert abs(aside[0]) == pytest.approx(columns, rel=1e-4) and abs(above[0]) < 1e-6
+    assert np.hypot(aside[1], above[1]) == pytest.approx(rows, rel=1e-4)
+    beside = on(pair[1], STACK.x_m[1]) - on(frame.middle_m, STACK.x_m[1])
+    assert abs(beside[0]) == pytest.approx(own, rel=1e-4)
 
 
 @given(

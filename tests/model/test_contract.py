@@ -33,12 +33,17 @@ def test_shipped_models_keep_their_contract_and_are_small(name: str) -> None:
 @pytest.mark.parametrize(
     ("change", "field"),
     [
-        ({"version": 2}, "version"),
+        ({"version": 1}, "version"),
         ({"input_frame": "eye"}, "input_frame"),
         ({"surprise": 1}, "surprise"),
         ({"panels": "three"}, "panels"),
         ({"value_range": [0, "x"]}, "value_range"),
         ({"steps": [{"kind": "front"}]}, "must begin with a chain step"),
+        ({"steps": [{"kind": "chain"}, {"kind": "chain"}]}, "the only one"),
+        ({"steps": []}, "needs one at least"),
+        ({"cell_px": -1}, "cell_px"),
+        ({"cell_px": 1e9}, "cell_px"),
+        ({"outputs": []}, "outputs"),
         ({"steps": [{"kind": "chain"}, {"kind": "rear", "reduction": 2}]}, "reduction must not grow"),
     ],
 )
@@ -47,7 +52,7 @@ def test_a_contract_that_does_not_fit_is_refused_by_field(change: dict[str, obje
         parse_contract({METADATA_KEY: json.dumps(contract_of("fast") | change)}, source="m.onnx")
 
 
-@pytest.mark.parametrize("text", [None, "{", "[1]"])
+@pytest.mark.parametrize("text", [None, "{", "[1]", "[" * 100_000, '{"a":' * 100_000])
 def test_a_missing_or_malformed_contract_is_refused(text: str | None) -> None:
     with pytest.raises(InputError, match=METADATA_KEY):
         parse_contract({} if text is None else {METADATA_KEY: text}, source="m.onnx")

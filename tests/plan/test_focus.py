@@ -21,7 +21,7 @@ from runtime.plan import measure
 from runtime.plan.drawing import raster_views
 from runtime.plan.focus import FocusedPredictor
 from runtime.plan.measure import displayed_psnr
-from runtime.plan.planning import focused, planned_predictor
+from runtime.plan.predictors import focused, planned_predictor
 from runtime.plan.reduced import ladder_predictor
 from runtime.plan.savings import selected_eyes
 from runtime.support.gl import offscreen_context

@@ -27,7 +27,7 @@ def regression_file(
         "methods": [
             {
                 "name": "balanced", **size, "psnr_db": psnr, "worst_eye_psnr_db": psnr - 1, "memory_mib": 200.0,
-                "psnr_db_off_eye": {"2mm": psnr - 8},
+                "psnr_db_off_eye": {"2mm": psnr - 8}, "expected_db": {"1": psnr - 3, "2": psnr - 6},
             }
         ],
         "stages": [{"name": "balanced", **size, "total_ms": ms, "total_scatter": scatter, "stage_ms": {"render": 1.0}}],
@@ -62,11 +62,20 @@ def test_a_slower_machine_is_not_a_slower_program() -> None:
 
 def test_lost_quality_and_memory_are_named() -> None:
     found = texts(regression_file(), regression_file(psnr=41.5))
-    assert [worse for worse, _ in found] == [True, True, True]
+    assert [worse for worse, _ in found] == [True] * 5
     assert found[0][1] == "-0.50 dB at the eyes"
     more = regression_file()
     more["methods"][0]["memory_mib"] = 300.0
     assert texts(regression_file(), more) == [(True, "1.50 times the memory")]
+
+
+def test_what_a_pupil_sees_counts_on_its_own() -> None:
+    worse = regression_file()
+    worse["methods"][0]["expected_db"]["1"] -= 0.5
+    assert texts(regression_file(), worse) == [(True, "-0.50 dB expected of eyes unsure by 1 mm")]
+    earlier = regression_file()
+    del earlier["methods"][0]["expected_db"]
+    assert texts(earlier, regression_file()) == []
 
 
 def test_a_model_that_is_gone_is_named_once() -> None:
@@ -102,6 +111,8 @@ def test_the_command_exits_with_1_only_where_something_got_worse(tmp_path: Path)
         (lambda r: r["methods"][0].update(psnr_db="x"), r"methods\[0\]\.psnr_db"),
         (lambda r: r["methods"][0].pop("name"), r"methods\[0\]\.name"),
         (lambda r: r["methods"][0].pop("psnr_db_off_eye"), r"methods\[0\]\.psnr_db_off_eye"),
+        (lambda r: r["methods"][0].update(expected_db=[1]), r"methods\[0\]\.expected_db"),
+        (lambda r: r["methods"][0].update(expected_db={"1": "x"}), r"methods\[0\]\.expected_db"),
     ],
 )
 def test_a_file_of_another_kind_is_refused_by_its_field(tmp_path: Path, change: Any, complaint: str) -> None:

@@ -73,15 +73,17 @@ def report_page() -> Page:
     ]  # fmt: skip
     sections = [
         frontier_page.frontier_section(methods, pairs="a pair", title="Frontier", name="test"),
-        sweep_page.volume_section(Volume(range(9), range(9), holed), model="balanced", scene="demo"),
+        sweep_page.volume_section(Volume(range(9), range(9), holed, holed - 2), model="balanced", scene="demo"),
         sweep_page.tolerance_section(tolerance, model="balanced", distance_m=0.6),
         sweep_page.trade_section(
             [Trade("balanced", [0.0, 1.0, 2.0], {0.0: [42, 41, 40], 1.0: [35, 38, 37.0], 2.0: [30, 32, 36.0]})],
             where="a scene",
         ),
         moving_section(*moving_runs_made_up()),
-        sweep_page.gap_section([Curve("balanced", [5, 30, 60], [30, 35, 36])]),
-        sweep_page.resolution_section([Size("balanced", 480, 270, 9.0, 30.0), Size("balanced", 960, 540, 30.0, 35.0)]),
+        sweep_page.gap_section([Curve("balanced", [5, 30, 60], [30, 35, 36], [29, 33, 32])]),
+        sweep_page.resolution_section(
+            [Size("balanced", 480, 270, 9.0, 30.0, 29.0), Size("balanced", 960, 540, 30.0, 35.0, 31.0)]
+        ),
         horizon_section([Horizon(name, percentiles, 2 * percentiles) for name in ("still", "walk")], tolerance),
         latency_section(runs),
     ]

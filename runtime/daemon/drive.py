@@ -9,9 +9,12 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from runtime.blackbox.recorder import Recorder
     from runtime.config import Settings
     from runtime.daemon.build import Run, RunOptions
     from runtime.frame.presenter import Supervisor
+
+JOBS_END_WITHIN_S = 3.0  # what is still loading at the end
 
 
 def drive(
@@ -26,11 +29,13 @@ def drive(
     wait_for_panels: Any = None,
     on_start: Callable[[str], bool] = lambda _: True,
     on_built: Callable[[Run], None] = lambda _: None,
+    recorder: Recorder | None = None,
 ) -> dict[str, Any]:
     """Run to the end and answer the summary. `total`: refreshes that the progress bar counts to, where it is known."""
     from runtime.daemon.build import build_run
     from runtime.evaluation.run_output import RunOutput
     from runtime.optics.alignment import shown_layers
+    from runtime.support.background import wait_for_all
 
     with ExitStack() as cleanup:
         output = cleanup.enter_context(RunOutput(out)) if out is not None else None
@@ -44,11 +49,14 @@ def drive(
             on_account=advance,
             wait_for_panels=wait_for_panels,
             on_start=on_start,
+            recorder=recorder,
         )
         on_built(run)
         begin_s = perf_counter()
         reason = run.presenter.run(frames=frames)
         machine_s = perf_counter() - begin_s
+        for sample in run.presenter.samples.recorded_ahead():
+            run.observer.sampled(sample)  # the last lights' truth: nothing else is done with it
         run.observer.finish()
         summary = run.summary() | {"stopped": reason}
         if output is not None:
@@ -56,7 +64,8 @@ def drive(
             has_picture = last is not None and (last.frame.solved is not None or last.frame.flat is not None)
             layers = shown_layers(last.frame) if last is not None and has_picture else None
             output.finish(summary, layers, run.observer.look)
-    return summary | {"machine_s": round(machine_s, 3), "left_behind": run.solver.left_behind}
+    left_behind = run.solver.left_behind + wait_for_all(JOBS_END_WITHIN_S)
+    return summary | {"machine_s": round(machine_s, 3), "left_behind": left_behind}
 
 
 def _progress(total: int | None) -> Any:

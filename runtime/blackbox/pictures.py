@@ -1,0 +1,133 @@
+"""Small pictures of a refresh: its layers, and what each eye sees through them. Made off the refresh's own time.
+
+What an eye sees is sampled from the layers as they are solved, ray by ray; only so many rays are taken as the picture
+has pixels. A layer's picture is every so-manieth row, averaged along it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from runtime.frame.presenter import Refresh
+from runtime.optics.alignment import EVEN_CODE, reference_x_m, scale_and_shift
+from runtime.optics.malus import intensity_from_phase
+from runtime.optics.stack import PanelStack
+from runtime.records import F64, U8, PanelFrame
+
+WIDTH_PX = 320
+JPEG_QUALITY = 80
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """JPEGs of one refresh."""
+
+    frame: int  # the refresh's number
+    time_ns: int  # when it was presented, on the run's clock
+    jpegs: dict[str, bytes]  # layer-0, ... rear to front; seen-left, seen-right
+
+
+def pictures_of(refresh: Refresh, stack: PanelStack, *, width_px: int = WIDTH_PX) -> Pictures:
+    """The pictures of a refresh; none where nothing was shown yet."""
+    frame, eyes_m = refresh.frame, refresh.account.eyes_m
+    found: dict[str, U8] = {}
+    if frame.solved is not None or frame.flat is not None:
+        width = min(width_px, stack.width_px)
+        height = max(1, round(width * stack.height_px / stack.width_px))
+        found = {f"layer-{n}": _layer(frame, n, width, height) for n in range(stack.count)}
+        if eyes_m is not None:
+            for name, eye_m in zip(("seen-left", "seen-right"), eyes_m, strict=True):
+                if eye_m[0] > max(stack.x_m):
+                    found[name] = seen(frame, stack, eye_m, width_px=width, height_px=height)
+    jpegs = {name: _jpeg(image) for name, image in found.items()}
+    return Pictures(refresh.account.frame, refresh.account.present_ns, jpegs)
+
+
+def seen(frame: PanelFrame, stack: PanelStack, eye_m: F64, *, width_px: int, height_px: int) -> U8:
+    """(h, w, 3) what an eye sees of the plane in the stack's middle; black where its ray passes beside a panel."""
+    reference_m = reference_x_m(stack)
+    across = (np.arange(width_px) + 0.5) / width_px - 0.5  # shares of the display's size from its middle
+    up = 0.5 - (np.arange(height_px) + 0.5) / height_px
+    total = np.zeros((height_px, width_px, 3), np.float32)
+    columns, rows = np.ones(width_px, bool), np.ones(height_px, bool)
+    for index, x_m in enumerate(stack.x_m):
+        # Along the ray from the eye through the reference plane.
+        along = (x_m - eye_m[0]) / (reference_m - eye_m[0])
+        u = ((eye_m[1] + (across * stack.width_m - eye_m[1]) * along) / stack.width_m + 0.5) * stack.width_px
+        v = (0.5 - (eye_m[2] + (up * stack.height_m - eye_m[2]) * along) / stack.height_m) * stack.height_px
+        total += _shown_at(frame, index, u, v)
+        columns &= (u >= 0) & (u < stack.width_px)
+        rows &= (v >= 0) & (v < stack.height_px)
+    image: U8 = (intensity_from_phase(total / np.float32(255.0)) * 255.0 + 0.5).astype(np.uint8)
+    image[~(rows[:, None] & columns)] = 0
+    return image
+
+
+def _shown_at(frame: PanelFrame, index: int, u: F64, v: F64) -> Any:
+    """(h, w, 3) codes of a panel where columns u and rows v of its pixels meet; what lies beside it is even."""
+    su, sv, tu, tv = _alignment(frame, index)
+    flatness = 1.0 if frame.solved is None else frame.flatness
+    mixed: Any = 0.0
+    if frame.solved is not None and flatness < 1.0:
+        mixed = _sampled(frame.solved[index], u * su + tu, v * sv + tv) * np.float32(1.0 - flatness)
+    if frame.flat is not None and flatness > 0.0:
+        mixed = mixed + _sampled(frame.flat[index], u, v) * np.float32(flatness)
+    return mixed
+
+
+def _sampled(layer: U8, u: F64, v: F64) -> Any:
+    """The nearest pixels' codes (h, w, 3) as float32."""
+    height, width = layer.shape[:2]
+    columns, rows = np.floor(u).astype(np.intp), np.floor(v).astype(np.intp)
+    inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
+    picked = layer[rows.clip(0, height - 1)[:, None], columns.clip(0, width - 1), :3].astype(np.float32)
+    picked[~inside] = EVEN_CODE
+    return picked
+
+
+def _layer(frame: PanelFrame, index: int, width: int, height: int) -> U8:
+    """(h, w, 3) a panel's picture as it is shown."""
+    import cv2
+
+    flatness = 1.0 if frame.solved is None else frame.flatness
+    small: Any = None
+    if frame.solved is not None and flatness < 1.0:
+        small = _small(frame.solved[index], width, height)
+        su, sv, tu, tv = _alignment(frame, index)
+        share_u, share_v = width / frame.solved.shape[2], height / frame.solved.shape[1]
+        # Pixels' centres are half-integers here, integers in OpenCV.
+        shift_u, shift_v = tu * share_u + (su - 1.0) / 2, tv * share_v + (sv - 1.0) / 2
+        matrix = np.array([[su, 0.0, shift_u], [0.0, sv, shift_v]])
+        how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        grey = (EVEN_CODE,) * 4
+        small = cv2.warpAffine(small, matrix, (width, height), flags=how, borderValue=grey)
+    if frame.flat is not None and flatness > 0.0:
+        flat = _small(frame.flat[index], width, height)
+        small = flat if small is None else cv2.addWeighted(small, 1.0 - flatness, flat, flatness, 0.0)
+    image: U8 = np.ascontiguousarray(small[..., :3])
+    return image
+
+
+def _small(layer: U8, width: int, height: int) -> Any:
+    import cv2
+
+    step = max(1, layer.shape[0] // height)
+    return cv2.resize(layer[step // 2 :: step], (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _alignment(frame: PanelFrame, index: int) -> tuple[float, float, float, float]:
+    if not frame.solved_from_shown:
+        return 1.0, 1.0, 0.0, 0.0
+    return scale_and_shift(frame.solved_from_shown[index])
+
+
+def _jpeg(image: U8) -> bytes:
+    import cv2
+
+    done, coded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not done:
+        raise ValueError("JPEG encoding failed")
+    return coded.tobytes()

@@ -1,0 +1,106 @@
+"""`status` says what is so: now, and only what was measured."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from runtime.commands.status import describe
+from runtime.daemon.supervise import snapshot
+from runtime.errors import SensorLost
+from runtime.support.artifacts import to_json
+from tests.daemon.rig import Rig
+
+
+def told_by(rig) -> tuple[dict, str]:
+    """The snapshot as it comes through the socket, and as a person reads it."""
+    account = rig.presenter.last.account
+    answer = json.loads(to_json({"ok": True, "pid": 1, "uptime_s": 1.0, **snapshot(rig.run, rig.presenter, account)}))
+    return answer, "\n".join(describe(answer))
+
+
+@pytest.fixture
+def rig():
+    with Rig() as made:
+        yield made
+
+
+def test_a_run_that_tracks_says_rates_of_now_eyes_and_how_sure_and_the_sensors_rate(rig):
+    rig.refresh_until("tracking")
+    rig.refreshes(60)
+    answer, text = told_by(rig)
+    assert re.search(r"^now +[\d.]+ refreshes/s", text, re.MULTILINE)
+    assert re.search(r"^sensor +[\d.]+ samples/s", text, re.MULTILINE)
+    assert re.search(r"^eyes .*to [\d.]+ mm \(one standard deviation\)", text, re.MULTILINE)
+    assert answer["eyes_label"] in text
+    assert "capture to light" in text and "solution's age" in text and "between frames" in text
+    assert (answer["paused"], answer["flat_asked"], answer["log_lines_lost"]) == (False, False, 0)
+    assert "paused" not in text and "rejected" not in text and "log " not in text
+
+
+@pytest.mark.parametrize(("name", "words"), [("paused", "frozen until"), ("flat_asked", "asked for, until")])
+def test_what_an_operator_asked_for_is_told(rig, name, words):
+    rig.refresh_until("tracking")
+    setattr(rig.presenter, name, True)
+    rig.refreshes(3)
+    answer, text = told_by(rig)
+    assert answer[name] is True
+    assert words in text
+
+
+def test_eyes_that_are_refused_are_counted_by_reason(rig):
+    rig.refresh_until("tracking")
+    rig.plan.eyes_m = np.array([[-0.7, -0.031, 0.0], [-0.7, 0.031, 0.0]])  # behind the display
+    rig.refreshes(100)
+    answer, text = told_by(rig)
+    refused = {why: count for why, count in answer["rejected_samples"].items() if count}
+    assert refused
+    for why, count in refused.items():
+        assert re.search(rf"^rejected .*{count} {re.escape(why)}", text, re.MULTILINE)
+
+
+def test_a_sensor_that_is_gone_has_no_rate(rig):
+    rig.refresh_until("tracking")
+    rig.plan.fault = SensorLost("unplugged")
+    rig.refresh_until("degraded: sensor")
+    answer, text = told_by(rig)
+    assert answer["sensor_hz"] is None
+    assert "samples/s" not in text
+    assert "unplugged" in text
+
+
+def test_a_stand_in_is_called_one():
+    with Rig(content={"scene": "lego_bulldozer"}) as rig:
+        rig.refreshes(3)
+        answer, text = told_by(rig)
+    assert "stand-in" in answer["content"]
+    assert re.search(r"^content +lego_bulldozer \(stand-in", text, re.MULTILINE)
+
+
+def test_what_was_not_measured_is_no_figure_anywhere(rig):
+    """Every value that can be None is, as before the first refresh and without a viewer."""
+    rig.refreshes(2)
+    answer, _ = told_by(rig)
+    unmeasured = {
+        name: None if value is None or isinstance(value, (int, float, dict, list)) else value
+        for name, value in answer.items()
+    }
+    text = "\n".join(describe({**unmeasured, "uptime_s": 1.0, "pid": 7, "provider": None, "model": None}))
+    digits = [line for line in text.splitlines() if re.search(r"\d", line) and not line.startswith(("up ", "panels"))]
+    assert digits == []
+
+
+def test_nothing_that_came_through_the_socket_breaks_a_line():
+    lines = list(describe({"state": "tracking\nup 3 h", "scene": "\x1b[2Ja\u202eb", "refused": "x" * 10000}))
+    assert all(line.isprintable() for line in lines)
+    assert all(len(line) <= 2000 for line in lines)
+
+
+def test_the_manual_names_what_the_status_tells():
+    text = (Path(__file__).parents[2] / "docs" / "operation.md").read_text()
+    for name in ("turn_age_s", "log_lines_lost", "loading", "refused"):
+        assert f"`{name}`" in text

@@ -1,0 +1,117 @@
+"""What a session takes: one file, whole, that says what it is; and nothing sent home."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from runtime.errors import InputError
+from runtime.model import predictor
+from runtime.model.contract import METADATA_KEY
+from runtime.model.onnx_bytes import digest, has_external_data
+from runtime.model.onnx_runtime import onnxruntime
+from runtime.model.predictor import SHIPPED, load_predictor, model_path
+from runtime.model.session import ModelSession
+from tests.model.scenes import STACK
+
+
+def shipped(name: str = "fast") -> onnx.ModelProto:
+    return onnx.load(str(model_path(name)))
+
+
+def saved(model: onnx.ModelProto, tmp_path: Path, **change: object) -> Path:
+    for entry in model.metadata_props:
+        if entry.key == METADATA_KEY:
+            entry.value = json.dumps(json.loads(entry.value) | change)
+    path = tmp_path / "other.onnx"
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+def outside(name: str) -> TensorProto:
+    tensor = numpy_helper.from_array(np.ones(2, np.float32), name)
+    tensor.ClearField("raw_data")
+    tensor.data_location = TensorProto.EXTERNAL
+    tensor.external_data.add(key="location", value="weights.bin")
+    return tensor
+
+
+def test_weights_in_another_file_are_refused_wherever_they_are_asked_for(tmp_path: Path) -> None:
+    model = shipped()
+    assert not has_external_data(model.SerializeToString())
+    model.graph.initializer.append(outside("elsewhere"))
+    with pytest.raises(InputError, match="external_data: is refused"):
+        ModelSession(saved(model, tmp_path))
+    branch = helper.make_graph([helper.make_node("Constant", [], ["y"], value=outside("deep"))], "b", [], [])
+    nested = helper.make_graph(
+        [helper.make_node("If", ["x"], ["y"], then_branch=branch, else_branch=branch)], "g", [], []
+    )
+    assert has_external_data(helper.make_model(nested).SerializeToString())
+
+
+def test_a_file_that_was_changed_after_its_export_is_refused(tmp_path: Path) -> None:
+    model = shipped()
+    weight = next(item for item in model.graph.initializer if item.name == "log_floor")
+    weight.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(weight) + 1, weight.name))
+    with pytest.raises(InputError, match="graph_sha256"):
+        ModelSession(saved(model, tmp_path))
+    ModelSession(saved(model, tmp_path, graph_sha256=""))  # who doesn't tell isn't checked
+
+
+def test_the_digest_leaves_out_the_metadata_alone() -> None:
+    model = shipped()
+    before = digest(model.SerializeToString())
+    model.metadata_props.add(key="note", value="x")
+    assert digest(model.SerializeToString()) == before
+    model.producer_name = "somebody else"
+    assert digest(model.SerializeToString()) != before
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_model_is_the_one_that_was_shipped(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    load_predictor(name, STACK).close()
+    path = model_path(name)
+    assert path is not None
+    other = tmp_path / "bitten.onnx"
+    other.write_bytes(path.read_bytes()[:-1] + b"\0")
+    monkeypatch.setattr(predictor, "model_path", lambda _: other)
+    with pytest.raises(InputError, match="SHA-256 differs"):
+        load_predictor(name, STACK)
+
+
+def test_inputs_are_the_ones_that_the_contract_declares(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"contract\.outputs: declares rear \(1 axes\), the graph rear \(3 axes\)"):
+        ModelSession(saved(shipped(), tmp_path, outputs=[{"name": "rear", "axes": ["x"]}]))
+
+
+def test_metadata_that_is_no_text_is_one_line(tmp_path: Path) -> None:
+    data = shipped().SerializeToString()
+    path = tmp_path / "other.onnx"
+    path.write_bytes(data.replace(b'"version"', b'"\xff\xfersion"'))
+    with pytest.raises(InputError) as caught:
+        ModelSession(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("data", [b"", b"\xff" * 40, b"not a model", b"\x3a\xff\xff\xff\x7f"])
+def test_bytes_that_are_no_model_are_one_line(data: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "other.onnx"
+    path.write_bytes(data)
+    with pytest.raises(InputError) as caught:
+        ModelSession(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_telemetry_is_off_before_onnxruntime_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    onnxruntime.cache_clear()
+    monkeypatch.delenv("ORT_DISABLE_TELEMETRY", raising=False)
+    onnxruntime()
+    assert os.environ["ORT_DISABLE_TELEMETRY"] == "1"

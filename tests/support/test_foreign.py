@@ -1,0 +1,170 @@
+"""The one place where paths, files, JSON and numbers from outside are read."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from runtime.errors import InputError
+from runtime.support import foreign
+from runtime.support.foreign import nesting, parsed_json, real, whole, whole_from_text
+
+HANG_S = 20  # on a busy machine; what hangs takes minutes, or for ever
+
+
+def refused(call, *arguments, **named) -> str:
+    with pytest.raises(InputError) as caught:
+        call(*arguments, **named)
+    line = str(caught.value)
+    assert "\n" not in line and "\0" not in line and len(line) < 1000
+    return line
+
+
+@pytest.mark.parametrize("kind", ["fifo", "folder", "socket", "zero", "full", "null", "gone", "loop"])
+def test_only_regular_files_are_read_and_opening_never_waits(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "a"
+    if kind == "fifo":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "socket":
+        socket.socket(socket.AF_UNIX).bind(str(path))
+    elif kind == "loop":
+        path.symlink_to(path)
+    elif kind != "gone":
+        path = Path("/dev") / kind
+    start = time.monotonic()
+    line = refused(foreign.read_bytes, path, most_bytes=1000)
+    assert time.monotonic() - start < HANG_S
+    told = {"fifo": "is a FIFO", "folder": "is a folder", "gone": "No such file", "loop": "symbolic links"}
+    assert str(path) in line and told.get(kind, "") in line
+
+
+def test_a_file_is_read_up_to_its_limit_and_refused_beyond_with_both_figures(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"x" * 1000)
+    assert foreign.read_bytes(tmp_path / "a", most_bytes=1000) == b"x" * 1000
+    assert "has 1000 bytes; at most 999 bytes" in refused(foreign.read_bytes, tmp_path / "a", most_bytes=999)
+
+
+def test_no_descriptor_is_left_open(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "big").write_bytes(b"x" * 100)
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    for name in ("fifo", "big", "gone"):
+        refused(foreign.read_bytes, tmp_path / name, most_bytes=10)
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+@pytest.mark.parametrize("path", ["a\0b", "x" * 5000, "y" * 300, "é" * 200, "/".join(["z" * 200] * 30)])
+def test_what_can_be_no_path_is_refused_before_the_system_is_asked(path: str) -> None:
+    refused(foreign.checked_path, path)
+    assert refused(foreign.checked_path, path, source="a.toml", field="content.file").startswith(
+        "a.toml: content.file: "
+    )
+
+
+def test_text_is_utf_8_with_or_without_a_mark(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"\xef\xbb\xbfx")
+    assert foreign.read_text(tmp_path / "a") == "x"
+    (tmp_path / "a").write_bytes(b"ab\xffc")
+    assert "is not UTF-8 at byte 2" in refused(foreign.read_text, tmp_path / "a")
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=20,
+)
+
+
+@given(json_values)
+def test_json_comes_back_as_it_is(value) -> None:
+    assert parsed_json(json.dumps(value), source="a") == value
+
+
+def depth_of(value) -> int:
+    if isinstance(value, dict):
+        return 1 + max(map(depth_of, value.values()), default=0)
+    if isinstance(value, list):
+        return 1 + max(map(depth_of, value), default=0)
+    return 0
+
+
+@given(json_values)
+def test_nesting_is_counted_outside_of_strings_alone(value) -> None:
+    assert nesting(json.dumps(value).encode(), most=1000) == depth_of(value)
+
+
+@pytest.mark.parametrize("opening", ["[", '{"a":', '[{"b":', "[[],"])
+@pytest.mark.parametrize("times", [65, 3000, 100_000, 1_000_000])
+def test_json_that_nests_deep_is_refused_in_no_time(opening: str, times: int) -> None:
+    start = time.monotonic()
+    assert "nested deeper than 64" in refused(parsed_json, opening * times, source="a")
+    assert time.monotonic() - start < HANG_S
+
+
+@pytest.mark.parametrize("text", ['"' + '\\"' * 500_000, '"' * 500_001, "\\" * 500_000, '"' + "\\" * 500_000])
+def test_strings_that_never_end_take_no_longer(text: str) -> None:
+    start = time.monotonic()
+    refused(parsed_json, text, source="a")
+    assert time.monotonic() - start < HANG_S
+
+
+@pytest.mark.parametrize(
+    "text", ["NaN", "[Infinity]", '{"a": -Infinity}', "", "{", "9" * 5000 + "x", b"\xff", "\ud800"]
+)
+def test_what_is_no_json_is_refused(text: str | bytes) -> None:
+    refused(parsed_json, text, source="a")
+
+
+def test_numbers_of_any_length_take_no_time() -> None:
+    start = time.monotonic()
+    assert parsed_json("9" * 1_000_000, source="a") == float("inf")
+    assert time.monotonic() - start < HANG_S
+
+
+@pytest.mark.parametrize(
+    "value", [float("inf"), float("nan"), 1.5, "5", "²", None, True, [], 2**70, 1e300, -1, int("9" * 4000)]
+)
+def test_what_is_no_whole_number_in_its_range_is_refused_briefly(value: object) -> None:
+    line = refused(whole, value, least=0, most=1 << 62, source="a", field="n")
+    assert line.startswith("a: n: is ") and len(line) < 200
+
+
+@pytest.mark.parametrize("value", [0, 5, 5.0, 1 << 62])
+def test_whole_numbers_are_taken(value: float) -> None:
+    assert whole(value, least=0, most=1 << 62) == value
+
+
+@pytest.mark.parametrize("text", ["²", "٣", "", "-", "1_0", "0x1", "1.0", "9" * 5000, "-1", " ", "½"])
+def test_digits_are_ascii_ones_and_not_too_many(text: str) -> None:
+    assert len(refused(whole_from_text, text, least=0, most=10**15, source="a", field="n")) < 200
+
+
+@pytest.mark.parametrize(("text", "number"), [("7", 7), (" +12 ", 12), ("-3", -3), ("007", 7)])
+def test_digits_are_read(text: str, number: int) -> None:
+    assert whole_from_text(text, least=-9, most=99, source="a", field="n") == number
+
+
+@pytest.mark.parametrize("value", [float("inf"), float("nan"), "1", None, True, 1e300, 10**400, -2])
+def test_what_is_no_number_in_its_range_is_refused(value: object) -> None:
+    refused(real, value, least=-1, most=1e6, source="a", field="n")
+
+
+@given(st.text())
+def test_a_shown_value_is_printable_and_short(text: str) -> None:
+    shown = foreign.shown(text)
+    assert shown.isprintable() and len(shown) <= 43
+
+
+@given(st.text(), st.text(), st.text())
+def test_any_refusal_is_one_line(source: str, field: str, problem: str) -> None:
+    line = str(InputError(source, field, problem))
+    assert line.isprintable() and len(line) < 1000
