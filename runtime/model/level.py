@@ -25,7 +25,7 @@ REAR, CENTRE, FRONT = 0, 1, 2
 OUTER = (REAR, FRONT)
 EYES = (0, 1)
 START = FULL // 2  # of every outer panel: the middle of its range
-LEAST_SPREAD, MOST_SPREAD = 0.2, 8.0  # pixels
+LEAST_SPREAD, MOST_SPREAD = 0.5, 8.0  # pixels; below half a pixel care costs more time than it gains
 EVEN = (START + SUBCODE // 2) // SUBCODE  # the same in 8-bit codes, rounded as what is shown is
 
 
