@@ -24,7 +24,10 @@ from runtime.config import Settings
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
+from runtime.support import foreign
 from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_png, write_text
+
+PHOTOGRAPH_BYTES_MAX = 512 << 20
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 MOST_PHOTOGRAPHS = 100
@@ -42,10 +45,7 @@ def write_board(out: Path, stack: PanelStack) -> dict[str, Any]:
 
 def read_photograph(path: Path) -> U8:
     """(h, w) grey, as the sensor saw it: a note to turn it is not heeded. Raises InputError."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, "", f"cannot be read ({error.strerror})") from None
+    data = foreign.read_bytes(path, most_bytes=PHOTOGRAPH_BYTES_MAX)
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     if picture is None:

@@ -175,7 +175,9 @@ class TrackerSettings(Section):
         1.0, description="how long a head keeps being calm, moving or hasty, on average"
     )
     turn_acceleration: Positive = Field(0.0003, description="the same of half the line between the eyes, m²/s³")
-    speed_max: Positive = Field(2.0, description="faster heads, in m/s, are outliers until a second sample confirms")
+    speed_max: Annotated[float, within(0.05, 50.0, "m/s")] = Field(
+        2.0, description="faster heads, in m/s, are outliers until a second sample confirms"
+    )
     confidence_min: Unit = Field(0.3, description="less certain samples (a blink) are not used")
     loss_s: Annotated[float, within(0.0, 60.0, "s")] = Field(
         0.2, description="without any sample for this long the eyes are held, not predicted"
@@ -202,7 +204,7 @@ class CalibrationSettings(Section):
         0.0, description="the viewer's known eye separation, metres, 0: unknown; checks for drift"
     )
     ipd_tolerance: Positive = Field(0.04, description="warn where the measured one parts by more than this share")
-    viewing_m: tuple[Positive, Positive] = Field(
+    viewing_m: tuple[Annotated[float, within(0.05, 20.0, "m")], Annotated[float, within(0.05, 20.0, "m")]] = Field(
         (0.4, 0.6), description="nearest and farthest viewer: charts and registration are for there"
     )
     viewing_side_deg: Annotated[float, Field(ge=2, le=40)] = Field(
@@ -241,7 +243,9 @@ class ContentSettings(Section):
     depth_m: tuple[Annotated[float, within(-10.0, 10.0, "m")], Annotated[float, within(-10.0, 10.0, "m")]] = Field(
         (-0.05, 0.05), description="rear and front between which an RGBD picture or a fitted mesh lies, along x"
     )
-    picture_rate_hz: Positive = Field(30.0, description="pictures a second of a folder of pictures")
+    picture_rate_hz: Annotated[float, within(0.01, 1000.0, "Hz")] = Field(
+        30.0, description="pictures a second of a folder of pictures"
+    )
     at_end: Literal["repeat", "hold"] = Field("repeat", description="what a video does at its end")
     fit: bool = Field(True, description="scale and centre a mesh or splat without a preset to the display")
     up: Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"] = Field(
@@ -278,7 +282,9 @@ class ModelSettings(Section):
         description="standard deviation of where light enters an eye, millimetres an axis: a picture for two points "
         "(0) or a forgiving one; auto: the pupil and the tracker's own covariance together",
     )
-    pupil_mm: NonNegative = Field(4.0, description="diameter of a pupil, millimetres, for eye_sigma_mm = auto")
+    pupil_mm: Annotated[float, within(0.0, 20.0, "mm")] = Field(
+        4.0, description="diameter of a pupil, millimetres, for eye_sigma_mm = auto"
+    )
     transfer: Literal["code", "srgb"] = Field("code", description="panel luminance: code values, or linear via sRGB")
     budget_ms: NonNegative = Field(0.0, description="time for one frame; 0: none. Picks model and resolution")
 
@@ -398,7 +404,9 @@ class LimitSettings(Section):
     splats: Annotated[int, Field(ge=1)] = Field(3_000_000, description="Gaussians of a splat file")
     instances: Annotated[int, Field(ge=1)] = Field(2000, description="times that meshes stand in a glTF scene")
     depth: Annotated[int, Field(ge=1, le=512)] = Field(64, description="how deep JSON or a glTF scene may nest")
-    load_s: Positive = Field(120.0, description="loading of one piece of content is given up after this")
+    load_s: Annotated[float, within(0.01, 86_400.0, "s")] = Field(
+        120.0, description="loading of one piece of content is given up after this"
+    )
     recording_s: Annotated[float, Field(gt=0, le=1_000_000)] = Field(
         21_600.0, description="length of a recording that is replayed, seconds"
     )

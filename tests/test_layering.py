@@ -22,8 +22,9 @@ FLOORS: tuple[tuple[str, ...], ...] = (  # from the ground up; what stands besid
     ("evaluation",),
     ("plan",),
     ("frame",),
+    ("blackbox",),
     ("daemon",),
-    ("report", "commands", "cli"),
+    ("report", "page", "commands", "cli"),
 )
 HEAVY = ("torch", "cv2", "onnxruntime", "scipy", "numpy")
 

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from runtime.daemon.build import Run, RunOptions
     from runtime.frame.presenter import Supervisor
 
+JOBS_END_WITHIN_S = 3.0  # what is still loading at the end
+
 
 def drive(
     settings: Settings,
@@ -33,6 +35,7 @@ def drive(
     from runtime.daemon.build import build_run
     from runtime.evaluation.run_output import RunOutput
     from runtime.optics.alignment import shown_layers
+    from runtime.support.background import wait_for_all
 
     with ExitStack() as cleanup:
         output = cleanup.enter_context(RunOutput(out)) if out is not None else None
@@ -52,6 +55,8 @@ def drive(
         begin_s = perf_counter()
         reason = run.presenter.run(frames=frames)
         machine_s = perf_counter() - begin_s
+        for sample in run.presenter.samples.recorded_ahead():
+            run.observer.sampled(sample)  # the last lights' truth: nothing else is done with it
         run.observer.finish()
         summary = run.summary() | {"stopped": reason}
         if output is not None:
@@ -59,7 +64,8 @@ def drive(
             has_picture = last is not None and (last.frame.solved is not None or last.frame.flat is not None)
             layers = shown_layers(last.frame) if last is not None and has_picture else None
             output.finish(summary, layers, run.observer.look)
-    return summary | {"machine_s": round(machine_s, 3), "left_behind": run.solver.left_behind}
+    left_behind = run.solver.left_behind + wait_for_all(JOBS_END_WITHIN_S)
+    return summary | {"machine_s": round(machine_s, 3), "left_behind": left_behind}
 
 
 def _progress(total: int | None) -> Any:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 import tomllib
 from pathlib import Path
 from typing import Any
 
 from runtime.errors import InputError
+from runtime.support import foreign
 
 # Where the daemon listens without a configuration: `ServiceSettings().socket`, without loading all settings.
 DEFAULT_SOCKET = "/run/phasestack/status.sock"
@@ -34,11 +34,10 @@ def configured_socket(config: Path | None) -> str:
     if config is None:
         return DEFAULT_SOCKET
     try:
-        text = config.read_text(encoding="utf-8")
-        table: Any = json.loads(text) if config.suffix.lower() == ".json" else tomllib.loads(text)
-    except OSError as error:
-        raise InputError(config, "", f"cannot be read ({error.strerror})") from None
-    except ValueError as error:  # not UTF-8, not TOML or JSON, or a NUL in the path
+        text = foreign.read_text(config)
+        is_json = config.suffix.lower() == ".json"
+        table: Any = foreign.parsed_json(text, source=config) if is_json else tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
         raise InputError(config, "", f"malformed: {error}") from None
     service = table.get("service", {}) if isinstance(table, dict) else {}
     socket = service.get("socket", DEFAULT_SOCKET) if isinstance(service, dict) else DEFAULT_SOCKET

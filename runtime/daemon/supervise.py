@@ -94,6 +94,12 @@ class Daemon:
                     self._metrics.fault(part)
                 self._faults_told[part] = count
 
+    def abandon_change(self) -> None:
+        """The run is over: what is being loaded is no longer wanted."""
+        if self._change is not None:
+            self._change.abandon()
+            self._change = None
+
     def watches(self, run: Run) -> None:
         """The run that it supervises."""
         self.run = run
@@ -396,6 +402,7 @@ def _lived(
             if not signals.stop:
                 raise
             summary = {"stopped": daemon.stop_reason()}  # told so while it waited for a panel
+        daemon.abandon_change()
         notifier.stopping(summary["stopped"])
     log.info("stopped: %s", summary["stopped"])
     if not quiet and not notifier.supervised and "frames" in summary:

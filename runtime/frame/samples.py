@@ -5,12 +5,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 
-from runtime.clock import Clock
+from runtime.clock import NS_PER_S, Clock
 from runtime.config import SensorSettings
 from runtime.errors import EndOfRecording, FatalError, InputError
 from runtime.records import SensorFrame
 from runtime.sensor.base import SensorDriver, SteppedDriver
 from runtime.sensor.worker import SensorState, SensorWorker
+
+AHEAD_NS = NS_PER_S // 10  # more than from a sample to the light of a refresh that used it
 
 
 class Samples(ABC):
@@ -35,6 +37,10 @@ class Samples(ABC):
     @abstractmethod
     def serial(self) -> str:
         """The sensor's serial, where it is known."""
+
+    def recorded_ahead(self) -> list[SensorFrame]:
+        """Samples of the next moment that a recording holds already; [] of a sensor. For what was known afterwards."""
+        return []
 
     @abstractmethod
     def close(self) -> None:
@@ -65,6 +71,16 @@ class RecordedSamples(Samples):
             except EndOfRecording as end:
                 self._next, self._end = None, end
         self.stale_inputs += max(0, len(frames) - 1)
+        return frames
+
+    def recorded_ahead(self) -> list[SensorFrame]:
+        frames: list[SensorFrame] = []
+        while self._next is not None and (not frames or self._next.capture_ns - frames[0].capture_ns < AHEAD_NS):
+            frames.append(self._next)
+            try:
+                self._next = self._driver.next_sample()
+            except EndOfRecording as end:
+                self._next, self._end = None, end
         return frames
 
     def fault(self) -> str:

@@ -15,6 +15,9 @@ from runtime.errors import InputError, MissingPart, ModelFailure
 from runtime.model.contract import Contract, parse_contract
 from runtime.model.onnx_bytes import digest, has_external_data
 from runtime.model.onnx_runtime import onnxruntime
+from runtime.support import foreign
+
+FILE_BYTES_MAX = 1 << 30
 
 log = logging.getLogger("phasestack.model")
 
@@ -108,10 +111,7 @@ class ModelSession:
 
 
 def _checked(path: Path, sha256: str) -> bytes:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, "", f"cannot be read ({error.strerror})") from None
+    data = foreign.read_bytes(path, most_bytes=FILE_BYTES_MAX)
     if sha256 and hashlib.sha256(data).hexdigest() != sha256:
         raise InputError(path, "", "is not the model that was shipped (SHA-256 differs): install phasestack again")
     try:

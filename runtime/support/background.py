@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
@@ -13,6 +14,17 @@ from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
 log = logging.getLogger("phasestack.background")
 
 T = TypeVar("T")
+
+
+_running: set[threading.Thread] = set()
+
+
+def wait_for_all(timeout_s: float) -> int:
+    """Wait for the jobs that still run, so long at most; how many still do then."""
+    deadline_s = time.monotonic() + timeout_s
+    for thread in tuple(_running):
+        thread.join(max(0.0, deadline_s - time.monotonic()))
+    return sum(thread.is_alive() for thread in tuple(_running))
 
 
 class Job(Generic[T]):
@@ -27,6 +39,7 @@ class Job(Generic[T]):
         self.result: T | None = None
         self.problem = ""  # one line, where it failed
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        _running.add(self._thread)
         self._thread.start()
 
     def abandon(self) -> None:
@@ -44,6 +57,12 @@ class Job(Generic[T]):
         return result
 
     def _run(self) -> None:
+        try:
+            self._work_through()
+        finally:
+            _running.discard(self._thread)
+
+    def _work_through(self) -> None:
         result: T | None = None
         set_niceness(BACKGROUND_NICENESS)
         try:

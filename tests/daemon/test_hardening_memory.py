@@ -20,7 +20,7 @@ FRAGMENTED = """
 import psutil
 from runtime.support.memory import give_back
 size = psutil.Process().memory_info
-pieces = [bytes(65000) for _ in range(4000)]
+pieces = [b"x" * (65000 + k % 2) for k in range(4000)]
 full = size().rss
 kept = pieces[::50]
 del pieces

@@ -93,7 +93,8 @@ def test_the_whole_report_is_made_in_one_run(tmp_path: Path) -> None:
     for method in record["methods"]:
         assert method["psnr_db_off_eye"].keys() == {"2mm", "4mm", "6mm"}
         assert method["expected_db"].keys() == {"1", "2"}
-        assert method["psnr_db"] >= method["expected_db"]["1"] >= method["expected_db"]["2"]
+        if method["kind"] == "network":
+            assert method["psnr_db"] > method["expected_db"]["1"] > method["expected_db"]["2"]
     assert {one["motion"] for one in record["moving"]} >= {"still", "lean", "walk", "stop-and-go"}
     assert {trade["model"] for trade in record["uncertainty"]} == {"fast", "balanced", "best"}
     page = (tmp_path / "index.html").read_text()

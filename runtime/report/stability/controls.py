@@ -14,7 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
+from runtime.optics.views import image_from_stack
 from runtime.records import F32, F64, U8
 from runtime.report.baselines import EyeOperator, as_codes, conjugate_gradients, eye_operator, mean_of_targets
 from runtime.report.eyesight import as_intensity
@@ -71,7 +73,7 @@ def first_pose(eye: Any) -> F64:
 
 def straight_projection(eye: Any, *, width_px: int, height_px: int, fov_deg: float) -> F64:
     """As if every eye were straight ahead."""
-    return poses.image_from_stack([0.6, 0.0, 0.0], width_px=width_px, height_px=height_px, fov_deg=fov_deg)
+    return image_from_stack([0.6, 0.0, 0.0], width_px=width_px, height_px=height_px, fov_deg=fov_deg)
 
 
 def unmoved(eye: Any, *, from_x_m: float, to_x_m: float) -> tuple[float, F64]:
@@ -103,7 +105,7 @@ def grey_retina(eye: Any, layers: U8, stack: PanelStack, *, fov_deg: float, **si
 
 def flat_retina(eye: Any, layers: U8, stack: PanelStack, *, fov_deg: float, **size: int) -> Any:
     """The layers one on the other as they lie, without the eye."""
-    real = retina.seen_by([1e6, 0.0, 0.0], layers, stack, fov_deg=fov_deg)
+    real = seen_by([1e6, 0.0, 0.0], layers, stack, fov_deg=fov_deg)
     total = layers.astype(np.float32).sum(0)[..., :3] / 255
     return SimpleNamespace(image=np.sin(np.pi / 2 * total) ** 2, mask=np.ones_like(real.mask))
 

@@ -228,7 +228,8 @@ USUAL = {"gap_m": 0.06, "ipd_m": 0.06, "distance_m": 0.54}
 
 def problem_of(geometry: tuple[str, dict[str, float]]) -> Problem:
     """The problem of one of the geometries."""
-    return Problem(**(USUAL | geometry[1]))
+    values = USUAL | geometry[1]
+    return Problem(gap_m=values["gap_m"], ipd_m=values["ipd_m"], distance_m=values["distance_m"])
 
 
 OURS: tuple[tuple[str, Method], ...] = (("CG-30", partial(cg, iterations=30)), ("mean of targets", mean))

@@ -1,0 +1,65 @@
+"""What is no file, no path or no JSON, as any option of any command: one line that names it, exit 2, no waiting."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+HEADLESS = "run --headless --max-speed --frames 1 --scale 0.1 --out {out}"
+EYES = "--left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0 --fov 40"
+HANG_S = 60  # and then killed: a blocked open does not hear SIGTERM
+
+
+def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    names = {name: folder / name for name in ("out", "config.toml", "deep.json", "deep.toml", "nul.toml", "start.toml")}
+    arguments = [part.format(out=names["out"], folder=folder) for part in command.split()]
+    code = "from runtime.cli import main; main()"
+    return subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, timeout=HANG_S)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name in ("fifo.png", "fifo.toml", "fifo.json", "fifo.mcap", "fifo.onnx", "fifo.csv", "fifo.pth"):
+        os.mkfifo(tmp_path / name)
+    (tmp_path / "deep.json").write_text("[" * 100_000)
+    (tmp_path / "deep.toml").write_text("a = " + "[" * 100_000)
+    (tmp_path / "nul.toml").write_text('[sensor]\nsource = "a\\u0000b"\n')
+    (tmp_path / "start.toml").write_text("[sensor]\nstart_s = 1e300\n")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("command", "told"),
+    [
+        (f"{HEADLESS} --config {{folder}}/fifo.toml", "fifo.toml: is a FIFO"),
+        (f"{HEADLESS} --config {{folder}}/deep.toml", "deep.toml: malformed: nested too deep"),
+        (f"{HEADLESS} --config {{folder}}/nul.toml", "sensor.source: holds a NUL"),
+        (f"{HEADLESS} --config {{folder}}/start.toml", "sensor.start_s: "),
+        (f"{HEADLESS} --replay {{folder}}/fifo.mcap", "fifo.mcap: is a FIFO"),
+        (f"{HEADLESS} --replay /dev/zero", "/dev/zero: is a device"),
+        (f"{HEADLESS} --replay demo --scene {{folder}}/fifo.png", "fifo.png: is a FIFO"),
+        (f"{HEADLESS} --replay demo --scene " + "x" * 5000, "5000 characters"),
+        (f"{HEADLESS} --replay demo --model {{folder}}/fifo.onnx", "fifo.onnx: is a FIFO"),
+        (
+            f"solve --left {{folder}}/fifo.png --right {{folder}}/fifo.png {EYES} --panels {{folder}}/deep.json"
+            " --out {out}",
+            "fifo.png: is a FIFO",
+        ),
+        ("plan --config {folder}/deep.json", "deep.json: JSON is nested deeper than 64"),
+        ("calibrate solve --pairs {folder}/fifo.csv --out {out}/a.toml", "fifo.csv: is a FIFO"),
+        ("calibrate solve --pairs {folder}/deep.json --out {out}/a.toml", "deep.json: JSON is nested deeper than 64"),
+        ("config --check {folder}/fifo.toml", "fifo.toml: is a FIFO"),
+        ("status --config {folder}/fifo.toml", "fifo.toml: is a FIFO"),
+        ("record --motion walk --out {folder}/a.txt", "a.txt: --out: must end in .mcap"),
+    ],
+)
+def test_it_is_refused_in_one_line(folder: Path, command: str, told: str) -> None:
+    answer = run(command, folder)
+    lines = [line for line in answer.stderr.splitlines() if line.strip()]
+    assert answer.returncode == 2, answer.stderr
+    assert len(lines) == 1 and told in lines[0] and "Traceback" not in answer.stderr
+    assert not (folder / "out").exists()
