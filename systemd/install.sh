@@ -37,7 +37,8 @@ if [ "${APP:-yes}" != no ]; then
   # An earlier installation may have made it for root alone.
   install -d -m 755 "$DESTDIR/opt/phasestack"
   rm -rf "$DESTDIR$library.new"
-  "$python" -m pip install --quiet --no-compile --target "$DESTDIR$library.new" -r "$source/requirements/runtime.lock"
+  "$python" -m pip install --quiet --no-compile --target "$DESTDIR$library.new" -r "$source/requirements/runtime.lock" \
+    -r "$source/requirements/page.lock"
   # From a copy: what an earlier build left beside the source would come along, modules that are gone included.
   copy=$(mktemp -d)
   trap 'rm -rf "$copy"' EXIT
@@ -58,6 +59,7 @@ chmod 755 "$DESTDIR/usr/bin/phasestack"
 
 put 644 phasestack.service /usr/lib/systemd/system/phasestack.service
 put 644 phasestack-x.service /usr/lib/systemd/system/phasestack-x.service
+put 644 phasestack-page.service /usr/lib/systemd/system/phasestack-page.service
 put 644 phasestack-user.service /usr/lib/systemd/user/phasestack.service
 put 644 phasestack.sysusers.conf /usr/lib/sysusers.d/phasestack.conf
 put 644 phasestack.tmpfiles.conf /usr/lib/tmpfiles.d/phasestack.conf
@@ -68,6 +70,8 @@ if [ "${version:-0}" -ge 254 ]; then
   put 644 50-backoff.conf /usr/lib/systemd/system/phasestack.service.d/50-backoff.conf
 fi
 put 644 ../docs/operation.md /usr/share/doc/phasestack/operation.md
+put 644 ../docs/page.md /usr/share/doc/phasestack/page.md
+put 644 ../docs/blackbox.md /usr/share/doc/phasestack/blackbox.md
 put 644 ../docs/install.md /usr/share/doc/phasestack/install.md
 put 644 ../docs/hardware.md /usr/share/doc/phasestack/hardware.md
 put 644 ../THIRD_PARTY.md /usr/share/doc/phasestack/THIRD_PARTY.md
@@ -84,4 +88,5 @@ cat <<NEXT
 phasestack is installed${DESTDIR:+ in $DESTDIR}. Next:
   1. edit /etc/phasestack/phasestack.toml (phasestack identify, phasestack doctor)
   2. systemctl enable --now phasestack
+  3. systemctl enable --now phasestack-page   (the operator's page: http://localhost:8717)
 NEXT

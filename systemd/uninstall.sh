@@ -24,11 +24,12 @@ fi
 live=no
 if [ -z "$DESTDIR" ] && [ -d /run/systemd/system ]; then
   live=yes
-  systemctl disable --now phasestack.service phasestack-x.service 2>/dev/null || true
+  systemctl disable --now phasestack-page.service phasestack.service phasestack-x.service 2>/dev/null || true
 fi
 rm -f "$DESTDIR/usr/bin/phasestack" \
   "$DESTDIR/usr/lib/systemd/system/phasestack.service" \
   "$DESTDIR/usr/lib/systemd/system/phasestack-x.service" \
+  "$DESTDIR/usr/lib/systemd/system/phasestack-page.service" \
   "$DESTDIR/usr/lib/systemd/user/phasestack.service" \
   "$DESTDIR/usr/lib/sysusers.d/phasestack.conf" \
   "$DESTDIR/usr/lib/tmpfiles.d/phasestack.conf" \

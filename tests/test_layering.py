@@ -24,7 +24,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (  # from the ground up; what stands besid
     ("frame",),
     ("blackbox",),
     ("daemon",),
-    ("report", "commands", "cli"),
+    ("report", "page", "commands", "cli"),
 )
 HEAVY = ("torch", "cv2", "onnxruntime", "scipy", "numpy")
 

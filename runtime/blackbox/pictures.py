@@ -7,6 +7,7 @@ has pixels. A layer's picture is every so-manieth row, averaged along it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,7 @@ def seen(frame: PanelFrame, stack: PanelStack, eye_m: F64, *, width_px: int, hei
     reference_m = reference_x_m(stack)
     across = (np.arange(width_px) + 0.5) / width_px - 0.5  # shares of the display's size from its middle
     up = 0.5 - (np.arange(height_px) + 0.5) / height_px
-    total = np.zeros((height_px, width_px, 3), np.float32)
+    total = np.zeros((height_px, width_px, 3), np.uint16)
     columns, rows = np.ones(width_px, bool), np.ones(height_px, bool)
     for index, x_m in enumerate(stack.x_m):
         # Along the ray from the eye through the reference plane.
@@ -61,31 +62,44 @@ def seen(frame: PanelFrame, stack: PanelStack, eye_m: F64, *, width_px: int, hei
         total += _shown_at(frame, index, u, v)
         columns &= (u >= 0) & (u < stack.width_px)
         rows &= (v >= 0) & (v < stack.height_px)
-    image: U8 = (intensity_from_phase(total / np.float32(255.0)) * 255.0 + 0.5).astype(np.uint8)
+    image = _codes_of_sums(stack.count)[total]
     image[~(rows[:, None] & columns)] = 0
     return image
 
 
 def _shown_at(frame: PanelFrame, index: int, u: F64, v: F64) -> Any:
-    """(h, w, 3) codes of a panel where columns u and rows v of its pixels meet; what lies beside it is even."""
+    """(h, w, 3) codes of a panel where columns u and rows v of its pixels meet; what lies beside the layer is even."""
+    import cv2
+
     su, sv, tu, tv = _alignment(frame, index)
     flatness = 1.0 if frame.solved is None else frame.flatness
-    mixed: Any = 0.0
-    if frame.solved is not None and flatness < 1.0:
-        mixed = _sampled(frame.solved[index], u * su + tu, v * sv + tv) * np.float32(1.0 - flatness)
-    if frame.flat is not None and flatness > 0.0:
-        mixed = mixed + _sampled(frame.flat[index], u, v) * np.float32(flatness)
-    return mixed
+    if flatness < 1.0 and frame.solved is not None:
+        solved = _sampled(frame.solved[index], u * su + tu, v * sv + tv)
+        if flatness <= 0.0 or frame.flat is None:
+            return solved
+        return cv2.addWeighted(solved, 1.0 - flatness, _sampled(frame.flat[index], u, v), flatness, 0.0)
+    assert frame.flat is not None
+    return _sampled(frame.flat[index], u, v)
 
 
 def _sampled(layer: U8, u: F64, v: F64) -> Any:
-    """The nearest pixels' codes (h, w, 3) as float32."""
+    """The nearest pixels' codes (h, w, 3)."""
     height, width = layer.shape[:2]
     columns, rows = np.floor(u).astype(np.intp), np.floor(v).astype(np.intp)
-    inside = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
-    picked = layer[rows.clip(0, height - 1)[:, None], columns.clip(0, width - 1), :3].astype(np.float32)
-    picked[~inside] = EVEN_CODE
-    return picked
+    pixels = layer.view(np.uint32)[..., 0]  # a pixel of four codes is gathered as one number
+    picked = pixels[rows.clip(0, height - 1)[:, None], columns.clip(0, width - 1)]
+    codes = picked.view(np.uint8).reshape(*picked.shape, 4)[..., :3]
+    codes[(rows < 0) | (rows >= height)] = EVEN_CODE
+    codes[:, (columns < 0) | (columns >= width)] = EVEN_CODE
+    return codes
+
+
+@cache
+def _codes_of_sums(panels: int) -> U8:
+    """What an eye sees, as codes, by the sum of the panels' codes along its ray."""
+    sums = np.arange(255 * panels + 1, dtype=np.float64)
+    codes: U8 = (intensity_from_phase(sums / 255.0) * 255.0 + 0.5).astype(np.uint8)
+    return codes
 
 
 def _layer(frame: PanelFrame, index: int, width: int, height: int) -> U8:

@@ -15,6 +15,7 @@ from runtime.commands.ctl import app as ctl_app
 from runtime.commands.demo import demo
 from runtime.commands.doctor import doctor
 from runtime.commands.identify import identify
+from runtime.commands.page import page
 from runtime.commands.plan import plan
 from runtime.commands.record import record
 from runtime.commands.report import report
@@ -50,6 +51,7 @@ COMMANDS: tuple[Callable[..., None] | tuple[str, typer.Typer], ...] = (
     doctor,
     status,
     ("ctl", ctl_app),
+    page,
     identify,
     config,
 )

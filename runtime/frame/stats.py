@@ -95,7 +95,7 @@ class RunStats:
 
     def rates_now(self) -> dict[str, float | None]:
         """Refreshes and solutions a second, over the last second; None where too little has happened."""
-        recent = [entry for entry in self._recent if entry[0] > self._last_ns - NOW_NS]
+        recent = [entry for entry in tuple(self._recent) if entry[0] > self._last_ns - NOW_NS]
         if len(recent) < 2:
             return {"fps_now": None, "solutions_per_s_now": None}
         span_s = max((recent[-1][0] - recent[0][0]) / NS_PER_S, 1e-9)

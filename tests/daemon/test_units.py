@@ -17,8 +17,8 @@ from runtime.sensor.known_devices import KNOWN_DEVICES
 
 ROOT = Path(__file__).parents[2]
 UNITS = ROOT / "systemd"
-SYSTEM = ("phasestack.service", "phasestack-x.service")
-EXPOSURE_MAX = {"phasestack.service": 1.8, "phasestack-x.service": 7.0}
+SYSTEM = ("phasestack.service", "phasestack-x.service", "phasestack-page.service")
+EXPOSURE_MAX = {"phasestack.service": 1.8, "phasestack-x.service": 7.0, "phasestack-page.service": 1.2}
 
 with_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze here")
 
@@ -154,6 +154,7 @@ def test_the_installer_writes_below_destdir_and_the_uninstaller_takes_it_away(tm
         "usr/bin/phasestack",
         "usr/lib/systemd/system/phasestack.service",
         "usr/lib/systemd/system/phasestack-x.service",
+        "usr/lib/systemd/system/phasestack-page.service",
         "usr/lib/systemd/user/phasestack.service",
         "usr/lib/sysusers.d/phasestack.conf",
         "usr/lib/tmpfiles.d/phasestack.conf",

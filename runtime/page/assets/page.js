@@ -1,0 +1,334 @@
+// The operator's page: asks what is new, draws it, and posts what is wished. Nothing is loaded from elsewhere.
+"use strict";
+
+const $ = (id) => document.getElementById(id);
+const SVG = "http://www.w3.org/2000/svg";
+const KEPT = 240; // points of a plot: two minutes
+const STATUS_MS = 500, PICTURES_MS = 400, LOG_MS = 1000, ABOUT_MS = 5000, RETRY_MS = 1000;
+const ZOOMED_SIGMAS = 20; // two standard deviations, ten times as large
+
+let about = null;
+let running = false;
+
+function element(name, attributes = {}, text = "") {
+  const made = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  if (text) made.textContent = text;
+  return made;
+}
+
+function html(name, text = "", data = {}) {
+  const made = document.createElement(name);
+  made.textContent = text;
+  Object.assign(made.dataset, data);
+  return made;
+}
+
+function setText(node, text) {
+  if (node.textContent !== text) node.textContent = text;
+}
+
+const number = (value, digits = 1) => (value === null || value === undefined ? "–" : Number(value).toFixed(digits));
+const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], { hour12: false });
+
+// Plots.
+
+const PLOTS = [
+  ["refreshes/s", (s) => s.fps_now, 1],
+  ["solutions/s", (s) => s.solutions_per_s_now, 1],
+  ["solution's age, ms", (s) => s.solution_age_now_ms, 1],
+  ["capture to light, ms", (s) => s.photon_now_ms, 1],
+  ["eyes known to, mm", (s) => s.eye_sigma_now_mm, 2],
+  ["presenting (median), ms", (s) => s.stage_ms?.present?.p50, 2],
+].map(([title, value, digits]) => {
+  const box = html("div");
+  box.className = "plot";
+  const line = html("p");
+  const shown = document.createElement("output");
+  line.append(html("span", title), shown);
+  const svg = element("svg", { viewBox: `0 0 ${KEPT} 56`, preserveAspectRatio: "none", "aria-hidden": "true" });
+  const curve = element("path");
+  svg.append(curve);
+  box.append(line, svg);
+  $("plots").append(box);
+  return { value, digits, shown, curve, values: [] };
+});
+
+function plot(status) {
+  for (const p of PLOTS) {
+    const value = status ? p.value(status) : null;
+    p.values.push(typeof value === "number" ? value : null);
+    if (p.values.length > KEPT) p.values.shift();
+    setText(p.shown, number(value, p.digits));
+    const known = p.values.filter((v) => v !== null);
+    const most = Math.max(1e-9, ...known) * 1.1;
+    const least = Math.min(0, ...known);
+    const begin = KEPT - p.values.length;
+    const height = (v) => (54 - (52 * (v - least)) / (most - least)).toFixed(1);
+    // A gap where nothing was known.
+    const steps = p.values.map((v, i) => v === null ? "" : `${i && p.values[i - 1] !== null ? "L" : "M"}${begin + i},${height(v)}`);
+    p.curve.setAttribute("d", steps.join(""));
+  }
+}
+
+// The eyes from above and from the side: x (to the viewer) is drawn to the right, 0.25 m behind the display to 1.2 m.
+
+function view(svg, status, axis, size_m, range) {
+  const eyes = status.eyes_m;
+  const far = Math.max(1.0, 1.15 * (about.viewing_m?.[1] ?? 0.6), eyes ? 1.15 * Math.max(eyes[0][0], eyes[1][0]) : 0);
+  const scale = 300 / (far + 0.15);
+  const at = (x, across) => [10 + (x + 0.15) * scale, 85 - across * scale];
+  const shapes = [];
+  const line = (from, to, kind) => {
+    const [[x1, y1], [x2, y2]] = [at(...from), at(...to)];
+    shapes.push(element("line", { x1, y1, x2, y2, class: kind }));
+  };
+  const outline = range.map(([x, across]) => at(x, across).map((v) => v.toFixed(1)).join(",")).join(" ");
+  shapes.push(element("polygon", { points: outline, class: "range" }));
+  for (const x of about.stack.x_m) line([x, -size_m / 2], [x, size_m / 2], "panel");
+  if (eyes) {
+    const rear = about.stack.x_m[0];
+    eyes.forEach((eye, index) => {
+      const side = index ? "right" : "left";
+      const place = [eye[0], eye[axis]];
+      line(place, [rear, -size_m / 2], `ray ${side}`);
+      line(place, [rear, size_m / 2], `ray ${side}`);
+      const [cx, cy] = at(...place);
+      const sure = ((status.eye_sigma_now_mm ?? 0) / 1000) * ZOOMED_SIGMAS * scale;
+      shapes.push(element("circle", { cx, cy, r: Math.max(sure, 0.1), class: `sure ${side}` }));
+      shapes.push(element("circle", { cx, cy, r: 3.5, class: side }));
+    });
+  }
+  svg.replaceChildren(...shapes);
+}
+
+function sector(low_deg, high_deg) {
+  const [near, far] = about.viewing_m;
+  const angles = Array.from({ length: 9 }, (_, k) => ((low_deg + ((high_deg - low_deg) * k) / 8) * Math.PI) / 180);
+  const arc = (r) => angles.map((a) => [r * Math.cos(a), r * Math.sin(a)]);
+  return [...arc(near), ...arc(far).reverse()];
+}
+
+function drawEyes(status) {
+  const told = status.eyes_m
+    ? status.eyes_m.map((eye, i) => `${i ? "right" : "left"} (${eye.map((v) => v.toFixed(3)).join(", ")}) m`).join(", ") +
+      ` – ${status.eyes_label}, to ${number(status.eye_sigma_now_mm, 2)} mm`
+    : "no viewer is seen";
+  setText($("eyes-told"), told);
+  if (!about?.stack) return;
+  const side = about.viewing_side_deg;
+  view($("above"), status, 1, about.stack.width_m, sector(-side, side));
+  view($("side"), status, 2, about.stack.height_m, sector(...about.viewing_up_deg));
+}
+
+// Figures, budget, faults.
+
+function figures(status) {
+  const rows = {
+    scene: status.scene === status.content ? status.scene : `${status.scene} (${status.content})`,
+    model: `${status.model} on ${status.provider}`,
+    panels: status.panels,
+    "up for": `${Math.floor(status.uptime_s / 3600)} h ${Math.floor((status.uptime_s % 3600) / 60)} min`,
+    refreshes: `${status.presented} presented, ${status.dropped} dropped, ${status.missed_blanks} blanks missed`,
+    solutions: `${status.inferences}`,
+    sensor: `${number(status.sensor_hz)} samples/s, ${status.stale_inputs} overtaken`,
+    "capture to light": status.photon_ms ? `${number(status.photon_ms.p50)} ms (p50), ${number(status.photon_ms.p99)} (p99)` : "–",
+    "solution's age": status.solution_age_ms ? `${number(status.solution_age_ms.p50)} ms (p50), ${number(status.solution_age_ms.p99)} (p99)` : "–",
+    stages: Object.entries(status.stage_ms ?? {}).filter(([, v]) => v).map(([k, v]) => `${k} ${number(v.p50, 2)}`).join(", ") + " ms (p50)",
+    "black box": status.blackbox ? `${number(status.blackbox.kept_s, 0)} s kept, ${number(status.blackbox.kept_mib)} MiB; last file: ${status.blackbox.last_file ?? "none"}` : "–",
+  };
+  if (status.loading) rows.loading = status.loading;
+  if (status.refused) rows.refused = status.refused;
+  const list = $("numbers");
+  if (list.children.length !== 2 * Object.keys(rows).length) {
+    list.replaceChildren(...Object.keys(rows).flatMap((name) => [html("dt", name), html("dd")]));
+  }
+  Object.entries(rows).forEach(([name, text], i) => {
+    setText(list.children[2 * i], name);
+    setText(list.children[2 * i + 1], text);
+  });
+}
+
+function budget(status) {
+  const b = status.budget;
+  const held = b?.held === true ? ", held" : b?.held === false ? ", not held" : "";
+  const text = !b ? "none set" : b.budget_ms > 0 ? `${b.budget_ms} ms: ${b.level}${held}` : `none set: ${b.level}`;
+  setText($("budget-told"), b?.measuring ? `${text}; measuring ${b.measuring}` : text);
+  const key = JSON.stringify(status.plan);
+  if ($("plan").dataset.key !== key) {
+    $("plan").dataset.key = key;
+    $("plan").replaceChildren(...(status.plan ?? []).map((item) => {
+      const row = html("tr");
+      row.append(html("td", item.what), html("td", item.why),
+        html("td", item.saves_ms === null ? "not measured" : `${number(item.saves_ms)} ms`),
+        html("td", item.costs_db === null ? "not measured" : `${number(item.costs_db, 2)} dB`));
+      return row;
+    }));
+  }
+  const faults = Object.entries(status.faults ?? {}).map(([part, count]) => `${part} ${count}`).join(", ");
+  setText($("faults"), faults ? `faults since the start: ${faults}` : "no faults since the start");
+}
+
+function entries(list, items, made) {
+  const newest = [...items].reverse();
+  const key = JSON.stringify(newest[0] ?? null) + newest.length;
+  if (list.dataset.key === key) return;
+  list.dataset.key = key;
+  list.replaceChildren(...newest.map((item) => {
+    const [text, data] = made(item);
+    const line = html("li", "", data);
+    line.append(html("time", clock(item.time_s)), text);
+    return line;
+  }));
+}
+
+// Pictures.
+
+const NAMED = (name) => name.startsWith("layer-") ? `layer ${Number(name.slice(6)) + 1} from the rear` :
+  name === "seen-left" ? "seen by the left eye" : "seen by the right eye";
+
+function pictures(answer) {
+  const box = $("pictures");
+  const names = Object.keys(answer.jpegs ?? {}).sort();
+  const eyes = ["seen-left", "seen-right"].filter((name) => !names.includes(name));
+  for (const name of [...names, ...eyes]) {
+    let figure = box.querySelector(`[data-name="${name}"]`);
+    if (!figure) {
+      figure = html("figure", "", { name });
+      const image = document.createElement("img");
+      image.alt = NAMED(name);
+      image.hidden = true;
+      figure.append(image, html("figcaption", NAMED(name)));
+      box.append(figure);
+      [...box.children].sort((a, b) => a.dataset.name.localeCompare(b.dataset.name)).forEach((f) => box.append(f));
+    }
+    const [image, caption] = figure.children;
+    const data = answer.jpegs?.[name];
+    image.hidden = false;
+    if (data) image.src = `data:image/jpeg;base64,${data}`;
+    setText(caption, NAMED(name) + (data ? "" : ": no viewer"));
+  }
+  box.dataset.frame = answer.frame ?? "";
+}
+
+// Asking.
+
+async function lookUp(name) {
+  const answer = await fetch(`/now/${name}`, { credentials: "same-origin" });
+  if (answer.status === 401) location.reload();
+  return answer.json();
+}
+
+function gone(why) {
+  running = false;
+  $("gone").hidden = false;
+  setText($("gone"), `No daemon answers. ${why}`);
+  setText($("state"), "no daemon");
+  $("state").dataset.state = "gone";
+  setText($("reason"), "");
+  setText($("eyes-told"), "unknown");
+  $("above").replaceChildren();
+  $("side").replaceChildren();
+  plot(null);
+}
+
+function show(status) {
+  running = true;
+  const hangs = status.turn_age_s > 5;
+  $("gone").hidden = !hangs;
+  if (hangs) setText($("gone"), `the daemon's loop has stood still for ${number(status.turn_age_s, 0)} s`);
+  setText($("state"), status.state ?? "starting");
+  $("state").dataset.state = (status.state ?? "starting").split(":")[0];
+  setText($("reason"), status.reason ?? "");
+  if (status.state === undefined) return; // it answers, and has shown nothing yet
+  document.querySelector('[data-command="pause"]').setAttribute("aria-pressed", String(status.paused));
+  document.querySelector('[data-command="flat"]').setAttribute("aria-pressed", String(status.flat_asked));
+  if (document.activeElement !== $("scene") && !$("scene").dataset.touched) $("scene").value = status.scene;
+  if (document.activeElement !== $("budget") && !$("budget").dataset.touched) $("budget").value = status.budget?.budget_ms ?? 0;
+  plot(status);
+  drawEyes(status);
+  figures(status);
+  budget(status);
+}
+
+async function every(ms, work) {
+  for (;;) {
+    let pause = document.hidden ? 4 * ms : ms;
+    try {
+      await work();
+    } catch {
+      gone("Nor does the page's own server: it has stopped, or the network is gone.");
+      pause = RETRY_MS;
+    }
+    await new Promise((done) => setTimeout(done, pause));
+  }
+}
+
+every(STATUS_MS, async () => {
+  const status = await lookUp("status");
+  if (status.ok) show(status);
+  else gone(status.error);
+});
+every(PICTURES_MS, async () => {
+  if (!running || document.hidden) return;
+  const answer = await lookUp("pictures");
+  if (answer.ok) pictures(answer);
+});
+every(LOG_MS, async () => {
+  if (!running) return;
+  const answer = await lookUp("log");
+  if (!answer.ok) return;
+  entries($("log"), answer.lines, (line) => [line.text, { level: line.level }]);
+  entries($("states"), answer.states, (s) => [`${s.state}: ${s.reason}`, { state: s.state.split(":")[0] }]);
+});
+every(ABOUT_MS, async () => {
+  if (about?.stack && running) return;
+  const answer = await lookUp("about");
+  if (!answer.ok) return;
+  about = answer;
+  $("scenes").replaceChildren(...(answer.scenes ?? []).map((name) => {
+    const option = document.createElement("option");
+    option.value = name;
+    return option;
+  }));
+});
+
+// Telling.
+
+async function tell(button, command, value = null) {
+  button.disabled = true;
+  $("told").dataset.kind = "";
+  setText($("told"), `${command}: asked`);
+  try {
+    const answer = await fetch("/do", {
+      method: "POST",
+      credentials: "same-origin",
+      headers: { "Content-Type": "application/json" },
+      body: JSON.stringify({ command, value }),
+    });
+    const said = await answer.json();
+    $("told").dataset.kind = said.ok ? "" : "bad";
+    setText($("told"), said.ok ? `${command}: done${said.file ? `: ${said.file}` : said.note ? `: ${said.note}` : ""}` : `${command}: ${said.error}`);
+  } catch {
+    $("told").dataset.kind = "bad";
+    setText($("told"), `${command}: the page's own server does not answer`);
+  } finally {
+    button.disabled = false;
+    button.focus();
+  }
+}
+
+for (const button of document.querySelectorAll("[data-command]")) {
+  button.addEventListener("click", () => tell(button, button.dataset.command));
+}
+for (const id of ["scene", "budget"]) $(id).addEventListener("input", () => ($(id).dataset.touched = "yes"));
+$("scene-form").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  await tell(event.submitter ?? event.target.querySelector("button"), "scene", $("scene").value.trim());
+  delete $("scene").dataset.touched;
+});
+$("budget-form").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  await tell(event.submitter ?? event.target.querySelector("button"), "budget", Number($("budget").value));
+  delete $("budget").dataset.touched;
+});

@@ -1,0 +1,205 @@
+"""The page's web application: what may be seen and done with the token, and nothing without.
+
+A GET never does anything. What does is a POST from the page itself: the browser says so (`Origin`), or who posts
+gives the token in the request, which no other site can.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections.abc import Awaitable, Callable
+from functools import cache
+from importlib.resources import files
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import anyio
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
+from starlette.routing import Route
+
+from runtime.page.daemon import LOOKED_UP_AGAIN_S, Daemon
+from runtime.page.token import cookie_of, same
+
+COOKIE = "phasestack"
+COMMANDS = ("scene", "pause", "resume", "flat", "budget", "reload", "blackbox")
+BODY_MAX_BYTES = 65536
+WRONG_TOKEN_S = 0.5  # so long a wrong token is thought about
+ASSETS = {"page.js": "text/javascript", "page.css": "text/css"}
+Handler = Callable[[Request], Awaitable[Response]]
+
+
+class TooLong(ValueError):
+    """A request's body."""
+
+
+def application(daemon: Daemon, token: str, *, any_host: bool) -> Starlette:
+    """The application; any_host: it is reached by names that are not this machine's own."""
+    cookie = cookie_of(token)
+
+    def permitted(request: Request) -> bool:
+        kind, _, given = request.headers.get("authorization", "").partition(" ")
+        if kind.lower() == "bearer":
+            return same(given.strip(), token)
+        return same(request.cookies.get(COOKIE, ""), cookie)
+
+    def guarded(handler: Handler) -> Handler:
+        async def answer(request: Request) -> Response:
+            if not permitted(request):
+                return JSONResponse({"ok": False, "error": "log in first"}, 401, {"WWW-Authenticate": "Bearer"})
+            return await handler(request)
+
+        return answer
+
+    async def index(request: Request) -> Response:
+        if not permitted(request):
+            return HTMLResponse(_login(), 401)
+        return HTMLResponse(_asset("page.html"))
+
+    async def asset(request: Request) -> Response:
+        name = request.path_params["name"]
+        return Response(_asset(name), media_type=ASSETS[name]) if name in ASSETS else Response(status_code=404)
+
+    async def look_up(request: Request) -> Response:
+        name = request.path_params["name"]
+        if name not in LOOKED_UP_AGAIN_S:
+            return JSONResponse({"ok": False, "error": "there is no such thing to look up"}, 404)
+        answer = await run_in_threadpool(daemon.look_up, name)
+        return JSONResponse(answer, 200 if answer.get("ok") else 503)
+
+    async def do(request: Request) -> Response:
+        try:
+            asked = json.loads(await _body(request))
+        except TooLong:
+            return JSONResponse({"ok": False, "error": "the request is too long"}, 413)
+        except ValueError:
+            asked = None
+        if not isinstance(asked, dict) or asked.get("command") not in COMMANDS:
+            return JSONResponse({"ok": False, "error": f"command: one of {', '.join(COMMANDS)}"}, 400)
+        answer = await run_in_threadpool(daemon.tell, asked["command"], asked.get("value"))
+        code = 200 if answer.get("ok") else 503 if answer.get("running") is False else 409
+        return JSONResponse(answer, code)
+
+    async def login(request: Request) -> Response:
+        try:
+            fields = parse_qs((await _body(request)).decode("utf-8", "replace"))
+        except TooLong:
+            fields = {}
+        if not same(fields.get("token", [""])[0].strip(), token):
+            await anyio.sleep(WRONG_TOKEN_S)
+            return HTMLResponse(_login("That is not the token."), 401)
+        answer = RedirectResponse("/", 303)
+        answer.set_cookie(COOKIE, cookie, httponly=True, samesite="strict", path="/")
+        return answer
+
+    async def logout(request: Request) -> Response:
+        answer = RedirectResponse("/", 303)
+        answer.delete_cookie(COOKIE, httponly=True, samesite="strict", path="/")
+        return answer
+
+    routes = [
+        Route("/", index, methods=["GET"]),
+        Route("/login", login, methods=["POST"]),
+        Route("/logout", guarded(logout), methods=["POST"]),
+        Route("/do", guarded(do), methods=["POST"]),
+        Route("/now/{name}", guarded(look_up), methods=["GET"]),
+        Route("/{name}", guarded(asset), methods=["GET"]),
+    ]
+    app = Starlette(routes=routes)
+    app.add_middleware(_Guard, any_host=any_host)
+    return app
+
+
+class _Guard:
+    """For every request: whose page it comes from, by which name, and what the answer may load."""
+
+    def __init__(self, app: Any, *, any_host: bool) -> None:
+        self._app, self._any_host = app, any_host
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        request = Request(scope)
+        refused = self._refused(request)
+
+        async def send_with_headers(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                message["headers"] = [*message.get("headers", []), *_headers()]
+            await send(message)
+
+        if refused:
+            await JSONResponse({"ok": False, "error": refused}, 403)(scope, receive, send_with_headers)
+        else:
+            await self._app(scope, receive, send_with_headers)
+
+    def _refused(self, request: Request) -> str:
+        host = request.headers.get("host", "")
+        # A name that another site has made to lead here is none of ours.
+        if not self._any_host and _name(host) not in ("localhost", "127.0.0.1", "::1"):
+            return "not by this name: open http://localhost, or start it with --host"
+        if request.method in ("GET", "HEAD"):
+            return ""
+        origin = request.headers.get("origin")
+        if origin is None:
+            given = request.headers.get("authorization", "").lower().startswith("bearer ")
+            return "" if given else "a browser's request says where it comes from (Origin)"
+        return "" if urlsplit(origin).netloc == host else "from another site"
+
+
+def _name(host: str) -> str:
+    try:
+        return urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        return ""
+
+
+@cache
+def _headers() -> tuple[tuple[bytes, bytes], ...]:
+    style = base64.b64encode(hashlib.sha256(_login_style().encode()).digest()).decode()
+    policy = (
+        f"default-src 'none'; script-src 'self'; style-src 'self' 'sha256-{style}'; img-src 'self' data:; "
+        "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+    )
+    told = {
+        "Content-Security-Policy": policy,
+        "X-Content-Type-Options": "nosniff",
+        "X-Frame-Options": "DENY",
+        "Referrer-Policy": "same-origin",
+        "Cross-Origin-Resource-Policy": "same-origin",
+        "Cross-Origin-Opener-Policy": "same-origin",
+        "Cache-Control": "no-store",
+    }
+    return tuple((name.lower().encode(), value.encode()) for name, value in told.items())
+
+
+async def _body(request: Request) -> bytes:
+    """Raises TooLong; ValueError where the client goes away."""
+    received = b""
+    try:
+        async for piece in request.stream():
+            received += piece
+            if len(received) > BODY_MAX_BYTES:
+                raise TooLong
+    except ClientDisconnect:
+        raise ValueError from None
+    return received
+
+
+@cache
+def _asset(name: str) -> str:
+    return (files("runtime.page") / "assets" / name).read_text(encoding="utf-8")
+
+
+def _login_style() -> str:
+    """What stands between the style tags of the login page: the policy allows just this."""
+    return _asset("login.html").partition("<style>")[2].partition("</style>")[0]
+
+
+def _login(problem: str = "") -> str:
+    told = f'<p role="alert">{problem}</p>' if problem else ""
+    return _asset("login.html").replace("<!-- problem -->", told)

@@ -1,0 +1,58 @@
+"""The page's token: a file that only its owner reads, made where there is none; what a browser keeps instead of it."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import os
+import secrets
+import stat
+from pathlib import Path
+
+from runtime.errors import InputError
+
+TOKEN_BYTES = 32
+LEAST_CHARACTERS = 16
+MOST_BYTES = 4096
+
+
+def token_of(path: Path) -> str:
+    """The token in a file, which is made where there is none. Raises InputError, naming the file."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    except FileExistsError:
+        return _read(path)
+    except OSError as error:
+        raise InputError(path, "", f"cannot be made ({error.strerror})") from None
+    token = secrets.token_urlsafe(TOKEN_BYTES)
+    with os.fdopen(file, "w", encoding="ascii") as opened:
+        opened.write(token + "\n")
+    return token
+
+
+def _read(path: Path) -> str:
+    try:
+        file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
+    except OSError as error:
+        raise InputError(path, "", f"cannot be read ({error.strerror})") from None
+    with os.fdopen(file, "rb") as opened:
+        found = os.fstat(opened.fileno())
+        if not stat.S_ISREG(found.st_mode):
+            raise InputError(path, "", "is not a file")
+        if found.st_mode & 0o077:
+            raise InputError(path, "", f"others may read it (mode {found.st_mode & 0o777:o}): chmod 600, or delete it")
+        token = opened.read(MOST_BYTES).decode("ascii", "replace").strip()
+    if len(token) < LEAST_CHARACTERS or not token.isprintable() or " " in token:
+        raise InputError(path, "", f"holds no token: at least {LEAST_CHARACTERS} characters on one line; or delete it")
+    return token
+
+
+def same(given: str, token: str) -> bool:
+    """Whether they are the same, in a time that does not tell how much of them is."""
+    return hmac.compare_digest(given.encode(), token.encode())
+
+
+def cookie_of(token: str) -> str:
+    """What the browser keeps: made from the token, which can't be found from it."""
+    return hmac.new(token.encode(), b"phasestack page", hashlib.sha256).hexdigest()

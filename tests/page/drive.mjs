@@ -1,0 +1,159 @@
+// Drives the page in Debian's Chromium: NODE_PATH=... node drive.mjs ORIGIN TOKEN FOLDER, with playwright-core and
+// axe-core under NODE_PATH. Prints a line of JSON for each thing tried; on the line "kill" or "start" its parent ends
+// or starts the daemon and answers with a line on stdin.
+import { createRequire } from "node:module";
+import { readFileSync } from "node:fs";
+import { createInterface } from "node:readline";
+
+const find = createRequire(process.env.NODE_PATH + "/x");
+const { chromium } = find("playwright-core");
+const axe = readFileSync(find.resolve("axe-core/axe.min.js"), "utf8");
+const [, , origin, token, folder] = process.argv;
+const lines = createInterface({ input: process.stdin })[Symbol.asyncIterator]();
+const say = (what, value) => console.log(JSON.stringify({ what, value }));
+const parent = async (wish) => { say(wish, null); await lines.next(); };
+
+const browser = await chromium.launch({
+  executablePath: "/usr/bin/chromium",
+  args: ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync"],
+});
+const context = await browser.newContext({ viewport: { width: 1280, height: 900 } });
+const page = await context.newPage();
+const elsewhere = [], violations = [];
+page.on("request", (request) => { if (!/^(data:|blob:)/.test(request.url()) && !request.url().startsWith(origin)) elsewhere.push(request.url()); });
+page.on("console", (message) => { if (/Content Security Policy/.test(message.text())) violations.push(message.text()); });
+page.on("pageerror", (error) => violations.push(error.message));
+
+const now = () => page.evaluate(async () => (await fetch("/now/status")).json());
+const until = async (holds, within_ms = 60000) => {
+  const end = Date.now() + within_ms;
+  while (Date.now() < end) {
+    if (await holds()) return true;
+    await page.waitForTimeout(200);
+  }
+  return false;
+};
+const statusIs = (holds) => until(async () => { const s = await now(); return s.ok && holds(s); });
+const told = (text) => until(async () => (await page.textContent("#told")).includes(text));
+const shows = (selector, text) => until(async () => (await page.textContent(selector)).includes(text));
+const findings = async (target) => {
+  await target.evaluate(axe);
+  const found = await target.evaluate(() => window.axe.run(document));
+  return found.violations.filter((v) => ["serious", "critical"].includes(v.impact)).map((v) => `${v.id}: ${v.nodes[0].html}`);
+};
+
+// A wrong token.
+await page.goto(origin);
+say("login is accessible", await findings(await evaluated(page)));
+await page.fill("#token", "wrong");
+await page.keyboard.press("Enter");
+await page.waitForSelector("[role=alert]");
+say("a wrong token gets nothing", await page.evaluate(async () => {
+  const codes = [];
+  for (const path of ["/", "/page.js", "/now/status", "/now/pictures", "/now/log"]) codes.push((await fetch(path)).status);
+  return codes;
+}));
+
+// In, by the keyboard alone.
+await page.fill("#token", token);
+await page.keyboard.press("Enter");
+await page.waitForSelector("#state");
+say("state is shown", await until(async () => ["tracking", "holding", "flat", "degraded"].some((s) => s === null) ||
+  /tracking|holding|flat|degraded/.test(await page.textContent("#state"))));
+say("pictures are shown", await until(() => page.evaluate(() =>
+  [...document.querySelectorAll("#pictures img[src]")].filter((i) => i.naturalWidth > 100).length >= 3)));
+
+// Live figures change.
+const seen = new Set(), frames = new Set(), curves = new Set(), eyes = new Set();
+for (let k = 0; k < 40; k += 1) {
+  seen.add(await page.textContent("#numbers dd:nth-of-type(5)"));
+  frames.add(await page.getAttribute("#pictures", "data-frame"));
+  curves.add(await page.getAttribute("#plots path", "d"));
+  eyes.add(await page.innerHTML("#above"));
+  await page.waitForTimeout(250);
+}
+say("figures changed", [seen.size, frames.size, curves.size, eyes.size]);
+
+// Every control.
+await page.click("[data-command=pause]");
+say("pause", (await told("pause: done")) && (await statusIs((s) => s.paused)) &&
+  (await until(async () => (await page.getAttribute("[data-command=pause]", "aria-pressed")) === "true")));
+await page.click("[data-command=resume]");
+say("resume", (await told("resume: done")) && (await statusIs((s) => !s.paused)));
+await page.click("[data-command=flat]");
+say("flat", (await told("flat: done")) && (await statusIs((s) => s.flat_asked)));
+await page.focus("[data-command=resume]");
+await page.keyboard.press("Space");
+say("resume by the keyboard", (await told("resume: done")) && (await statusIs((s) => !s.flat_asked)));
+await page.click("[data-command=reload]");
+say("reload", await told("reload: done"));
+await page.fill("#scene", "grey");
+await page.keyboard.press("Enter");
+say("scene", (await told("scene: done")) && (await statusIs((s) => s.scene === "grey")));
+await page.fill("#scene", "no-such-scene");
+await page.click("#scene-form button");
+say("a scene that is not there", (await told("no-such-scene")) && (await statusIs((s) => s.scene === "grey")));
+say("scenes to choose from", await page.evaluate(() => document.querySelectorAll("#scenes option").length));
+await page.fill("#scene", "demo");
+await page.click("#scene-form button");
+say("scene back", (await told("scene: done")) && (await statusIs((s) => s.scene === "demo")));
+await page.fill("#budget", "40");
+await page.click("#budget-form button");
+say("budget", (await told("budget: done")) && (await statusIs((s) => s.budget && s.budget.budget_ms === 40)) &&
+  (await shows("#budget-told", "40 ms")));
+await page.fill("#budget", "0");
+await page.click("#budget-form button");
+say("no budget", (await told("budget: done")) && (await statusIs((s) => !s.budget || !s.budget.budget_ms)));
+await page.click("[data-command=blackbox]");
+say("black box", (await told("blackbox: done: /")) && (await page.textContent("#told")).endsWith(".mcap"));
+say("log and states", await page.evaluate(() => [document.querySelectorAll("#log li").length, document.querySelectorAll("#states li").length]));
+
+// Every control is reached by the keyboard.
+await page.evaluate(() => { document.activeElement.blur(); window.scrollTo(0, 0); });
+const reached = [];
+for (let k = 0; k < 20; k += 1) {
+  await page.keyboard.press("Tab");
+  reached.push(await page.evaluate(() => document.activeElement.dataset.command ?? (document.activeElement.id || document.activeElement.textContent)));
+}
+say("reached by tab", reached);
+
+// The daemon dies and comes back.
+await parent("kill");
+say("it says that the daemon is gone", (await until(() => page.isVisible("#gone"))) && (await shows("#state", "no daemon")));
+await page.click("[data-command=pause]");
+say("a wish without a daemon is refused", await until(async () => (await page.getAttribute("#told", "data-kind")) === "bad"));
+await page.screenshot({ path: `${folder}/page-gone.png` });
+await parent("start");
+say("it goes on when it is back", (await until(() => page.isHidden("#gone"))) && (await shows("#numbers", "presented")));
+await statusIs((s) => s.eyes_m && s.presented > 100);
+await page.waitForTimeout(8000);
+
+// As it looks, wide and narrow; accessibility.
+const narrow = await context.newPage();
+await narrow.setViewportSize({ width: 390, height: 844 });
+await narrow.goto(origin);
+await narrow.waitForSelector("#pictures img[src]");
+await narrow.waitForTimeout(5000);
+for (const [width, target] of [[1280, page], [390, narrow]]) {
+  await target.screenshot({ path: `${folder}/page-${width}.png`, fullPage: true });
+  await target.screenshot({ path: `${folder}/page-${width}-top.png` });
+  say(`fits ${width}`, await target.evaluate(() => document.documentElement.scrollWidth <= window.innerWidth));
+  say(`accessible at ${width}`, await findings(await evaluated(target)));
+}
+say("nothing from elsewhere", elsewhere);
+say("no violation of the policy, no error", violations);
+
+// Out.
+await page.click("header form button");
+await page.waitForSelector("#token");
+say("logged out", await page.evaluate(async () => (await fetch("/now/status")).status));
+await browser.close();
+process.exit(0);
+
+// The policy forbids what axe needs to run in the page: a second context ignores it, with the same cookie.
+async function evaluated(target) {
+  const session = await target.context().newCDPSession(target);
+  await session.send("Page.setBypassCSP", { enabled: true });
+  return target;
+}

@@ -1,0 +1,140 @@
+"""The page in Debian's Chromium, driven, on a running daemon: every control, live figures, a daemon that dies.
+
+Needs chromium, node, and a folder NODE_PATH with playwright-core and axe-core (npm).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from runtime.daemon.client import NotRunning, ask
+from tests.page.rig import ROOT, page_of, short_folder
+from tests.waiting import eventually
+
+pytestmark = pytest.mark.slow
+
+CONTROLS = (
+    "state is shown", "pictures are shown", "pause", "resume", "flat", "resume by the keyboard", "reload", "scene",
+    "a scene that is not there", "scene back", "budget", "no budget", "black box", "it says that the daemon is gone",
+    "a wish without a daemon is refused", "it goes on when it is back", "fits 1280", "fits 390",
+)  # fmt: skip
+CONFIGURATION = """
+[stack]
+width_px = 480
+height_px = 270
+[sensor]
+driver = "replay"
+source = "demo"
+loop = true
+[model]
+name = "fast"
+threads = 1
+[loop]
+solver_late_s = 10.0
+[service]
+socket = "s.sock"
+blackbox_folder = "boxes"
+"""
+
+
+class RunningDaemon:
+    """`phasestack run` that can be killed and started again."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        (folder / "d.toml").write_text(CONFIGURATION)
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        command = [sys.executable, "-m", "runtime.cli", "run", "--config", str(self._folder / "d.toml"), "--headless"]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        with (self._folder / "log").open("ab") as log:
+            self._process = subprocess.Popen(
+                [*command, "--json"], cwd=ROOT, env=environment, stdout=subprocess.DEVNULL, stderr=log
+            )
+        assert eventually(self._presents, within_s=120.0), (self._folder / "log").read_text()[-2000:]
+
+    def _presents(self) -> bool:
+        try:
+            return ask([self._folder / "s.sock"], {"command": "status"}).get("presented", 0) > 0
+        except NotRunning:
+            return False
+
+    def kill(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
+
+@pytest.fixture(scope="module")
+def tried(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
+    """What became of everything that was tried, by its name."""
+    modules = Path(os.environ.get("NODE_PATH", ""))
+    there = all((modules / name).is_dir() for name in ("playwright-core", "axe-core"))
+    if shutil.which("node") is None or shutil.which("chromium") is None or not there:
+        pytest.skip("chromium, node, and a NODE_PATH with playwright-core and axe-core are needed")
+    pictures = Path(os.environ.get("PHASESTACK_SCREENSHOTS") or tmp_path_factory.mktemp("pictures"))
+    with short_folder() as folder, page_of(folder / "s.sock", folder) as page:
+        daemon = RunningDaemon(folder)
+        daemon.start()
+        script = Path(__file__).with_name("drive.mjs")
+        command = ["node", str(script), page.origin, page.token, str(pictures)]
+        results: dict[str, Any] = {}
+        try:
+            with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as driver:
+                assert driver.stdin is not None and driver.stdout is not None
+                for line in driver.stdout:
+                    told = json.loads(line)
+                    results[told["what"]] = told["value"]
+                    if told["what"] in ("kill", "start"):
+                        daemon.kill() if told["what"] == "kill" else daemon.start()
+                        driver.stdin.write("done\n")
+                        driver.stdin.flush()
+            assert driver.returncode == 0, results
+        finally:
+            daemon.kill()
+        yield results
+
+
+@pytest.mark.parametrize("what", CONTROLS)
+def test_it_works_in_a_browser(tried: dict[str, Any], what: str) -> None:
+    assert tried[what] is True
+
+
+def test_a_wrong_token_gets_nothing(tried: dict[str, Any]) -> None:
+    assert tried["a wrong token gets nothing"] == [401] * 5
+    assert tried["logged out"] == 401
+
+
+def test_figures_pictures_plots_and_eyes_move(tried: dict[str, Any]) -> None:
+    assert min(tried["figures changed"]) >= 3
+
+
+def test_scenes_log_and_states_are_listed(tried: dict[str, Any]) -> None:
+    assert tried["scenes to choose from"] >= 10
+    assert min(tried["log and states"]) >= 2
+
+
+def test_every_control_is_reached_by_the_keyboard(tried: dict[str, Any]) -> None:
+    wanted = {"pause", "flat", "resume", "reload", "blackbox", "scene", "Show scene", "budget", "Set budget"}
+    assert wanted <= set(tried["reached by tab"])
+
+
+@pytest.mark.parametrize("where", ["login is accessible", "accessible at 1280", "accessible at 390"])
+def test_it_is_accessible(tried: dict[str, Any], where: str) -> None:
+    assert tried[where] == []
+
+
+def test_nothing_comes_from_elsewhere_and_nothing_breaks_the_policy(tried: dict[str, Any]) -> None:
+    assert tried["nothing from elsewhere"] == []
+    assert tried["no violation of the policy, no error"] == []

@@ -1,0 +1,196 @@
+"""The operator's page without a browser: nothing without the token, nothing done by GET, and the daemon's own words."""
+
+from __future__ import annotations
+
+import json
+import stat
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from runtime.clock import MonotonicClock
+from runtime.daemon.server import StatusServer
+from runtime.errors import InputError
+from runtime.page.token import cookie_of, token_of
+from tests.page.rig import ROOT, Page, page_of, short_folder
+from tests.waiting import eventually
+
+PATHS = ("/", "/page.js", "/page.css", "/now/status", "/now/pictures", "/now/log", "/now/about")
+
+
+class Loop:
+    """A daemon's socket and a loop that does what it is told; `told` remembers."""
+
+    def __init__(self, path: Path) -> None:
+        self.server = StatusServer(path, group="nobody", clock=MonotonicClock())
+        self.server.publish(lambda: {"state": "tracking", "secret": "of the daemon"})
+        self.server.lookups["pictures"] = lambda: {"frame": 7, "jpegs": {}}
+        self.server.lookups["log"] = lambda: {"lines": [], "states": []}
+        self.server.lookups["about"] = lambda: {"scenes": ["demo"]}
+        self.told: list[tuple[str, Any]] = []
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.01):
+            while not self.server.commands.empty():
+                command = self.server.commands.get()
+                if command.take():
+                    self.told.append((command.name, command.value))
+                    if command.value == "missing":
+                        command.refuse("nobody knows 'missing'")
+                    else:
+                        command.done()
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self.server.close()
+
+
+@pytest.fixture(scope="module")
+def folder() -> Iterator[Path]:
+    with short_folder() as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def page(folder: Path) -> Iterator[Page]:
+    with page_of(folder / "s.sock", folder) as running:
+        yield running
+
+
+@pytest.fixture
+def loop(folder: Path) -> Iterator[Loop]:
+    running = Loop(folder / "s.sock")
+    yield running
+    running.close()
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("given", [{}, {"Authorization": "Bearer wrong"}, {"Cookie": "phasestack=wrong"}])
+def test_without_the_token_there_is_nothing_but_the_form(page: Page, loop: Loop, path: str, given: dict) -> None:
+    code, _, body = page.ask("GET", path, **given)
+    assert code == 401
+    assert b"secret" not in body and b"page.js" not in body
+    assert (b"<form" in body) == (path == "/")
+
+
+@pytest.mark.parametrize("path", ["/do", "/login", "/logout"])
+def test_a_get_does_nothing(page: Page, loop: Loop, path: str) -> None:
+    code, _, _ = page.ask("GET", f"{path}?command=pause&token={page.token}", **page.bearer)
+    assert code in (404, 405) and loop.told == []
+
+
+def test_with_the_token_it_tells_what_the_daemon_tells(page: Page, loop: Loop) -> None:
+    assert eventually(lambda: page.look_up("status").get("secret") == "of the daemon")
+    assert eventually(lambda: page.look_up("pictures").get("frame") == 7)
+    assert page.look_up("other") == {"ok": False, "error": "there is no such thing to look up"}
+
+
+def test_the_form_gives_a_cookie_that_is_not_the_token_and_that_scripts_cant_read(page: Page, loop: Loop) -> None:
+    code, headers, _ = page.ask("POST", "/login", body=f"token={page.token}", Origin=page.origin)
+    assert (code, headers["location"]) == (303, "/")
+    cookie = headers["set-cookie"]
+    assert page.token not in cookie and "HttpOnly" in cookie and "SameSite=strict" in cookie
+    code, _, body = page.ask("GET", "/", Cookie=cookie.partition(";")[0])
+    assert code == 200 and b"page.js" in body
+
+
+def test_a_wrong_token_in_the_form_gets_no_cookie(page: Page) -> None:
+    code, headers, body = page.ask("POST", "/login", body="token=wrong", Origin=page.origin)
+    assert code == 401 and "set-cookie" not in headers and b"not the token" in body
+
+
+def test_another_sites_request_is_refused_though_the_browser_gives_the_cookie(page: Page, loop: Loop) -> None:
+    cookie = f"phasestack={cookie_of(page.token)}"
+    body = json.dumps({"command": "pause"})
+    for headers in ({"Origin": "http://elsewhere.example"}, {"Origin": "null"}, {}):
+        code, _, _ = page.ask("POST", "/do", body=body, Cookie=cookie, **headers)
+        assert code == 403
+    assert loop.told == []
+    code, _, _ = page.ask("POST", "/do", body=body, Cookie=cookie, Origin=page.origin)
+    assert code == 200 and loop.told == [("pause", None)]
+
+
+def test_a_name_that_leads_here_and_is_not_this_machines_is_refused(page: Page, loop: Loop) -> None:
+    assert page.ask("GET", "/now/status", **(page.bearer | {"Host": "elsewhere.example"}))[0] == 403
+
+
+def test_wishes_reach_the_daemon_and_its_refusals_the_page(page: Page, loop: Loop) -> None:
+    assert page.tell("scene", "grey") == (200, {"ok": True})
+    assert page.tell("budget", 20) == (200, {"ok": True})
+    code, answer = page.tell("scene", "missing")
+    assert (code, answer["error"]) == (409, "nobody knows 'missing'")
+    code, answer = page.tell("budget", "much")
+    assert (code, answer["error"]) == (409, "value: budget wants milliseconds")
+    assert loop.told == [("scene", "grey"), ("budget", 20.0), ("scene", "missing")]
+
+
+@pytest.mark.parametrize("body", ["", "[]", "{", '{"command": "status"}', '{"command": "exec"}', "x" * 70_000])
+def test_what_is_no_wish_is_refused_in_one_line(page: Page, loop: Loop, body: str) -> None:
+    code, _, answer = page.ask("POST", "/do", body=body, **page.bearer)
+    assert code in (400, 413) and json.loads(answer)["ok"] is False and loop.told == []
+
+
+def test_without_a_daemon_it_says_so_and_when_one_is_back_it_goes_on(page: Page, folder: Path) -> None:
+    assert eventually(lambda: "no daemon" in page.look_up("status").get("error", ""))
+    assert page.ask("GET", "/now/status", **page.bearer)[0] == 503
+    assert page.tell("pause")[0] == 503
+    back = Loop(folder / "s.sock")
+    try:
+        assert eventually(lambda: page.look_up("status").get("ok") is True)
+    finally:
+        back.close()
+
+
+def test_nothing_may_be_loaded_from_elsewhere_and_no_inline_script_runs(page: Page) -> None:
+    _, headers, body = page.ask("GET", "/", **page.bearer)
+    policy = headers["content-security-policy"]
+    assert "default-src 'none'" in policy and "script-src 'self';" in policy and "frame-ancestors 'none'" in policy
+    assert "unsafe" not in policy and headers["cache-control"] == "no-store"
+    for name in ("page.html", "page.css", "page.js", "login.html"):
+        text = (ROOT / "runtime" / "page" / "assets" / name).read_text()
+        assert "https://" not in text and text.replace("http://www.w3.org/2000/svg", "").count("http://") == 0
+    assert b"style=" not in body and b"onclick" not in body
+
+
+def test_the_token_is_made_once_for_its_owner_alone(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "token"
+    token = token_of(path)
+    assert len(token) >= 40 and token_of(path) == token
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "problem"),
+    [("a" * 40, 0o640, "others may read it"), ("short", 0o600, "holds no token"), ("", 0o600, "holds no token")],
+)
+def test_a_token_file_that_is_none_is_refused(tmp_path: Path, text: str, mode: int, problem: str) -> None:
+    path = tmp_path / "token"
+    path.write_text(text)
+    path.chmod(mode)
+    with pytest.raises(InputError, match=problem):
+        token_of(path)
+
+
+def test_a_link_in_the_tokens_place_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "aim").write_text("a" * 40)
+    (tmp_path / "token").symlink_to(tmp_path / "aim")
+    with pytest.raises(InputError, match="cannot be read"):
+        token_of(tmp_path / "token")
+
+
+@pytest.mark.parametrize(
+    ("options", "field"), [(["--host", "192.0.2.1"], "--host"), (["--config", "/nowhere.toml"], "nowhere.toml")]
+)
+def test_bad_options_are_one_line_and_exit_2(tmp_path: Path, options: list[str], field: str) -> None:
+    command = [sys.executable, "-m", "runtime.cli", "page", "--token-file", str(tmp_path / "t"), "--port", "0"]
+    done = subprocess.run([*command, *options], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2 and field in done.stderr and done.stderr.count("\n") == 1
