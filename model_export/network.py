@@ -39,21 +39,26 @@ class SpectralSolver(nn.Module):
         self.register_buffer("w", w.repeat(BLOCK_ROWS), persistent=False)
         self.register_buffer("v", v.repeat_interleave(2 * cell_px), persistent=False)
         self.log_floor = nn.Parameter(torch.log(torch.tensor([0.01, 0.2])))  # λ of g and of h
+        self.log_rough = nn.Parameter(torch.log(torch.tensor([0.05, 0.2])))  # and how they grow with w²
         self.log_doubt = nn.Parameter(torch.zeros(2))  # how much the doubt along the line and across it weighs
-        self.log_penalty = nn.Parameter(torch.full((max(iterations, 1),), math.log(0.1)))
-        self.relaxation = nn.Parameter(torch.full((max(iterations, 1),), 1.6))
+        self.log_penalty = nn.Parameter(torch.full((iterations,), math.log(0.05)))
+        self.relaxation = nn.Parameter(torch.full((iterations,), 1.6))
 
     def gains(self, spectrum: Tensor, doubt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(patterns, cells + 1) each: numerator and denominator of g, with what h takes over left out, and h's gain."""
         scale = torch.exp(self.log_doubt)
-        along, across = doubt[0] * self.w * scale[0], doubt[1] * self.v * scale[1]
-        m2 = torch.exp(-(along * along + across * across))[:, None]
+        # A mode of the chain in a pattern of the block is two waves, its frequency beside the pattern's either way.
+        beside = 2 * torch.asin(torch.clamp(spectrum / 4, 0, 1))[None] / (2 * self.cell_px)
+        pattern = self.w[:, None]
+        along2 = (doubt[0] * scale[0]) ** 2 * (pattern * pattern + beside * beside)
+        across = (doubt[1] * scale[1] * self.v)[:, None]
+        m2 = torch.exp(-(along2 + across * across))
         s2 = (spectrum * spectrum)[None]  # 16 sin²(ws)
         c2 = 16 - s2
         cos_2ws = 1 - s2 / 8
-        turn = (self.w * doubt[2])[:, None]
-        alpha2, beta2 = m2 * s2 * torch.cos(turn) ** 2, m2 * c2 * torch.sin(turn) ** 2
-        floor = torch.exp(self.log_floor)
+        cos_2we = torch.cos(2 * pattern * doubt[2]) * torch.cos(2 * beside * doubt[2])
+        alpha2, beta2 = m2 * s2 * (1 + cos_2we) / 2, m2 * c2 * (1 - cos_2we) / 2
+        floor = torch.exp(self.log_floor)[:, None, None] + torch.exp(self.log_rough)[:, None, None] * pattern * pattern
         noise, crossed = 8 * (1 - m2), 8 * cos_2ws * (m2 - m2 * m2)
         cost_g, cost_h = noise + crossed + floor[0], noise - crossed + floor[1]
         m = torch.sqrt(m2)

@@ -21,7 +21,7 @@ class Weights:
 
     def __init__(self, graph: Any) -> None:
         self._graph = graph
-        self._held = {item.name: numpy_helper.to_array(item) for item in graph.initializer}
+        self._stored = {item.name: numpy_helper.to_array(item) for item in graph.initializer}
         self._made = {output: node for node in graph.node for output in node.output}
 
     def of(self, kinds: set[str]) -> list[list[np.ndarray]]:
@@ -37,20 +37,13 @@ class Weights:
                     found.append(parts)
         return found
 
-    def kinds(self) -> list[str]:
-        """The operator of every node, in order."""
-        return [node.op_type for node in self._graph.node]
-
-    def named(self, name: str) -> np.ndarray:
-        """A constant by its name. Raises ValueError where there is none."""
-        value = self._constant(name)
-        if value is None:
-            raise ValueError(f"{name} is missing")
-        return value
+    def held(self, name: str) -> np.ndarray | None:
+        """A constant by its name."""
+        return self._constant(name)
 
     def _constant(self, name: str) -> np.ndarray | None:
-        if name in self._held:
-            return self._held[name].astype(np.float32)
+        if name in self._stored:
+            return self._stored[name].astype(np.float32)
         node = self._made.get(name)
         if node is None:
             return None
@@ -58,10 +51,10 @@ class Weights:
             return numpy_helper.to_array(node.attribute[0].t).astype(np.float32)
         if node.op_type in {"Cast", "Identity"}:
             return self._constant(node.input[0])
-        if node.op_type != "DequantizeLinear" or node.input[0] not in self._held:
+        if node.op_type != "DequantizeLinear" or node.input[0] not in self._stored:
             return None
-        value, scale = self._held[node.input[0]], self._held[node.input[1]]
-        zero = self._held[node.input[2]] if len(node.input) > 2 else np.zeros_like(scale)
+        value, scale = self._stored[node.input[0]], self._stored[node.input[1]]
+        zero = self._stored[node.input[2]] if len(node.input) > 2 else np.zeros_like(scale)
         axis = next((a.i for a in node.attribute if a.name == "axis"), 1)
         shape = [1] * value.ndim
         if scale.ndim == 1:
@@ -84,12 +77,14 @@ def rebuilt(model: onnx.ModelProto, contract: Contract, *, source: str) -> nn.Mo
 
 
 def _spectral(weights: Weights, contract: Contract) -> nn.Module:
-    cell_px, iterations = contract.cell_px, sum(name == "Clip" for name in weights.kinds()) - 2
-    net = SpectralSolver(cell_px, max(iterations, 0))
+    penalties = weights.held("log_penalty")
+    net = SpectralSolver(contract.cell_px, 0 if penalties is None else penalties.size)
     for name, parameter in net.named_parameters():
-        value = weights.named(name)
-        if value.shape != tuple(parameter.shape):
-            raise ValueError(f"{name}: {value.shape} instead of {tuple(parameter.shape)}")
+        if not parameter.numel():
+            continue
+        value = weights.held(name)
+        if value is None or value.shape != tuple(parameter.shape):
+            raise ValueError(f"{name} is missing or of another shape")
         parameter.data = torch.from_numpy(value.copy())
     return net.eval()
 

@@ -30,6 +30,11 @@ class Fade:
     right: bool = True
     bottom: bool = True
 
+    def turned(self) -> Fade:
+        """The same with rows for columns."""
+        box = Box(self.kept.v0, self.kept.u0, self.kept.v1, self.kept.u1)
+        return Fade(box, self.over_px[::-1], left=self.top, top=self.left, right=self.bottom, bottom=self.right)
+
     def wave_weights(self, centre_from_raster: F64, *, rows: int, columns: int) -> F32:
         """(rows or 1, columns, 1): 0 beside what is kept to 1 inside, on a raster; 3x3, affine."""
         m = centre_from_raster

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import ceil
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ REAR, CENTRE, FRONT = 0, 1, 2
 OUTER = (REAR, FRONT)
 EYES = (0, 1)
 START = FULL // 2  # of every outer panel: the middle of its range
+LEAST_SPREAD, MOST_SPREAD = 0.5, 8.0  # pixels; below half a pixel care costs more time than it gains
 EVEN = (START + SUBCODE // 2) // SUBCODE  # the same in 8-bit codes, rounded as what is shown is
 
 
@@ -42,6 +44,8 @@ class Level:
         names += [(name, CENTRE, side) for name in ("residual", "back") for side in EYES]
         self._whole = {name: buffer(height, width, channels=channels) for name in names}
         self.rasters: tuple[PlaneRaster, ...] = ()
+        self.spread: dict[int, tuple[float, float]] = {}  # per outer panel, right and down, pixels
+        self._mean: dict[int, I16] = {}
         self.wanted: list[I16] = []  # per eye, phase sums on the centre panel
 
     @property
@@ -57,11 +61,25 @@ class Level:
         self.residual = tuple(self._view("residual", CENTRE, side, on=CENTRE) for side in EYES)
         self._back = {n: tuple(self._view("back", CENTRE, side, on=n) for side in EYES) for n in OUTER}
 
+    def be_unsure(self, eyes_m: F64, *, eye_sigma_mm: float) -> None:
+        """Correct for eyes (2, 3) that err by so much, an axis: what is left of the outer panels in the mean counts,
+        and what moves of them is noise. Spreads too small to be felt on this raster are none."""
+        eye_x_m, centre_x_m = eyes_m[:, 0].mean(), self.rasters[CENTRE].x_m
+        self.spread = {}
+        for n in OUTER:
+            raster = self.rasters[n]
+            moved_m = eye_sigma_mm / 1e3 * abs(raster.x_m - centre_x_m) / (eye_x_m - centre_x_m)
+            spread = min(moved_m / raster.pitch_u_m, MOST_SPREAD), min(moved_m / raster.pitch_v_m, MOST_SPREAD)
+            if max(spread) >= LEAST_SPREAD:
+                self.spread[n] = spread
+
     def look(self, panels: Sequence[int], eyes_m: F64) -> None:
-        """See outer panels anew through the centre panel's pixels."""
+        """See outer panels anew through the centre panel's pixels: in the mean, where the eyes are unsure."""
         for n in panels:
+            panel = self._blurred(self.outer[n], n)
+            self._mean[n] = panel
             for side, eye_m in enumerate(eyes_m):
-                self._between(self.outer[n], eye_m, of=n, on=CENTRE, out=self.seen[n, side])
+                self._between(panel, eye_m, of=n, on=CENTRE, out=self.seen[n, side])
 
     def lacks(self) -> None:
         """Find what each eye still lacks when the centre panel is the best one for the outer panels."""
@@ -83,8 +101,18 @@ class Level:
     def correct(self, panel: int, eyes_m: F64, *, size: float, shown: bool) -> None:
         """Change one outer panel by what both eyes lack along the rays through each of its pixels."""
         back, outer = self._back[panel], self.outer[panel]
+        other = REAR if panel == FRONT else FRONT
         for side, eye_m in enumerate(eyes_m):
-            self._between(self.residual[side], eye_m, of=CENTRE, on=panel, out=back[side])
+            residual = self.residual[side]
+            if self.spread:
+                # With m of a wave left, the noise is |front - m²·rear|²(1 - m²): its gradient joins the mean's.
+                seen = self.seen[other, side]
+                residual = residual + seen - self._blurred(seen, panel, twice=True)
+            self._between(residual, eye_m, of=CENTRE, on=panel, out=back[side])
+        if self.spread:
+            noise = outer - self._blurred(self._mean[panel], panel)
+            back[0][...] = self._blurred(back[0] + back[1], panel) - 2 * noise
+            back[1][...] = 0
         eighths = np.int16(round(size * 8))
 
         def work(rows: slice, change: I16) -> None:
@@ -127,6 +155,15 @@ class Level:
             out[rows] = best
 
         self._each(CENTRE, work)
+
+    def _blurred(self, image: I16, panel: int, *, twice: bool = False) -> I16:
+        """What is left of an image in the mean over where the eyes may be, as an outer panel's pixels move."""
+        spread = self.spread.get(panel)
+        if spread is None:
+            return image
+        u, v = (s * np.sqrt(2.0) if twice else s for s in spread)
+        size = 2 * ceil(3 * max(u, v)) + 1
+        return np.asarray(cv2.GaussianBlur(image, (size, size), sigmaX=u, sigmaY=v, borderType=cv2.BORDER_REPLICATE))
 
     def _each(self, panel: int, work: Work) -> None:
         raster = self.rasters[panel]

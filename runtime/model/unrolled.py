@@ -32,6 +32,8 @@ from runtime.optics.pupil import POINT_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
 
+HALF_IPD_M = 0.031
+
 
 class UnrolledPredictor(Predictor):
     """Models of `input_frame` chain: three evenly spaced panels, any pose.
@@ -52,6 +54,8 @@ class UnrolledPredictor(Predictor):
         self.name, self.provider = session.contract.name, session.provider
         self.parameters = session.contract.parameters
         self.one_channel = one_channel
+        self._threads = threads
+        self._twin: UnrolledPredictor | None = None  # for eyes above each other
         self.fade: Fade | None = None  # how this stack ends, where it is a part of larger panels
         self._rows = RowPool(threads, width_px=stack.width_px)
         self._benches: dict[int, Bench] = {}
@@ -74,10 +78,15 @@ class UnrolledPredictor(Predictor):
         return (visible_boxes(eyes_m, self.stack)[CENTRE].slices,)
 
     def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> Prediction:
+        across_m = np.abs(eyes_m[1] - eyes_m[0])
+        if across_m[2] > across_m[1]:
+            return self._turned(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
         watch = Stopwatch()
         contract = self.session.contract
+        # One eye that stands for both asks for no difference: the chain may run along any line.
+        along_m = eyes_m if across_m.any() else eyes_m + HALF_IPD_M * np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
         try:
-            frame = chain_frame(eyes_m, self.stack, cell_px=contract.cell_px, reduction=contract.reduction)
+            frame = chain_frame(along_m, self.stack, cell_px=contract.cell_px, reduction=contract.reduction)
         except ValueError as error:
             raise ModelFailure(str(error)) from None
         self._boxes = visible_boxes(eyes_m, self.stack)
@@ -88,6 +97,8 @@ class UnrolledPredictor(Predictor):
         for level in bench.levels.values():
             level.wanted = [np.asarray(phases, np.int16) for phases in self._phases(pictures, level.size)]
         last = {n: _last_change(contract.steps, n) for n in OUTER}
+        for level in bench.levels.values():
+            level.be_unsure(eyes_m, eye_sigma_mm=eye_sigma_mm)
         level = bench.levels[contract.steps[0].reduction]
         for index, step in enumerate(contract.steps):
             if step.reduction != level.reduction:
@@ -114,6 +125,26 @@ class UnrolledPredictor(Predictor):
 
     def close(self) -> None:
         self._rows.close()
+        if self._twin is not None:
+            self._twin.close()
+
+    def _turned(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float) -> Prediction:
+        """Eyes above each other: the same problem with rows for columns, solved by a twin for panels turned so."""
+        if self._twin is None:
+            stack = self.stack
+            turned = PanelStack(stack.height_m, stack.width_m, stack.x_m, stack.height_px, stack.width_px)
+            self._twin = UnrolledPredictor(self.session, turned, threads=self._threads)
+        twin = self._twin
+        twin.one_channel, twin.fade = self.one_channel, self.fade and self.fade.turned()
+        # A picture's rows become its columns: what was down (-z) is to the right (+y), what was right is down.
+        turned_m = np.stack([eyes_m[:, 0], -eyes_m[:, 2], -eyes_m[:, 1]], axis=1)
+        order = (0, 1) if turned_m[1, 1] > turned_m[0, 1] else (1, 0)
+        pictures = [[np.asarray(cv2.transpose(images[side][0]), np.uint8)] for side in order]
+        solved = twin.predict(pictures, turned_m[list(order)], eye_sigma_mm=eye_sigma_mm)
+        for layer, part in zip(self._layers, solved.layers, strict=True):
+            cv2.transpose(part, dst=layer)
+        self._drawn, self.channels = (), twin.channels
+        return Prediction(self._layers, solved.stage_ms)
 
     def _bench(self) -> Bench:
         """What the steps work on, cut to what the eyes look through; panels are even beside it."""

@@ -42,7 +42,6 @@ COUNTED_ONCE = (
     *("Abs", "Add", "Clip", "Cos", "Div", "Erf", "Exp", "HardSigmoid", "LeakyRelu", "Log", "Max", "Min", "Mul", "Neg"),
     *("Pow", "Reciprocal", "Relu", "Sigmoid", "Sin", "Softplus", "Sqrt", "Sub", "Tanh"),
 )
-DTYPES = {"tensor(int16)": np.int16, "tensor(uint8)": np.uint8, "tensor(float16)": np.float16}  # others: float32
 
 
 def node_multiply_adds(kind: str, inputs: Sequence[Shape], output: Shape) -> int:
@@ -65,7 +64,10 @@ def node_multiply_adds(kind: str, inputs: Sequence[Shape], output: Shape) -> int
 
 def graph_multiply_adds(path: Path, shapes: Sequence[Shape]) -> int:
     """Of one run of an ONNX file on inputs of these shapes, in its order. Raises InputError: no such run."""
-    import onnxruntime as ort
+    from runtime.model.onnx_runtime import onnxruntime
+    from runtime.model.session import TYPES
+
+    ort = onnxruntime()
 
     options = ort.SessionOptions()
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
@@ -76,13 +78,8 @@ def graph_multiply_adds(path: Path, shapes: Sequence[Shape]) -> int:
         options.profile_file_prefix = str(Path(folder) / "run")
         try:
             session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-            session.run(
-                None,
-                {
-                    item.name: np.zeros(shape, DTYPES.get(item.type, np.float32))
-                    for item, shape in zip(session.get_inputs(), shapes, strict=True)
-                },
-            )
+            inputs = zip(session.get_inputs(), shapes, strict=True)
+            session.run(None, {item.name: np.zeros(shape, TYPES[item.type]) for item, shape in inputs})
         except Exception as error:  # onnxruntime raises its own hierarchy of undocumented exceptions
             raise InputError(path, "", f"does not run ({(str(error).splitlines() or [''])[0][:120]})") from None
         events = json.loads(Path(session.end_profiling()).read_text(encoding="utf-8"))

@@ -11,6 +11,7 @@ from runtime.model.predictor import load_predictor
 from runtime.model.sart import SartPredictor
 from runtime.model.still import solve_still
 from runtime.model.visible import visible_boxes
+from runtime.optics.carried import expected_psnrs_db
 from runtime.optics.retina import panel_positions
 from runtime.optics.stack import PanelStack
 from tests.model.scenes import FOV_DEG, STACK, card_scene, displayed, eyes
@@ -93,11 +94,47 @@ def test_what_was_seen_before_does_not_leak_into_the_next_frame() -> None:
     assert (again.layers == solved("balanced", pair)).all()
 
 
-def test_eyes_above_each_other_are_a_model_failure_not_a_crash() -> None:
+@pytest.mark.parametrize("roll_deg", [-90, 60, 90, 120])
+def test_a_head_that_lies_on_its_side_is_served_as_well_as_an_upright_one(roll_deg: float) -> None:
+    pair = eyes(0.6, roll_deg=roll_deg)
+    upright = displayed(solved("balanced", eyes(0.6)), eyes(0.6), STACK).psnr_db
+    assert displayed(solved("balanced", pair), pair, STACK).psnr_db > upright - 1.5
+
+
+def test_a_head_that_lies_down_and_sits_up_again_leaves_nothing_behind() -> None:
+    predictor = load_predictor("balanced", STACK, ModelSettings(threads=1))
+    for roll_deg in (0, 90, 0):
+        pair = eyes(0.6, roll_deg=roll_deg)
+        pictures = [card_scene(eye) for eye in pair]
+        layers = solve_still(*pictures, eyes_m=pair, fov_deg=FOV_DEG, predictor=predictor).layers
+        assert (layers == solved("balanced", pair)).all()
+
+
+def test_eyes_at_one_place_and_a_doubt_that_is_no_number_are_model_failures() -> None:
     predictor = load_predictor("fast", STACK)
     grey = np.full((270, 480, 4), 128, np.uint8)
-    with pytest.raises(ModelFailure):
-        predictor.predict([[grey], [grey]], np.array([[0.6, 0.0, -0.03], [0.6, 0.0, 0.03]]))
+    for pair, sigma_mm in ((np.array([[0.6, 0.0, 0.0]] * 2), 1.0), (eyes(0.6), np.nan), (eyes(0.6), np.inf)):
+        with pytest.raises(ModelFailure):
+            predictor.predict([[grey], [grey]], pair, eye_sigma_mm=sigma_mm)
+
+
+def test_what_is_solved_for_unsure_eyes_is_better_for_them_and_worse_for_two_points() -> None:
+    pair = POSES["in front"]
+    pictures = [card_scene(eye) for eye in pair]
+    predictor = load_predictor("balanced", STACK, ModelSettings(threads=1))
+    shown = {
+        sigma_mm: solve_still(
+            *pictures, eyes_m=pair, fov_deg=FOV_DEG, predictor=predictor, eye_sigma_mm=sigma_mm
+        ).layers.copy()
+        for sigma_mm in (0.0, 4.0)
+    }
+    expected = {
+        s: expected_psnrs_db(layers, pictures, STACK, eyes_m=pair, fov_deg=FOV_DEG, sigmas_mm=[4.0])[4.0]
+        for s, layers in shown.items()
+    }
+    assert expected[4.0] > expected[0.0] + 1
+    exact = {s: displayed(layers, pair, STACK).psnr_db for s, layers in shown.items()}
+    assert exact[0.0] > exact[4.0] + 1
 
 
 @pytest.mark.parametrize("pose", POSES)

@@ -89,7 +89,8 @@ def test_the_raster_s_own_sight_is_what_eyes_see_of_panels_that_are_drawn_on_it(
     smooth = tuple(cv2.GaussianBlur(picture, (0, 0), 3.0) for picture in pair.images)
     pair = replace(pair, images=smooth, eye_sigma_mm=4.0)
     with torch.no_grad():
-        ours = displayed_mse(net, sight_of(pair, recipe, device=torch.device("cpu")))
+        sight = sight_of(pair, recipe, device=torch.device("cpu"))
+        ours = displayed_mse(net, sight)
     predictor = load_predictor("balanced", pair.stack, ModelSettings(threads=1))
     session = predictor.session  # type: ignore[attr-defined]
     alone = {"steps": session.contract.steps[:1], "emphasis": 0.0}
@@ -108,7 +109,11 @@ def test_the_raster_s_own_sight_is_what_eyes_see_of_panels_that_are_drawn_on_it(
             phase += sample_bilinear(layers[n].astype(np.float32), u=x, v=y)
         errors.append(np.square(np.sin(phase * np.pi / 2) ** 2 - picture / 255)[counts].mean())
     theirs_db, ours_db = -10 * np.log10(np.mean(errors)), -10 * np.log10(float(ours[0]))
-    assert ours_db == pytest.approx(theirs_db, abs=3.0), "half of the error would be another geometry"
+    mirrored = replace(sight, wanted=sight.wanted[::-1])
+    with torch.no_grad():
+        wrong_db = -10 * np.log10(float(displayed_mse(net, mirrored)[0]))
+    assert ours_db == pytest.approx(theirs_db, abs=6.0)  # eight bits and the panels' own pixels
+    assert wrong_db < ours_db - 12, "the wrong eye's sight would be no better"
     assert float(ours[1]) > float(ours[0])
 
 

@@ -5,7 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 
-from runtime.report.stability import calibration, controls, networks, phases, poses, retina, rpu, solve, tracking
+from runtime.report.stability import (
+    calibration,
+    controls,
+    networks,
+    phases,
+    poses,
+    retina,
+    rpu,
+    solve,
+    tracking,
+    uncertainty,
+)
 from runtime.report.stability.calibration import Fit
 from runtime.report.stability.limits import key_of
 from runtime.report.stability.networks import Check
@@ -27,6 +38,7 @@ def every_trial(fits: Mapping[str, Fit], check: Check, *, full: bool, limits: Ma
         retina.STAGE: retina.trials,
         solve.STAGE: partial(solve.trials, solve.Solvers(methods=methods)),
         networks.STAGE: partial(networks.trials, check, full=full),
+        uncertainty.STAGE: uncertainty.trials,
         tracking.STAGE: partial(tracking.trials, full=full),
         calibration.STAGE: partial(calibration.trials, fits),
         controls.STAGE: partial(controls.trials, limits, fits),

@@ -1,0 +1,145 @@
+"""Extreme cases of unsure eyes: the network along the eyes' line against least squares written out in double."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from functools import lru_cache, partial
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from runtime.config import ModelSettings
+from runtime.model.chain import chain_modes
+from runtime.model.predictor import load_predictor
+from runtime.model.transfer import FULL
+from runtime.model.unrolled import UnrolledPredictor
+from runtime.optics.stack import PanelStack
+from runtime.records import F64, U8
+from runtime.report.stability.trial import Answer, Trial, refusal
+
+STAGE = "unsure eyes"
+STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
+SIGMAS_MM = (0.0, 1e-6, 0.1, 1.0, 2.0, 4.0, 10.0, 50.0)
+MODELS = ("fast", "balanced", "best")
+ROWS, PANEL_CODE = 8, 1 / 255
+
+
+@lru_cache(maxsize=len(MODELS))
+def loaded(model: str) -> UnrolledPredictor:
+    """A shipped model on the small panels."""
+    predictor = load_predictor(model, STACK, ModelSettings(threads=1))
+    assert isinstance(predictor, UnrolledPredictor)
+    return predictor
+
+
+def answer_of(model: str, need: F64, doubt: tuple[float, float, float]) -> F64:
+    """(2, rows, columns) rear and front for what the right eye lacks (rows, columns), the left one the opposite."""
+    session = loaded(model).session
+    columns = 2 * session.contract.cell_px
+    cells = need.shape[1] // columns
+    codes = np.rint(need * FULL).astype(np.int16).reshape(ROWS, cells, columns)
+    modes: Mapping[str, Any] = dict(
+        zip(("waves", "shifted_waves", "spectrum", "modes_in"), chain_modes(cells), strict=True)
+    )
+    shape = (ROWS, cells + 1, columns)
+    feeds = {"left": -codes, "right": codes, **modes, "doubt": np.array(doubt, np.float32)}
+    found = session.run(feeds, {"rear": shape, "front": shape, "check": (1,)})
+    return np.stack([found[name].reshape(ROWS, -1) for name in ("rear", "front")]) / FULL
+
+
+def unsure(model: str, sigma_columns: float) -> Answer:
+    """One wave, even along rows and within cells, against its own least squares.
+
+    Even in every cell, the centre's parallax nothing: g = s/(s² + 8(1 - m²)cos(2ws)-terms + floor)·2·need per mode of
+    the chain (the network's docstring). What an even pattern has of doubt is its mode's own frequency; the floor is
+    bounded, not known: the answer must lie between none and a hundredth.
+    """
+    cell = loaded(model).session.contract.cell_px
+    cells, k = 12, 3
+    angle = np.pi * k / (cells + 1)
+    along = np.repeat(np.sin(angle * np.arange(1, cells + 1)), 2 * cell) * 0.05
+    need = np.tile(along, (ROWS, 1))
+    rear, front = answer_of(model, need, (sigma_columns, 0.0, 0.0))
+    s2 = (4 * np.sin(angle / 2)) ** 2
+    m2 = np.exp(-((sigma_columns * angle / (2 * cell)) ** 2))
+    noise = 8 * (1 - m2) + 8 * (1 - s2 / 8) * (m2 - m2 * m2)
+    at = np.repeat(np.cos(angle * (np.arange(cells + 1) + 0.5)), 2 * cell)
+    found = float((front - rear).mean(axis=0) @ at / (at @ at) / 2)
+    wanted = [-2 * 0.05 * math.sqrt(m2 * s2) / (m2 * s2 + noise + floor) for floor in (0.0, 0.05)]
+    off = max(min(wanted) - found, found - max(wanted), 0.0)
+    return Answer(
+        off, PANEL_CODE, 1 / (m2 * s2 + noise + 1e-3), note=f"{found:.4f}, between {wanted[0]:.4f} and {wanted[1]:.4f}"
+    )
+
+
+def small(model: str, rows_or_columns: str) -> Answer:
+    """One cell, or one chain's worth of difference: finite, in the box, nothing where nothing is wanted."""
+    cell = loaded(model).session.contract.cell_px
+    cells = 1 if rows_or_columns == "one cell" else 9
+    need = np.zeros((ROWS, cells * 2 * cell))
+    need[:, :: 2 * cell] = 0.2
+    panels = answer_of(model, need, (0.1, 0.1, 0.3))
+    even = answer_of(model, 0 * need, (0.1, 0.1, 0.3))
+    inside = float(max(panels.max() - 1, -panels.min(), 0.0))
+    return Answer(max(inside, float(np.abs(even - 0.5).max())), 1 / FULL)
+
+
+def clipped(model: str) -> Answer:
+    """A difference that no panel can show: every value in the range, the way to it taken as far as it goes."""
+    cell = loaded(model).session.contract.cell_px
+    need = np.full((ROWS, 40 * 2 * cell), 0.5)
+    rear, front = answer_of(model, need, (0.0, 0.0, 0.0))
+    outside = float(max(front.max() - 1, -front.min(), rear.max() - 1, -rear.min(), 0.0))
+    reached = float(np.ptp(front))  # a ramp as long as the raster fills the range and stays
+    return Answer(outside + max(0.98 - reached, 0.0), 1 / FULL, note=f"range used {reached:.3f}")
+
+
+def monotone(model: str) -> Answer:
+    """The surer the eyes, the stronger the drive: never more for more doubt."""
+    random = np.random.default_rng(5)
+    cell = loaded(model).session.contract.cell_px
+    need = random.uniform(-0.1, 0.1, (ROWS, 24 * 2 * cell))
+    doubts = (0.0, 0.1, 0.3, 1.0, 5.0, 50.0)
+    drives = [float(np.square(answer_of(model, need, (doubt, doubt, 0.3)) - 0.5).mean()) for doubt in doubts]
+    rises = max(b - a for a, b in pairwise(drives))
+    return Answer(max(rises, 0.0), 1e-6, note=" ".join(f"{drive:.2g}" for drive in drives))
+
+
+def whole(model: str, sigma_mm: float) -> Answer:
+    """A whole prediction of eyes that disagree everywhere: finite, and even panels where nothing can be known."""
+    layers = _layers(model, sigma_mm)
+    driven = float(np.abs(layers[[0, 2]].astype(float) - 128).mean() / 255)
+    sure = float(np.abs(_layers(model, 0.0)[[0, 2]].astype(float) - 128).mean() / 255)
+    return Answer(max(driven - sure, 0.0), 0.01, note=f"outer panels {driven:.3f} from even, for two points {sure:.3f}")
+
+
+def _layers(model: str, sigma_mm: float, separation_m: float = 0.062) -> U8:
+    random = np.random.default_rng(3)
+    images = [[random.integers(0, 256, (108, 192, 4), dtype=np.uint8)] for _ in range(2)]
+    eyes = np.array([[0.6, -separation_m / 2, 0.0], [0.6, separation_m / 2, 0.0]])
+    return loaded(model).predict(images, eyes, eye_sigma_mm=sigma_mm).layers[..., :3].copy()
+
+
+def trials() -> Iterator[Trial]:
+    """What there is to try."""
+    for model in MODELS:
+        for columns in (0.0, 0.01, 0.13, 1.0, 6.0, 100.0):
+            yield Trial(
+                STAGE,
+                f"{model}: a wave, doubt of {columns:g} columns",
+                partial(unsure, model, columns),
+                measure="phase",
+            )
+        for what in ("one cell", "one chain"):
+            yield Trial(STAGE, f"{model}: {what}", partial(small, model, what), measure="phase")
+        yield Trial(STAGE, f"{model}: all clipped", partial(clipped, model), measure="phase")
+        yield Trial(STAGE, f"{model}: doubt from nothing to 50 columns", partial(monotone, model), measure="phase²")
+    for sigma_mm in SIGMAS_MM:
+        yield Trial(
+            STAGE, f"balanced: eyes off by {sigma_mm:g} mm", partial(whole, "balanced", sigma_mm), measure="phase"
+        )
+    for name, sigma_mm in (("NaN", math.nan), ("infinite", math.inf)):
+        yield refusal(STAGE, f"balanced: {name} doubt", partial(_layers, "balanced", sigma_mm))
+    yield refusal(STAGE, "balanced: separation vanishes", partial(_layers, "balanced", 1.0, 1e-15))
