@@ -36,7 +36,7 @@ def capture_recording(
     from runtime.sensor.registry import open_sensor
 
     chosen = settings.sensor.model_copy(update={"driver": "replay", "source": source, "loop": False, "start_s": 0.0})
-    driver = open_sensor(chosen, SimulatedClock())
+    driver = open_sensor(chosen, SimulatedClock(), limits=settings.limits)
     if not isinstance(driver, SteppedDriver):
         raise InputError(source, "", "cannot be replayed sample by sample")
     file = PairsFile(out)
@@ -177,7 +177,7 @@ def capture_live(
     clock = MonotonicClock()
     file = PairsFile(out)
     open_sensor(settings.sensor, clock)  # refuses unknown names before anything starts
-    worker = SensorWorker(lambda: open_sensor(settings.sensor, clock), settings.sensor, clock)
+    worker = SensorWorker(lambda: open_sensor(settings.sensor, clock, limits=settings.limits), settings.sensor, clock)
     chart = _chart_display(settings, stack) if show else None
     keys = TerminalKeys()
     poll = keys.poll if chart is None else first_of(keys.poll, chart.keys.poll)

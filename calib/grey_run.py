@@ -19,11 +19,21 @@ from runtime.support.artifacts import OutputFolder, write_bytes, write_text
 
 
 def fit_lut(
-    out: Path, series: Path | None, *, settings: Settings, stack: PanelStack, levels: int, panel: int
+    out: Path,
+    series: Path | None,
+    *,
+    settings: Settings,
+    stack: PanelStack,
+    levels: int,
+    panel: int,
+    photos: Path | None = None,
 ) -> tuple[dict[str, Any], str]:
     """Write the LUT and its plot. Raises InputError."""
-    source = series or "typed"
-    measured = read_series(series) if series else typed_series(settings, stack, levels=levels, panel=panel)
+    source = series or photos or "typed"
+    if photos is not None:
+        measured = photographed_series(photos, stack, panel=panel)
+    else:
+        measured = read_series(series) if series else typed_series(settings, stack, levels=levels, panel=panel)
     curves = fit_series(measured, source)
     with OutputFolder(out.parent) as folder:
         write_text(folder.staging / out.name, lut_text(curves))
@@ -39,6 +49,47 @@ def fit_lut(
         for name, curve in zip(CHANNELS, curves, strict=True)
     ]
     return summary, "\n".join([*lines, f"{out}"])
+
+
+def photographed_series(photos: Path, stack: PanelStack, *, panel: int) -> Series:
+    """Relative luminances from photographs of a panel's grey chart. Raises InputError, naming the photograph."""
+    from calib.grey_chart import Unusable, histograms, measure
+    from calib.photo_run import photograph_files, read_photograph
+
+    found = []
+    for path in photograph_files(photos):
+        try:
+            found.append(histograms(read_photograph(path), stack, panel))
+        except Unusable as problem:
+            raise InputError(path, "", str(problem)) from None
+    try:
+        return measure(found, stack, panel)
+    except Unusable as problem:
+        raise InputError(photos, "greys", str(problem)) from None
+
+
+def show_grey_chart(settings: Settings, stack: PanelStack, *, panel: int) -> None:
+    """A panel's grey chart on the bare panel, the others clear, until Enter or q. Raises InputError, PanelLost."""
+    import typer
+
+    from calib.bare_panels import BarePanels
+    from calib.charts import alone
+    from calib.grey_chart import grey_chart
+    from calib.keys import Key, TerminalKeys, first_of
+
+    keys = TerminalKeys()
+    panels = BarePanels(settings, stack, grey_curve=False)
+    poll = first_of(keys.poll, panels.keys.poll)
+    try:
+        if not panels.seen:
+            typer.echo("warning: output.kind is offscreen: nobody sees this chart", err=True)
+        typer.echo(f"the grey chart of panel {panel} is shown (Enter or q: done)", err=True)
+        panels.show(alone(grey_chart(stack, panel), stack, index=panel))
+        while poll() not in (Key.ACCEPT, Key.QUIT):
+            panels.again()
+    finally:
+        panels.close()
+        keys.close()
 
 
 def typed_series(settings: Settings, stack: PanelStack, *, levels: int, panel: int) -> Series:

@@ -208,23 +208,59 @@ def grey(
     series: Annotated[Path | None, typer.Option(help="CSV of grey and luminance, or of grey, red, green, blue")] = None,
     typed: Annotated[bool, typer.Option("--typed", help="ask for the luminances, one after the other")] = False,
     levels: Annotated[int, typer.Option(help="grey levels asked for with --typed", min=4, max=64)] = 9,
-    panel: Annotated[int, typer.Option(help="with --typed: show the greys on this panel; -1: on none")] = -1,
+    photos: Annotated[Path | None, typer.Option(help="folder of photographs of --panel's `grey-chart`")] = None,
+    panel: Annotated[
+        int, typer.Option(help="with --photos: whose chart; with --typed: show the greys on it, -1: on none")
+    ] = -1,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Fit one panel's grey curve, the other panels at zero, and invert it to its LUT.
 
+    From a photometer's series, or from photographs of the panel's `grey-chart` with any camera: exposure locked, the
+    room dark, the whole chart in the picture, nothing cut off. Two or three from different places are better than one.
+
     Example: phasestack calibrate panels grey --series photometer.csv --out panel-2.csv
     """
     from calib.grey_run import fit_lut
 
-    if (series is None) == (not typed):
-        raise InputError("calibrate panels grey", "--series", "or --typed is needed, one of them")
+    if (series is not None) + typed + (photos is not None) != 1:
+        raise InputError("calibrate panels grey", "--series", "or --photos or --typed is needed, one of them")
     settings, stack = settings_and_stack(config)
     if not -1 <= panel < stack.count:
         raise InputError("calibrate panels grey", "--panel", f"must be -1 to {stack.count - 1}")
-    summary, text = fit_lut(out, series, settings=settings, stack=stack, levels=levels, panel=panel)
+    if photos is not None and panel < 0:
+        raise InputError("calibrate panels grey", "--panel", "is needed: whose chart the photographs show")
+    summary, text = fit_lut(out, series, settings=settings, stack=stack, levels=levels, panel=panel, photos=photos)
     tell(summary, as_json, text)
+
+
+@app.command("grey-chart")
+def grey_chart_command(
+    panel: Annotated[int, typer.Option(help="the panel that shows it; the others are clear", min=0)],
+    out: Annotated[Path | None, typer.Option(help="write it as this PNG")] = None,
+    show: Annotated[bool, typer.Option("--show", help="show it on the panel until Enter or q")] = False,
+    panels: PanelsOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Draw or show a panel's chart of greys, of which `grey --photos` wants photographs.
+
+    Example: phasestack calibrate panels grey-chart --panel 2 --config phasestack.toml --show
+    """
+    if out is None and not show:
+        raise InputError("calibrate panels grey-chart", "--out", "is missing (or give --show)")
+    from calib.grey_chart import grey_chart
+    from calib.grey_run import show_grey_chart
+    from runtime.support.artifacts import write_png
+
+    settings, stack = settings_and_stack(config, panels)
+    if panel >= stack.count:
+        raise InputError("calibrate panels grey-chart", "--panel", f"must be 0 to {stack.count - 1}")
+    if out is not None:
+        write_png(out, grey_chart(stack, panel))
+        typer.echo(f"{out}")
+    if show:
+        show_grey_chart(settings, stack, panel=panel)
 
 
 @app.command()

@@ -19,7 +19,7 @@ def scene_pictures(settings: Settings, stack: PanelStack, eyes_m: F64) -> tuple[
     from runtime.content.registry import open_content
     from runtime.support.gl import offscreen_context
 
-    content = open_content(settings.content, stack, offscreen_context())
+    content = open_content(settings.content, stack, offscreen_context(), limits=settings.limits)
     try:
         found = []
         for side, eye_m in enumerate(eyes_m):

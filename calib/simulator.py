@@ -55,6 +55,7 @@ class Exposure:
     grid: float = 0.05  # depth to which the grid between a panel's pixels still modulates the light that is sampled
     gamma: float = 2.2  # of the camera's tone curve
     jpeg_quality: int = 92  # 0: not compressed
+    samples: int = 1  # by as many, of what a pixel of the sensor sees; 1: one, of softened layers (quick)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,21 +155,40 @@ def photograph(
     rays: what `camera_rays` of the same lens gave, to save the time.
     """
     x, y = rays if isinstance(rays, tuple) else _directions(lens)
-    # A sensor's pixel is an area: sampled in its middle alone, edges would be jagged.
-    soft = [cv2.GaussianBlur(layer, (0, 0), APERTURE_PX) for layer in scene.layers]
+    if exposure.samples > 1:
+        light = _light_of_areas(scene, lens, pose, exposure, x, y)
+    else:
+        # A sensor's pixel is an area: sampled in its middle alone, edges would be jagged.
+        soft = [cv2.GaussianBlur(layer, (0, 0), APERTURE_PX) for layer in scene.layers]
+        light = _light(scene, soft, pose, exposure, x, y)
+    return _developed(_softened(light, exposure), lens, exposure, random)
+
+
+def _light_of_areas(scene: Scene, lens: Lens, pose: F64, exposure: Exposure, x: F32, y: F32) -> F32:
+    """(h, w) mean light over the area of each of the sensor's pixels."""
+    steps = ((np.arange(exposure.samples) + 0.5) / exposure.samples - 0.5) / lens.focal_px
+    layers = list(scene.layers)
+    total = np.zeros(x.shape, np.float32)
+    for across in steps.astype(np.float32):
+        for down in steps.astype(np.float32):
+            total += _light(scene, layers, pose, exposure, x + across, y + down)
+    return total / np.float32(exposure.samples**2)
+
+
+def _light(scene: Scene, layers: Sequence[U8], pose: F64, exposure: Exposure, x: F32, y: F32) -> F32:
+    """(h, w) light along the rays with x/z and y/z, before the lens softens it."""
     total = np.zeros(x.shape, np.float32)
     passes = np.ones(x.shape, np.float32)
+    kind = cv2.INTER_LINEAR if exposure.samples == 1 else cv2.INTER_NEAREST
     inside = np.ones(x.shape, bool)
     for index in range(len(scene.panels)):
         u, v = crossing(scene, index, pose, x, y)
-        total += cv2.remap(soft[index], u - np.float32(0.5), v - np.float32(0.5), cv2.INTER_LINEAR).astype(np.float32)
+        total += cv2.remap(layers[index], u - np.float32(0.5), v - np.float32(0.5), kind).astype(np.float32)
         inside &= (u > 0) & (u < scene.stack.width_px) & (v > 0) & (v < scene.stack.height_px)
         if exposure.grid:
             passes *= _grid(u, exposure.grid) * _grid(v, exposure.grid)
     light = exposure.dark + intensity_from_phase(total * np.float32(1 / 255)) * passes
-    light *= inside
-    light = _softened(light, exposure)
-    return _developed(light, lens, exposure, random)
+    return np.asarray(light * inside, dtype=np.float32)
 
 
 def camera_rays(lens: Lens) -> tuple[F32, F32]:

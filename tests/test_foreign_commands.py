@@ -63,3 +63,20 @@ def test_it_is_refused_in_one_line(folder: Path, command: str, told: str) -> Non
     assert answer.returncode == 2, answer.stderr
     assert len(lines) == 1 and told in lines[0] and "Traceback" not in answer.stderr
     assert not (folder / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("limits", "command", "told"),
+    [
+        ("recording_s = 3.0", HEADLESS + " --replay demo", "limits.recording_s"),
+        ("pixels = 1000", HEADLESS + " --replay demo --scene {folder}/a.png", "limits.pixels"),
+    ],
+)
+def test_limits_of_the_configuration_hold(folder: Path, limits: str, command: str, told: str) -> None:
+    from PIL import Image
+
+    Image.new("RGB", (100, 50)).save(folder / "a.png")
+    (folder / "limits.toml").write_text(f"[limits]\n{limits}\n")
+    command = command.replace("--frames 1", "--frames 400 --config {folder}/limits.toml --model fast")
+    answer = run(command, folder)
+    assert answer.returncode == 2 and told in answer.stderr and "Traceback" not in answer.stderr

@@ -18,7 +18,7 @@ from runtime.optics.malus import intensity_from_phase
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8, PanelFrame
 
-WIDTH_PX = 320
+WIDTH_PX = 256
 JPEG_QUALITY = 80
 
 

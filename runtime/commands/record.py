@@ -46,7 +46,7 @@ def record(
 
     Example: phasestack record --motion walk --seed 3 --rate-hz 60 --out walk.mcap
     """
-    refuse_target(out, force=force)
+    refuse_target(out, force=force or motion is not None)  # a motion is made again from its seed; a viewer is not
     made = {"--seed": seed, "--rate-hz": rate_hz, "--noise-mm": noise_mm}
     if motion is not None:
         _refuse_with("--motion", {"--config": config, "--images": images or None})

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock, SimulatedClock
-from runtime.config import Settings
+from runtime.config import OutputSettings, Settings
 from runtime.records import RefreshAccount
 from runtime.support.priority import PRESENTER_NICENESS, niceness
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from runtime.optics.stack import PanelStack
     from runtime.panels.base import PanelSink
     from runtime.sensor.base import SensorDriver
+    from runtime.support.progress import Listener
 
 log = logging.getLogger("phasestack.build")
 
@@ -85,6 +86,18 @@ def scaled_stack(settings: Settings, scale: float) -> PanelStack:
     )
 
 
+def _heard(on_start: Callable[[str], bool]) -> Listener:
+    """A listener to what is read before the first refresh, which ends it when it is told to stop."""
+
+    def heard(what: str, done: int, total: int | None) -> None:
+        from runtime.errors import Stopped
+
+        if not on_start("reading the recording"):
+            raise Stopped("told to stop while starting")
+
+    return heard
+
+
 def build_run(
     settings: Settings,
     options: RunOptions,
@@ -117,6 +130,7 @@ def build_run(
     from runtime.sensor.detecting import DetectingDriver
     from runtime.sensor.registry import open_sensor
     from runtime.support.gl import offscreen_context
+    from runtime.support.progress import listening
 
     cv2.setNumThreads(settings.model.threads or -1)
     simulated = options.max_speed
@@ -127,17 +141,22 @@ def build_run(
         log.warning("%s", warning)
 
     def make_driver() -> SensorDriver:
-        driver = open_sensor(settings.sensor, clock, latency_ms=settings.loop.sensor_latency_ms)
+        latency_ms = settings.loop.sensor_latency_ms
+        driver = open_sensor(settings.sensor, clock, latency_ms=latency_ms, limits=settings.limits)
         return DetectingDriver(driver, lambda: EyeFinder(settings.detector).find)
 
     driver = make_driver()
     samples: Samples
     if simulated:
-        samples = RecordedSamples(driver)
+        with listening(_heard(on_start)):  # a recording may be long to skip through
+            samples = RecordedSamples(driver)
         cleanup.callback(samples.close)
     context = offscreen_context()
     cleanup.callback(context.release)
-    panels = _open_panels(settings, stack, clock, context, wait_for_panels)
+    output_settings = settings.output
+    if options.scale != 1.0:  # asked for: no monitor's mode fits such a stack
+        output_settings = output_settings.model_copy(update={"allow_rescaling": True})
+    panels = _open_panels(output_settings, stack, clock, context, wait_for_panels)
     cleanup.callback(panels.close)
     maker = SolverMaker(settings, stack, calibration, on_start=on_start)
     solver: SolverHost
@@ -218,14 +237,14 @@ def _refresh_ms(stage_ms: Mapping[str, float]) -> float:
 
 
 def _open_panels(
-    settings: Settings, stack: PanelStack, clock: Clock, context: Any, wait: Callable[[str], bool] | None
+    settings: OutputSettings, stack: PanelStack, clock: Clock, context: Any, wait: Callable[[str], bool] | None
 ) -> PanelSink:
     from runtime.errors import PanelLost
     from runtime.panels.registry import open_panels
 
     while True:
         try:
-            return open_panels(settings.output, stack, clock, context)
+            return open_panels(settings, stack, clock, context)
         except PanelLost as error:
             if wait is None or not wait(str(error)):
                 raise

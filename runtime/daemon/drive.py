@@ -38,7 +38,7 @@ def drive(
     from runtime.support.background import wait_for_all
 
     with ExitStack() as cleanup:
-        output = cleanup.enter_context(RunOutput(out)) if out is not None else None
+        output = cleanup.enter_context(RunOutput(out, every_one=options.max_speed)) if out is not None else None
         advance = cleanup.enter_context(_progress(total)) if progress else None
         run = build_run(
             settings,

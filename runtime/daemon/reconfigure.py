@@ -37,7 +37,7 @@ class Reconfiguration:
         self.problem = ""  # one line, where it can't be done
         self.finished = False
         if reload_content or settings.content != old.content:
-            self._loader = ContentLoader(stack)
+            self._loader = ContentLoader(stack, limits=settings.limits)
             self._loader.request(settings.content)
         if _model_part(settings) != _model_part(old):
             self._model = Job("model", lambda: ready_predictor(settings, stack), discard=lambda made: made.close())

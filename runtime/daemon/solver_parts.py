@@ -95,7 +95,7 @@ class SolverMaker:
             settings = self.run.state.settings if self.run is not None else self._settings
             predictor = ready_predictor(settings, self._stack)
             try:
-                content = open_content(settings.content, self._stack, made)
+                content = open_content(settings.content, self._stack, made, limits=settings.limits)
             except BaseException:
                 predictor.close()
                 raise

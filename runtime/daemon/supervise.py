@@ -265,6 +265,7 @@ def snapshot(run: Run | None, presenter: Presenter, account: RefreshAccount) -> 
         "rejected_samples": {
             "outlier": presenter.viewer.outliers,
             **presenter.viewer.dropped,
+            **presenter.viewer.implausible,
             **presenter.samples.refused_inputs,
         },
         "sensor_hz": presenter.viewer.rate_hz if "sensor" not in presenter.missing else None,

@@ -52,6 +52,11 @@ class Measured:
     true_look: Look | None = None  # at the true eyes, against their own truth
     carried_true: Quality | None = None
 
+    def whole_look(self) -> Look:
+        """The look, with what else was measured beside it: what the contact sheet tells."""
+        true = self.true_look.quality if self.true_look else None
+        return replace(self.look, carried=self.carried, true=true, carried_true=self.carried_true)
+
 
 @dataclass(slots=True)
 class Means:
@@ -138,7 +143,7 @@ class RunObserver:
         if last is not None and wants_last:
             measured = self._measured_now(last)
             if measured is not None:
-                self.look = measured.look
+                self.look = measured.whole_look()
                 if not self.means.values and last.account.state is State.TRACKING:
                     self.means.add(measured)
 
@@ -261,7 +266,7 @@ class RunObserver:
 
     def _take(self, measured: Measured | None) -> None:
         if measured is not None:
-            self.look = measured.look
+            self.look = measured.whole_look()
             self.means.add(measured)
 
     def _measured_now(self, refresh: Refresh) -> Measured | None:

@@ -275,7 +275,7 @@ class Presenter:
         missing = dict(news.missing)
         if lost:
             missing["panel"] = lost
-        if fault := self.samples.fault():
+        if fault := self.samples.fault() or self.viewer.warning.removeprefix("sensor: "):
             missing["sensor"] = fault
         for part in news.missing:
             if part not in self.missing or news.missing[part] != self.missing[part]:

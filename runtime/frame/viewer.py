@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter, deque
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from runtime.clock import NS_PER_S
 from runtime.config import Settings
 from runtime.eyes.calibration import Calibration
 from runtime.eyes.calibration_drift import SeparationWatch
+from runtime.eyes.plausibility import PlausibilityWatch
 from runtime.eyes.rest import RestWatch
 from runtime.eyes.tracker import Tracker
 from runtime.records import EyesEstimate, SensorFrame
@@ -33,6 +35,7 @@ class Viewer:
         self._tracker = Tracker(settings.tracker)
         self._rest = _rest_watch(settings)
         self._drift = _drift_watch(settings)
+        self._plausible = _plausibility_watch(settings)
         self._serial_checked = False
         self._captures_ns: deque[int] = deque(maxlen=64)
         self.dropped: Counter[str] = Counter()  # eyes that were not used, by reason
@@ -42,10 +45,21 @@ class Viewer:
         before, self._settings, self._calibration = self._settings, settings, calibration
         if settings.tracker != before.tracker:
             self._tracker = Tracker(settings.tracker)
+            self._plausible = _plausibility_watch(settings)
         if (settings.plan, settings.model) != (before.plan, before.model):
             self._rest = _rest_watch(settings)
         if settings.calibration != before.calibration:
             self._drift = _drift_watch(settings)
+
+    @property
+    def warning(self) -> str:
+        """What most samples of late can't be (exchanged, in millimetres, ...); empty: all is well."""
+        return self._plausible.warning
+
+    @property
+    def implausible(self) -> Mapping[str, int]:
+        """Samples that can't be a viewer's eyes, by reason."""
+        return self._plausible.counts
 
     @property
     def outliers(self) -> int:
@@ -72,6 +86,8 @@ class Viewer:
             points = self._calibration.apply(points)
             if drift := self._drift.update(points):
                 log.warning("%s", drift)
+        if points is not None and (told := self._plausible.update(points.eyes_m)):
+            log.warning("%s", told)
         self._tracker.update(points, capture_ns=frame.capture_ns)
         if self._rest is not None and points is not None:
             self._rest.update(points.eyes_m, capture_ns=frame.capture_ns)
@@ -111,6 +127,10 @@ def _rest_watch(settings: Settings) -> RestWatch | None:
     plan = settings.plan
     most_m = (plan.dead_band_mm or plan.most_band_mm) / 1000
     return RestWatch(most_m=most_m) if plan.enabled and plan.reuse and most_m > 0 else None
+
+
+def _plausibility_watch(settings: Settings) -> PlausibilityWatch:
+    return PlausibilityWatch(ipd_min_m=settings.tracker.ipd_min_m, ipd_max_m=settings.tracker.ipd_max_m)
 
 
 def _drift_watch(settings: Settings) -> SeparationWatch:

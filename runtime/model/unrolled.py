@@ -32,6 +32,8 @@ from runtime.optics.pupil import POINT_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
 
+HALF_IPD_M = 0.031
+
 
 class UnrolledPredictor(Predictor):
     """Models of `input_frame` chain: three evenly spaced panels, any pose.
@@ -81,8 +83,10 @@ class UnrolledPredictor(Predictor):
             return self._turned(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
         watch = Stopwatch()
         contract = self.session.contract
+        # One eye that stands for both asks for no difference: the chain may run along any line.
+        along_m = eyes_m if across_m.any() else eyes_m + HALF_IPD_M * np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
         try:
-            frame = chain_frame(eyes_m, self.stack, cell_px=contract.cell_px, reduction=contract.reduction)
+            frame = chain_frame(along_m, self.stack, cell_px=contract.cell_px, reduction=contract.reduction)
         except ValueError as error:
             raise ModelFailure(str(error)) from None
         self._boxes = visible_boxes(eyes_m, self.stack)

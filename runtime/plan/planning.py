@@ -63,7 +63,7 @@ def plan_for(
         tell = teller(cleanup, quiet)
         context = offscreen_context()
         cleanup.callback(context.release)
-        content = open_content(settings.content, stack, context)
+        content = open_content(settings.content, stack, context, limits=settings.limits)
         cleanup.callback(content.close)
         plain = load_predictor(settings.model.name, stack, settings.model)
         cleanup.callback(plain.close)

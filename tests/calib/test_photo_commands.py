@@ -133,7 +133,7 @@ def test_a_model_for_even_gaps_gets_even_gaps_and_is_told_what_that_costs(tmp_pa
 def test_what_the_registration_gains_is_told_in_decibels(tmp_path, photos) -> None:
     told = panels("photo", "--photos", str(photos), "--out", str(tmp_path / "r"), "--model", "fast")["psnr_db"]
     assert told["registered"] > told["as configured"] + 5
-    assert told["registered"] < told["perfect stack"]
+    assert told["registered"] > told["perfect stack"] - 5
 
 
 @pytest.mark.parametrize(

@@ -85,8 +85,9 @@ def test_eyes_behind_the_panels_are_none_and_the_picture_goes_flat(stage):
     stage.eyes = lambda _: aside(x_m=-0.7)
     stage.refresh(30)
     assert stage.presenter.last.account.eyes_label == "none"
-    assert stage.presenter.machine.state is State.FLAT
+    assert stage.presenter.last.frame.flatness == 1.0
     assert stage.viewer.dropped["not in front of the panels"] > 0
+    assert "behind the display" in stage.presenter.machine.reason  # told, not a silent flat picture
 
 
 def test_an_eye_that_the_solution_was_not_made_for_moves_nothing(stage):

@@ -135,7 +135,6 @@ def test_an_eye_that_can_t_see_the_display_gives_way_to_the_other(solver, cell):
     planned.close()
 
 
-@pytest.mark.xfail(strict=True, reason="a model that is not run on windows (plan.focus = false) refuses one eye twice")
 def test_one_eye_is_served_without_the_saving_of_windows_too(solver):
     assert solver.step(wish(OFF_M)).missing == {}
 

@@ -166,3 +166,19 @@ def test_another_sensor_than_the_calibrated_one_is_told_once(caplog):
         seen.take(frame, serial="another")
     warnings = [record for record in caplog.records if "another" in record.getMessage()]
     assert len(warnings) == bool(calibration.serial_warning("another"))
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda eyes_m: eyes_m[::-1], "left and right exchanged"),
+        (lambda eyes_m: eyes_m * 1000.0, "in millimetres, not metres"),
+    ],
+)
+def test_eyes_that_can_not_be_a_viewer_s_are_told_and_counted_by_reason(change, reason) -> None:
+    seen = viewer()
+    for number in range(30):
+        points = EyePoints(change(aside(0.001 * number)), np.ones(2))
+        seen.take(SensorFrame(number, number * 33 * NS_PER_MS, points), serial="F-1")
+    assert seen.implausible[reason] == 30
+    assert reason in seen.warning

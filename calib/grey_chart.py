@@ -1,0 +1,167 @@
+"""A chart from which any camera tells a panel's grey curve, whatever its own tone curve is.
+
+Patches of every grey, many of each and scattered, so that an uneven light is told apart from the greys; and patches
+of black and white pixels mixed in known shares, whose light is known however the panel's greys are: they measure the
+camera. The board's marks among them tell where each patch lies in a photograph.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from calib.board import CORNER, TILE, board, marks
+from calib.detect_marks import find_marks
+from calib.grey import Series
+from runtime.optics.stack import PanelStack
+from runtime.records import F64, U8
+
+GREYS = tuple(round(255 * step / 12) for step in range(13))
+SHARES = tuple(step / 16 for step in (1, 2, 4, 6, 8, 11, 14))  # of white pixels in a mixed patch
+PATCHES_ACROSS = 32
+MARGIN = 0.15  # of a panel on each side: seen from nearby, its rim has no other panel behind it and no light
+INNER = 0.5  # share of a patch's side that is measured
+SAMPLES = 24  # by as many, of a patch
+LEAST_MARKS = 4
+FALLS = 0.01  # of the range: a brighter grey that is darker by more is no grey curve
+CLIPPED = 0.02
+BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
+
+
+class Unusable(ValueError):
+    """A photograph that tells no grey curve; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """One square of the chart."""
+
+    left_px: int
+    top_px: int
+    side_px: int
+    grey: int  # 0 to 255; -1: black and white pixels
+    share: float  # of white pixels where they are mixed
+
+
+@lru_cache(maxsize=8)
+def patches(stack: PanelStack, panel: int) -> tuple[Patch, ...]:
+    """Where which patch lies: between the board's marks, kinds scattered, always the same."""
+    pitch = stack.width_px // PATCHES_ACROSS
+    side = pitch * 5 // 6 // 8 * 8  # half of it, what is measured, holds the mixing pattern whole
+    free = [
+        (left, top)
+        for top in range(round(MARGIN * stack.height_px), round((1 - MARGIN) * stack.height_px) - side, pitch)
+        for left in range(round(MARGIN * stack.width_px), round((1 - MARGIN) * stack.width_px) - side, pitch)
+        if not any(_covers(stack, panel, left, top, side))
+    ]
+    kinds = [(grey, 0.0) for grey in GREYS] + [(-1, share) for share in SHARES]
+    order = np.random.default_rng(panel).permutation(len(free))
+    found = []
+    for number, place in enumerate(order.tolist()):
+        (left, top), (grey, share) = free[place], kinds[number % len(kinds)]
+        found.append(Patch(left, top, side, grey, share))
+    return tuple(found)
+
+
+def _covers(stack: PanelStack, panel: int, left: int, top: int, side: int) -> list[bool]:
+    found = []
+    for mark in marks(stack):
+        if mark.panel == panel:
+            u, v = (place - CORNER * mark.unit_px for place in (mark.left_px, mark.top_px))
+            tile, gap = TILE * mark.unit_px, 2 * mark.unit_px
+            found.append(u - gap < left + side and left < u + tile + gap and v - gap < top + side
+                         and top < v + tile + gap)  # fmt: skip
+    return found
+
+
+def grey_chart(stack: PanelStack, panel: int) -> U8:
+    """(H, W) what the panel shows; the others are clear. Not to be resampled, nor sent through a LUT."""
+    picture = board(stack, panel)
+    for patch in patches(stack, panel):
+        area = picture[patch.top_px : patch.top_px + patch.side_px, patch.left_px : patch.left_px + patch.side_px]
+        if patch.grey >= 0:
+            area[:] = patch.grey
+        else:
+            mixed = np.tile(16 * patch.share > BAYER, (patch.side_px // 4, patch.side_px // 4))
+            area[:] = np.where(mixed, 255, 0)
+    return picture
+
+
+def histograms(picture: U8, stack: PanelStack, panel: int) -> NDArray[np.float64]:
+    """(P, 256) shares of the code values in the middle of every patch of a grey photograph (h, w).
+
+    Raises Unusable.
+    """
+    seen = find_marks(picture, stack, name="")
+    mine = seen.panel == panel
+    if seen.marks[panel] < LEAST_MARKS:
+        raise Unusable(f"shows {seen.marks[panel]} marks of panel {panel}: blurred, cut off, or another panel's chart")
+    image_from_panel, _ = cv2.findHomography(seen.panel_px[mine], seen.image_px[mine], cv2.RANSAC, 8.0)
+    step = (np.arange(SAMPLES) + 0.5) / SAMPLES * INNER + (1 - INNER) / 2
+    found = []
+    for patch in patches(stack, panel):
+        u, v = np.meshgrid(patch.left_px + step * patch.side_px, patch.top_px + step * patch.side_px)
+        places = cv2.perspectiveTransform(np.stack([u, v], axis=-1).reshape(1, -1, 2), image_from_panel)[0]
+        column, row = np.rint(places).astype(int).T
+        if min(column.min(), row.min()) < 0 or column.max() >= picture.shape[1] or row.max() >= picture.shape[0]:
+            raise Unusable("does not show the whole chart")
+        found.append(np.bincount(picture[row, column], minlength=256) / len(row))
+    counts = np.array(found)
+    white = np.array([patch.grey == 255 for patch in patches(stack, panel)])
+    if counts[white, 253:].sum(axis=1).mean() > CLIPPED:
+        raise Unusable("is overexposed: white is cut off; expose less")
+    if (counts[white] @ np.arange(256)).mean() < 60:
+        raise Unusable("is too dark: expose more")
+    return counts
+
+
+def measure(pictures: list[NDArray[np.float64]], stack: PanelStack, panel: int) -> Series:
+    """Relative luminance of every grey from the histograms of one or more photographs with one exposure.
+
+    Fitted together: the camera's tone curve, each photograph's uneven light (a quadratic of its logarithm), and the
+    greys. Raises Unusable where the greys do not ascend.
+    """
+    chart = patches(stack, panel)
+    place = np.array([[p.left_px / stack.width_px - 0.5, p.top_px / stack.height_px - 0.5] for p in chart])
+    u, v = place.T
+    uneven = np.stack([u, v, u * u, u * v, v * v], axis=-1)
+    kind = np.array([GREYS.index(p.grey) if p.grey >= 0 else -1 for p in chart])
+    share = np.array([p.share for p in chart])
+    codes = np.linspace(0.0, 1.0, 256)
+    photographs = len(pictures)
+
+    def parts(x: F64) -> tuple[F64, F64, F64, F64]:
+        response = codes ** np.exp(x[0]) * np.exp(x[1] * (codes - 1) + x[2] * (codes**2 - 1))
+        levels = np.concatenate([[0.0], x[4 : 4 + len(GREYS) - 2], [1.0]])
+        dark = x[3]
+        light = np.where(kind >= 0, levels[kind], share)
+        fields = x[4 + len(GREYS) - 2 :].reshape(photographs, 6)
+        return response, dark + (1 - dark) * light, fields, levels
+
+    def residuals(x: F64) -> F64:
+        response, light, fields, _ = parts(x)
+        found = []
+        for picture, field in zip(pictures, fields, strict=True):
+            measured = picture @ response
+            expected = np.exp(field[0] + uneven @ field[1:]) * light
+            found.append((measured - expected) / (expected + 0.02))
+        return np.concatenate(found)
+
+    inner = np.array(GREYS[1:-1]) / 255
+    start = np.concatenate([[np.log(2.0), 0.0, 0.0, 0.01], inner**2, np.zeros(6 * photographs)])
+    fit = least_squares(residuals, start, loss="soft_l1", f_scale=0.05, x_scale="jac", max_nfev=200)
+    _, _, _, levels = parts(fit.x)
+    dark = max(float(fit.x[3]), 0.0)
+    falls = np.flatnonzero(np.diff(levels) < -FALLS)
+    if falls.size:
+        lower, upper = GREYS[int(falls[0])], GREYS[int(falls[0]) + 1]
+        raise Unusable(
+            f"grey {upper} is darker than grey {lower}: not a grey curve (a reflection, another exposure, a wrong LUT)"
+        )
+    luminance = dark + (1 - dark) * np.clip(levels, 0.0, None)
+    return Series(np.array(GREYS) / 255, np.repeat(luminance[:, None], 3, axis=1))

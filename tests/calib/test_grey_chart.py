@@ -1,0 +1,109 @@
+"""Grey curves by any camera: the chart through a simulated panel and camera, against the panel's own curve."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from calib.commands import app
+from calib.grey_chart import GREYS, Unusable, grey_chart, histograms, measure, patches
+from calib.placed import ideal_panel
+from calib.simulator import Exposure, Scene, camera_from_stack, phone, photograph, smaller
+from runtime.config import StackGeometry
+from runtime.errors import InputError
+from runtime.panels.lut import measured_curve
+
+STACK = StackGeometry().stack()
+PANEL = 2
+run = CliRunner()
+
+
+def phase_of(grey: np.ndarray) -> np.ndarray:
+    """The simulated panel's own curve: an s, with a gamma."""
+    return (1 - np.cos(np.pi * grey**1.4)) / 2
+
+
+def photographs(curve, *, count: int = 2, **changes) -> list[np.ndarray]:
+    random = np.random.default_rng(1)
+    layers = np.zeros((3, STACK.height_px, STACK.width_px), np.uint8)
+    layers[PANEL] = np.rint(255 * curve(grey_chart(STACK, PANEL) / 255)).astype(np.uint8)
+    scene = Scene(STACK, tuple(ideal_panel(STACK, index) for index in range(3)), layers)
+    lens = smaller(phone(random=random), 0.7)
+    exposure = Exposure(**({"dark": 0.004, "gain": 0.85, "samples": 3} | changes))
+    places = np.array([[0.75, 0.0, 0.0], [0.8, 0.1, 0.05], [0.8, -0.1, 0.0]])[:count]
+    return [
+        photograph(scene, lens, camera_from_stack(place, towards_m=np.zeros(3)), exposure, random=random)
+        for place in places
+    ]
+
+
+@pytest.fixture(scope="module")
+def pictures() -> list[np.ndarray]:
+    return photographs(phase_of)
+
+
+def test_every_grey_has_many_patches_all_over_the_panel() -> None:
+    for grey in GREYS:
+        mine = [patch for patch in patches(STACK, PANEL) if patch.grey == grey]
+        assert len(mine) >= 5
+        assert np.ptp([patch.left_px for patch in mine]) > STACK.width_px / 3
+
+
+def test_mixed_patches_hold_their_share_of_white_pixels() -> None:
+    chart = grey_chart(STACK, PANEL)
+    for patch in patches(STACK, PANEL):
+        area = chart[patch.top_px : patch.top_px + patch.side_px, patch.left_px : patch.left_px + patch.side_px]
+        assert area.mean() / 255 == pytest.approx(patch.share if patch.grey < 0 else patch.grey / 255)
+
+
+def test_two_photographs_tell_a_panels_curve_without_knowing_the_cameras(tmp_path: Path, pictures) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number, picture in enumerate(pictures):
+        cv2.imwrite(str(folder / f"{number}.png"), picture)
+    result = run.invoke(
+        app, ["panels", "grey", "--photos", str(folder), "--panel", str(PANEL), "--out", str(tmp_path / "lut.csv")]
+    )
+    assert result.exception is None
+    lut = measured_curve(tmp_path / "lut.csv")[:, 1].astype(float)
+    wanted = np.linspace(0, 1, 256)
+    shown = np.sin(np.pi / 2 * phase_of(lut)) ** 2
+    assert np.abs(shown - np.sin(np.pi / 2 * wanted) ** 2).max() < 0.03
+
+
+def test_a_curve_that_falls_is_told_and_not_swallowed() -> None:
+    falling = photographs(lambda grey: np.where(grey < 0.6, grey, grey - 0.25), count=1)
+    with pytest.raises(Unusable, match=r"grey 170 is darker than grey 149"):
+        measure([histograms(picture, STACK, PANEL) for picture in falling], STACK, PANEL)
+
+
+@pytest.mark.parametrize(("gain", "why"), [(2.0, "overexposed"), (0.02, "marks|too dark")])
+def test_a_wrong_exposure_is_told(gain, why) -> None:
+    (picture,) = photographs(phase_of, count=1, gain=gain)
+    with pytest.raises(Unusable, match=why):
+        histograms(picture, STACK, PANEL)
+
+
+def test_another_panels_chart_is_told(pictures) -> None:
+    with pytest.raises(Unusable, match="marks of panel 0"):
+        histograms(pictures[0], STACK, 0)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["grey", "--out", "l.csv", "--photos", "none", "--panel", "1"],
+        ["grey", "--out", "l.csv", "--photos", "none"],
+        ["grey", "--out", "l.csv", "--photos", "none", "--typed"],
+        ["grey-chart", "--panel", "3", "--out", "c.png"],
+        ["grey-chart", "--panel", "1"],
+    ],
+)
+def test_wrong_requests_are_refused_and_leave_nothing(tmp_path, monkeypatch, options) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert isinstance(run.invoke(app, ["panels", *options]).exception, InputError)
+    assert list(tmp_path.iterdir()) == []

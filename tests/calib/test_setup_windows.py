@@ -1,0 +1,89 @@
+"""`phasestack setup` on real windows of a real X server: cards, words, boards, and photographs of them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.board import board
+from calib.message import message_layers
+from calib.photo_trial import simulated_photographs
+from calib.placed import misplaced
+from calib.setup_steps import STEPS
+from runtime.config import load_settings
+from runtime.optics.stack import PanelStack
+from runtime.support.artifacts import write_png
+from tests.panels import xserver
+from tests.panels.xserver import HEIGHT_PX, WIDTH_PX
+from tests.waiting import eventually
+
+pytestmark = pytest.mark.windows
+STACK = PanelStack(0.5, 0.28, (-0.06, 0.0, 0.06), WIDTH_PX, HEIGHT_PX)
+CONFIG = f"[stack]\nwidth_m = 0.5\nheight_m = 0.28\nwidth_px = {WIDTH_PX}\nheight_px = {HEIGHT_PX}\n"
+
+
+@pytest.fixture(scope="module")
+def screen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[xserver.XServer]:
+    server = xserver.start_or_skip(tmp_path_factory.mktemp("xorg"))
+    yield server
+    server.stop()
+
+
+def test_keys_lead_through_cards_words_and_boards_on_the_panels(screen, tmp_path: Path) -> None:
+    config, photos = tmp_path / "c.toml", tmp_path / "photos"
+    config.write_text(CONFIG + '[model]\nname = "fast"\n')
+    random = np.random.default_rng(0)
+    truth = misplaced(STACK, shift_m=0.002, turn_deg=0.3, gap_m=0.001, random=random)
+    for number, picture in enumerate(simulated_photographs(STACK, truth, count=5, megapixels=2.0, random=random)):
+        write_png(photos / f"{number}.png", picture)
+    command = [sys.executable, "-m", "runtime.cli", "setup", "--config", str(config), "--out", str(tmp_path / "out"),
+               "--photos", str(photos)]  # fmt: skip
+    environment = os.environ | {"DISPLAY": screen.name, "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen(
+        command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as running:
+
+        def press(keys: str) -> None:
+            running.stdin.write(keys)
+            running.stdin.flush()
+
+        def lit() -> list[bool]:
+            return [bool(screen.panel(index).any()) for index in range(3)]
+
+        try:
+            up = "\x1b[A"
+            press("\n")
+            for monitor in range(3):  # rear, middle, front: from left to right
+                alone = [index == monitor for index in range(3)]
+                assert eventually(lambda alone=alone: lit() == alone, within_s=60)
+                press("\n" + up + "\n")
+            lines = ["Step 2 of 5: Sizes and distances", STEPS[1].what, "(not done yet)"]
+            words = message_layers(STACK, [*lines, "Enter: do it   n: skip   p: back   q: stop"])
+            assert eventually(lambda: np.array_equal(screen.panel(1), words[1, ..., :3]), within_s=60)
+            assert lit() == [False, True, False]
+            press("n\n")
+            for monitor in range(3):
+                expected = board(STACK, monitor)
+                assert eventually(
+                    lambda monitor=monitor, expected=expected: np.array_equal(screen.panel(monitor)[..., 0], expected),
+                    within_s=60,
+                )
+            # The photographs are there. On panels of so few rows the marks cover each other: that is told.
+            output = running.communicate("\nq", timeout=120)[0]
+        finally:
+            running.kill()
+    assert running.returncode == 0
+    assert "it did not work:" in output
+    assert "photographs can be used, at least 5 are needed" in output
+    assert output.count("Step 3 of 5") == 2
+    assert "not done: geometry, registration, sensor, calibration" in output
+    settings = load_settings(config)
+    assert [panel.connector for panel in settings.output.panels] == ["DUMMY0", "DUMMY1", "DUMMY2"]
+    assert settings.output.kind == "windows"
+    assert all(panel.homography[0][0] == 1.0 for panel in settings.output.panels)
