@@ -42,7 +42,9 @@ def spectral_bytes(net: nn.Module, *, cell_px: int, opset: int) -> bytes:
     """The solver along the eyes' line: rows, cells and columns are whatever a pose asks for."""
     sides = (torch.zeros(16, 8, 6 * cell_px, dtype=torch.int16),) * 2
     modes = tuple(torch.from_numpy(part) for part in chain_modes(8))
-    return _exported(net, (*sides, *modes, torch.ones(3)), network.INPUTS, network.OUTPUTS, CELL_AXES, opset)
+    return _exported(
+        net, (*sides, *modes, torch.ones(3)), network.INPUTS, network.OUTPUTS, CELL_AXES, opset, folded=False
+    )
 
 
 def ports(names: Sequence[str]) -> tuple[Port, ...]:
@@ -121,7 +123,10 @@ def _exported(
     outputs: Sequence[str],
     axes: Mapping[str, tuple[str, ...]],
     opset: int,
+    *,
+    folded: bool = True,
 ) -> bytes:
+    """folded: constants are worked out; else every weight keeps its name (onnxruntime folds as it loads)."""
     buffer = io.BytesIO()
     with _quiet(), torch.no_grad():
         torch.onnx.export(
@@ -134,7 +139,7 @@ def _exported(
             dynamic_axes={
                 name: {at: axis for at, axis in enumerate(named) if axis not in FIXED} for name, named in axes.items()
             },
-            do_constant_folding=False,  # so that weights keep their names; onnxruntime folds as it loads
+            do_constant_folding=folded,
             dynamo=False,
         )
     return buffer.getvalue()

@@ -111,6 +111,8 @@ def _panels(answer: Any) -> np.ndarray:
     """What a module or a session answers, as panel values in one row: two panels in codes, or one tensor of values."""
     if isinstance(answer, torch.Tensor):
         answer = [answer]
+    if any(x.numel() == 1 and not torch.isfinite(x).all() for x in answer):
+        return np.full(1, np.nan, np.float32)
     panels = [x.to(torch.float32) / (1.0 if x.is_floating_point() else FULL) for x in answer if x.numel() > 1]
     return torch.cat([x.reshape(-1) for x in panels]).numpy()
 

@@ -112,8 +112,8 @@ def test_the_raster_s_own_sight_is_what_eyes_see_of_panels_that_are_drawn_on_it(
     mirrored = replace(sight, wanted=sight.wanted[::-1])
     with torch.no_grad():
         wrong_db = -10 * np.log10(float(displayed_mse(net, mirrored)[0]))
-    assert ours_db == pytest.approx(theirs_db, abs=6.0)  # eight bits and the panels' own pixels
-    assert wrong_db < ours_db - 12, "the wrong eye's sight would be no better"
+    assert ours_db == pytest.approx(theirs_db, abs=8.0)  # eight bits and the panels' own pixels
+    assert wrong_db < ours_db - 15, "the wrong eye's sight would be no better"
     assert float(ours[1]) > float(ours[0])
 
 
@@ -127,7 +127,8 @@ def test_what_is_learned_gets_gradients_and_steps_down_the_loss() -> None:
     assert torch.isfinite(gradient).all() and gradient.norm() > 0
     with torch.no_grad():
         for p in model.parameters():
-            p -= 0.02 * p.grad / gradient.norm()
+            if p.grad is not None:
+                p -= 0.02 * p.grad / gradient.norm()
         assert pair_loss(model, pair, recipe) < loss
 
 

@@ -64,7 +64,9 @@ def test_json_plots_and_page_lie_in_the_folder(record: tuple[dict, Path]) -> Non
 
 
 STAGES = {
-    "eye pose", "RPU", "phase", "Jones optics", "retina", "solve", "network", "tracker", "calibration", "unsure eyes"}  # fmt: skip
+    "eye pose", "RPU", "phase", "Jones optics", "retina", "solve", "network", "tracker", "calibration",
+    "unsure eyes",
+}  # fmt: skip
 
 
 def test_every_stage_has_its_impostors_and_they_fail_most_of_its_cases(record: tuple[dict, Path]) -> None:
