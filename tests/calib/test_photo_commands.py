@@ -123,6 +123,7 @@ def test_photographs_register_the_panels_in_the_configuration(tmp_path, photos, 
     assert "data:image/png" in (tmp_path / "r" / "index.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_model_for_even_gaps_gets_even_gaps_and_is_told_what_that_costs(tmp_path, photos) -> None:
     told = panels("photo", "--photos", str(photos), "--out", str(tmp_path / "r"), "--model", "")
     assert load_settings(tmp_path / "r" / "panels.toml").stack.stack().is_evenly_spaced
@@ -130,6 +131,7 @@ def test_a_model_for_even_gaps_gets_even_gaps_and_is_told_what_that_costs(tmp_pa
     assert any("even ones of" in note for note in told["notes"])
 
 
+@pytest.mark.slow
 def test_what_the_registration_gains_is_told_in_decibels(tmp_path, photos) -> None:
     told = panels("photo", "--photos", str(photos), "--out", str(tmp_path / "r"), "--model", "fast")["psnr_db"]
     assert told["registered"] > told["as configured"] + 5
@@ -180,6 +182,7 @@ def test_a_video_device_takes_photographs_by_itself_when_it_is_held_still(tmp_pa
     assert "hold still" in said
 
 
+@pytest.mark.slow
 def test_a_video_registers_the_panels(tmp_path, pictures) -> None:
     number = 0
     for picture in pictures:

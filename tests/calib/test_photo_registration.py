@@ -40,6 +40,7 @@ def test_without_noise_the_panels_are_found_exactly() -> None:
     assert found.lens[0] == pytest.approx(lens.focal_px, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_dozen_stacks_are_found_within_a_tenth_of_a_pixel_and_the_intervals_hold_the_truth() -> None:
     errors, inside = [], []
     for seed in range(12):  # `calibrate panels photo-trial --stacks 30` tries thirty, with pictures

@@ -112,4 +112,4 @@ def test_the_methods_table_is_written_with_its_plots(tmp_path) -> None:
     assert result.exit_code == 0, result.output
     told = json.loads((tmp_path / "m" / "methods.json").read_text())
     assert [case["sigma_m"] for case in told["cases"]["clean"]] == [0.0, 0.001, 0.003, 0.01, 0.03]
-    assert (tmp_path / "m" / "index.html").read_text().count("data:image/png;base64,") == 4
+    assert (tmp_path / "m" / "index.html").read_text().count("data:image/png;base64,") == 6
