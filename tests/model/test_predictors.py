@@ -7,6 +7,7 @@ import pytest
 
 from runtime.config import ModelSettings
 from runtime.errors import ModelFailure
+from runtime.model.level import EVEN
 from runtime.model.predictor import load_predictor
 from runtime.model.sart import SartPredictor
 from runtime.model.still import solve_still
@@ -110,12 +111,21 @@ def test_a_head_that_lies_down_and_sits_up_again_leaves_nothing_behind() -> None
         assert (layers == solved("balanced", pair)).all()
 
 
-def test_eyes_at_one_place_and_a_doubt_that_is_no_number_are_model_failures() -> None:
+def test_a_doubt_that_is_no_number_is_a_model_failure() -> None:
     predictor = load_predictor("fast", STACK)
     grey = np.full((270, 480, 4), 128, np.uint8)
-    for pair, sigma_mm in ((np.array([[0.6, 0.0, 0.0]] * 2), 1.0), (eyes(0.6), np.nan), (eyes(0.6), np.inf)):
+    for sigma_mm in (np.nan, np.inf):
         with pytest.raises(ModelFailure):
-            predictor.predict([[grey], [grey]], pair, eye_sigma_mm=sigma_mm)
+            predictor.predict([[grey], [grey]], eyes(0.6), eye_sigma_mm=sigma_mm)
+
+
+def test_one_eye_that_stands_for_both_drives_no_outer_panel() -> None:
+    """The other eye can't see the display, and gave way: nothing differs, and the centre panel carries the picture."""
+    predictor = load_predictor("fast", STACK)
+    eye = eyes(0.6)[[0, 0]]
+    picture = card_scene(eye[0])
+    layers = solve_still(picture, picture, eyes_m=eye, fov_deg=FOV_DEG, predictor=predictor).layers
+    assert np.abs(layers[[0, 2], ..., :3].astype(int) - EVEN).max() <= 1
 
 
 def test_what_is_solved_for_unsure_eyes_is_better_for_them_and_worse_for_two_points() -> None:

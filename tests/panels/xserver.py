@@ -126,9 +126,13 @@ class XServer:
 
     def screenshot(self) -> npt.NDArray[np.uint8]:
         """(h, w, 3) RGB of the whole X screen."""
-        data = subprocess.run(
-            ["xwd", "-root", "-silent", "-display", self.name], check=True, capture_output=True, timeout=20
-        ).stdout
+        command = ["xwd", "-root", "-silent", "-display", self.name]
+        for _ in range(5):  # a window that closes while xwd lists it makes it fail
+            done = subprocess.run(command, check=False, capture_output=True, timeout=20)
+            if done.returncode == 0:
+                break
+        done.check_returncode()
+        data = done.stdout
         header = np.frombuffer(data, ">u4", 25)
         start, stride, width, height = int(header[0] + 12 * header[19]), int(header[12]), int(header[4]), int(header[5])
         pixel_bytes = int(header[11]) // 8  # 4, or 3 where windows of several visuals are put together
