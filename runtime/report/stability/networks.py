@@ -229,8 +229,6 @@ def trials(check: Check, *, full: bool = False) -> Iterator[Trial]:
         "85 degrees aside: no ray crosses all panels",
         partial(stressed, predicted, "balanced", smooth(STACK), aside),
     )
-    one_place = np.repeat(eyes_at(distance_m=0.6)[:1], 2, axis=0)
-    yield refusal(STAGE, "balanced: eyes at one place", partial(predicted, "balanced", smooth(STACK), one_place, STACK))
     for cells in (8, 112, 1024):
         yield Trial(STAGE, f"singular vectors of {cells} chain cells, float32", partial(modes, cells))
 
