@@ -1,4 +1,4 @@
-"""One piece of work on a thread of its own, asked about between two turns of the loop."""
+"""One piece of work on a thread of its own, asked about between two steps of whoever wants it."""
 
 from __future__ import annotations
 

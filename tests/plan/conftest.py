@@ -1,46 +1,5 @@
-"""What the content tests share: one GL context, the display of the paper, views of it."""
+"""The plan's tests share what the content's do: one GL context, the display of the paper, views of it."""
 
-from __future__ import annotations
+from tests.content.conftest import context, image_view, panel_view, shared_context, stack
 
-from collections.abc import Iterator
-from typing import Any
-
-import numpy as np
-import pytest
-from numpy.typing import ArrayLike
-
-from runtime.content.base import View
-from runtime.optics.stack import PanelStack, PlaneRaster
-from runtime.optics.views import image_from_stack, raster_from_stack
-from runtime.support.gl import offscreen_context
-
-
-@pytest.fixture(scope="session")
-def shared_context() -> Any:
-    return offscreen_context()
-
-
-@pytest.fixture
-def context(shared_context: Any) -> Iterator[Any]:
-    """The shared context, current again whatever another test made current."""
-    with shared_context:
-        yield shared_context
-
-
-@pytest.fixture
-def stack() -> PanelStack:
-    """The paper's display at a quarter of its pixels each way."""
-    return PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
-
-
-def panel_view(eye_m: ArrayLike, raster: PlaneRaster, side: int = 0) -> View:
-    """What an eye sees, in a plane's pixels."""
-    eye = np.asarray(eye_m, dtype=np.float64)
-    return View(eye, side, raster_from_stack(eye, raster), raster.width_px, raster.height_px)
-
-
-def image_view(eye_m: ArrayLike, width_px: int, height_px: int, fov_deg: float = 40.0, side: int = 0) -> View:
-    """What an eye sees, in its own image."""
-    eye = np.asarray(eye_m, dtype=np.float64)
-    projection = image_from_stack(eye, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
-    return View(eye, side, projection, width_px, height_px)
+__all__ = ["context", "image_view", "panel_view", "shared_context", "stack"]
