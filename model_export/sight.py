@@ -19,7 +19,7 @@ from model_export.network import FULL, SpectralSolver
 from model_export.recipe import Recipe
 from runtime.model.chain import ChainFrame, chain_frame, chain_modes
 from runtime.model.resample import buffer, resample
-from runtime.model.transfer import emphasised, phase_codes
+from runtime.model.transfer import phase_codes, pre_emphasised
 from runtime.records import F64
 
 SPREAD = 2.0  # standard deviations to the four places beside the nominal one (design 5.5)
@@ -49,7 +49,7 @@ def sight_of(pair: TrainingPair, recipe: Recipe, *, device: torch.device) -> Sig
     size = (max(1, width // recipe.reduction), max(1, height // recipe.reduction))
     table = phase_codes(2)
     phases = [
-        cv2.LUT(cv2.resize(emphasised(image, recipe.emphasis), size, interpolation=cv2.INTER_AREA), table)
+        cv2.LUT(cv2.resize(pre_emphasised(image, recipe.emphasis), size, interpolation=cv2.INTER_AREA), table)
         for image in pair.images
     ]
     half = np.asarray(phases[1] - phases[0], np.int16) >> 1

@@ -45,7 +45,10 @@ def main() -> None:
             code = _code_of(app, output)
     except BaseException as error:
         code = _told(error, output)
-    sys.exit(_flushed(code, output))
+    code = _flushed(code, output)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt now would find the interpreter half taken down
+    sys.exit(code)
 
 
 def _code_of(app: Any, output: _Output) -> int:

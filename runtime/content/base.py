@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-from runtime.content.camera import PixelBox
+from runtime.optics.rect import PixelRect
 from runtime.records import F64, U8
 
 
@@ -48,7 +48,7 @@ class ContentSource(ABC):
         Raises ContentFailure: the last picture stays.
         """
 
-    def extent(self, view: View, *, time_ns: int) -> PixelBox | None:
+    def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
         """A box of the view's pixels beside which only the background shows, told without drawing; None: not known."""
         return None
 

@@ -2,32 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
+from runtime.optics.rect import PixelRect
 from runtime.records import F64
 
 NEAREST_M = 1e-3
-
-
-@dataclass(frozen=True, slots=True)
-class PixelBox:
-    """A rectangle of whole pixels, right and bottom exclusive; u right, v down."""
-
-    u0: int
-    v0: int
-    u1: int
-    v1: int
-
-    @property
-    def width_px(self) -> int:
-        return max(self.u1 - self.u0, 0)
-
-    @property
-    def height_px(self) -> int:
-        return max(self.v1 - self.v0, 0)
 
 
 def clip_from_stack(pixels_from_stack: F64, *, width_px: int, height_px: int, near_m: float, far_m: float) -> F64:
@@ -69,24 +50,24 @@ def depth_bounds(pixels_from_stack: F64, corners_m: F64) -> tuple[float, float] 
 
 def covered_box(
     pixels_from_stack: F64, corners_m: F64, *, width_px: int, height_px: int, align_px: int = 32
-) -> PixelBox:
+) -> PixelRect:
     """The part of the raster that a convex hull of corners may touch, grown to multiples of `align_px`."""
     pixels, depths = project(pixels_from_stack, corners_m)
     if (depths <= NEAREST_M).any():
-        return PixelBox(0, 0, width_px, height_px)
+        return PixelRect(0, 0, width_px, height_px)
     low = np.floor((pixels.min(0) - 1) / align_px) * align_px
     high = np.ceil((pixels.max(0) + 1) / align_px) * align_px
     u0, v0 = (int(value) for value in np.clip(low, 0, [width_px, height_px]))
     u1, v1 = (int(value) for value in np.clip(high, 0, [width_px, height_px]))
-    return PixelBox(u0, v0, max(u1, u0), max(v1, v0))
+    return PixelRect(u0, v0, max(u1, u0), max(v1, v0))
 
 
-def union(boxes: list[PixelBox]) -> PixelBox:
+def union(boxes: list[PixelRect]) -> PixelRect:
     """The smallest box around those that aren't empty; empty where all are."""
     filled = [box for box in boxes if box.width_px and box.height_px]
     if not filled:
-        return PixelBox(0, 0, 0, 0)
-    return PixelBox(
+        return PixelRect(0, 0, 0, 0)
+    return PixelRect(
         min(box.u0 for box in filled),
         min(box.v0 for box in filled),
         max(box.u1 for box in filled),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from runtime.content.camera import PixelBox
+from runtime.optics.rect import PixelRect
 from runtime.records import U8
 from runtime.support.gl import finish
 
@@ -40,7 +40,7 @@ class Canvas:
         self.clear_colour = (*background, 0.0)
         self._targets: dict[tuple[int, int], _Target] = {}
 
-    def draw(self, *, width_px: int, height_px: int, side: int, box: PixelBox, paint: Callable[[], None]) -> U8:
+    def draw(self, *, width_px: int, height_px: int, side: int, box: PixelRect, paint: Callable[[], None]) -> U8:
         """Clear, let `paint` issue its draw calls inside `box`, and return the (h, w, 4) picture of that side."""
         target = self._target(width_px, height_px)
         target.plain.use()

@@ -13,12 +13,12 @@ import numpy as np
 
 from runtime.config import LimitSettings
 from runtime.content.base import ContentInfo, ContentSource, View
-from runtime.content.camera import PixelBox
 from runtime.content.gltf_header import check_gltf, file_of
 from runtime.content.ply import check_counts
 from runtime.content.shapes import Shape
 from runtime.content.triangles import Part, ReadyPart, TrianglePainter
 from runtime.errors import InputError, MissingPart, one_line
+from runtime.optics.rect import PixelRect
 from runtime.records import F64, U8
 from runtime.support import foreign, progress
 from runtime.support.picture_header import check_picture
@@ -260,7 +260,7 @@ class MeshSource(ContentSource):
     def render(self, view: View, *, time_ns: int) -> U8:
         return self._painter.paint(view, self._placed)
 
-    def extent(self, view: View, *, time_ns: int) -> PixelBox:
+    def extent(self, view: View, *, time_ns: int) -> PixelRect:
         return self._painter.extent(view, self._placed)
 
     def close(self) -> None:

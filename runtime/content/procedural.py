@@ -10,9 +10,9 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.content import shapes, textures
 from runtime.content.base import ContentInfo, ContentSource, View
-from runtime.content.camera import PixelBox
 from runtime.content.scenes import Scene, Thing, scene
 from runtime.content.triangles import Part, ReadyPart, TrianglePainter, ready
+from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 
@@ -77,7 +77,7 @@ class ProceduralSource(ContentSource):
         """The scene through the view's projection; the same bytes for the same view and time."""
         return self._painter.paint(view, self._places(time_ns))
 
-    def extent(self, view: View, *, time_ns: int) -> PixelBox:
+    def extent(self, view: View, *, time_ns: int) -> PixelRect:
         return self._painter.extent(view, self._places(time_ns))
 
     def close(self) -> None:

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 
 from runtime.content.base import ContentInfo, ContentSource, View
-from runtime.content.camera import PixelBox
 from runtime.content.images import rgba_from_rgb
 from runtime.content.pictures import screen
 from runtime.content.shapes import Shape
 from runtime.content.triangles import Part, TrianglePainter
 from runtime.errors import InputError
+from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, U8
 
@@ -84,7 +84,7 @@ class RgbdSource(ContentSource):
     def render(self, view: View, *, time_ns: int) -> U8:
         return self._painter.paint(view, [np.eye(4)])
 
-    def extent(self, view: View, *, time_ns: int) -> PixelBox:
+    def extent(self, view: View, *, time_ns: int) -> PixelRect:
         return self._painter.extent(view, [np.eye(4)])
 
     def close(self) -> None:

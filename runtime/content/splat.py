@@ -8,9 +8,9 @@ import moderngl
 import numpy as np
 
 from runtime.content.base import ContentInfo, ContentSource, View
-from runtime.content.camera import PixelBox
 from runtime.content.canvas import Canvas
 from runtime.content.gaussians import Gaussians, colours_towards, moved, seen_splats
+from runtime.optics.rect import PixelRect
 from runtime.records import F64, U8
 
 OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
@@ -86,7 +86,7 @@ class SplatSource(ContentSource):
             self._context.blend_func = OVER
             self._vertices.render(vertices=6 * count)
 
-        whole = PixelBox(0, 0, view.width_px, view.height_px if count else 0)
+        whole = PixelRect(0, 0, view.width_px, view.height_px if count else 0)
         return self._canvas.draw(
             width_px=view.width_px, height_px=view.height_px, side=view.side, box=whole, paint=paint
         )

@@ -17,6 +17,7 @@ from runtime.content.base import View
 from runtime.content.canvas import Canvas
 from runtime.content.fringe import Edges, edges_of, ramps, silhouette
 from runtime.content.shapes import Shape
+from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64, U8
 
 MOST_OUTLINED = 200_000  # triangles of a part; beyond, finding its outline costs more than drawing it
@@ -179,7 +180,7 @@ class TrianglePainter:
         placed = zip(self._parts, stack_from_parts, strict=True)
         return np.concatenate([item.corners_m @ matrix[:3, :3].T + matrix[:3, 3] for item, matrix in placed])
 
-    def extent(self, view: View, stack_from_parts: Sequence[F64]) -> camera.PixelBox:
+    def extent(self, view: View, stack_from_parts: Sequence[F64]) -> PixelRect:
         """A box of the view's pixels that holds all that `paint` would draw."""
         size = {"width_px": view.width_px, "height_px": view.height_px}
         boxes = []
@@ -197,7 +198,7 @@ class TrianglePainter:
         corners = self.corners_m(stack_from_parts).reshape(-1, 8, 3)
         bounds = camera.depth_bounds(view.pixels_from_stack, corners.reshape(-1, 3))
         boxes = [camera.covered_box(view.pixels_from_stack, part, **size) for part in corners]
-        area = camera.union(boxes) if bounds else camera.PixelBox(0, 0, 0, 0)
+        area = camera.union(boxes) if bounds else PixelRect(0, 0, 0, 0)
         # Nearest first: what they hide need not be shaded.
         order = np.argsort(-corners[..., 0].mean(1), kind="stable")
         placed = [(self._parts[index], stack_from_parts[index]) for index in order]

@@ -38,8 +38,8 @@ class Predictor(ABC):
         return "linear"
 
     @property
-    def emphasis(self) -> float:
-        """How strongly it sharpens pictures against the blur of interpolation (`transfer.emphasised`)."""
+    def pre_emphasis(self) -> float:
+        """How strongly it sharpens pictures against the blur of interpolation (`transfer.pre_emphasised`)."""
         return 0.0
 
     @property

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from runtime.model.level import I16, Level
-from runtime.model.visible import Box
+from runtime.model.pyramid_level import I16, PyramidLevel
+from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64
 
 QUARTERS = 4  # the finest steps in which 16 bits hold any phase that an eye can lack
@@ -23,7 +23,7 @@ CORRECTED_SHARE = 1 / 6  # of the fade, in which corrections fade too: they mend
 class Fade:
     """In pixels of the part's centre panel."""
 
-    kept: Box  # beside which the outer panels stay even
+    kept: PixelRect  # beside which the outer panels stay even
     over_px: tuple[float, float]  # right and down: how far the fade reaches inwards
     left: bool = True  # the sides that fade: where the part ends within the panels
     top: bool = True
@@ -32,7 +32,7 @@ class Fade:
 
     def turned(self) -> Fade:
         """The same with rows for columns."""
-        box = Box(self.kept.v0, self.kept.u0, self.kept.v1, self.kept.u1)
+        box = PixelRect(self.kept.v0, self.kept.u0, self.kept.v1, self.kept.u1)
         return Fade(box, self.over_px[::-1], left=self.top, top=self.left, right=self.bottom, bottom=self.right)
 
     def wave_weights(self, centre_from_raster: F64, *, rows: int, columns: int) -> F32:
@@ -48,7 +48,7 @@ class Fade:
             weights = weights * np.clip(inside / over_px, 0.0, 1.0)
         return np.asarray(weights, np.float32)[..., None]
 
-    def soften(self, level: Level, centre_from_raster: F64) -> None:
+    def soften(self, level: PyramidLevel, centre_from_raster: F64) -> None:
         """Take back, towards the edges, what the eyes lack: no correction must drive the panels beyond them."""
         m = centre_from_raster
         height, width = level.residual[0].shape[:2]

@@ -21,7 +21,7 @@ def phase_codes(branch: Branch = 2) -> NDArray[np.int16]:
     return np.rint(phase_from_intensity(codes, branch) * FULL).astype(np.int16)
 
 
-def emphasised(picture: U8, strength: float) -> U8:
+def pre_emphasised(picture: U8, strength: float) -> U8:
     """Sharpened by what interpolation will blur: on the way to the panels' pixels, and between them in the eye.
 
     A separable [-a, 1 + 2a, -a] on every channel; 0 leaves the picture as it is.

@@ -16,19 +16,20 @@ from numpy.typing import NDArray
 
 from runtime.errors import ModelFailure
 from runtime.model.base import Prediction, Predictor
-from runtime.model.bench import Bench
 from runtime.model.chain import ChainFrame, chain_frame, chain_modes
 from runtime.model.channels import RGBA_FROM, is_grey, without_alpha
 from runtime.model.contract import Step
 from runtime.model.fade import Fade
-from runtime.model.level import CENTRE, EVEN, FRONT, I16, OUTER, REAR, START, Level
+from runtime.model.pyramid_level import CENTRE, FRONT, I16, NEUTRAL, OUTER, REAR, START, PyramidLevel
 from runtime.model.resample import resample
 from runtime.model.rows import RowPool
 from runtime.model.session import ModelSession
 from runtime.model.timing import Stopwatch
-from runtime.model.transfer import SUBCODE, emphasised, phase_codes
-from runtime.model.visible import Box, visible_boxes
+from runtime.model.transfer import SUBCODE, phase_codes, pre_emphasised
+from runtime.model.visible import visible_boxes
+from runtime.model.workspace import Workspace
 from runtime.optics.pupil import POINT_MM
+from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
 
@@ -58,9 +59,9 @@ class UnrolledPredictor(Predictor):
         self._twin: UnrolledPredictor | None = None  # for eyes above each other
         self.fade: Fade | None = None  # how this stack ends, where it is a part of larger panels
         self._rows = RowPool(threads, width_px=stack.width_px)
-        self._benches: dict[int, Bench] = {}
-        self._boxes: tuple[Box, ...] = ()
-        self._drawn: tuple[Box, ...] = ()  # where the layers hold more than even panels
+        self._workspaces: dict[int, Workspace] = {}
+        self._boxes: tuple[PixelRect, ...] = ()
+        self._drawn: tuple[PixelRect, ...] = ()  # where the layers hold more than even panels
         self._layers = np.full((3, stack.height_px, stack.width_px, 4), 255, np.uint8)
 
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
@@ -71,7 +72,7 @@ class UnrolledPredictor(Predictor):
         return self.session.contract.interpolation
 
     @property
-    def emphasis(self) -> float:
+    def pre_emphasis(self) -> float:
         return self.session.contract.emphasis
 
     def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
@@ -92,34 +93,34 @@ class UnrolledPredictor(Predictor):
         self._boxes = visible_boxes(eyes_m, self.stack)
         cut = [image[0][self._boxes[CENTRE].slices] for image in images]
         self.channels = 1 if self.one_channel and all(is_grey(picture) for picture in cut) else 3
-        bench = self._bench()
-        pictures = [emphasised(without_alpha(picture, self.channels), contract.emphasis) for picture in cut]
-        for level in bench.levels.values():
+        workspace = self._workspace()
+        pictures = [pre_emphasised(without_alpha(picture, self.channels), contract.emphasis) for picture in cut]
+        for level in workspace.levels.values():
             level.wanted = [np.asarray(phases, np.int16) for phases in self._phases(pictures, level.size)]
         last = {n: _last_change(contract.steps, n) for n in OUTER}
-        for level in bench.levels.values():
-            level.be_unsure(eyes_m, eye_sigma_mm=eye_sigma_mm)
-        level = bench.levels[contract.steps[0].reduction]
+        for level in workspace.levels.values():
+            level.set_eye_sigma(eyes_m, eye_sigma_mm=eye_sigma_mm)
+        level = workspace.levels[contract.steps[0].reduction]
         for index, step in enumerate(contract.steps):
             if step.reduction != level.reduction:
-                coarser, level = level, bench.levels[step.reduction]
-                level.refine(coarser, shown=False)
-                level.look(OUTER, eyes_m)
+                coarser, level = level, workspace.levels[step.reduction]
+                level.upsample(coarser, shown=False)
+                level.project(OUTER, eyes_m)
             if index:
-                level.lacks()
+                level.update_residuals()
                 if self.fade is not None:
                     self.fade.soften(level, self._centre_from(level.rasters[CENTRE].plane_from_raster()))
             shown = {n: index == last[n] for n in OUTER}
             if step.kind == "chain":
-                needs = self._needs(pictures, bench)
-                panels = self._network(needs, frame, eyes_m, watch, bench=bench, eye_sigma_mm=eye_sigma_mm)
-                _drive(level, panels, frame, shown=shown)
+                residuals = self._initial_residuals(pictures, workspace)
+                panels = self._network(residuals, frame, eyes_m, watch, workspace=workspace, eye_sigma_mm=eye_sigma_mm)
+                _set_outer_panels(level, panels, frame, shown=shown)
                 changed: tuple[int, ...] = OUTER
             else:
                 changed = (FRONT if step.kind == "front" else REAR,)
                 level.correct(changed[0], eyes_m, size=step.size, shown=shown[changed[0]])
-            level.look(changed, eyes_m)
-        self._finish(level, eyes_m, bench)
+            level.project(changed, eyes_m)
+        self._finish(level, eyes_m, workspace)
         watch.lap("finish")
         return Prediction(self._layers, watch.stage_ms)
 
@@ -146,14 +147,14 @@ class UnrolledPredictor(Predictor):
         self._drawn, self.channels = (), twin.channels
         return Prediction(self._layers, solved.stage_ms)
 
-    def _bench(self) -> Bench:
+    def _workspace(self) -> Workspace:
         """What the steps work on, cut to what the eyes look through; panels are even beside it."""
-        if self.channels not in self._benches:
+        if self.channels not in self._workspaces:
             reductions = {1} | {step.reduction for step in self.session.contract.steps}
-            self._benches[self.channels] = Bench(self.stack, reductions, rows=self._rows, channels=self.channels)
-        bench = self._benches[self.channels]
-        bench.look_through(self._boxes, self.stack)
-        return bench
+            self._workspaces[self.channels] = Workspace(self.stack, reductions, rows=self._rows, channels=self.channels)
+        workspace = self._workspaces[self.channels]
+        workspace.crop(self._boxes, self.stack)
+        return workspace
 
     def _phases(self, pictures: Sequence[U8], size: tuple[int, int]) -> list[Any]:
         """Phase sums of two pictures at a size, averaged as codes."""
@@ -162,25 +163,25 @@ class UnrolledPredictor(Predictor):
         sized = pictures if same else [cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in pictures]
         return [cv2.LUT(picture, table) for picture in sized]
 
-    def _finish(self, level: Level, eyes_m: F64, bench: Bench) -> None:
+    def _finish(self, level: PyramidLevel, eyes_m: F64, workspace: Workspace) -> None:
         """Close the centre panel on every pixel, and bring the panels into their layers."""
-        whole = bench.levels[1]
+        whole = workspace.levels[1]
         if level is not whole:
-            whole.refine(level, shown=True)
-            whole.look(OUTER, eyes_m)
-        whole.close_centre(bench.shown[CENTRE])
+            whole.upsample(level, shown=True)
+            whole.project(OUTER, eyes_m)
+        whole.close_centre(workspace.shown[CENTRE])
         if self._drawn != self._boxes:
-            self._layers[..., :3] = EVEN
+            self._layers[..., :3] = NEUTRAL
             self._drawn = self._boxes
         for n, box in enumerate(self._boxes):
             if n != CENTRE:
-                cv2.convertScaleAbs(whole.outer[n], dst=bench.shown[n], alpha=1 / SUBCODE)
-            self._layers[n][box.slices] = cv2.cvtColor(bench.shown[n], RGBA_FROM[self.channels])
+                cv2.convertScaleAbs(whole.outer[n], dst=workspace.shown[n], alpha=1 / SUBCODE)
+            self._layers[n][box.slices] = cv2.cvtColor(workspace.shown[n], RGBA_FROM[self.channels])
 
-    def _needs(self, pictures: Sequence[U8], bench: Bench) -> list[I16]:
+    def _initial_residuals(self, pictures: Sequence[U8], workspace: Workspace) -> list[I16]:
         """What each eye lacks while the outer panels are even, at the network's coarser raster."""
         size = self._reduced_size()
-        known = (level.wanted for level in bench.levels.values() if level.size == size)
+        known = (level.wanted for level in workspace.levels.values() if level.size == size)
         left, right = next(known, None) or self._phases(pictures, size)
         half = (np.asarray(right, np.int16) - np.asarray(left, np.int16)) >> 1
         return [-half, half]
@@ -191,12 +192,12 @@ class UnrolledPredictor(Predictor):
 
     def _network(
         self,
-        needs: Sequence[I16],
+        residuals: Sequence[I16],
         frame: ChainFrame,
         eyes_m: F64,
         watch: Stopwatch,
         *,
-        bench: Bench,
+        workspace: Workspace,
         eye_sigma_mm: float,
     ) -> dict[int, I16]:
         """The network's answer: both outer panels on the chain frame's raster, from one parallax before its first
@@ -205,10 +206,10 @@ class UnrolledPredictor(Predictor):
         centre = self._boxes[CENTRE].cut(self.stack.panel(CENTRE))
         reduced_from_full = np.diag([width / centre.width_px, height / centre.height_px, 1.0])
         reduced_from_plane = reduced_from_full @ centre.raster_from_plane()
-        seen = bench.chain_buffers(frame)
+        seen = workspace.chain_buffers(frame)
         for side, eye_m in enumerate(eyes_m):
             matrix = reduced_from_plane @ frame.plane_from_frame(eye_m, x_m=self.stack.x_m[CENTRE])
-            resample(needs[side], image_from_result=matrix, out=seen[side])
+            resample(residuals[side], image_from_result=matrix, out=seen[side])
         waves, shifted_waves, spectrum, modes_in = chain_modes(frame.cells)
         left, right = (image.reshape(frame.rows, frame.cells, -1) for image in seen)
         feeds: dict[str, NDArray[Any]] = {
@@ -244,13 +245,15 @@ class UnrolledPredictor(Predictor):
         return self.stack.panel(CENTRE).raster_from_plane() @ plane_from_raster
 
 
-def _drive(level: Level, panels: Mapping[int, I16], frame: ChainFrame, *, shown: dict[int, bool]) -> None:
+def _set_outer_panels(
+    level: PyramidLevel, panels: Mapping[int, I16], frame: ChainFrame, *, shown: dict[int, bool]
+) -> None:
     """Both outer panels as the network wants them."""
     for n, codes in panels.items():
         panel = level.rasters[n]
         matrix = frame.frame_from_plane(x_m=panel.x_m) @ panel.plane_from_raster()
         matrix[0, 2] += frame.cell_px  # the answer begins one parallax before the first column
-        level.drive(n, codes, matrix, shown=shown[n])
+        level.set_panel(n, codes, matrix, shown=shown[n])
 
 
 def _last_change(steps: Sequence[Step], panel: int) -> int:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from math import ceil, floor
 
 import numpy as np
 
-from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.rect import PixelRect
+from runtime.optics.stack import PanelStack
 from runtime.optics.views import relative_scale_shift
 from runtime.records import F64
 
@@ -16,40 +16,7 @@ ALIGN_PX = 8  # boxes begin and end at multiples of this, so that a half or a qu
 LEAST_PX = 32
 
 
-@dataclass(frozen=True, slots=True)
-class Box:
-    """Pixels [u0, u1) x [v0, v1) of a panel."""
-
-    u0: int
-    v0: int
-    u1: int
-    v1: int
-
-    @property
-    def width_px(self) -> int:
-        return self.u1 - self.u0
-
-    @property
-    def height_px(self) -> int:
-        return self.v1 - self.v0
-
-    @property
-    def slices(self) -> tuple[slice, slice]:
-        """Rows and columns, to index an image."""
-        return slice(self.v0, self.v1), slice(self.u0, self.u1)
-
-    def cut(self, raster: PlaneRaster) -> PlaneRaster:
-        """The part of a panel's raster."""
-        return replace(
-            raster,
-            left_m=raster.left_m + self.u0 * raster.pitch_u_m,
-            top_m=raster.top_m - self.v0 * raster.pitch_v_m,
-            width_px=self.width_px,
-            height_px=self.height_px,
-        )
-
-
-def visible_boxes(eyes_m: F64, stack: PanelStack) -> tuple[Box, ...]:
+def visible_boxes(eyes_m: F64, stack: PanelStack) -> tuple[PixelRect, ...]:
     """For each panel the pixels on rays of either eye (2, 3) that cross every panel, a little padded.
 
     Where an eye sees nothing through all panels, a small box in the middle: there is nothing to solve.
@@ -79,10 +46,10 @@ def visible_boxes(eyes_m: F64, stack: PanelStack) -> tuple[Box, ...]:
     return tuple(boxes)
 
 
-def _box(low_m: F64, high_m: F64, stack: PanelStack) -> Box:
+def _box(low_m: F64, high_m: F64, stack: PanelStack) -> PixelRect:
     u0, u1 = _span(low_m[0] / stack.width_m + 0.5, high_m[0] / stack.width_m + 0.5, stack.width_px)
     v0, v1 = _span(0.5 - high_m[1] / stack.height_m, 0.5 - low_m[1] / stack.height_m, stack.height_px)
-    return Box(u0, v0, u1, v1)
+    return PixelRect(u0, v0, u1, v1)
 
 
 def _span(low: float, high: float, size: int) -> tuple[int, int]:

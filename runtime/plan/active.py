@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from runtime.content.camera import PixelBox
+from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 
@@ -29,24 +29,24 @@ EDGE_PX = 2
 class Window:
     """A rectangle of every panel that is solved by itself."""
 
-    box: PixelBox  # panel pixels
+    box: PixelRect  # panel pixels
     stack: PanelStack  # the same panels, cut to the box and moved to its centre
     shift_m: F64  # (3,) of the stack frame: where the box's centre is (0, y, z)
     steps: float  # parallaxes over which what is driven beside the difference fades out
 
 
-def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> PixelBox:
+def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> PixelRect:
     """The smallest box of pixels in which two (h, w, 4) RGBA pictures differ; empty where they agree everywhere."""
     return _box(left, right, tolerance)
 
 
-def coarse_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> PixelBox:
+def coarse_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> PixelRect:
     """A box within `differing_box`, from a look at a few pixels, for a hundredth of the time: what is too much of the
     panel to be cut out is told by it."""
     box = _box(left[::COARSE_STEP, ::COARSE_STEP], right[::COARSE_STEP, ::COARSE_STEP], tolerance)
     if not box.width_px:
         return box
-    return PixelBox(
+    return PixelRect(
         box.u0 * COARSE_STEP,
         box.v0 * COARSE_STEP,
         (box.u1 - 1) * COARSE_STEP + 1,
@@ -54,11 +54,11 @@ def coarse_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> Pixe
     )
 
 
-def _box(left: U8, right: U8, tolerance: int) -> PixelBox:
+def _box(left: U8, right: U8, tolerance: int) -> PixelRect:
     difference = cv2.absdiff(np.ascontiguousarray(left), np.ascontiguousarray(right))
     agree = cv2.inRange(difference, (0, 0, 0, 0), (tolerance, tolerance, tolerance, 255))
     u, v, width, height = cv2.boundingRect(cv2.bitwise_not(agree))
-    return PixelBox(u, v, u + width, v + height)
+    return PixelRect(u, v, u + width, v + height)
 
 
 def stray_px(eyes_m: F64, stack: PanelStack) -> F64:
@@ -82,7 +82,7 @@ def steepness(codes: U8) -> float:
     return float(np.sqrt((4 * intensities * (1 - intensities)).mean())) if codes.size else 0.0
 
 
-def steepness_beside(picture: U8, box: PixelBox) -> float:
+def steepness_beside(picture: U8, box: PixelRect) -> float:
     """The same of what lies right and left of a box in an (h, w, 4) picture: there a wave must fade."""
     rows = slice(box.v0, box.v1, COARSE_STEP)
     beside = (picture[rows, : box.u0 : COARSE_STEP, :3], picture[rows, box.u1 :: COARSE_STEP, :3])
@@ -115,7 +115,7 @@ def room_px(low: float, high: float, stray: F64, *, eyes_px: F64, weights: F64, 
     return PANEL_CROSSINGS * max(float(before), 0.0) + room, PANEL_CROSSINGS * max(float(after), 0.0) + room
 
 
-def whole_rays(window: Window, eyes_m: F64, stack: PanelStack) -> PixelBox:
+def whole_rays(window: Window, eyes_m: F64, stack: PanelStack) -> PixelRect:
     """The part of a window in which no eye's ray leaves it on another panel; up to the panels' own edges.
 
     A ray through p on the centre panel meets a panel of weight t at p(1 - t) + e·t. eyes_m: (2, 3), frame
@@ -131,7 +131,7 @@ def whole_rays(window: Window, eyes_m: F64, stack: PanelStack) -> PixelBox:
         last = min(int(np.floor(high)), end) if end < whole else whole
         limits.append((first, max(first, last)))
     (u0, u1), (v0, v1) = limits
-    return PixelBox(u0, v0, u1, v1)
+    return PixelRect(u0, v0, u1, v1)
 
 
 def _weights(eyes_m: F64, stack: PanelStack) -> F64:
@@ -147,7 +147,7 @@ def _eyes_px(eyes_m: F64, stack: PanelStack) -> F64:
     return places
 
 
-def window_of(box: PixelBox, eyes_m: F64, stack: PanelStack, *, steep: float = 1.0) -> Window | None:
+def window_of(box: PixelRect, eyes_m: F64, stack: PanelStack, *, steep: float = 1.0) -> Window | None:
     """The window that a difference is solved in: grown by its room, rounded up to whole sixteenths of the panel.
 
     steep: of what lies beside it (`steepness`). None where it would be most of the panel: then the whole is as fast.
@@ -171,10 +171,10 @@ def window_of(box: PixelBox, eyes_m: F64, stack: PanelStack, *, steep: float = 1
     (u0, u1), (v0, v1) = spans
     if (u1 - u0) * (v1 - v0) > WHOLE_ABOVE * stack.width_px * stack.height_px:
         return None
-    return cut_out(PixelBox(u0, v0, u1, v1), stack, steps=wave_steps(steep))
+    return cut_out(PixelRect(u0, v0, u1, v1), stack, steps=wave_steps(steep))
 
 
-def cut_out(box: PixelBox, stack: PanelStack, *, steps: float = WAVE_STEPS[1]) -> Window:
+def cut_out(box: PixelRect, stack: PanelStack, *, steps: float = WAVE_STEPS[1]) -> Window:
     """The panels behind a box of pixels, as a stack of their own."""
     pitch_u, pitch_v = stack.width_m / stack.width_px, stack.height_m / stack.height_px
     cut = PanelStack(pitch_u * box.width_px, pitch_v * box.height_px, stack.x_m, box.width_px, box.height_px)

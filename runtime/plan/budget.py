@@ -25,7 +25,7 @@ from runtime.plan.ladder import (
     ready_level,
     simulated_stage_ms,
 )
-from runtime.plan.levels import BudgetKeeper, Level, useful
+from runtime.plan.levels import BudgetKeeper, QualityLevel, useful
 from runtime.plan.savings import Saving
 from runtime.records import F64
 from runtime.support.background import Job
@@ -71,10 +71,10 @@ class BudgetControl:
         self._settings = solving.settings
         self._configured: Rung = (self._settings.model.name, 1.0)
         self._shown = self._configured
-        self._levels: list[Level] = []
+        self._levels: list[QualityLevel] = []
         self._keeper: BudgetKeeper | None = None
         self._calls = SolverCalls()
-        self._measuring: Job[list[Level]] | None = None
+        self._measuring: Job[list[QualityLevel]] | None = None
         self._doing = ""  # what is being measured
         self._kept: dict[Rung, Predictor] = {}
         self._job: tuple[Rung, Job[Predictor]] | None = None  # makes one level ready
@@ -213,7 +213,7 @@ class BudgetControl:
 
     def _get_ready(self, rung: Rung) -> None:
         settings, scenery, calls = self._settings, self._scenery(), self._calls
-        name = f"model {Level(*rung, 0.0, 0.0).label}"
+        name = f"model {QualityLevel(*rung, 0.0, 0.0).label}"
         work = partial(ready_level, rung, settings, scenery, calls)
         self._job = rung, Job(name, work, discard=lambda made: made.close())
 
@@ -267,7 +267,7 @@ class BudgetControl:
             return
         self._choose(self._as_the_loop_finds_them(levels))
 
-    def _as_the_loop_finds_them(self, levels: list[Level]) -> list[Level]:
+    def _as_the_loop_finds_them(self, levels: list[QualityLevel]) -> list[QualityLevel]:
         """Times that were measured beside the loop, scaled by what its own frames took before that."""
         present = [level for level in levels if _rung(level) == self._shown]
         if not present or len(self._frames_ms) < FEWEST_FRAMES:
@@ -275,7 +275,7 @@ class BudgetControl:
         ratio = float(np.median(self._frames_ms)) / present[0].expected_ms
         return [replace(level, expected_ms=level.expected_ms * ratio) for level in levels]
 
-    def _choose(self, levels: list[Level]) -> None:
+    def _choose(self, levels: list[QualityLevel]) -> None:
         self._levels = levels
         self._keeper = BudgetKeeper(useful(levels), self.budget_ms)
         self._told_missed = False
@@ -296,7 +296,7 @@ class BudgetControl:
         self._solving.tell_level(label, self._saving())
 
     def _label(self) -> str:
-        return Level(*self._shown, 0.0, 0.0).label
+        return QualityLevel(*self._shown, 0.0, 0.0).label
 
     def _scenery(self) -> Scenery:
         fov_deg = self._settings.content.fov_deg
@@ -318,11 +318,11 @@ class BudgetControl:
         self._kept = {}
 
 
-def _rung(level: Level) -> Rung:
+def _rung(level: QualityLevel) -> Rung:
     return level.model, level.scale
 
 
-def _why(before: Level, keeper: BudgetKeeper) -> str:
+def _why(before: QualityLevel, keeper: BudgetKeeper) -> str:
     """One phrase for the log."""
     if keeper.level.psnr_db < before.psnr_db:
         return f"frames took longer than {keeper.budget_ms:g} ms"

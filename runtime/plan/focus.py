@@ -16,14 +16,14 @@ import cv2
 import numpy as np
 
 from runtime.content.base import ContentSource, View
-from runtime.content.camera import PixelBox, union
+from runtime.content.camera import union
 from runtime.model.fade import Fade
-from runtime.model.level import EVEN
 from runtime.model.predictor import Prediction, Predictor
-from runtime.model.transfer import SUBCODE, emphasised, phase_codes
+from runtime.model.pyramid_level import NEUTRAL
+from runtime.model.transfer import SUBCODE, phase_codes, pre_emphasised
 from runtime.model.unrolled import UnrolledPredictor
-from runtime.model.visible import Box
 from runtime.optics.pupil import POINT_MM
+from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import raster_from_stack
 from runtime.plan.active import (
@@ -56,8 +56,8 @@ class FocusedPredictor(Predictor):
         self.stack = whole.stack
         self._parts: dict[tuple[int, int], UnrolledPredictor] = {}
         self._layers = np.full((self.stack.count, self.stack.height_px, self.stack.width_px, 4), 255, np.uint8)
-        self._layers[..., :3] = EVEN
-        self._solved: PixelBox | None = None  # where the outer panels are not even
+        self._layers[..., :3] = NEUTRAL
+        self._solved: PixelRect | None = None  # where the outer panels are not even
         self._aimed: Window | None = None
         self._wanted_background: tuple[int, ...] = (255, 255, 255)
         self._background: tuple[int, ...] | None = None  # that fills the centre panel beside the aimed window
@@ -96,8 +96,8 @@ class FocusedPredictor(Predictor):
         return self.whole.interpolation
 
     @property
-    def emphasis(self) -> float:
-        return self.whole.emphasis
+    def pre_emphasis(self) -> float:
+        return self.whole.pre_emphasis
 
     def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
         return super().windows(eyes_m) if self._aimed is not None else self.whole.windows(eyes_m)
@@ -153,7 +153,7 @@ class FocusedPredictor(Predictor):
             self._fill_with(left, but=window.box)
         return self._place(window, solved, eyes_m, found_ms + (perf_counter_ns() - begin_ns) / 1e6)
 
-    def _around(self, box: PixelBox, picture: U8, eyes_m: F64) -> Window | None:
+    def _around(self, box: PixelRect, picture: U8, eyes_m: F64) -> Window | None:
         """The window around a box in which the eyes' pictures differ; None where nothing does, or too much."""
         if not box.width_px:
             return None
@@ -181,11 +181,11 @@ class FocusedPredictor(Predictor):
         filled_ms = (perf_counter_ns() - begin_ns) / 1e6
         return Prediction(self._layers, {"prepare": filled_ms, "inference": 0.0, "finish": 0.0})
 
-    def _fill_with(self, picture: U8, *, but: PixelBox | None) -> None:
+    def _fill_with(self, picture: U8, *, but: PixelRect | None) -> None:
         """The picture on the centre panel, as both eyes see it where they agree."""
         self._even_out(but=but)
         self._background = None
-        sharp = emphasised(picture, self.whole.emphasis)
+        sharp = pre_emphasised(picture, self.whole.pre_emphasis)
         cv2.LUT(sharp, _centre_codes(self.stack.count), dst=self._layers[self.stack.count // 2])
 
     def _place(self, window: Window, solved: Prediction, eyes_m: F64, filled_ms: float) -> Prediction:
@@ -207,7 +207,7 @@ class FocusedPredictor(Predictor):
         """How a window ends: gently, but where the panels themselves do."""
         box, kept = window.box, whole_rays(window, eyes_m, self.stack)
         return Fade(
-            Box(kept.u0 - box.u0, kept.v0 - box.v0, kept.u1 - box.u0, kept.v1 - box.v0),
+            PixelRect(kept.u0 - box.u0, kept.v0 - box.v0, kept.u1 - box.u0, kept.v1 - box.v0),
             over_px=wave_px(eyes_m, self.stack, steps=window.steps),
             left=box.u0 > 0,
             top=box.v0 > 0,
@@ -218,13 +218,13 @@ class FocusedPredictor(Predictor):
     def _middle(self) -> PlaneRaster:
         return self.stack.panel(self.stack.count // 2)
 
-    def _even_out(self, *, but: PixelBox | None) -> None:
+    def _even_out(self, *, but: PixelRect | None) -> None:
         """Bring the outer panels back to the middle of their range where the last frame drove them."""
         if self._solved is None or self._solved == but:
             return
         area = self._solved
         for layer in self._layers:
-            _fill(layer, area, (EVEN, EVEN, EVEN))
+            _fill(layer, area, (NEUTRAL, NEUTRAL, NEUTRAL))
         self._solved, self._background = None, None
 
     def _paint_background(self, colour: tuple[int, ...]) -> None:
@@ -232,7 +232,7 @@ class FocusedPredictor(Predictor):
         codes = _centre_codes(self.stack.count)[list(colour)].tolist()
         layer = self._layers[self.stack.count // 2]
         if self._background != colour:
-            _fill(layer, PixelBox(0, 0, self.stack.width_px, self.stack.height_px), codes)
+            _fill(layer, PixelRect(0, 0, self.stack.width_px, self.stack.height_px), codes)
             self._background = colour
         elif self._solved is not None:
             _fill(layer, self._solved, codes)
@@ -246,13 +246,13 @@ class FocusedPredictor(Predictor):
         return self._parts[size]
 
 
-def _fill(layer: U8, area: PixelBox, codes: Sequence[int]) -> None:
+def _fill(layer: U8, area: PixelRect, codes: Sequence[int]) -> None:
     """One colour in a part of an RGBA layer; whole pixels at a time, which is many times as fast as bytes."""
     pixel = np.array([*codes, 255], np.uint8).view(np.uint32)
     layer.view(np.uint32)[area.v0 : area.v1, area.u0 : area.u1, 0] = pixel
 
 
 def _centre_codes(panels: int) -> U8:
-    """(256,) the centre panel's code for each code of the picture, the others standing at EVEN."""
+    """(256,) the centre panel's code for each code of the picture, the others standing at NEUTRAL."""
     phases = phase_codes(2).reshape(256, -1)[:, 0].astype(np.int32)
-    return np.clip((phases - (panels - 1) * EVEN * SUBCODE + SUBCODE // 2) // SUBCODE, 0, 255).astype(np.uint8)
+    return np.clip((phases - (panels - 1) * NEUTRAL * SUBCODE + SUBCODE // 2) // SUBCODE, 0, 255).astype(np.uint8)

@@ -19,7 +19,7 @@ from runtime.evaluation.displayed import displayed
 from runtime.model.predictor import SHIPPED, Predictor
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import drawn_for, retina_view
-from runtime.plan.levels import Level
+from runtime.plan.levels import QualityLevel
 from runtime.plan.predictors import LADDER
 from runtime.plan.reduced import ladder_predictor
 from runtime.records import F32, F64, U8
@@ -150,15 +150,15 @@ def measured_levels(
     *,
     simulated: bool = False,
     tell: Callable[[str], None] = lambda _: None,
-) -> list[Level]:
+) -> list[QualityLevel]:
     """What each level takes and how well it shows the present picture; those that can't be had are left out.
 
     simulated: times are the simulated clock's instead of the machine's. Raises FatalError where none can be had.
     """
     wanted = ask(scenery.wanted)
-    levels: list[Level] = []
+    levels: list[QualityLevel] = []
     for rung in rungs(settings, scenery.stack):
-        level = Level(*rung, 0.0, 0.0)
+        level = QualityLevel(*rung, 0.0, 0.0)
         tell(level.label)
         try:
             level = _measured(rung, settings, scenery, ask, wanted, simulated=simulated)
@@ -174,7 +174,7 @@ def measured_levels(
 
 def _measured(
     rung: Rung, settings: Settings, scenery: Scenery, ask: Ask, wanted: list[F32], *, simulated: bool
-) -> Level:
+) -> QualityLevel:
     predictor = ready_level(rung, settings, scenery, ask)
     try:
         times_ms = []
@@ -189,7 +189,7 @@ def _measured(
     cost_ms = min(times_ms)  # the least disturbed: the loop may be at work beside this
     if simulated:
         cost_ms = sum(simulated_stage_ms(rung, settings)[stage] for stage in ("render", *SOLVING))
-    return Level(*rung, cost_ms, shown_db)
+    return QualityLevel(*rung, cost_ms, shown_db)
 
 
 def simulated_stage_ms(rung: Rung, settings: Settings) -> dict[str, float]:

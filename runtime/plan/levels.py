@@ -13,7 +13,7 @@ LEARNING = 0.2  # of the newest frame in a level's expected time
 
 
 @dataclass(frozen=True, slots=True)
-class Level:
+class QualityLevel:
     """One choice of model and resolution."""
 
     model: str
@@ -26,10 +26,10 @@ class Level:
         return self.model if self.scale == 1.0 else f"{self.model} at {self.scale:g}"
 
 
-def useful(levels: list[Level]) -> list[Level]:
+def useful(levels: list[QualityLevel]) -> list[QualityLevel]:
     """Best picture first; a level that is both slower and worse than another is left out."""
     ordered = sorted(levels, key=lambda level: (-level.psnr_db, level.expected_ms))
-    kept: list[Level] = []
+    kept: list[QualityLevel] = []
     for level in ordered:
         if not kept or level.expected_ms < kept[-1].expected_ms:
             kept.append(level)
@@ -39,7 +39,7 @@ def useful(levels: list[Level]) -> list[Level]:
 class BudgetKeeper:
     """Goes down a level when frames miss the budget, and up again when there has long been room."""
 
-    def __init__(self, levels: list[Level], budget_ms: float) -> None:
+    def __init__(self, levels: list[QualityLevel], budget_ms: float) -> None:
         """levels: best first, as `useful` orders them; budget 0: none, the best."""
         if not levels:
             raise ValueError("a budget needs at least one level")
@@ -54,7 +54,7 @@ class BudgetKeeper:
         self.switches = 0
 
     @property
-    def level(self) -> Level:
+    def level(self) -> QualityLevel:
         return self.levels[self.index]
 
     @property

@@ -15,7 +15,7 @@ from runtime.errors import FatalError, InputError
 if TYPE_CHECKING:
     from runtime.content.base import ContentSource
     from runtime.optics.stack import PanelStack
-    from runtime.plan.levels import Level
+    from runtime.plan.levels import QualityLevel
     from runtime.plan.measure import Trial
     from runtime.records import F64
 
@@ -73,7 +73,7 @@ def plan_for(
         numbers, without, with_plan = measure(
             content, plain, predictor, eyes_m, stack, fov_deg=settings.content.fov_deg, band_m=_band_m(settings)
         )
-        levels: list[Level] = []
+        levels: list[QualityLevel] = []
         if settings.model.budget_ms > 0:
             levels, numbers, with_plan = _budget(settings, stack, content, eyes_m, numbers, with_plan, tell)
         planned = make_plan(
@@ -113,13 +113,13 @@ def _budget(
     numbers: Any,
     present: Trial,
     tell: Callable[[str], None],
-) -> tuple[list[Level], Any, Trial]:
+) -> tuple[list[QualityLevel], Any, Trial]:
     """Measure what the running daemon would choose from (`ladder.rungs`), and choose by the budget.
 
     Raises FatalError where no level can be had.
     """
     from runtime.plan.ladder import rungs
-    from runtime.plan.levels import BudgetKeeper, Level, useful
+    from runtime.plan.levels import BudgetKeeper, QualityLevel, useful
     from runtime.plan.measure import trial
     from runtime.plan.reduced import ladder_predictor
     from runtime.plan.savings import Saving
@@ -127,7 +127,7 @@ def _budget(
     trials: dict[str, Trial] = {}
     levels = []
     for name, scale in rungs(settings, stack):
-        level = Level(name, scale, 0.0, 0.0)
+        level = QualityLevel(name, scale, 0.0, 0.0)
         tell(level.label)
         try:
             predictor = ladder_predictor(name, scale, stack, settings)

@@ -8,7 +8,7 @@ from runtime.config import ModelSettings
 from runtime.model.fade import Fade
 from runtime.model.predictor import load_predictor
 from runtime.model.unrolled import UnrolledPredictor
-from runtime.model.visible import Box
+from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
@@ -16,7 +16,7 @@ EYES = np.array([[0.6, -0.031, 0.0], [0.6, 0.031, 0.0]])
 
 
 def test_weights_rise_from_nothing_at_the_edge_to_one_inside() -> None:
-    fade = Fade(Box(10, 0, 90, 50), over_px=(20.0, 0.0), right=False)
+    fade = Fade(PixelRect(10, 0, 90, 50), over_px=(20.0, 0.0), right=False)
     weights = fade.wave_weights(np.eye(3), rows=50, columns=100)[0, :, 0]
     assert (weights[:10] == 0).all()
     assert (np.diff(weights[10:30]) > 0).all()
@@ -24,7 +24,7 @@ def test_weights_rise_from_nothing_at_the_edge_to_one_inside() -> None:
 
 
 def test_a_sheared_raster_is_weighed_in_the_panel_s_own_directions() -> None:
-    fade = Fade(Box(0, 0, 100, 100), over_px=(0.0, 10.0))
+    fade = Fade(PixelRect(0, 0, 100, 100), over_px=(0.0, 10.0))
     sheared = np.array([[1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 1.0]])
     weights = fade.wave_weights(sheared, rows=60, columns=60)[..., 0]
     assert weights[0, 0] < 0.1
@@ -38,7 +38,7 @@ def test_outer_panels_stay_even_beside_what_is_kept() -> None:
     pictures = [[np.full((270, 480, 4), 128, np.uint8)] for _ in EYES]
     for side, shift in enumerate((3, -3)):
         pictures[side][0][100:160, 220 + shift : 260 + shift, :3] = (250, 60, 20)
-    predictor.fade = Fade(Box(150, 60, 330, 200), over_px=(60.0, 0.0))
+    predictor.fade = Fade(PixelRect(150, 60, 330, 200), over_px=(60.0, 0.0))
     outer = predictor.predict(pictures, EYES).layers[[0, 2], ..., :3].astype(np.int16)
     assert np.abs(outer - 128).max() > 20
     assert np.abs(outer[:, :, :120] - 128).max() <= 1

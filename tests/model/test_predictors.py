@@ -7,8 +7,8 @@ import pytest
 
 from runtime.config import ModelSettings
 from runtime.errors import ModelFailure
-from runtime.model.level import EVEN
 from runtime.model.predictor import load_predictor
+from runtime.model.pyramid_level import NEUTRAL
 from runtime.model.sart import SartPredictor
 from runtime.model.still import solve_still
 from runtime.model.visible import visible_boxes
@@ -125,7 +125,7 @@ def test_one_eye_that_stands_for_both_drives_no_outer_panel() -> None:
     eye = eyes(0.6)[[0, 0]]
     picture = card_scene(eye[0])
     layers = solve_still(picture, picture, eyes_m=eye, fov_deg=FOV_DEG, predictor=predictor).layers
-    assert np.abs(layers[[0, 2], ..., :3].astype(int) - EVEN).max() <= 1
+    assert np.abs(layers[[0, 2], ..., :3].astype(int) - NEUTRAL).max() <= 1
 
 
 def test_what_is_solved_for_unsure_eyes_is_better_for_them_and_worse_for_two_points() -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from runtime.model.level import EVEN
+from runtime.model.pyramid_level import NEUTRAL
 from runtime.optics.alignment import (
     EVEN_CODE,
     FARTHEST_M,
@@ -246,7 +246,7 @@ def test_whole_pixels_are_moved_to_the_bit(layers):
 
 
 def test_even_is_where_the_solver_starts_its_outer_panels():
-    assert EVEN_CODE == EVEN
+    assert EVEN_CODE == NEUTRAL
 
 
 def test_where_nothing_moves_nothing_is_resampled_or_copied(layers):

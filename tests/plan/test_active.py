@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runtime.content.camera import PixelBox
+from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
 from runtime.plan.active import (
@@ -33,7 +33,7 @@ def test_the_box_is_exactly_where_they_differ(v: int, u: int, height: int, width
     right = left.copy()
     right[v : v + height, u : u + width, 1] = (100 + step) % 256
     box = differing_box(left, right, tolerance=2)
-    assert box == PixelBox(u, v, min(u + width, 160), min(v + height, 100))
+    assert box == PixelRect(u, v, min(u + width, 160), min(v + height, 100))
 
 
 def test_eyes_that_agree_within_the_tolerance_leave_nothing_to_do() -> None:
@@ -47,7 +47,7 @@ def test_eyes_that_agree_within_the_tolerance_leave_nothing_to_do() -> None:
 def test_a_picture_that_differs_everywhere_is_whole() -> None:
     random = np.random.default_rng(0)
     left, right = random.integers(0, 256, (2, 270, 480, 4), np.uint8)
-    assert differing_box(left, right) == PixelBox(0, 0, 480, 270)
+    assert differing_box(left, right) == PixelRect(0, 0, 480, 270)
 
 
 def test_a_coarse_look_never_finds_more_than_a_close_one() -> None:
@@ -68,7 +68,7 @@ def test_a_coarse_look_never_finds_more_than_a_close_one() -> None:
 
 def test_a_window_s_panels_are_the_same_panels() -> None:
     """A point projects on to the window's raster, seen by moved eyes, where it did on the whole panel."""
-    window = cut_out(PixelBox(200, 100, 440, 260), STACK)
+    window = cut_out(PixelRect(200, 100, 440, 260), STACK)
     point = np.array([0.03, -0.06, 0.04, 1.0])
     for panel in range(3):
         for eye in EYES:
@@ -90,7 +90,7 @@ def test_stray_is_the_parallax_of_the_outer_panels() -> None:
 @settings(max_examples=100, deadline=None)
 def test_a_window_holds_the_difference_and_its_room_or_is_whole(x: float, y: float, z: float, u: int, v: int) -> None:
     eyes = np.array([[x, y - 0.03, z], [x, y + 0.03, z]])
-    box = PixelBox(u, v, u + 30, v + 20)
+    box = PixelRect(u, v, u + 30, v + 20)
     window = window_of(box, eyes, STACK)
     if window is None:
         return
@@ -106,7 +106,7 @@ def test_a_window_holds_the_difference_and_its_room_or_is_whole(x: float, y: flo
 def test_windows_have_few_sizes() -> None:
     sizes = set()
     for width in range(5, 200, 3):
-        window = window_of(PixelBox(400, 200, 400 + width, 240), EYES, STACK)
+        window = window_of(PixelRect(400, 200, 400 + width, 240), EYES, STACK)
         assert window is not None
         sizes.add(window.box.width_px)
     assert len(sizes) <= 5
@@ -116,7 +116,7 @@ def test_a_phase_s_error_shows_most_before_mid_grey() -> None:
     assert steepness(np.array([0, 255], np.uint8)) == 0.0
     assert steepness(np.array([127], np.uint8)) == pytest.approx(1.0, abs=0.01)
     picture = np.full((100, 200, 4), 255, np.uint8)
-    box = PixelBox(80, 20, 120, 60)
+    box = PixelRect(80, 20, 120, 60)
     picture[20:60, 80:120] = 127  # within the box nothing fades
     assert steepness_beside(picture, box) == 0.0
     picture[70:, :80] = 127  # neither in other rows
@@ -126,7 +126,7 @@ def test_a_phase_s_error_shows_most_before_mid_grey() -> None:
 
 
 def test_before_white_a_window_is_smaller_than_before_grey() -> None:
-    box = PixelBox(400, 200, 440, 240)
+    box = PixelRect(400, 200, 440, 240)
     white, grey = (window_of(box, EYES, STACK, steep=steep) for steep in (0.0, 1.0))
     assert white is not None
     assert grey is not None

@@ -56,10 +56,10 @@ def test_a_budget_is_planned_from_the_levels_that_the_daemon_would_choose_from(t
 def test_what_can_be_chosen_is_the_ladder_of_the_running_loop(model: str) -> None:
     from runtime.config import Settings
     from runtime.plan.ladder import rungs
-    from runtime.plan.levels import Level
+    from runtime.plan.levels import QualityLevel
 
     settings = Settings.model_validate({"model": {"name": model}})
-    known = {Level(name, scale, 0.0, 0.0).label for name, scale in rungs(settings, settings.stack.stack())}
+    known = {QualityLevel(name, scale, 0.0, 0.0).label for name, scale in rungs(settings, settings.stack.stack())}
     shown = set(labels("--model", model))
     assert shown <= known, "levels that are slower and worse than another are left out"
     assert len(known) > 1

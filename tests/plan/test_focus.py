@@ -158,7 +158,7 @@ def test_still_pictures_are_warped_as_the_model_asks() -> None:
     part = focused(entire, settings)
     assert part is not None
     assert part.interpolation == entire.interpolation == "cubic"
-    assert part.emphasis == entire.emphasis
+    assert part.pre_emphasis == entire.pre_emphasis
     assert part.windows(EYES) == entire.windows(EYES)
 
 

@@ -7,9 +7,13 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.plan.levels import PATIENCE, BudgetKeeper, Level, useful
+from runtime.plan.levels import PATIENCE, BudgetKeeper, QualityLevel, useful
 
-LADDER = [Level("best", 1.0, 80.0, 44.0), Level("balanced", 1.0, 50.0, 42.0), Level("fast", 0.5, 20.0, 37.0)]
+LADDER = [
+    QualityLevel("best", 1.0, 80.0, 44.0),
+    QualityLevel("balanced", 1.0, 50.0, 42.0),
+    QualityLevel("fast", 0.5, 20.0, 37.0),
+]
 
 
 def run(keeper: BudgetKeeper, slowdown: float, frames: int) -> list[str]:
@@ -50,7 +54,7 @@ def test_one_slow_frame_changes_nothing() -> None:
 
 @given(st.lists(st.tuples(st.floats(1, 500), st.floats(20, 60)), min_size=1, max_size=8))
 def test_no_useful_level_is_slower_and_worse_than_another(values: list[tuple[float, float]]) -> None:
-    levels = useful([Level(str(index), 1.0, time, quality) for index, (time, quality) in enumerate(values)])
+    levels = useful([QualityLevel(str(index), 1.0, time, quality) for index, (time, quality) in enumerate(values)])
     for better, worse in pairwise(levels):
         assert better.psnr_db >= worse.psnr_db
         assert better.expected_ms > worse.expected_ms

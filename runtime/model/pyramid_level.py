@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from runtime.model.resample import buffer, resample, target_from_source
 from runtime.model.rows import RowPool, Work
 from runtime.model.transfer import FULL, SUBCODE
-from runtime.model.visible import Box
+from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
 
@@ -26,10 +26,10 @@ OUTER = (REAR, FRONT)
 EYES = (0, 1)
 START = FULL // 2  # of every outer panel: the middle of its range
 LEAST_SPREAD, MOST_SPREAD = 0.5, 8.0  # pixels; below half a pixel care costs more time than it gains
-EVEN = (START + SUBCODE // 2) // SUBCODE  # the same in 8-bit codes, rounded as what is shown is
+NEUTRAL = (START + SUBCODE // 2) // SUBCODE  # the same in 8-bit codes, rounded as what is shown is
 
 
-class Level:
+class PyramidLevel:
     """Buffers for one stack at `1 / reduction` of its columns and rows; state lives from frame to frame.
 
     Images are (h, w, 3), or (h, w) where there is one channel.
@@ -53,7 +53,7 @@ class Level:
         """(width, height) of the centre panel's raster."""
         return self.rasters[CENTRE].width_px, self.rasters[CENTRE].height_px
 
-    def look_through(self, boxes: Sequence[Box], stack: PanelStack) -> None:
+    def crop(self, boxes: Sequence[PixelRect], stack: PanelStack) -> None:
         """Cut every raster and buffer to what the eyes look through."""
         self.rasters = tuple(_coarser(box.cut(stack.panel(n)), self.reduction) for n, box in enumerate(boxes))
         self.outer = {n: self._view("outer", n, 0, on=n) for n in OUTER}
@@ -61,7 +61,7 @@ class Level:
         self.residual = tuple(self._view("residual", CENTRE, side, on=CENTRE) for side in EYES)
         self._back = {n: tuple(self._view("back", CENTRE, side, on=n) for side in EYES) for n in OUTER}
 
-    def be_unsure(self, eyes_m: F64, *, eye_sigma_mm: float) -> None:
+    def set_eye_sigma(self, eyes_m: F64, *, eye_sigma_mm: float) -> None:
         """Correct for eyes (2, 3) that err by so much, an axis: what is left of the outer panels in the mean counts,
         and what moves of them is noise. Spreads too small to be felt on this raster are none."""
         eye_x_m, centre_x_m = eyes_m[:, 0].mean(), self.rasters[CENTRE].x_m
@@ -73,7 +73,7 @@ class Level:
             if max(spread) >= LEAST_SPREAD:
                 self.spread[n] = spread
 
-    def look(self, panels: Sequence[int], eyes_m: F64) -> None:
+    def project(self, panels: Sequence[int], eyes_m: F64) -> None:
         """See outer panels anew through the centre panel's pixels: in the mean, where the eyes are unsure."""
         for n in panels:
             panel = self._blurred(self.outer[n], n)
@@ -81,7 +81,7 @@ class Level:
             for side, eye_m in enumerate(eyes_m):
                 self._between(panel, eye_m, of=n, on=CENTRE, out=self.seen[n, side])
 
-    def lacks(self) -> None:
+    def update_residuals(self) -> None:
         """Find what each eye still lacks when the centre panel is the best one for the outer panels."""
         seen, residual, wanted = self.seen, self.residual, self.wanted
 
@@ -120,24 +120,24 @@ class Level:
             np.right_shift(change, 3, out=change)
             np.multiply(change, eighths, out=change)
             np.add(change, outer[rows], out=change)
-            _settle(change, outer[rows], shown=shown)
+            _clamp_and_quantise(change, outer[rows], shown=shown)
 
         self._each(panel, work)
 
-    def drive(self, panel: int, codes: I16, codes_from_raster: F64, *, shown: bool) -> None:
+    def set_panel(self, panel: int, codes: I16, codes_from_raster: F64, *, shown: bool) -> None:
         """An outer panel as it was drawn on a raster of its own."""
         outer = self.outer[panel]
         resample(codes, image_from_result=codes_from_raster, out=outer, outside=START, cubic=True)
-        self._each(panel, lambda rows, _: _settle(outer[rows], outer[rows], shown=shown))
+        self._each(panel, lambda rows, _: _clamp_and_quantise(outer[rows], outer[rows], shown=shown))
 
-    def refine(self, coarser: Level, *, shown: bool) -> None:
+    def upsample(self, coarser: PyramidLevel, *, shown: bool) -> None:
         """Take the outer panels over from a coarser raster of the same boxes."""
         for n in OUTER:
             outer = self.outer[n]
             cv2.resize(coarser.outer[n], outer.shape[1::-1], dst=outer, interpolation=cv2.INTER_CUBIC)
 
             def work(rows: slice, _: I16, outer: I16 = outer) -> None:
-                _settle(outer[rows], outer[rows], shown=shown)
+                _clamp_and_quantise(outer[rows], outer[rows], shown=shown)
 
             self._each(n, work)
 
@@ -195,7 +195,7 @@ def _coarser(raster: PlaneRaster, reduction: int) -> PlaneRaster:
     )
 
 
-def _settle(codes: I16, out: I16, *, shown: bool) -> None:
+def _clamp_and_quantise(codes: I16, out: I16, *, shown: bool) -> None:
     """Keep within the panel's range; what will be shown is rounded to what 8 bits can show.
 
     Rounded any earlier, corrections of less than half a code would be lost.
