@@ -26,6 +26,7 @@ class Predictor(ABC):
     provider: str
     parameters: int
     stack: PanelStack
+    backend: str = "opencv"  # what does all that surrounds the network
     channels: int = 3  # that the last pictures were solved in: one, where grey ones may be
 
     @abstractmethod

@@ -55,7 +55,7 @@ class PyramidLevel:
 
     def crop(self, boxes: Sequence[PixelRect], stack: PanelStack) -> None:
         """Cut every raster and buffer to what the eyes look through."""
-        self.rasters = tuple(_coarser(box.cut(stack.panel(n)), self.reduction) for n, box in enumerate(boxes))
+        self.rasters = tuple(coarser(box.cut(stack.panel(n)), self.reduction) for n, box in enumerate(boxes))
         self.outer = {n: self._view("outer", n, 0, on=n) for n in OUTER}
         self.seen = {(n, side): self._view("seen", n, side, on=CENTRE) for n in OUTER for side in EYES}
         self.residual = tuple(self._view("residual", CENTRE, side, on=CENTRE) for side in EYES)
@@ -181,7 +181,7 @@ class PyramidLevel:
         return resample(image, image_from_result=matrix, out=out, outside=0 if of == CENTRE else START)
 
 
-def _coarser(raster: PlaneRaster, reduction: int) -> PlaneRaster:
+def coarser(raster: PlaneRaster, reduction: int) -> PlaneRaster:
     """The same rectangle in fewer pixels."""
     if reduction == 1:
         return raster
