@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import cv2
@@ -41,7 +42,7 @@ class OpenCvSurround:
         self._layers: U8 = np.full((3, stack.height_px, stack.width_px, 4), 255, np.uint8)
         self._pictures: list[U8] = []
 
-    def begin(self, pictures: Sequence[U8], problem: Problem) -> None:
+    def begin(self, pictures: Sequence[U8], problem: Problem) -> AbstractContextManager[None]:
         self._problem = problem
         if problem.channels not in self._workspaces:
             self._workspaces[problem.channels] = Workspace(
@@ -55,6 +56,7 @@ class OpenCvSurround:
         for level in self._workspace.levels.values():
             level.wanted = [np.asarray(phases, np.int16) for phases in self._phases(level.size)]
             level.set_eye_sigma(problem.eyes_m, eye_sigma_mm=problem.eye_sigma_mm)
+        return nullcontext()
 
     def network_pictures(self) -> tuple[I16, I16]:
         problem, size = self._problem, self._problem.reduced_size
@@ -73,14 +75,12 @@ class OpenCvSurround:
     def project(self, reduction: int, panels: Sequence[int]) -> None:
         self._workspace.levels[reduction].project(panels, self._problem.eyes_m)
 
-    def update_residuals(self, reduction: int) -> None:
+    def correct(self, reduction: int, panel: int, *, size: float, shown: bool) -> None:
         level, problem = self._workspace.levels[reduction], self._problem
         level.update_residuals()
         if problem.fade is not None:
             problem.fade.soften(level.residual, problem.centre_from(level.rasters[CENTRE].plane_from_raster()))
-
-    def correct(self, reduction: int, panel: int, *, size: float, shown: bool) -> None:
-        self._workspace.levels[reduction].correct(panel, self._problem.eyes_m, size=size, shown=shown)
+        level.correct(panel, problem.eyes_m, size=size, shown=shown)
 
     def upsample(self, coarser_reduction: int, reduction: int, *, shown: bool) -> None:
         levels = self._workspace.levels

@@ -64,14 +64,7 @@ class PyramidLevel:
     def set_eye_sigma(self, eyes_m: F64, *, eye_sigma_mm: float) -> None:
         """Correct for eyes (2, 3) that err by so much, an axis: what is left of the outer panels in the mean counts,
         and what moves of them is noise. Spreads too small to be felt on this raster are none."""
-        eye_x_m, centre_x_m = eyes_m[:, 0].mean(), self.rasters[CENTRE].x_m
-        self.spread = {}
-        for n in OUTER:
-            raster = self.rasters[n]
-            moved_m = eye_sigma_mm / 1e3 * abs(raster.x_m - centre_x_m) / (eye_x_m - centre_x_m)
-            spread = min(moved_m / raster.pitch_u_m, MOST_SPREAD), min(moved_m / raster.pitch_v_m, MOST_SPREAD)
-            if max(spread) >= LEAST_SPREAD:
-                self.spread[n] = spread
+        self.spread = spreads(self.rasters, eyes_m, eye_sigma_mm=eye_sigma_mm)
 
     def project(self, panels: Sequence[int], eyes_m: F64) -> None:
         """See outer panels anew through the centre panel's pixels: in the mean, where the eyes are unsure."""
@@ -179,6 +172,19 @@ class PyramidLevel:
         """Panel `of`'s pixels on panel `on`'s raster, as an eye sees them in line."""
         matrix = target_from_source(eye_m, source=self.rasters[on], target=self.rasters[of])
         return resample(image, image_from_result=matrix, out=out, outside=0 if of == CENTRE else START)
+
+
+def spreads(rasters: Sequence[PlaneRaster], eyes_m: F64, *, eye_sigma_mm: float) -> dict[int, tuple[float, float]]:
+    """Per outer panel whose pixels move by enough to be felt for eyes (2, 3) that err by so much: right and down."""
+    eye_x_m, centre_x_m = eyes_m[:, 0].mean(), rasters[CENTRE].x_m
+    found = {}
+    for n in OUTER:
+        raster = rasters[n]
+        moved_m = eye_sigma_mm / 1e3 * abs(raster.x_m - centre_x_m) / (eye_x_m - centre_x_m)
+        spread = min(moved_m / raster.pitch_u_m, MOST_SPREAD), min(moved_m / raster.pitch_v_m, MOST_SPREAD)
+        if max(spread) >= LEAST_SPREAD:
+            found[n] = spread
+    return found
 
 
 def coarser(raster: PlaneRaster, reduction: int) -> PlaneRaster:

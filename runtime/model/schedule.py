@@ -7,6 +7,7 @@ steps, and knows neither their order nor when a panel is rounded.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -81,9 +82,9 @@ Network = Callable[[tuple[I16, I16]], Answer]
 class Surround(Protocol):
     """What surrounds the network. State lives from frame to frame; one thread uses it."""
 
-    def begin(self, pictures: Sequence[U8], problem: Problem) -> None:
+    def begin(self, pictures: Sequence[U8], problem: Problem) -> AbstractContextManager[None]:
         """Take two pictures (h, w, 4) of the centre panel's pixels: cut to its box, the phase sums that the eyes want,
-        on every raster that the steps need."""
+        on every raster that the steps need. The steps are done within what it answers."""
 
     def network_pictures(self) -> tuple[I16, I16]:
         """What each eye lacks while the outer panels are even, on the network's raster: (rows, columns[, 3])."""
@@ -94,11 +95,9 @@ class Surround(Protocol):
     def project(self, reduction: int, panels: Sequence[int]) -> None:
         """See outer panels anew through the centre panel's pixels."""
 
-    def update_residuals(self, reduction: int) -> None:
-        """Find what each eye still lacks when the centre panel is the best one for the outer panels."""
-
     def correct(self, reduction: int, panel: int, *, size: float, shown: bool) -> None:
-        """Change one outer panel by what both eyes lack along the rays through each of its pixels."""
+        """Change one outer panel by what both eyes lack along the rays through each of its pixels, when the centre
+        panel is the best one for the outer panels."""
 
     def upsample(self, coarser_reduction: int, reduction: int, *, shown: bool) -> None:
         """Take the outer panels over from a coarser raster."""
@@ -133,8 +132,6 @@ def carry_out(steps: Sequence[Step], surround: Surround, network: Network) -> U8
             surround.upsample(reduction, step.reduction, shown=False)
             reduction = step.reduction
             surround.project(reduction, OUTER)
-        if index:
-            surround.update_residuals(reduction)
         shown = {n: index == last[n] for n in OUTER}
         changed: tuple[int, ...] = OUTER
         if step.kind == "chain":

@@ -91,8 +91,8 @@ class UnrolledPredictor(Predictor):
         grey = self.one_channel and all(is_grey(picture[boxes[CENTRE].slices]) for picture in pictures)
         self.channels = 1 if grey else 3
         problem = Problem(contract, self.stack, boxes, eyes_m, frame, eye_sigma_mm, self.channels, self.fade)
-        self._surround.begin(pictures, problem)
-        layers = carry_out(contract.steps, self._surround, lambda seen: self._network(seen, problem, watch))
+        with self._surround.begin(pictures, problem):
+            layers = carry_out(contract.steps, self._surround, lambda seen: self._network(seen, problem, watch))
         watch.lap("finish")
         return Prediction(layers, watch.stage_ms)
 

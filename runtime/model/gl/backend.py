@@ -1,0 +1,25 @@
+"""OpenGL as a backend: one context, whose programs all models on it share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from runtime.model.contract import Contract
+from runtime.model.gl.programs import Passes
+from runtime.model.gl.surround import GlSurround
+from runtime.optics.stack import PanelStack
+from runtime.support.gl import describe
+
+
+class GlBackend:
+    """Used on one thread, on which its context is current."""
+
+    name = "gl"
+
+    def __init__(self, context: Any) -> None:
+        """context: the content's, or one of the backend's own; whoever made it releases it."""
+        self.passes = Passes(context)
+        self.renderer = describe(context)["renderer"]
+
+    def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> GlSurround:
+        return GlSurround(self.passes, contract, stack)
