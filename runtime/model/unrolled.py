@@ -47,18 +47,28 @@ class UnrolledPredictor(Predictor):
         surroundings: Backend | None = None,
     ) -> None:
         """one_channel: whether pictures without colour are solved in a single channel. surroundings: who does what
-        surrounds the network; None: OpenCV. Raises InputError where the stack is too large for it."""
+        surrounds the network; None: OpenCV."""
         self.session, self.stack = session, stack
         self.name, self.provider = session.contract.name, session.provider
         self.parameters = session.contract.parameters
         self.one_channel = one_channel
         self.surroundings: Backend = surroundings or OpenCvBackend()
-        self.backend = self.surroundings.name
         self._threads = threads
         self._twin: UnrolledPredictor | None = None  # for eyes above each other
         self.fade: Fade | None = None  # how this stack ends, where it is a part of larger panels
-        self._surround: Surround = self.surroundings.surround(session.contract, stack, threads=threads)
+        self._made: Surround | None = None
         self._turned_layers: U8 | None = None
+
+    @property
+    def backend(self) -> str:  # type: ignore[override]
+        return self.surroundings.name
+
+    def on_panels(self, stack: PanelStack) -> UnrolledPredictor:
+        return UnrolledPredictor(self.session, stack, threads=self._threads, one_channel=self.one_channel)
+
+    def surround_with(self, backend: Backend) -> None:
+        self.close()
+        self.surroundings, self._made, self._twin = backend, None, None
 
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         return (self.stack.panel(CENTRE),)
@@ -91,15 +101,23 @@ class UnrolledPredictor(Predictor):
         grey = self.one_channel and all(is_grey(picture[boxes[CENTRE].slices]) for picture in pictures)
         self.channels = 1 if grey else 3
         problem = Problem(contract, self.stack, boxes, eyes_m, frame, eye_sigma_mm, self.channels, self.fade)
-        with self._surround.begin(pictures, problem):
-            layers = carry_out(contract.steps, self._surround, lambda seen: self._network(seen, problem, watch))
+        surround = self._surround()
+        with surround.begin(pictures, problem):
+            layers = carry_out(contract.steps, surround, lambda seen: self._network(seen, problem, watch))
         watch.lap("finish")
         return Prediction(layers, watch.stage_ms)
 
     def close(self) -> None:
-        self._surround.close()
+        if self._made is not None:
+            self._made.close()
         if self._twin is not None:
             self._twin.close()
+
+    def _surround(self) -> Surround:
+        """Made when it is first needed, on the thread that uses it. Raises InputError where the stack is too large."""
+        if self._made is None:
+            self._made = self.surroundings.surround(self.session.contract, self.stack, threads=self._threads)
+        return self._made
 
     def _turned(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float) -> Prediction:
         """Eyes above each other: the same problem with rows for columns, solved by a twin for panels turned so."""

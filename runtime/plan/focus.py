@@ -20,6 +20,7 @@ from runtime.content.camera import union
 from runtime.model.fade import Fade
 from runtime.model.predictor import Prediction, Predictor
 from runtime.model.pyramid_level import NEUTRAL
+from runtime.model.schedule import Backend
 from runtime.model.transfer import SUBCODE, phase_codes, pre_emphasised
 from runtime.model.unrolled import UnrolledPredictor
 from runtime.optics.pupil import POINT_MM
@@ -63,6 +64,17 @@ class FocusedPredictor(Predictor):
         self._background: tuple[int, ...] | None = None  # that fills the centre panel beside the aimed window
         self.window: Window | None = None  # of the last frame
         self.active_fraction = 1.0  # of the panel's pixels that went through the model
+
+    @property
+    def backend(self) -> str:  # type: ignore[override]
+        return self.whole.backend
+
+    def on_panels(self, stack: PanelStack) -> Predictor | None:
+        return self.whole.on_panels(stack)
+
+    def surround_with(self, backend: Backend) -> None:
+        for part in (self.whole, *self._parts.values()):
+            part.surround_with(backend)
 
     def aim(self, content: ContentSource, eyes_m: F64, *, time_ns: int) -> None:
         """Ask the content where it lies, so that only that is drawn and solved."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from runtime.config import Settings
 from runtime.model.predictor import Prediction, Predictor
+from runtime.model.schedule import Backend
 from runtime.optics.pupil import POINT_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.plan.predictors import planned_predictor
@@ -25,6 +26,16 @@ class ReducedPredictor(Predictor):
         self.small, self.stack = small, stack
         self.name, self.provider, self.parameters = small.name, small.provider, small.parameters
         self._layers = np.empty((stack.count, stack.height_px, stack.width_px, 4), np.uint8)
+
+    @property
+    def backend(self) -> str:  # type: ignore[override]
+        return self.small.backend
+
+    def on_panels(self, stack: PanelStack) -> Predictor | None:
+        return self.small.on_panels(stack)
+
+    def surround_with(self, backend: Backend) -> None:
+        self.small.surround_with(backend)
 
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         return self.small.rasters(eyes_m)

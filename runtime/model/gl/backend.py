@@ -6,7 +6,7 @@ from typing import Any
 
 from runtime.model.contract import Contract
 from runtime.model.gl.programs import Passes
-from runtime.model.gl.surround import GlSurround
+from runtime.model.gl.surround import GlSurround, check_size
 from runtime.optics.stack import PanelStack
 from runtime.support.gl import describe
 
@@ -16,8 +16,10 @@ class GlBackend:
 
     name = "gl"
 
-    def __init__(self, context: Any) -> None:
-        """context: the content's, or one of the backend's own; whoever made it releases it."""
+    def __init__(self, context: Any, stack: PanelStack) -> None:
+        """context: the content's, or one of the backend's own; whoever made it releases it. Raises InputError where
+        a panel of the stack is too large for the driver."""
+        check_size(context, stack)
         self.passes = Passes(context)
         self.renderer = describe(context)["renderer"]
 
