@@ -8,7 +8,7 @@ asked for, the layers cross the bus.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from math import ceil
 from typing import Any
 
@@ -17,7 +17,7 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.errors import InputError, ModelFailure
+from runtime.errors import ContextLost, InputError, ModelFailure, PhasestackError
 from runtime.model.contract import Contract
 from runtime.model.fade import CORRECTED_SHARE
 from runtime.model.gl.programs import Image, Passes
@@ -65,10 +65,13 @@ class GlSurround:
             self._outer: dict[tuple[int, int], str] = {}  # which of two images a panel is in
             self._want(self._taken(pictures))
             yield
-        except moderngl.Error as error:
-            raise ModelFailure(f"OpenGL: {error}") from error
-        if (fault := self._passes.context.error) != "GL_NO_ERROR":
-            raise ModelFailure(f"OpenGL: {fault}")
+            fault = self._passes.context.error
+        except PhasestackError:
+            raise
+        except Exception as error:  # a lost context answers with whatever moderngl has at hand
+            raise ContextLost(f"OpenGL: {error}") from error
+        if fault != "GL_NO_ERROR":
+            raise ContextLost(f"OpenGL: {fault}")
 
     def network_pictures(self) -> tuple[I16, I16]:
         problem, frame, reduction = self._problem, self._problem.frame, self._contract.reduction
@@ -148,8 +151,9 @@ class GlSurround:
     def close(self) -> None:
         if not self._closed:
             self._closed = True
-            for texture in self._textures.values():
-                self._passes.forget(texture)
+            with suppress(Exception):  # of a context that is lost there is nothing to release
+                for texture in self._textures.values():
+                    self._passes.forget(texture)
             self._textures = {}
 
     def _drawn_layers(self) -> tuple[Image, ...]:

@@ -19,14 +19,14 @@ vec3 code(sampler2D picture, ivec2 place) {
 
 vec3 sharp(sampler2D picture, ivec2 place) {
     if (emphasis == 0.0) return code(picture, place);
-    vec3 weights = vec3(-emphasis, 1.0 + 2.0 * emphasis, -emphasis), sum = vec3(0.0);
-    for (int row = -1; row <= 1; row++) {
-        vec3 line = vec3(0.0);
-        for (int column = -1; column <= 1; column++)
-            line += weights[column + 1] * code(picture, place + ivec2(column, row));
-        sum += weights[row + 1] * line;
+    float middle = 1.0 + 2.0 * emphasis;
+    vec3 line[3];
+    for (int row = 0; row < 3; row++) {
+        ivec2 at = place + ivec2(0, row - 1);
+        vec3 beside = code(picture, at - ivec2(1, 0)) + code(picture, at + ivec2(1, 0));
+        line[row] = middle * code(picture, at) - emphasis * beside;
     }
-    return clamp(roundEven(sum), 0.0, 255.0);
+    return clamp(roundEven(middle * line[1] - emphasis * (line[0] + line[2])), 0.0, 255.0);
 }
 
 vec3 averaged(sampler2D picture) {
@@ -41,7 +41,8 @@ vec3 averaged(sampler2D picture) {
             sum += weight * sharp(picture, ivec2(u, v));
             total += weight;
         }
-    return floor(sum / total + 0.5);
+    vec3 mean = sum / total;
+    return reduction == floor(reduction) ? floor(mean + 0.5) : roundEven(mean);  // as OpenCV rounds
 }
 
 ivec4 phases(sampler2D picture) {
