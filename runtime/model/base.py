@@ -33,6 +33,10 @@ class Predictor(ABC):
     backend: str = "opencv"  # what does all that surrounds the network at present
     channels: int = 3  # that the last pictures were solved in: one, where grey ones may be
 
+    def reads_textures_of(self, context: object) -> bool:
+        """Whether `predict` takes pictures that were left in textures of a GL context (`DrawnPicture`)."""
+        return False
+
     def on_panels(self, stack: PanelStack) -> Predictor | None:
         """The same model for other panels of the same kind, to measure backends with; None: it has one backend."""
         return None

@@ -14,18 +14,20 @@ from runtime.model.contract import Contract
 from runtime.model.pyramid_level import CENTRE, I16, NEUTRAL, OUTER, PyramidLevel
 from runtime.model.resample import resample
 from runtime.model.rows import RowPool
-from runtime.model.schedule import Problem, reductions
+from runtime.model.schedule import Picture, Problem, reductions
 from runtime.model.transfer import SUBCODE, phase_codes, pre_emphasised
 from runtime.model.workspace import Workspace
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import U8
+from runtime.support.gl import DrawnPicture
 
 
 class OpenCvBackend:
     """Runs everywhere."""
 
     name = "opencv"
+    context: object = None
 
     def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> OpenCvSurround:
         return OpenCvSurround(contract, stack, threads=threads)
@@ -42,7 +44,7 @@ class OpenCvSurround:
         self._layers: U8 = np.full((3, stack.height_px, stack.width_px, 4), 255, np.uint8)
         self._pictures: list[U8] = []
 
-    def begin(self, pictures: Sequence[U8], problem: Problem) -> AbstractContextManager[None]:
+    def begin(self, pictures: Sequence[Picture], problem: Problem) -> AbstractContextManager[None]:
         self._problem = problem
         if problem.channels not in self._workspaces:
             self._workspaces[problem.channels] = Workspace(
@@ -51,7 +53,8 @@ class OpenCvSurround:
         self._workspace = self._workspaces[problem.channels]
         self._workspace.crop(problem.boxes, self._stack)
         box = problem.boxes[CENTRE]
-        cut = [without_alpha(picture[box.slices], problem.channels) for picture in pictures]
+        arrays = [picture.pixels() if isinstance(picture, DrawnPicture) else picture for picture in pictures]
+        cut = [without_alpha(picture[box.slices], problem.channels) for picture in arrays]
         self._pictures = [pre_emphasised(picture, self._contract.emphasis) for picture in cut]
         for level in self._workspace.levels.values():
             level.wanted = [np.asarray(phases, np.int16) for phases in self._phases(level.size)]

@@ -20,6 +20,7 @@ from runtime.model.pyramid_level import CENTRE, FRONT, I16, OUTER, REAR, coarser
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
+from runtime.support.gl import DrawnPicture
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +76,7 @@ class Problem:
         return self.stack.panel(CENTRE).raster_from_plane() @ plane_from_raster
 
 
+Picture = U8 | DrawnPicture
 Answer = Mapping[int, I16]  # per outer panel, (rows, columns[, 3]) on the network's raster, sixteenths of a code
 Network = Callable[[tuple[I16, I16]], Answer]
 
@@ -82,7 +84,7 @@ Network = Callable[[tuple[I16, I16]], Answer]
 class Surround(Protocol):
     """What surrounds the network. State lives from frame to frame; one thread uses it."""
 
-    def begin(self, pictures: Sequence[U8], problem: Problem) -> AbstractContextManager[None]:
+    def begin(self, pictures: Sequence[Picture], problem: Problem) -> AbstractContextManager[None]:
         """Take two pictures (h, w, 4) of the centre panel's pixels: cut to its box, the phase sums that the eyes want,
         on every raster that the steps need. The steps are done within what it answers."""
 
@@ -114,6 +116,7 @@ class Backend(Protocol):
     """One way of doing what surrounds the network."""
 
     name: str  # as `model.backend` calls it
+    context: object  # of OpenGL, whose textures it reads; None: it reads arrays
 
     def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> Surround:
         """One for a model and a stack. Raises InputError where the stack does not fit."""

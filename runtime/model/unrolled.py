@@ -20,13 +20,15 @@ from runtime.model.channels import is_grey
 from runtime.model.fade import Fade
 from runtime.model.opencv_surround import OpenCvBackend
 from runtime.model.pyramid_level import CENTRE, FRONT, I16, REAR, START
-from runtime.model.schedule import Answer, Backend, Problem, Surround, carry_out
+from runtime.model.schedule import Answer, Backend, Picture, Problem, Surround, carry_out
 from runtime.model.session import ModelSession
 from runtime.model.timing import Stopwatch
 from runtime.model.visible import visible_boxes
 from runtime.optics.pupil import POINT_MM
+from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
+from runtime.support.gl import DrawnPicture
 
 HALF_IPD_M = 0.031
 
@@ -63,6 +65,9 @@ class UnrolledPredictor(Predictor):
     def backend(self) -> str:  # type: ignore[override]
         return self.surroundings.name
 
+    def reads_textures_of(self, context: object) -> bool:
+        return context is not None and self.surroundings.context is context
+
     def on_panels(self, stack: PanelStack) -> UnrolledPredictor:
         return UnrolledPredictor(self.session, stack, threads=self._threads, one_channel=self.one_channel)
 
@@ -84,7 +89,9 @@ class UnrolledPredictor(Predictor):
     def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
         return (visible_boxes(eyes_m, self.stack)[CENTRE].slices,)
 
-    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> Prediction:
+    def predict(
+        self, images: Sequence[Sequence[Picture]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM
+    ) -> Prediction:
         across_m = np.abs(eyes_m[1] - eyes_m[0])
         if across_m[2] > across_m[1]:
             return self._turned(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
@@ -98,7 +105,7 @@ class UnrolledPredictor(Predictor):
             raise ModelFailure(str(error)) from None
         boxes = visible_boxes(eyes_m, self.stack)
         pictures = [image[0] for image in images]
-        grey = self.one_channel and all(is_grey(picture[boxes[CENTRE].slices]) for picture in pictures)
+        grey = self.one_channel and all(_is_grey(picture, boxes[CENTRE]) for picture in pictures)
         self.channels = 1 if grey else 3
         problem = Problem(contract, self.stack, boxes, eyes_m, frame, eye_sigma_mm, self.channels, self.fade)
         surround = self._surround()
@@ -119,7 +126,7 @@ class UnrolledPredictor(Predictor):
             self._made = self.surroundings.surround(self.session.contract, self.stack, threads=self._threads)
         return self._made
 
-    def _turned(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float) -> Prediction:
+    def _turned(self, images: Sequence[Sequence[Picture]], eyes_m: F64, *, eye_sigma_mm: float) -> Prediction:
         """Eyes above each other: the same problem with rows for columns, solved by a twin for panels turned so."""
         stack = self.stack
         if self._twin is None:
@@ -132,7 +139,8 @@ class UnrolledPredictor(Predictor):
         # A picture's rows become its columns: what was down (-z) is to the right (+y), what was right is down.
         turned_m = np.stack([eyes_m[:, 0], -eyes_m[:, 2], -eyes_m[:, 1]], axis=1)
         order = (0, 1) if turned_m[1, 1] > turned_m[0, 1] else (1, 0)
-        pictures = [[np.asarray(cv2.transpose(images[side][0]), np.uint8)] for side in order]
+        arrays = [image[0].pixels() if isinstance(image[0], DrawnPicture) else image[0] for image in images]
+        pictures = [[np.asarray(cv2.transpose(arrays[side]), np.uint8)] for side in order]
         solved = twin.predict(pictures, turned_m[list(order)], eye_sigma_mm=eye_sigma_mm)
         for layer, part in zip(layers, solved.layers, strict=True):
             cv2.transpose(part, dst=layer)
@@ -163,3 +171,8 @@ class UnrolledPredictor(Predictor):
         tail = seen[0].shape[2:]
         panels = {n: answer[name].reshape(frame.rows, -1, *tail) for n, name in ((REAR, "rear"), (FRONT, "front"))}
         return {n: problem.faded(panel, start=START) for n, panel in panels.items()}
+
+
+def _is_grey(picture: Picture, box: PixelRect) -> bool:
+    """Whether there is no colour in a box of a picture; as far as it is told, where that was left in a texture."""
+    return picture.grey if isinstance(picture, DrawnPicture) else is_grey(picture[box.slices])

@@ -20,6 +20,7 @@ class GlBackend:
         """context: the content's, or one of the backend's own; whoever made it releases it. Raises InputError where
         a panel of the stack is too large for the driver."""
         check_size(context, stack)
+        self.context = context
         self.passes = Passes(context)
         self.renderer = describe(context)["renderer"]
 

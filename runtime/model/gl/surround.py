@@ -23,11 +23,11 @@ from runtime.model.fade import CORRECTED_SHARE
 from runtime.model.gl.programs import Image, Passes
 from runtime.model.pyramid_level import CENTRE, FRONT, I16, NEUTRAL, OUTER, REAR, START, spreads
 from runtime.model.resample import target_from_source
-from runtime.model.schedule import Problem, reductions
+from runtime.model.schedule import Picture, Problem, reductions
 from runtime.model.transfer import phase_codes
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
-from runtime.support.gl import finish
+from runtime.support.gl import DrawnPicture, finish
 
 EYES = ("left", "right")
 NAMES = {REAR: "rear", FRONT: "front"}
@@ -51,7 +51,7 @@ class GlSurround:
         self._closed = False
 
     @contextmanager
-    def begin(self, pictures: Sequence[U8], problem: Problem) -> Iterator[None]:
+    def begin(self, pictures: Sequence[Picture], problem: Problem) -> Iterator[None]:
         try:
             self._passes.context.enable_only(moderngl.NOTHING)
             self._problem = problem
@@ -175,11 +175,16 @@ class GlSurround:
         )
         return images
 
-    def _taken(self, pictures: Sequence[U8]) -> list[Image]:
-        """The pictures' box, uploaded."""
+    def _taken(self, pictures: Sequence[Picture]) -> list[Image]:
+        """The pictures where they were drawn, or their box, uploaded."""
         box = self._problem.boxes[CENTRE]
         taken = []
+        self._origin = (0, 0)
         for eye, picture in zip(EYES, pictures, strict=True):
+            if isinstance(picture, DrawnPicture):
+                self._origin = (box.u0, box.v0)
+                taken.append(Image(picture.texture, box.width_px, box.height_px))
+                continue
             texture = self._texture(("picture", eye), self._stack.width_px, self._stack.height_px, 4, dtype="f1")
             image = Image(texture, box.width_px, box.height_px)
             texture.write(np.ascontiguousarray(picture[box.slices]), viewport=(0, 0, *image.size))
@@ -198,7 +203,7 @@ class GlSurround:
                 tuple(wanted.values()),
                 {"left": pictures[0], "right": pictures[1], "table": self._table},
                 {
-                    "origin": (0, 0),
+                    "origin": self._origin,
                     "box": (box.width_px, box.height_px),
                     "reduction": (box.width_px / width, box.height_px / height),
                     "emphasis": self._contract.emphasis,
