@@ -37,7 +37,7 @@ HALF_IPD_M = 0.031
 
 
 class UnrolledPredictor(Predictor):
-    """Models of `input_frame` chain: three evenly spaced panels, any pose.
+    """Models of `input_frame` chain: three panels, evenly spaced or nearly so, any pose.
 
     Where `one_channel` is set, grey pictures are solved in one channel of three: in less than half the time.
     """
@@ -132,9 +132,7 @@ class UnrolledPredictor(Predictor):
     def _turned(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float) -> Prediction:
         """Eyes above each other: the same problem with rows for columns, solved by a twin for panels turned so."""
         if self._twin is None:
-            stack = self.stack
-            turned = PanelStack(stack.height_m, stack.width_m, stack.x_m, stack.height_px, stack.width_px)
-            self._twin = UnrolledPredictor(self.session, turned, threads=self._threads)
+            self._twin = UnrolledPredictor(self.session, self.stack.turned(), threads=self._threads)
         twin = self._twin
         twin.one_channel, twin.fade = self.one_channel, self.fade and self.fade.turned()
         # A picture's rows become its columns: what was down (-z) is to the right (+y), what was right is down.
@@ -251,7 +249,9 @@ def _set_outer_panels(
     """Both outer panels as the network wants them."""
     for n, codes in panels.items():
         panel = level.rasters[n]
-        matrix = frame.frame_from_plane(x_m=panel.x_m) @ panel.plane_from_raster()
+        plane_from_layer = np.linalg.inv(level.layer_from_seen(n, frame.middle_m))
+        matrix = frame.frame_from_plane(x_m=panel.x_m) @ plane_from_layer @ panel.plane_from_raster()
+        matrix /= matrix[2, 2]
         matrix[0, 2] += frame.cell_px  # the answer begins one parallax before the first column
         level.set_panel(n, codes, matrix, shown=shown[n])
 
