@@ -12,6 +12,7 @@ from runtime.clock import NS_PER_S
 from runtime.records import F64, EyePoints
 
 LEAST_SAMPLES = 5
+FILLED = 0.9  # of a window's length
 LEAST_CONFIDENCE = 0.3
 OUTLIER_MADS = 5.0
 OUTLIER_FLOOR_M = 0.01
@@ -62,6 +63,17 @@ class EyeWindow:
     def clear(self) -> None:
         """Forget all: what was seen before does not belong to what comes."""
         self._samples.clear()
+
+    def still(self, drift_m: float) -> bool:
+        """Whether the whole window is filled, and the middles of its two halves lie no farther apart than this."""
+        if len(self._samples) < 2 * LEAST_SAMPLES:
+            return False
+        if self._samples[-1][0] - self._samples[0][0] < FILLED * self._length_ns:
+            return False
+        points = np.array([point for _, point in self._samples])
+        half = len(points) // 2
+        drift = np.median(points[half:], axis=0) - np.median(points[:half], axis=0)
+        return float(np.linalg.norm(drift)) <= drift_m
 
     def measure(self) -> Measured | None:
         """Median and spread; None with fewer than `LEAST_SAMPLES` samples."""

@@ -169,6 +169,7 @@ def capture_live(
     again: bool,
     window_s: float,
     max_spread_m: float,
+    hold_s: float,
 ) -> dict[str, Any]:
     """Walk through the viewpoints with a person before the display. Raises InputError, FatalError."""
     from runtime.sensor.registry import open_sensor
@@ -183,7 +184,10 @@ def capture_live(
     poll = keys.poll if chart is None else first_of(keys.poll, chart.keys.poll)
     worker.start()
     try:
-        walk = Walk(file, viewpoints, again=again, window_s=window_s, max_spread_m=max_spread_m, say=_say, chart=chart)
+        walk = Walk(
+            file, viewpoints, again=again, window_s=window_s, max_spread_m=max_spread_m, say=_say, chart=chart,
+            hold_s=hold_s,
+        )  # fmt: skip
         told = ""
         while worker.capabilities is None:
             if worker.error is not None:
