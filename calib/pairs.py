@@ -137,7 +137,7 @@ class PairsFile:
         self._rows: list[dict[str, str]] = []
         if path.exists():
             read_pairs(path)
-            with path.open(encoding="utf-8-sig", newline="") as file:
+            with io.StringIO(foreign.read_text(path), newline="") as file:
                 for row in csv.DictReader(file, skipinitialspace=True):
                     self._rows.append({name: row.get(name) or "" for name in (*COLUMNS, *NOTES)})
 
