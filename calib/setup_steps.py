@@ -11,6 +11,7 @@ from calib.config_file import put, put_lut, put_monitors, read_document, save_do
 from calib.interview import Interview
 from calib.keys import Key
 from calib.setup_world import Poll, Say, SimulatedWorld, World
+from calib.viewpoints import IPD_M
 from runtime.config import Settings, load_settings
 from runtime.errors import InputError
 
@@ -93,7 +94,12 @@ class Dial:
     most: float
     show: Callable[[float], str]
 
+    unknown: float | None = None  # the value to begin with, where 0 says that nothing is known
+
     def turn(self, direction: int) -> None:
+        if self.unknown is not None and (self.value == 0 or self.value + direction * self.step < self.least):
+            self.value = self.unknown if direction > 0 else 0.0
+            return
         self.value = min(max(self.value + direction * self.step, self.least), self.most)
 
 
@@ -112,6 +118,15 @@ def geometry(setup: Setup) -> Figures:
         Dial("from panel to panel", gap_m, 0.001, 0.002, 0.5, mm),
         Dial("nearest viewer", calibration.viewing_m[0], 0.05, 0.2, 5.0, lambda v: f"{v:.2f} m"),
         Dial("farthest viewer", calibration.viewing_m[1], 0.05, 0.25, 8.0, lambda v: f"{v:.2f} m"),
+        Dial(
+            "the eye separation of who will calibrate, if it is known (an optician's PD)",
+            calibration.ipd_m,
+            0.0005,
+            0.05,
+            0.08,
+            lambda v: mm(v) if v else "not known",
+            unknown=IPD_M,
+        ),
     ]
     chosen, coarse = 0, 1  # which dial; how many of its steps at once
     while True:
@@ -131,14 +146,18 @@ def geometry(setup: Setup) -> Figures:
         elif key in (Key.LEFT, Key.RIGHT):
             for _ in range(coarse):
                 dials[chosen].turn(1 if key is Key.RIGHT else -1)
-    width_m, height_m, found_m, near_m, far_m = (round(dial.value, 5) for dial in dials)
+    width_m, height_m, found_m, near_m, far_m, ipd_m = (round(dial.value, 5) for dial in dials)
     document = read_document(setup.config)
     values: dict[str, Any] = {"width_m": width_m, "height_m": height_m}
     if abs(found_m - gap_m) > 1e-6:  # else distances that were measured stay as they are
         middle = (len(stack.x_m) - 1) / 2
         values["x_m"] = [round((index - middle) * found_m, 6) for index in range(len(stack.x_m))]
     put(document, "stack", values)
-    put(document, "calibration", {"viewing_m": [near_m, far_m]})
+    put(
+        document,
+        "calibration",
+        {"viewing_m": [near_m, far_m]} | ({"ipd_m": ipd_m} if ipd_m != calibration.ipd_m else {}),
+    )
     save_document(setup.config, document)
     return {"width_m": width_m, "height_m": height_m, "gap_m": found_m, "viewing_m": [near_m, far_m]}
 

@@ -44,6 +44,7 @@ def captured(measured: Measured, stack_m: F64, name: str) -> CapturedPair:
         viewpoint=name,
         spread_mm=measured.spread_m * 1e3,
         samples=measured.samples,
+        separation_m=measured.separation_m,
         accepted_at=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     )
 

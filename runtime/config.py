@@ -224,6 +224,10 @@ class CalibrationSettings(Section):
     ipd_m: Annotated[float, within(0.04, 0.08, "m", zero=True)] = Field(
         0.0, description="the viewer's known eye separation, metres, 0: unknown; checks for drift"
     )
+    ipd_sigma_m: Annotated[float, within(0.0001, 0.02, "m")] = Field(
+        0.001,
+        description="how exactly ipd_m is known (a standard deviation): `calibrate solve` learns the scale from it",
+    )
     ipd_tolerance: Positive = Field(0.04, description="warn where the measured one parts by more than this share")
     viewing_m: tuple[Annotated[float, within(0.05, 20.0, "m")], Annotated[float, within(0.05, 20.0, "m")]] = Field(
         (0.4, 0.6), description="nearest and farthest viewer: charts and registration are for there"

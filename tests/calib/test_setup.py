@@ -21,7 +21,7 @@ from calib.registration import through
 from calib.setup_run import progress_path, read_progress, walk_through
 from calib.setup_steps import STEPS, Setup, geometry, identify
 from calib.setup_world import SimulatedWorld
-from calib.viewpoints import eyes_at, grid, viewing_place_m
+from calib.viewpoints import IPD_M, eyes_at, grid, viewing_place_m
 from runtime.config import Settings, load_settings
 from runtime.errors import InputError
 from runtime.eyes.calibration import load_calibration
@@ -241,6 +241,16 @@ def test_sizes_are_set_with_arrows_and_measured_distances_stay(tmp_path) -> None
     assert found.x_m == (-0.0601, 0.0, 0.0593)
     geometry(Scripted(tmp_path, [Key.DOWN, Key.DOWN, Key.LEFT, Key.ACCEPT]).setup)
     assert load_settings(config).stack.x_m == pytest.approx((-0.0587, 0.0, 0.0587))
+
+
+def test_who_knows_the_distance_of_their_eyes_says_so_and_may_take_it_back(tmp_path) -> None:
+    down = [Key.DOWN] * 5
+    geometry(Scripted(tmp_path, [*down, Key.RIGHT, Key.RIGHT, Key.ACCEPT]).setup)
+    assert load_settings(tmp_path / "c.toml").calibration.ipd_m == pytest.approx(IPD_M + 0.0005)
+    geometry(Scripted(tmp_path, [*down, Key.ACCEPT]).setup)
+    assert load_settings(tmp_path / "c.toml").calibration.ipd_m == pytest.approx(IPD_M + 0.0005)
+    geometry(Scripted(tmp_path, [*down, *[Key.LEFT] * 40, Key.ACCEPT]).setup)
+    assert load_settings(tmp_path / "c.toml").calibration.ipd_m == 0.0
 
 
 def test_panels_already_known_keep_their_registration_when_they_are_identified_again(tmp_path) -> None:
