@@ -76,7 +76,7 @@ def _faster(predictor: Predictor, context: Callable[[], Any]) -> Choice:
 
 
 def _smaller(stack: PanelStack, share: int) -> PanelStack:
-    return replace(stack, width_px=max(64, stack.width_px // share), height_px=max(64, stack.height_px // share))
+    return replace(stack, tilt=None, width_px=max(64, stack.width_px // share), height_px=max(64, stack.height_px // share))
 
 
 def _solution_ms(predictor: Predictor, stack: PanelStack, backend: Backend) -> float:
