@@ -25,7 +25,7 @@ golden: $(VENV)/.test
 	$(BIN)/python -m tests.golden --renew $(GOLDEN_ARGS)
 
 # Mutants of the modules that compute, and what of them the tests notice (half an hour); docs/testing.md.
-mutants: $(VENV)/.test
+mutants: $(VENV)/.mutation
 	$(BIN)/python -m tests.mutation $(MUTANT_ARGS)
 
 lint: $(VENV)/.test
@@ -79,6 +79,10 @@ $(VENV)/.test: $(VENV)/.runtime requirements/test.lock requirements/torch.lock
 	@sh systemd/packages.sh test
 	$(BIN)/python -m pip install --quiet -r requirements/test.lock
 	$(BIN)/python -m pip install --quiet -r requirements/torch.lock
+	@touch $@
+
+$(VENV)/.mutation: $(VENV)/.test requirements/mutation.lock
+	$(BIN)/python -m pip install --quiet -r requirements/mutation.lock
 	@touch $@
 
 clean:
