@@ -12,7 +12,7 @@ from runtime.errors import ModelFailure
 from runtime.frame.presenter import Presenter
 from tests.golden.recordings import path_to
 
-Deed = Callable[[Presenter], None]
+Action = Callable[[Presenter], None]
 LOADED_WITHIN_S = 60.0  # of the machine's time; the simulated clock stands meanwhile
 
 
@@ -22,7 +22,7 @@ class Case:
 
     recording: str
     tables: dict[str, dict[str, Any]] = field(default_factory=dict)  # settings beside SMALL
-    deeds: dict[int, Deed] = field(default_factory=dict)  # before the refresh of that number
+    actions: dict[int, Action] = field(default_factory=dict)  # before the refresh of that number
     pictures: tuple[int, ...] = ()  # refreshes whose panels are kept
 
     @property
@@ -46,7 +46,7 @@ SMALL: dict[str, dict[str, Any]] = {
 }
 
 
-def change_scene(name: str) -> Deed:
+def change_scene(name: str) -> Action:
     """`ctl scene`, complete before the simulated clock goes on."""
 
     def do(presenter: Presenter) -> None:

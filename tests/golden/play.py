@@ -36,7 +36,7 @@ class Played:
     light: dict[int, U8] = field(default_factory=dict)  # the same, as the run's files have it (`shown_layers`)
 
 
-class Witness:
+class Collector:
     """Looks at every refresh as the black box does: another observer of the presenter."""
 
     def __init__(self, case: Case) -> None:
@@ -79,14 +79,14 @@ class Operator:
     """The run's supervisor: does what the case says, when it says."""
 
     def __init__(self, case: Case) -> None:
-        self._deeds, self._refresh = case.deeds, 0
+        self._actions, self._refresh = case.actions, 0
 
     def stop_reason(self) -> str:
         return ""
 
     def obey(self, presenter: Presenter) -> None:
-        if deed := self._deeds.get(self._refresh):
-            deed(presenter)
+        if action := self._actions.get(self._refresh):
+            action(presenter)
         self._refresh += 1
 
     def refreshed(self, presenter: Presenter, account: RefreshAccount) -> None:
@@ -96,7 +96,7 @@ class Operator:
 def play(case: Case, out: Path) -> Played:
     """Run it; `out` is the folder of the run's own files."""
     settings = Settings.model_validate(case.settings())
-    witness: Any = Witness(case)
+    collector: Any = Collector(case)
     runs: list[Run] = []
     summary = drive(
         settings,
@@ -107,17 +107,17 @@ def play(case: Case, out: Path) -> Played:
         progress=False,
         supervisor=Operator(case),
         on_built=runs.append,
-        recorder=witness,
+        recorder=collector,
     )
     lines = [json.loads(line) for line in (out / "frames.jsonl").read_text(encoding="utf-8").splitlines()]
-    refreshes = [line | told for line, told in zip(lines, witness.refreshes, strict=True)]
+    refreshes = [line | told for line, told in zip(lines, collector.refreshes, strict=True)]
     for line in refreshes:
         if line["inference"] != "ran":  # as they were when their solution was first shown
             del line["solved_for_m"], line["stage_ms"]
     told = {name: summary.get(name) for name in SUMMARY}
     told["plan"] = [item["what"] for item in summary["plan"]]
     told["samples"] = runs[0].observer.means.values
-    return Played(rounded(told), rounded(refreshes), witness.panels, witness.light)
+    return Played(rounded(told), rounded(refreshes), collector.panels, collector.light)
 
 
 def rounded(value: Any) -> Any:
