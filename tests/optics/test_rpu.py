@@ -1,4 +1,4 @@
-"""The reverse perspective uniform: closed form, plane-induced and brute force agree (seed 40-47)."""
+"""The reverse perspective uniform: closed form, plane-induced and brute force agree (EyeReal supplement, (40)-(47))."""
 
 from __future__ import annotations
 
