@@ -46,7 +46,9 @@ class Solution:
         return self.moved_bytes / gb_s / 1e6
 
 
-def counted(models: Sequence[str], *, width_px: int, height_px: int) -> list[Solution]:
+def counted(
+    models: Sequence[str], *, width_px: int, height_px: int, cases: Sequence[tuple[float, bool]] = CASES
+) -> list[Solution]:
     """Of real solutions, one a model and case, drawn and solved in one context as the daemon does.
 
     Raises MissingPart without OpenGL.
@@ -57,7 +59,7 @@ def counted(models: Sequence[str], *, width_px: int, height_px: int) -> list[Sol
         backend = GlBackend(painter.context, stack)
         for model in models:
             predictor = load_predictor(model, stack, ModelSettings(name=model))
-            for sigma_mm, at_once in CASES:
+            for sigma_mm, at_once in cases:
                 backend.at_once = at_once
                 predictor.surround_with(backend)
                 images = drawn_for(predictor, painter.content, eyes_m, time_ns=0)

@@ -21,6 +21,7 @@ from runtime.model.chain import chain_frame
 from runtime.optics.stack import PanelStack
 from runtime.records import SolveRequest
 from runtime.support.gl import offscreen_context
+from tests.daemon.gl_soak import soaked
 from tests.model.exact import exact_resample
 from tests.waiting import eventually
 
@@ -147,3 +148,12 @@ def test_a_lost_context_is_made_anew_from_the_settings() -> None:
         assert maker.parts.backend.backend.name == "gl"
     finally:
         host.close()
+
+
+@pytest.mark.slow
+def test_thousands_of_solutions_with_contexts_lost_under_way_do_not_grow() -> None:
+    """2,000 here; `python -m tests.daemon.gl_soak --solutions 100000` for the rest."""
+    found = soaked(2000, lose_every=500)
+    assert found.lost == 3
+    assert found.textures[-1] <= found.textures[0]
+    assert found.resident_mib[-1] - found.resident_mib[0] < 64  # the process's, after the first hundred
