@@ -43,7 +43,7 @@ class Canvas:
     def draw(
         self, *, width_px: int, height_px: int, side: int, box: PixelRect, paint: Callable[[], None]
     ) -> DrawnPicture:
-        """Clear, let `paint` issue its draw calls inside `box`; the picture is good until its side's next."""
+        """Clear, let `paint` issue its draw calls inside `box`; that side's picture, until its next of this size."""
         target = self._target(width_px, height_px)
         plain = target.plain[side]
         plain.use()

@@ -111,7 +111,8 @@ def _faster(predictor: Predictor, context: Callable[[], Any]) -> Choice:
 
 
 def _smaller(stack: PanelStack, share: int) -> PanelStack:
-    return replace(stack, width_px=max(64, stack.width_px // share), height_px=max(64, stack.height_px // share))
+    width_px, height_px = (max(64, size // share) for size in (stack.width_px, stack.height_px))
+    return replace(stack, tilt=None, width_px=width_px, height_px=height_px)
 
 
 def _solution_ms(predictor: Predictor, stack: PanelStack, backend: Backend, *, runs: int) -> float:

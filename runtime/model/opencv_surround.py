@@ -73,7 +73,7 @@ class OpenCvSurround:
 
     def set_panel(self, reduction: int, panel: int, codes: I16, *, shown: bool) -> None:
         level = self._workspace.levels[reduction]
-        level.set_panel(panel, codes, self._problem.answer_from_raster(level.rasters[panel]), shown=shown)
+        level.set_panel(panel, codes, self._problem.answer_from_raster(panel, level.rasters[panel]), shown=shown)
 
     def project(self, reduction: int, panels: Sequence[int]) -> None:
         self._workspace.levels[reduction].project(panels, self._problem.eyes_m)

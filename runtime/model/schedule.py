@@ -19,6 +19,7 @@ from runtime.model.fade import Fade
 from runtime.model.pyramid_level import CENTRE, FRONT, I16, OUTER, REAR, coarser
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.tilt import coarse_layer_from_seen
 from runtime.records import F64, U8
 from runtime.support.gl import DrawnPicture
 
@@ -54,9 +55,11 @@ class Problem:
         reduced_from_plane = reduced_from_full @ centre.raster_from_plane()
         return reduced_from_plane @ self.frame.plane_from_frame(self.eyes_m[side], x_m=self.stack.x_m[CENTRE])
 
-    def answer_from_raster(self, raster: PlaneRaster) -> F64:
+    def answer_from_raster(self, panel: int, raster: PlaneRaster) -> F64:
         """3x3: the network's answer's pixels from an outer panel's, in line as seen from between the eyes."""
-        matrix = self.frame.frame_from_plane(x_m=raster.x_m) @ raster.plane_from_raster()
+        seen_from_layer = np.linalg.inv(coarse_layer_from_seen(self.stack, panel, self.frame.middle_m))
+        matrix = self.frame.frame_from_plane(x_m=raster.x_m) @ seen_from_layer @ raster.plane_from_raster()
+        matrix /= matrix[2, 2]
         matrix[0, 2] += self.frame.cell_px  # the answer begins one parallax before the first column
         return matrix
 

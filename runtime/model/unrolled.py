@@ -34,7 +34,7 @@ HALF_IPD_M = 0.031
 
 
 class UnrolledPredictor(Predictor):
-    """Models of `input_frame` chain: three evenly spaced panels, any pose.
+    """Models of `input_frame` chain: three panels, evenly spaced or nearly so, any pose.
 
     Where `one_channel` is set, grey pictures are solved in one channel of three: in less than half the time.
     """
@@ -130,8 +130,9 @@ class UnrolledPredictor(Predictor):
         """Eyes above each other: the same problem with rows for columns, solved by a twin for panels turned so."""
         stack = self.stack
         if self._twin is None:
-            turned = PanelStack(stack.height_m, stack.width_m, stack.x_m, stack.height_px, stack.width_px)
-            self._twin = UnrolledPredictor(self.session, turned, threads=self._threads, surroundings=self.surroundings)
+            self._twin = UnrolledPredictor(
+                self.session, stack.turned(), threads=self._threads, surroundings=self.surroundings
+            )
             self._turned_layers = np.empty((stack.count, stack.height_px, stack.width_px, 4), np.uint8)
         twin, layers = self._twin, self._turned_layers
         assert layers is not None

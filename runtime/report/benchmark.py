@@ -54,7 +54,8 @@ def scatter(values: Sequence[float]) -> float:
     """How far a median of these may be off, relative: 1.4826·MAD·1.25/sqrt(n)."""
     middle = float(np.median(values))
     deviation = float(np.median(np.abs(np.asarray(values) - middle)))
-    return 1.4826 * 1.2533 * deviation / middle / len(values) ** 0.5
+    relative: float = 1.4826 * 1.2533 * deviation / middle / len(values) ** 0.5
+    return relative
 
 
 def stage_times(model: str, stack: PanelStack, eyes_m: F64, *, backend: Wanted = "opencv") -> dict[str, Any]:

@@ -97,7 +97,7 @@ class GlSurround:
         answer = self._grown(f"answer {panel}", columns, rows, components=self._problem.channels)
         answer.texture.write(np.ascontiguousarray(codes), viewport=(0, 0, columns, rows), alignment=1)
         self._passes.crossed("answer up", answer, bytes_px=2 * self._problem.channels, to_gpu=True)
-        matrix = self._problem.answer_from_raster(self._rasters[reduction][panel])
+        matrix = self._problem.answer_from_raster(panel, self._rasters[reduction][panel])
         self._resample(answer, reduction, panel, matrix, shown=shown)
 
     def project(self, reduction: int, panels: Sequence[int]) -> None:
@@ -382,7 +382,9 @@ class GlSurround:
 
 
 def check_size(context: moderngl.Context, stack: PanelStack) -> None:
-    """Raises InputError where a panel is wider or higher than the driver allows."""
+    """Raises InputError where a panel is wider or higher than the driver allows, or tilted."""
+    if stack.tilt is not None:
+        raise InputError("stack", "tilt", 'tilted panels are solved for by model.backend = "opencv" alone')
     most = int(context.info["GL_MAX_TEXTURE_SIZE"])
     most_wide, most_high = (min(most, int(value)) for value in context.info["GL_MAX_VIEWPORT_DIMS"])
     for name, value, limit in (("width_px", stack.width_px, most_wide), ("height_px", stack.height_px, most_high)):
