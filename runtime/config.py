@@ -298,8 +298,10 @@ class ModelSettings(Section):
 
     name: str = Field("balanced", description="fast, balanced, best, sart, or an ONNX file with our contract")
     provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = Field("cpu", description="execution provider")
-    backend: Literal["auto", "opencv"] = Field(
-        "auto", description="what does all that surrounds the network; auto: the one there is"
+    backend: Literal["auto", "opencv", "gl"] = Field(
+        "auto",
+        description="what does all that surrounds the network: OpenCV on the processor, or OpenGL's shaders; "
+        "auto: both are measured at the start, and the faster one is taken",
     )
     threads: Annotated[int, Field(ge=0, le=256)] = Field(2, description="inference threads; 0: all cores")
     eye_sigma_mm: Literal["auto"] | NonNegative = Field(

@@ -20,6 +20,7 @@ app = typer.Typer()
 def bench(
     context: typer.Context,
     out: Annotated[Path | None, typer.Option(help="write the regression file here (JSON)")] = None,
+    backend: Annotated[str, typer.Option(help="what surrounds the network: opencv, gl or auto")] = "opencv",
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
     """Measure what a frame costs, or compare two measurements.
@@ -28,16 +29,20 @@ def bench(
 
     Example: phasestack bench --out bench.json
 
+    Example: phasestack bench --backend gl --out gl.json
+
     Example: phasestack bench compare old.json new.json
     """
     if context.invoked_subcommand is not None:
         return
+    from runtime.config import Settings, changed
     from runtime.report import benchmark
     from runtime.report.progress import status_line
     from runtime.support.artifacts import to_json, write_json
 
+    wanted = changed(Settings(), "model", {"backend": backend}, source="--backend").model.backend
     with status_line("bench") as tell:
-        record = benchmark.measured(progress=tell)
+        record = benchmark.measured(backend=wanted, progress=tell)
     if out is not None:
         write_json(out, record)
     if as_json:

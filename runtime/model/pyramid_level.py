@@ -57,7 +57,7 @@ class PyramidLevel:
 
     def crop(self, boxes: Sequence[PixelRect], stack: PanelStack) -> None:
         """Cut every raster and buffer to what the eyes look through."""
-        self.rasters = tuple(_coarser(box.cut(stack.panel(n)), self.reduction) for n, box in enumerate(boxes))
+        self.rasters = tuple(coarser(box.cut(stack.panel(n)), self.reduction) for n, box in enumerate(boxes))
         self.outer = {n: self._view("outer", n, 0, on=n) for n in OUTER}
         self.seen = {(n, side): self._view("seen", n, side, on=CENTRE) for n in OUTER for side in EYES}
         self.residual = tuple(self._view("residual", CENTRE, side, on=CENTRE) for side in EYES)
@@ -70,14 +70,7 @@ class PyramidLevel:
     def set_eye_sigma(self, eyes_m: F64, *, eye_sigma_mm: float) -> None:
         """Correct for eyes (2, 3) that err by so much, an axis: what is left of the outer panels in the mean counts,
         and what moves of them is noise. Spreads too small to be felt on this raster are none."""
-        eye_x_m, centre_x_m = eyes_m[:, 0].mean(), self.rasters[CENTRE].x_m
-        self.spread = {}
-        for n in OUTER:
-            raster = self.rasters[n]
-            moved_m = eye_sigma_mm / 1e3 * abs(raster.x_m - centre_x_m) / (eye_x_m - centre_x_m)
-            spread = min(moved_m / raster.pitch_u_m, MOST_SPREAD), min(moved_m / raster.pitch_v_m, MOST_SPREAD)
-            if max(spread) >= LEAST_SPREAD:
-                self.spread[n] = spread
+        self.spread = spreads(self.rasters, eyes_m, eye_sigma_mm=eye_sigma_mm)
 
     def project(self, panels: Sequence[int], eyes_m: F64) -> None:
         """See outer panels anew through the centre panel's pixels: in the mean, where the eyes are unsure."""
@@ -195,7 +188,20 @@ class PyramidLevel:
         return resample(image, image_from_result=matrix, out=out, outside=0 if of == CENTRE else START)
 
 
-def _coarser(raster: PlaneRaster, reduction: int) -> PlaneRaster:
+def spreads(rasters: Sequence[PlaneRaster], eyes_m: F64, *, eye_sigma_mm: float) -> dict[int, tuple[float, float]]:
+    """Per outer panel whose pixels move by enough to be felt for eyes (2, 3) that err by so much: right and down."""
+    eye_x_m, centre_x_m = eyes_m[:, 0].mean(), rasters[CENTRE].x_m
+    found = {}
+    for n in OUTER:
+        raster = rasters[n]
+        moved_m = eye_sigma_mm / 1e3 * abs(raster.x_m - centre_x_m) / (eye_x_m - centre_x_m)
+        spread = min(moved_m / raster.pitch_u_m, MOST_SPREAD), min(moved_m / raster.pitch_v_m, MOST_SPREAD)
+        if max(spread) >= LEAST_SPREAD:
+            found[n] = spread
+    return found
+
+
+def coarser(raster: PlaneRaster, reduction: int) -> PlaneRaster:
     """The same rectangle in fewer pixels."""
     if reduction == 1:
         return raster

@@ -46,7 +46,7 @@ class CarriedView:
         return through_layers(layers, lambda rows: self._positions(true, rows), toward_panels, self._stack)
 
     def _positions(self, true_m: F64, rows: slice) -> Iterator[tuple[F64, F64]]:
-        """On every panel: where the lines from the true eye through the centre panel's points cross it (seed 3)."""
+        """On every panel: where the lines from the true eye through the centre panel's points cross it (section 3)."""
         stack = self._stack
         centre = stack.panel(stack.count // 2)
         u, v = self._rays.on(centre, rows)

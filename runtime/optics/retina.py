@@ -156,7 +156,7 @@ def seen_by(
     height_px: int | None = None,
     step: int = 1,
 ) -> Retina:
-    """What a pinhole eye sees (seed 6, 7): panel values summed along each ray, then sin².
+    """What a pinhole eye sees (EyeReal supplement, (6), (7)): panel values summed along each ray, then sin².
 
     layers: (N, H, W, 3 or 4), rear to front, uint8 code values or float in [0, 1]; a fourth channel is ignored.
     The image has the layers' size unless told; step: only every so-manieth ray of every so-manieth row of it.
@@ -225,7 +225,7 @@ def pupil_points(diameter_m: float, rings: int = 2) -> F64:
 
 
 def average(images: Iterable[F32]) -> F32:
-    """Mean of equally sized images: a finite pupil sees the average of what its points see (seed 1.4)."""
+    """Mean of equally sized images: a finite pupil sees the average of what its points see (section 1.4)."""
     total: F32 | None = None
     count = 0
     for image in images:

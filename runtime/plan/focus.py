@@ -20,6 +20,7 @@ from runtime.content.camera import union
 from runtime.model.fade import Fade
 from runtime.model.predictor import Prediction, Predictor
 from runtime.model.pyramid_level import NEUTRAL
+from runtime.model.schedule import Backend, Picture
 from runtime.model.transfer import SUBCODE, phase_codes, pre_emphasised
 from runtime.model.unrolled import UnrolledPredictor
 from runtime.optics.pupil import POINT_MM
@@ -38,6 +39,7 @@ from runtime.plan.active import (
     window_of,
 )
 from runtime.records import F64, U8
+from runtime.support.gl import DrawnPicture
 
 SIZES_KEPT = 6
 
@@ -63,6 +65,20 @@ class FocusedPredictor(Predictor):
         self._background: tuple[int, ...] | None = None  # that fills the centre panel beside the aimed window
         self.window: Window | None = None  # of the last frame
         self.active_fraction = 1.0  # of the panel's pixels that went through the model
+
+    @property
+    def backend(self) -> str:  # type: ignore[override]
+        return self.whole.backend
+
+    def reads_textures_of(self, context: object) -> bool:
+        return self.whole.reads_textures_of(context)
+
+    def on_panels(self, stack: PanelStack) -> Predictor | None:
+        return self.whole.on_panels(stack)
+
+    def surround_with(self, backend: Backend) -> None:
+        for part in (self.whole, *self._parts.values()):
+            part.surround_with(backend)
 
     def aim(self, content: ContentSource, eyes_m: F64, *, time_ns: int) -> None:
         """Ask the content where it lies, so that only that is drawn and solved."""
@@ -117,12 +133,19 @@ class FocusedPredictor(Predictor):
             ),
         )
 
-    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> Prediction:
+    def predict(
+        self, images: Sequence[Sequence[Picture]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM
+    ) -> Prediction:
         begin_ns = perf_counter_ns()
         left, right = images[0][0], images[1][0]
         aimed, self._aimed = self._aimed, None
         if aimed is not None:
             window, cut = aimed, [[left], [right]]
+        elif isinstance(left, DrawnPicture) or isinstance(right, DrawnPicture):  # nobody looked where they differ
+            self.window, self.active_fraction = None, 1.0
+            prediction = self.whole.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
+            self.channels = self.whole.channels
+            return prediction
         else:
             # A coarse look tells for next to nothing what is too large; only the rest is worth a close one.
             for look in (coarse_box, differing_box):
@@ -149,7 +172,7 @@ class FocusedPredictor(Predictor):
         if aimed is not None:
             self._even_out(but=window.box)
             self._paint_background(self._wanted_background)
-        else:
+        elif not isinstance(left, DrawnPicture):
             self._fill_with(left, but=window.box)
         return self._place(window, solved, eyes_m, found_ms + (perf_counter_ns() - begin_ns) / 1e6)
 

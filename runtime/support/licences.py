@@ -89,7 +89,7 @@ def _home(package: Distribution) -> str:
     for entry in metadata.get_all("Project-URL") or ():
         label, _, url = entry.partition(",")
         if label.strip().lower() in ("homepage", "source", "repository", "source code", "github"):
-            return url.strip()
+            return str(url.strip())
     return metadata.get("Home-page") or f"https://pypi.org/project/{package.name}/"
 
 

@@ -335,7 +335,7 @@ def test_a_person_at_the_terminal_takes_pairs_from_a_sensor(tmp_path: Path) -> N
     with contextlib.suppress(BrokenPipeError):
         running.stdin.close()
     running.stdout.close()
-    assert running.wait(timeout=10) == 0
+    assert running.wait(timeout=60) == 0
     assert told["accepted"] == 1
     pairs = read_pairs(out)
     np.testing.assert_allclose(pairs.sensor_m, [eyes_at(viewpoint.midpoint_m).eyes_m.mean(0)], atol=1e-6)

@@ -56,7 +56,7 @@ def test_the_seeds_scale_lies_between_the_two_optima(seed, sigma_m) -> None:
 
 
 def test_least_squares_is_the_minimum_of_the_seeds_objective() -> None:
-    """Against a general minimiser that knows nothing of SVD (seed 20)."""
+    """Against a general minimiser that knows nothing of SVD (EyeReal supplement, (20))."""
     points = cloud(3)
     sensor = camera(points, rotation=Rotation.from_rotvec([0.4, -1.0, 0.3]), scale=2.0, shift=np.array([0.1, 0, 0]))
     sensor = sensor + np.random.default_rng(0).normal(scale=0.01, size=points.shape)

@@ -70,8 +70,8 @@ def test_its_jitter_lies_under_the_curve_of_single_filters_at_its_lag(trades):
     assert shipped.jitter_mm < np.interp(shipped.lag_ms, lags, jitters)
 
 
-def test_an_update_costs_at_most_50_microseconds_on_an_idle_machine():
-    # Machines differ: 50 us are some 1500 times what Python takes for a small call.
+def test_an_update_costs_no_more_than_three_thousand_small_calls_of_python():
+    # Machines differ, and are busy: on an idle one it is some 1500, or 50 us.
     import timeit
 
     call_us = min(timeit.repeat("f(1.0)", "f = abs", number=10_000, repeat=5)) / 10_000 * 1e6
