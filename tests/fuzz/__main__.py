@@ -45,7 +45,6 @@ def fuzz_one(name: str, seconds: float, seed: int) -> dict[str, Any]:
     seeds = target.seeds() + [path.read_bytes() for path in sorted((CORPUS / name).glob("*"))]
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_MIB << 20, ADDRESS_MIB << 20))
     told: dict[str, Any] = {"cases": 0, "refused": 0, "slowest_s": 0.0, "largest_mib": 0.0, "findings": []}
-    end = time.monotonic() + seconds
 
     def too_slow(number: int, frame: Any) -> None:
         raise Slow
