@@ -102,7 +102,7 @@ def _done(setup: Setup, step: Step) -> bool:
     try:
         figures = step.run(setup)
     except Stopped:
-        setup.say("stopped: nothing of this step is written into the configuration")
+        setup.say("stopped: what was not finished is not written into the configuration")
         return False
     except PhasestackError as problem:
         setup.say(f"it did not work: {problem}")

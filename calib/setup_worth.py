@@ -38,7 +38,8 @@ def grey_worth(settings: Settings) -> dict[str, dict[str, float]]:
     """
     layers, pictures, eyes_m = _solved(settings)
     codes = np.repeat(np.arange(256)[:, None] / 255, 3, axis=1)
-    sent, bare = layers[..., :3].astype(np.float32) / 255, layers[..., :3].astype(np.float32) / 255
+    sent: F32 = layers[..., :3].astype(np.float32) / np.float32(255)
+    bare = sent.copy()
     for number, panel in enumerate(settings.output.panels):
         if not panel.lut:
             continue

@@ -227,7 +227,7 @@ def test_a_step_that_is_stopped_writes_nothing_and_is_offered_again(tmp_path) ->
     scripted = Scripted(tmp_path, [Key.ACCEPT, Key.ACCEPT, Key.QUIT, Key.QUIT])
     assert not walk_through(scripted.setup)
     assert not (tmp_path / "c.toml").exists()
-    assert any("nothing of this step" in text for text in scripted.said)
+    assert any("what was not finished is not written" in text for text in scripted.said)
     assert len([text for text in scripted.said if text.startswith("\nStep 1")]) == 2
 
 
