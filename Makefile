@@ -12,7 +12,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 NIGHTLY := out/nightly
 
-.PHONY: demo test test-slow golden mutants lint types secrets coverage nightly bench fuzz soak install uninstall system docs gallery hashes clean
+.PHONY: demo test test-slow golden mutants lint types secrets coverage nightly package bench fuzz soak install uninstall system docs gallery hashes clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/phasestack demo $(DEMO_ARGS)
@@ -56,6 +56,10 @@ nightly: test-slow coverage fuzz secrets
 	$(BIN)/phasestack bench --out $(NIGHTLY)/bench-new.json
 	if [ -e $(NIGHTLY)/bench.json ]; then $(BIN)/phasestack bench compare $(NIGHTLY)/bench.json $(NIGHTLY)/bench-new.json; fi
 	mv $(NIGHTLY)/bench-new.json $(NIGHTLY)/bench.json
+
+# Wheel and sdist in dist/; tests/test_packages.py (slow) installs them from nothing and runs the demo.
+package: $(VENV)/.test
+	$(BIN)/python -m build --outdir dist
 
 bench: $(VENV)/.test
 	$(BIN)/phasestack bench --out out/bench.json
