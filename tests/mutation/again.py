@@ -1,6 +1,6 @@
 """One survivor again: its edit in place of the module, and the module's tests, in a process of its own.
 
-`python -m tests.mutation.again MODULE MUTANT DIFF-FILE`: rc 0: the tests pass with it, 1: they fail, 2: no place for it.
+`python -m tests.mutation.again MODULE MUTANT DIFF-FILE`: rc 0: the tests pass with it, 1: they fail, 2: it has none.
 """
 
 from __future__ import annotations
