@@ -43,6 +43,8 @@ Unit = Annotated[float, Field(ge=0, le=1)]
 SocketPath = Annotated[str, AfterValidator(socket_path)]
 Entry = Annotated[float, Field(ge=-MOST, le=MOST)]  # of a matrix
 Place = Annotated[float, within(-50.0, 50.0, "m")]  # a coordinate of an eye
+Offset = Annotated[float, within(-10.0, 10.0, "m")]  # of a scene
+Turn = Annotated[float, within(-360.0, 360.0, "degrees")]
 
 
 class StackGeometry(Section):
@@ -258,6 +260,19 @@ class ContentSettings(Section):
         0, description="samples a pixel for outlines; 0: smooth outlines that a software rasteriser draws faster"
     )
     external: SocketPath = Field("/run/phasestack/content.sock", description="socket of another program's pictures")
+    scale: Annotated[float, within(0.001, 1000.0, "")] = Field(
+        1.0, description="the scene's size, times its own, about the display's middle"
+    )
+    offset_m: tuple[Offset, Offset, Offset] = Field(
+        (0.0, 0.0, 0.0), description="where the scene is moved: out of the screen, to the right, up; metres"
+    )
+    rotation_deg: tuple[Turn, Turn, Turn] = Field(
+        (0.0, 0.0, 0.0),
+        description="the scene's turns about the axes out of the screen, to the right and up, in this order",
+    )
+    turntable_per_min: Annotated[float, within(-600.0, 600.0, "turns a minute")] = Field(
+        0.0, description="the scene turns about the vertical so often a minute; negative: the other way; 0: it stands"
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> ContentSettings:

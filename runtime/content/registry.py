@@ -9,6 +9,7 @@ from typing import Any
 
 from runtime.config import ContentSettings, LimitSettings
 from runtime.content.base import ContentSource
+from runtime.content.placed import placed_source, placing_of
 from runtime.content.presets import Preset, preset, preset_names
 from runtime.content.scenes import SCENES
 from runtime.errors import InputError
@@ -37,7 +38,9 @@ def prepare_content(settings: ContentSettings, stack: PanelStack, *, limits: Lim
     """
     limits = limits or LimitSettings()
     with progress.task(f"loading {settings.scene}", seconds=limits.load_s, too_slow=_too_slow(settings.scene, limits)):
-        return _prepared(settings, stack, limits)
+        opener = _prepared(settings, stack, limits)
+    placing = placing_of(settings)
+    return lambda context: placed_source(opener(context), placing, settings, stack)
 
 
 def _too_slow(scene: str, limits: LimitSettings) -> InputError:
@@ -104,7 +107,7 @@ def _stand_in(name: str, settings: ContentSettings, stack: PanelStack) -> Opener
 
     def make(context: Any) -> ContentSource:
         source = make_demo(context)
-        source.info = replace(source.info, name=f"{name} (stand-in `demo`: content.file is empty)")
+        source.info = replace(source.info, name=f"{name} (stand-in `demo`: content.file is empty)", stand_in=True)
         return source
 
     return make

@@ -208,7 +208,7 @@ class TrianglePainter:
             clip = camera.clip_from_stack(view.pixels_from_stack, near_m=near_m, far_m=far_m, **size)
             self._context.enable_only(self._context.DEPTH_TEST)
             for item, stack_from_part in placed:
-                self._describe(item.surface_program, item, stack_from_part)
+                self._describe(item.surface_program, item, stack_from_part, view)
                 item.surface_program["clip_from_part"].write(_gl(clip @ stack_from_part))
                 item.surface.render()
             if self._with_ramps:
@@ -271,8 +271,8 @@ class TrianglePainter:
             self._textures[id(picture)] = texture
         return self._textures[id(picture)]
 
-    def _describe(self, program: Any, item: _Uploaded, stack_from_part: F64) -> None:
-        linear = stack_from_part[:3, :3]
+    def _describe(self, program: Any, item: _Uploaded, stack_from_part: F64, view: View) -> None:
+        linear = stack_from_part[:3, :3] if view.turned is None else view.turned @ stack_from_part[:3, :3]
         if "stack_from_part" in program:
             program["stack_from_part"].write(_gl(linear / np.cbrt(abs(np.linalg.det(linear)))))
         program["colour"] = item.part.colour
@@ -296,7 +296,7 @@ class TrianglePainter:
                 continue
             packed = np.concatenate([corners.reshape(-1, 5), item.attributes[vertices.reshape(-1)]], axis=1)
             item.outline_buffer.write(packed)
-            self._describe(item.outline_program, item, stack_from_part)
+            self._describe(item.outline_program, item, stack_from_part, view)
             item.outline.render(vertices=len(packed))
         framebuffer.depth_mask = True
 

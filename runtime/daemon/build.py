@@ -71,6 +71,7 @@ class Run:
         return {
             **self.presenter.summary(simulated=self.simulated),
             **self.observer.means.summary(),
+            "scene": self.presenter.run_cell.state.content.info.name,
             "backend": "opencv",
             "plan": self.plan_items(),
         }

@@ -99,6 +99,7 @@ def print_summary(summary: dict[str, Any], out: Path | None) -> None:
     if abs(summary["machine_s"] - summary["seconds"]) > 0.1 * summary["seconds"]:
         rates += f" (simulated; it took {summary['machine_s']:.1f} s)"
     table.add_row("time", rates)
+    table.add_row("scene", summary["scene"])
     table.add_row("model", f"{summary['model']} on {summary['provider']}, {summary['backend']}")
     if summary["psnr_db"] is not None:
         quality = f"{summary['psnr_db']:.2f} dB, SSIM {summary['ssim']:.4f} at the eyes used"

@@ -20,13 +20,29 @@ def scene_names() -> tuple[str, ...]:
     return (*SCENES, *preset_names(), "external")
 
 
+def model_names() -> tuple[str, ...]:
+    """Every model that is no file."""
+    from runtime.model.predictor import SHIPPED
+
+    return (*SHIPPED, "sart")
+
+
 def scene_from_here(name: str) -> str:
     """A scene for a daemon that runs elsewhere: a file's or folder's absolute path; a known name as it is.
 
     What is neither known nor there is left as it is: the daemon says what it knows.
     """
+    return _from_here(name, scene_names())
+
+
+def model_from_here(name: str) -> str:
+    """The same of a model."""
+    return _from_here(name, model_names())
+
+
+def _from_here(name: str, known: tuple[str, ...]) -> str:
     try:
-        if not Path(name).exists() or (Path(name).name == name and name in scene_names()):
+        if not Path(name).exists() or (Path(name).name == name and name in known):
             return name
         return str(Path(name).absolute())
     except (OSError, ValueError):  # too long, or a NUL character
@@ -36,7 +52,6 @@ def scene_from_here(name: str) -> str:
 def check_names(settings: Settings, *, source: str | Path) -> None:
     """Raise InputError for the first name that nobody knows, or file that is not there, naming its field."""
     from runtime.eyes.calibration import load_calibration
-    from runtime.model.predictor import SHIPPED
     from runtime.sensor.registry import driver_names
 
     sensor, content, output = settings.sensor, settings.content, settings.output
@@ -55,8 +70,8 @@ def check_names(settings: Settings, *, source: str | Path) -> None:
         _known_or_there("content.scene", content.scene, scene_names(), source)
     if content.file:
         _there("content.file", content.file, source)
-    if settings.model.name not in (*SHIPPED, "sart"):
-        _known_or_there("model.name", settings.model.name, (*SHIPPED, "sart"), source)
+    if settings.model.name not in model_names():
+        _known_or_there("model.name", settings.model.name, model_names(), source)
     for number, panel in enumerate(output.panels):
         if panel.lut:
             _there(f"output.panels.{number}.lut", panel.lut, source)
