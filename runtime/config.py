@@ -256,6 +256,9 @@ class ContentSettings(Section):
     out: Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"] = Field(
         "auto", description="the axis of a mesh or splat that faces the viewer; auto: +z, for PLY +x"
     )
+    animation: str = Field(
+        "", description="which animation of a glTF plays: its name or number (from 0), `none`; empty: the first"
+    )
     samples: Annotated[int, Field(ge=0, le=16)] = Field(
         0, description="samples a pixel for outlines; 0: smooth outlines that a software rasteriser draws faster"
     )
@@ -418,6 +421,8 @@ class LimitSettings(Section):
     triangles: Annotated[int, Field(ge=1)] = Field(2_000_000, description="triangles of a mesh, all instances together")
     splats: Annotated[int, Field(ge=1)] = Field(3_000_000, description="Gaussians of a splat file")
     instances: Annotated[int, Field(ge=1)] = Field(2000, description="times that meshes stand in a glTF scene")
+    nodes: Annotated[int, Field(ge=1)] = Field(5000, description="nodes of a glTF scene that moves, bones among them")
+    points: Annotated[int, Field(ge=1)] = Field(5_000_000, description="points of a cloud")
     depth: Annotated[int, Field(ge=1, le=512)] = Field(64, description="how deep JSON or a glTF scene may nest")
     load_s: Annotated[float, within(0.01, 86_400.0, "s")] = Field(
         120.0, description="loading of one piece of content is given up after this"

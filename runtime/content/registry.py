@@ -16,7 +16,7 @@ from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.support import foreign, progress
 
-MESHES = (".glb", ".gltf", ".obj")
+MESHES = (".glb", ".gltf", ".obj", ".stl")
 Opener = Callable[[Any], ContentSource]
 
 
@@ -168,7 +168,7 @@ def _mesh(
     from runtime.content.placing import stack_from_scene
     from runtime.content.triangles import ready
 
-    data = load_mesh(path, limits=limits)
+    data = load_mesh(path, limits=limits, animation=settings.animation)
     parts = []
     for number, part in enumerate(data.parts):
         progress.tell(f"{path.name}: outlines", number, len(data.parts))
