@@ -144,7 +144,7 @@ class _Reader:
         """Every node, and the order in which those of the scene can be worked out: parents first."""
         file = self._file
         tables = file.objects("nodes")
-        parents = {}
+        parents: dict[int, int] = {}
         for number, table in enumerate(tables):
             for child in table.get("children", []) or []:
                 parents.setdefault(file.index("nodes", child, f"nodes[{number}].children"), number)
@@ -181,8 +181,8 @@ class _Reader:
     def _row(self, value: Any, count: int, field: str) -> F64:
         if not isinstance(value, list) or len(value) != count:
             raise self._file.refuse(field, f"must be {count} numbers")
-        most = {"least": -1e15, "most": 1e15, "source": self._file.path, "field": field}
-        return np.array([foreign.real(item, **most) for item in value])
+        path = self._file.path
+        return np.array([foreign.real(item, least=-1e15, most=1e15, source=path, field=field) for item in value])
 
     # Meshes.
 

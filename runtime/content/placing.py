@@ -14,7 +14,7 @@ from runtime.records import F64
 
 FILL = 0.85  # of the display's width and height that a fitted scene takes
 FARTHEST_VIEWER_M = 1.5
-Z_UP = (".ply", ".stl", ".xyz")
+Z_UP = (".ply", ".stl")
 
 
 def axes_of(settings: ContentSettings, path: Path) -> F64:

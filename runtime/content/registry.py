@@ -82,8 +82,12 @@ def _from_path(
     if suffix in MESHES:
         return _mesh(path, settings, stack, chosen, limits)
     if suffix == ".ply":
+        from runtime.content.ply import holds_points_alone
+
         if _holds_splats(path):
             return _splat(path, settings, stack, chosen, limits)
+        if holds_points_alone(path):
+            return _points(path, settings, stack, chosen, limits)
         return _mesh(path, settings, stack, chosen, limits)
     return _pictures(path, settings, stack, limits)
 
@@ -213,6 +217,30 @@ def _splat(
     )
     return lambda context: SplatSource(
         gaussians, stack_from_scene=matrix, context=context, background=settings.background, name=path.stem
+    )
+
+
+def _points(
+    path: Path, settings: ContentSettings, stack: PanelStack, chosen: Preset | None, limits: LimitSettings
+) -> Opener:
+    import numpy as np
+
+    from runtime.content.placing import stack_from_scene
+    from runtime.content.points import PointSource, load_points
+
+    cloud = load_points(path, limits=limits)
+    # A few stray points must not decide the scale.
+    low, high = np.percentile(cloud.positions.astype(np.float64), [0.5, 99.5], axis=0)
+    matrix = stack_from_scene(
+        low,
+        high,
+        settings=settings,
+        path=path,
+        stack=stack,
+        scene_from_stack=chosen.scene_from_stack if chosen else None,
+    )
+    return lambda context: PointSource(
+        cloud, stack_from_scene=matrix, context=context, background=settings.background, name=path.stem
     )
 
 
