@@ -227,6 +227,11 @@ class CalibrationSettings(Section):
         return self
 
 
+Layout = Literal[
+    "auto", "mono", "side-by-side", "half-side-by-side", "top-bottom", "half-top-bottom", "quilt", "rgbd"
+]
+
+
 class ContentSettings(Section):
     """What is shown."""
 
@@ -237,8 +242,9 @@ class ContentSettings(Section):
     fov_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="horizontal field of view of eye images")
     background: tuple[Unit, Unit, Unit] = Field((1.0, 1.0, 1.0), description="colour behind the scene, 0-1")
     file: str = Field("", description="a preset's data: its .ply or .glb, or its data-set folder; empty: a stand-in")
-    layout: Literal["auto", "mono", "side-by-side", "top-bottom", "quilt", "rgbd"] = Field(
-        "auto", description="how a picture or video holds its views; auto: by its name (_sbs, _tb, _qs8x6, _rgbd)"
+    layout: Layout = Field(
+        "auto",
+        description="how a picture or video holds its views; auto: by its name (_sbs, _hsbs, _tb, _htb, _qs8x6, _rgbd)",
     )
     quilt: tuple[int, int] = Field((0, 0), description="columns and rows of a quilt; 0, 0: from the file's name")
     cone_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="angle that a quilt's views span")
