@@ -227,9 +227,7 @@ class CalibrationSettings(Section):
         return self
 
 
-Layout = Literal[
-    "auto", "mono", "side-by-side", "half-side-by-side", "top-bottom", "half-top-bottom", "quilt", "rgbd"
-]
+Layout = Literal["auto", "mono", "side-by-side", "half-side-by-side", "top-bottom", "half-top-bottom", "quilt", "rgbd"]
 
 
 class ContentSettings(Section):

@@ -157,6 +157,7 @@ def _pictures(path: Path, settings: ContentSettings, stack: PanelStack, limits: 
                 depth_m=settings.depth_m,
                 context=context,
                 background=settings.background,
+                samples=settings.samples,
             )
 
         return make

@@ -257,3 +257,25 @@ def test_a_quilt_of_no_possible_shape_is_refused(tmp_path: Path, context: Any, s
     write_png(tmp_path / "a_qs4x2a99.png", solid(GREEN))
     with pytest.raises(InputError, match=r"a_qs4x2a99.png: quilt: an aspect of 99; must be 0.05 to 20"):
         opened(tmp_path / "a_qs4x2a99.png", context, stack)
+
+
+@pytest.mark.parametrize("blur", [0, 3])
+@pytest.mark.parametrize("eye", [(0.6, -0.12, 0.05), (0.6, 0.12, -0.05)])
+def test_beside_an_edge_there_is_neither_a_hole_nor_the_near_thing_drawn_out(
+    tmp_path: Path, context: Any, stack: PanelStack, blur: int, eye: tuple[float, float, float]
+) -> None:
+    """A green square before a blue ground, its edges mixed in colour and depth: only these two colours are seen."""
+    colour, depth = solid(BLUE, 320, 180), np.zeros((180, 320, 3), np.uint8)
+    colour[60:120, 130:190] = GREEN
+    depth[60:120, 130:190] = 255
+    if blur:
+        colour, depth = (cv2.blur(picture, (blur, blur)) for picture in (colour, depth))
+    write_png(tmp_path / "a_rgbd.png", np.concatenate([colour, depth], axis=1))
+    source = opened(tmp_path / "a_rgbd.png", context, stack, depth_m=(-0.05, 0.05))
+    picture = source.render(panel_view(eye, stack.panel(1)), time_ns=0)[40:230, 80:400].astype(int)
+    assert (picture[..., 3] == 255).all()
+    green = picture[..., 1] > 200
+    ground = (picture[..., 2] > 200) & (picture[..., 1] < 40)
+    assert (green | ground).mean() > 0.985  # but for the outline's own smoothing
+    expected = (60 * 480 / 320) ** 2  # 0.55 m from the eye it is drawn as large as it was from 0.6
+    assert green.sum() == pytest.approx(expected, rel=0.08)
