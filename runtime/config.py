@@ -573,8 +573,18 @@ PATHS = (
 NAMES_OR_PATHS = (("content", "scene"), ("model", "name"))
 
 
+LIVE = "live:"  # before a scene: a stream, a capture card or a file, its newest picture
+
+
 def located(name: str, folder: Path) -> str:
-    """A name as it is; a path that is relative, seen from a folder. A bare word without a suffix is a name."""
+    """A name as it is; a path that is relative, seen from a folder. A bare word without a suffix is a name.
+
+    What has a scheme (`rtsp://...`) is no path; what is shown as it comes (`live:FILE`) is one behind its mark.
+    """
+    if name.startswith(LIVE) and "://" not in name:
+        return LIVE + located(name.removeprefix(LIVE), folder)
+    if "://" in name:
+        return name
     if not name or "\0" in name or not ("/" in name or Path(name).suffix):
         return name
     return str(folder / name)

@@ -36,6 +36,15 @@ def scene(
     tell({"command": "scene", "value": scene_from_here(name)}, config, socket)
 
 
+@app.command("next")
+def next_one(config: Config = None, socket: Socket = None) -> None:
+    """Go to the next scene of the playlist that is shown.
+
+    Example: phasestack ctl next
+    """
+    tell({"command": "next"}, config, socket)
+
+
 @app.command()
 def place(
     scale: Annotated[float | None, typer.Option(help="the scene's size, times its own")] = None,

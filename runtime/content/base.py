@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 from runtime.errors import ContentFailure
 from runtime.optics.rect import PixelRect
@@ -65,6 +66,14 @@ class ContentSource(ABC):
             return not self.render(view, time_ns=time_ns)[..., 3].any()
         except ContentFailure:
             return False
+
+    def describe(self, *, time_ns: int) -> dict[str, Any] | None:
+        """Of a playlist: its entries, which one is shown, for how long still. None: it is none."""
+        return None
+
+    def skip(self, *, time_ns: int) -> bool:
+        """Go to the next one of a playlist; False: there is none."""
+        return False
 
     @property
     def problem(self) -> str:

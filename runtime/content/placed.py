@@ -7,6 +7,7 @@ scene is another eye.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -75,9 +76,7 @@ def placing_of(settings: ContentSettings) -> Placing:
     return Placing(settings.scale, settings.offset_m, settings.rotation_deg, settings.turntable_per_min)
 
 
-def placed_source(
-    source: ContentSource, placing: Placing, settings: ContentSettings, stack: PanelStack, *, time_ns: int = 0
-) -> ContentSource:
+def placed_source(source: ContentSource, placing: Placing, stack: PanelStack, *, time_ns: int = 0) -> ContentSource:
     """The source at its place; one that was placed before is placed anew. For the thread with the GL context.
 
     Raises InputError, naming the field, where nothing of it would be seen; the source is closed only if it is new.
@@ -163,6 +162,12 @@ class PlacedSource(ContentSource):
             return self.source.is_empty(self._seen_from_scene(view, time_ns), time_ns=time_ns)
         except ValueError:
             return True
+
+    def describe(self, *, time_ns: int) -> dict[str, Any] | None:
+        return self.source.describe(time_ns=time_ns)
+
+    def skip(self, *, time_ns: int) -> bool:
+        return self.source.skip(time_ns=time_ns)
 
     def close(self) -> None:
         self.source.close()

@@ -17,6 +17,7 @@ from runtime.optics.stack import PanelStack
 from runtime.support import foreign, progress
 
 MESHES = (".glb", ".gltf", ".obj", ".stl")
+PLAYLISTS = (".toml", ".json")
 Opener = Callable[[Any], ContentSource]
 
 
@@ -38,9 +39,12 @@ def prepare_content(settings: ContentSettings, stack: PanelStack, *, limits: Lim
     """
     limits = limits or LimitSettings()
     with progress.task(f"loading {settings.scene}", seconds=limits.load_s, too_slow=_too_slow(settings.scene, limits)):
-        opener = _prepared(settings, stack, limits)
-    placing = placing_of(settings)
-    return lambda context: placed_source(opener(context), placing, settings, stack)
+        return _placed(settings, stack, limits)
+
+
+def _placed(settings: ContentSettings, stack: PanelStack, limits: LimitSettings) -> Opener:
+    opener, placing = _prepared(settings, stack, limits), placing_of(settings)
+    return lambda context: placed_source(opener(context), placing, stack)
 
 
 def _too_slow(scene: str, limits: LimitSettings) -> InputError:
@@ -73,6 +77,8 @@ def _from_path(
         raise InputError(path, "", "is not there")
     progress.tell(f"loading {path.name}", 0)
     suffix = path.suffix.lower()
+    if suffix in PLAYLISTS and path.is_file():
+        return _playlist(path, settings, stack, limits)
     if path.is_dir():
         from runtime.content.eyereal import is_data_set
 
@@ -137,6 +143,20 @@ def _eyereal(path: Path, settings: ContentSettings, chosen: Preset | None) -> Op
     pairs = read_folder(path, preset(name, reading))
     source = EyeRealSource(pairs, fov_deg=settings.fov_deg, background=settings.background, name=name)
     return lambda context: source
+
+
+def _playlist(path: Path, settings: ContentSettings, stack: PanelStack, limits: LimitSettings) -> Opener:
+    from runtime.content.playlist import PlaylistSource, read_playlist
+
+    playlist = read_playlist(path, settings)
+    openers = []
+    for number, entry in enumerate(playlist.entries):
+        progress.tell(f"{path.name}: {Path(entry.settings.scene).name}", number, len(playlist.entries))
+        try:
+            openers.append(_placed(entry.settings, stack, limits))
+        except InputError as error:
+            raise InputError(path, f"show[{number}]", str(error)) from None
+    return lambda context: PlaylistSource(playlist, openers, context=context, background=settings.background)
 
 
 def _pictures(path: Path, settings: ContentSettings, stack: PanelStack, limits: LimitSettings) -> Opener:

@@ -10,7 +10,9 @@ from typing import Any, Literal, get_args
 
 from runtime.support.foreign import shown
 
-Name = Literal["scene", "place", "model", "pause", "resume", "flat", "budget", "reload", "blackbox", "restart"]
+Name = Literal[
+    "scene", "next", "place", "model", "pause", "resume", "flat", "budget", "reload", "blackbox", "restart"
+]  # fmt: skip
 NAMES: tuple[Name, ...] = get_args(Name)
 BUDGET_MAX_MS = 10_000.0
 PLACING = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # of `place`: settings of [content]

@@ -172,6 +172,8 @@ class Daemon:
                 self._begin(presenter, shown, command, reload_content=True)
             case "place":
                 self._place(presenter, command)
+            case "next":
+                self._skip(presenter, command)
             case "model":
                 self._set_model(presenter, command)
             case "budget":
@@ -196,7 +198,7 @@ class Daemon:
             settings = changed(state.settings, "content", values, source="place")
             placing = placing_of(settings.content)
             try:
-                source = placed_source(state.content, placing, settings.content, presenter.stack, time_ns=now_ns)
+                source = placed_source(state.content, placing, presenter.stack, time_ns=now_ns)
             except PhasestackError as error:
                 self._answer(command, str(error))
             else:
@@ -205,6 +207,14 @@ class Daemon:
             return True
 
         presenter.solver.do(place)
+
+    def _skip(self, presenter: Presenter, command: Command) -> None:
+        def skip(parts: Any) -> bool:
+            done = parts.run.state.content.skip(time_ns=presenter.clock.now_ns())
+            self._answer(command, "" if done else "there is no next one: what is shown is no playlist, or its last")
+            return True
+
+        presenter.solver.do(skip)
 
     def _set_model(self, presenter: Presenter, command: Command) -> None:
         settings = presenter.run_cell.state.settings
@@ -318,6 +328,7 @@ def snapshot(run: Run | None, presenter: Presenter, account: RefreshAccount) -> 
         "content": state.content.info.name,
         "content_problem": state.content.problem,
         "placing": _placing_in(state.settings),
+        "playlist": state.content.describe(time_ns=presenter.clock.now_ns()),
         "plan": run.plan_items() if run is not None else [],
         "model": state.predictor.name,
         "provider": state.predictor.provider,

@@ -77,7 +77,7 @@ def test_a_turntable_turns_by_the_clock_and_goes_on_where_its_speed_is_changed(c
     assert (pictures[0] == pictures[2]).all()  # six turns a minute
     assert source.revision(time_ns=1) != source.revision(time_ns=2)
     now_ns = 7 * NS_PER_S + 3 * 60 * NS_PER_S
-    faster = placed_source(source, Placing(turntable_per_min=-30), ContentSettings(), stack, time_ns=now_ns)
+    faster = placed_source(source, Placing(turntable_per_min=-30), stack, time_ns=now_ns)
     assert isinstance(faster, PlacedSource)
     assert np.allclose(faster.placing.rotation(now_ns), source.placing.rotation(now_ns))
     assert not np.allclose(faster.placing.rotation(now_ns + NS_PER_S), source.placing.rotation(now_ns + NS_PER_S))
