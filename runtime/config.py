@@ -267,6 +267,10 @@ class ContentSettings(Section):
         0, description="samples a pixel for outlines; 0: smooth outlines that a software rasteriser draws faster"
     )
     external: SocketPath = Field("/run/phasestack/content.sock", description="socket of another program's pictures")
+    stream_options: dict[str, str] = Field(
+        default_factory=dict,
+        description="for live pictures, as FFmpeg names them: video_size, framerate, input_format, rtsp_transport, ...",
+    )
     scale: Annotated[float, within(0.001, 1000.0, "")] = Field(
         1.0, description="the scene's size, times its own, about the display's middle"
     )
@@ -574,6 +578,11 @@ NAMES_OR_PATHS = (("content", "scene"), ("model", "name"))
 
 
 LIVE = "live:"  # before a scene: a stream, a capture card or a file, its newest picture
+
+
+def is_live(scene: str) -> bool:
+    """True for a stream's URL, a capture card, or a file behind the mark."""
+    return scene.startswith((LIVE, "/dev/video")) or "://" in scene
 
 
 def located(name: str, folder: Path) -> str:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from runtime.config import ContentSettings, LimitSettings
+from runtime.config import ContentSettings, LimitSettings, is_live
 from runtime.content.base import ContentSource
 from runtime.content.placed import placed_source, placing_of
 from runtime.content.presets import Preset, preset, preset_names
@@ -62,6 +62,8 @@ def _prepared(settings: ContentSettings, stack: PanelStack, limits: LimitSetting
         if settings.file:
             return _from_path(Path(settings.file), settings, stack, chosen, limits)
         return _stand_in(name, settings, stack)
+    if is_live(name):
+        return _live(name, settings, stack, limits)
     path = foreign.checked_path(name, source="content", field="scene")
     if not path.exists():
         known = ", ".join((*SCENES, *preset_names(), "external"))
@@ -130,6 +132,13 @@ def _external(settings: ContentSettings, stack: PanelStack) -> Opener:
         return ExternalSource(settings, stack=stack)
 
     return make
+
+
+def _live(name: str, settings: ContentSettings, stack: PanelStack, limits: LimitSettings) -> Opener:
+    from runtime.content.stream import LiveSource, open_feed
+
+    feed, layout, quilt = open_feed(name, settings, limits)
+    return lambda context: LiveSource(feed, layout=layout, quilt=quilt, stack=stack, settings=settings)
 
 
 def _eyereal(path: Path, settings: ContentSettings, chosen: Preset | None) -> Opener:

@@ -32,6 +32,10 @@ def scene_from_here(name: str) -> str:
 
     What is neither known nor there is left as it is: the daemon says what it knows.
     """
+    from runtime.config import LIVE
+
+    if name.startswith(LIVE):
+        return LIVE + _from_here(name.removeprefix(LIVE), ())
     return _from_here(name, scene_names())
 
 
@@ -51,6 +55,7 @@ def _from_here(name: str, known: tuple[str, ...]) -> str:
 
 def check_names(settings: Settings, *, source: str | Path) -> None:
     """Raise InputError for the first name that nobody knows, or file that is not there, naming its field."""
+    from runtime.config import is_live
     from runtime.eyes.calibration import load_calibration
     from runtime.sensor.registry import driver_names
 
@@ -66,7 +71,7 @@ def check_names(settings: Settings, *, source: str | Path) -> None:
     if settings.calibration.file:
         _there("calibration.file", settings.calibration.file, source)
         load_calibration(Path(settings.calibration.file))
-    if content.scene not in scene_names():
+    if content.scene not in scene_names() and not is_live(content.scene):
         _known_or_there("content.scene", content.scene, scene_names(), source)
     if content.file:
         _there("content.file", content.file, source)
