@@ -142,15 +142,21 @@ def _live(name: str, settings: ContentSettings, stack: PanelStack, limits: Limit
 
 
 def _eyereal(path: Path, settings: ContentSettings, chosen: Preset | None) -> Opener:
-    from runtime.content.eyereal import EyeRealSource, read_folder
+    from runtime.content.eyereal import EyeRealSource, fitting_presets, read_folder
 
-    name = chosen.name if chosen else next((known for known in preset_names() if known in path.resolve().name), "")
-    if not name:
-        raise InputError(path, "name", "names no preset: set content.scene to one and content.file to the folder")
     # The data set was drawn by the published code: its scale holds in every reading.
     reading = "published-code" if settings.reading == "seed" else settings.reading
-    pairs = read_folder(path, preset(name, reading))
-    source = EyeRealSource(pairs, fov_deg=settings.fov_deg, background=settings.background, name=name)
+    known = chosen.name if chosen else next((name for name in preset_names() if name in path.resolve().name), "")
+    told = known
+    if not known:
+        fitting = fitting_presets(path, (preset(name, reading) for name in preset_names()))
+        if not fitting:
+            problem = "names no preset, and its eyes fit none: set content.scene to one and content.file to the folder"
+            raise InputError(path, "name", problem)
+        known = fitting[0].name
+        told = f"{path.resolve().name} (read as {known}, which its eyes fit)"
+    pairs = read_folder(path, preset(known, reading))
+    source = EyeRealSource(pairs, fov_deg=settings.fov_deg, background=settings.background, name=told)
     return lambda context: source
 
 
