@@ -267,6 +267,7 @@ class ContentSettings(Section):
         0, description="samples a pixel for outlines; 0: smooth outlines that a software rasteriser draws faster"
     )
     external: SocketPath = Field("/run/phasestack/content.sock", description="socket of another program's pictures")
+    library: str = Field("", description="folder whose pictures, films, models and playlists the page offers")
     stream_options: dict[str, str] = Field(
         default_factory=dict,
         description="for live pictures, as FFmpeg names them: video_size, framerate, input_format, rtsp_transport, ...",
@@ -572,7 +573,7 @@ def _fields(model: type[BaseModel], place: tuple[int | str, ...]) -> list[str]:
 # What is always a path, and what is one where it has a slash or a suffix: a bare word is a name (`demo`, `balanced`).
 PATHS = (
     ("sensor", "openni2_folder"), ("detector", "yunet_model"), ("calibration", "file"), ("content", "file"),
-    ("content", "external"), ("service", "socket"), ("service", "blackbox_folder"),
+    ("content", "library"),    ("content", "external"), ("service", "socket"), ("service", "blackbox_folder"),
 )  # fmt: skip
 NAMES_OR_PATHS = (("content", "scene"), ("model", "name"))
 

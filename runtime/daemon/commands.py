@@ -11,10 +11,11 @@ from typing import Any, Literal, get_args
 from runtime.support.foreign import shown
 
 Name = Literal[
-    "scene", "next", "place", "model", "pause", "resume", "flat", "budget", "reload", "blackbox", "restart"
+    "scene", "playlist", "next", "place", "model", "pause", "resume", "flat", "budget", "reload", "blackbox", "restart"
 ]  # fmt: skip
 NAMES: tuple[Name, ...] = get_args(Name)
 BUDGET_MAX_MS = 10_000.0
+SHOWS_MAX = 64
 PLACING = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # of `place`: settings of [content]
 
 
@@ -72,6 +73,8 @@ def parse(request: Any) -> Command:
         raise ValueError(f"value: {name} wants a name")
     if name == "place":
         return Command(name, _placing(value))
+    if name == "playlist":
+        return Command(name, _shows(value))
     if name == "budget":
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ValueError("value: budget wants milliseconds")
@@ -79,6 +82,18 @@ def parse(request: Any) -> Command:
             raise ValueError(f"value: budget must lie in 0 to {BUDGET_MAX_MS:.0f} ms")
         return Command(name, float(value))
     return Command(name, value if name in ("scene", "model") else None)
+
+
+def _shows(value: Any) -> list[dict[str, Any]]:
+    """What `playlist` is to show; times and names are checked where the list is read."""
+    if not isinstance(value, list) or not 0 < len(value) <= SHOWS_MAX:
+        raise ValueError(f"value: playlist wants a list of 1 to {SHOWS_MAX} scenes with their seconds")
+    for number, show in enumerate(value):
+        if not (isinstance(show, dict) and set(show) == {"scene", "seconds"} and isinstance(show["scene"], str)):
+            raise ValueError(f"value[{number}]: playlist wants a scene and its seconds, and nothing else")
+        if isinstance(show["seconds"], bool) or not isinstance(show["seconds"], int | float):
+            raise ValueError(f"value[{number}].seconds: playlist wants a number")
+    return value
 
 
 def _placing(value: Any) -> dict[str, Any]:

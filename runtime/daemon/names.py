@@ -9,7 +9,9 @@ from runtime.errors import InputError
 from runtime.support.plausible import nearest
 
 if TYPE_CHECKING:
-    from runtime.config import Settings
+    from runtime.config import ContentSettings, Settings
+
+LIBRARY_MOST, LIBRARY_LOOKED_AT = 200, 2000
 
 
 def scene_names() -> tuple[str, ...]:
@@ -18,6 +20,23 @@ def scene_names() -> tuple[str, ...]:
     from runtime.content.scenes import SCENES
 
     return (*SCENES, *preset_names(), "external")
+
+
+def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
+    """What can be shown of the library's folder, by its whole path; as many as a page can offer."""
+    from runtime.content.pictures import PICTURES, VIDEOS
+    from runtime.content.registry import MESHES, PLAYLISTS
+
+    shown = {*PICTURES, *VIDEOS, *MESHES, *PLAYLISTS, ".ply"}
+    if not settings.library:
+        return ()
+    try:
+        entries = sorted(Path(settings.library).absolute().iterdir())[:LIBRARY_LOOKED_AT]
+    except (OSError, ValueError):
+        return ()
+    entries = [path for path in entries if not path.name.startswith(".")]
+    found = [str(path) for path in entries if path.suffix.lower() in shown or path.is_dir()]
+    return tuple(found[:LIBRARY_MOST])
 
 
 def model_names() -> tuple[str, ...]:
@@ -75,6 +94,8 @@ def check_names(settings: Settings, *, source: str | Path) -> None:
         _known_or_there("content.scene", content.scene, scene_names(), source)
     if content.file:
         _there("content.file", content.file, source)
+    if content.library:
+        _there("content.library", content.library, source)
     if settings.model.name not in model_names():
         _known_or_there("model.name", settings.model.name, model_names(), source)
     for number, panel in enumerate(output.panels):

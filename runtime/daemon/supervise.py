@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import time
 from collections.abc import Iterator
@@ -9,7 +10,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from runtime.blackbox.location import black_box_folder
+from runtime.blackbox.location import black_box_folder, state_folder
 from runtime.blackbox.recorder import MIB, Plan, Recorder
 from runtime.clock import NS_PER_MS, MonotonicClock
 from runtime.config import Overrides, Settings, changed, load_settings
@@ -17,7 +18,7 @@ from runtime.content.placed import placed_source, placing_of
 from runtime.daemon.build import Run, RunOptions
 from runtime.daemon.commands import PLACING, Command
 from runtime.daemon.drive import drive, print_summary
-from runtime.daemon.names import model_names, scene_names
+from runtime.daemon.names import library_scenes, model_names, scene_from_here, scene_names
 from runtime.daemon.notify import Notifier, may_restart
 from runtime.daemon.reconfigure import Reconfiguration
 from runtime.daemon.server import StatusServer, open_status_server
@@ -26,6 +27,7 @@ from runtime.errors import InputError, PanelLost, PhasestackError, Stopped, Tran
 from runtime.frame.presenter import Presenter
 from runtime.records import RefreshAccount, State
 from runtime.support import logs
+from runtime.support.artifacts import write_text
 from runtime.support.transient import MayPass, may_pass
 from runtime.support.version import version
 
@@ -165,11 +167,14 @@ class Daemon:
             case "reload":
                 self._reload(presenter, command)
             case "scene":
-                settings = presenter.run_cell.state.settings
-                # Another scene stands as the configuration has it, not as the one before it was moved.
-                content = settings.content.model_copy(update={"scene": command.value, **self._configured_placing})
-                shown = settings.model_copy(update={"content": content})
-                self._begin(presenter, shown, command, reload_content=True)
+                self._show(presenter, command.value, command)
+            case "playlist":
+                try:
+                    path = self._written_playlist(command.value)
+                except (OSError, ValueError) as error:  # no room, or a name that is no text
+                    command.refuse(f"the playlist can't be written ({one_line(str(error), most=120)})")
+                else:
+                    self._show(presenter, str(path), command)
             case "place":
                 self._place(presenter, command)
             case "next":
@@ -183,6 +188,24 @@ class Daemon:
                 self._restart(command)
             case "blackbox":
                 self._write_black_box(command)
+
+    def _show(self, presenter: Presenter, scene: str, command: Command) -> None:
+        settings = presenter.run_cell.state.settings
+        # Another scene stands as the configuration has it, not as the one before it was moved.
+        content = settings.content.model_copy(update={"scene": scene, **self._configured_placing})
+        shown = settings.model_copy(update={"content": content})
+        self._begin(presenter, shown, command, reload_content=True)
+
+    def _written_playlist(self, shows: list[dict[str, Any]]) -> Path:
+        """The operator's list as a file, which `content.scene` can name for good. Raises OSError."""
+        text = "# Shown from the page or by a program; made anew each time.\n"
+        for show in shows:
+            scene = json.dumps(scene_from_here(show["scene"]), ensure_ascii=False)  # a TOML string too
+            text += f"\n[[show]]\nscene = {scene}\nseconds = {float(show['seconds'])!r}\n"
+        path = state_folder() / "playlist.toml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(path, text)
+        return path
 
     def _place(self, presenter: Presenter, command: Command) -> None:
         """Move the scene: settings and content change together, once the solver has seen that something is visible."""
@@ -331,6 +354,7 @@ def snapshot(run: Run | None, presenter: Presenter, account: RefreshAccount) -> 
         "playlist": state.content.describe(time_ns=presenter.clock.now_ns()),
         "plan": run.plan_items() if run is not None else [],
         "model": state.predictor.name,
+        "model_asked": state.settings.model.name,
         "provider": state.predictor.provider,
         "backend": "opencv",
         "budget": run.parts.budget.describe() if run is not None else None,
@@ -367,7 +391,7 @@ def about(run: Run | None) -> dict[str, Any]:
         "viewing_up_deg": settings.calibration.viewing_up_deg,
         "models": model_names(),
         "may_restart": may_restart(),
-        "scenes": scene_names(),
+        "scenes": (*scene_names(), *library_scenes(settings.content)),
     }
 
 

@@ -118,3 +118,36 @@ def test_ctl_place_wants_something_to_change(arguments: list[str]) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 2 and "--scale" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_a_playlist_of_the_operators_is_written_shown_and_gone_through(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    shows = [{"scene": "thin", "seconds": 500}, {"scene": "grey", "seconds": 700}]
+    with Served(tmp_path) as served:
+        assert served.asked("playlist", shows) == {"ok": True}
+        told = served.status()
+        assert told["scene"] == str(tmp_path / "state" / "playlist.toml")
+        assert told["playlist"]["entries"] == shows and told["playlist"]["index"] == 0
+        assert served.asked("next") == {"ok": True}
+        assert served.status()["playlist"]["index"] == 1 and "grey (2 of 2)" in served.status()["content"]
+        answer = served.asked("playlist", [{"scene": 'no"such\n.glb', "seconds": 5}])
+        assert not answer["ok"] and "show[0]" in answer["error"]
+        assert "grey (2 of 2)" in served.status()["content"]
+        assert served.asked("scene", "flat")["ok"]
+        assert "no playlist" in served.asked("next")["error"]
+
+
+def test_the_library_is_offered_with_the_scenes(tmp_path: Path) -> None:
+    from runtime.daemon.supervise import about
+
+    library = tmp_path / "library"
+    library.mkdir()
+    for name in ("b.glb", "a.ply", "film_sbs.mp4", "list.toml", "notes.txt", ".hidden.glb"):
+        (library / name).touch()
+    (library / "lego").mkdir()
+    with Served(tmp_path, content={"library": str(library)}) as served:
+        offered = [Path(name).name for name in about(served.run)["scenes"] if name.startswith(str(library))]
+        assert offered == ["a.ply", "b.glb", "film_sbs.mp4", "lego", "list.toml"]
+        assert about(served.run)["models"][:2] == ("fast", "balanced")
