@@ -131,12 +131,11 @@ class PlaylistSource(ContentSource):
         return {"entries": entries, "index": index % len(entries), "left_s": None if last else round(left_s, 1)}
 
     def skip(self, *, time_ns: int) -> bool:
-        index, since_ns = self._at(time_ns)
+        index, _ = self._at(time_ns)
         if not self._list.repeat and index >= len(self._sources) - 1:
             return False
-        entry = self._list.entries[index % len(self._sources)]
-        begin_ns = time_ns if self._begin_ns is None else self._begin_ns
-        self._begin_ns = begin_ns - (round(entry.seconds * NS_PER_S) - since_ns)
+        rounds, within = divmod(index, len(self._sources))
+        self._begin_ns = time_ns - rounds * self._ends_ns[-1] - self._ends_ns[within]
         return True
 
     def render(self, view: View, *, time_ns: int) -> U8:
