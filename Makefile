@@ -12,13 +12,13 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 NIGHTLY := out/nightly
 
-.PHONY: demo test test-slow golden mutants lint types secrets coverage nightly bench fuzz soak install uninstall system docs gallery hashes clean
+.PHONY: demo test test-slow golden mutants lint types secrets coverage nightly package bench fuzz soak install uninstall system docs gallery hashes clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/phasestack demo $(DEMO_ARGS)
 
 test: $(VENV)/.test lint types
-	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist worksteal $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist loadfile $(PYTEST_ARGS)
 
 test-slow: $(VENV)/.test
 	$(BIN)/python -m pytest -m slow --timeout 3600 $(PYTEST_ARGS)
@@ -47,7 +47,7 @@ secrets: $(VENV)/.test
 
 # Of branches; the floor is in pyproject.toml. Twice the tests' time.
 coverage: $(VENV)/.test
-	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist worksteal --cov --cov-report=term:skip-covered --cov-report=html:out/coverage
+	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:out/coverage
 
 # What takes too long for every change: the slow tests, coverage, every fuzzer, secrets in all files, and the frontier
 # against that of the night before (exit 1 where it got slower or worse beyond noise).
@@ -56,6 +56,10 @@ nightly: test-slow coverage fuzz secrets
 	$(BIN)/phasestack bench --out $(NIGHTLY)/bench-new.json
 	if [ -e $(NIGHTLY)/bench.json ]; then $(BIN)/phasestack bench compare $(NIGHTLY)/bench.json $(NIGHTLY)/bench-new.json; fi
 	mv $(NIGHTLY)/bench-new.json $(NIGHTLY)/bench.json
+
+# Wheel and sdist in dist/; tests/test_packages.py (slow) installs them from nothing and runs the demo.
+package: $(VENV)/.test
+	$(BIN)/python -m build --outdir dist
 
 bench: $(VENV)/.test
 	$(BIN)/phasestack bench --out out/bench.json

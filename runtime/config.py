@@ -312,7 +312,6 @@ class ModelSettings(Section):
     pupil_mm: Annotated[float, within(0.0, 20.0, "mm")] = Field(
         4.0, description="diameter of a pupil, millimetres, for eye_sigma_mm = auto"
     )
-    transfer: Literal["code", "srgb"] = Field("code", description="panel luminance: code values, or linear via sRGB")
     budget_ms: NonNegative = Field(0.0, description="time for one frame; 0: none. Picks model and resolution")
 
 

@@ -171,6 +171,7 @@ def model(settings: Settings) -> Iterator[Row]:
     """The network loads, its contract fits the stack, and the provider is there."""
     from runtime.model.backends import choose
     from runtime.model.predictor import load_predictor
+    from runtime.model.session import told_nodes
     from runtime.support.gl import offscreen_context
 
     predictor = load_predictor(settings.model.name, settings.stack.stack(), settings.model)
@@ -192,6 +193,12 @@ def model(settings: Settings) -> Iterator[Row]:
         "model", "warn" if other else "ok", f"{name} on {settings.model.provider}",
         f"{settings.model.name} was asked for and does not fit this stack" if other else "",
     )  # fmt: skip
+    if predictor.fell_back:
+        count, which = told_nodes(predictor.fell_back)
+        yield Row(
+            "provider", "warn", f"{settings.model.provider} leaves {count} to another: {which}",
+            "they cross to the processor and back: model.provider = \"cpu\" may be faster",
+        )  # fmt: skip
     yield Row("backend", "ok", f"{choice.backend.name} around the network: {choice.why}")
 
 

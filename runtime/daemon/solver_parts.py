@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -23,6 +24,8 @@ from runtime.plan.predictors import planned_predictor
 from runtime.plan.savings import Saving
 from runtime.records import SolveRequest
 from runtime.support.gl import offscreen_context
+
+log = logging.getLogger("phasestack.solver")
 
 WARM_EYES_M = ((0.6, -0.031, 0.0), (0.6, 0.031, 0.0))
 
@@ -86,10 +89,11 @@ class RunningSolver:
     def close(self, *, abandoned: bool = False) -> None:
         self.budget.close()
         state = self._held if abandoned else self.run.state
-        state.content.close()
-        state.predictor.close()
-        if self._owns_context:
-            self.context.release()
+        for release in (state.content.close, state.predictor.close, *([self.context.release] * self._owns_context)):
+            try:
+                release()
+            except Exception as error:  # of a context that is lost there is nothing to release
+                log.warning("solver: closing it: %s", error)
 
 
 class SolverMaker:

@@ -31,6 +31,7 @@ class Predictor(ABC):
     parameters: int
     stack: PanelStack
     backend: str = "opencv"  # what does all that surrounds the network at present
+    fell_back: tuple[str, ...] = ()  # nodes of the network that run on another provider than the wished one
     channels: int = 3  # that the last pictures were solved in: one, where grey ones may be
 
     def reads_textures_of(self, context: object) -> bool:

@@ -54,8 +54,11 @@ class OpenCvSurround:
         self._workspace.crop(problem.boxes, self._stack)
         box = problem.boxes[CENTRE]
         arrays = [picture.pixels() if isinstance(picture, DrawnPicture) else picture for picture in pictures]
-        cut = [without_alpha(picture[box.slices], problem.channels) for picture in arrays]
-        self._pictures = [pre_emphasised(picture, self._contract.emphasis) for picture in cut]
+
+        def prepared(picture: U8) -> U8:
+            return pre_emphasised(without_alpha(picture[box.slices], problem.channels), self._contract.emphasis)
+
+        self._pictures = self._rows.map(prepared, arrays)
         for level in self._workspace.levels.values():
             level.wanted = [np.asarray(phases, np.int16) for phases in self._phases(level.size)]
             level.set_eye_sigma(problem.eyes_m, eye_sigma_mm=problem.eye_sigma_mm)
@@ -109,5 +112,8 @@ class OpenCvSurround:
         """Phase sums of the pictures at a size, averaged as codes."""
         pictures, table = self._pictures, phase_codes(self._contract.branch)
         same = pictures[0].shape[1::-1] == size
-        sized = pictures if same else [cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in pictures]
-        return [cv2.LUT(picture, table) for picture in sized]
+
+        def phases(picture: U8) -> Any:
+            return cv2.LUT(picture if same else cv2.resize(picture, size, interpolation=cv2.INTER_AREA), table)
+
+        return self._rows.map(phases, pictures)

@@ -52,7 +52,7 @@ class UnrolledPredictor(Predictor):
         surrounds the network; None: OpenCV."""
         self.session, self.stack = session, stack
         self.name, self.provider = session.contract.name, session.provider
-        self.parameters = session.contract.parameters
+        self.parameters, self.fell_back = session.contract.parameters, session.fell_back
         self.one_channel = one_channel
         self.surroundings: Backend = surroundings or OpenCvBackend()
         self._threads = threads

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from runtime.content.base import ContentSource, View
+from runtime.errors import ContextLost, PhasestackError
 from runtime.model.predictor import Predictor
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack, raster_from_stack
@@ -69,9 +70,17 @@ def drawn_for(predictor: Predictor, content: ContentSource, eyes_m: F64, *, time
 
 
 def _drawn(predictor: Predictor, content: ContentSource, view: View, *, time_ns: int) -> DrawnPicture | None:
-    """A picture that is left in a texture which the model reads; None: there is none, or it reads arrays."""
+    """A picture that is left in a texture which the model reads; None: there is none, or it reads arrays.
+
+    Raises ContentFailure, ContextLost.
+    """
     if content.draws_in is None or not predictor.reads_textures_of(content.draws_in):
         return None
-    picture = content.draw(view, time_ns=time_ns)
+    try:
+        picture = content.draw(view, time_ns=time_ns)
+    except PhasestackError:
+        raise
+    except Exception as error:  # a lost context answers with whatever moderngl has at hand
+        raise ContextLost(f"OpenGL: {error}") from error
     plain = content.info.background is None or len(set(content.info.background)) == 1
     return picture and replace(picture, grey=content.info.grey and plain)

@@ -173,7 +173,7 @@ class FocusedPredictor(Predictor):
             self._even_out(but=window.box)
             self._paint_background(self._wanted_background)
         elif not isinstance(left, DrawnPicture):
-            self._fill_with(left, but=window.box)
+            self._fill_with(left, but=window.box, solved=whole_rays(window, eyes_m, self.stack))
         return self._place(window, solved, eyes_m, found_ms + (perf_counter_ns() - begin_ns) / 1e6)
 
     def _around(self, box: PixelRect, picture: U8, eyes_m: F64) -> Window | None:
@@ -199,17 +199,22 @@ class FocusedPredictor(Predictor):
 
     def _filled(self, picture: U8, begin_ns: int) -> Prediction:
         """Layers of which the centre panel alone carries the picture, for both eyes."""
-        self._fill_with(picture, but=None)
+        self._fill_with(picture, but=None, solved=None)
         self.window, self.active_fraction, self.channels = None, 0.0, 3
         filled_ms = (perf_counter_ns() - begin_ns) / 1e6
         return Prediction(self._layers, {"prepare": filled_ms, "inference": 0.0, "finish": 0.0})
 
-    def _fill_with(self, picture: U8, *, but: PixelRect | None) -> None:
+    def _fill_with(self, picture: U8, *, but: PixelRect | None, solved: PixelRect | None) -> None:
         """The picture on the centre panel, as both eyes see it where they agree."""
         self._even_out(but=but)
         self._background = None
-        sharp = pre_emphasised(picture, self.whole.pre_emphasis)
-        cv2.LUT(sharp, _centre_codes(self.stack.count), dst=self._layers[self.stack.count // 2])
+        centre, codes = self._layers[self.stack.count // 2], _centre_codes(self.stack.count)
+        for part in _around(solved, width_px=self.stack.width_px, height_px=self.stack.height_px):
+            grown = PixelRect(max(0, part.u0 - 1), max(0, part.v0 - 1), part.u1 + 1, part.v1 + 1)
+            sharp = pre_emphasised(picture[grown.slices], self.whole.pre_emphasis)
+            rows = slice(part.v0 - grown.v0, part.v1 - grown.v0)
+            columns = slice(part.u0 - grown.u0, part.u1 - grown.u0)
+            centre[part.slices] = cv2.LUT(np.ascontiguousarray(sharp[rows, columns]), codes)
 
     def _place(self, window: Window, solved: Prediction, eyes_m: F64, filled_ms: float) -> Prediction:
         """The window's layers among the rest."""
@@ -267,6 +272,19 @@ class FocusedPredictor(Predictor):
                 self._parts.pop(next(iter(self._parts))).close()
             self._parts[size] = self._make(stack)
         return self._parts[size]
+
+
+def _around(hole: PixelRect | None, *, width_px: int, height_px: int) -> list[PixelRect]:
+    """A panel's pixels but for a hole."""
+    if hole is None:
+        return [PixelRect(0, 0, width_px, height_px)]
+    parts = (
+        PixelRect(0, 0, width_px, hole.v0),
+        PixelRect(0, hole.v1, width_px, height_px),
+        PixelRect(0, hole.v0, hole.u0, hole.v1),
+        PixelRect(hole.u1, hole.v0, width_px, hole.v1),
+    )
+    return [part for part in parts if part.width_px and part.height_px]
 
 
 def _fill(layer: U8, area: PixelRect, codes: Sequence[int]) -> None:

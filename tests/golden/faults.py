@@ -197,13 +197,13 @@ def main() -> int:
     name = parser.parse_args().name
     if not name:
         unnoticed = 0
-        print("| fault | edit | run | noticed by |\n| --- | --- | --- | --- |")
+        print("| fault | edit | run | fields that moved | the first |\n| --- | --- | --- | ---: | --- |")
         for one, fault in FAULTS.items():
             result = played(one)
-            lines = result.stdout.splitlines() if result.returncode == 1 else result.stderr.splitlines()[-1:]
-            unnoticed += result.returncode != 1 or not lines
-            seen = "; ".join(lines[:1]) or "**nothing**"
-            print(f"| {fault.kind} | {one} | {fault.case} | {len(lines)} fields; first: {seen} |", flush=True)
+            lines = result.stdout.splitlines() if result.returncode == 1 else []
+            unnoticed += not lines
+            first = lines[0].partition(": ")[2].split("; ")[0] if lines else "**nothing**"
+            print(f"| {fault.kind} | {one.replace('-', ' ')} | `{fault.case}` | {len(lines)} | {first} |", flush=True)
         return 1 if unnoticed else 0
     fault = FAULTS[name]
     logging.getLogger("phasestack").addHandler(logging.NullHandler())

@@ -124,6 +124,22 @@ def test_grey_pictures_in_one_channel(sigma_mm: float, gl: GlBackend) -> None:
     assert within_one(*layers) >= WITHIN_ONE
 
 
+def test_corrections_in_one_pass_are_those_in_two(gl: GlBackend, monkeypatch: pytest.MonkeyPatch) -> None:
+    pair, found, passes = eyes(0.6), [], []
+    for at_once in (False, True):
+        monkeypatch.setattr(gl, "at_once", at_once)
+        _, predictor = both("balanced", STACK, gl)
+        predictor.fade = Fade(PixelRect(30, 15, 200, 120), over_px=(40.0, 10.0))
+        gl.passes.account = account = Account()
+        found.append(layers_of(predictor, cards(pair, STACK), pair, sigma_mm=0.0))
+        passes.append([one.name for one in account.passes])
+    assert (found[0] == found[1]).all()
+    corrections = sum(step.kind != "chain" for step in predictor.session.contract.steps)
+    assert passes[0].count("residual") == passes[0].count("correct") == corrections
+    assert passes[1].count("correct_at_once") == corrections
+    assert "residual" not in passes[1]
+
+
 @pytest.mark.usefixtures("exactly")
 def test_a_part_of_larger_panels_ends_gently(gl: GlBackend) -> None:
     pair, layers = eyes(0.6), []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import erf
 
 import numpy as np
 import pytest
@@ -216,3 +217,48 @@ def test_unsure_eyes_see_a_blurred_panel_and_sure_ones_a_sharp_one(rows: RowPool
     # The steepest place of a step blurred by a normal distribution.
     slope = (FULL - START) / (spread * np.sqrt(2 * np.pi)) * 0.54 / 0.6
     assert blurred == pytest.approx(slope, rel=0.15)
+
+
+def test_even_panels_that_lack_nothing_are_left_as_they_are_however_unsure_the_eyes(rows: RowPool) -> None:
+    level = level_of(rows)
+    level.set_eye_sigma(PAIR, eye_sigma_mm=60.0)
+    level.project(OUTER, PAIR)
+    for side in (0, 1):
+        level.residual[side][...] = 0
+    for n in OUTER:
+        level.correct(n, PAIR, size=1.0, shown=False)
+        assert (level.outer[n][INNER] == START).all()
+
+
+def test_unsure_eyes_have_the_front_panel_follow_what_moves_of_the_rear_one(rows: RowPool) -> None:
+    """An edge on the rear panel, blurred as it is seen, again by both panels' moving, again on the way back."""
+    level = level_of(rows)
+    level.outer[REAR][:, 48:] += 800
+    level.set_eye_sigma(PAIR, eye_sigma_mm=60.0)
+    sigma = level.spread[REAR][0]
+    level.project(OUTER, PAIR)
+    for side in (0, 1):
+        level.residual[side][...] = 0
+    level.correct(FRONT, PAIR, size=0.5, shown=False)
+    change = level.outer[FRONT][24, 16:80, 0].astype(float) - START
+    place = np.linspace(-40, 40, 2001)
+    apart = (PAIR[1, 1] - PAIR[0, 1]) / 2 * 0.12 / 0.6 / 0.005  # an eye's ray from rear to front, columns
+    expected = sum(
+        400 * (normal((place + side * apart) / (sigma * np.sqrt(2))) - normal((place + side * apart) / (sigma * 2)))
+        for side in (-1, 1)
+    )
+    assert change.max() == pytest.approx(expected.max(), rel=0.12)
+    assert change.min() == pytest.approx(expected.min(), rel=0.12)
+
+
+def normal(value: np.ndarray) -> np.ndarray:
+    """The normal distribution function."""
+    return np.array([0.5 * (1 + erf(one / np.sqrt(2))) for one in value])
+
+
+def test_a_drawn_panel_keeps_its_edges_it_is_sampled_by_cubics(rows: RowPool) -> None:
+    level = level_of(rows)
+    codes = np.full((24, 48, 3), 1000, np.int16)
+    codes[:, 24:] = 3000
+    level.set_panel(REAR, codes, np.diag([0.5, 0.5, 1.0]), shown=False)
+    assert level.outer[REAR][INNER].max() > 3050 and level.outer[REAR][INNER].min() < 950

@@ -55,9 +55,16 @@ def test_the_right_eye_has_the_last_word_of_an_iteration() -> None:
     assert codes.sum(axis=0) / 255.0 == pytest.approx([2.0] * 3, abs=0.01)
 
 
-def test_the_sum_is_on_the_second_branch() -> None:
-    for code in (0, 128, 255):
-        assert (solved(3, code, code).sum(axis=0) / 255.0 >= 0.99).all()
+def test_the_sum_is_on_the_second_branch_from_black_two_panels_to_white_one() -> None:
+    """Where sin² is flat an intensity says little: here the phases themselves are looked at."""
+    for code, sum_ in ((0, 2.0), (128, 2 - 2 / np.pi * np.arcsin(np.sqrt(128 / 255))), (255, 1.0)):
+        assert solved(3, code, code).sum(axis=0) / 255.0 == pytest.approx([sum_] * 3, abs=1.6 / 255)
+
+
+def test_layers_are_rgba_of_8_bits_without_transparency() -> None:
+    layers = SartPredictor(stack_of(3), iterations=1).predict([[even(9)], [even(9)]], PAIR).layers
+    assert layers.dtype == np.uint8 and layers.shape == (3, 48, 96, 4)
+    assert (layers[..., 3] == 255).all()
 
 
 def test_panels_end_at_their_range_and_do_not_come_round() -> None:

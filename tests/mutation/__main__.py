@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tests.mutation import again
 from tests.mutation.modules import MODULES
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -100,8 +101,8 @@ def codes_of(meta: Path) -> dict[str, int | None]:
     return codes
 
 
-def tried(module: str, *, count: int, seed: int, only: Sequence[str] = ()) -> Score:
-    """Sample, run, collect. only: these mutants and no sample. Raises RuntimeError where mutmut itself fails."""
+def tried(module: str, *, count: int, seed: int) -> Score:
+    """Sample, run, collect. Raises RuntimeError where mutmut itself fails."""
     tests = [path for path in MODULES[module] if (ROOT / path).exists()]
     with tempfile.TemporaryDirectory(prefix="mutants-") as name:
         folder = Path(name)
@@ -110,7 +111,7 @@ def tried(module: str, *, count: int, seed: int, only: Sequence[str] = ()) -> Sc
         if not meta.exists():
             raise RuntimeError(f"{module}: mutmut made no mutants:\n{first.stdout[-2000:]}{first.stderr[-2000:]}")
         names = list(codes_of(meta))
-        chosen = [name for name in names if name in only] if only else sample(names, count=count, seed=seed)
+        chosen = sample(names, count=count, seed=seed)
         ran = mutmut(folder, "run", "--max-children", "1", *chosen)
         codes = codes_of(meta)
         untried = [name for name in chosen if codes[name] is None]
@@ -137,6 +138,16 @@ def reasons() -> dict[str, str]:
 
 def _flat(diff: str) -> str:
     return " ".join(diff.split())
+
+
+def _left(module: str, survivors: dict[str, str]) -> dict[str, str]:
+    """Those that still survive; one that can't be placed by its diff alone counts as one that does."""
+    known = reasons()
+    return {
+        name: diff
+        for name, diff in survivors.items()
+        if _flat(diff) in known or again.survives(module, name, diff) is not False
+    }
 
 
 def told(scores: Sequence[Score]) -> str:
@@ -176,7 +187,7 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=25, help="mutants a module")
     parser.add_argument("--seed", type=int, default=0, help="of the sample")
     parser.add_argument("--out", type=Path, default=Path("out/mutants.json"), help="what survived, with diffs")
-    parser.add_argument("--again", action="store_true", help="only those that survived, by --out; the rest stays")
+    parser.add_argument("--again", action="store_true", help="only those of --out that survived, without mutmut")
     given = parser.parse_args()
     if unknown := [name for name in given.modules if name not in MODULES]:
         parser.error(f"{unknown[0]!r} is none of {', '.join(MODULES)}")
@@ -184,15 +195,17 @@ def main() -> int:
     found: dict[str, dict[str, Any]] = dict(before)
     for module in given.modules or MODULES:
         old = before.get(module)
-        if given.again and not (old and old["survivors"]):
-            continue
-        only = list(old["survivors"]) if given.again and old else []
-        score = tried(module, count=given.count, seed=given.seed, only=only)
-        count = old["tried"] if given.again and old else score.tried
-        found[module] = {"mutants": score.mutants, "tried": count, "survivors": score.survivors}
+        if given.again:
+            if old:
+                found[module] = old | {"survivors": _left(module, old["survivors"])}
+        else:
+            score = tried(module, count=given.count, seed=given.seed)
+            found[module] = {"mutants": score.mutants, "tried": score.tried, "survivors": score.survivors}
         given.out.parent.mkdir(parents=True, exist_ok=True)
         given.out.write_text(json.dumps(found, indent=1), encoding="utf-8")
-        print(f"{module}: {count - len(score.survivors)} of {count} killed", flush=True)
+        if module in found:
+            count, left = found[module]["tried"], len(found[module]["survivors"])
+            print(f"{module}: {count - left} of {count} killed", flush=True)
     scores = [Score(name, **found[name]) for name in MODULES if name in found]
     print(told(scores))
     known = reasons()

@@ -21,8 +21,9 @@ class GlBackend:
         a panel of the stack is too large for the driver."""
         check_size(context, stack)
         self.context = context
+        self.at_once = False  # corrections in one pass: found by trying (`backends`)
         self.passes = Passes(context)
         self.renderer = describe(context)["renderer"]
 
     def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> GlSurround:
-        return GlSurround(self.passes, contract, stack)
+        return GlSurround(self.passes, contract, stack, at_once=self.at_once)

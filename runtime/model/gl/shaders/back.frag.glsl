@@ -7,5 +7,7 @@ out ivec4 lacks;
 #include "sample.glsl"
 
 void main() {
-    lacks = crossed(left, size, centre_from_left, 0) + crossed(right, size, centre_from_right, 0);
+    vec2 by_left = gl_FragCoord.xy * centre_from_left.xy + centre_from_left.zw;
+    vec2 by_right = gl_FragCoord.xy * centre_from_right.xy + centre_from_right.zw;
+    lacks = crossed(left, size, by_left, 0) + crossed(right, size, by_right, 0);
 }

@@ -14,8 +14,7 @@ layout(location = 2) out vec4 front_codes;
 #include "sample.glsl"
 
 ivec4 through(isampler2D image, ivec2 size, vec4 scale_shift, vec2 at) {
-    vec2 place = at * scale_shift.xy + scale_shift.zw;
-    return beside(place, size) ? ivec4(even) : bilinear(image, size, place);
+    return crossed(image, size, at * scale_shift.xy + scale_shift.zw, even);
 }
 
 bool within(ivec2 place, ivec2 size) {

@@ -9,6 +9,8 @@ out ivec4 corrected;
 #include "shown.glsl"
 
 void main() {
-    ivec4 lacks = crossed(left, size, centre_from_left, 0) + crossed(right, size, centre_from_right, 0);
+    vec2 by_left = gl_FragCoord.xy * centre_from_left.xy + centre_from_left.zw;
+    vec2 by_right = gl_FragCoord.xy * centre_from_right.xy + centre_from_right.zw;
+    ivec4 lacks = crossed(left, size, by_left, 0) + crossed(right, size, by_right, 0);
     corrected = kept(texelFetch(panel, ivec2(gl_FragCoord.xy), 0) + (lacks >> 3) * eighths);
 }

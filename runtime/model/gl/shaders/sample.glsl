@@ -23,7 +23,6 @@ ivec4 bilinear(isampler2D image, ivec2 size, vec2 place) {
 }
 
 // What a ray meets that leaves an image is `outside`: nobody sees it, for it does not cross every panel.
-ivec4 crossed(isampler2D image, ivec2 size, vec4 scale_shift, int outside) {
-    vec2 place = gl_FragCoord.xy * scale_shift.xy + scale_shift.zw;
+ivec4 crossed(isampler2D image, ivec2 size, vec2 place, int outside) {
     return beside(place, size) ? ivec4(outside) : bilinear(image, size, place);
 }
