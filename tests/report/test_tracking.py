@@ -70,15 +70,6 @@ def test_its_jitter_lies_under_the_curve_of_single_filters_at_its_lag(trades):
     assert shipped.jitter_mm < np.interp(shipped.lag_ms, lags, jitters)
 
 
-def test_the_figure_is_written(rows, trades, tmp_path):
-    import cv2
-
-    plot_benchmark(rows, trades, tmp_path / "tracking.png")
-    picture = cv2.imread(str(tmp_path / "tracking.png"))
-    assert picture is not None and picture.std() > 10
-    assert benchmark_table(rows)[0]["motion"] == "lean"
-
-
 def test_an_update_costs_less_than_three_thousand_calls_of_a_small_function():
     """In one process and in turns: some 50 us where a call takes 30 ns, and twice that is still allowed."""
     observed, tracker = observe("walk", seconds=6.0, rate_hz=60), Tracker()
