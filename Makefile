@@ -6,11 +6,13 @@ DEMO_ARGS ?=
 PYTEST_ARGS ?=
 TEST_WORKERS ?= logical
 FUZZ_ARGS ?=
+GOLDEN_ARGS ?=
+MUTANT_ARGS ?=
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 NIGHTLY := out/nightly
 
-.PHONY: demo test test-slow lint types secrets coverage nightly package bench fuzz soak install uninstall system docs gallery hashes clean
+.PHONY: demo test test-slow golden mutants lint types secrets coverage nightly package bench fuzz soak install uninstall system docs gallery hashes clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/phasestack demo $(DEMO_ARGS)
@@ -20,6 +22,14 @@ test: $(VENV)/.test lint types
 
 test-slow: $(VENV)/.test
 	$(BIN)/python -m pytest -m slow --timeout 3600 $(PYTEST_ARGS)
+
+# The golden runs' references anew, on purpose; GOLDEN_ARGS="walk fault" for some of them.
+golden: $(VENV)/.test
+	$(BIN)/python -m tests.golden --renew $(GOLDEN_ARGS)
+
+# Mutants of the modules that compute, and what of them the tests notice (half an hour); docs/testing.md.
+mutants: $(VENV)/.mutation
+	$(BIN)/python -m tests.mutation $(MUTANT_ARGS)
 
 # Style, layers, spelling, shell; `pre-commit install` has them run, with types and secrets, before every commit.
 lint: $(VENV)/.test
@@ -95,6 +105,10 @@ $(VENV)/.test: $(VENV)/.runtime requirements/test.lock requirements/torch.lock
 	@sh systemd/packages.sh test
 	$(BIN)/python -m pip install --quiet -r requirements/test.lock
 	$(BIN)/python -m pip install --quiet -r requirements/torch.lock
+	@touch $@
+
+$(VENV)/.mutation: $(VENV)/.test requirements/mutation.lock
+	$(BIN)/python -m pip install --quiet -r requirements/mutation.lock
 	@touch $@
 
 clean:

@@ -67,6 +67,10 @@ class ModelFailure(TransientError):
     """Inference failed or answered something that is not a picture: the last good layers stay."""
 
 
+class ContextLost(TransientError):
+    """The solver's GL context is gone: whatever is in it is made anew, from the settings."""
+
+
 class PanelLost(TransientError):
     """A panel's window, monitor or GL context is gone: rebuild it; the loop goes on with none."""
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from runtime.config import LimitSettings
-from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.base import ContentInfo, DrawingSource, View
 from runtime.content.gltf_header import check_gltf, file_of
 from runtime.content.ply import check_counts
 from runtime.content.shapes import Shape
@@ -21,6 +21,7 @@ from runtime.errors import InputError, MissingPart, one_line
 from runtime.optics.rect import PixelRect
 from runtime.records import F64, U8
 from runtime.support import foreign, progress
+from runtime.support.gl import DrawnPicture
 from runtime.support.picture_header import check_picture
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
@@ -231,7 +232,7 @@ def _names_texture(line: str) -> bool:
     return line.lower().startswith("map_kd ") and len(line.split()) > 1
 
 
-class MeshSource(ContentSource):
+class MeshSource(DrawingSource):
     """A loaded mesh at its place in the stack frame."""
 
     def __init__(
@@ -245,6 +246,7 @@ class MeshSource(ContentSource):
         parts: Sequence[ReadyPart] | None = None,
     ) -> None:
         """parts: those of `data`, where they were made ready on another thread."""
+        self.draws_in = context
         self._painter = TrianglePainter(parts or data.parts, context=context, background=background, samples=samples)
         self._placed = [stack_from_scene] * len(data.parts)
         corners = self._painter.corners_m(self._placed)
@@ -257,7 +259,7 @@ class MeshSource(ContentSource):
             left_out=tuple(text for feature, text in names.items() if feature not in used),
         )
 
-    def render(self, view: View, *, time_ns: int) -> U8:
+    def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         return self._painter.paint(view, self._placed)
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect:

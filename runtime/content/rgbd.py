@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.base import ContentInfo, DrawingSource, View
 from runtime.content.images import rgba_from_rgb
 from runtime.content.pictures import screen
 from runtime.content.shapes import Shape
@@ -17,6 +17,7 @@ from runtime.errors import InputError
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, U8
+from runtime.support.gl import DrawnPicture
 
 COLUMNS = 320  # of the surface: as fine as depth cameras see, and quick without a graphics card
 NOMINAL_DISTANCE_M = 0.6  # from here the surface looks like the picture
@@ -59,7 +60,7 @@ def surface(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float, 
     return Part(Shape(positions, normals, uv, triangles), picture=rgba_from_rgb(colour), lit=False)
 
 
-class RgbdSource(ContentSource):
+class RgbdSource(DrawingSource):
     """A picture with depth between two planes of the stack frame."""
 
     def __init__(
@@ -75,13 +76,14 @@ class RgbdSource(ContentSource):
         colour, depth = split_rgbd(rgb, path)
         part = surface(colour, depth, stack=stack, depth_m=depth_m)
         # Outlines of a torn surface run through its inside: no ramps there.
+        self.draws_in = context
         self._painter = TrianglePainter([part], context=context, background=background, samples=1)
         low, high = float(part.shape.positions_m[:, 0].min()), float(part.shape.positions_m[:, 0].max())
         self.info = ContentInfo(
             name=path.stem, depth_range_m=(low, high), background=background, left_out=("lights", "sorting")
         )
 
-    def render(self, view: View, *, time_ns: int) -> U8:
+    def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         return self._painter.paint(view, [np.eye(4)])
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect:

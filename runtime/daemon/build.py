@@ -71,7 +71,7 @@ class Run:
         return {
             **self.presenter.summary(simulated=self.simulated),
             **self.observer.means.summary(),
-            "backend": "opencv",
+            "backend": self.presenter.run_cell.state.predictor.backend,
             "plan": self.plan_items(),
         }
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from runtime.optics.malus import intensity_from_phase
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.tilt import layer_from_seen, layer_pixels_from_seen
 from runtime.optics.views import image_from_stack
 from runtime.records import F32, F64, U8
 
@@ -110,9 +111,14 @@ class Rays:
     def shape(self) -> tuple[int, int]:
         return len(self.v), len(self.u)
 
-    def on(self, raster: PlaneRaster, rows: slice = slice(None)) -> tuple[F64, F64]:
-        """(h, w) where some rows' rays cross a plane, in its raster's pixels (M_RPU)."""
+    def on(self, raster: PlaneRaster, rows: slice = slice(None), *, moved: F64 | None = None) -> tuple[F64, F64]:
+        """(h, w) where some rows' rays cross a plane, in its raster's pixels (M_RPU).
+
+        moved: (3, 3) of those pixels, what is done to them afterwards.
+        """
         h = panel_from_image(self.from_stack, raster)
+        if moved is not None:
+            h = moved @ h
         u, v = self.u, self.v[rows]
         with np.errstate(divide="ignore", invalid="ignore"):
             weight = h[2, 0] * u + h[2, 1] * v + h[2, 2]
@@ -129,8 +135,9 @@ class Rays:
 def panel_positions(
     eye_m: ArrayLike, stack: PanelStack, *, index: int, width_px: int, height_px: int, fov_deg: float
 ) -> tuple[F32, F32]:
-    """Where the rays of an eye's image cross panel `index`: (h, w) u and v in that panel's pixels (M_RPU)."""
-    u, v = Rays.of_eye(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg).on(stack.panel(index))
+    """Where the rays of an eye's image cross panel `index`: (h, w) u and v in its layer's pixels (M_RPU)."""
+    rays = Rays.of_eye(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
+    u, v = rays.on(stack.panel(index), moved=_moved(stack, index, np.asarray(eye_m, dtype=np.float64)))
     return u.astype(np.float32), v.astype(np.float32)
 
 
@@ -158,8 +165,17 @@ def seen_by(
     eye = checked_eye(eye_m, stack)
     width, height = width_px or layers.shape[2], height_px or layers.shape[1]
     rays = Rays.of_eye(eye, width_px=width, height_px=height, fov_deg=fov_deg, step=step)
-    panels = [stack.panel(index) for index in range(stack.count)]
-    return through_layers(layers, lambda rows: (rays.on(panel, rows) for panel in panels), rays.toward_panels(), stack)
+    panels = [(stack.panel(index), _moved(stack, index, eye)) for index in range(stack.count)]
+    return through_layers(
+        layers, lambda rows: (rays.on(panel, rows, moved=m) for panel, m in panels), rays.toward_panels(), stack
+    )
+
+
+def _moved(stack: PanelStack, index: int, eye_m: F64) -> F64 | None:
+    """(3, 3) a layer's pixels from the ideal panel's, as an eye sees them; None where they are the same."""
+    if stack.tilt is None:
+        return None
+    return layer_pixels_from_seen(stack.panel(index), layer_from_seen(stack, index, eye_m))
 
 
 def checked_eye(eye_m: ArrayLike, stack: PanelStack) -> F64:
