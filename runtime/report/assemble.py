@@ -130,7 +130,7 @@ def _sweeps(record: dict[str, Any], *, stack: Any, small: Any, progress: Progres
     with Simulation("demo", small, model="balanced") as simulation:
         progress("viewing volume")
         volume = sweeps.viewing_volume(simulation)
-    # On small panels a pixel is millimetres: there, nobody is beside anything.
+    # On small panels a pixel is millimetres: there, no eye is anywhere else.
     finer = stack if stack.width_px < 1920 else replace(stack, width_px=960, height_px=540)
     progress("tolerance to tracking errors")
     with Simulation("demo", finer, model="balanced") as simulation:
