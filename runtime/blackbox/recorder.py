@@ -145,7 +145,7 @@ class Recorder:
     # On any thread.
 
     def save(self, why: str, told: Callable[[str, Path | None], None] = lambda problem, path: None) -> None:
-        """Write what is kept to a file beside the run. told: why not (empty: done), and the file; from a thread."""
+        """Write what is kept to a file as the run goes on. told: why not (empty: done), and the file; from a thread."""
         if self._ring is None:
             told("nothing is kept in memory (service.blackbox_minutes is 0)", None)
             return

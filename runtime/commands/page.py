@@ -1,4 +1,4 @@
-"""`phasestack page`: the operator's page, beside the daemon."""
+"""`phasestack page`: the operator's page, outside the daemon."""
 
 from __future__ import annotations
 

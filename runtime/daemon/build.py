@@ -33,7 +33,7 @@ SWITCH_INTERVAL_S = 0.0005  # between Python threads: the presenter must not wai
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """What the command line says beside the configuration."""
+    """What the command line says in addition to the configuration."""
 
     max_speed: bool = False
     measure: bool = False

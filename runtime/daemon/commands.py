@@ -21,7 +21,7 @@ PLACING = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # of `plac
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One wish of an operator. The loop carries it out between two turns, or begins to, and answers exactly once.
+    """One command of an operator. The loop carries it out between two turns, or begins to, and answers exactly once.
 
     Whoever carries it out takes it first, and leaves it where `take` says so: what was given up is never done.
     `flat` with value True holds the 2D picture until `resume`; `pause` freezes the picture until `resume`.

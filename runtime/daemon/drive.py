@@ -64,7 +64,7 @@ def drive(
             last = run.presenter.last
             has_picture = last is not None and (last.frame.solved is not None or last.frame.flat is not None)
             layers = shown_layers(last.frame) if last is not None and has_picture else None
-            output.finish(summary, layers, run.observer.look)
+            output.finish(summary, layers, run.observer.eye_views)
     left_behind = run.solver.left_behind + wait_for_all(JOBS_END_WITHIN_S)
     return summary | {"machine_s": round(machine_s, 3), "left_behind": left_behind}
 

@@ -73,7 +73,7 @@ class Daemon:
             return "restart asked for"
         return f"{self._signals.stop} received" if self._signals.stop else ""
 
-    def obey(self, presenter: Presenter) -> None:
+    def carry_out_commands(self, presenter: Presenter) -> None:
         if self._signals.take_reload():
             self._notifier.reloading()
             self._reload(presenter, None)

@@ -163,7 +163,7 @@ def _sweeps(record: dict[str, Any], *, stack: Any, small: Any, progress: Progres
 
     progress("viewing volume")
     volume = kept.part("viewing volume", viewing_volume)
-    # On small panels a pixel is millimetres: there, nobody is beside anything.
+    # On small panels a pixel is millimetres: there, no eye is anywhere else.
     finer = stack if stack.width_px < 1920 else replace(stack, width_px=960, height_px=540)
     progress("tolerance to tracking errors")
     tolerance = kept.part("tolerance", tolerance_map)
