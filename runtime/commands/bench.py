@@ -105,6 +105,7 @@ def passes(
     width: Annotated[int, typer.Option(min=64, max=16384, help="columns of a panel")] = 1920,
     height: Annotated[int, typer.Option(min=64, max=16384, help="rows of a panel")] = 1080,
     each: Annotated[bool, typer.Option("--each", help="every pass of every solution")] = False,
+    timed: Annotated[bool, typer.Option("--timed", help="with --each: what this GPU takes, by timer queries")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
     """What the OpenGL backend reads and writes for a solution, and how long memories of three speeds take for that.
@@ -112,6 +113,8 @@ def passes(
     Counted while it solves: the driver's own time does not matter. The network itself is not in it.
 
     Example: phasestack bench passes --model balanced
+
+    Example: phasestack bench passes --model fast --each --timed
     """
     from dataclasses import asdict
 
@@ -123,7 +126,7 @@ def passes(
     names = list(dict.fromkeys(model or SHIPPED))
     check_models([name for name in names if name not in SHIPPED])
     with status_line("passes"):
-        found = account.counted(names, width_px=width, height_px=height)
+        found = account.counted(names, width_px=width, height_px=height, timed=timed)
     if as_json:
         rows = [asdict(one) | {"moved_bytes": one.moved_bytes} for one in found]
         print(to_json({"width_px": width, "height_px": height, "solutions": rows}))
@@ -134,7 +137,12 @@ def passes(
         for step in one.passes:
             crosses = "  crosses" if step.crosses else ""
             moved = f"reads {step.read_bytes / 1e6:8.2f} MB, writes {step.written_bytes / 1e6:8.2f} MB"
-            print(f"  {step.name:16} {step.width_px:5}x{step.height_px:<5} {moved}{crosses}")
+            took = f"  {step.gpu_ms:9.3f} ms" if step.gpu_ms is not None else ""
+            print(f"  {step.name:16} {step.width_px:5}x{step.height_px:<5} {moved}{took}{crosses}")
+        if timed:
+            print(
+                f"  together {sum(step.gpu_ms or 0.0 for step in one.passes):.3f} ms on this GPU, without the network"
+            )
 
 
 @app.command()
