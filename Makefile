@@ -18,7 +18,7 @@ demo: $(VENV)/.runtime
 	$(BIN)/phasestack demo $(DEMO_ARGS)
 
 test: $(VENV)/.test lint types
-	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist worksteal $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist loadfile $(PYTEST_ARGS)
 
 test-slow: $(VENV)/.test
 	$(BIN)/python -m pytest -m slow --timeout 3600 $(PYTEST_ARGS)
@@ -47,7 +47,7 @@ secrets: $(VENV)/.test
 
 # Of branches; the floor is in pyproject.toml. Twice the tests' time.
 coverage: $(VENV)/.test
-	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist worksteal --cov --cov-report=term:skip-covered --cov-report=html:out/coverage
+	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:out/coverage
 
 # What takes too long for every change: the slow tests, coverage, every fuzzer, secrets in all files, and the frontier
 # against that of the night before (exit 1 where it got slower or worse beyond noise).

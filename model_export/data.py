@@ -1,4 +1,4 @@
-"""Endless procedural pairs: poses over the whole design range, scenes of planes, views beside the eyes drawn anew."""
+"""Endless procedural pairs: poses over the whole design range, scenes of planes, views from around the eyes."""
 
 from __future__ import annotations
 

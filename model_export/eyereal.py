@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-PICTURE_FOV_DEG = 40.0  # horizontal; the published code feeds black beside it
+PICTURE_FOV_DEG = 40.0  # horizontal; the published code feeds black outside it
 OFFSET = 0.2  # the published code shows sigmoid(y) - 0.2, clipped at the panel
 INPUT, OUTPUT = "eyes", "panels"
 LEAST_PX = 32  # five halvings

@@ -23,7 +23,7 @@ PANELS = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 1920, 1080)
 
 
 def folder_pairs(folders: Sequence[Path], *, scene: str, width_px: int, height_px: int) -> list[TrainingPair]:
-    """Every pair of some folders, on the panels of a scene's preset at a raster. They have no views beside the eyes.
+    """Every pair of some folders, on the panels of a scene's preset at a raster. They have no views from elsewhere.
 
     Raises InputError: a folder without pairs, half a pair, a picture that can't be read or fits no other.
     """

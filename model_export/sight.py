@@ -22,7 +22,7 @@ from runtime.model.resample import buffer, resample
 from runtime.model.transfer import phase_codes, pre_emphasised
 from runtime.records import F64
 
-SPREAD = 2.0  # standard deviations to the four places beside the nominal one (design 5.5)
+SPREAD = 2.0  # standard deviations to the four places around the nominal one (docs/contracts.md, Error)
 WEIGHTS = (0.5, 0.125, 0.125, 0.125, 0.125)
 
 

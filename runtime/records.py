@@ -19,7 +19,7 @@ Inference = Literal["ran", "reused", "skipped"]
 
 
 class State(StrEnum):
-    """What the daemon is doing; DEGRADED names what is missing beside it."""
+    """What the daemon is doing; DEGRADED names what is missing as well."""
 
     STARTING = "starting"
     TRACKING = "tracking"

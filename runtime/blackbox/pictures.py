@@ -48,7 +48,7 @@ def pictures_of(refresh: Refresh, stack: PanelStack, *, width_px: int = WIDTH_PX
 
 
 def seen(frame: PanelFrame, stack: PanelStack, eye_m: F64, *, width_px: int, height_px: int) -> U8:
-    """(h, w, 3) what an eye sees of the plane in the stack's middle; black where its ray passes beside a panel."""
+    """(h, w, 3) what an eye sees of the plane in the stack's middle; black where its ray misses a panel."""
     reference_m = reference_x_m(stack)
     across = (np.arange(width_px) + 0.5) / width_px - 0.5  # shares of the display's size from its middle
     up = 0.5 - (np.arange(height_px) + 0.5) / height_px
@@ -68,7 +68,7 @@ def seen(frame: PanelFrame, stack: PanelStack, eye_m: F64, *, width_px: int, hei
 
 
 def _shown_at(frame: PanelFrame, index: int, u: F64, v: F64) -> Any:
-    """(h, w, 3) codes of a panel where columns u and rows v of its pixels meet; what lies beside the layer is even."""
+    """(h, w, 3) codes of a panel where columns u and rows v of its pixels meet; outside the layer it is neutral."""
     import cv2
 
     su, sv, tu, tv = _alignment(frame, index)

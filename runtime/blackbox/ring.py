@@ -7,7 +7,7 @@ from collections import deque
 from runtime.blackbox.messages import Message
 from runtime.blackbox.schemas import STATE
 
-OVERHEAD_BYTES = 200  # of a message beside its data
+OVERHEAD_BYTES = 200  # of a message besides its data
 
 
 class Ring:

@@ -15,7 +15,7 @@ import numpy as np
 from runtime.config import ModelSettings, Overrides, changed, load_settings, load_stack
 from runtime.content.base import ContentInfo
 from runtime.errors import InputError
-from runtime.evaluation.displayed import Look, Picture, displayed, expected_db
+from runtime.evaluation.displayed import EyeViews, Picture, displayed, expected_db
 from runtime.evaluation.trials import timed, timed_in_turn
 from runtime.model.backends import choose
 from runtime.model.predictor import Prediction, Predictor, load_predictor
@@ -202,12 +202,12 @@ def _write(
 ) -> dict[str, Any]:
     for n, layer in enumerate(layers):
         write_png(folder / f"layer-{n}.png", layer)
-    look = _shown(layers, pictures, eyes_m, stack, request)
-    for name, retina, target in zip(("left", "right"), look.seen, look.wanted, strict=True):
+    eye_views = _shown(layers, pictures, eyes_m, stack, request)
+    for name, retina, target in zip(("left", "right"), eye_views.seen, eye_views.wanted, strict=True):
         write_png(folder / f"seen-{name}.png", as_codes(retina.image))
         write_png(folder / f"wanted-{name}.png", as_codes(intensities(target)))
-    measured = look.quality
-    expected = expected_db(look, layers, stack, eyes_m=eyes_m, fov_deg=request.fov_deg)
+    measured = eye_views.quality
+    expected = expected_db(eye_views, layers, stack, eyes_m=eyes_m, fov_deg=request.fov_deg)
     return {
         "psnr_db": round(measured.psnr_db, 3),
         "expected_db": {sigma: None if value is None else round(value, 3) for sigma, value in expected.items()},
@@ -216,7 +216,7 @@ def _write(
     }
 
 
-def _shown(layers: U8, pictures: Sequence[Picture], eyes_m: F64, stack: PanelStack, request: SolveRequest) -> Look:
+def _shown(layers: U8, pictures: Sequence[Picture], eyes_m: F64, stack: PanelStack, request: SolveRequest) -> EyeViews:
     """What the eyes see, and what they should see. Raises InputError where they see nothing."""
     try:
         return displayed(layers, pictures, stack, eyes_m=eyes_m, fov_deg=request.fov_deg)

@@ -33,7 +33,7 @@ SWITCH_INTERVAL_S = 0.0005  # between Python threads: the presenter must not wai
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """What the command line says beside the configuration."""
+    """What the command line says in addition to the configuration."""
 
     max_speed: bool = False
     measure: bool = False
@@ -72,6 +72,7 @@ class Run:
             **self.presenter.summary(simulated=self.simulated),
             **self.observer.means.summary(),
             "backend": self.presenter.run_cell.state.predictor.backend,
+            "scene": self.presenter.run_cell.state.content.info.name,
             "plan": self.plan_items(),
         }
 

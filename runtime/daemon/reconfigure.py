@@ -1,4 +1,4 @@
-"""Other settings while it runs: what they need is made ready beside the solver, and taken over between two steps."""
+"""Other settings while it runs: what they need is made ready alongside the solver, and taken over between two steps."""
 
 from __future__ import annotations
 

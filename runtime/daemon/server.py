@@ -1,4 +1,4 @@
-"""The status and control socket: JSON lines over a local socket of mode 0660, answered beside the loop."""
+"""The status and control socket: JSON lines over a local socket of mode 0660, answered alongside the loop."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ def _line(answer: dict[str, Any]) -> bytes:
 
 
 def _claim(path: Path) -> int:
-    """A locked file beside the socket: the daemon that holds it owns the socket, whatever else has crashed.
+    """A locked file next to the socket: the daemon that holds it owns the socket, whatever else has crashed.
 
     A link is never followed, and nothing is written to a file that is not ours alone.
     """

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from runtime.evaluation.displayed import Look
+from runtime.evaluation.displayed import EyeViews
 from runtime.optics.carried import intensities
 from runtime.optics.quality import Quality
 from runtime.optics.retina import as_codes
@@ -21,7 +21,7 @@ INK = (40, 40, 40)
 PAPER = 246
 
 
-def contact_sheet(layers: U8, look: Look | None, *, headline: str) -> U8:
+def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str) -> U8:
     """(h, w, 3) RGB: a row of layers, and for each eye a row of what it should see, sees, and the difference.
 
     Under the headline, displayed quality at the eyes used and, where they are known, at the true ones.
@@ -31,14 +31,14 @@ def contact_sheet(layers: U8, look: Look | None, *, headline: str) -> U8:
     names = {0: "layer 0 (rear, at the backlight)", len(layers) - 1: f"layer {len(layers) - 1} (front)"}
     rows = [[(names.get(n, f"layer {n}"), np.ascontiguousarray(layers[n, ..., :3])) for n in range(len(layers))]]
     lines = [headline]
-    if look is not None:
-        lines += list(_figures(look))
+    if eye_views is not None:
+        lines += list(_figures(eye_views))
         for side, eye in enumerate(("left", "right")):
-            seen = look.seen[side]
-            target = intensities(look.wanted[side])
+            seen = eye_views.seen[side]
+            target = intensities(eye_views.wanted[side])
             shown = np.where(seen.mask[..., None], seen.image, 0.94)
             error = np.where(seen.mask[..., None], np.abs(seen.image - target) * ERROR_GAIN, 0.94)
-            decibels = look.quality.eye_psnr_db[side]
+            decibels = eye_views.quality.eye_psnr_db[side]
             rows.append(
                 [
                     (f"{eye} eye: wanted", as_codes(target)),
@@ -61,11 +61,11 @@ def contact_sheet(layers: U8, look: Look | None, *, headline: str) -> U8:
     return sheet
 
 
-def _figures(look: Look) -> Iterator[str]:
+def _figures(eye_views: EyeViews) -> Iterator[str]:
     """A line for the eyes used, and one for the true ones where anything is known of them."""
     for where, exact, carried in (
-        ("at the eyes used", look.quality, look.carried),
-        ("at the true eyes", look.true, look.carried_true),
+        ("at the eyes used", eye_views.quality, eye_views.carried),
+        ("at the true eyes", eye_views.true, eye_views.carried_true),
     ):
         parts = [f"exact {_told(exact)} (against what these eyes should see now)"] if exact else []
         parts += [f"carried {_told(carried)} (against the picture that the layers were solved for)"] if carried else []

@@ -16,8 +16,8 @@ Picture = U8 | U16 | F32  # (h, w, 3): code values, or intensities in [0, 1]
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """What both eyes see of some layers, beside what they should."""
+class EyeViews:
+    """What both eyes see of some layers, and what they should."""
 
     seen: tuple[Retina, ...]
     wanted: tuple[Picture, ...]
@@ -35,7 +35,7 @@ def displayed(
     eyes_m: F64,
     fov_deg: float,
     similarity: bool = True,
-) -> Look:
+) -> EyeViews:
     """What eyes (2, 3), frame `stack`, see of layers (N, H, W, 3 or 4), against a picture for each eye.
 
     The pictures are `fov_deg` wide. One that has the panels' aspect is compared in their pixels, any other in its own.
@@ -49,25 +49,31 @@ def displayed(
     )
     targets = [intensities(picture) for picture in wanted]
     measured = quality([r.image for r in seen], targets, [r.mask for r in seen], similarity=similarity)
-    return Look(seen, tuple(wanted), measured)
+    return EyeViews(seen, tuple(wanted), measured)
 
 
 def expected_db(
-    look: Look, layers: U8, stack: PanelStack, *, eyes_m: F64, fov_deg: float, sigmas_mm: Sequence[float] = (1.0, 2.0)
+    eye_views: EyeViews,
+    layers: U8,
+    stack: PanelStack,
+    *,
+    eyes_m: F64,
+    fov_deg: float,
+    sigmas_mm: Sequence[float] = (1.0, 2.0),
 ) -> dict[str, float | None]:
-    """Expected PSNR (design 5.5) of a look's layers and pictures, by the eyes' uncertainty in millimetres: "1", "2".
+    """Expected PSNR (docs/contracts.md, Error) of layers, by the eyes' uncertainty in millimetres: "1", "2".
 
     None where such an error would take an eye to where it sees nothing.
     """
     try:
-        values = expected_psnrs_db(layers, look.wanted, stack, eyes_m=eyes_m, fov_deg=fov_deg, sigmas_mm=sigmas_mm)
+        values = expected_psnrs_db(layers, eye_views.wanted, stack, eyes_m=eyes_m, fov_deg=fov_deg, sigmas_mm=sigmas_mm)
     except ValueError:
         return {f"{sigma_mm:g}": None for sigma_mm in sigmas_mm}
     return {f"{sigma_mm:g}": value for sigma_mm, value in values.items()}
 
 
 def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:
-    """A picture in the panels' pixels where it has their aspect, as the judge compares it; else as it is.
+    """A picture in the panels' pixels where it has their aspect, as a judge of the layers compares it; else as it is.
 
     A picture of another aspect would be stretched, and then no eye is meant to see it.
     """

@@ -11,7 +11,7 @@ from typing import Any, TextIO
 
 from runtime.errors import InputError
 from runtime.evaluation.contact_sheet import contact_sheet
-from runtime.evaluation.displayed import Look
+from runtime.evaluation.displayed import EyeViews
 from runtime.optics.carried import intensities
 from runtime.optics.retina import as_codes
 from runtime.records import U8
@@ -112,7 +112,7 @@ class RunOutput:
 
         self._later(write)
 
-    def finish(self, summary: dict[str, Any], layers: U8 | None, look: Look | None) -> None:
+    def finish(self, summary: dict[str, Any], layers: U8 | None, eye_views: EyeViews | None) -> None:
         """The pictures of the last frame, the contact sheet and the summary."""
 
         def write() -> None:
@@ -122,11 +122,11 @@ class RunOutput:
                 return
             for n, layer in enumerate(layers):
                 write_png(folder / f"layer-{n}.png", layer)
-            if look is not None:
+            if eye_views is not None:
                 for side, eye in enumerate(("left", "right")):
-                    write_png(folder / f"seen-{eye}.png", as_codes(look.seen[side].image))
-                    write_png(folder / f"wanted-{eye}.png", as_codes(intensities(look.wanted[side])))
-            write_png(folder / "contact-sheet.png", contact_sheet(layers, look, headline=headline(summary)))
+                    write_png(folder / f"seen-{eye}.png", as_codes(eye_views.seen[side].image))
+                    write_png(folder / f"wanted-{eye}.png", as_codes(intensities(eye_views.wanted[side])))
+            write_png(folder / "contact-sheet.png", contact_sheet(layers, eye_views, headline=headline(summary)))
 
         self._work.put(write)
 

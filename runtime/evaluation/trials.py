@@ -25,10 +25,6 @@ class Timed(Generic[T]):
     def median_ms(self) -> float:
         return float(np.median(self.times_ms))
 
-    @property
-    def p99_ms(self) -> float:
-        return float(np.percentile(self.times_ms, 99))
-
 
 def timed(
     call: Callable[[], T],
@@ -63,7 +59,7 @@ def timed_in_turn(
 ) -> dict[str, Timed[T]]:
     """Several calls that take turns, run by run: what slows the machine slows all of them.
 
-    Each is told the number of its run, warm-ups included. keep: makes the last answer one's own, beside the time.
+    Each is told the number of its run, warm-ups included. keep: makes the last answer one's own, outside of the time.
     """
     times: dict[str, list[float]] = {name: [] for name in ways}
     answers: dict[str, T] = {}

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from runtime.content.base import ContentSource
-from runtime.evaluation.displayed import Look, displayed
+from runtime.evaluation.displayed import EyeViews, displayed
 from runtime.frame.presenter import Refresh
 from runtime.frame.solver_host import SolverHost
 from runtime.frame.truth import TrueEyes, Unknown
@@ -47,15 +47,15 @@ class Output(Protocol):
 class Measured:
     """What eyes saw of one refresh."""
 
-    look: Look  # at the eyes aligned to, against their own truth
+    eye_views: EyeViews  # at the eyes aligned to, against their own truth
     carried: Quality  # at the eyes aligned to
-    true_look: Look | None = None  # at the true eyes, against their own truth
+    true_views: EyeViews | None = None  # at the true eyes, against their own truth
     carried_true: Quality | None = None
 
-    def whole_look(self) -> Look:
-        """The look, with what else was measured beside it: what the contact sheet tells."""
-        true = self.true_look.quality if self.true_look else None
-        return replace(self.look, carried=self.carried, true=true, carried_true=self.carried_true)
+    def all_views(self) -> EyeViews:
+        """What the eyes aligned to see, with all else that was measured: what the contact sheet tells."""
+        true = self.true_views.quality if self.true_views else None
+        return replace(self.eye_views, carried=self.carried, true=true, carried_true=self.carried_true)
 
 
 @dataclass(slots=True)
@@ -66,10 +66,10 @@ class Means:
 
     def add(self, measured: Measured) -> None:
         found: dict[str, float | None] = {
-            "psnr_db": measured.look.quality.psnr_db,
-            "ssim": measured.look.quality.ssim,
+            "psnr_db": measured.eye_views.quality.psnr_db,
+            "ssim": measured.eye_views.quality.ssim,
             "carried_db": measured.carried.psnr_db,
-            "psnr_db_true_eyes": measured.true_look.quality.psnr_db if measured.true_look else None,
+            "psnr_db_true_eyes": measured.true_views.quality.psnr_db if measured.true_views else None,
             "carried_db_true_eyes": measured.carried_true.psnr_db if measured.carried_true else None,
         }
         for name, value in found.items():
@@ -81,14 +81,6 @@ class Means:
         names = ("psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
         means = {name: round(float(np.mean(self.values[name])), 3) if self.values.get(name) else None for name in names}
         return {**means, "quality_frames": len(self.values.get("psnr_db", []))}
-
-
-class ContentHolder(Protocol):
-    """The part of a solver that can draw."""
-
-    @property
-    def content(self) -> ContentSource:
-        """What is drawn at present."""
 
 
 class RunObserver:
@@ -113,7 +105,7 @@ class RunObserver:
         self._output, self._on_account, self._simulated = output, on_account, simulated
         self.truth = TrueEyes()
         self.means = Means()
-        self.look: Look | None = None  # of the newest measured refresh
+        self.eye_views: EyeViews | None = None  # of the newest measured refresh
         self.last: Refresh | None = None
         self._lines: deque[RefreshAccount] = deque()
         self._samples: deque[Refresh] = deque()
@@ -143,7 +135,7 @@ class RunObserver:
         if last is not None and wants_last:
             measured = self._measured_now(last)
             if measured is not None:
-                self.look = measured.whole_look()
+                self.eye_views = measured.all_views()
                 if not self.means.values and last.account.state is State.TRACKING:
                     self.means.add(measured)
 
@@ -246,14 +238,14 @@ class RunObserver:
             return None
         stack, fov_deg, solved_for_m = self._stack, self._fov_deg, account.solved_for_m
         try:
-            look = displayed(layers, drawn["used"], stack, eyes_m=account.eyes_m, fov_deg=fov_deg)
+            eye_views = displayed(layers, drawn["used"], stack, eyes_m=account.eyes_m, fov_deg=fov_deg)
             carried = carried_quality(
                 layers, drawn["solved"], stack, solved_for_m=solved_for_m, eyes_m=account.eyes_m, fov_deg=fov_deg
             )
             if true_m is None:
-                return Measured(look, carried)
+                return Measured(eye_views, carried)
             return Measured(
-                look,
+                eye_views,
                 carried,
                 displayed(layers, drawn["true"], stack, eyes_m=true_m, fov_deg=fov_deg),
                 carried_quality(
@@ -266,7 +258,7 @@ class RunObserver:
 
     def _take(self, measured: Measured | None) -> None:
         if measured is not None:
-            self.look = measured.whole_look()
+            self.eye_views = measured.all_views()
             self.means.add(measured)
 
     def _measured_now(self, refresh: Refresh) -> Measured | None:

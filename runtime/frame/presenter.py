@@ -1,6 +1,6 @@
 """One refresh after the other: receive, map, predict, align, present, account. It waits for nothing but its time.
 
-The solver works beside it (`solver_host`) and hands over complete solutions; every refresh shows the newest one,
+The solver works alongside it (`solver_host`) and hands over complete solutions; every refresh shows the newest one,
 aligned to where the eyes will be when its light leaves.
 """
 
@@ -50,7 +50,7 @@ class Supervisor(Protocol):
     def stop_reason(self) -> str:
         """Why to stop; empty: go on."""
 
-    def obey(self, presenter: Presenter) -> None:
+    def carry_out_commands(self, presenter: Presenter) -> None:
         """Carry out what an operator asked for since the last refresh."""
 
     def refreshed(self, presenter: Presenter, account: RefreshAccount) -> None:
@@ -63,7 +63,7 @@ class Unsupervised:
     def stop_reason(self) -> str:
         return ""
 
-    def obey(self, presenter: Presenter) -> None:
+    def carry_out_commands(self, presenter: Presenter) -> None:
         return
 
     def refreshed(self, presenter: Presenter, account: RefreshAccount) -> None:
@@ -157,7 +157,7 @@ class Presenter:
         self.clock.sleep_until_ns(timing.wake_ns)
         times.lap("wait")
         woke_ns = self.clock.now_ns()
-        self._supervisor.obey(self)
+        self._supervisor.carry_out_commands(self)
         self._adopt_settings()
         self._receive(woke_ns)
         times.lap("sensor")

@@ -49,7 +49,7 @@ class SolverHost(ABC):
 
     @abstractmethod
     def post(self, request: SolveRequest) -> None:
-        """The newest wish; one that was not begun is forgotten."""
+        """Ask for a solution; a request that was not begun is forgotten."""
 
     @abstractmethod
     def news(self) -> News:

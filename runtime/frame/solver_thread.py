@@ -32,7 +32,7 @@ class _Attempt:
 
 
 class SolverThread(SolverHost):
-    """Runs a solver beside the presenter. `post`, `news` and `watch` never wait."""
+    """Runs a solver alongside the presenter. `post`, `news` and `watch` never wait."""
 
     def __init__(
         self, make: Callable[[], SolverParts], clock: Clock, *, late_s: float, abandon_s: float, first_cost_ns: int = 0
@@ -146,7 +146,7 @@ class SolverThread(SolverHost):
         except ContextLost as error:
             log.error("solver: %s", error)
             attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
-        except Exception as error:  # beside what a step answers with: a bug of ours, or a library's
+        except Exception as error:  # what no step answers with: a bug of ours, or a library's
             log.exception("solver: unexpected error")
             attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
         finally:

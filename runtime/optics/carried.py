@@ -150,8 +150,8 @@ def _five_points(error: Callable[[F64], float], *, right: F64, sigmas_mm: Sequen
     result = {}
     for sigma_mm in sigmas_mm:
         moves = [side * 2e-3 * sigma_mm * axis for axis in (right, up) for side in (-1, 1)]
-        beside = sum(error(move) for move in moves) / 8 if sigma_mm > 0 else unmoved / 2
-        result[sigma_mm] = psnr_db(unmoved / 2 + beside)
+        moved = sum(error(move) for move in moves) / 8 if sigma_mm > 0 else unmoved / 2
+        result[sigma_mm] = psnr_db(unmoved / 2 + moved)
     return result
 
 

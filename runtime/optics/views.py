@@ -26,7 +26,7 @@ def stack_from_eye(eye_m: ArrayLike) -> F64:
     # Scaled first: squares of 1e-200 or 1e200 would leave float64.
     back = eye / scale
     back = back / math.hypot(*back)
-    # From the unscaled eye: beside the vertical axis its x and y may be too small to survive the scaling.
+    # From the unscaled eye: near the vertical axis its x and y may be too small to survive the scaling.
     off_axis = float(np.abs(eye[:2]).max())
     along = eye[:2] / off_axis if off_axis > 0.0 else np.array([1.0, 0.0])
     along = along / math.hypot(*along)

@@ -27,7 +27,7 @@ void main() {
 """
 
 # runtime.optics.alignment.shown_layers is the reference for what `shown` answers. Aligned layers are sampled with
-# weights of full precision, which hardware's filters (1/256) have not, and are even beside their edge. Layers that a
+# weights of full precision, which hardware's filters (1/256) have not, and are neutral outside. Layers that a
 # homography moves are sampled with cubic weights, once for registration and alignment: bilinear ones cost 0.15 dB more.
 FRAGMENT = """#version 330 core
 uniform sampler2DArray solved;

@@ -247,7 +247,7 @@ class BudgetControl:
         self._report()
 
     def _measure(self) -> None:
-        """Begin to measure, beside the loop; the present level stays until that is done."""
+        """Begin to measure, alongside the loop; the present level stays until that is done."""
         settings, scenery, calls = self._settings, self._scenery(), self._calls
         self._problem = ""
 
@@ -268,7 +268,7 @@ class BudgetControl:
         self._choose(self._as_the_loop_finds_them(levels))
 
     def _as_the_loop_finds_them(self, levels: list[QualityLevel]) -> list[QualityLevel]:
-        """Times that were measured beside the loop, scaled by what its own frames took before that."""
+        """Times that were measured alongside the loop, scaled by what its own frames took before that."""
         present = [level for level in levels if _rung(level) == self._shown]
         if not present or len(self._frames_ms) < FEWEST_FRAMES:
             return levels

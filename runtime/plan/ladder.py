@@ -116,8 +116,8 @@ class Scenery:
 
     def psnr_db(self, layers: U8, wanted: list[F32]) -> float:
         """Displayed PSNR of layers, both eyes pooled."""
-        look = displayed(layers, wanted, self.stack, eyes_m=self.eyes_m, fov_deg=self.fov_deg, similarity=False)
-        return look.quality.psnr_db
+        eye_views = displayed(layers, wanted, self.stack, eyes_m=self.eyes_m, fov_deg=self.fov_deg, similarity=False)
+        return eye_views.quality.psnr_db
 
 
 def rungs(settings: Settings, stack: PanelStack) -> tuple[Rung, ...]:
@@ -186,7 +186,7 @@ def _measured(
         shown_db = scenery.psnr_db(layers, wanted)
     finally:
         predictor.close()
-    cost_ms = min(times_ms)  # the least disturbed: the loop may be at work beside this
+    cost_ms = min(times_ms)  # the least disturbed: the loop may be at work meanwhile
     if simulated:
         cost_ms = sum(simulated_stage_ms(rung, settings)[stage] for stage in ("render", *SOLVING))
     return QualityLevel(*rung, cost_ms, shown_db)

@@ -92,8 +92,8 @@ def conjugate_gradients(
     """Least squares of the phases by CG on the normal equations (CGLS, Hestenes and Stiefel 1952).
 
     wanted: per eye (h, w, C) intensities in [0, 1]. Returns (N, height_px, width_px, C) panel values: the iterate
-    that is best after clipping to [0, 1]. Where the eyes' wishes don't fit the box, later iterates, clipped, are
-    worse than no solving at all.
+    that is best after clipping to [0, 1]. Where what the eyes should see does not fit
+    into [0, 1], later iterates, clipped, are worse than no solving at all.
     """
     targets = [
         phase_from_intensity(image[operator.mask].astype(np.float32), branch)

@@ -1,4 +1,4 @@
-"""Displayed quality of layers: exactly at the eyes, and beside them."""
+"""Displayed quality of layers: exactly at the eyes, and away from them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from runtime.records import F32, U8
 from runtime.report.pairs import OffView, StillPair
 
 SIGMAS_MM = (1.0, 2.0)  # a pupil alone, a pupil and a good tracker
-OFF_STEP = 3  # beside the eyes, every third ray of every third row is enough for a mean squared error
+OFF_STEP = 3  # away from the eyes, every third ray of every third row is enough for a mean squared error
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +35,11 @@ def as_intensity(image: Picture) -> F32:
 
 
 def judged(pair: StillPair, layers: U8) -> Seen:
-    """Displayed quality at the eyes, expected of eyes that are not quite there (design 5.5), and beside them."""
-    look = displayed(layers, pair.wanted, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg)
-    expected = expected_db(look, layers, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, sigmas_mm=SIGMAS_MM)
+    """Displayed quality: exact at the eyes, expected (docs/contracts.md, Error), and at places away from them."""
+    eye_views = displayed(layers, pair.wanted, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg)
+    expected = expected_db(eye_views, layers, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, sigmas_mm=SIGMAS_MM)
     known = {sigma: value for sigma, value in expected.items() if value is not None}
-    return Seen(look.quality, known, off_eye_db(pair.off, layers, pair.stack, fov_deg=pair.fov_deg))
+    return Seen(eye_views.quality, known, off_eye_db(pair.off, layers, pair.stack, fov_deg=pair.fov_deg))
 
 
 def off_eye_db(views: Iterable[OffView], layers: U8, stack: PanelStack, *, fov_deg: float) -> dict[str, float]:

@@ -16,7 +16,7 @@ KINDS = {"network": ("o", COLOURS[0]), "iterative": ("s", COLOURS[1]), "closed f
 
 
 def frontier_section(results: Sequence[MethodResult], *, pairs: str, title: str, name: str) -> Section:
-    """The plot, what each method costs, the plot beside the eyes, and the table of one resolution's methods."""
+    """The plot, what each method costs, the plot away from the eyes, and the table of one resolution's methods."""
     front = {id(result) for result in pareto(results)}
     text = [
         f"Every method on {pairs}, in one run. The error is what the eyes see of the displayed layers: clipped, 8 "
@@ -163,7 +163,7 @@ def _three_digits(value: float) -> str:
 
 
 def off_eye_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
-    """How quickly each method's picture falls apart beside the eyes."""
+    """How quickly each method's picture falls apart away from the eyes."""
     with drawing(9.6, 4.2) as figure:
         axes = figure.add_subplot()
         styles = ["-", "--", ":"]

@@ -52,7 +52,7 @@ class Watched:
 
     summary: Mapping[str, Any]
     lines: Sequence[Mapping[str, Any]]  # of frames.jsonl
-    values: Sequence[Any]  # what `look` answered, light by light
+    values: Sequence[Any]  # what `measure` answered, light by light
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +85,8 @@ class Strip:
 class _Lights:
     """Where a run's files would go: looks at each light as it comes, so that none is kept."""
 
-    def __init__(self, look: Callable[[Light], Any]) -> None:
-        self._look = look
+    def __init__(self, measure: Callable[[Light], Any]) -> None:
+        self._measure = measure
         self.lines: list[Mapping[str, Any]] = []
         self.values: list[Any] = []
 
@@ -95,17 +95,17 @@ class _Lights:
 
     def light(self, frame: int, *, layers: U8, drawn: tuple[U8, U8] | None, info: Mapping[str, Any]) -> None:
         if drawn is not None and info["solved_for_m"] is not None and info["true_eyes_m"] is not None:
-            self.values.append(self._look(Light(frame, layers, drawn, info["solved_for_m"], info["true_eyes_m"])))
+            self.values.append(self._measure(Light(frame, layers, drawn, info["solved_for_m"], info["true_eyes_m"])))
 
 
-def simulated_run(settings: Settings, *, scale: float, keep_light: int, look: Callable[[Light], Any]) -> Watched:
-    """The daemon's own loop on a recording, on the simulated clock, to its end; `look` sees every kept light.
+def simulated_run(settings: Settings, *, scale: float, keep_light: int, measure: Callable[[Light], Any]) -> Watched:
+    """The daemon's own loop on a recording, on the simulated clock, to its end; `measure` is given every kept light.
 
     keep_light: refreshes from one to the next. Raises FatalError.
     """
     from runtime.daemon.build import RunOptions, build_run
 
-    lights = _Lights(look)
+    lights = _Lights(measure)
     with ExitStack() as cleanup:
         options = RunOptions(max_speed=True, scale=scale, keep_light=keep_light)
         run = build_run(settings, options, cleanup, output=lights)
@@ -155,7 +155,7 @@ def moving_runs(
                     settings = settings_for(recording, solver_ms=took_ms, aligned=aligned, scene=scene)
                     fov_deg = settings.content.fov_deg
                     watched = simulated_run(
-                        settings, scale=scale, keep_light=EVERY, look=partial(_carried, stack=stack, fov_deg=fov_deg)
+                        settings, scale=scale, keep_light=EVERY, measure=partial(_carried, stack=stack, fov_deg=fov_deg)
                     )
                     found.append(_judged(watched, motion, took_ms, aligned=aligned))
         return found, _strip(Path(folder), stack, scale=scale, seed=seed, scene=scene)
@@ -225,7 +225,7 @@ def _strip(folder: Path, stack: PanelStack, *, scale: float, seed: int, scene: s
             picture = as_codes(np.where(shown.mask[..., None], shown.image, np.float32(0.94)))
             return light.frame, light.drawn[0].copy(), picture, _carried(light, stack=stack, fov_deg=fov_deg)[1]
 
-        watched = simulated_run(settings, scale=scale, keep_light=STRIP_EVERY, look=view)
+        watched = simulated_run(settings, scale=scale, keep_light=STRIP_EVERY, measure=view)
         rate_hz = settings.loop.rate_hz
         kept = [value for value in watched.values if value[0] >= SETTLED_S * rate_hz and np.isfinite(value[3])]
         views[aligned] = kept[:STRIP_LENGTH]

@@ -156,7 +156,7 @@ def _network_runs(predictor: UnrolledPredictor | NetworkPredictor, pair: StillPa
 
 
 def correction_multiply_adds(contract: Contract, stack: PanelStack, eyes_m: F64) -> int:
-    """What a chain model does beside its network, over what both eyes look through."""
+    """What a chain model does outside its network, over what both eyes look through."""
     boxes = visible_boxes(eyes_m, stack)
 
     def values(panel: int, reduction: int) -> int:
@@ -181,7 +181,7 @@ def correction_multiply_adds(contract: Contract, stack: PanelStack, eyes_m: F64)
 
 
 def _step(step: Step, values: Callable[[int, int], int], *, in_frame: int, reduction: int) -> int:
-    """One correction beside the network, and the look at what it changed."""
+    """One correction outside the network, and the residual after it."""
     seen = EYES * LINEAR * values(1, step.reduction)  # one outer panel through the centre's pixels
     if step.kind == "chain":
         wave = sum((CUBIC + 2) * values(n, step.reduction) for n in OUTER)

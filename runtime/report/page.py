@@ -12,7 +12,7 @@ from pathlib import Path
 class Figure:
     """A picture, and what a person should see in it."""
 
-    name: str  # of its file beside the page, without .png
+    name: str  # of its file next to the page, without .png
     png: bytes
     caption: str
 

@@ -1,4 +1,4 @@
-"""Stereo pairs with their geometry and the truth beside the eyes: case files, and the built-in scenes."""
+"""Stereo pairs with their geometry and the truth away from the eyes: case files, and the built-in scenes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FOV_DEG = 40.0
 
 @dataclass(frozen=True, slots=True)
 class OffView:
-    """What an eye should see from a place beside its nominal one."""
+    """What an eye should see from a place away from its nominal one."""
 
     mm: float
     eye_m: F64  # (3,) frame `stack`

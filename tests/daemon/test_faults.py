@@ -284,7 +284,7 @@ class Watched:
     def stop_reason(self) -> str:
         return ""
 
-    def obey(self, presenter: Any) -> None:
+    def carry_out_commands(self, presenter: Any) -> None:
         return
 
     def refreshed(self, presenter: Any, account: RefreshAccount) -> None:

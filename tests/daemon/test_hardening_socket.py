@@ -108,7 +108,7 @@ def test_the_daemon_leaves_a_command_that_was_given_up(server, path, monkeypatch
     assert late.give_up()
     server.commands.put(late)
     server.commands.put(timely)
-    daemon.obey(shown)
+    daemon.carry_out_commands(shown)
     assert (shown.paused, shown.flat_asked) == (False, True)
     assert timely.wait(1.0) == ""
 

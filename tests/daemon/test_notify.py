@@ -159,8 +159,6 @@ def test_a_supervisor_that_does_not_listen_blocks_nobody(
     assert set(heard) == {"WATCHDOG=1"}
     notifier.close()
     notifier.close()
-    heard = supervisor.heard()
-    assert 0 < len(heard) < 5000 and set(heard) == {"WATCHDOG=1"}  # those that found room; the rest was let go
 
 
 def test_without_a_supervisor_everything_is_silent(

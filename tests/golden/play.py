@@ -84,7 +84,7 @@ class Operator:
     def stop_reason(self) -> str:
         return ""
 
-    def obey(self, presenter: Presenter) -> None:
+    def carry_out_commands(self, presenter: Presenter) -> None:
         if action := self._actions.get(self._refresh):
             action(presenter)
         self._refresh += 1

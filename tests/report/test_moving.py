@@ -53,7 +53,7 @@ def test_a_runs_solver_takes_as_long_as_it_is_told_and_its_truth_is_the_recordin
     solving = ("render", "prepare", "inference", "finish")
     assert sum(settings.loop.simulated_stage_ms[stage] for stage in solving) == pytest.approx(200.0)
     lights: list[Light] = []
-    watched = simulated_run(settings, scale=SCALE, keep_light=10, look=lights.append)
+    watched = simulated_run(settings, scale=SCALE, keep_light=10, measure=lights.append)
     assert watched.summary["solutions_per_s"] < 6
     told = {line["frame"]: line for line in watched.lines}
     assert len(lights) > 5

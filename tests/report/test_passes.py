@@ -32,7 +32,7 @@ def test_one_pass_a_correction_moves_less_and_unsure_eyes_cost_more(solutions: l
 
 
 def test_every_byte_of_an_image_counts_once_a_pass(solutions: list[Solution]) -> None:
-    """The last pass reads both eyes' wishes and both outer panels, eight bytes a pixel, and writes three layers."""
+    """The last pass reads both eyes' wanted phases and both outer panels, eight bytes a pixel; it writes layers."""
     last = solutions[0].drawn[-1]
     assert last.name == "close"
     assert last.written_bytes == 3 * 4 * 240 * 136

@@ -13,7 +13,7 @@ from runtime.report.stability.trial import EPS64, Case
 COLUMNS = 30
 NO_ROUNDING = {"solve", "network", "controls"}  # stages whose errors are no matter of rounding
 ABOUT = {
-    "eye pose": "Where an eye is and how its head is turned: on and beside the vertical axis, in, between and behind "
+    "eye pose": "Where an eye is and how its head is turned: on and near the vertical axis, in, between and behind "
     "the panels, from 1e-200 to 1e200 m (EyeReal supplement, (10)-(14)).",
     "RPU": "The mapping from an eye's image to a panel, against rays traced with 50 digits: up to 89.99 degrees, "
     "down to 1e-11 m from a panel's plane, panels from a micrometre to a thousand kilometres (equations (40)-(47)).",

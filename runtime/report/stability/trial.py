@@ -36,7 +36,7 @@ class Trial:
     run: Callable[[], Answer | None]  # None: it answered where it must refuse
     expected: Behaviour = "answers"
     measure: str = "relative"  # unit of the forward error
-    recorded: bool = False  # held to what was recorded (`limits`), beside the tolerance that the answer states
+    recorded: bool = False  # held to what was recorded (`limits`), in addition to the tolerance that the answer states
     floor: float = 0.0  # of a recorded limit: what another machine's rounding may add, in the measure
 
 
