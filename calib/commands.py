@@ -48,6 +48,8 @@ def charts(
         raise InputError("calibrate charts", "--out", "is missing (or give --show)")
     if kind not in ("solved", "seed"):
         raise InputError("calibrate charts", "--kind", f"must be solved or seed, not {kind}")
+    if check and (kind == "seed" or out is None):
+        raise InputError("calibrate charts", "--check", "measures solved charts that are written: give --out")
     if not 5.0 <= ipd_mm <= 100.0:
         raise InputError("calibrate charts", "--ipd-mm", "must lie between 5 and 100")
     settings, stack = settings_and_stack(config, panels)
@@ -56,11 +58,25 @@ def charts(
     try:
         if out is not None:
             summary = make_charts(out, chosen, drawer, check=check)
-            tell(summary, as_json, f"{summary['files']} files for {len(chosen)} viewpoints in {out}")
+            tell(summary, as_json, f"{summary['files']} files for {len(chosen)} viewpoints in {out}{_fused(summary)}")
         if show:
             show_charts(settings, chosen, drawer)
     finally:
         drawer.close()
+
+
+def _fused(summary: dict[str, Any]) -> str:
+    """What --check found; empty where nothing was checked."""
+    found = summary["psnr_db"]
+    if not found:
+        return ""
+    worst = min(range(len(found)), key=lambda index: found[index])
+    lines = "".join(
+        f"\n  {name:24}{db:6.2f} dB" for name, db in zip(summary["viewpoints"], found, strict=True) if len(found) > 1
+    )
+    name = summary["viewpoints"][worst]
+    middle = sorted(found)[len(found) // 2]
+    return f"\nfused: {middle:.2f} dB at the median viewpoint, {found[worst]:.2f} dB at the worst ({name}){lines}"
 
 
 @app.command()

@@ -44,6 +44,8 @@ SocketPath = Annotated[str, AfterValidator(socket_path)]
 Entry = Annotated[float, Field(ge=-MOST, le=MOST)]  # of a matrix
 Slope = Annotated[float, Field(ge=-0.2, le=0.2)]  # of a panel that should stand upright
 Place = Annotated[float, within(-50.0, 50.0, "m")]  # a coordinate of an eye
+Offset = Annotated[float, within(-10.0, 10.0, "m")]  # of a scene
+Turn = Annotated[float, within(-360.0, 360.0, "degrees")]
 
 
 class StackGeometry(Section):
@@ -250,6 +252,9 @@ class CalibrationSettings(Section):
         return self
 
 
+Layout = Literal["auto", "mono", "side-by-side", "half-side-by-side", "top-bottom", "half-top-bottom", "quilt", "rgbd"]
+
+
 class ContentSettings(Section):
     """What is shown."""
 
@@ -260,8 +265,9 @@ class ContentSettings(Section):
     fov_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="horizontal field of view of eye images")
     background: tuple[Unit, Unit, Unit] = Field((1.0, 1.0, 1.0), description="colour behind the scene, 0-1")
     file: str = Field("", description="a preset's data: its .ply or .glb, or its data-set folder; empty: a stand-in")
-    layout: Literal["auto", "mono", "side-by-side", "top-bottom", "quilt", "rgbd"] = Field(
-        "auto", description="how a picture or video holds its views; auto: by its name (_sbs, _tb, _qs8x6, _rgbd)"
+    layout: Layout = Field(
+        "auto",
+        description="how a picture or video holds its views; auto: by its name (_sbs, _hsbs, _tb, _htb, _qs8x6, _rgbd)",
     )
     quilt: tuple[int, int] = Field((0, 0), description="columns and rows of a quilt; 0, 0: from the file's name")
     cone_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="angle that a quilt's views span")
@@ -279,10 +285,31 @@ class ContentSettings(Section):
     out: Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"] = Field(
         "auto", description="the axis of a mesh or splat that faces the viewer; auto: +z, for PLY +x"
     )
+    animation: str = Field(
+        "", description="which animation of a glTF plays: its name or number (from 0), `none`; empty: the first"
+    )
     samples: Annotated[int, Field(ge=0, le=16)] = Field(
         0, description="samples a pixel for outlines; 0: smooth outlines that a software rasteriser draws faster"
     )
     external: SocketPath = Field("/run/phasestack/content.sock", description="socket of another program's pictures")
+    library: str = Field("", description="folder whose pictures, films, models and playlists the page offers")
+    stream_options: dict[str, str] = Field(
+        default_factory=dict,
+        description="for live pictures, as FFmpeg names them: video_size, framerate, input_format, rtsp_transport, ...",
+    )
+    scale: Annotated[float, within(0.001, 1000.0, "")] = Field(
+        1.0, description="the scene's size, times its own, about the display's middle"
+    )
+    offset_m: tuple[Offset, Offset, Offset] = Field(
+        (0.0, 0.0, 0.0), description="where the scene is moved: out of the screen, to the right, up; metres"
+    )
+    rotation_deg: tuple[Turn, Turn, Turn] = Field(
+        (0.0, 0.0, 0.0),
+        description="the scene's turns about the axes out of the screen, to the right and up, in this order",
+    )
+    turntable_per_min: Annotated[float, within(-600.0, 600.0, "turns a minute")] = Field(
+        0.0, description="the scene turns about the vertical so often a minute; negative: the other way; 0: it stands"
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> ContentSettings:
@@ -429,6 +456,8 @@ class LimitSettings(Section):
     triangles: Annotated[int, Field(ge=1)] = Field(2_000_000, description="triangles of a mesh, all instances together")
     splats: Annotated[int, Field(ge=1)] = Field(3_000_000, description="Gaussians of a splat file")
     instances: Annotated[int, Field(ge=1)] = Field(2000, description="times that meshes stand in a glTF scene")
+    nodes: Annotated[int, Field(ge=1)] = Field(5000, description="nodes of a glTF scene that moves, bones among them")
+    points: Annotated[int, Field(ge=1)] = Field(5_000_000, description="points of a cloud")
     depth: Annotated[int, Field(ge=1, le=512)] = Field(64, description="how deep JSON or a glTF scene may nest")
     load_s: Annotated[float, within(0.01, 86_400.0, "s")] = Field(
         120.0, description="loading of one piece of content is given up after this"
@@ -570,13 +599,28 @@ def _fields(model: type[BaseModel], place: tuple[int | str, ...]) -> list[str]:
 # What is always a path, and what is one where it has a slash or a suffix: a bare word is a name (`demo`, `balanced`).
 PATHS = (
     ("sensor", "openni2_folder"), ("detector", "yunet_model"), ("calibration", "file"), ("content", "file"),
-    ("content", "external"), ("service", "socket"), ("service", "blackbox_folder"),
+    ("content", "library"),    ("content", "external"), ("service", "socket"), ("service", "blackbox_folder"),
 )  # fmt: skip
 NAMES_OR_PATHS = (("content", "scene"), ("model", "name"))
 
 
+LIVE = "live:"  # before a scene: a stream, a capture card or a file, its newest picture
+
+
+def is_live(scene: str) -> bool:
+    """True for a stream's URL, a capture card, or a file behind the mark."""
+    return scene.startswith((LIVE, "/dev/video")) or "://" in scene
+
+
 def located(name: str, folder: Path) -> str:
-    """A name as it is; a path that is relative, seen from a folder. A bare word without a suffix is a name."""
+    """A name as it is; a path that is relative, seen from a folder. A bare word without a suffix is a name.
+
+    What has a scheme (`rtsp://...`) is no path; what is shown as it comes (`live:FILE`) is one behind its mark.
+    """
+    if name.startswith(LIVE) and "://" not in name:
+        return LIVE + located(name.removeprefix(LIVE), folder)
+    if "://" in name:
+        return name
     if not name or "\0" in name or not ("/" in name or Path(name).suffix):
         return name
     return str(folder / name)

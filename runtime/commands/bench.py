@@ -59,6 +59,8 @@ def compare(
 ) -> None:
     """Name what got slower or worse beyond noise. Exits with 1 where anything is named.
 
+    Times are not compared where the machine was too busy in either measurement; that is said.
+
     Example: phasestack bench compare old.json new.json
     """
     from rich.console import Console
@@ -69,12 +71,15 @@ def compare(
     before, after = benchmark.read(old), benchmark.read(new)
     changes = benchmark.compare(before, after)
     worse = [change for change in changes if change.worse]
+    busy = [f"{path}: {why}" for path, file in ((old, before), (new, after)) if (why := benchmark.too_busy(file))]
     if as_json:
         rows = [{"what": change.what, "worse": change.worse, "text": change.text} for change in changes]
-        print(to_json({"worse": len(worse), "changes": rows}))
+        print(to_json({"worse": len(worse), "changes": rows, "times_compared": not busy, "too_busy": busy}))
     else:
         console = Console(highlight=False)
         speed = after["yardstick_ms"] / before["yardstick_ms"]
+        for why in busy:
+            console.print(f"times are not compared, the machine was too busy: {why}", style="yellow", soft_wrap=True)
         console.print(
             f"machine: {speed:.2f} times the time of the yardstick; frame times are compared net of it", soft_wrap=True
         )
@@ -84,7 +89,9 @@ def compare(
                 f"{verdict} {change.what}: {change.text}", style="red" if change.worse else "green", soft_wrap=True
             )
         console.print(
-            f"{len(worse)} worse, {len(changes) - len(worse)} better" if changes else "no change beyond noise"
+            f"{len(worse)} worse, {len(changes) - len(worse)} better"
+            if changes
+            else "no change beyond noise" + (", but for times, which can't be compared: measure again" if busy else "")
         )
     if worse:
         raise typer.Exit(1)

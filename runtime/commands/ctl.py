@@ -36,6 +36,69 @@ def scene(
     tell({"command": "scene", "value": scene_from_here(name)}, config, socket)
 
 
+@app.command("next")
+def next_one(config: Config = None, socket: Socket = None) -> None:
+    """Go to the next scene of the playlist that is shown.
+
+    Example: phasestack ctl next
+    """
+    tell({"command": "next"}, config, socket)
+
+
+@app.command()
+def place(
+    scale: Annotated[float | None, typer.Option(help="the scene's size, times its own")] = None,
+    offset: Annotated[
+        tuple[float, float, float] | None, typer.Option(help="where it is moved: out, right, up; metres")
+    ] = None,
+    rotate: Annotated[
+        tuple[float, float, float] | None, typer.Option(help="turns about the axes out, right and up; degrees")
+    ] = None,
+    turntable: Annotated[float | None, typer.Option(help="turns a minute about the vertical; 0: it stands")] = None,
+    reset: Annotated[bool, typer.Option("--reset", help="as the configuration has it")] = False,
+    config: Config = None,
+    socket: Socket = None,
+) -> None:
+    """Move, turn or scale the scene that is shown, at once. What is not named stays as it is.
+
+    Another scene stands as the configuration has it again. Where nothing would be seen the scene stays where it is,
+    and this exits with 2 and one line.
+
+    Example: phasestack ctl place --scale 1.2 --offset 0.01 0 -0.02 --turntable 3
+    """
+    from runtime.errors import InputError
+
+    given = {"scale": scale, "offset_m": offset, "rotation_deg": rotate, "turntable_per_min": turntable}
+    value = {name: asked for name, asked in given.items() if asked is not None}
+    if reset == bool(value):
+        raise InputError("ctl place", "", "give --reset alone, or what is to change: --scale, --offset, --rotate, ...")
+    tell({"command": "place", "value": None if reset else value}, config, socket)
+
+
+@app.command()
+def model(
+    name: Annotated[str, typer.Argument(help="fast, balanced, best, sart or an ONNX file")],
+    config: Config = None,
+    socket: Socket = None,
+) -> None:
+    """Solve with another model; the present one goes on while it is loaded, and stays where it can't be.
+
+    Example: phasestack ctl model best
+    """
+    from runtime.daemon.names import model_from_here
+
+    tell({"command": "model", "value": model_from_here(name)}, config, socket)
+
+
+@app.command()
+def restart(config: Config = None, socket: Socket = None) -> None:
+    """End the daemon so that its unit starts it again; refused where it is not run by a unit that does.
+
+    Example: phasestack ctl restart
+    """
+    tell({"command": "restart"}, config, socket)
+
+
 @app.command()
 def pause(config: Config = None, socket: Socket = None) -> None:
     """Freeze the picture as it is, until `resume`.

@@ -43,13 +43,15 @@ def page(
     from runtime.blackbox.location import state_folder
     from runtime.commands.status import sockets
     from runtime.page.daemon import Daemon
+    from runtime.page.thumbnails import Thumbnails
     from runtime.page.token import token_of
 
     sockets(config, socket)  # a bad configuration is told now
     path = token_file or state_folder() / "page-token"
     token = token_of(path)
     listening = _listening(host, port)
-    app = application(Daemon(lambda: sockets(config, socket)), token, any_host=not _is_loopback(host))
+    daemon = Daemon(lambda: sockets(config, socket), Thumbnails(path.parent / "thumbnails"))
+    app = application(daemon, token, any_host=not _is_loopback(host))
     settings = uvicorn.Config(
         app,
         log_level="warning",

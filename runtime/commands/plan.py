@@ -95,11 +95,23 @@ def _print(result: dict[str, Any]) -> None:
     console = Console()
     console.print(f"scene {result['scene']}, model {result['model']}, {result['width_px']} x {result['height_px']}")
     table = Table("left out", "why", "saves ms", "costs dB")
+    drifted = result["psnr_db_drifted"]
     for item in result["plan"]:
-        table.add_row(item["what"], item["why"], _number(item["saves_ms"], 1), _number(item["costs_db"], 2))
+        costs = _number(item["costs_db"], 2)
+        if drifted is not None and item["what"] == "render and inference":
+            costs = f"0, and {costs} after a drift of {result['drift_mm']:g} mm"
+        table.add_row(item["what"], item["why"], _number(item["saves_ms"], 1), costs)
     console.print(table)
     console.print(f"one frame: {result['frame_ms']:.1f} ms with the plan, {result['frame_ms_without']:.1f} ms without")
-    console.print(f"displayed: {result['psnr_db']:.2f} dB with, {result['psnr_db_without']:.2f} dB without")
+    console.print(
+        f"displayed to the eyes that were solved for: {result['psnr_db']:.2f} dB with, "
+        f"{result['psnr_db_without']:.2f} dB without"
+    )
+    if drifted is not None:
+        console.print(
+            f"to a resting head that has drifted by {result['drift_mm']:g} mm, just before its picture is renewed: "
+            f"{drifted:.2f} dB"
+        )
     if result["levels"]:
         levels = Table("model and resolution", "ms", "dB", "chosen")
         for level in result["levels"]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,9 +22,12 @@ def report(
     compare: Annotated[
         bool, typer.Option("--compare/--no-compare", help="the published network and other precisions (needs torch)")
     ] = True,
+    fresh: Annotated[bool, typer.Option("--fresh", help="measure again what a stopped run had measured")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
     """Measure quality against run time, in one run on this machine, and write a page of it. Takes minutes.
+
+    Where it is stopped, what it has measured is kept, and the same command goes on from there.
 
     The published network is compared with untrained weights (time and memory only) where torch is installed, and
     with its own as `--model FILE.onnx`.
@@ -39,7 +43,7 @@ def report(
     parts = ["phasestack report", *([f"--pairs {pairs.name}"] if pairs else []), *(["--focal"] if focal else [])]
     parts += [f"--model {Path(name).name}" for name in model or []] + (["--quick"] if quick else [])
     parts += [] if compare else ["--no-compare"]
-    with status_line("report") as tell:
+    with _kept_where_stopped(), status_line("report") as tell:
         done = whole_report(
             pairs=pairs,
             with_focal=focal,
@@ -48,12 +52,14 @@ def report(
             command=" ".join(parts),
             variants=_variants if compare and not quick else lambda width_px, height_px: [],
             progress=tell,
+            fresh=fresh,
         )
     with OutputFolder(out) as folder:
         write_json(folder.staging / "report.json", done.record)
         write_text(folder.staging / "index.html", done.page.html())
         for figure in done.page.figures():
             (folder.staging / f"{figure.name}.png").write_bytes(figure.png)
+    done.forget()
     if as_json:
         print(to_json(done.record))
         return
@@ -68,7 +74,19 @@ def report(
             f"{shown if result['trained'] else '  untrained: no picture':73}{result['memory_mib']:7.0f} MiB",
             soft_wrap=True,
         )
+    if earlier := done.record.get("parts_of_an_earlier_run"):
+        console.print(f"{len(earlier)} parts were measured by an earlier run, which was stopped", soft_wrap=True)
     console.print(f"see {out / 'index.html'}")
+
+
+@contextmanager
+def _kept_where_stopped() -> Iterator[None]:
+    """Says what a stopped run leaves."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo("report: stopped; what is measured is kept, and the same command goes on from there", err=True)
+        raise
 
 
 def _variants(width_px: int, height_px: int) -> list[Method]:

@@ -65,7 +65,7 @@ def describe(answer: dict[str, Any]) -> Iterator[str]:
     if "uptime_s" in answer:
         yield row("up", duration(float(answer["uptime_s"])), f"pid {answer.get('pid', '?')}")
     yield from rates(answer)
-    for name in ("scene", "content", "loading", "refused", "model", "provider", "panels"):
+    for name in ("scene", "content", "content_problem", "loading", "refused", "model", "provider", "panels"):
         if answer.get(name) and (name != "content" or answer["content"] != answer.get("scene")):
             yield row(name, str(answer[name]))
     yield from eyes(answer)

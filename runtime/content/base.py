@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from runtime.errors import ContentFailure
 from runtime.optics.rect import PixelRect
 from runtime.records import F64, U8
 
@@ -22,6 +23,7 @@ class View:
     pixels_from_stack: F64  # (3, 4) projection; third coordinate: positive before the eye, metres
     width_px: int
     height_px: int
+    turned: F64 | None = None  # 3x3 rotation of this view's frame into the display's own, whose lamp stands still
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +32,7 @@ class ContentInfo:
 
     name: str
     moving: bool = False
+    stand_in: bool = False  # what was named is not here, and this is shown in its place; `name` says so
     grey: bool = False
     depth_range_m: tuple[float, float] | None = None  # nearest to farthest along +x of `stack`: (rear, front)
     background: tuple[float, float, float] | None = (1.0, 1.0, 1.0)  # uniform colour behind it, 0-1; None: none
@@ -65,6 +68,26 @@ class ContentSource(ABC):
     def revision(self, *, time_ns: int) -> int:
         """A number that changes when what `render` draws for the same view may have changed; 0 for ever if static."""
         return time_ns if self.info.moving else 0
+
+    def is_empty(self, view: View, *, time_ns: int) -> bool:
+        """True where the eye sees nothing of it in the view; False too where that can't be told yet."""
+        try:
+            return not self.render(view, time_ns=time_ns)[..., 3].any()
+        except ContentFailure:
+            return False
+
+    def describe(self, *, time_ns: int) -> dict[str, Any] | None:
+        """Of a playlist: its entries, which one is shown, for how long still. None: it is none."""
+        return None
+
+    def skip(self, *, time_ns: int) -> bool:
+        """Go to the next one of a playlist; False: there is none."""
+        return False
+
+    @property
+    def problem(self) -> str:
+        """What is wrong at present while the last good picture stays: one line; empty: nothing is."""
+        return ""
 
     def close(self) -> None:  # noqa: B027 - most sources hold nothing
         """Release GL objects and files. May be called twice."""

@@ -104,6 +104,13 @@ class ExternalSource(ContentSource):
         picture = self._pictures[side]
         return picture.warped(matrix, width_px=view.width_px, height_px=view.height_px, side=view.side)
 
+    def is_empty(self, view: View, *, time_ns: int) -> bool:
+        return False  # the client is asked for the eyes that look, and for no others
+
+    @property
+    def problem(self) -> str:
+        return "" if self.status == "connected" else f"external: {self.status}"
+
     def close(self) -> None:
         self._drop("closed")
         self._listener.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from runtime.support.artifacts import read_image
 
 NAME = re.compile(r"pair(\d+)_x(-?[\d.]+)_y(-?[\d.]+)_z(-?[\d.]+)_([01]|left|right)\.(?:jpg|jpeg|png)$", re.IGNORECASE)
 KEPT = 4  # pairs in memory
+USUAL_SEPARATION_M, SEPARATION_DIFFERS_M = 0.06, 0.006
+NEAREST_M, FARTHEST_M = 0.1, 2.0  # of viewers
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +91,28 @@ def read_folder(folder: Path, preset: Preset) -> tuple[Pair, ...]:
             first, second, first_eye, second_eye = second, first, second_eye, first_eye
         pairs.append(Pair(number, (first, second), np.array([first_eye, second_eye]), stack_from_scene[:3, 3]))
     return tuple(pairs)
+
+
+def fitting_presets(folder: Path, presets: Iterable[Preset]) -> list[Preset]:
+    """Those whose scale and axes make people of a folder's eyes, the likeliest first.
+
+    A person's eyes are some 60 mm apart, side by side, before the display: a scale and axes that are not the folder's
+    own put them elsewhere.
+    """
+    found = []
+    for preset in presets:
+        try:
+            eyes_m = np.stack([pair.eyes_m for pair in read_folder(folder, preset)])
+        except InputError:
+            continue
+        apart_m = eyes_m[:, 1] - eyes_m[:, 0]
+        separation_m = np.linalg.norm(apart_m, axis=1)
+        across = np.abs(apart_m[:, 1]) / separation_m
+        distance_m = np.linalg.norm(eyes_m.mean(1), axis=1)
+        apart = abs(float(np.median(separation_m)) - USUAL_SEPARATION_M)
+        if apart <= SEPARATION_DIFFERS_M and across.min() > 0.7 and NEAREST_M < distance_m.min() < FARTHEST_M:
+            found.append((round(apart, 4), preset))
+    return [preset for _, preset in sorted(found, key=lambda item: item[0])]
 
 
 class EyeRealSource(ContentSource):

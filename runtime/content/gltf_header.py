@@ -1,7 +1,4 @@
-"""What a glTF or GLB file says of itself, checked before a loader takes memory for it or passes over what is broken.
-
-The loader believes counts, follows any nesting, and leaves out textures that it can't have without a word.
-"""
+"""What a glTF or GLB file says of itself, checked before memory is taken for it: counts, nesting, what is missing."""
 
 from __future__ import annotations
 
@@ -25,18 +22,20 @@ UNDERSTOOD = {
     "KHR_materials_unlit", "KHR_materials_pbrSpecularGlossiness", "KHR_materials_ior", "KHR_materials_specular",
     "KHR_materials_emissive_strength", "KHR_materials_clearcoat", "KHR_materials_sheen", "KHR_materials_transmission",
     "KHR_materials_volume", "KHR_lights_punctual", "EXT_texture_webp", "KHR_mesh_quantization",
+    "KHR_texture_transform",
 }  # fmt: skip
 MOST_INDEX = (1 << 31) - 1
 
 
 @dataclass(frozen=True, slots=True)
-class _File:
-    """A file's JSON and what it refers to."""
+class GltfFile:
+    """A file's JSON, once it was checked, and the buffers that it refers to."""
 
     path: Path
     table: dict[str, Any]
     binary: bytes | None  # a GLB's own buffer
     limits: LimitSettings
+    buffers: list[bytes] = field(default_factory=list)
     checked: dict[str, list[dict[str, Any]]] = field(default_factory=dict)  # lists that are known to hold objects
 
     def refuse(self, field: str, problem: str) -> InputError:
@@ -54,12 +53,19 @@ class _File:
             raise self.refuse(field, f"names {key}[{number}], which is not there")
         return number
 
+    def view_bytes(self, index: Any, field: str) -> tuple[bytes, int]:
+        """What a buffer view holds, and its stride (0: none). Raises InputError."""
+        view = self.at("bufferViews", index, field)
+        start, length = int(view.get("byteOffset", 0)), int(view.get("byteLength", 0))  # known to be whole
+        stride = foreign.whole(view.get("byteStride", 0), least=0, most=252, source=self.path, field=f"{field}.stride")
+        return self.buffers[int(view["buffer"])][start : start + length], stride
+
     def at(self, key: str, index: Any, field: str) -> dict[str, Any]:
         """The object that an index names. Raises InputError where it isn't there."""
         return self.objects(key)[self.index(key, index, field)]
 
 
-def check_gltf(path: Path, data: bytes, *, limits: LimitSettings) -> None:
+def check_gltf(path: Path, data: bytes, *, limits: LimitSettings) -> GltfFile:
     """data: the whole file. Raises InputError, naming the field: over a limit, nested too deep, parts missing."""
     file = _read(path, data, limits)
     required = file.table.get("extensionsRequired", [])
@@ -67,15 +73,17 @@ def check_gltf(path: Path, data: bytes, *, limits: LimitSettings) -> None:
         for name in required:
             if name not in UNDERSTOOD:
                 raise file.refuse("extensionsRequired", f"{foreign.shown(name)} is not understood")
-    buffers = [
+    file.buffers.extend(
         _buffer(file, index, item, limits.file_mib * foreign.MIB) for index, item in enumerate(file.objects("buffers"))
-    ]
-    _check_views(file, buffers)
+    )
+    _check_views(file)
     _check_counts(file)
-    _check_pictures(file, buffers)
+    _check_bones(file)
+    _check_pictures(file)
+    return file
 
 
-def _read(path: Path, data: bytes, limits: LimitSettings) -> _File:
+def _read(path: Path, data: bytes, limits: LimitSettings) -> GltfFile:
     binary = None
     text = data
     if data[:4] == GLB_MAGIC:
@@ -89,7 +97,7 @@ def _read(path: Path, data: bytes, limits: LimitSettings) -> _File:
     table = foreign.parsed_json(text, source=path, most_depth=limits.depth)
     if not isinstance(table, dict):
         raise InputError(path, "", "malformed: a glTF file is a JSON object")
-    return _File(path, table, binary, limits)
+    return GltfFile(path, table, binary, limits)
 
 
 def _chunks(path: Path, data: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -105,7 +113,7 @@ def _chunks(path: Path, data: bytes) -> Iterator[tuple[bytes, bytes]]:
         at += 8 + size + (-size % 4)
 
 
-def _objects(table: dict[str, Any], key: str, file: _File) -> list[dict[str, Any]]:
+def _objects(table: dict[str, Any], key: str, file: GltfFile) -> list[dict[str, Any]]:
     items = table.get(key, [])
     if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
         raise file.refuse(key, "must be a list of objects")
@@ -124,7 +132,7 @@ def file_of(uri: str, *, source: Path, field: str) -> Path | None:
     return source.parent / name
 
 
-def _held(file: _File, item: dict[str, Any], field: str, missing: str, most_bytes: float) -> bytes | None:
+def _held(file: GltfFile, item: dict[str, Any], field: str, missing: str, most_bytes: float) -> bytes | None:
     """The bytes that an object's URI stands for; None without one. Raises InputError.
 
     missing: the field that is told where the file is not there.
@@ -146,7 +154,7 @@ def _held(file: _File, item: dict[str, Any], field: str, missing: str, most_byte
         raise file.refuse(f"{field}.uri", "is no base64") from None
 
 
-def _buffer(file: _File, index: int, item: dict[str, Any], most_bytes: float) -> bytes:
+def _buffer(file: GltfFile, index: int, item: dict[str, Any], most_bytes: float) -> bytes:
     field = f"buffers[{index}]"
     wanted = foreign.whole(
         item.get("byteLength", 0), least=0, most=1 << 40, source=file.path, field=f"{field}.byteLength"
@@ -164,19 +172,19 @@ def _name(item: dict[str, Any]) -> str:
     return f"{foreign.shown(unquote(uri), most=200)} " if uri and not uri.startswith("data:") else ""
 
 
-def _check_views(file: _File, buffers: list[bytes]) -> None:
+def _check_views(file: GltfFile) -> None:
     for index, view in enumerate(file.objects("bufferViews")):
         field = f"bufferViews[{index}]"
         start, length = (
             foreign.whole(view.get(key, 0), least=0, most=1 << 40, source=file.path, field=f"{field}.{key}")
             for key in ("byteOffset", "byteLength")
         )
-        held = len(buffers[file.index("buffers", view.get("buffer"), f"{field}.buffer")])
+        held = len(file.buffers[file.index("buffers", view.get("buffer"), f"{field}.buffer")])
         if start + length > held:
             raise file.refuse(field, f"ends at byte {start + length} of {held}")
 
 
-def _check_counts(file: _File) -> None:
+def _check_counts(file: GltfFile) -> None:
     """Accessors, triangles, instances and nesting against the limits."""
     limits, total = file.limits, 0
     counts = []
@@ -196,7 +204,7 @@ def _check_counts(file: _File) -> None:
     foreign.within(max(triangles, held), limits.triangles, source=file.path, field="meshes", limit="limits.triangles")
 
 
-def _triangles(file: _File, index: int, mesh: dict[str, Any], counts: list[int]) -> list[int]:
+def _triangles(file: GltfFile, index: int, mesh: dict[str, Any], counts: list[int]) -> list[int]:
     """Triangles of each primitive of a mesh."""
     result = []
     for number, primitive in enumerate(_objects(mesh, "primitives", file)):
@@ -213,7 +221,7 @@ def _triangles(file: _File, index: int, mesh: dict[str, Any], counts: list[int])
     return result
 
 
-def _instances(file: _File, meshes: int) -> dict[int, int]:
+def _instances(file: GltfFile, meshes: int) -> dict[int, int]:
     """How often each mesh stands in the scene. Raises InputError for nodes that nest too deep, or in a circle."""
     nodes = file.objects("nodes")
     scenes = file.objects("scenes")
@@ -240,27 +248,42 @@ def _instances(file: _File, meshes: int) -> dict[int, int]:
     return stands
 
 
-def _list(file: _File, value: Any, field: str) -> list[Any]:
+def _list(file: GltfFile, value: Any, field: str) -> list[Any]:
     if not isinstance(value, list):
         raise file.refuse(field, "must be a list")
     return value
 
 
-def _check_pictures(file: _File, buffers: list[bytes]) -> None:
+def picture_bytes(file: GltfFile, index: int) -> bytes:
+    """The coded picture images[index]. Raises InputError."""
+    field, image = f"images[{index}]", file.objects("images")[index]
+    data = _held(file, image, field, "texture", file.limits.file_mib * foreign.MIB)
+    if data is not None:
+        return data
+    if "bufferView" not in image:
+        raise file.refuse("texture", f"{field} has neither a file nor data")
+    return file.view_bytes(image["bufferView"], f"{field}.bufferView")[0]
+
+
+def _check_bones(file: GltfFile) -> None:
+    """What moves: every node of it is worked out for every picture."""
+    limits = file.limits
+    bones = 0
+    for index, skin in enumerate(file.objects("skins")):
+        bones += len(_list(file, skin.get("joints"), f"skins[{index}].joints"))
+        foreign.within(bones, limits.nodes, source=file.path, field=f"skins[{index}].joints", limit="limits.nodes")
+    if file.objects("animations") or bones:
+        foreign.within(len(file.objects("nodes")), limits.nodes, source=file.path, field="nodes", limit="limits.nodes")
+
+
+def _check_pictures(file: GltfFile) -> None:
     """Every picture can be decoded and is within the limit; every texture that a material names is there."""
     for index, image in enumerate(file.objects("images")):
         field = f"images[{index}]"
         if image.get("mimeType") == "image/ktx2":
             raise file.refuse("texture", f"{field} is KTX2, which is not understood; PNG, JPEG or WebP are")
-        data = _held(file, image, field, "texture", file.limits.file_mib * foreign.MIB)
-        if data is None:
-            if "bufferView" not in image:
-                raise file.refuse("texture", f"{field} has neither a file nor data")
-            view = file.at("bufferViews", image["bufferView"], f"{field}.bufferView")
-            start, length = int(view.get("byteOffset", 0)), int(view.get("byteLength", 0))  # known to be whole
-            data = buffers[int(view["buffer"])][start : start + length]
         name = _name(image).rstrip() or field
-        check_picture(data, source=file.path, field="texture", name=name, limits=file.limits)
+        check_picture(picture_bytes(file, index), source=file.path, field="texture", name=name, limits=file.limits)
     for index, material in enumerate(file.objects("materials")):
         field = f"materials[{index}]"
         shading = material.get("pbrMetallicRoughness", {})

@@ -25,7 +25,13 @@ from runtime.support.picture_header import check_size, size_of_file
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEOS = (".mp4", ".mkv", ".avi", ".mov", ".webm", ".m4v")
-QUILT_NAME = re.compile(r"_qs([0-9]+)x([0-9]+)")
+QUILT_NAME = re.compile(r"_qs([0-9]+)x([0-9]+)(?:a([0-9]+(?:\.[0-9]+)?))?")
+ASPECT_LEAST, ASPECT_MOST = 0.05, 20.0  # width over height of one view
+MARKS = (  # in a file's name, the longer ones first
+    ("_rgbd", "rgbd"), ("_hsbs", "half-side-by-side"), ("_half_sbs", "half-side-by-side"),
+    ("_htb", "half-top-bottom"), ("_hou", "half-top-bottom"), ("_half_ou", "half-top-bottom"),
+    ("_half_tb", "half-top-bottom"), ("_sbs", "side-by-side"), ("_tb", "top-bottom"), ("_ou", "top-bottom"),
+)  # fmt: skip
 TELL_EVERY = 64
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 VIDEO_FRAMES_MAX = 1e8
@@ -44,7 +50,7 @@ def layout_of(path: Path, settings: ContentSettings) -> str:
     stem = path.stem.lower()
     if QUILT_NAME.search(stem):
         return "quilt"
-    for mark, layout in (("_rgbd", "rgbd"), ("_sbs", "side-by-side"), ("_tb", "top-bottom"), ("_ou", "top-bottom")):
+    for mark, layout in MARKS:
         if stem.endswith(mark) or f"{mark}_" in stem:
             return layout
     return "mono"
@@ -60,14 +66,33 @@ def quilt_size(path: Path, settings: ContentSettings) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def screen(stack: PanelStack, *, width_px: int, height_px: int) -> PlaneRaster:
-    """A picture's pixels on the plane through the stack's centre: as large as the display lets its shape be."""
-    pitch_m = min(stack.width_m / width_px, stack.height_m / height_px)
+def pixel_aspect(path: Path, layout: str, *, width_px: int, height_px: int) -> float:
+    """Width over height of a pixel of a view of that size: of halves, and of a quilt whose name tells its aspect.
+
+    Raises InputError for an aspect that no picture has.
+    """
+    if layout.startswith("half"):
+        return 2.0 if layout == "half-side-by-side" else 0.5
+    found = QUILT_NAME.search(path.stem.lower()) if layout == "quilt" else None
+    if not found or not found[3]:
+        return 1.0
+    aspect = float(found[3])
+    if not ASPECT_LEAST <= aspect <= ASPECT_MOST:
+        raise InputError(path, "quilt", f"an aspect of {aspect:g}; must be {ASPECT_LEAST:g} to {ASPECT_MOST:g}")
+    return aspect * height_px / width_px
+
+
+def screen(stack: PanelStack, *, width_px: int, height_px: int, pixel_aspect: float = 1.0) -> PlaneRaster:
+    """A picture's pixels on the plane through the stack's centre: as large as the display lets its shape be.
+
+    pixel_aspect: width of a pixel over its height.
+    """
+    pitch_m = min(stack.width_m / (width_px * pixel_aspect), stack.height_m / height_px)
     return PlaneRaster(
         x_m=0.0,
-        left_m=-pitch_m * width_px / 2,
+        left_m=-pitch_m * pixel_aspect * width_px / 2,
         top_m=pitch_m * height_px / 2,
-        pitch_u_m=pitch_m,
+        pitch_u_m=pitch_m * pixel_aspect,
         pitch_v_m=pitch_m,
         width_px=width_px,
         height_px=height_px,
@@ -209,6 +234,7 @@ def split(rgb: U8, layout: str, quilt: tuple[int, int] = (1, 1)) -> list[U8]:
     Raises ValueError for a picture that is smaller than one pixel a view.
     """
     height, width = rgb.shape[:2]
+    layout = layout.removeprefix("half-")
     columns, rows = {"side-by-side": (2, 1), "top-bottom": (1, 2), "quilt": quilt}.get(layout, (1, 1))
     if not 0 < columns <= width or not 0 < rows <= height:
         raise ValueError(f"{width} x {height} pixels cannot hold {columns} x {rows} views")
@@ -249,7 +275,8 @@ class ScreenPictures(ContentSource):
             height, width = split(frames.frame(0), layout, quilt)[0].shape[:2]
         except ValueError as error:
             raise InputError(path, "quilt" if layout == "quilt" else "layout", str(error)) from None
-        self._screen = screen(stack, width_px=width, height_px=height)
+        aspect = pixel_aspect(path, layout, width_px=width, height_px=height)
+        self._screen = screen(stack, width_px=width, height_px=height, pixel_aspect=aspect)
         self._shown: dict[int, WarpedPicture] = {}
         self._at = -1
         self._views: list[U8] = []

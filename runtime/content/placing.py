@@ -7,22 +7,23 @@ from pathlib import Path
 import numpy as np
 
 from runtime.config import ContentSettings
-from runtime.content.presets import Axis, axes_matrix
+from runtime.content.presets import axes_matrix
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
 
 FILL = 0.85  # of the display's width and height that a fitted scene takes
 FARTHEST_VIEWER_M = 1.5
+Z_UP = (".ply", ".stl")
 
 
 def axes_of(settings: ContentSettings, path: Path) -> F64:
-    """3x3 scene_from_stack rotation of a file: glTF and OBJ have y up and face +z; PLY has z up and faces +x here."""
+    """3x3 scene_from_stack rotation of a file: glTF and OBJ have y up and face +z; PLY and STL have z up, face +x."""
     if settings.up != "auto" and settings.out != "auto":
         return axes_matrix(out=settings.out, up=settings.up)
-    out: Axis = "+x" if path.suffix.lower() == ".ply" else "+z"
-    up: Axis = "+z" if path.suffix.lower() == ".ply" else "+y"
-    return axes_matrix(out=out, up=up)
+    if path.suffix.lower() in Z_UP:
+        return axes_matrix(out="+x", up="+z")
+    return axes_matrix(out="+z", up="+y")
 
 
 def fitted(low: F64, high: F64, *, axes: F64, stack: PanelStack, depth_m: tuple[float, float]) -> F64:

@@ -1,10 +1,11 @@
-"""The vertices of a PLY file as a table: scalar properties only, which is all that splat files have."""
+"""The vertices of a PLY file as a table: scalar properties only, which is all that splats and point clouds have."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ TYPES = {
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
+_FACES = re.compile(rb"element (?:face|tristrips)\s+0*[1-9]")
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -58,13 +60,25 @@ def check_counts(path: Path, data: bytes, *, limits: LimitSettings) -> None:
             raise InputError(path, field, f"the file is cut off: {count:,} are promised in {held:,} bytes")
 
 
-def read_vertices(path: Path, *, limits: LimitSettings | None = None) -> Table:
-    """A structured array with a field for each property. Raises InputError: no PLY, truncated, lists among them."""
+def holds_points_alone(path: Path) -> bool:
+    """True where a PLY's header has vertices and no faces. Raises InputError where it can't be read."""
+    with foreign.open_regular(path) as file:
+        head = file.read(LONGEST_HEADER).partition(b"end_header")[0]
+    return head.startswith(b"ply") and b"element vertex" in head and not _FACES.search(head)
+
+
+def read_vertices(
+    path: Path, *, limits: LimitSettings | None = None, kind: Literal["splats", "points"] = "splats"
+) -> Table:
+    """A structured array with a field for each property. Raises InputError: no PLY, truncated, lists among them.
+
+    kind: what the vertices are, which says how many there may be.
+    """
     limits = limits or LimitSettings()
     with foreign.open_regular(path, most_bytes=round(limits.file_mib * foreign.MIB)) as file:
         head = file.read(LONGEST_HEADER)
         size = file.seek(0, 2)
-        header = _header(head, path, limits)
+        header = _header(head, path, limits, kind)
         if not header.ascii:
             held = (size - header.starts_at) // header.dtype.itemsize
             if held < header.count:
@@ -76,7 +90,7 @@ def read_vertices(path: Path, *, limits: LimitSettings | None = None) -> Table:
         table = np.empty(header.count, header.dtype)
         fill = _from_text if header.ascii else _from_bytes
         for start in range(0, header.count, ROWS_AT_ONCE):
-            progress.tell(f"{path.name}: splats", start, header.count)
+            progress.tell(f"{path.name}: {kind}", start, header.count)
             fill(table[start : start + ROWS_AT_ONCE], file, path, start)
     return table
 
@@ -102,7 +116,7 @@ def _from_text(rows: Table, file: IO[bytes], path: Path, start: int) -> None:
         rows[name] = values[:, column]
 
 
-def _header(head: bytes, path: Path, limits: LimitSettings) -> _Header:
+def _header(head: bytes, path: Path, limits: LimitSettings, what: Literal["splats", "points"]) -> _Header:
     text, mark, _ = head.partition(b"end_header")
     newline = head.find(b"\n", len(text))
     if not head.startswith(b"ply") or not mark or newline < 0:
@@ -137,5 +151,5 @@ def _header(head: bytes, path: Path, limits: LimitSettings) -> _Header:
         raise InputError(path, "vertex", "the header declares none")
     if len({name for name, _ in fields}) < len(fields):
         raise InputError(path, "vertex", "a property is declared twice")
-    foreign.within(count, limits.splats, source=path, field="vertex", limit="limits.splats")
+    foreign.within(count, getattr(limits, what), source=path, field="vertex", limit=f"limits.{what}")
     return _Header(order == "ascii", count, np.dtype(fields), newline + 1)

@@ -7,15 +7,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from runtime.config import ContentSettings, LimitSettings
+from runtime.config import ContentSettings, LimitSettings, is_live
 from runtime.content.base import ContentSource
+from runtime.content.placed import placed_source, placing_of
 from runtime.content.presets import Preset, preset, preset_names
 from runtime.content.scenes import SCENES
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.support import foreign, progress
 
-MESHES = (".glb", ".gltf", ".obj")
+MESHES = (".glb", ".gltf", ".obj", ".stl")
+PLAYLISTS = (".toml", ".json")
 Opener = Callable[[Any], ContentSource]
 
 
@@ -37,7 +39,12 @@ def prepare_content(settings: ContentSettings, stack: PanelStack, *, limits: Lim
     """
     limits = limits or LimitSettings()
     with progress.task(f"loading {settings.scene}", seconds=limits.load_s, too_slow=_too_slow(settings.scene, limits)):
-        return _prepared(settings, stack, limits)
+        return _placed(settings, stack, limits)
+
+
+def _placed(settings: ContentSettings, stack: PanelStack, limits: LimitSettings) -> Opener:
+    opener, placing = _prepared(settings, stack, limits), placing_of(settings)
+    return lambda context: placed_source(opener(context), placing, stack)
 
 
 def _too_slow(scene: str, limits: LimitSettings) -> InputError:
@@ -55,6 +62,8 @@ def _prepared(settings: ContentSettings, stack: PanelStack, limits: LimitSetting
         if settings.file:
             return _from_path(Path(settings.file), settings, stack, chosen, limits)
         return _stand_in(name, settings, stack)
+    if is_live(name):
+        return _live(name, settings, stack, limits)
     path = foreign.checked_path(name, source="content", field="scene")
     if not path.exists():
         known = ", ".join((*SCENES, *preset_names(), "external"))
@@ -70,6 +79,8 @@ def _from_path(
         raise InputError(path, "", "is not there")
     progress.tell(f"loading {path.name}", 0)
     suffix = path.suffix.lower()
+    if suffix in PLAYLISTS and path.is_file():
+        return _playlist(path, settings, stack, limits)
     if path.is_dir():
         from runtime.content.eyereal import is_data_set
 
@@ -79,8 +90,12 @@ def _from_path(
     if suffix in MESHES:
         return _mesh(path, settings, stack, chosen, limits)
     if suffix == ".ply":
+        from runtime.content.ply import holds_points_alone
+
         if _holds_splats(path):
             return _splat(path, settings, stack, chosen, limits)
+        if holds_points_alone(path):
+            return _points(path, settings, stack, chosen, limits)
         return _mesh(path, settings, stack, chosen, limits)
     return _pictures(path, settings, stack, limits)
 
@@ -104,7 +119,7 @@ def _stand_in(name: str, settings: ContentSettings, stack: PanelStack) -> Opener
 
     def make(context: Any) -> ContentSource:
         source = make_demo(context)
-        source.info = replace(source.info, name=f"{name} (stand-in `demo`: content.file is empty)")
+        source.info = replace(source.info, name=f"{name} (stand-in `demo`: content.file is empty)", stand_in=True)
         return source
 
     return make
@@ -119,17 +134,44 @@ def _external(settings: ContentSettings, stack: PanelStack) -> Opener:
     return make
 
 
-def _eyereal(path: Path, settings: ContentSettings, chosen: Preset | None) -> Opener:
-    from runtime.content.eyereal import EyeRealSource, read_folder
+def _live(name: str, settings: ContentSettings, stack: PanelStack, limits: LimitSettings) -> Opener:
+    from runtime.content.stream import LiveSource, open_feed
 
-    name = chosen.name if chosen else next((known for known in preset_names() if known in path.resolve().name), "")
-    if not name:
-        raise InputError(path, "name", "names no preset: set content.scene to one and content.file to the folder")
+    feed, layout, quilt = open_feed(name, settings, limits)
+    return lambda context: LiveSource(feed, layout=layout, quilt=quilt, stack=stack, settings=settings)
+
+
+def _eyereal(path: Path, settings: ContentSettings, chosen: Preset | None) -> Opener:
+    from runtime.content.eyereal import EyeRealSource, fitting_presets, read_folder
+
     # The data set was drawn by the published code: its scale holds in every reading.
     reading = "published-code" if settings.reading == "seed" else settings.reading
-    pairs = read_folder(path, preset(name, reading))
-    source = EyeRealSource(pairs, fov_deg=settings.fov_deg, background=settings.background, name=name)
+    known = chosen.name if chosen else next((name for name in preset_names() if name in path.resolve().name), "")
+    told = known
+    if not known:
+        fitting = fitting_presets(path, (preset(name, reading) for name in preset_names()))
+        if not fitting:
+            problem = "names no preset, and its eyes fit none: set content.scene to one and content.file to the folder"
+            raise InputError(path, "name", problem)
+        known = fitting[0].name
+        told = f"{path.resolve().name} (read as {known}, which its eyes fit)"
+    pairs = read_folder(path, preset(known, reading))
+    source = EyeRealSource(pairs, fov_deg=settings.fov_deg, background=settings.background, name=told)
     return lambda context: source
+
+
+def _playlist(path: Path, settings: ContentSettings, stack: PanelStack, limits: LimitSettings) -> Opener:
+    from runtime.content.playlist import PlaylistSource, read_playlist
+
+    playlist = read_playlist(path, settings)
+    openers = []
+    for number, entry in enumerate(playlist.entries):
+        progress.tell(f"{path.name}: {Path(entry.settings.scene).name}", number, len(playlist.entries))
+        try:
+            openers.append(_placed(entry.settings, stack, limits))
+        except InputError as error:
+            raise InputError(path, f"show[{number}]", str(error)) from None
+    return lambda context: PlaylistSource(playlist, openers, context=context, background=settings.background)
 
 
 def _pictures(path: Path, settings: ContentSettings, stack: PanelStack, limits: LimitSettings) -> Opener:
@@ -150,6 +192,7 @@ def _pictures(path: Path, settings: ContentSettings, stack: PanelStack, limits: 
                 depth_m=settings.depth_m,
                 context=context,
                 background=settings.background,
+                samples=settings.samples,
             )
 
         return make
@@ -165,7 +208,7 @@ def _mesh(
     from runtime.content.placing import stack_from_scene
     from runtime.content.triangles import ready
 
-    data = load_mesh(path, limits=limits)
+    data = load_mesh(path, limits=limits, animation=settings.animation)
     parts = []
     for number, part in enumerate(data.parts):
         progress.tell(f"{path.name}: outlines", number, len(data.parts))
@@ -210,6 +253,30 @@ def _splat(
     )
     return lambda context: SplatSource(
         gaussians, stack_from_scene=matrix, context=context, background=settings.background, name=path.stem
+    )
+
+
+def _points(
+    path: Path, settings: ContentSettings, stack: PanelStack, chosen: Preset | None, limits: LimitSettings
+) -> Opener:
+    import numpy as np
+
+    from runtime.content.placing import stack_from_scene
+    from runtime.content.points import PointSource, load_points
+
+    cloud = load_points(path, limits=limits)
+    # A few stray points must not decide the scale.
+    low, high = np.percentile(cloud.positions.astype(np.float64), [0.5, 99.5], axis=0)
+    matrix = stack_from_scene(
+        low,
+        high,
+        settings=settings,
+        path=path,
+        stack=stack,
+        scene_from_stack=chosen.scene_from_stack if chosen else None,
+    )
+    return lambda context: PointSource(
+        cloud, stack_from_scene=matrix, context=context, background=settings.background, name=path.stem
     )
 
 

@@ -1,4 +1,8 @@
-"""A picture with depth: colour and a grey depth map side by side, drawn as a surface."""
+"""A picture with depth: colour and a grey depth map side by side, drawn as two surfaces.
+
+The front one is the picture, split where its depth jumps. The other one is what lies behind its edges, made up from
+what is seen beside them: a viewer who looks past an edge sees neither a hole nor the near thing drawn out.
+"""
 
 from __future__ import annotations
 
@@ -7,21 +11,30 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.content.base import ContentInfo, DrawingSource, View
 from runtime.content.images import rgba_from_rgb
 from runtime.content.pictures import screen
-from runtime.content.shapes import Shape
+from runtime.content.shapes import I32, Shape
 from runtime.content.triangles import Part, TrianglePainter
 from runtime.errors import InputError
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
-from runtime.records import F32, U8
+from runtime.records import F32, F64, U8
 from runtime.support.gl import DrawnPicture
 
-COLUMNS = 320  # of the surface: as fine as depth cameras see, and quick without a graphics card
+COLUMNS = 320  # of the surface where it is smooth: as fine as depth cameras see, and quick without a graphics card
+FINEST_COLUMNS = 1600  # of the surface beside an edge
 NOMINAL_DISTANCE_M = 0.6  # from here the surface looks like the picture
 TORN_RELATIVE = 0.12  # of the depth range: a larger step between neighbours is an edge, not a slope
+BLURRED_PX = 5  # so wide an edge of the depth map still is one
+MIXED_PX = 2  # to either side of an edge colours are of both sides
+BEHIND_SHARE = 0.1  # of the picture's width: so far behind an edge a surface is made up
+SET_BACK = 0.004  # of the depth range: the made-up surface lies behind the true one where both are
+SAMPLES = 4  # a pixel: the split edges are its outlines
+
+Mask = NDArray[np.bool_]
 
 
 def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
@@ -35,29 +48,157 @@ def split_rgbd(rgb: U8, path: Path) -> tuple[U8, F32]:
     return np.ascontiguousarray(rgb[:, :width]), depth.mean(2, dtype=np.float32) / 255
 
 
-def surface(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float, float]) -> Part:
-    """The picture as triangles: each point on its ray from the nominal eye, at its depth; torn at edges."""
+def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float, float]) -> list[Part]:
+    """The picture as triangles, each point on its ray from the nominal eye, at its depth: in front, and behind edges.
+
+    colour: (h, w, 3); depth: (h, w), 1 nearest.
+    """
+    depth = sharpened(depth)
+    colour = unmixed(colour, depth)
     height, width = depth.shape
-    columns = min(COLUMNS, width)
-    rows = max(round(height * columns / width), 2)
-    coarse = cv2.resize(depth, (columns, rows), interpolation=cv2.INTER_NEAREST)
+    if width > FINEST_COLUMNS:
+        rows = max(round(height * FINEST_COLUMNS / width), 2)
+        depth = np.asarray(cv2.resize(depth, (FINEST_COLUMNS, rows), interpolation=cv2.INTER_NEAREST), np.float32)
+    parts = [_placed(depth, _quads(depth), rgba_from_rgb(colour), stack=stack, depth_m=depth_m)]
+    columns = min(COLUMNS, depth.shape[1])
+    size = (columns, max(round(depth.shape[0] * columns / depth.shape[1]), 2))
+    coarse = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
+    coloured = np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+    behind, filled = background(coarse, coloured)
+    if not np.isnan(behind).all():
+        corners = np.isnan(np.stack([behind[:-1, :-1], behind[1:, :-1], behind[:-1, 1:], behind[1:, 1:]])).any(0)
+        first = np.flatnonzero(~corners.reshape(-1))
+        quads = _corners(first // (size[0] - 1), first % (size[0] - 1), size[0])
+        steps = np.ptp(behind.reshape(-1)[quads], axis=1) if len(quads) else np.empty(0)
+        quads = quads[steps <= TORN_RELATIVE]
+        if len(quads):
+            set_back = np.nan_to_num(behind) - SET_BACK
+            parts.append(_placed(set_back, quads, rgba_from_rgb(filled), stack=stack, depth_m=depth_m))
+    return parts
+
+
+def sharpened(depth: F32) -> F32:
+    """(h, w) depth whose edges are one step wide: what a blur left between two sides goes to the nearer one."""
+    kernel = np.ones((BLURRED_PX, BLURRED_PX), np.uint8)
+    high, low = cv2.dilate(depth, kernel), cv2.erode(depth, kernel)
+    snapped = np.where(high - depth < depth - low, high, low)
+    return np.where(high - low > TORN_RELATIVE, snapped, depth).astype(np.float32)
+
+
+def unmixed(colour: U8, depth: F32) -> U8:
+    """(h, w, 3) colours; those beside an edge of the depth are taken from farther inside their own side."""
+    kernel = np.ones((2 * MIXED_PX + 1, 2 * MIXED_PX + 1), np.uint8)
+    unknown = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel) > TORN_RELATIVE
+    if not unknown.any():
+        return colour
+    known, result = ~unknown, colour.astype(np.float32)
+    for _ in range(2 * MIXED_PX):
+        grown, values, _ = _grown(known, unknown & ~known, result, depth, depth)
+        result[grown], known = values[grown], known | grown
+    return np.clip(np.rint(result), 0, 255).astype(np.uint8)
+
+
+def background(depth: F32, colour: U8) -> tuple[F32, U8]:
+    """(h, w) depth and (h, w, 3) colour of what lies behind edges, made up from their far side; NaN elsewhere.
+
+    It grows from the far side under the near one, a pixel a step, each the mean of what it grows from; a ring of the
+    far side itself belongs to it, so that it has no gap there.
+    """
+    steps = round(BEHIND_SHARE * depth.shape[1])
+    kernel = np.ones((5, 5), np.uint8)
+    far_side = depth < cv2.dilate(depth, kernel) - TORN_RELATIVE
+    behind = np.where(far_side, depth, np.float32(np.nan))
+    result = colour.astype(np.float32)
+    for _ in range(steps):
+        known = ~np.isnan(behind)
+        grown, values, depths = _grown(known, ~known, result, behind, depth, under=True)
+        if not grown.any():
+            break
+        behind[grown], result[grown] = depths[grown], values[grown]
+    return behind, np.clip(np.rint(result), 0, 255).astype(np.uint8)
+
+
+def _grown(
+    known: Mask, wanted: Mask, colour: F32, depth: F32, own: F32, *, under: bool = False
+) -> tuple[Mask, F32, F32]:
+    """Which of `wanted` have known neighbours of their own side, and the means of their colours and depths.
+
+    own: the depth of each pixel itself; under: neighbours count that lie behind it, rather than beside it.
+    """
+    sums = np.zeros((*own.shape, 4), np.float32)
+    count = np.zeros(own.shape, np.float32)
+    held = np.dstack([colour, np.nan_to_num(depth)])
+    for down in (-1, 0, 1):
+        for across in (-1, 0, 1):
+            if not (down or across):
+                continue
+            here, there = _shifted(down, own.shape[0]), _shifted(across, own.shape[1])
+            step = own[here[0], there[0]] - held[here[1], there[1], 3]
+            counts = known[here[1], there[1]] & ((step > TORN_RELATIVE / 2) if under else (abs(step) <= TORN_RELATIVE))
+            sums[here[0], there[0]] += counts[..., None] * held[here[1], there[1]]
+            count[here[0], there[0]] += counts
+    grown = wanted & (count > 0)
+    means: F32 = (sums / np.maximum(count, 1)[..., None]).astype(np.float32)
+    return grown, means[..., :3], means[..., 3]
+
+
+def _shifted(step: int, size: int) -> tuple[slice, slice]:
+    """Where pixels are along an axis, and where their neighbours a step on."""
+    return slice(max(-step, 0), size - max(step, 0)), slice(max(step, 0), size - max(-step, 0))
+
+
+def _quads(depth: F32) -> I32:
+    """(n, 4) corners, as indices into the depth map: large where it is smooth, single pixels beside edges."""
+    rows, columns = depth.shape
+    step = -(-columns // COLUMNS)
+    down = np.unique(np.r_[np.arange(0, rows - 1, step), rows - 1])
+    across = np.unique(np.r_[np.arange(0, columns - 1, step), columns - 1])
+    kernel = np.ones((3, 3), np.uint8)
+    edges = (cv2.dilate(depth, kernel) - cv2.erode(depth, kernel) > TORN_RELATIVE).astype(np.uint8)
+    cells = np.maximum.reduceat(np.maximum.reduceat(edges, down[:-1], axis=0), across[:-1], axis=1).astype(bool)
+    i, j = np.nonzero(~cells)
+    large = np.column_stack(
+        [
+            down[i] * columns + across[j],
+            down[i + 1] * columns + across[j],
+            down[i] * columns + across[j + 1],
+            down[i + 1] * columns + across[j + 1],
+        ]
+    )
+    fine = np.repeat(np.repeat(cells, np.diff(down), axis=0), np.diff(across), axis=1)
+    row, column = np.nonzero(fine)
+    small = _corners(row, column, columns)
+    small = small[np.ptp(depth.reshape(-1)[small], axis=1) <= TORN_RELATIVE] if len(small) else small
+    return np.concatenate([large, small]).astype(np.int32)
+
+
+def _corners(row: Any, column: Any, columns: int) -> I32:
+    first = row * columns + column
+    return np.column_stack([first, first + columns, first + 1, first + columns + 1]).astype(np.int32)
+
+
+def _placed(depth: F32, quads: I32, picture: U8, *, stack: PanelStack, depth_m: tuple[float, float]) -> Part:
+    """Quads of a depth map as triangles in the stack's frame."""
+    rows, columns = depth.shape
+    used, corners = np.unique(quads, return_inverse=True)
+    corners = corners.reshape(-1, 4)
     plane = screen(stack, width_px=columns, height_px=rows)
-    u, v = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
-    # The outermost samples stand for the picture's edge.
-    u[:, 0], u[:, -1], v[0], v[-1] = 0.0, columns, 0.0, rows
-    x = depth_m[0] + coarse.astype(np.float64) * (depth_m[1] - depth_m[0])
+    u, v = _edge_to_edge(used % columns, columns), _edge_to_edge(used // columns, rows)
+    x = depth_m[0] + depth.reshape(-1)[used].astype(np.float64) * (depth_m[1] - depth_m[0])
     spread = (NOMINAL_DISTANCE_M - x) / NOMINAL_DISTANCE_M
     y = (plane.left_m + u * plane.pitch_u_m) * spread
     z = (plane.top_m - v * plane.pitch_v_m) * spread
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
-    quads = np.column_stack([corner, corner + columns, corner + 1, corner + columns + 1])
-    steps = np.ptp(coarse.reshape(-1)[quads], axis=1)
-    quads = quads[steps <= TORN_RELATIVE]
-    triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [2, 1, 3]]]).astype(np.int32)
-    positions = np.stack([x, y, z], axis=2).reshape(-1, 3).astype(np.float32)
-    uv = np.stack([u / columns, v / rows], axis=2).reshape(-1, 2).astype(np.float32)
+    positions = np.column_stack([x, y, z]).astype(np.float32)
     normals = np.tile(np.array([1.0, 0.0, 0.0], np.float32), (len(positions), 1))
-    return Part(Shape(positions, normals, uv, triangles), picture=rgba_from_rgb(colour), lit=False)
+    uv = np.column_stack([u / columns, v / rows]).astype(np.float32)
+    triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [2, 1, 3]]]).astype(np.int32)
+    return Part(Shape(positions, normals, uv, triangles), picture=picture, lit=False)
+
+
+def _edge_to_edge(index: Any, count: int) -> F64:
+    """Pixel centres; the outermost stand for the picture's edge."""
+    place = index + 0.5
+    return np.where(index == 0, 0.0, np.where(index == count - 1, float(count), place))
 
 
 class RgbdSource(DrawingSource):
@@ -72,22 +213,26 @@ class RgbdSource(DrawingSource):
         depth_m: tuple[float, float],
         context: Any,
         background: tuple[float, float, float],
+        samples: int = 0,
     ) -> None:
+        """samples: a pixel; 0: as many as the split edges need to look smooth."""
         colour, depth = split_rgbd(rgb, path)
-        part = surface(colour, depth, stack=stack, depth_m=depth_m)
+        parts = surfaces(colour, depth, stack=stack, depth_m=depth_m)
         # Outlines of a torn surface run through its inside: no ramps there.
         self.draws_in = context
-        self._painter = TrianglePainter([part], context=context, background=background, samples=1)
-        low, high = float(part.shape.positions_m[:, 0].min()), float(part.shape.positions_m[:, 0].max())
+        self._painter = TrianglePainter(parts, context=context, background=background, samples=samples or SAMPLES)
+        self._places = [np.eye(4)] * len(parts)
+        x_m = parts[0].shape.positions_m[:, 0]
+        low, high = float(x_m.min()), float(x_m.max())
         self.info = ContentInfo(
             name=path.stem, depth_range_m=(low, high), background=background, left_out=("lights", "sorting")
         )
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
-        return self._painter.paint(view, [np.eye(4)])
+        return self._painter.paint(view, self._places)
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect:
-        return self._painter.extent(view, [np.eye(4)])
+        return self._painter.extent(view, self._places)
 
     def close(self) -> None:
         self._painter.close()

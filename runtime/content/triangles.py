@@ -49,7 +49,8 @@ void main() {
     shade *= in_colour;
 #endif
 #ifdef LIT
-    float lamp = 0.5 + 0.5 * dot(stack_from_part * in_normal, TO_LAMP);
+    vec3 normal = stack_from_part * in_normal;
+    float lamp = 0.5 + 0.5 * dot(normal, TO_LAMP) / max(length(normal), 1e-6);
     shade *= 0.38 + 0.62 * lamp;
 #endif
     uv = in_uv;
@@ -140,9 +141,10 @@ def ready(part: Part, *, samples: int = 0) -> ReadyPart:
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Uploaded:
     part: Part
+    positions: F32  # (v, 3) at present
     surface: Any
     surface_buffers: tuple[Any, ...]  # vertices, triangles: a vertex array does not release them
     outline: Any
@@ -186,12 +188,22 @@ class TrianglePainter:
         size = {"width_px": view.width_px, "height_px": view.height_px}
         boxes = []
         for item, matrix in zip(self._parts, stack_from_parts, strict=True):
-            vertices = item.part.shape.positions_m
+            vertices = item.positions
             points = item.corners_m if len(vertices) > MOST_PROJECTED else vertices.astype(np.float64)
             placed = points @ matrix[:3, :3].T + matrix[:3, 3]
             if camera.depth_bounds(view.pixels_from_stack, placed) is not None:
                 boxes.append(camera.covered_box(view.pixels_from_stack, placed, align_px=1, **size))
         return camera.union(boxes)
+
+    def deform(self, index: int, shape: Shape) -> None:
+        """Another shape for a part: the same triangles, their vertices elsewhere."""
+        item = self._parts[index]
+        item.positions = shape.positions_m
+        item.attributes[:, :3] = shape.normals
+        item.surface_buffers[0].write(np.concatenate([shape.positions_m, item.attributes], axis=1, dtype=np.float32))
+        if item.edges is not None:
+            item.edges = item.edges.moved(shape)
+        item.corners_m = camera.box_corners(shape.positions_m.min(0), shape.positions_m.max(0))
 
     def paint(self, view: View, stack_from_parts: Sequence[F64]) -> DrawnPicture:
         """The parts at their places (4x4 each, a similarity), over the background."""
@@ -209,7 +221,7 @@ class TrianglePainter:
             clip = camera.clip_from_stack(view.pixels_from_stack, near_m=near_m, far_m=far_m, **size)
             self._context.enable_only(self._context.DEPTH_TEST)
             for item, stack_from_part in placed:
-                self._describe(item.surface_program, item, stack_from_part)
+                self._describe(item.surface_program, item, stack_from_part, view)
                 item.surface_program["clip_from_part"].write(_gl(clip @ stack_from_part))
                 item.surface.render()
             if self._with_ramps:
@@ -243,6 +255,7 @@ class TrianglePainter:
         layout = _layout(outline_program, buffer, ("in_clip", "in_coverage", *names), (4, 1, 3, 2, 3))
         return _Uploaded(
             part=part,
+            positions=part.shape.positions_m,
             surface=surface,
             surface_buffers=(vertices, triangles),
             outline=context.vertex_array(outline_program, [layout]),
@@ -272,10 +285,10 @@ class TrianglePainter:
             self._textures[id(picture)] = texture
         return self._textures[id(picture)]
 
-    def _describe(self, program: Any, item: _Uploaded, stack_from_part: F64) -> None:
-        linear = stack_from_part[:3, :3]
+    def _describe(self, program: Any, item: _Uploaded, stack_from_part: F64, view: View) -> None:
+        linear = stack_from_part[:3, :3] if view.turned is None else view.turned @ stack_from_part[:3, :3]
         if "stack_from_part" in program:
-            program["stack_from_part"].write(_gl(linear / np.cbrt(abs(np.linalg.det(linear)))))
+            program["stack_from_part"].write(_gl(np.linalg.pinv(linear).T * np.cbrt(abs(np.linalg.det(linear)))))
         program["colour"] = item.part.colour
         if item.texture is not None:
             item.texture.use(0)
@@ -286,18 +299,18 @@ class TrianglePainter:
         context.blend_func = OVER
         framebuffer.depth_mask = False
         for item, stack_from_part in reversed(placed):
-            if item.edges is None:
-                continue
+            if item.edges is None or not np.linalg.det(stack_from_part[:3, :3]):
+                continue  # nor where it was squashed: then it has no inside
             eye = np.linalg.solve(stack_from_part, np.append(view.eye_m, 1.0))[:3]
             ends, apex = silhouette(item.edges, eye)
             clip_from_part = clip_from_stack @ stack_from_part
-            clip = item.part.shape.positions_m @ clip_from_part[:, :3].T + clip_from_part[:, 3]
+            clip = item.positions @ clip_from_part[:, :3].T + clip_from_part[:, 3]
             corners, vertices, _ = ramps(clip, ends, apex, width_px=view.width_px, height_px=view.height_px)
             if not len(corners):
                 continue
             packed = np.concatenate([corners.reshape(-1, 5), item.attributes[vertices.reshape(-1)]], axis=1)
             item.outline_buffer.write(packed)
-            self._describe(item.outline_program, item, stack_from_part)
+            self._describe(item.outline_program, item, stack_from_part, view)
             item.outline.render(vertices=len(packed))
         framebuffer.depth_mask = True
 

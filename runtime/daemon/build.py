@@ -72,6 +72,7 @@ class Run:
             **self.presenter.summary(simulated=self.simulated),
             **self.observer.means.summary(),
             "backend": self.presenter.run_cell.state.predictor.backend,
+            "scene": self.presenter.run_cell.state.content.info.name,
             "plan": self.plan_items(),
         }
 

@@ -8,9 +8,15 @@ import threading
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
-Name = Literal["scene", "pause", "resume", "flat", "budget", "reload", "blackbox"]
+from runtime.support.foreign import shown
+
+Name = Literal[
+    "scene", "playlist", "next", "place", "model", "pause", "resume", "flat", "budget", "reload", "blackbox", "restart"
+]  # fmt: skip
 NAMES: tuple[Name, ...] = get_args(Name)
 BUDGET_MAX_MS = 10_000.0
+SHOWS_MAX = 64
+PLACING = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # of `place`: settings of [content]
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +28,7 @@ class Command:
     """
 
     name: Name
-    value: Any = None  # scene: str; budget: milliseconds, 0 for none; the others: None
+    value: Any = None  # scene, model: str; place: settings, none for the configured ones; budget: milliseconds or 0
     told: dict[str, Any] = field(default_factory=dict)  # beside `ok`, once it is done: what came of it
     _answers: queue.SimpleQueue[str] = field(default_factory=queue.SimpleQueue)
     _decided: threading.Lock = field(default_factory=threading.Lock)  # who has it says whether it is carried out
@@ -63,12 +69,38 @@ def parse(request: Any) -> Command:
     name, value = request.get("command"), request.get("value")
     if name not in NAMES:
         raise ValueError(f"command: unknown; one of status, {', '.join(NAMES)}")
-    if name == "scene" and not (isinstance(value, str) and value):
-        raise ValueError("value: scene wants a name")
+    if name in ("scene", "model") and not (isinstance(value, str) and value):
+        raise ValueError(f"value: {name} wants a name")
+    if name == "place":
+        return Command(name, _placing(value))
+    if name == "playlist":
+        return Command(name, _shows(value))
     if name == "budget":
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ValueError("value: budget wants milliseconds")
         if not (math.isfinite(value) and 0 <= value <= BUDGET_MAX_MS):
             raise ValueError(f"value: budget must lie in 0 to {BUDGET_MAX_MS:.0f} ms")
         return Command(name, float(value))
-    return Command(name, value if name == "scene" else None)
+    return Command(name, value if name in ("scene", "model") else None)
+
+
+def _shows(value: Any) -> list[dict[str, Any]]:
+    """What `playlist` is to show; times and names are checked where the list is read."""
+    if not isinstance(value, list) or not 0 < len(value) <= SHOWS_MAX:
+        raise ValueError(f"value: playlist wants a list of 1 to {SHOWS_MAX} scenes with their seconds")
+    for number, show in enumerate(value):
+        if not (isinstance(show, dict) and set(show) == {"scene", "seconds"} and isinstance(show["scene"], str)):
+            raise ValueError(f"value[{number}]: playlist wants a scene and its seconds, and nothing else")
+        if isinstance(show["seconds"], bool) or not isinstance(show["seconds"], int | float):
+            raise ValueError(f"value[{number}].seconds: playlist wants a number")
+    return value
+
+
+def _placing(value: Any) -> dict[str, Any]:
+    """What `place` changes; its values are checked with the settings."""
+    if not isinstance(value, dict | None):
+        raise ValueError("value: place wants an object of settings, or null for the configured ones")
+    for key in value or {}:
+        if key not in PLACING:
+            raise ValueError(f"value.{shown(key)}: place knows {', '.join(PLACING)}")
+    return value or {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -71,11 +72,23 @@ def drive(
 def _progress(total: int | None) -> Any:
     from contextlib import contextmanager
 
+    from runtime.support.progress import NowAndThen
+
     @contextmanager
     def bar() -> Any:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+        if not sys.stderr.isatty():
+            told, done = NowAndThen(sys.stderr), 0
+
+            def tell(frame: Any) -> None:
+                nonlocal done
+                done += 1
+                told(f"{frame.state}: refresh {done}" + (f" of {total}" if total else ""))
+
+            yield tell
+            return
         columns = (TextColumn("{task.description:12}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
         with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
             task = shown.add_task("starting", total=total)
@@ -99,6 +112,7 @@ def print_summary(summary: dict[str, Any], out: Path | None) -> None:
     if abs(summary["machine_s"] - summary["seconds"]) > 0.1 * summary["seconds"]:
         rates += f" (simulated; it took {summary['machine_s']:.1f} s)"
     table.add_row("time", rates)
+    table.add_row("scene", summary["scene"])
     table.add_row("model", f"{summary['model']} on {summary['provider']}, {summary['backend']}")
     if summary["psnr_db"] is not None:
         quality = f"{summary['psnr_db']:.2f} dB, SSIM {summary['ssim']:.4f} at the eyes used"

@@ -9,7 +9,9 @@ from runtime.errors import InputError
 from runtime.support.plausible import nearest
 
 if TYPE_CHECKING:
-    from runtime.config import Settings
+    from runtime.config import ContentSettings, Settings
+
+LIBRARY_MOST, LIBRARY_LOOKED_AT = 200, 2000
 
 
 def scene_names() -> tuple[str, ...]:
@@ -20,13 +22,50 @@ def scene_names() -> tuple[str, ...]:
     return (*SCENES, *preset_names(), "external")
 
 
+def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
+    """What can be shown of the library's folder, by its whole path; as many as a page can offer."""
+    from runtime.content.pictures import PICTURES, VIDEOS
+    from runtime.content.registry import MESHES, PLAYLISTS
+
+    shown = {*PICTURES, *VIDEOS, *MESHES, *PLAYLISTS, ".ply"}
+    if not settings.library:
+        return ()
+    try:
+        entries = sorted(Path(settings.library).absolute().iterdir())[:LIBRARY_LOOKED_AT]
+    except (OSError, ValueError):
+        return ()
+    entries = [path for path in entries if not path.name.startswith(".")]
+    found = [str(path) for path in entries if path.suffix.lower() in shown or path.is_dir()]
+    return tuple(found[:LIBRARY_MOST])
+
+
+def model_names() -> tuple[str, ...]:
+    """Every model that is no file."""
+    from runtime.model.predictor import SHIPPED
+
+    return (*SHIPPED, "sart")
+
+
 def scene_from_here(name: str) -> str:
     """A scene for a daemon that runs elsewhere: a file's or folder's absolute path; a known name as it is.
 
     What is neither known nor there is left as it is: the daemon says what it knows.
     """
+    from runtime.config import LIVE
+
+    if name.startswith(LIVE):
+        return LIVE + _from_here(name.removeprefix(LIVE), ())
+    return _from_here(name, scene_names())
+
+
+def model_from_here(name: str) -> str:
+    """The same of a model."""
+    return _from_here(name, model_names())
+
+
+def _from_here(name: str, known: tuple[str, ...]) -> str:
     try:
-        if not Path(name).exists() or (Path(name).name == name and name in scene_names()):
+        if not Path(name).exists() or (Path(name).name == name and name in known):
             return name
         return str(Path(name).absolute())
     except (OSError, ValueError):  # too long, or a NUL character
@@ -35,8 +74,8 @@ def scene_from_here(name: str) -> str:
 
 def check_names(settings: Settings, *, source: str | Path) -> None:
     """Raise InputError for the first name that nobody knows, or file that is not there, naming its field."""
+    from runtime.config import is_live
     from runtime.eyes.calibration import load_calibration
-    from runtime.model.predictor import SHIPPED
     from runtime.sensor.registry import driver_names
 
     sensor, content, output = settings.sensor, settings.content, settings.output
@@ -51,12 +90,14 @@ def check_names(settings: Settings, *, source: str | Path) -> None:
     if settings.calibration.file:
         _there("calibration.file", settings.calibration.file, source)
         load_calibration(Path(settings.calibration.file))
-    if content.scene not in scene_names():
+    if content.scene not in scene_names() and not is_live(content.scene):
         _known_or_there("content.scene", content.scene, scene_names(), source)
     if content.file:
         _there("content.file", content.file, source)
-    if settings.model.name not in (*SHIPPED, "sart"):
-        _known_or_there("model.name", settings.model.name, (*SHIPPED, "sart"), source)
+    if content.library:
+        _there("content.library", content.library, source)
+    if settings.model.name not in model_names():
+        _known_or_there("model.name", settings.model.name, model_names(), source)
     for number, panel in enumerate(output.panels):
         if panel.lut:
             _there(f"output.panels.{number}.lut", panel.lut, source)

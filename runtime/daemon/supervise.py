@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import time
 from collections.abc import Iterator
@@ -9,15 +10,16 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from runtime.blackbox.location import black_box_folder
+from runtime.blackbox.location import black_box_folder, state_folder
 from runtime.blackbox.recorder import MIB, Plan, Recorder
 from runtime.clock import NS_PER_MS, MonotonicClock
-from runtime.config import Overrides, Settings, load_settings
+from runtime.config import Overrides, Settings, changed, load_settings
+from runtime.content.placed import placed_source, placing_of
 from runtime.daemon.build import Run, RunOptions
-from runtime.daemon.commands import Command
+from runtime.daemon.commands import PLACING, Command
 from runtime.daemon.drive import drive, print_summary
-from runtime.daemon.names import scene_names
-from runtime.daemon.notify import Notifier
+from runtime.daemon.names import library_scenes, model_names, scene_from_here, scene_names
+from runtime.daemon.notify import Notifier, may_restart
 from runtime.daemon.reconfigure import Reconfiguration
 from runtime.daemon.server import StatusServer, open_status_server
 from runtime.daemon.signals import Signals
@@ -25,6 +27,7 @@ from runtime.errors import InputError, PanelLost, PhasestackError, Stopped, Tran
 from runtime.frame.presenter import Presenter
 from runtime.records import RefreshAccount, State
 from runtime.support import logs
+from runtime.support.artifacts import write_text
 from runtime.support.transient import MayPass, may_pass
 from runtime.support.version import version
 
@@ -33,6 +36,10 @@ log = logging.getLogger("phasestack.daemon")
 PANEL_RETRY_S = 1.0
 START_EXTENSION_S = 10.0
 NEEDS_RESTART = ("stack", "sensor", "detector", "output", "service")
+
+
+class RestartAsked(TransientError):
+    """The run has ended so that the service manager starts it again."""
 
 
 class Daemon:
@@ -58,8 +65,12 @@ class Daemon:
         self._change: Reconfiguration | None = None
         self._asked_by: Command | None = None  # for the change under way; None: a signal
         self._refused = ""  # why the last change was refused, until one is taken
+        self._configured_placing: dict[str, Any] = {}
+        self.restarting = False  # asked for by an operator
 
     def stop_reason(self) -> str:
+        if self.restarting:
+            return "restart asked for"
         return f"{self._signals.stop} received" if self._signals.stop else ""
 
     def carry_out_commands(self, presenter: Presenter) -> None:
@@ -75,6 +86,8 @@ class Daemon:
             if not change.problem:
                 state = presenter.run_cell.state
                 log.info("changed: scene %s, model %s", state.content.info.name, state.predictor.name)
+                if state.content.info.stand_in and self._asked_by is not None:
+                    self._asked_by.told["note"] = f"shown: {state.content.info.name}"
             self._answer(self._asked_by, change.problem)
 
     def refreshed(self, presenter: Presenter, account: RefreshAccount) -> None:
@@ -103,6 +116,7 @@ class Daemon:
     def watches(self, run: Run) -> None:
         """The run that it supervises."""
         self.run = run
+        self._configured_placing = _placing_in(run.presenter.run_cell.state.settings)
 
     def wait_for_panels(self, why: str) -> bool:
         """A panel is not there yet: under a supervisor wait for it, by hand refuse."""
@@ -153,15 +167,94 @@ class Daemon:
             case "reload":
                 self._reload(presenter, command)
             case "scene":
-                settings = presenter.run_cell.state.settings
-                content = settings.content.model_copy(update={"scene": command.value})
-                changed = settings.model_copy(update={"content": content})
-                self._begin(presenter, changed, command, reload_content=True)
+                self._show(presenter, command.value, command)
+            case "playlist":
+                try:
+                    path = self._written_playlist(command.value)
+                except (OSError, ValueError) as error:  # no room, or a name that is no text
+                    command.refuse(f"the playlist can't be written ({one_line(str(error), most=120)})")
+                else:
+                    self._show(presenter, str(path), command)
+            case "place":
+                self._place(presenter, command)
+            case "next":
+                self._skip(presenter, command)
+            case "model":
+                self._set_model(presenter, command)
             case "budget":
                 self._set_budget(presenter, command.value)
                 command.done()
+            case "restart":
+                self._restart(command)
             case "blackbox":
                 self._write_black_box(command)
+
+    def _show(self, presenter: Presenter, scene: str, command: Command) -> None:
+        settings = presenter.run_cell.state.settings
+        # Another scene stands as the configuration has it, not as the one before it was moved.
+        content = settings.content.model_copy(update={"scene": scene, **self._configured_placing})
+        shown = settings.model_copy(update={"content": content})
+        self._begin(presenter, shown, command, reload_content=True)
+
+    def _written_playlist(self, shows: list[dict[str, Any]]) -> Path:
+        """The operator's list as a file, which `content.scene` can name for good. Raises OSError."""
+        text = "# Shown from the page or by a program; made anew each time.\n"
+        for show in shows:
+            scene = json.dumps(scene_from_here(show["scene"]), ensure_ascii=False)  # a TOML string too
+            text += f"\n[[show]]\nscene = {scene}\nseconds = {float(show['seconds'])!r}\n"
+        path = state_folder() / "playlist.toml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(path, text)
+        return path
+
+    def _place(self, presenter: Presenter, command: Command) -> None:
+        """Move the scene: settings and content change together, once the solver has seen that something is visible."""
+        values = command.value or self._configured_placing
+        try:
+            changed(presenter.run_cell.state.settings, "content", values, source="place")
+        except PhasestackError as error:
+            command.refuse(str(error))
+            return
+
+        def place(parts: Any) -> bool:
+            state, now_ns = parts.run.state, presenter.clock.now_ns()
+            settings = changed(state.settings, "content", values, source="place")
+            placing = placing_of(settings.content)
+            try:
+                source = placed_source(state.content, placing, presenter.stack, time_ns=now_ns)
+            except PhasestackError as error:
+                self._answer(command, str(error))
+            else:
+                parts.run.replace(settings=settings, content=source)
+                self._answer(command, "")
+            return True
+
+        presenter.solver.do(place)
+
+    def _skip(self, presenter: Presenter, command: Command) -> None:
+        def skip(parts: Any) -> bool:
+            done = parts.run.state.content.skip(time_ns=presenter.clock.now_ns())
+            self._answer(command, "" if done else "there is no next one: what is shown is no playlist, or its last")
+            return True
+
+        presenter.solver.do(skip)
+
+    def _set_model(self, presenter: Presenter, command: Command) -> None:
+        settings = presenter.run_cell.state.settings
+        try:
+            self._begin(presenter, changed(settings, "model", {"name": command.value}, source="model"), command)
+        except PhasestackError as error:
+            self._answer(command, str(error))
+
+    def _restart(self, command: Command) -> None:
+        """Stop in a way after which the service manager starts it again; where nobody would, refuse."""
+        if not may_restart():
+            command.refuse(
+                "nothing would start it again: it is not run by a unit with Restart= (see docs/operation.md)"
+            )
+            return
+        command.done()
+        self.restarting = True
 
     def _write_black_box(self, command: Command) -> None:
         """What the black box keeps, to a file; the answer comes once it is there."""
@@ -198,10 +291,11 @@ class Daemon:
             self._answer(command, str(error))
             return
         present = presenter.run_cell.state.settings
-        changed = [name for name in NEEDS_RESTART if getattr(settings, name) != getattr(present, name)]
-        if changed:
-            self._answer(command, f"{self._config}: {changed[0]}: a change needs a restart of the service")
+        frozen = [name for name in NEEDS_RESTART if getattr(settings, name) != getattr(present, name)]
+        if frozen:
+            self._answer(command, f"{self._config}: {frozen[0]}: a change needs a restart of the service")
         else:
+            self._configured_placing = _placing_in(settings)
             self._begin(presenter, settings, command)
 
     def _begin(
@@ -234,6 +328,11 @@ class Daemon:
             command.done()
 
 
+def _placing_in(settings: Settings) -> dict[str, Any]:
+    """What `place` may change, as it is in the settings."""
+    return settings.content.model_dump(include=set(PLACING))
+
+
 def _with_budget(settings: Settings, budget_ms: float) -> Settings:
     return settings.model_copy(update={"model": settings.model.model_copy(update={"budget_ms": budget_ms})})
 
@@ -250,8 +349,12 @@ def snapshot(run: Run | None, presenter: Presenter, account: RefreshAccount) -> 
         "flat_asked": presenter.flat_asked,
         "scene": state.settings.content.scene,
         "content": state.content.info.name,
+        "content_problem": state.content.problem,
+        "placing": _placing_in(state.settings),
+        "playlist": state.content.describe(time_ns=presenter.clock.now_ns()),
         "plan": run.plan_items() if run is not None else [],
         "model": state.predictor.name,
+        "model_asked": state.settings.model.name,
         "provider": state.predictor.provider,
         "backend": state.predictor.backend,
         "backend_why": run.parts.backend.why if run is not None else "",
@@ -287,7 +390,9 @@ def about(run: Run | None) -> dict[str, Any]:
         "viewing_m": settings.calibration.viewing_m,
         "viewing_side_deg": settings.calibration.viewing_side_deg,
         "viewing_up_deg": settings.calibration.viewing_up_deg,
-        "scenes": scene_names(),
+        "models": model_names(),
+        "may_restart": may_restart(),
+        "scenes": (*scene_names(), *library_scenes(settings.content)),
     }
 
 
@@ -407,6 +512,8 @@ def _lived(
         daemon.abandon_change()
         notifier.stopping(summary["stopped"])
     log.info("stopped: %s", summary["stopped"])
+    if daemon.restarting:
+        raise RestartAsked("an operator asked for a restart")
     if not quiet and not notifier.supervised and "frames" in summary:
         print_summary(summary, out)
     return summary

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from runtime.daemon.client import NotRunning, ask
+from runtime.page.thumbnails import Thumbnails
 
 LOOKED_UP_AGAIN_S = {"status": 0.2, "pictures": 0.3, "log": 0.5, "about": 2.0}
 LOOKED_UP_WITHIN_S = 3.0
@@ -18,9 +19,9 @@ TOLD_WITHIN_S = 70.0  # a scene or a model is loaded first
 class Daemon:
     """Any thread may ask."""
 
-    def __init__(self, sockets: Callable[[], tuple[Path, ...]]) -> None:
+    def __init__(self, sockets: Callable[[], tuple[Path, ...]], thumbnails: Thumbnails) -> None:
         """sockets: where it may listen."""
-        self._sockets = sockets
+        self._sockets, self.thumbnails = sockets, thumbnails
         self._locks = {name: threading.Lock() for name in LOOKED_UP_AGAIN_S}
         self._answers: dict[str, tuple[float, dict[str, Any]]] = {}
 
@@ -32,7 +33,9 @@ class Daemon:
                 return answer
             answer = self._asked({"command": name}, timeout_s=LOOKED_UP_WITHIN_S)
             self._answers[name] = time.monotonic(), answer
-            return answer
+        if name == "pictures" and answer.get("ok"):
+            self.thumbnails.note(self.look_up("status"), answer)
+        return answer
 
     def tell(self, command: str, value: Any) -> dict[str, Any]:
         """One wish; what became of it."""

@@ -26,7 +26,9 @@ from runtime.page.daemon import LOOKED_UP_AGAIN_S, Daemon
 from runtime.page.token import cookie_of, same
 
 COOKIE = "phasestack"
-COMMANDS = ("scene", "pause", "resume", "flat", "budget", "reload", "blackbox")
+COMMANDS = (
+    "scene", "playlist", "next", "place", "model", "pause", "resume", "flat", "budget", "reload", "blackbox", "restart",
+)  # fmt: skip
 BODY_MAX_BYTES = 65536
 WRONG_TOKEN_S = 0.5  # so long a wrong token is thought about
 ASSETS = {"page.js": "text/javascript", "page.css": "text/css"}
@@ -71,6 +73,12 @@ def application(daemon: Daemon, token: str, *, any_host: bool) -> Starlette:
         answer = await run_in_threadpool(daemon.look_up, name)
         return JSONResponse(answer, 200 if answer.get("ok") else 503)
 
+    async def thumbnail(request: Request) -> Response:
+        jpeg = await run_in_threadpool(daemon.thumbnails.jpeg, request.query_params.get("scene", ""))
+        if jpeg is None:
+            return Response(status_code=404)
+        return Response(jpeg, media_type="image/jpeg")
+
     async def do(request: Request) -> Response:
         try:
             asked = json.loads(await _body(request))
@@ -107,6 +115,7 @@ def application(daemon: Daemon, token: str, *, any_host: bool) -> Starlette:
         Route("/logout", guarded(logout), methods=["POST"]),
         Route("/do", guarded(do), methods=["POST"]),
         Route("/now/{name}", guarded(look_up), methods=["GET"]),
+        Route("/thumbnail", guarded(thumbnail), methods=["GET"]),
         Route("/{name}", guarded(asset), methods=["GET"]),
     ]
     app = Starlette(routes=routes)

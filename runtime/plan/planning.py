@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from runtime.config import Settings, load_settings, validated
 from runtime.errors import FatalError, InputError
+from runtime.support.progress import NowAndThen
 
 if TYPE_CHECKING:
     from runtime.content.base import ContentSource
@@ -85,6 +86,7 @@ def plan_for(
             can_focus=focused_part(predictor) is not None,
             loaded_modules=sys.modules,
         )
+        drift_db = numbers.reuse.costs_db if planned.reuse and not content.info.moving else None
         return {
             "scene": content.info.name,
             "model": plain.name,
@@ -97,6 +99,8 @@ def plan_for(
             "frame_ms_without": round(without.frame_ms, 2),
             "psnr_db": round(with_plan.psnr_db, 3),
             "psnr_db_without": round(without.psnr_db, 3),
+            "drift_mm": round(1000 * _band_m(settings), 3),
+            "psnr_db_drifted": None if drift_db is None else round(with_plan.psnr_db - drift_db, 3),
             "level": numbers.level,
             "levels": [
                 {"label": level.label, "ms": round(level.expected_ms, 2), "psnr_db": round(level.psnr_db, 3)}
@@ -186,8 +190,11 @@ def overridden(settings: Settings, *, scene: str | None, model: str | None, budg
 
 def teller(cleanup: ExitStack, quiet: bool) -> Callable[[str], None]:
     """Shows what is being measured, on stderr."""
-    if quiet or not sys.stderr.isatty():
+    if quiet:
         return lambda text: None
+    if not sys.stderr.isatty():
+        told = NowAndThen(sys.stderr)
+        return lambda text: told(f"measuring: {text}")
     from rich.console import Console
 
     status = cleanup.enter_context(Console(stderr=True).status("loading"))

@@ -12,6 +12,7 @@ from runtime.report import focal, horizon, latency, moving, sweeps
 from runtime.report.focal_page import focal_section
 from runtime.report.frontier import MethodResult, check_models, measure
 from runtime.report.frontier_page import frontier_section
+from runtime.report.kept import KeptParts
 from runtime.report.machine import describe
 from runtime.report.methods import Method, shipped_and_references
 from runtime.report.moving_page import moving_section
@@ -36,6 +37,7 @@ class Report:
 
     page: Page
     record: dict[str, Any]
+    forget: Callable[[], None]  # once it is written: what was kept for the case that it was stopped
 
 
 def whole_report(
@@ -47,8 +49,11 @@ def whole_report(
     command: str,
     variants: Variants = lambda width_px, height_px: [],
     progress: Progress = lambda name: None,
+    fresh: bool = False,
 ) -> Report:
     """Measure everything. `quick`: quarter-size panels and fewer references, for a first look.
+
+    What an earlier run of the same had measured before it was stopped is not measured again, unless `fresh`.
 
     variants: what else to compare on panels of a size, such as models made for it.
 
@@ -70,6 +75,10 @@ def whole_report(
         own = further[pair.stack.width_px, pair.stack.height_px]
         return shipped_and_references(models=models, variants=own, quick=quick)
 
+    case_files = [path for path in sorted(pairs.iterdir()) if path.is_file()] if pairs is not None else []
+    kept = KeptParts(
+        "report", sources=[*case_files, *map(Path, models)], facts=(quick, with_focal, sorted(further)), fresh=fresh
+    )
     record: dict[str, Any] = {"machine": describe(seed=0), "command": command}
     sections: list[Section] = []
 
@@ -78,7 +87,12 @@ def whole_report(
 
     found: list[MethodResult] = []
     for name, own in _by_size(cases).items():
-        results = measure(methods(own[0]), own, progress=tell(f"frontier, case files {name}"))
+        results = measure(
+            methods(own[0]),
+            own,
+            progress=tell(f"frontier, case files {name}"),
+            keep=kept.of(f"case files {name}"),
+        )
         found += results
         title = f"Error against run time: {len(own)} case file{'s' if len(own) > 1 else ''}, {name}"
         sections.append(
@@ -86,7 +100,12 @@ def whole_report(
         )
     progress("drawing pairs")
     own_pairs = procedural_pairs(stack)
-    results = measure(methods(own_pairs[0]), own_pairs, progress=tell("frontier, built-in scenes"))
+    results = measure(
+        methods(own_pairs[0]),
+        own_pairs,
+        progress=tell("frontier, built-in scenes"),
+        keep=kept.of("built-in scenes"),
+    )
     text = "; ".join(pair.name for pair in own_pairs)
     title = "Error against run time: built-in scenes"
     sections.append(frontier_section(results, pairs=text, title=title, name="scenes"))
@@ -94,28 +113,34 @@ def whole_report(
     if found:
         record["methods_on_built_in_scenes"] = [r.record() for r in results]
 
-    sections += _sweeps(record, stack=stack, small=small, progress=progress)
+    sections += _sweeps(record, stack=stack, small=small, progress=progress, kept=kept)
     progress("the daemon, plan on and off")
     scale = 0.25 if quick else 0.5
-    runs = latency.plan_on_and_off(frames=60 if quick else 150, scale=scale)
+    runs = kept.part("daemon", lambda: latency.plan_on_and_off(frames=60 if quick else 150, scale=scale))
     sections.insert(len(sections) - 1, latency.latency_section(runs, scale=scale))
     record["runs"] = [{"name": run.name, "latency_ms": run.latency_ms, "summary": run.summary} for run in runs]
     progress("what scenes do not need")
-    section, record["plan"] = surveyed(quick=quick)
+    section, record["plan"] = kept.part("plan", lambda: surveyed(quick=quick))
     sections.insert(len(sections) - 1, section)
     progress("what a moving viewer sees")
     motions = moving.QUICK if quick else {}
-    found_moving, strip = apart(moving.moving_runs, scale=scale, **motions)
+    found_moving, strip = kept.part("moving", lambda: apart(moving.moving_runs, scale=scale, **motions))
     sections.insert(2 if cases else 1, moving_section(found_moving, strip))
     record["moving"] = [asdict(one) for one in found_moving]
     if with_focal:
-        stacks = []
         full = StackGeometry().stack()
-        with focal.cards_painter(full) as painter:
-            stacks.append(focal.focal_stack(painter, full, model="best", progress=tell("focal stack")))
+
+        def focal_stack() -> focal.FocalStack:
+            with focal.cards_painter(full) as painter:
+                return focal.focal_stack(painter, full, model="best", progress=tell("focal stack"))
+
+        stacks = [kept.part("focal", focal_stack)]
         sections += [focal_section(one) for one in stacks]
         record["focal"] = [_focal_record(one) for one in stacks]
-    return Report(_page(sections, found or results, record, command), record)
+    if kept.earlier:
+        record["parts_of_an_earlier_run"] = kept.earlier
+        record["machine"]["measured"] = f"{len(kept.earlier)} parts by an earlier run, which was stopped"
+    return Report(_page(sections, found or results, record, command), record, kept.forget)
 
 
 def _by_size(cases: Sequence[StillPair]) -> dict[str, list[StillPair]]:
@@ -125,24 +150,33 @@ def _by_size(cases: Sequence[StillPair]) -> dict[str, list[StillPair]]:
     return groups
 
 
-def _sweeps(record: dict[str, Any], *, stack: Any, small: Any, progress: Progress) -> list[Section]:
+def _sweeps(record: dict[str, Any], *, stack: Any, small: Any, progress: Progress, kept: KeptParts) -> list[Section]:
     distance_m = 0.6
-    with Simulation("demo", small, model="balanced") as simulation:
-        progress("viewing volume")
-        volume = sweeps.viewing_volume(simulation)
+
+    def viewing_volume() -> Any:
+        with Simulation("demo", small, model="balanced") as simulation:
+            return sweeps.viewing_volume(simulation)
+
+    def tolerance_map() -> Any:
+        with Simulation("demo", finer, model="balanced") as simulation:
+            return sweeps.tolerance_map(simulation, eyes_at(distance_m=distance_m), OFFSETS_MM)
+
+    progress("viewing volume")
+    volume = kept.part("viewing volume", viewing_volume)
     # On small panels a pixel is millimetres: there, no eye is anywhere else.
     finer = stack if stack.width_px < 1920 else replace(stack, width_px=960, height_px=540)
     progress("tolerance to tracking errors")
-    with Simulation("demo", finer, model="balanced") as simulation:
-        tolerance = sweeps.tolerance_map(simulation, eyes_at(distance_m=distance_m), OFFSETS_MM)
+    tolerance = kept.part("tolerance", tolerance_map)
     progress("tracker horizon")
-    horizons = horizon.all_motions()
+    horizons = kept.part("horizons", horizon.all_motions)
     progress("exactness against tolerance")
-    trades = sweeps.over_uncertainty("texture", finer, MODELS, distance_m=KNOB_DISTANCE_M)
+    trades = kept.part(
+        "exactness", lambda: sweeps.over_uncertainty("texture", finer, MODELS, distance_m=KNOB_DISTANCE_M)
+    )
     progress("panel gap")
-    gaps = sweeps.over_gaps("demo", small, MODELS, distance_m=distance_m - 0.06)
+    gaps = kept.part("gaps", lambda: sweeps.over_gaps("demo", small, MODELS, distance_m=distance_m - 0.06))
     progress("resolution")
-    sizes = sweeps.over_resolutions("demo", stack, MODELS, distance_m=distance_m)
+    sizes = kept.part("resolutions", lambda: sweeps.over_resolutions("demo", stack, MODELS, distance_m=distance_m))
     record["viewing_volume"] = {
         "angles_deg": volume.angles_deg,
         "distances_m": volume.distances_m,

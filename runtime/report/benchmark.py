@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter_ns
+from time import monotonic, perf_counter_ns
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,8 @@ RUNS = 15
 WORSE_DB = 0.1  # more than rounding and the order of threads can change
 SLOWER = 0.15  # at least; more where the runs themselves scatter more
 MORE_MEMORY = 0.15
+UNSTEADY = 1.3  # times the least yardstick: the machine's speed changed by more than a difference that counts
+OTHERS_CORES = 0.5
 SCATTERS = 3.0  # of the medians' own scatter before a difference counts
 
 
@@ -97,8 +100,8 @@ def measured(
     progress: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
     """The regression file's content. Takes about a minute."""
-    before = yardstick_ms()
-    stages, methods = [], []
+    yardsticks, stages, methods = [yardstick_ms()], [], []
+    others = OthersLoad()
     eyes = eyes_at(distance_m=0.6, height_m=0.05)
     for width, height in sizes:
         stack = replace(StackGeometry().stack(), width_px=width, height_px=height)
@@ -109,13 +112,55 @@ def measured(
             stages.append(stage_times(model, stack, eyes, backend=backend))
             result = measure([Method(model, "network", model, backend=backend)], [pair])[0]
             methods.append({key: value for key, value in result.record().items() if key != "pairs"})
+            yardsticks.append(yardstick_ms())
     return {
         "version": VERSION,
         "machine": describe(seed=0),
-        "yardstick_ms": (before + yardstick_ms()) / 2,
+        "yardstick_ms": float(np.median(yardsticks)),
+        "yardsticks_ms": yardsticks,  # over the whole measurement: whether the machine stayed as fast
+        "others_cores": others.cores(),
         "methods": methods,
         "stages": stages,
     }
+
+
+class OthersLoad:
+    """How many cores other programs took since this was made, on average; what our own processes took is left out."""
+
+    def __init__(self) -> None:
+        self._begin_s, self._all_s, self._own_s = monotonic(), _busy_s(), _own_s()
+
+    def cores(self) -> float | None:
+        """None where the system does not tell."""
+        all_s, seconds = _busy_s(), monotonic() - self._begin_s
+        if self._all_s is None or all_s is None or seconds <= 0:
+            return None
+        return round(max(0.0, (all_s - self._all_s - (_own_s() - self._own_s)) / seconds), 3)
+
+
+def _busy_s() -> float | None:
+    """Of all cores together, since the machine was started."""
+    try:
+        user, nice, system, _, _, irq, soft = Path("/proc/stat").read_text(encoding="ascii").split("\n")[0].split()[1:8]
+        return sum(map(int, (user, nice, system, irq, soft))) / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError):
+        return None
+
+
+def _own_s() -> float:
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+def too_busy(table: dict[str, Any]) -> str:
+    """Why a file's times can't be compared: the machine had other things to do. Empty: they can."""
+    yardsticks = table.get("yardsticks_ms") or []
+    if len(yardsticks) > 1 and max(yardsticks) > UNSTEADY * min(yardsticks):
+        return f"the same work took {min(yardsticks):.1f} to {max(yardsticks):.1f} ms while it was measured"
+    others = table.get("others_cores")
+    if isinstance(others, int | float) and others > OTHERS_CORES:
+        return f"other programs took {others:.1f} cores while it was measured"
+    return ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,10 +173,16 @@ class Change:
 
 
 def compare(old: dict[str, Any], new: dict[str, Any]) -> list[Change]:
-    """What got slower, faster, worse or better. Times are compared as multiples of each file's own yardstick."""
+    """What got slower, faster, worse or better. Times are compared as multiples of each file's own yardstick.
+
+    Where the machine was too busy in either (`too_busy`) they are not compared at all.
+    """
     changes: list[Change] = []
     machine = new["yardstick_ms"] / old["yardstick_ms"]
+    comparable = not (too_busy(old) or too_busy(new))
     for before, after in _matched(old["stages"], new["stages"], changes):
+        if not comparable:
+            continue
         ratio = after["total_ms"] / before["total_ms"] / machine
         noise = max(SLOWER, SCATTERS * float(np.hypot(before["total_scatter"], after["total_scatter"])))
         if ratio > 1 + noise or ratio < 1 / (1 + noise):
@@ -185,6 +236,9 @@ def read(path: Path) -> dict[str, Any]:
         raise InputError(path, "version", f"must be {VERSION}: made by `phasestack bench`")
     if not _is_positive(table.get("yardstick_ms")):
         raise InputError(path, "yardstick_ms", "must be a positive number")
+    yardsticks = table.get("yardsticks_ms", [])  # files of earlier versions have none
+    if not isinstance(yardsticks, list) or not all(_is_positive(value) for value in yardsticks):
+        raise InputError(path, "yardsticks_ms", "must be a list of positive numbers")
     for name, keys in NUMBERS.items():
         entries = table.get(name)
         if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):

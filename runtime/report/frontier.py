@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from runtime.errors import InputError
 from runtime.evaluation.trials import timed
 from runtime.records import U8
 from runtime.report.eyesight import Seen, judged
+from runtime.report.kept import measured_anew
 from runtime.report.methods import Kind, Method, opened
 from runtime.report.pairs import StillPair
 from runtime.report.worker import apart
@@ -111,20 +113,25 @@ def measure(
     *,
     threads: int = 2,
     progress: Callable[[int, int], None] = lambda done, of: None,
+    keep: Callable[[str, Callable[[], Any]], Any] = measured_anew,
 ) -> list[MethodResult]:
     """Every method on every pair; one without training on the first alone. Pairs of one call share a resolution.
 
-    Raises FatalError where a method fails.
+    keep: takes each method's name and how to measure it. Raises FatalError where a method fails.
     """
     results: list[MethodResult] = []
     for index, method in enumerate(methods):
-        runs = []
-        for pair in pairs if method.trained else pairs[:1]:
-            run = apart(run_method, method, replace(pair, off=()), threads)
-            runs.append((pair, run, judged(pair, run.layers)))
-        results.append(_together(method, runs))
+        results.append(keep(method.name, partial(_measured, method, pairs, threads)))
         progress(index + 1, len(methods))
     return results
+
+
+def _measured(method: Method, pairs: Sequence[StillPair], threads: int) -> MethodResult:
+    runs = []
+    for pair in pairs if method.trained else pairs[:1]:
+        run = apart(run_method, method, replace(pair, off=()), threads)
+        runs.append((pair, run, judged(pair, run.layers)))
+    return _together(method, runs)
 
 
 def _together(method: Method, runs: Sequence[tuple[StillPair, MethodRun, Seen]]) -> MethodResult:

@@ -1,14 +1,21 @@
-"""Progress of long work, on stderr, so that stdout stays the result's."""
+"""Progress of long work, on stderr, so that stdout stays the result's. Off a terminal: a line now and then."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+
+from runtime.support.progress import NowAndThen
 
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar that is told (done, of); nothing is drawn where stderr is no terminal."""
+    """A bar that is told (done, of)."""
+    if not sys.stderr.isatty():
+        told = NowAndThen(sys.stderr)
+        yield lambda done, of: told(f"{title}: {done} of {of}")
+        return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -21,7 +28,11 @@ def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def status_line(title: str) -> Iterator[Callable[[str], None]]:
-    """A line that says what is being done; nothing is drawn where stderr is no terminal."""
+    """A line that says what is being done."""
+    if not sys.stderr.isatty():
+        told = NowAndThen(sys.stderr)
+        yield lambda text: told(f"{title}: {text}")
+        return
     from rich.console import Console
 
     console = Console(stderr=True)

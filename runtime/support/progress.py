@@ -13,6 +13,8 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from typing import TextIO
 
+NOW_AND_THEN_S = 30.0  # between two lines where nobody watches
+
 Listener = Callable[[str, int, int | None], None]  # what is done, how many of them, of how many (None: not known)
 
 _LISTENER: ContextVar[Listener | None] = ContextVar("progress", default=None)
@@ -57,12 +59,36 @@ def listening(listener: Listener) -> Iterator[None]:
         _LISTENER.reset(token)
 
 
-class TerminalLine:
-    """A listener that shows a task which takes long on one line of a terminal, and takes the line away at its end."""
+class NowAndThen:
+    """Where long work is, in a log or a pipe: a line once in a while, none of what is quick."""
 
-    def __init__(self, stream: TextIO, *, after_s: float = 1.0, every_s: float = 0.25) -> None:
-        """Shows nothing where the stream is no terminal."""
+    def __init__(self, stream: TextIO, *, every_s: float = NOW_AND_THEN_S) -> None:
+        self._stream, self._every_s = stream, every_s
+        self._begin_s = self._told_s = time.monotonic()
+
+    def __call__(self, text: str) -> None:
+        now_s = time.monotonic()
+        if now_s - self._told_s < self._every_s:
+            return
+        self._told_s = now_s
+        minutes, seconds = divmod(round(now_s - self._begin_s), 60)
+        with suppress(OSError, ValueError):
+            self._stream.write(f"{minutes}:{seconds:02} {text}\n")
+            self._stream.flush()
+
+
+class TerminalLine:
+    """A listener that shows a task which takes long on one line of a terminal, and takes the line away at its end.
+
+    Where the stream is no terminal it tells now and then.
+    """
+
+    def __init__(
+        self, stream: TextIO, *, after_s: float = 1.0, every_s: float = 0.25, now_and_then_s: float = NOW_AND_THEN_S
+    ) -> None:
         self._stream, self._after_s, self._every_s = stream, after_s, every_s
+        self._now_and_then_s = now_and_then_s
+        self._lines = NowAndThen(stream, every_s=now_and_then_s)
         self._told: tuple[str, int, int | None] = ("", 0, None)
         self._ended: threading.Event | None = None  # of the task under way
 
@@ -72,7 +98,11 @@ class TerminalLine:
             if self._ended is not None:
                 self._ended.set()
                 self._ended = None
-        elif self._ended is None and done == 0 and self._stream.isatty():
+        elif not self._stream.isatty():
+            if done == 0 and total is None:
+                self._lines = NowAndThen(self._stream, every_s=self._now_and_then_s)
+            self._lines(what + (f": {done} of {total}" if total else f": {done}" if done else ""))
+        elif self._ended is None and done == 0:
             self._ended = threading.Event()
             threading.Thread(target=self._show, args=(self._ended,), name="progress", daemon=True).start()
 

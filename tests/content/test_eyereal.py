@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from runtime.config import ContentSettings
 from runtime.content.base import View
 from runtime.content.eyereal import EyeRealSource, is_data_set, read_folder
 from runtime.content.presets import preset
 from runtime.content.procedural import ProceduralSource
+from runtime.content.registry import open_content
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import write_png
@@ -155,3 +157,25 @@ def test_an_eye_behind_the_display_is_told(tmp_path: Path) -> None:
         (tmp_path / f"pair0_x-6.0_y{y}_z2.0_{half}.jpg").write_bytes(b"")
     with pytest.raises(InputError, match="behind the display"):
         read_folder(tmp_path, LEGO)
+
+
+def test_a_folder_of_any_name_is_read_as_the_preset_that_its_eyes_fit(
+    tmp_path: Path, context: Any, stack: PanelStack
+) -> None:
+    folder = tmp_path / "from-the-net"
+    folder.mkdir()
+    write_pair(folder, context, stack)
+    source = open_content(ContentSettings(scene=str(folder)), stack, context)
+    assert source.info.name.startswith("from-the-net (read as ") and "which its eyes fit" in source.info.name
+    known = EyeRealSource(read_folder(folder, LEGO), fov_deg=40, background=(1, 1, 1), name="lego")
+    view = panel_view((0.78, 0.0, 0.24), stack.panel(1))
+    assert (source.render(view, time_ns=0) == known.render(view, time_ns=0)).all()
+
+
+def test_a_folder_whose_eyes_fit_no_scene_is_told_what_to_set(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    folder = tmp_path / "from-the-net"
+    folder.mkdir()
+    for half, y in ((0, -400.0), (1, 400.0)):
+        write_png(folder / f"pair0_x9000.0_y{y}_z0.0_{half}.png", np.zeros((4, 4, 3), np.uint8))
+    with pytest.raises(InputError, match=r"from-the-net: name: names no preset, and its eyes fit none: set content"):
+        open_content(ContentSettings(scene=str(folder)), stack, context)

@@ -215,3 +215,67 @@ def test_an_rgbd_picture_without_depth_is_told(tmp_path: Path, context: Any, sta
     write_png(tmp_path / "a_rgbd.png", np.concatenate([solid(RED), solid(BLUE)], axis=1))
     with pytest.raises(InputError, match=r"a_rgbd.png: layout: the right half is no grey depth map"):
         opened(tmp_path / "a_rgbd.png", context, stack)
+
+
+def drawn_size(path: Path, context: Any, stack: PanelStack) -> tuple[int, int]:
+    """Columns and rows of what is drawn on the display."""
+    source = opened(path, context, stack)
+    picture = source.render(panel_view(EYES[0], stack.panel(1)), time_ns=0)
+    rows, columns = np.nonzero(picture[..., 3] > 127)
+    return int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "aspect"),
+    [
+        ("a_sbs.png", (200, 50), 2.0),
+        ("a_hsbs.png", (200, 50), 4.0),
+        ("a_half_sbs.png", (100, 100), 1.0),
+        ("a_htb.png", (100, 100), 1.0),
+        ("a_tb.png", (100, 100), 2.0),
+        ("a_qs4x2.png", (200, 200), 0.5),
+        ("a_qs4x2a0.75.png", (200, 200), 0.75),
+        ("a_qs4x2a1.5.png", (200, 200), 1.5),
+    ],
+)
+def test_halves_and_quilts_have_the_shape_that_their_name_tells(
+    tmp_path: Path, context: Any, stack: PanelStack, name: str, size: tuple[int, int], aspect: float
+) -> None:
+    write_png(tmp_path / name, solid(GREEN, *size))
+    columns, rows = drawn_size(tmp_path / name, context, stack)
+    assert columns / rows == pytest.approx(aspect, rel=0.03)
+
+
+@pytest.mark.parametrize("name", ["a_hsbs.png", "a_htb.png"])
+def test_each_eye_gets_its_squeezed_half(tmp_path: Path, context: Any, stack: PanelStack, name: str) -> None:
+    write_png(tmp_path / name, np.concatenate([solid(RED), solid(BLUE)], axis=1 if "sbs" in name else 0))
+    source = opened(tmp_path / name, context, stack)
+    assert centre(source, stack, 0) == list(RED) and centre(source, stack, 1) == list(BLUE)
+
+
+def test_a_quilt_of_no_possible_shape_is_refused(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    write_png(tmp_path / "a_qs4x2a99.png", solid(GREEN))
+    with pytest.raises(InputError, match=r"a_qs4x2a99.png: quilt: an aspect of 99; must be 0.05 to 20"):
+        opened(tmp_path / "a_qs4x2a99.png", context, stack)
+
+
+@pytest.mark.parametrize("blur", [0, 3])
+@pytest.mark.parametrize("eye", [(0.6, -0.12, 0.05), (0.6, 0.12, -0.05)])
+def test_beside_an_edge_there_is_neither_a_hole_nor_the_near_thing_drawn_out(
+    tmp_path: Path, context: Any, stack: PanelStack, blur: int, eye: tuple[float, float, float]
+) -> None:
+    """A green square before a blue ground, its edges mixed in colour and depth: only these two colours are seen."""
+    colour, depth = solid(BLUE, 320, 180), np.zeros((180, 320, 3), np.uint8)
+    colour[60:120, 130:190] = GREEN
+    depth[60:120, 130:190] = 255
+    if blur:
+        colour, depth = (cv2.blur(picture, (blur, blur)) for picture in (colour, depth))
+    write_png(tmp_path / "a_rgbd.png", np.concatenate([colour, depth], axis=1))
+    source = opened(tmp_path / "a_rgbd.png", context, stack, depth_m=(-0.05, 0.05))
+    picture = source.render(panel_view(eye, stack.panel(1)), time_ns=0)[40:230, 80:400].astype(int)
+    assert (picture[..., 3] == 255).all()
+    green = picture[..., 1] > 200
+    ground = (picture[..., 2] > 200) & (picture[..., 1] < 40)
+    assert (green | ground).mean() > 0.985  # but for the outline's own smoothing
+    expected = (60 * 480 / 320) ** 2  # 0.55 m from the eye it is drawn as large as it was from 0.6
+    assert green.sum() == pytest.approx(expected, rel=0.08)

@@ -98,6 +98,41 @@ say("scenes to choose from", await page.evaluate(() => document.querySelectorAll
 await page.fill("#scene", "demo");
 await page.click("#scene-form button");
 say("scene back", (await told("scene: done")) && (await statusIs((s) => s.scene === "demo")));
+// Scenes by their pictures, a playlist, the model, the place.
+say("thumbnails", await until(() => page.evaluate(() =>
+  [...document.querySelectorAll("#picker img")].filter((i) => i.complete && i.naturalWidth > 100).length >= 5)));
+await page.click('#picker button[data-scene="sparse"]');
+say("a scene by its picture", (await told("scene: done")) && (await statusIs((s) => s.scene === "sparse")) &&
+  (await until(async () => (await page.getAttribute('#picker button[data-scene="sparse"]', "aria-pressed")) === "true")));
+await page.fill("#p-right", "60");
+say("moved at once", (await statusIs((s) => Math.abs(s.placing.offset_m[1] - 0.06) < 1e-9)) &&
+  (await until(async () => (await page.textContent("#placed")).includes("place: done"))));
+await page.fill("#p-turntable", "6");
+say("turntable", await statusIs((s) => s.placing.turntable_per_min === 6 && Math.abs(s.placing.offset_m[1] - 0.06) < 1e-9));
+await page.fill("#p-up", "5000");
+say("a place where nothing is seen", (await until(async () => (await page.textContent("#placed")).includes("leaves nothing"))) &&
+  (await statusIs((s) => s.placing.offset_m[2] === 0)));
+await page.click("#place-reset");
+say("as configured", await statusIs((s) => s.placing.turntable_per_min === 0 && s.placing.offset_m[1] === 0));
+await page.fill("#model", "sart");
+await page.keyboard.press("Enter");
+say("another model", (await told("model: done")) && (await statusIs((s) => s.model.startsWith("sart"))));
+await page.fill("#model", "fast");
+await page.click("#model-form button");
+say("the model back", (await told("model: done")) && (await statusIs((s) => s.model.startsWith("fast"))));
+await page.fill("#seconds", "300");
+for (const scene of ["thin", "grey"]) {
+  await page.fill("#scene", scene);
+  await page.click("#list-add");
+}
+await page.click("#list-show");
+say("a playlist", (await told("playlist: done")) && (await statusIs((s) => s.playlist && s.playlist.entries.length === 2 && s.content.includes("thin (1 of 2)"))) &&
+  (await until(async () => (await page.textContent("#list-told")).includes("1 of 2"))));
+await page.click("[data-command=next]");
+say("the next one", (await told("next: done")) && (await statusIs((s) => s.content.includes("grey (2 of 2)"))));
+say("a restart is not offered here", await page.isDisabled("#restart"));
+await page.click('#picker button[data-scene="demo"]');
+say("from a playlist to a scene", (await told("scene: done")) && (await statusIs((s) => s.scene === "demo" && !s.playlist)));
 await page.fill("#budget", "40");
 await page.click("#budget-form button");
 say("budget", (await told("budget: done")) && (await statusIs((s) => s.budget && s.budget.budget_ms === 40)) &&
@@ -112,7 +147,7 @@ say("log and states", await page.evaluate(() => [document.querySelectorAll("#log
 // Every control is reached by the keyboard.
 await page.evaluate(() => { document.activeElement.blur(); window.scrollTo(0, 0); });
 const reached = [];
-for (let k = 0; k < 20; k += 1) {
+for (let k = 0; k < 70; k += 1) {
   await page.keyboard.press("Tab");
   reached.push(await page.evaluate(() => document.activeElement.dataset.command ?? (document.activeElement.id || document.activeElement.textContent)));
 }

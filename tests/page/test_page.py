@@ -16,11 +16,22 @@ import pytest
 from runtime.clock import MonotonicClock
 from runtime.daemon.server import StatusServer
 from runtime.errors import InputError
+from runtime.page import thumbnails
+from runtime.page.thumbnails import Thumbnails
 from runtime.page.token import cookie_of, token_of
 from tests.page.rig import ROOT, Page, page_of, short_folder
 from tests.waiting import eventually
 
-PATHS = ("/", "/page.js", "/page.css", "/now/status", "/now/pictures", "/now/log", "/now/about")
+PATHS = (
+    "/",
+    "/thumbnail?scene=demo",
+    "/page.js",
+    "/page.css",
+    "/now/status",
+    "/now/pictures",
+    "/now/log",
+    "/now/about",
+)
 
 
 class Loop:
@@ -194,3 +205,48 @@ def test_bad_options_are_one_line_and_exit_2(tmp_path: Path, options: list[str],
     command = [sys.executable, "-m", "runtime.cli", "page", "--token-file", str(tmp_path / "t"), "--port", "0"]
     done = subprocess.run([*command, *options], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2 and field in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_built_in_scenes_have_a_picture_and_others_the_one_that_was_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from runtime.content.scenes import SCENES
+
+    kept = Thumbnails(tmp_path / "deep" / "folder")
+    for name in SCENES:
+        assert (kept.jpeg(name) or b"").startswith(b"\xff\xd8")
+    for name in ("/srv/robot.glb", "../../etc/passwd", "", "a" * 5000, "\ud800"):
+        assert kept.jpeg(name) is None
+    told = {"jpegs": {"seen-left": "/9j/"}}
+    status = {"scene": "/srv/robot.glb", "content": "robot"}
+    kept.note(status, told)
+    assert kept.jpeg("/srv/robot.glb") is None  # the pictures may still be of the scene before
+    monkeypatch.setattr(thumbnails, "SETTLED_S", 0.0)
+    kept.note({**status, "loading": "x"}, told)
+    assert kept.jpeg("/srv/robot.glb") is None
+    kept.note(status, told)
+    kept.note(status, told)
+    assert kept.jpeg("/srv/robot.glb") == b"\xff\xd8\xff"
+    kept.note({**status, "scene": "other"}, {"jpegs": {"seen-left": "no base64!"}})
+    assert kept.jpeg("other") is None
+
+
+def test_a_picture_is_given_with_the_token_alone(page: Page, loop: Loop) -> None:
+    code, headers, body = page.ask("GET", "/thumbnail?scene=demo", **page.bearer)
+    assert (code, headers["content-type"]) == (200, "image/jpeg") and body.startswith(b"\xff\xd8")
+    assert page.ask("GET", "/thumbnail?scene=never-seen", **page.bearer)[0] == 404
+
+
+@pytest.mark.parametrize(
+    ("value", "problem"),
+    [
+        (None, "playlist wants a list of 1 to 64"),
+        ([], "playlist wants a list of 1 to 64"),
+        ([{"scene": "demo"}], "value[0]: playlist wants a scene and its seconds"),
+        ([{"scene": "demo", "seconds": "1"}], "value[0].seconds: playlist wants a number"),
+        ([{"scene": "demo", "seconds": 1, "file": "/etc"}], "value[0]: playlist wants a scene and its seconds"),
+    ],
+)
+def test_a_playlist_that_is_none_is_told(page: Page, loop: Loop, value: Any, problem: str) -> None:
+    code, answer = page.tell("playlist", value)
+    assert code == 409 and problem in answer["error"] and loop.told == []

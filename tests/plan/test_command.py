@@ -160,3 +160,18 @@ def test_the_survey_s_options_go_together(options: list[str], said: str) -> None
     done = runner.invoke(app, options)
     assert isinstance(done.exception, InputError)
     assert said in str(done.exception)
+
+
+def test_one_figure_stands_for_one_thing() -> None:
+    """What reuse costs is told with the drift that it is of, and agrees with what is shown then."""
+    import re
+
+    done = runner.invoke(app, ["--scene", "sparse", "--scale", "0.2"])
+    assert done.exit_code == 0, done.output
+    text = " ".join(done.output.split())
+    still = float(re.search(r"solved for: ([\d.]+) dB with", text)[1])  # type: ignore[index]
+    drifted = float(re.search(r"drifted by 1 mm, just before its picture is renewed: ([\d.]+) dB", text)[1])  # type: ignore[index]
+    result = json.loads(runner.invoke(app, ["--scene", "sparse", "--scale", "0.2", "--json"]).stdout)
+    (reuse,) = [item for item in result["plan"] if item["what"] == "render and inference"]
+    assert still - drifted == pytest.approx(reuse["costs_db"], abs=0.02)
+    assert result["psnr_db"] - result["psnr_db_drifted"] == pytest.approx(reuse["costs_db"], abs=0.002)

@@ -140,3 +140,65 @@ def test_a_measurement_compares_with_itself_and_has_every_stage(tmp_path: Path) 
     for entry in again["stages"]:
         assert {"render", "prepare", "inference", "finish"} <= entry["stage_ms"].keys()
         assert sum(entry["stage_ms"].values()) <= 1.5 * entry["total_ms"]
+
+
+def busy_file(**changes: Any) -> dict[str, Any]:
+    return regression_file(ms=200) | changes
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"yardsticks_ms": [10.0, 10.4, 16.0]}, "the same work took 10.0 to 16.0 ms"),
+        ({"others_cores": 1.4}, "other programs took 1.4 cores"),
+    ],
+)
+def test_on_a_busy_machine_times_are_not_compared_and_that_is_said(
+    tmp_path: Path, changes: dict[str, Any], told: str
+) -> None:
+    assert texts(regression_file(), busy_file(**changes)) == []
+    assert texts(busy_file(**changes), regression_file()) == []
+    lost = busy_file(**changes)
+    lost["methods"][0]["memory_mib"] = 300.0
+    assert texts(regression_file(), lost) == [(True, "1.50 times the memory")]  # what is no time is
+    for name, table in (("old", regression_file()), ("new", busy_file(**changes))):
+        (tmp_path / f"{name}.json").write_text(json.dumps(table))
+    paths = [str(tmp_path / f"{name}.json") for name in ("old", "new")]
+    done = CliRunner().invoke(app, ["compare", *paths])
+    assert done.exit_code == 0 and told in done.output and "measure again" in done.output
+    assert "worse" not in done.output
+    done = CliRunner().invoke(app, ["compare", *paths, "--json"])
+    assert json.loads(done.stdout)["times_compared"] is False
+
+
+def test_a_steady_machine_is_not_called_busy() -> None:
+    steady = regression_file() | {"yardsticks_ms": [10.0, 10.5, 11.0], "others_cores": 0.1}
+    assert benchmark.too_busy(steady) == "" and benchmark.too_busy(regression_file()) == ""
+
+
+def test_what_others_take_is_told_apart_from_our_own_work() -> None:
+    import subprocess
+    import sys
+    import time
+
+    ours = benchmark.OthersLoad()
+    end = time.process_time() + 0.6
+    while time.process_time() < end:
+        pass
+    mine = ours.cores()
+    others = benchmark.OthersLoad()
+    loop = "import time\nend = time.time() + 1.2\nwhile time.time() < end: pass"
+    with subprocess.Popen([sys.executable, "-c", loop]) as other:
+        time.sleep(0.9)
+        theirs = others.cores()  # a child that still runs is counted as another's
+        other.wait()
+    assert mine is not None and theirs is not None
+    assert theirs > 0.2
+
+
+@pytest.mark.parametrize("value", [5, ["x"], [0.0]])
+def test_yardsticks_that_are_none_are_refused(tmp_path: Path, value: Any) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps(regression_file() | {"yardsticks_ms": value}))
+    with pytest.raises(InputError, match="yardsticks_ms: must be a list of positive numbers"):
+        benchmark.read(path)

@@ -57,3 +57,19 @@ def test_time_that_is_up_ends_the_work() -> None:
     with pytest.raises(InputError, match="too slow"), task("a", seconds=0.01, too_slow=InputError("a", "", "too slow")):
         time.sleep(0.05)
         progress.tell("a", 1)
+
+
+def test_off_a_terminal_long_work_tells_where_it_is_now_and_then() -> None:
+    log = io.StringIO()
+    with listening(TerminalLine(log, now_and_then_s=0.1)):
+        work(0.45)
+    lines = log.getvalue().splitlines()
+    assert 2 <= len(lines) <= 5
+    assert all(line.startswith("0:00 a.glb: parts: 3 of 7") for line in lines)
+
+
+def test_off_a_terminal_quick_work_tells_nothing() -> None:
+    log = io.StringIO()
+    with listening(TerminalLine(log)):
+        work(0.02)
+    assert log.getvalue() == ""

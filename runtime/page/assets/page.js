@@ -211,6 +211,157 @@ function pictures(answer) {
   box.dataset.frame = answer.frame ?? "";
 }
 
+// Scenes.
+
+const short = (name) => name.split("/").filter(Boolean).pop() ?? name;
+
+function picker(names) {
+  const box = $("picker");
+  const key = JSON.stringify(names);
+  if (box.dataset.key === key) return;
+  box.dataset.key = key;
+  box.replaceChildren(...names.map((name) => {
+    const button = html("button", "", { scene: name });
+    button.type = "button";
+    button.setAttribute("aria-pressed", "false");
+    button.title = name;
+    const image = document.createElement("img");
+    image.alt = "";
+    image.loading = "lazy";
+    image.src = `/thumbnail?scene=${encodeURIComponent(name)}`;
+    image.addEventListener("error", () => {
+      const none = html("span", "not seen yet");
+      none.className = "none";
+      image.replaceWith(none);
+    });
+    button.append(image, html("span", short(name)));
+    button.addEventListener("click", async () => {
+      delete $("scene").dataset.touched;
+      await tell(button, "scene", name);
+    });
+    return button;
+  }));
+}
+
+function scenes(status) {
+  for (const button of $("picker").children) {
+    button.setAttribute("aria-pressed", String(button.dataset.scene === status.scene));
+  }
+}
+
+let own = []; // the playlist that is being put together
+let shown = null; // the one that the daemon shows
+
+function drawList() {
+  const entries = own.length ? own : shown?.entries ?? [];
+  const key = JSON.stringify([entries, own.length ? -1 : shown?.index]);
+  if ($("list").dataset.key === key) return;
+  $("list").dataset.key = key;
+  $("list").replaceChildren(...entries.map((entry, index) => {
+    const line = html("li");
+    line.append(html("span", `${short(entry.scene)}, ${entry.seconds} s`));
+    if (own.length) {
+      const remove = html("button", "Remove");
+      remove.type = "button";
+      remove.className = "quiet";
+      remove.setAttribute("aria-label", `Remove ${short(entry.scene)}`);
+      remove.addEventListener("click", () => {
+        own.splice(index, 1);
+        drawList();
+        ($("list").querySelector("button") ?? $("list-add")).focus();
+      });
+      line.append(remove);
+    } else if (index === shown?.index) {
+      line.setAttribute("aria-current", "true");
+    }
+    return line;
+  }));
+}
+
+function playlist(told) {
+  shown = told ?? null;
+  drawList();
+  const left = shown?.left_s === null || shown?.left_s === undefined ? "it stays" : `for ${number(shown.left_s, 0)} s more`;
+  const now = shown ? `shown: ${shown.index + 1} of ${shown.entries.length}, ${left}` : "none is shown";
+  setText($("list-told"), own.length ? `${now}; below: a new one, not shown yet` : now);
+}
+
+$("list-add").addEventListener("click", () => {
+  const scene = $("scene").value.trim();
+  if (!scene || !$("seconds").reportValidity()) return;
+  own.push({ scene, seconds: Number($("seconds").value) });
+  playlist(shown);
+});
+$("list-clear").addEventListener("click", () => {
+  own = [];
+  playlist(shown);
+});
+$("list-form").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  if (!own.length) {
+    $("told").dataset.kind = "bad";
+    setText($("told"), "playlist: add a scene first");
+    return;
+  }
+  if (await tell($("list-show"), "playlist", own)) own = [];
+});
+
+// Where the scene stands: sent as it is changed.
+
+const PLACE = [
+  ["p-scale", "scale", null, 1], ["p-turntable", "turntable_per_min", null, 1],
+  ["p-out", "offset_m", 0, 1000], ["p-right", "offset_m", 1, 1000], ["p-up", "offset_m", 2, 1000],
+  ["p-roll", "rotation_deg", 0, 1], ["p-pitch", "rotation_deg", 1, 1], ["p-yaw", "rotation_deg", 2, 1],
+];
+let placed = null, waiting = null, sending = false;
+
+function placing(told) {
+  if (!told) return;
+  placed = told;
+  for (const [id, name, part, units] of PLACE) {
+    const value = (part === null ? told[name] : told[name][part]) * units;
+    // What is being typed, or not sent yet, stays.
+    if (document.activeElement !== $(id) && !waiting && !sending) $(id).value = Number(value.toFixed(4));
+  }
+}
+
+async function sendPlacing() {
+  if (sending || !waiting) return;
+  sending = true;
+  const value = waiting;
+  waiting = null;
+  await tell(null, "place", value, $("placed"));
+  sending = false;
+  sendPlacing();
+}
+
+for (const [id, name, part, units] of PLACE) {
+  $(id).addEventListener("input", () => {
+    if (!placed || $(id).value === "" || !$(id).checkValidity()) return;
+    const value = Number($(id).value) / units;
+    const before = (waiting ?? {})[name] ?? placed[name];
+    const next = part === null ? value : before.map((v, k) => (k === part ? value : v));
+    waiting = { ...waiting, [name]: next };
+    placed = { ...placed, [name]: next };
+    sendPlacing();
+  });
+}
+$("place-form").addEventListener("submit", (event) => event.preventDefault());
+$("place-reset").addEventListener("click", () => tell($("place-reset"), "place", null, $("placed")));
+
+// A restart darkens the display: it is asked for twice.
+
+let armed = 0;
+$("restart").addEventListener("click", async () => {
+  if (Date.now() - armed > 5000) {
+    armed = Date.now();
+    setText($("told"), "restart: the display goes dark for some seconds; press again to do it");
+    return;
+  }
+  armed = 0;
+  await tell($("restart"), "restart");
+});
+
 // Asking.
 
 async function lookUp(name) {
@@ -243,7 +394,14 @@ function show(status) {
   if (status.state === undefined) return; // it answers, and has shown nothing yet
   document.querySelector('[data-command="pause"]').setAttribute("aria-pressed", String(status.paused));
   document.querySelector('[data-command="flat"]').setAttribute("aria-pressed", String(status.flat_asked));
-  if (document.activeElement !== $("scene") && !$("scene").dataset.touched) $("scene").value = status.scene;
+  for (const [id, value] of [["scene", status.scene], ["model", status.model_asked]]) {
+    if (document.activeElement !== $(id) && !$(id).dataset.touched) $(id).value = value ?? "";
+  }
+  $("content-problem").hidden = !status.content_problem;
+  setText($("content-problem"), status.content_problem ?? "");
+  scenes(status);
+  playlist(status.playlist);
+  placing(status.placing);
   if (document.activeElement !== $("budget") && !$("budget").dataset.touched) $("budget").value = status.budget?.budget_ms ?? 0;
   plot(status);
   drawEyes(status);
@@ -282,23 +440,29 @@ every(LOG_MS, async () => {
   entries($("states"), answer.states, (s) => [`${s.state}: ${s.reason}`, { state: s.state.split(":")[0] }]);
 });
 every(ABOUT_MS, async () => {
-  if (about?.stack && running) return;
+  if (!running) return;
   const answer = await lookUp("about");
   if (!answer.ok) return;
   about = answer;
-  $("scenes").replaceChildren(...(answer.scenes ?? []).map((name) => {
-    const option = document.createElement("option");
-    option.value = name;
-    return option;
-  }));
+  for (const id of ["scenes", "models"]) {
+    $(id).replaceChildren(...(answer[id] ?? []).map((name) => {
+      const option = document.createElement("option");
+      option.value = name;
+      return option;
+    }));
+  }
+  $("restart").disabled = !answer.may_restart;
+  $("restart-told").hidden = answer.may_restart;
+  picker(answer.scenes ?? []);
 });
 
 // Telling.
 
-async function tell(button, command, value = null) {
-  button.disabled = true;
-  $("told").dataset.kind = "";
-  setText($("told"), `${command}: asked`);
+async function tell(button, command, value = null, where = $("told")) {
+  if (button) button.disabled = true;
+  where.dataset.kind = "";
+  setText(where, `${command}: asked`);
+  let done = false;
   try {
     const answer = await fetch("/do", {
       method: "POST",
@@ -307,25 +471,34 @@ async function tell(button, command, value = null) {
       body: JSON.stringify({ command, value }),
     });
     const said = await answer.json();
-    $("told").dataset.kind = said.ok ? "" : "bad";
-    setText($("told"), said.ok ? `${command}: done${said.file ? `: ${said.file}` : said.note ? `: ${said.note}` : ""}` : `${command}: ${said.error}`);
+    done = said.ok === true;
+    where.dataset.kind = said.ok ? "" : "bad";
+    setText(where, said.ok ? `${command}: done${said.file ? `: ${said.file}` : said.note ? `: ${said.note}` : ""}` : `${command}: ${said.error}`);
   } catch {
-    $("told").dataset.kind = "bad";
-    setText($("told"), `${command}: the page's own server does not answer`);
+    where.dataset.kind = "bad";
+    setText(where, `${command}: the page's own server does not answer`);
   } finally {
-    button.disabled = false;
-    button.focus();
+    if (button) {
+      button.disabled = false;
+      button.focus();
+    }
   }
+  return done;
 }
 
 for (const button of document.querySelectorAll("[data-command]")) {
   button.addEventListener("click", () => tell(button, button.dataset.command));
 }
-for (const id of ["scene", "budget"]) $(id).addEventListener("input", () => ($(id).dataset.touched = "yes"));
+for (const id of ["scene", "model", "budget"]) $(id).addEventListener("input", () => ($(id).dataset.touched = "yes"));
 $("scene-form").addEventListener("submit", async (event) => {
   event.preventDefault();
   await tell(event.submitter ?? event.target.querySelector("button"), "scene", $("scene").value.trim());
   delete $("scene").dataset.touched;
+});
+$("model-form").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  await tell(event.submitter ?? event.target.querySelector("button"), "model", $("model").value.trim());
+  delete $("model").dataset.touched;
 });
 $("budget-form").addEventListener("submit", async (event) => {
   event.preventDefault();

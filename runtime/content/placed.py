@@ -1,0 +1,216 @@
+"""A scene moved, turned, scaled or on a turntable, whatever draws it: the eye is moved the other way.
+
+A source never learns of it: a view's projection times the placing is another projection, and the eye seen from the
+scene is another eye.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from runtime.clock import NS_PER_S
+from runtime.config import ContentSettings
+from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.presets import rotation_matrix
+from runtime.errors import InputError
+from runtime.optics.rect import PixelRect
+from runtime.optics.stack import PanelStack
+from runtime.optics.views import raster_from_stack
+from runtime.records import F64, U8
+from runtime.support.gl import DrawnPicture
+
+FIELDS = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # of ContentSettings
+NS_PER_MIN = 60 * NS_PER_S
+LOOKED_FROM_M = ((0.6, 0.0, 0.0), (0.57, -0.2, 0.05), (0.57, 0.2, 0.05))  # whether anything is seen
+LOOKED_PX = (192, 108)
+LOOKED_TURNS = 6  # places of a turntable
+
+
+@dataclass(frozen=True, slots=True)
+class Placing:
+    """Where a scene stands: p_stack = offset + scale · R · p, R the turntable's turn after the rotation."""
+
+    scale: float = 1.0
+    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # frame `stack`
+    rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # about x, y, z of `stack`, in this order
+    turntable_per_min: float = 0.0  # about the vertical
+    start_turns: float = 0.0  # of the turntable at time 0
+
+    @property
+    def stands_as_it_is(self) -> bool:
+        """Nothing is moved."""
+        return self == Placing(start_turns=self.start_turns)
+
+    def turns_at(self, time_ns: int) -> float:
+        """Of the turntable."""
+        # Whole turns are left out first: a clock that has run for months keeps its fractions.
+        period_ns = NS_PER_MIN / self.turntable_per_min if self.turntable_per_min else 0.0
+        return self.start_turns + (time_ns % period_ns) / period_ns if period_ns else 0.0
+
+    def rotation(self, time_ns: int) -> F64:
+        """3x3 stack_from_scene turn."""
+        fixed = rotation_matrix(self.rotation_deg, "xyz")
+        if not self.turntable_per_min:
+            return fixed
+        return rotation_matrix((0.0, 0.0, 360.0 * self.turns_at(time_ns)), "xyz") @ fixed
+
+    def stack_from_scene(self, time_ns: int) -> F64:
+        """4x4 similarity."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.scale * self.rotation(time_ns)
+        matrix[:3, 3] = self.offset_m
+        return matrix
+
+    def after(self, earlier: Placing, time_ns: int) -> Placing:
+        """This one, its turntable going on from where an earlier one's stands."""
+        if not self.turntable_per_min:
+            return self
+        ahead = replace(self, start_turns=0.0).turns_at(time_ns)
+        return replace(self, start_turns=(earlier.turns_at(time_ns) - ahead) % 1.0)
+
+
+def placing_of(settings: ContentSettings) -> Placing:
+    """As the settings have it."""
+    return Placing(settings.scale, settings.offset_m, settings.rotation_deg, settings.turntable_per_min)
+
+
+def placed_source(source: ContentSource, placing: Placing, stack: PanelStack, *, time_ns: int = 0) -> ContentSource:
+    """The source at its place; one that was placed before is placed anew. For the thread with the GL context.
+
+    Raises InputError, naming the field, where nothing of it would be seen; the source is closed only if it is new.
+    """
+    new = not isinstance(source, PlacedSource)
+    inner = source.source if isinstance(source, PlacedSource) else source
+    if isinstance(source, PlacedSource):
+        placing = placing.after(source.placing, time_ns)
+    if placing.stands_as_it_is:
+        return inner
+    result = PlacedSource(inner, placing)
+    if _nothing_is_seen(result, stack, time_ns):
+        name = inner.info.name
+        if new:
+            inner.close()
+        raise InputError("content", _field_of(placing), _told(name, placing, stack))
+    return result
+
+
+def _nothing_is_seen(source: PlacedSource, stack: PanelStack, time_ns: int) -> bool:
+    """Drawn small, from the middle and either side, and at some turns of a turntable."""
+    width, height = LOOKED_PX
+    raster = replace(stack, width_px=width, height_px=height).panel(stack.count // 2)
+    turntable = source.placing.turntable_per_min
+    period_ns = NS_PER_MIN / abs(turntable) if turntable else 0.0
+    times_ns = [time_ns + round(period_ns * turn / LOOKED_TURNS) for turn in range(LOOKED_TURNS if turntable else 1)]
+    views = [View(np.array(eye), 0, raster_from_stack(np.array(eye), raster), width, height) for eye in LOOKED_FROM_M]
+    return all(source.is_empty(view, time_ns=time) for time in times_ns for view in views)
+
+
+def _field_of(placing: Placing) -> str:
+    """What is most likely wrong."""
+    if placing.scale < 0.1:
+        return "scale"
+    return "offset_m" if any(placing.offset_m) else "scale" if placing.scale != 1.0 else "rotation_deg"
+
+
+def _told(name: str, placing: Placing, stack: PanelStack) -> str:
+    out, right, up = placing.offset_m
+    return (
+        f"leaves nothing of `{name}` to be seen: it stands at {placing.scale:g} times its size {out:g} m out, "
+        f"{right:g} m to the right and {up:g} m up, and the display reaches {stack.width_m / 2:.2f} m to the right and "
+        f"{stack.height_m / 2:.2f} m up"
+    )
+
+
+class PlacedSource(ContentSource):
+    """A source at another place."""
+
+    def __init__(self, source: ContentSource, placing: Placing) -> None:
+        """source: closed with this one."""
+        self.source, self.placing = source, placing
+        self._told: tuple[ContentInfo, ContentInfo] | None = None  # of the source, and as placed
+        self._blank: dict[tuple[int, int], U8] = {}
+
+    @property
+    def info(self) -> ContentInfo:  # type: ignore[override]
+        """The source's own, as far as it still holds here."""
+        inner = self.source.info
+        if self._told is None or self._told[0] is not inner:
+            self._told = inner, _moved(inner, self.placing)
+        return self._told[1]
+
+    @property
+    def problem(self) -> str:
+        return self.source.problem
+
+    @property
+    def draws_in(self) -> object:  # type: ignore[override]
+        return self.source.draws_in
+
+    def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
+        try:
+            return self.source.draw(self._seen_from_scene(view, time_ns), time_ns=time_ns)
+        except ValueError:  # `render` has the background then
+            return None
+
+    def render(self, view: View, *, time_ns: int) -> U8:
+        try:
+            return self.source.render(self._seen_from_scene(view, time_ns), time_ns=time_ns)
+        except ValueError:  # of the optics: a flat picture was turned until its plane goes through the eye
+            return self._background(view)
+
+    def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
+        return self.source.extent(self._seen_from_scene(view, time_ns), time_ns=time_ns)
+
+    def revision(self, *, time_ns: int) -> int:
+        inner = self.source.revision(time_ns=time_ns)
+        return time_ns if self.placing.turntable_per_min else inner
+
+    def is_empty(self, view: View, *, time_ns: int) -> bool:
+        try:
+            return self.source.is_empty(self._seen_from_scene(view, time_ns), time_ns=time_ns)
+        except ValueError:
+            return True
+
+    def describe(self, *, time_ns: int) -> dict[str, Any] | None:
+        return self.source.describe(time_ns=time_ns)
+
+    def skip(self, *, time_ns: int) -> bool:
+        return self.source.skip(time_ns=time_ns)
+
+    def close(self) -> None:
+        self.source.close()
+
+    def _seen_from_scene(self, view: View, time_ns: int) -> View:
+        """The same pixels for the same eye, in the scene's frame."""
+        matrix = self.placing.stack_from_scene(time_ns)
+        turn = matrix[:3, :3] / self.placing.scale
+        eye = turn.T @ (view.eye_m - matrix[:3, 3]) / self.placing.scale
+        turned = turn if view.turned is None else view.turned @ turn
+        return View(eye, view.side, view.pixels_from_stack @ matrix, view.width_px, view.height_px, turned)
+
+    def _background(self, view: View) -> U8:
+        size = (view.height_px, view.width_px)
+        if size not in self._blank:
+            colour = self.info.background or (1.0, 1.0, 1.0)
+            pixel = [*(round(255 * value) for value in colour), 0]
+            self._blank = {size: np.tile(np.array(pixel, np.uint8), (*size, 1))}
+        return self._blank[size]
+
+
+def _moved(info: ContentInfo, placing: Placing) -> ContentInfo:
+    still = not placing.turntable_per_min
+    upright = still and placing.rotation_deg[1:] == (0.0, 0.0)  # its planes stay parallel to the panels
+    out_m = placing.offset_m[0]
+    depth = None
+    if upright and info.depth_range_m is not None:
+        rear, front = (out_m + placing.scale * x for x in info.depth_range_m)
+        depth = (rear, front)
+    return replace(
+        info,
+        moving=info.moving or not still,
+        depth_range_m=depth,
+        flat_x_m=info.flat_x_m if upright and out_m == 0.0 else None,
+    )

@@ -1,0 +1,193 @@
+"""A playlist: scenes one after another, each for a time, each with settings of its own.
+
+Every one of them is loaded before the first is shown: what is missing is told then, and a change takes no time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from runtime.clock import NS_PER_S
+from runtime.config import ContentSettings, Section, located, read_table, validated
+from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.placed import FIELDS, Placing
+from runtime.errors import InputError
+from runtime.optics.rect import PixelRect
+from runtime.records import U8
+from runtime.support import foreign
+from runtime.support.gl import DrawnPicture
+
+ENTRIES_MAX = 64
+SECONDS_LEAST, SECONDS_MOST = 0.5, 86_400.0
+KEPT_FOR_ALL = ("background", "external")  # settings of content that entries share
+
+
+class PlaylistFile(Section):
+    """The file: TOML (or JSON) with a table `[[show]]` for each scene."""
+
+    repeat: bool = Field(True, description="begin again after the last one; else it stays")
+    show: list[dict[str, Any]] = Field(min_length=1, max_length=ENTRIES_MAX, description="the scenes, in this order")
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One scene of a playlist."""
+
+    settings: ContentSettings  # with its own placing
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Playlist:
+    """A file that was read; nothing of what it names has been opened."""
+
+    path: Path
+    repeat: bool
+    entries: tuple[Entry, ...]
+
+
+def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
+    """Raises InputError, naming file, entry and field.
+
+    settings: what holds where an entry says nothing; where the whole list is placed is not theirs.
+    """
+    file = validated(PlaylistFile, read_table(path), source=path)
+    unplaced = Placing()
+    common = settings.model_dump() | {name: getattr(unplaced, name) for name in FIELDS} | {"file": ""}
+    entries = []
+    for number, table in enumerate(file.show):
+        field = f"show[{number}]"
+        for name in KEPT_FOR_ALL:
+            if name in table:
+                raise InputError(path, f"{field}.{name}", "holds for the whole list: set it in [content]")
+        seconds = foreign.real(
+            table.get("seconds"), least=SECONDS_LEAST, most=SECONDS_MOST, source=path, field=f"{field}.seconds"
+        )
+        own = {name: value for name, value in table.items() if name != "seconds"}
+        if not isinstance(own.get("scene"), str) or not own["scene"]:
+            raise InputError(path, f"{field}.scene", "names no scene")
+        own["scene"] = located(own["scene"], path.absolute().parent)
+        if own["scene"] == "external" or Path(own["scene"]).suffix.lower() in (".toml", ".json"):
+            raise InputError(path, f"{field}.scene", "is no scene for a playlist: another list, or another program's")
+        if isinstance(own.get("file"), str) and own["file"]:
+            own["file"] = str(path.absolute().parent / own["file"])
+        try:
+            entries.append(Entry(validated(ContentSettings, common | own, source=""), seconds))
+        except InputError as error:
+            raise InputError(path, f"{field}.{error.field}", error.problem) from None
+    return Playlist(path, file.repeat, tuple(entries))
+
+
+class PlaylistSource(ContentSource):
+    """The scenes of a list, one after another, from the first time that it is asked for."""
+
+    def __init__(
+        self,
+        playlist: Playlist,
+        openers: list[Callable[[Any], ContentSource]],
+        *,
+        context: Any,
+        background: tuple[float, float, float],
+    ) -> None:
+        """Raises InputError where one of them can't be shown."""
+        self._list = playlist
+        self._ends_ns = _ends_ns(playlist)
+        self._begin_ns: int | None = None
+        self._number = 0  # of the entry at present, counted over all rounds
+        self._background = background
+        self._sources: list[ContentSource] = []
+        try:
+            for number, opener in enumerate(openers):
+                try:
+                    self._sources.append(opener(context))
+                except InputError as error:
+                    raise InputError(playlist.path, f"show[{number}]", str(error)) from None
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def info(self) -> ContentInfo:  # type: ignore[override]
+        """Of the one at present, by the list's name."""
+        index = self._number % len(self._sources)
+        inner = self._sources[index].info
+        name = f"{self._list.path.stem}: {inner.name} ({index + 1} of {len(self._sources)})"
+        return replace(inner, name=name, moving=True, background=self._background)
+
+    @property
+    def problem(self) -> str:
+        return self._sources[self._number % len(self._sources)].problem
+
+    def describe(self, *, time_ns: int) -> dict[str, Any]:
+        """For the status: the scenes and their seconds, which one is shown, and for how long still."""
+        entries = [{"scene": entry.settings.scene, "seconds": entry.seconds} for entry in self._list.entries]
+        index, since_ns = self._at(time_ns)
+        left_s = self._list.entries[index % len(entries)].seconds - since_ns / NS_PER_S
+        last = not self._list.repeat and index >= len(entries) - 1
+        return {"entries": entries, "index": index % len(entries), "left_s": None if last else round(left_s, 1)}
+
+    def skip(self, *, time_ns: int) -> bool:
+        index, _ = self._at(time_ns)
+        if not self._list.repeat and index >= len(self._sources) - 1:
+            return False
+        rounds, within = divmod(index, len(self._sources))
+        self._begin_ns = time_ns - rounds * self._ends_ns[-1] - self._ends_ns[within]
+        return True
+
+    @property
+    def draws_in(self) -> object:  # type: ignore[override]
+        return self._sources[self._number % len(self._sources)].draws_in
+
+    def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
+        source, since_ns = self._source(time_ns)
+        return source.draw(view, time_ns=since_ns)
+
+    def render(self, view: View, *, time_ns: int) -> U8:
+        source, since_ns = self._source(time_ns)
+        return source.render(view, time_ns=since_ns)
+
+    def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
+        source, since_ns = self._source(time_ns)
+        return source.extent(view, time_ns=since_ns)
+
+    def revision(self, *, time_ns: int) -> int:
+        source, since_ns = self._source(time_ns)
+        return (self._number << 64) + source.revision(time_ns=since_ns)
+
+    def is_empty(self, view: View, *, time_ns: int) -> bool:
+        return all(source.is_empty(view, time_ns=0) for source in self._sources)
+
+    def close(self) -> None:
+        for source in self._sources:
+            source.close()
+
+    def _source(self, time_ns: int) -> tuple[ContentSource, int]:
+        """The one at a time, and the time since it began."""
+        if self._begin_ns is None:
+            self._begin_ns = time_ns
+        self._number, since_ns = self._at(time_ns)
+        return self._sources[self._number % len(self._sources)], since_ns
+
+    def _at(self, time_ns: int) -> tuple[int, int]:
+        """Which entry, counted over all rounds, and for how long."""
+        passed_ns = max(0, time_ns - (time_ns if self._begin_ns is None else self._begin_ns))
+        count, round_ns = len(self._ends_ns), self._ends_ns[-1]
+        if not self._list.repeat:
+            passed_ns = min(passed_ns, round_ns - 1)
+        rounds, within_ns = divmod(passed_ns, round_ns)
+        index = next(index for index, end in enumerate(self._ends_ns) if within_ns < end)
+        begin_ns = self._ends_ns[index - 1] if index else 0
+        return rounds * count + index, within_ns - begin_ns
+
+
+def _ends_ns(playlist: Playlist) -> list[int]:
+    ends, end = [], 0
+    for entry in playlist.entries:
+        end += round(entry.seconds * NS_PER_S)
+        ends.append(end)
+    return ends

@@ -1,0 +1,109 @@
+"""Films made for the tests, and a server that sends one as a stream, as well or badly as it is told."""
+
+from __future__ import annotations
+
+import io
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+
+RATE = 25
+
+
+def stereo_picture(number: int, width: int = 160, height: int = 48) -> np.ndarray:
+    """Left half red, right half blue, both with a green level that tells the number."""
+    picture = np.zeros((height, width, 3), np.uint8)
+    picture[:, : width // 2, 0] = 200
+    picture[:, width // 2 :, 2] = 200
+    picture[..., 1] = 20 + 4 * (number % 40)
+    return picture
+
+
+def film(
+    file: str | io.BytesIO,
+    *,
+    kind: str,
+    pictures: int,
+    first: int = 0,
+    size: tuple[int, int] = (160, 48),
+    told_rate: int = RATE,
+) -> None:
+    """A film of stereo pictures; told_rate: what the file says of its pictures a second."""
+    with av.open(file, "w", format=kind) as container:
+        stream = container.add_stream("mpeg2video" if kind == "mpegts" else "mpeg4", rate=told_rate)
+        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+        stream.bit_rate = 4_000_000
+        stream.gop_size = 5
+        for number in range(pictures):
+            frame = av.VideoFrame.from_ndarray(stereo_picture(first + number, *size), format="rgb24")
+            frame.pts, frame.time_base = number, Fraction(1, told_rate)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
+def transport_stream(pictures: int, **options: object) -> bytes:
+    """The same as MPEG-TS bytes, as cameras and encoders send it."""
+    held = io.BytesIO()
+    film(held, kind="mpegts", pictures=pictures, **options)  # type: ignore[arg-type]
+    return held.getvalue()
+
+
+class StreamServer:
+    """Sends bytes to whoever connects, at a pace, until told to hold or to hang up."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.hold, self.hang_up = data, threading.Event(), threading.Event()
+        self.pace_s = 0.01
+        self.connections = 0
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self.url = f"tcp://127.0.0.1:{self._listening.getsockname()[1]}"
+        self._closing = threading.Event()
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def close(self) -> None:
+        self._closing.set()
+        self._listening.close()
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            try:
+                client, _ = self._listening.accept()
+            except OSError:
+                return
+            self.connections += 1
+            self.hang_up.clear()
+            with client:
+                self._send(client)
+
+    def _send(self, client: socket.socket) -> None:
+        data, at, step = self.data, 0, 188 * 16
+        while at < len(data) and not self._closing.is_set() and not self.hang_up.is_set():
+            if self.hold.is_set():
+                self._closing.wait(0.02)
+                continue
+            try:
+                client.sendall(data[at : at + step])
+            except OSError:
+                return
+            at += step
+            self._closing.wait(self.pace_s)
+
+
+@contextmanager
+def served(data: bytes) -> Iterator[StreamServer]:
+    server = StreamServer(data)
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def film_file(path: Path, **options: object) -> Path:
+    film(str(path), kind=path.suffix.removeprefix(".").replace("mkv", "matroska"), **options)  # type: ignore[arg-type]
+    return path

@@ -1,0 +1,139 @@
+"""Placing: any scene moved, turned, scaled or turning, as the settings say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runtime.clock import NS_PER_S
+from runtime.config import ContentSettings
+from runtime.content.camera import project
+from runtime.content.placed import PlacedSource, Placing, placed_source
+from runtime.content.registry import open_content
+from runtime.errors import InputError
+from runtime.optics.stack import PanelStack
+from runtime.support.artifacts import write_png
+from tests.content.conftest import panel_view
+
+EYE = (0.6, 0.02, 0.03)
+
+
+def middle_of(picture: np.ndarray) -> np.ndarray:
+    """Columns and rows of the middle of what is drawn."""
+    rows, columns = np.nonzero(picture[..., 3] == 255)
+    return np.array([columns.mean() + 0.5, rows.mean() + 0.5])
+
+
+def drawn(context: Any, stack: PanelStack, scene: str = "sparse", time_ns: int = 0, **settings: Any) -> np.ndarray:
+    source = open_content(ContentSettings(scene=scene, **settings), stack, context)
+    picture = source.render(panel_view(EYE, stack.panel(1)), time_ns=time_ns).copy()
+    source.close()
+    return picture
+
+
+def test_a_scene_that_is_not_placed_is_the_source_itself(context: Any, stack: PanelStack) -> None:
+    source = open_content(ContentSettings(scene="sparse"), stack, context)
+    assert not isinstance(source, PlacedSource)
+    source.close()
+
+
+def test_a_placed_scene_can_be_left_in_a_texture(context: Any, stack: PanelStack) -> None:
+    source = open_content(ContentSettings(scene="sparse", offset_m=(0.0, 0.05, 0.0)), stack, context)
+    view = panel_view(EYE, stack.panel(1))
+    assert isinstance(source, PlacedSource) and source.draws_in is context
+    left = source.draw(view, time_ns=0)
+    assert left is not None
+    assert (left.pixels().copy() == source.render(view, time_ns=0)).all()
+    source.close()
+
+
+def test_an_offset_moves_it_to_where_the_projection_says(context: Any, stack: PanelStack) -> None:
+    offset = np.array([0.03, 0.08, -0.05])
+    there = middle_of(drawn(context, stack, offset_m=tuple(offset)))
+    view = panel_view(EYE, stack.panel(1))
+    centre = np.array([0.02, 0.03, 0.0])  # of the ring
+    expected = project(view.pixels_from_stack, (centre + offset)[None])[0][0]
+    assert np.abs(there - expected).max() < 2.5
+
+
+def test_scale_is_about_the_displays_middle(context: Any, stack: PanelStack) -> None:
+    small, large = (drawn(context, stack, scale=scale) for scale in (0.5, 1.5))
+    areas = [(picture[..., 3] == 255).sum() for picture in (small, large)]
+    assert areas[1] / areas[0] == pytest.approx(9, rel=0.15)
+
+
+def test_a_turn_about_the_axis_out_of_the_screen_turns_the_picture(tmp_path: Path, context: Any) -> None:
+    square = PanelStack(0.3, 0.3, (-0.06, 0.0, 0.06), 200, 200)
+    picture = np.full((100, 100, 3), 255, np.uint8)
+    picture[:50, 50:] = (255, 0, 0)  # red above right
+    write_png(tmp_path / "a.png", picture)
+    source = open_content(ContentSettings(scene=str(tmp_path / "a.png"), rotation_deg=(90, 0, 0)), square, context)
+    seen = source.render(panel_view((0.6, 0, 0), square.panel(1)), time_ns=0)
+    # From +y (right) towards +z (up): what was above right is above left.
+    assert seen[50, 50, :3].tolist() == [255, 0, 0]
+    assert seen[50, 150, :3].tolist() == [255, 255, 255]
+    assert source.info.flat_x_m == 0.0
+
+
+def test_a_turntable_turns_by_the_clock_and_goes_on_where_its_speed_is_changed(context: Any, stack: PanelStack) -> None:
+    source = open_content(ContentSettings(scene="sparse", turntable_per_min=6), stack, context)
+    assert isinstance(source, PlacedSource) and source.info.moving
+    view = panel_view(EYE, stack.panel(1))
+    pictures = [source.render(view, time_ns=second * NS_PER_S).copy() for second in (0, 5, 10)]
+    assert (pictures[0] != pictures[1]).any()
+    assert (pictures[0] == pictures[2]).all()  # six turns a minute
+    assert source.revision(time_ns=1) != source.revision(time_ns=2)
+    now_ns = 7 * NS_PER_S + 3 * 60 * NS_PER_S
+    faster = placed_source(source, Placing(turntable_per_min=-30), stack, time_ns=now_ns)
+    assert isinstance(faster, PlacedSource)
+    assert np.allclose(faster.placing.rotation(now_ns), source.placing.rotation(now_ns))
+    assert not np.allclose(faster.placing.rotation(now_ns + NS_PER_S), source.placing.rotation(now_ns + NS_PER_S))
+    faster.close()
+
+
+def test_the_lamp_stands_still_while_the_scene_turns(context: Any, stack: PanelStack) -> None:
+    """A ball without a picture looks alike from everywhere, if the lamp doesn't turn with it."""
+    from runtime.content import shapes
+    from runtime.content.procedural import ProceduralSource
+    from runtime.content.scenes import Scene, Thing
+
+    ball = Scene("ball", (Thing(shapes.sphere(0.05), "plain", (0.0, 0.0, 0.0), (0.5, 0.5, 0.5)),))
+    inner = ProceduralSource(ball, stack=stack, context=context)
+    view = panel_view((0.6, 0, 0), stack.panel(1))
+    stands = inner.render(view, time_ns=0).astype(int)
+    turned = PlacedSource(inner, Placing(rotation_deg=(0, 0, 90))).render(view, time_ns=0).astype(int)
+    inside = (stands[..., 3] == 255) & (turned[..., 3] == 255)
+    assert np.abs(stands - turned)[inside].max() <= 6
+    inner.close()
+
+
+def test_a_picture_turned_edge_on_is_the_background_and_no_error(tmp_path: Path, context: Any) -> None:
+    stack = PanelStack(0.3, 0.3, (-0.06, 0.0, 0.06), 64, 64)
+    write_png(tmp_path / "a.png", np.zeros((10, 10, 3), np.uint8))
+    source = open_content(ContentSettings(scene=str(tmp_path / "a.png")), stack, context)
+    turned = PlacedSource(source, Placing(rotation_deg=(0, 0, 90)))
+    assert (turned.render(panel_view((0.6, 0, 0), stack.panel(1)), time_ns=0) == (255, 255, 255, 0)).all()
+
+
+@pytest.mark.parametrize(
+    ("settings", "field"),
+    [
+        ({"offset_m": (0.0, 0.0, 2.0)}, "offset_m"),
+        ({"offset_m": (1.5, 0.0, 0.0)}, "offset_m"),
+        ({"scale": 0.001}, "scale"),
+    ],
+)
+def test_placing_that_leaves_nothing_to_be_seen_is_told_with_its_field(
+    context: Any, stack: PanelStack, settings: dict[str, Any], field: str
+) -> None:
+    with pytest.raises(InputError, match=rf"^content: {field}: leaves nothing of `sparse` to be seen: it stands at"):
+        open_content(ContentSettings(scene="sparse", **settings), stack, context)
+
+
+def test_what_is_seen_at_some_turn_of_the_table_is_shown(tmp_path: Path, context: Any, stack: PanelStack) -> None:
+    write_png(tmp_path / "a.png", np.zeros((10, 10, 3), np.uint8))
+    settings = ContentSettings(scene=str(tmp_path / "a.png"), rotation_deg=(0, 0, 90), turntable_per_min=1)
+    open_content(settings, stack, context).close()

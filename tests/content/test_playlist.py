@@ -1,0 +1,120 @@
+"""Playlists: which scene is shown when, what each has of its own, and what is told of one that is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from runtime.clock import NS_PER_S
+from runtime.config import ContentSettings
+from runtime.content.base import ContentSource
+from runtime.content.registry import open_content
+from runtime.errors import InputError
+from runtime.optics.stack import PanelStack
+from runtime.support.artifacts import write_png
+from tests.content.conftest import panel_view
+
+EYE = (0.6, 0.0, 0.0)
+COLOURS = {"red.png": (255, 0, 0), "green.png": (0, 255, 0), "blue.png": (0, 0, 255)}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name, colour in COLOURS.items():
+        write_png(tmp_path / name, np.full((90, 160, 3), colour, np.uint8))
+    return tmp_path
+
+
+def written(folder: Path, *shows: str, head: str = "") -> Path:
+    path = folder / "list.toml"
+    path.write_text(head + "".join(f"[[show]]\n{show}\n" for show in shows))
+    return path
+
+
+def opened(path: Path, context: Any, stack: PanelStack, **settings: Any) -> ContentSource:
+    return open_content(ContentSettings(scene=str(path), **settings), stack, context)
+
+
+def colour_at(source: ContentSource, stack: PanelStack, time_s: float) -> str:
+    picture = source.render(panel_view(EYE, stack.panel(1)), time_ns=round(time_s * NS_PER_S))
+    pixel = tuple(picture[stack.height_px // 2, stack.width_px // 2, :3].tolist())
+    return next((name.removesuffix(".png") for name, colour in COLOURS.items() if colour == pixel), str(pixel))
+
+
+THREE = ("scene = 'red.png'\nseconds = 2", "scene = 'green.png'\nseconds = 3", "scene = 'blue.png'\nseconds = 1")
+
+
+def test_each_is_shown_for_its_time_from_when_the_first_was(folder: Path, context: Any, stack: PanelStack) -> None:
+    source = opened(written(folder, *THREE), context, stack)
+    start = 1000.0
+    times = (0, 1.9, 2.1, 4.9, 5.1, 5.9, 6.1, 8.5)
+    shown = [colour_at(source, stack, start + time) for time in times]
+    assert shown == ["red", "red", "green", "green", "blue", "blue", "red", "green"]
+    assert source.info.name == "list: green (2 of 3)"
+    told = source.describe(time_ns=round((start + 8.5) * NS_PER_S))
+    assert told is not None and (told["index"], told["left_s"]) == (1, 2.5)
+    assert [entry["seconds"] for entry in told["entries"]] == [2, 3, 1]
+    source.close()
+
+
+def test_a_revision_changes_with_the_scene_and_not_within_one(folder: Path, context: Any, stack: PanelStack) -> None:
+    source = opened(written(folder, *THREE), context, stack)
+    revisions = [source.revision(time_ns=round(time * NS_PER_S)) for time in (0, 1, 2.5, 3, 6.5)]
+    assert revisions[0] == revisions[1] and revisions[2] == revisions[3]
+    assert len({revisions[0], revisions[2], revisions[4]}) == 3
+
+
+def test_one_that_does_not_repeat_stays_at_its_last(folder: Path, context: Any, stack: PanelStack) -> None:
+    source = opened(written(folder, *THREE, head="repeat = false\n"), context, stack)
+    assert [colour_at(source, stack, time) for time in (0, 5.5, 100)] == ["red", "blue", "blue"]
+    assert not source.skip(time_ns=101 * NS_PER_S)
+
+
+def test_the_next_one_can_be_asked_for(folder: Path, context: Any, stack: PanelStack) -> None:
+    source = opened(written(folder, *THREE), context, stack)
+    assert colour_at(source, stack, 50.0) == "red"
+    assert source.skip(time_ns=round(50.5 * NS_PER_S))
+    assert colour_at(source, stack, 50.6) == "green"
+    assert colour_at(source, stack, 53.4) == "green" and colour_at(source, stack, 53.6) == "blue"
+
+
+def test_an_entry_has_settings_and_a_place_of_its_own_within_the_lists(
+    folder: Path, context: Any, stack: PanelStack
+) -> None:
+    shows = ("scene = 'red.png'\nseconds = 1\nscale = 0.5", "scene = 'sparse'\nseconds = 1\nturntable_per_min = 6")
+    source = opened(written(folder, *shows), context, stack, offset_m=(0.0, 0.05, 0.0))
+    picture = source.render(panel_view(EYE, stack.panel(1)), time_ns=0)
+    columns = np.nonzero(picture[..., 3] > 127)[1]
+    pitch_m = stack.width_m / stack.width_px
+    assert columns.mean() + 0.5 - stack.width_px / 2 == pytest.approx(0.05 / pitch_m, abs=1)
+    assert np.ptp(columns) + 1 == pytest.approx(stack.width_px / 2, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("shows", "told"),
+    [
+        (("scene = 'red.png'\nseconds = 1", "scene = 'gone.png'\nseconds = 1"), "show[1]: content: scene: "),
+        (("scene = 'red.png'",), "show[0].seconds: is not a finite number"),
+        (("scene = 'red.png'\nseconds = 0",), "show[0].seconds: is 0; must be 0.5 to 86400"),
+        (("seconds = 1",), "show[0].scene: names no scene"),
+        (("scene = 'list.toml'\nseconds = 1",), "show[0].scene: is no scene for a playlist"),
+        (("scene = 'external'\nseconds = 1",), "show[0].scene: is no scene for a playlist"),
+        (("scene = 'red.png'\nseconds = 1\nscael = 2",), "show[0].scael: is no setting: did you mean scale?"),
+        (("scene = 'red.png'\nseconds = 1\nscale = 'x'",), "show[0].scale: "),
+        (("scene = 'red.png'\nseconds = 1\nbackground = [0, 0, 0]",), "show[0].background: holds for the whole list"),
+        (("scene = 'red.png'\nseconds = 1\noffset_m = [0, 9, 0]",), "show[0]: content: offset_m: leaves nothing"),
+        ((), "show: "),
+        (("scene = 'red.png'\nseconds = 1",) * 65, "show: "),
+    ],
+)
+def test_a_list_that_is_wrong_is_one_line_that_names_its_entry(
+    folder: Path, context: Any, stack: PanelStack, shows: tuple[str, ...], told: str
+) -> None:
+    path = written(folder, *shows)
+    with pytest.raises(InputError) as refused:
+        opened(path, context, stack)
+    assert str(refused.value).startswith(f"{path}: {told}")
+    assert "\n" not in str(refused.value)

@@ -1,0 +1,209 @@
+"""Live pictures: the newest one for both eyes; a source that ends, stalls, changes its size or lies is told."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from runtime.clock import MonotonicClock
+from runtime.config import ContentSettings, LimitSettings, is_live, located
+from runtime.content import stream
+from runtime.content.base import ContentSource
+from runtime.content.registry import open_content, prepare_content
+from runtime.errors import ContentFailure, InputError, MissingPart
+from runtime.optics.stack import PanelStack
+from tests.content.conftest import panel_view
+from tests.waiting import eventually
+
+pytest.importorskip("av")
+from tests.content.streams import film_file, served, transport_stream
+
+EYES = ((0.6, -0.03, 0.0), (0.6, 0.03, 0.0))
+CLOCK = MonotonicClock()
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stream, "STALLED_S", 0.5)
+    monkeypatch.setattr(stream, "AGAIN_S", 0.1)
+
+
+def opened(name: str, context: Any, stack: PanelStack, limits: LimitSettings | None = None, **settings: Any) -> Any:
+    settings = {"layout": "side-by-side"} | settings
+    return open_content(ContentSettings(scene=name, **settings), stack, context, limits=limits)
+
+
+def seen(source: ContentSource, stack: PanelStack) -> list[list[int]]:
+    """The middle pixel of both eyes' pictures of one frame."""
+    time_ns = CLOCK.now_ns()
+    source.revision(time_ns=time_ns)
+    return [
+        source.render(panel_view(EYES[side], stack.panel(1), side=side), time_ns=time_ns)[
+            stack.height_px // 2, stack.width_px // 2, :3
+        ].tolist()
+        for side in (0, 1)
+    ]
+
+
+def level(source: ContentSource, stack: PanelStack) -> int:
+    return seen(source, stack)[0][1]
+
+
+def test_a_film_is_played_live_each_eye_its_half_of_one_picture(
+    tmp_path: Path, context: Any, stack: PanelStack
+) -> None:
+    path = film_file(tmp_path / "a_sbs.mkv", pictures=50)
+    source = opened(f"live:{path}", context, stack, layout="auto")
+    levels = set()
+
+    def moves() -> bool:
+        left, right = seen(source, stack)
+        assert left[0] > 150 and left[2] < 60 and right[2] > 150 and right[0] < 60
+        assert abs(left[1] - right[1]) < 12  # one picture
+        levels.add(left[1] // 8)
+        return len(levels) >= 4
+
+    assert source.info.moving and eventually(moves, within_s=20)
+    assert source.problem == ""
+    source.close()
+
+
+def test_a_stream_that_stalls_and_ends_keeps_its_last_picture_and_is_taken_up_again(
+    context: Any, stack: PanelStack, caplog: pytest.LogCaptureFixture
+) -> None:
+    with served(transport_stream(500)) as server, caplog.at_level(logging.WARNING, "phasestack.content"):
+        source = opened(server.url, context, stack)
+        first = level(source, stack)
+        assert eventually(lambda: level(source, stack) != first, within_s=20)
+        server.hold.set()
+        assert eventually(lambda: "no new picture for" in source.problem, within_s=20)
+        held = seen(source, stack)
+        assert held[0][0] > 150 and seen(source, stack) == held  # the last good one
+        server.hold.clear()
+        assert eventually(lambda: bool(seen(source, stack)) and source.problem == "", within_s=20)
+        server.hang_up.set()
+        assert eventually(lambda: server.connections >= 2, within_s=20)
+        assert seen(source, stack)[0][0] > 150
+        assert eventually(lambda: bool(seen(source, stack)) and source.problem == "", within_s=20)
+        source.close()
+    told = [record.getMessage() for record in caplog.records]
+    assert sum("the last one stays" in line for line in told) == 1
+    assert any("pictures come again" in line for line in told)
+    assert all("\n" not in line and server.url in line for line in told)
+
+
+def test_a_stream_that_changes_its_size_goes_on_and_is_told(
+    context: Any, stack: PanelStack, caplog: pytest.LogCaptureFixture
+) -> None:
+    data = transport_stream(60) + transport_stream(400, size=(320, 48), first=60)
+    with served(data) as server, caplog.at_level(logging.WARNING, "phasestack.content"):
+        source = opened(server.url, context, stack)
+        seen(source, stack)
+        shape = source._views[0].shape
+
+        def changed() -> bool:
+            seen(source, stack)
+            return source._views[0].shape == (48, 160, 4) != shape
+
+        assert eventually(changed, within_s=30)
+        assert seen(source, stack)[1][2] > 150
+        source.close()
+    assert "its pictures changed from 160 x 48 to 320 x 48 pixels" in caplog.text
+
+
+def test_one_that_becomes_too_large_is_told_and_the_last_picture_stays(context: Any, stack: PanelStack) -> None:
+    data = transport_stream(60) + transport_stream(60, size=(640, 480))
+    with served(data) as server:
+        source = opened(server.url, context, stack, LimitSettings(pixels=100_000))
+        assert eventually(lambda: bool(seen(source, stack)) and "has 640 x 480 pixels" in source.problem, within_s=30)
+        assert seen(source, stack)[0][0] > 150
+        source.close()
+
+
+def test_one_that_lies_about_its_rate_is_shown_as_it_comes_and_told(
+    context: Any, stack: PanelStack, caplog: pytest.LogCaptureFixture
+) -> None:
+    with served(transport_stream(1200, told_rate=60)) as server, caplog.at_level(logging.WARNING, "phasestack.content"):
+        server.pace_s = 0.1  # some pictures a second
+        source = opened(server.url, context, stack)
+        assert eventually(lambda: bool(seen(source, stack)) and "shown as they come" in caplog.text, within_s=60)
+        source.close()
+    assert "says 60 pictures a second and gives" in caplog.text
+
+
+def test_one_that_is_not_there_yet_is_waited_for(context: Any, stack: PanelStack, monkeypatch: Any) -> None:
+    monkeypatch.setattr(stream, "FIRST_PICTURE_S", 0.3)
+    with served(b"") as server:
+        url = server.url
+    source = opened(url, context, stack)
+    with pytest.raises(ContentFailure, match=r"127\.0\.0\.1"):
+        seen(source, stack)
+    assert "it is tried again" in source.problem
+    source.close()
+
+
+def test_a_password_is_in_no_name_and_no_log(context: Any, stack: PanelStack, monkeypatch: Any) -> None:
+    monkeypatch.setattr(stream, "FIRST_PICTURE_S", 0.3)
+    source = opened("rtsp://operator:secret@127.0.0.1:9/door", context, stack)
+    assert eventually(lambda: "tried again" in source.problem)
+    assert source.info.name == "rtsp://127.0.0.1:9/door" and "secret" not in source.problem
+    source.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "told"),
+    [
+        ("live:/nowhere/a.mkv", {}, "/nowhere/a.mkv: cannot be read"),
+        ("gopher://x", {}, "content: scene: gopher:// is none of rtsp"),
+        ("file:///etc/passwd", {}, "content: scene: file:// is none of"),
+        ("rtsp://127.0.0.1:9/x", {"layout": "rgbd"}, "content: layout: rgbd is not for live pictures"),
+        ("rtsp://127.0.0.1:9/x", {"layout": "quilt"}, "quilt: columns and rows are in neither"),
+    ],
+)
+def test_what_is_no_live_source_is_one_line(
+    context: Any, stack: PanelStack, name: str, settings: dict[str, Any], told: str
+) -> None:
+    with pytest.raises(InputError) as refused:
+        opened(name, context, stack, **settings)
+    assert told in str(refused.value)
+
+
+def test_a_playlist_under_a_films_name_opens_nothing_else(
+    tmp_path: Path, context: Any, stack: PanelStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stream, "FIRST_PICTURE_S", 0.3)
+    path = tmp_path / "a.mkv"
+    path.write_text("#EXTM3U\n#EXTINF:1,\nhttp://127.0.0.1:9/x.ts\n")
+    source = opened(f"live:{path}", context, stack)
+    assert eventually(lambda: "tried again" in source.problem)
+    source.close()
+
+
+def test_without_the_extra_the_line_says_what_to_install(
+    tmp_path: Path, context: Any, stack: PanelStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import sys
+
+    path = film_file(tmp_path / "a.mkv", pictures=3)
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(MissingPart, match=r"pip install 'phasestack\[stream\]'"):
+        opened(f"live:{path}", context, stack)
+
+
+def test_a_scene_that_is_dropped_while_it_loads_ends_its_thread(tmp_path: Path, stack: PanelStack) -> None:
+    path = film_file(tmp_path / "a.mkv", pictures=200)
+    opener = prepare_content(ContentSettings(scene=f"live:{path}"), stack)
+    assert any(thread.name == "stream" for thread in threading.enumerate())
+    del opener
+    assert eventually(lambda: not any(thread.name == "stream" for thread in threading.enumerate()), within_s=20)
+
+
+def test_names_of_live_scenes_are_no_paths(tmp_path: Path) -> None:
+    assert located("rtsp://host/a.mkv", tmp_path) == "rtsp://host/a.mkv"
+    assert located("live:a.mkv", tmp_path) == f"live:{tmp_path}/a.mkv"
+    assert located("/dev/video0", tmp_path) == "/dev/video0"
+    assert is_live("/dev/video2") and is_live("live:a.mkv") and not is_live("a.mkv")
