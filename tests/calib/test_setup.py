@@ -71,7 +71,7 @@ def setup_command(folder: Path, keys: str, *options: str) -> subprocess.Complete
     command = [sys.executable, "-m", "runtime.cli", "setup", "--config", "new.toml", "--out", "out", *options]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
     return subprocess.run(
-        command, input=keys, cwd=folder, env=environment, capture_output=True, text=True, timeout=500, check=False
+        command, input=keys, cwd=folder, env=environment, capture_output=True, text=True, timeout=1700, check=False
     )
 
 
@@ -83,6 +83,7 @@ def set_up(tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess[str], Si
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_keys_alone_lead_from_nothing_to_a_configuration_that_is_valid(set_up) -> None:
     folder, done, _ = set_up
     assert done.returncode == 0, done.stdout + done.stderr
@@ -97,6 +98,7 @@ def test_keys_alone_lead_from_nothing_to_a_configuration_that_is_valid(set_up) -
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_every_panel_is_bound_to_its_monitor_as_it_is_mounted(set_up) -> None:
     folder, _, world = set_up
     for index, panel in enumerate(load_settings(folder / "new.toml").output.panels):
@@ -106,6 +108,7 @@ def test_every_panel_is_bound_to_its_monitor_as_it_is_mounted(set_up) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_the_sensor_is_found_where_it_stands(set_up) -> None:
     folder, _, _ = set_up
     settings = load_settings(folder / "new.toml")
@@ -166,13 +169,14 @@ def carried_db(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_a_run_of_it_shows_the_eyes_within_a_decibel_of_a_perfect_stack(set_up, tmp_path) -> None:
     """The run's own light, sent through the registration to the panels where they truly are."""
     folder, _, world = set_up
     command = [sys.executable, "-m", "runtime.cli", "run", "--config", str(folder / "new.toml"), "--replay", "demo",
                "--headless", "--max-speed", "--frames", "31", "--keep-light", "15",
                "--out", str(tmp_path / "run")]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1700, check=False)
     assert done.returncode == 0, done.stderr
     assert "calibrated for sensor" not in done.stderr
     settings = load_settings(folder / "new.toml")
@@ -187,6 +191,7 @@ def test_a_run_of_it_shows_the_eyes_within_a_decibel_of_a_perfect_stack(set_up, 
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_what_the_service_reads_is_gathered_and_stands_by_itself(set_up, tmp_path) -> None:
     folder, _, _ = set_up
     there = shutil.copytree(folder / "out" / "service", tmp_path / "etc")

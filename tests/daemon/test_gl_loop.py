@@ -92,14 +92,15 @@ def test_nothing_is_read_back_but_the_network_s_raster_and_the_layers(
     assert raster == [frame.rows * frame.width_px * 3 * 2] * 2
 
 
-def test_pictures_in_textures_are_solved_as_pictures_in_arrays_are(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("scene", ["demo", "texture", "grey", "thin"])
+def test_pictures_in_textures_are_solved_as_pictures_in_arrays_are(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (runtime.model.opencv_surround, runtime.model.pyramid_level):
         monkeypatch.setattr(module, "resample", exact_resample)
     layers = []
     for backend in ("gl", "opencv"):
         context = offscreen_context()
         with context:
-            made = maker_of(backend)(context=context, simulated=True)
+            made = maker_of(backend, scene)(context=context, simulated=True)
             made.step(wish())
             solution = made.step(wish()).solution
             assert solution is not None

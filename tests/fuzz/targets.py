@@ -145,6 +145,42 @@ def _pair(data: bytes, folder: Path) -> object:
     return read_pairs(_at(folder, "a.json" if data[:1] in b"[{" else "a.csv", data))
 
 
+def _tables() -> list[bytes]:
+    """What calibration reads besides pairs: the first line tells which reader it is for."""
+    greys = "\n".join(f"{grey},{0.1 + grey**2}" for grey in (0, 64, 128, 192, 255))
+    verniers = "reference,panel,eye_x,eye_y,eye_z,reference_u,reference_v,panel_u,panel_v\n1,0,0.5,0,0,9,9,8,8\n"
+    return [
+        b"grey,luminance\n" + greys.encode(),
+        b"grey,red,green,blue\n0,1,1,1\n0.5,2,2,2\n0.7,3,3,3\n1,4,4,4\n",
+        b"phase,grey\n0,0\n0.4,0.5\n1,1\n",
+        b"phase,red,green,blue\n0,0,0,0\n1,1,1,1\n",
+        b"seconds,viewpoint\n0.9,R40-phi70-theta80\n2,R50-phi80-theta90\n",
+        verniers.encode(),
+        b'{"done": {"geometry": {"width_m": 0.5}}}',
+    ]
+
+
+def _table(data: bytes, folder: Path) -> object:
+    from calib.capture_run import read_marks
+    from calib.grey import fit_series, read_series
+    from calib.setup_run import read_progress
+    from calib.vernier import read_settings
+    from calib.viewpoints import grid
+    from runtime.config import StackGeometry
+    from runtime.panels.lut import measured_curve
+
+    path = _at(folder, "a.csv", data)
+    if data[:1] == b"{":
+        return read_progress(path)
+    if data[:1] == b"p":
+        return measured_curve(path)
+    if data[:1] == b"s":
+        return read_marks(path, grid())
+    if data[:1] == b"r":
+        return read_settings(path, StackGeometry().stack())
+    return fit_series(read_series(path), path)
+
+
 # Models
 
 
@@ -398,6 +434,7 @@ TARGETS: dict[str, Target] = {
     "panels": Target(_panels, _panel),
     "calibration": Target(_calibrations, _calibration),
     "pairs": Target(_pairs, _pair),
+    "tables": Target(_tables, _table),
     "contract": Target(_contracts, _contract),
     "model": Target(_models, _model),
     "checkpoint": Target(_checkpoints, _checkpoint),

@@ -41,7 +41,7 @@ class Case:
 
 SMALL: dict[str, dict[str, Any]] = {
     "stack": {"width_px": 96, "height_px": 54},
-    "model": {"name": "balanced", "threads": 1},
+    "model": {"name": "balanced", "threads": 1, "backend": "opencv"},
     "loop": {"evaluate_every": 20},
 }
 

@@ -53,7 +53,7 @@ FAULTS = {
         "for side, eye in enumerate(eyes_m[::-1])\n    )\n    return left, right\n\n\ndef retina_view",
     ),
     "eyes-swapped-in-the-solver": Fault(
-        "eyes swapped", "runtime.model.unrolled", "return [-half, half]", "return [half, -half]"
+        "eyes swapped", "runtime.model.opencv_surround", "enumerate((-half, half))", "enumerate((half, -half))"
     ),
     "transposed-calibration": Fault(
         "a transposed matrix",
@@ -89,8 +89,8 @@ FAULTS = {
     "half-a-pixel-of-sart": Fault(
         "half a pixel",
         "runtime.model.sart",
-        "matrix[:, 2] += matrix[:, :2] @ (0.5, 0.5) - 0.5",
-        "matrix[:, 2] += matrix[:, :2] @ (0.5, 0.5)",
+        "[[1.0, 0.0, -0.5], [0.0, 1.0, -0.5],",
+        "[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0],",
         case="four-panels",
     ),
     "the-wrong-branch": Fault(
@@ -101,7 +101,7 @@ FAULTS = {
     ),
     "panels-swapped-by-the-solver": Fault(
         "panels swapped",
-        "runtime.model.unrolled",
+        "runtime.model.opencv_surround",
         "self._layers[n][box.slices] =",
         "self._layers[2 - n][box.slices] =",
     ),

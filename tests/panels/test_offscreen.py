@@ -86,6 +86,15 @@ def test_a_homography_may_have_either_sign(context, layers):
     assert np.array_equal(picture, layers[0, ..., :3])
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_horizon_just_beyond_the_panel_darkens_nothing(context, layers, sign):
+    """Below the picture, but nearer than twice its height: what counts is the panel's middle."""
+    bent = sign * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1 / (1.5 * HEIGHT), 1.0]])
+    settings = PanelSettings(homography=tuple(map(tuple, bent.tolist())))
+    (picture,) = shown(context, np.full_like(layers[:1], 200), settings)
+    assert (picture[: HEIGHT // 3, : WIDTH // 2] == 200).all()
+
+
 def test_each_channel_goes_through_its_own_curve(context, tmp_path):
     path = tmp_path / "curve.csv"
     path.write_text("phase,red,green,blue\n0,0,1,0.5\n1,1,0,0.5\n")

@@ -229,7 +229,7 @@ class GlSurround:
             "residual",
             (left, right, *seen),
             {**self._wanted(reduction), **self._means(reduction)},
-            {**self._through(reduction), **self._fade(reduction), "of_front": panel == REAR},
+            {**self._through(reduction), **self._fade(reduction), "unsure": unsure, "of_front": panel == REAR},
         )
         if not seen:
             return left, right
@@ -242,8 +242,6 @@ class GlSurround:
             {
                 "left": left,
                 "right": right,
-                "seen_left": seen[0],
-                "seen_right": seen[1],
                 "half_blurred_left": half[0],
                 "half_blurred_right": half[1],
             },
