@@ -1,4 +1,4 @@
-"""Simulated retinas: what an eye sees through the layers (design 5.5), pinhole and with a pupil of finite size."""
+"""Simulated retinas: what an eye sees through the layers (contracts), pinhole and with a pupil of finite size."""
 
 from __future__ import annotations
 
