@@ -4,26 +4,62 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO_ARGS ?=
 PYTEST_ARGS ?=
+TEST_WORKERS ?= logical
 FUZZ_ARGS ?=
+GOLDEN_ARGS ?=
+MUTANT_ARGS ?=
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test test-slow lint types bench fuzz soak install uninstall system docs gallery hashes clean
+NIGHTLY := out/nightly
+
+.PHONY: demo test test-slow golden mutants lint types secrets coverage nightly package bench fuzz soak install uninstall system docs gallery hashes clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/phasestack demo $(DEMO_ARGS)
 
 test: $(VENV)/.test lint types
-	$(BIN)/python -m pytest -m "not slow" $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist loadfile $(PYTEST_ARGS)
 
 test-slow: $(VENV)/.test
-	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -m slow --timeout 3600 $(PYTEST_ARGS)
 
+# The golden runs' references anew, on purpose; GOLDEN_ARGS="walk fault" for some of them.
+golden: $(VENV)/.test
+	$(BIN)/python -m tests.golden --renew $(GOLDEN_ARGS)
+
+# Mutants of the modules that compute, and what of them the tests notice (half an hour); docs/testing.md.
+mutants: $(VENV)/.mutation
+	$(BIN)/python -m tests.mutation $(MUTANT_ARGS)
+
+# Style, layers, spelling, shell; `pre-commit install` has them run, with types and secrets, before every commit.
 lint: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/typos
+	$(BIN)/shellcheck .ci/run systemd/*.sh requirements/*.sh systemd/x-authority
 
 types: $(VENV)/.test
 	$(BIN)/mypy
+
+secrets: $(VENV)/.test
+	git ls-files -z | xargs -0 $(BIN)/detect-secrets-hook --exclude-files '\.lock$$|\.npz$$'
+
+# Of branches; the floor is in pyproject.toml. Twice the tests' time.
+coverage: $(VENV)/.test
+	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html:out/coverage
+
+# What takes too long for every change: the slow tests, coverage, every fuzzer, secrets in all files, and the frontier
+# against that of the night before (exit 1 where it got slower or worse beyond noise).
+nightly: test-slow coverage fuzz secrets
+	mkdir -p $(NIGHTLY)
+	$(BIN)/phasestack bench --out $(NIGHTLY)/bench-new.json
+	if [ -e $(NIGHTLY)/bench.json ]; then $(BIN)/phasestack bench compare $(NIGHTLY)/bench.json $(NIGHTLY)/bench-new.json; fi
+	mv $(NIGHTLY)/bench-new.json $(NIGHTLY)/bench.json
+
+# Wheel and sdist in dist/; tests/test_packages.py (slow) installs them from nothing and runs the demo.
+package: $(VENV)/.test
+	$(BIN)/python -m build --outdir dist
 
 bench: $(VENV)/.test
 	$(BIN)/phasestack bench --out out/bench.json
@@ -69,6 +105,10 @@ $(VENV)/.test: $(VENV)/.runtime requirements/test.lock requirements/torch.lock
 	@sh systemd/packages.sh test
 	$(BIN)/python -m pip install --quiet -r requirements/test.lock
 	$(BIN)/python -m pip install --quiet -r requirements/torch.lock
+	@touch $@
+
+$(VENV)/.mutation: $(VENV)/.test requirements/mutation.lock
+	$(BIN)/python -m pip install --quiet -r requirements/mutation.lock
 	@touch $@
 
 clean:

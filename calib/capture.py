@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ from runtime.clock import NS_PER_S
 from runtime.records import F64, EyePoints
 
 LEAST_SAMPLES = 5
+FILLED = 0.9  # of a window's length
 LEAST_CONFIDENCE = 0.3
 OUTLIER_MADS = 5.0
 OUTLIER_FLOOR_M = 0.01
@@ -25,6 +27,7 @@ class Measured:
     midpoint_m: F64  # (3,) frame `sensor`
     spread_m: float  # robust RMS distance of the samples from it
     samples: int
+    separation_m: float = math.nan  # of the two eyes, by the sensor's metre
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,13 +52,13 @@ class EyeWindow:
 
     def __init__(self, window_s: float) -> None:
         self._length_ns = round(window_s * NS_PER_S)
-        self._samples: deque[tuple[int, F64]] = deque()
+        self._samples: deque[tuple[int, F64, F64]] = deque()  # instant, middle of the eyes, from left to right
 
     def add(self, capture_ns: int, eyes: EyePoints | None) -> None:
         """Take in a sample in frame `sensor`; unusable ones only let time pass."""
         middle = midpoint(eyes)
-        if middle is not None:
-            self._samples.append((capture_ns, middle))
+        if middle is not None and eyes is not None:
+            self._samples.append((capture_ns, middle, eyes.eyes_m[1] - eyes.eyes_m[0]))
         while self._samples and self._samples[0][0] <= capture_ns - self._length_ns:
             self._samples.popleft()
 
@@ -63,14 +66,26 @@ class EyeWindow:
         """Forget all: what was seen before does not belong to what comes."""
         self._samples.clear()
 
+    def still(self, drift_m: float) -> bool:
+        """Whether the whole window is filled, and the middles of its two halves lie no farther apart than this."""
+        if len(self._samples) < 2 * LEAST_SAMPLES:
+            return False
+        if self._samples[-1][0] - self._samples[0][0] < FILLED * self._length_ns:
+            return False
+        points = np.array([point for _, point, _ in self._samples])
+        half = len(points) // 2
+        drift = np.median(points[half:], axis=0) - np.median(points[:half], axis=0)
+        return float(np.linalg.norm(drift)) <= drift_m
+
     def measure(self) -> Measured | None:
         """Median and spread; None with fewer than `LEAST_SAMPLES` samples."""
         if len(self._samples) < LEAST_SAMPLES:
             return None
-        points = np.array([point for _, point in self._samples])
+        points = np.array([point for _, point, _ in self._samples])
+        across = np.median([apart for _, _, apart in self._samples], axis=0)
         centre = np.median(points, axis=0)
         mad_m = np.median(np.abs(points - centre), axis=0) * MAD_TO_SIGMA
-        return Measured(centre, float(np.linalg.norm(mad_m)), len(points))
+        return Measured(centre, float(np.linalg.norm(mad_m)), len(points), float(np.linalg.norm(across)))
 
 
 def true_pair(times_s: F64, sensor_m: F64, true_m: F64) -> TruePair | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -22,6 +23,7 @@ from runtime.errors import EndOfRecording, InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, EyePoints, SensorFrame
 from runtime.sensor.base import SensorDriver, SteppedDriver
+from runtime.support import foreign
 
 POLL_NS = 20 * NS_PER_MS
 SHOW_AGAIN_NS = 100 * NS_PER_MS
@@ -97,7 +99,7 @@ def read_marks(path: Path, viewpoints: Sequence[Viewpoint]) -> list[tuple[float,
     known = {viewpoint.name: viewpoint for viewpoint in viewpoints}
     found = []
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with io.StringIO(foreign.read_text(path), newline="") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
             if not {"seconds", "viewpoint"} <= set(reader.fieldnames or ()):
                 raise InputError(path, "columns", "must be seconds, viewpoint")
@@ -113,8 +115,8 @@ def read_marks(path: Path, viewpoints: Sequence[Viewpoint]) -> list[tuple[float,
                 if name not in known:
                     raise InputError(path, f"{label}, viewpoint", f"unknown: {name}")
                 found.append((seconds, known[name]))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, "", f"cannot be read ({getattr(error, 'strerror', None) or error})") from None
+    except csv.Error as error:
+        raise InputError(path, "", f"malformed: {error}") from None
     if not found:
         raise InputError(path, "", "holds no mark")
     return found
@@ -169,6 +171,7 @@ def capture_live(
     again: bool,
     window_s: float,
     max_spread_m: float,
+    hold_s: float,
 ) -> dict[str, Any]:
     """Walk through the viewpoints with a person before the display. Raises InputError, FatalError."""
     from runtime.sensor.registry import open_sensor
@@ -183,7 +186,10 @@ def capture_live(
     poll = keys.poll if chart is None else first_of(keys.poll, chart.keys.poll)
     worker.start()
     try:
-        walk = Walk(file, viewpoints, again=again, window_s=window_s, max_spread_m=max_spread_m, say=_say, chart=chart)
+        walk = Walk(
+            file, viewpoints, again=again, window_s=window_s, max_spread_m=max_spread_m, say=_say, chart=chart,
+            hold_s=hold_s,
+        )  # fmt: skip
         told = ""
         while worker.capabilities is None:
             if worker.error is not None:

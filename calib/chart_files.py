@@ -16,16 +16,19 @@ from calib.keys import Key, TerminalKeys, WindowKeys, first_of
 from calib.viewpoints import Viewpoint
 from runtime.clock import NS_PER_MS, MonotonicClock
 from runtime.config import ModelSettings, Settings
+from runtime.model.visible import visible_boxes
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
-from runtime.records import U8, PanelFrame
+from runtime.optics.views import relative_scale_shift
+from runtime.records import F64, U8, PanelFrame
 from runtime.support.artifacts import OutputFolder, write_json, write_png
 
 if TYPE_CHECKING:
     from runtime.model.predictor import Predictor
 
 CAPTION_SHARE = 0.07  # of the height, for words
+CAPTION_ROOM_M = 0.015  # by which all panels are clear beyond the words: who reads is not there yet
 UNFUSED_M = 0.03
 EYE_NAMES = ("left", "right")
 THUMBNAIL_PX = 320
@@ -86,18 +89,36 @@ def fused_psnr_db(layers: U8, viewpoint: Viewpoint, *, stack: PanelStack, ipd_m:
     return quality([r.image for r in seen], [wanted, wanted], [r.mask for r in seen]).psnr_db
 
 
-def captioned(layers: U8, text: str) -> U8:
-    """(N, H, W, 4) layers with a line of words at the bottom: on the middle panel, the others clear there."""
-    shown = layers.copy()
-    height, width = layers.shape[1:3]
-    top = round(height * (1 - CAPTION_SHARE))
-    shown[:, top:, :, :3] = 0
+def captioned(layers: U8, text: str, *, stack: PanelStack, eyes_m: F64) -> U8:
+    """(N, H, W, 4) layers with a line of words that eyes (2, 3) about there read: on the middle panel, low down.
+
+    All panels are clear where these eyes look through them at it, and `CAPTION_ROOM_M` around.
+    """
+    shown, middle = layers.copy(), stack.count // 2
+    box, pitch_m = visible_boxes(eyes_m, stack)[middle], stack.height_m / stack.height_px
+    tall_px = round(CAPTION_SHARE * stack.height_px)
+    bottom = box.v1 - round(CAPTION_ROOM_M / 2 / pitch_m)
+    top = max(bottom - tall_px, 0)
+    edges_m = stack.height_m / 2 - np.array([top, bottom]) * pitch_m
+    for index, x_m in enumerate(stack.x_m):
+        seen_m = []
+        for eye_m in eyes_m:
+            scale, shift_m = relative_scale_shift(eye_m, from_x_m=stack.x_m[middle], to_x_m=x_m)
+            seen_m.append(edges_m * scale + shift_m[1])
+        rows = (
+            stack.height_m / 2 - np.array([np.max(seen_m) + CAPTION_ROOM_M, np.min(seen_m) - CAPTION_ROOM_M])
+        ) / pitch_m
+        first, last = np.clip(np.rint(rows), 0, stack.height_px).astype(int)
+        shown[index, first:last, :, :3] = 0
     (long, tall), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 1.0, 2)
-    scale = min(0.6 * (height - top) / tall, 0.9 * width / max(long, 1))
-    strip = np.zeros((height - top, width), np.uint8)
-    place = (round((width - scale * long) / 2), round((height - top + scale * (tall - below)) / 2))
-    cv2.putText(strip, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, 255, max(1, round(2 * scale)), cv2.LINE_AA)
-    shown[len(shown) // 2, top:, :, :3] = strip[..., None]
+    scale = min(0.6 * tall_px / tall, 0.8 * box.width_px / max(long, 1))
+    page = np.zeros((stack.height_px, stack.width_px), np.uint8)
+    place = (
+        round((box.u0 + box.u1 - scale * long) / 2),
+        round((top + bottom + scale * (tall - below)) / 2),
+    )
+    cv2.putText(page, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, 255, max(1, round(2 * scale)), cv2.LINE_AA)
+    shown[middle, top:bottom, :, :3] = page[top:bottom, :, None]
     return shown
 
 
@@ -213,7 +234,10 @@ class ChartDisplay:
         """A chart on all panels. Raises PanelLost."""
         self._number += 1
         self._shown = chart
-        layers = captioned(chart.layers, self._caption) if self._caption else chart.layers
+        layers = chart.layers
+        if self._caption:
+            eyes_m = chart.viewpoint.eyes_m(self._drawer.ipd_m)
+            layers = captioned(layers, self._caption, stack=self._drawer.stack, eyes_m=eyes_m)
         self._sink.present(PanelFrame(self._number, layers, self._number))
 
     def caption(self, text: str) -> None:

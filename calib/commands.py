@@ -92,12 +92,16 @@ def capture(
     show: Annotated[bool, typer.Option("--show", help="show each chart on the panels")] = False,
     window_s: Annotated[float, typer.Option(help="median over the last so many seconds")] = 0.5,
     max_spread_mm: Annotated[float, typer.Option(help="refuse a pair whose eyes moved or scattered by more")] = 10.0,
+    hold_s: Annotated[
+        float, typer.Option(help="eyes held still for so long near the viewpoint are taken without a key; 0: never")
+    ] = 1.5,
     as_json: JsonOption = False,
 ) -> None:
     """Pair each chart's viewpoint with where the sensor sees the eyes. Every accepted pair is on disk at once.
 
-    Live: at each chart move until the lines fuse, then press Enter (n: next, p: previous, q: stop). A recording
-    needs --marks, unless it knows its true eyes, as the demo does.
+    Live: at each chart move until the lines fuse, then press Enter (n: next, p: previous, u: undo, q: stop); after
+    three places that are not on a line it says where to go, and holding still there is enough.
+    A recording needs --marks, unless it knows its true eyes, as the demo does.
 
     Example: phasestack calibrate capture --config /etc/phasestack/phasestack.toml --out pairs.csv
     """
@@ -105,6 +109,8 @@ def capture(
 
     if not 0.0 < window_s <= 10.0:
         raise InputError("calibrate capture", "--window-s", "must be above 0, at most 10")
+    if not 0.0 <= hold_s <= 10.0:
+        raise InputError("calibrate capture", "--hold-s", "must be 0 to 10")
     if not max_spread_mm > 0.0:
         raise InputError("calibrate capture", "--max-spread-mm", "must be above 0")
     if marks is not None and replay is None:
@@ -115,7 +121,7 @@ def capture(
         summary = capture_recording(out, settings, source=replay, marks=marks, **limits)
     else:
         chosen = _viewpoints("calibrate capture", viewpoint, settings)
-        summary = capture_live(out, settings, chosen, stack=stack, show=show, again=again, **limits)
+        summary = capture_live(out, settings, chosen, stack=stack, show=show, again=again, hold_s=hold_s, **limits)
     tell(summary, as_json, f"{summary['pairs']} pairs in {out} ({summary['accepted']} new)")
 
 

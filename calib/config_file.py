@@ -11,6 +11,7 @@ from calib.store import save
 from runtime.config import load_settings
 from runtime.errors import InputError
 from runtime.records import F64
+from runtime.support import foreign
 from runtime.support.artifacts import write_text
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def read_document(config: Path) -> TOMLDocument:
         return tomlkit.document()
     load_settings(config)
     try:
-        return tomlkit.parse(config.read_text(encoding="utf-8"))
+        return tomlkit.parse(foreign.read_text(config))
     except ParseError as error:
         raise InputError(config, "", f"malformed: {error}") from None
 
@@ -51,6 +52,18 @@ def put_homographies(document: TOMLDocument, matrices: F64) -> None:
             output["panels"].append(tomlkit.table())
     for table, matrix in zip(output["panels"], matrices, strict=True):
         table["homography"] = matrix.tolist()
+
+
+def put_lut(document: TOMLDocument, panel: int, lut: str, *, panels: int) -> None:
+    """Set one panel's measured grey curve, making the panels' tables where there are none."""
+    import tomlkit
+
+    output: Any = document.setdefault("output", tomlkit.table())
+    if "panels" not in output:
+        output["panels"] = tomlkit.aot()
+        for _ in range(panels):
+            output["panels"].append(tomlkit.table())
+    output["panels"][panel]["lut"] = lut
 
 
 def put_monitors(document: TOMLDocument, tables: Sequence[Mapping[str, Any]]) -> None:

@@ -25,6 +25,7 @@ from scipy.special import comb
 from runtime.errors import InputError
 from runtime.optics.malus import intensity_from_phase, phase_from_intensity
 from runtime.records import F64
+from runtime.support import foreign
 
 CHANNELS = ("red", "green", "blue")
 LEAST_LEVELS = 4
@@ -168,7 +169,7 @@ def read_series(path: Path) -> Series:
     Raises InputError, naming the row and the column.
     """
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with io.StringIO(foreign.read_text(path), newline="") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
             header = [(name or "").strip().lower() for name in reader.fieldnames or ()]
             reader.fieldnames = header
@@ -179,8 +180,8 @@ def read_series(path: Path) -> Series:
                         path, name, "column is missing (wanted: grey, luminance or grey, red, green, blue)"
                     )
             rows = [[_cell(path, reader.line_num, name, row.get(name)) for name in ("grey", *names)] for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, "", f"cannot be read ({getattr(error, 'strerror', None) or error})") from None
+    except csv.Error as error:
+        raise InputError(path, "", f"malformed: {error}") from None
     if not rows:
         raise InputError(path, "grey", "there are no rows")
     table = np.array(rows)

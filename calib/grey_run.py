@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calib.grey import CHANNELS, Series, fit_series, lut_text, read_series
+from calib.grey import CHANNELS, GreyCurve, Series, fit_series, lut_text, read_series
 from calib.panel_figures import grey_figure
 from runtime.config import Settings
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, PanelFrame
+from runtime.records import F64, U8, PanelFrame
 from runtime.support.artifacts import OutputFolder, write_bytes, write_text
 
 
@@ -35,9 +35,7 @@ def fit_lut(
     else:
         measured = read_series(series) if series else typed_series(settings, stack, levels=levels, panel=panel)
     curves = fit_series(measured, source)
-    with OutputFolder(out.parent) as folder:
-        write_text(folder.staging / out.name, lut_text(curves))
-        write_bytes(folder.staging / f"{out.stem}.png", grey_figure(measured, curves))
+    write_lut(out, measured, curves)
     summary = {
         "file": str(out),
         "plot": str(out.with_suffix(".png")),
@@ -51,21 +49,35 @@ def fit_lut(
     return summary, "\n".join([*lines, f"{out}"])
 
 
+def write_lut(out: Path, measured: Series, curves: tuple[GreyCurve, GreyCurve, GreyCurve]) -> None:
+    """A panel's LUT, and its plot beside it."""
+    with OutputFolder(out.parent) as folder:
+        write_text(folder.staging / out.name, lut_text(curves))
+        write_bytes(folder.staging / f"{out.stem}.png", grey_figure(measured, curves))
+
+
 def photographed_series(photos: Path, stack: PanelStack, *, panel: int) -> Series:
     """Relative luminances from photographs of a panel's grey chart. Raises InputError, naming the photograph."""
-    from calib.grey_chart import Unusable, histograms, measure
     from calib.photo_run import photograph_files, read_photograph
 
+    pictures = ((str(path), read_photograph(path)) for path in photograph_files(photos))
+    return pictures_series(pictures, stack, panel=panel, source=str(photos))
+
+
+def pictures_series(pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, panel: int, source: str) -> Series:
+    """The same from named grey photographs (h, w). Raises InputError."""
+    from calib.grey_chart import Unusable, histograms, measure
+
     found = []
-    for path in photograph_files(photos):
+    for name, picture in pictures:
         try:
-            found.append(histograms(read_photograph(path), stack, panel))
+            found.append(histograms(picture, stack, panel))
         except Unusable as problem:
-            raise InputError(path, "", str(problem)) from None
+            raise InputError(name, "", str(problem)) from None
     try:
         return measure(found, stack, panel)
     except Unusable as problem:
-        raise InputError(photos, "greys", str(problem)) from None
+        raise InputError(source, "greys", str(problem)) from None
 
 
 def show_grey_chart(settings: Settings, stack: PanelStack, *, panel: int) -> None:

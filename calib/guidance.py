@@ -25,7 +25,7 @@ def rough_similarity(sensor_m: F64, stack_m: F64) -> Similarity | None:
 
 
 def way_to(viewpoint_m: F64, eyes_m: F64) -> str:
-    """ "7 cm to the right, 3 cm nearer": from where the eyes (3,) are to a viewpoint (3,), frame `stack`.
+    """The way from where the eyes (3,) are to a viewpoint (3,), frame `stack`, as "7 cm to the right, 3 cm nearer".
 
     Empty where they are there.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +26,11 @@ def seen_through(
     width_px: int,
     height_px: int,
 ) -> Retina:
-    """What an eye sees where panel n's pixels lie displaced by a homography (3, 3): `optics.retina.seen_by` of it."""
+    """What an eye sees where panel n's pixels lie displaced by a homography (3, 3): `optics.retina.seen_by` of it.
+
+    Tilts are told by the homographies of this eye, not by the stack.
+    """
+    stack = replace(stack, tilt=None)
     total = np.zeros((height_px, width_px, 3), np.float32)
     mask = ray_mask(eye_m, stack, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
     for index, matrix in enumerate(true_from_ideal):
@@ -41,7 +46,7 @@ def seen_through(
 
 
 def corrected(layers: U8, true_from_ideal: Sequence[F64]) -> U8:
-    """The layers as the presentation shader shows them on registered panels: bilinear, black beyond the edges."""
+    """The layers as the presentation shader shows them on registered panels: bicubic, black beyond the edges."""
     import cv2
 
     half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
@@ -50,7 +55,7 @@ def corrected(layers: U8, true_from_ideal: Sequence[F64]) -> U8:
     shown = [
         layer
         if np.array_equal(matrix, np.eye(3))
-        else cv2.warpPerspective(layer, whole @ matrix @ half, (width, height), flags=cv2.INTER_LINEAR)
+        else cv2.warpPerspective(layer, whole @ matrix @ half, (width, height), flags=cv2.INTER_CUBIC)
         for layer, matrix in zip(layers, true_from_ideal, strict=True)
     ]
     return np.ascontiguousarray(np.stack(shown))

@@ -6,7 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,8 @@ from runtime.support import foreign
 from runtime.support.artifacts import write_text
 
 COLUMNS = ("sensor_x", "sensor_y", "sensor_z", "stack_x", "stack_y", "stack_z")
-NOTES = ("viewpoint", "spread_mm", "samples", "accepted_at", "sensor_serial")
+SEPARATION = "separation_m"  # of the eyes, by the sensor's metre; may be missing
+NOTES = ("viewpoint", "spread_mm", "samples", "accepted_at", "sensor_serial", SEPARATION)
 MAXIMUM_PAIRS = 1_000_000
 
 
@@ -31,6 +32,7 @@ class Pairs:
     names: tuple[str, ...]
     source: str
     sensor_serial: str = ""  # of the device that measured all of them; empty: not known
+    separation_m: F64 = field(default_factory=lambda: np.empty(0))  # (K,) of the eyes; NaN where not known, or (0,)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -39,7 +41,10 @@ class Pairs:
         """Some of them, by index."""
         index = np.array(list(keep), dtype=int)
         names = tuple(self.names[i] for i in index.tolist())
-        return replace(self, sensor_m=self.sensor_m[index], stack_m=self.stack_m[index], names=names)
+        separation_m = self.separation_m[index] if len(self.separation_m) else self.separation_m
+        return replace(
+            self, sensor_m=self.sensor_m[index], stack_m=self.stack_m[index], names=names, separation_m=separation_m
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +58,7 @@ class CapturedPair:
     samples: int
     accepted_at: str
     sensor_serial: str = ""
+    separation_m: float = math.nan
 
     def row(self) -> dict[str, str]:
         numbers = zip(COLUMNS, (*self.sensor_m, *self.stack_m), strict=True)
@@ -62,6 +68,7 @@ class CapturedPair:
             "samples": str(self.samples),
             "accepted_at": self.accepted_at,
             "sensor_serial": self.sensor_serial,
+            SEPARATION: f"{self.separation_m:.6g}" if math.isfinite(self.separation_m) else "",
         }
 
 
@@ -82,7 +89,12 @@ def read_pairs(path: Path) -> Pairs:
     serials = {str(row.get("sensor_serial") or "") for _, row in rows} - {""}
     if len(serials) > 1:
         raise InputError(path, "sensor_serial", f"pairs of different sensors: {', '.join(sorted(serials))}")
-    return Pairs(values[:, :3].copy(), values[:, 3:].copy(), names, str(path), "".join(serials))
+    told = [row.get(SEPARATION) for _, row in rows]
+    apart_m = [math.nan if value in (None, "") else _number(path, label, SEPARATION, value)
+               for (label, _), value in zip(rows, told, strict=True)]  # fmt: skip
+    return Pairs(
+        values[:, :3].copy(), values[:, 3:].copy(), names, str(path), "".join(serials), np.array(apart_m, np.float64)
+    )
 
 
 def _csv_rows(path: Path, text: str) -> list[tuple[str, Mapping[str, Any]]]:
@@ -137,7 +149,7 @@ class PairsFile:
         self._rows: list[dict[str, str]] = []
         if path.exists():
             read_pairs(path)
-            with path.open(encoding="utf-8-sig", newline="") as file:
+            with io.StringIO(foreign.read_text(path), newline="") as file:
                 for row in csv.DictReader(file, skipinitialspace=True):
                     self._rows.append({name: row.get(name) or "" for name in (*COLUMNS, *NOTES)})
 

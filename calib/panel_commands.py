@@ -135,9 +135,10 @@ def photo(
     device: Annotated[str | None, typer.Option(help="a video device (number or path) instead of photographs")] = None,
     count: Annotated[int, typer.Option(help="with --device: photographs to take", min=5, max=40)] = 12,
     spacing: Annotated[
-        str, typer.Option(help="even or true distances; auto: even ones where the configured model serves no others")
+        str,
+        typer.Option(help="even or true distances; auto: true ones, unless too uneven for the configured model"),
     ] = "auto",
-    write: Annotated[bool, typer.Option("--write", help="put distances and homographies into --config")] = False,
+    write: Annotated[bool, typer.Option("--write", help="put distances, tilts and homographies into --config")] = False,
     model: Annotated[
         str, typer.Option(help="model that tells what the registration gains in dB; configured; empty: none")
     ] = "configured",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -229,13 +229,13 @@ def panels_text(registration: StackRegistration) -> str:
     return panels_document(np.stack([panel.true_from_ideal for panel in registration.panels]))
 
 
-def panels_document(matrices: F64, *, x_m: Sequence[float] | None = None) -> str:
-    """The same from (N, 3, 3) homographies; with distances also `[stack]`."""
+def panels_document(matrices: F64, *, stack: Mapping[str, Any] | None = None) -> str:
+    """The same from (N, 3, 3) homographies, and what is to be put into `[stack]`."""
     import tomlkit
 
     document = tomlkit.document()
-    if x_m is not None:
-        document["stack"] = {"x_m": [round(float(x), 7) for x in x_m]}
+    if stack is not None:
+        document["stack"] = dict(stack)
     tables = tomlkit.aot()
     for matrix in matrices:
         table = tomlkit.table()
@@ -252,4 +252,5 @@ def write_homographies(config: Path, registration: StackRegistration) -> Path | 
     """
     document = read_document(config)
     put_homographies(document, np.stack([panel.true_from_ideal for panel in registration.panels]))
+    document.get("stack", {}).pop("tilt", None)  # of an earlier registration by photographs: verniers tell none
     return save_document(config, document)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from calib.bundle import Bundle
@@ -62,11 +64,12 @@ def displayed_db(
     def solved(stack: PanelStack) -> U8:
         return layers_for(wanted, stack, eyes_m, settings=settings, model=model, fov_deg=fov_deg)
 
-    perfect = solved(found.stack)
+    parallel = replace(found.stack, tilt=None)
+    perfect = solved(parallel)
     ideal = tuple(PlacedPanel(np.eye(3), np.array([x, 0.0, 0.0])) for x in found.stack.x_m)
-    shown = corrected(perfect, list(found.homographies))
+    shown = corrected(solved(found.stack), list(found.homographies))
     return {
-        "perfect stack": seen_db(perfect, wanted, eyes_m, found.stack, ideal, fov_deg=fov_deg),
+        "perfect stack": seen_db(perfect, wanted, eyes_m, parallel, ideal, fov_deg=fov_deg),
         "as configured": seen_db(solved(believed), wanted, eyes_m, believed, panels, fov_deg=fov_deg),
-        "registered": seen_db(shown, wanted, eyes_m, found.stack, panels, fov_deg=fov_deg),
+        "registered": seen_db(shown, wanted, eyes_m, parallel, panels, fov_deg=fov_deg),
     }

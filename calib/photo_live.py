@@ -39,6 +39,14 @@ def open_video(device: str) -> Any:
     return video
 
 
+def one_picture(video: Any) -> U8:
+    """(h, w) the next picture of an open device, grey. Raises InputError where there is none."""
+    going, picture = video.read()
+    if not going:
+        raise InputError("calibrate", "--device", "the video device gives no more pictures")
+    return np.asarray(picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+
+
 @dataclass
 class Taker:
     """Decides which pictures of a video become photographs. No clock, no device."""

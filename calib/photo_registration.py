@@ -3,7 +3,7 @@
 The stack's frame is the reference (middle) panel's: it stays where it is and its picture is not resampled. The other
 panels get their true distance, and a homography that puts each of their pixels where a panel parallel to the
 reference would have it: exact for every eye where the panel is parallel, and for an eye at the viewing place where
-it is tilted.
+it is tilted. The tilts are told to the models, which solve for what other eyes see of such a panel.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from calib.bundle import Bundle, Undetermined, adjust
 from calib.detect_marks import SeenMarks
 from calib.placed import PlacedPanel, found_stack, true_from_ideal_seen
 from calib.registration import through
-from runtime.optics.stack import PanelStack
+from runtime.optics.stack import PanelStack, Tilt
 from runtime.records import F64
 
 LEAST_PHOTOGRAPHS = 5
@@ -46,7 +46,7 @@ class PhotoRegistration:
     """Where the panels are, and how that is known."""
 
     bundle: Bundle
-    stack: PanelStack  # the geometry to configure: `true` distances, or even ones near them
+    stack: PanelStack  # the geometry to configure: true distances, or even ones near them, and tilts
     true_x_m: F64  # (N,)
     gap_sigma_m: F64  # (N-1,)
     homographies: F64  # (N, 3, 3) true pixels from ideal ones of `stack`
@@ -102,10 +102,20 @@ def evenly_spaced(stack: PanelStack, *, reference: int) -> PanelStack:
     return replace(stack, x_m=x_m)
 
 
+def tilt_of(panels: Sequence[PlacedPanel], eye_m: F64) -> Tilt:
+    """What models need to know of tilted panels whose homographies are for an eye (3,)."""
+    x, y, z = np.asarray(eye_m, dtype=np.float64).tolist()
+    depth = tuple((0.0, float(right), float(up)) for right, up in (panel.slope + 0.0 for panel in panels))
+    return Tilt(depth, (x, y, z))
+
+
 def register_photographs(
-    seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m: F64, even: bool, reference: int | None = None
+    seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m: F64, even: bool | None, reference: int | None = None
 ) -> PhotoRegistration:
-    """Fit and judge. even: write even distances near the true ones. Raises Undetermined, saying what is wrong."""
+    """Fit and judge. Raises Undetermined, saying what is wrong.
+
+    even: write even distances near the true ones; None: where those are too uneven for the shipped networks.
+    """
     reference = stack.count // 2 if reference is None else reference
     faults = {s.name: s.fault for s in seen if s.fault}
     faults |= _other_sizes([s for s in seen if not s.fault])
@@ -128,7 +138,10 @@ def register_photographs(
     except ValueError as problem:
         raise Undetermined(str(problem)) from None
     _refuse_implausible(bundle, stack)
+    if even is None:
+        even = not true.is_evenly_spaced
     model = evenly_spaced(true, reference=reference) if even else true
+    model = replace(model, tilt=tilt_of(bundle.panels, eye_m))
     corners = corner_pixels(stack)
 
     def moved(panels: Sequence[PlacedPanel]) -> F64:

@@ -22,8 +22,8 @@ from calib.registration import through
 from calib.viewpoints import viewing_place_m
 from runtime.config import Settings
 from runtime.errors import InputError
-from runtime.optics.stack import PanelStack
-from runtime.records import F64, U8
+from runtime.optics.stack import UNEVEN_MOST, PanelStack
+from runtime.records import U8
 from runtime.support import foreign
 from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_png, write_text
 
@@ -77,7 +77,14 @@ def look_at(files: Sequence[Path], stack: PanelStack) -> list[SeenMarks]:
 
 
 def register_folder(
-    photos: Path, out: Path, settings: Settings, stack: PanelStack, *, even: bool, model: str, config: Path | None
+    photos: Path,
+    out: Path,
+    settings: Settings,
+    stack: PanelStack,
+    *,
+    even: bool | None,
+    model: str,
+    config: Path | None,
 ) -> tuple[dict[str, Any], str]:
     """Register from a folder of photographs, report, and write into `config` where one is given.
 
@@ -94,7 +101,7 @@ def register_seen(
     settings: Settings,
     stack: PanelStack,
     *,
-    even: bool,
+    even: bool | None,
     model: str,
     config: Path | None,
 ) -> tuple[dict[str, Any], str]:
@@ -114,7 +121,7 @@ def register_seen(
     picture = Picture("registration.png", photo_figure(found, stack), "Where the panels and the camera stood")
     with OutputFolder(out) as folder:
         write_json(folder.staging / "registration.json", summary)
-        write_text(folder.staging / "panels.toml", panels_document(found.homographies, x_m=found.stack.x_m))
+        write_text(folder.staging / "panels.toml", panels_document(found.homographies, stack=stack_table(found)))
         write_bytes(folder.staging / picture.name, picture.png)
         html = page(
             title="Registration of the panels by photographs",
@@ -126,7 +133,7 @@ def register_seen(
         )
         write_text(folder.staging / "index.html", html)
     if config is not None:
-        kept = write_registration(config, found.homographies, x_m=found.stack.x_m)
+        kept = write_registration(config, found)
         summary["kept_version"] = str(kept) if kept else None
     return summary, summary_text(found, summary)
 
@@ -137,9 +144,9 @@ def check_tables(settings: Settings, stack: PanelStack, config: Path) -> None:
         raise InputError(config, "output.panels", f"has {len(settings.output.panels)} tables for {stack.count} panels")
 
 
-def wants_even(settings: Settings, stack: PanelStack) -> bool:
-    """Whether the configured model serves evenly spaced panels alone."""
-    return settings.model.name in EVEN_MODELS and stack.count == 3
+def wants_even(settings: Settings, stack: PanelStack) -> bool | None:
+    """Whether to write even distances: None: where the true ones are too uneven for the configured model."""
+    return None if settings.model.name in EVEN_MODELS and stack.count == 3 else False
 
 
 def registration_summary(found: PhotoRegistration, stack: PanelStack) -> dict[str, Any]:
@@ -169,15 +176,16 @@ def registration_summary(found: PhotoRegistration, stack: PanelStack) -> dict[st
     if not np.allclose(found.true_x_m, found.stack.x_m, atol=5e-5):
         notes.append(
             f"the gaps are {' and '.join(f'{gap * 1e3:.2f}' for gap in gaps)} mm; even ones of "
-            f"{(found.stack.x_m[1] - found.stack.x_m[0]) * 1e3:.2f} mm are written, since the shipped networks "
-            "serve no others; from the viewing place nothing is lost, 10 cm beside it up to "
-            f"{uneven_cost_px(found):.2f} px (--spacing true writes the true ones, for the model sart)"
+            f"{(found.stack.x_m[1] - found.stack.x_m[0]) * 1e3:.2f} mm are written, since the shipped networks serve "
+            f"none that differ by more than {100 * UNEVEN_MOST:.0f}%; from the viewing place nothing is lost, 10 cm "
+            f"beside it up to {uneven_cost_px(found):.2f} px (--spacing true writes the true ones, for the model sart)"
         )
     worst = float(np.abs(tilt).max())
     if worst > 0.3:
         notes.append(
-            f"a panel is tilted by {worst:.1f} degrees against panel {found.bundle.reference}: exact from the viewing "
-            f"place, up to {tilt_cost_px(found, aside_m=0.1):.1f} px off at its edges 10 cm beside it"
+            f"a panel is tilted by {worst:.1f} degrees against panel {found.bundle.reference}: the shipped networks "
+            "and sart allow for it, and take longer; with other models it is exact from the viewing place, up to "
+            f"{tilt_cost_px(found, aside_m=0.1):.1f} px off at its edges 10 cm beside it"
         )
     return {
         "reference": found.bundle.reference,
@@ -279,14 +287,24 @@ def summary_text(found: PhotoRegistration, summary: dict[str, Any]) -> str:
     return "\n".join([*lines, *(f"note: {note}" for note in summary["notes"])])
 
 
-def write_registration(config: Path, matrices: F64, *, x_m: Sequence[float]) -> Path | None:
-    """Put distances and homographies into a configuration, its comments kept; answers where the old one is kept.
+def stack_table(found: PhotoRegistration) -> dict[str, Any]:
+    """What a registration puts into `[stack]`."""
+    tilt = found.stack.tilt
+    table: dict[str, Any] = {"x_m": [round(float(x), 7) for x in found.stack.x_m]}
+    if tilt is not None:
+        table["tilt"] = [[round(right, 7), round(up, 7)] for _, right, up in tilt.depth]
+        table["registered_from_m"] = [round(value, 7) for value in tilt.seen_from_m]
+    return table
+
+
+def write_registration(config: Path, found: PhotoRegistration) -> Path | None:
+    """Put distances, tilts and homographies into a configuration, its comments kept; answers where the old one is kept.
 
     The new text is checked as a configuration before it takes the old one's place. Raises InputError.
     """
     document = read_document(config)
-    put_homographies(document, matrices)
-    put(document, "stack", {"x_m": [round(float(x), 7) for x in x_m]})
+    put_homographies(document, found.homographies)
+    put(document, "stack", stack_table(found))
     return save_document(config, document)
 
 
@@ -318,7 +336,7 @@ def register_live(
     stack: PanelStack,
     *,
     wanted: int,
-    even: bool,
+    even: bool | None,
     model: str,
     config: Path | None,
 ) -> tuple[dict[str, Any], str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,10 @@ from calib.setup_steps import STEPS, Setup, Step, Stopped
 from calib.setup_world import RealWorld, SimulatedWorld, World
 from runtime.config import Settings, load_settings
 from runtime.errors import InputError, PhasestackError
+from runtime.support import foreign
 from runtime.support.artifacts import write_json, write_text
+
+PROGRESS_BYTES_MAX = 4 << 20
 
 
 def progress_path(config: Path) -> Path:
@@ -25,13 +27,14 @@ def read_progress(path: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = foreign.read_json(path, most_bytes=PROGRESS_BYTES_MAX)
         done = found["done"]
-        assert isinstance(done, dict)
-    except (OSError, ValueError, KeyError, TypeError, AssertionError):
+        steps = {step.name: done[step.name] for step in STEPS if step.name in done}
+    except (InputError, KeyError, TypeError):
         raise InputError(path, "done", "is not what setup wrote: remove the file to begin anew") from None
-    known = {step.name for step in STEPS}
-    return {name: figures for name, figures in done.items() if name in known}
+    if not all(isinstance(figures, dict) for figures in steps.values()):
+        raise InputError(path, "done", "is not what setup wrote: remove the file to begin anew")
+    return steps
 
 
 def run_setup(
@@ -99,7 +102,7 @@ def _done(setup: Setup, step: Step) -> bool:
     try:
         figures = step.run(setup)
     except Stopped:
-        setup.say("stopped: nothing of this step is written into the configuration")
+        setup.say("stopped: what was not finished is not written into the configuration")
         return False
     except PhasestackError as problem:
         setup.say(f"it did not work: {problem}")
@@ -158,12 +161,23 @@ def figure_rows(setup: Setup, settings: Settings) -> list[list[str]]:
                      f"{db['perfect stack']:.1f}; without the registration: {db['as configured']:.1f}; it is worth "
                      f"{gain:.1f} dB)"])  # fmt: skip
         rows.append(["its uncertainty", f"{done['registration']['eye_error_mm']:.2f} mm at the eye"])
+    if "grey" in done:
+        db = done["grey"]["psnr_db"]
+        which = ", ".join(str(number) for number in done["grey"]["panels"])
+        rows.append(["eyes see, grey curves measured", f"{db['with curves']:.1f} dB (panels that follow exactly: "
+                     f"{db['perfect panels']:.1f}; without curves: {db['without']:.1f}; they are worth "
+                     f"{db['with curves'] - db['without']:.1f} dB); of panels {which}"])  # fmt: skip
     if "sensor" in done:
         rows.append(["sensor", done["sensor"]["sensor"]])
     if "calibration" in done:
         figures = done["calibration"]
+        db = figures["expected_db"]
         rows.append(["error of the eyes' places", f"{figures['eye_error_mm']:.1f} mm expected, from "
-                     f"{figures['pairs']} pairs, {figures['rms_mm']:.1f} mm off on average"])  # fmt: skip
+                     f"{figures['pairs']} pairs, {figures['rms_mm']:.1f} mm off on average; it costs "
+                     f"{db['eyes known exactly'] - db['as calibrated']:.1f} dB "
+                     f"({db['eyes known exactly']:.1f} to {db['as calibrated']:.1f})"])  # fmt: skip
+    if "service" in done:
+        rows.append(["service", f"{len(done['service']['files'])} files: {done['service']['commands'][0]}"])
     return rows
 
 
@@ -173,5 +187,5 @@ def _next(setup: Setup, settings: Settings) -> list[str]:
     return [
         f"try it: phasestack run --config {setup.config}",
         f"check it: phasestack doctor --config {setup.config}",
-        "at every start: copy it to /etc/phasestack/phasestack.toml, then sudo systemctl enable --now phasestack",
+        *(["at every start: " + "; ".join(setup.done["service"]["commands"])] if "service" in setup.done else []),
     ]

@@ -7,17 +7,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from calib.config_file import put, put_monitors, read_document, save_document
+from calib.config_file import put, put_lut, put_monitors, read_document, save_document
 from calib.interview import Interview
 from calib.keys import Key
 from calib.setup_world import Poll, Say, SimulatedWorld, World
+from calib.viewpoints import IPD_M
 from runtime.config import Settings, load_settings
 from runtime.errors import InputError
 
 Figures = dict[str, Any]
 LEAST_PAIRS = 9
-EYES_WAIT_SAMPLES = 300
-MOST_WAITS = 500
+SERVICE_FOLDER = "/etc/phasestack"
 
 
 @dataclass
@@ -94,7 +94,12 @@ class Dial:
     most: float
     show: Callable[[float], str]
 
+    unknown: float | None = None  # the value to begin with, where 0 says that nothing is known
+
     def turn(self, direction: int) -> None:
+        if self.unknown is not None and (self.value == 0 or self.value + direction * self.step < self.least):
+            self.value = self.unknown if direction > 0 else 0.0
+            return
         self.value = min(max(self.value + direction * self.step, self.least), self.most)
 
 
@@ -113,6 +118,15 @@ def geometry(setup: Setup) -> Figures:
         Dial("from panel to panel", gap_m, 0.001, 0.002, 0.5, mm),
         Dial("nearest viewer", calibration.viewing_m[0], 0.05, 0.2, 5.0, lambda v: f"{v:.2f} m"),
         Dial("farthest viewer", calibration.viewing_m[1], 0.05, 0.25, 8.0, lambda v: f"{v:.2f} m"),
+        Dial(
+            "the eye separation of who will calibrate, if it is known (an optician's PD)",
+            calibration.ipd_m,
+            0.0005,
+            0.05,
+            0.08,
+            lambda v: mm(v) if v else "not known",
+            unknown=IPD_M,
+        ),
     ]
     chosen, coarse = 0, 1  # which dial; how many of its steps at once
     while True:
@@ -132,14 +146,18 @@ def geometry(setup: Setup) -> Figures:
         elif key in (Key.LEFT, Key.RIGHT):
             for _ in range(coarse):
                 dials[chosen].turn(1 if key is Key.RIGHT else -1)
-    width_m, height_m, found_m, near_m, far_m = (round(dial.value, 5) for dial in dials)
+    width_m, height_m, found_m, near_m, far_m, ipd_m = (round(dial.value, 5) for dial in dials)
     document = read_document(setup.config)
     values: dict[str, Any] = {"width_m": width_m, "height_m": height_m}
     if abs(found_m - gap_m) > 1e-6:  # else distances that were measured stay as they are
         middle = (len(stack.x_m) - 1) / 2
         values["x_m"] = [round((index - middle) * found_m, 6) for index in range(len(stack.x_m))]
     put(document, "stack", values)
-    put(document, "calibration", {"viewing_m": [near_m, far_m]})
+    put(
+        document,
+        "calibration",
+        {"viewing_m": [near_m, far_m]} | ({"ipd_m": ipd_m} if ipd_m != calibration.ipd_m else {}),
+    )
     save_document(setup.config, document)
     return {"width_m": width_m, "height_m": height_m, "gap_m": found_m, "viewing_m": [near_m, far_m]}
 
@@ -171,6 +189,51 @@ def _made(config: Path) -> Path:
     if not config.exists():
         save_document(config, read_document(config))
     return config
+
+
+def grey(setup: Setup) -> Figures:
+    """What each panel makes of a grey, from photographs of its chart; a panel at a time, each kept at once."""
+    from calib.grey import fit_series
+    from calib.grey_run import pictures_series, write_lut
+    from calib.setup_worth import grey_worth
+
+    stack = setup.settings.stack.stack()
+    known = [bool(panel.lut) for panel in setup.settings.output.panels] or [False] * stack.count
+    residual: dict[int, float] = {}
+    number = 0
+    while number < stack.count:
+        state = "has a curve" if known[number] else "has no curve yet"
+        setup.say(f"panel {number} ({state}): Enter: measure it; n: leave it; u: the panel before; q: stop")
+        key = setup.key()
+        if key is Key.QUIT:
+            raise Stopped
+        if key in (Key.UNDO, Key.PREVIOUS, Key.LEFT):
+            number = max(0, number - 1)
+        elif key in (Key.NEXT, Key.RIGHT):
+            number += 1
+        elif key is Key.ACCEPT:
+            try:
+                pictures = setup.world.grey_photographs(setup.settings, number, poll=setup.poll, say=setup.say)
+                measured = pictures_series(pictures, stack, panel=number, source="photographs")
+                curves = fit_series(measured, "photographs")
+            except InputError as problem:
+                setup.say(f"it did not work: {problem}")
+                continue
+            path = (setup.out / "grey" / f"panel-{number}.csv").resolve()
+            write_lut(path, measured, curves)
+            document = read_document(setup.config)
+            put_lut(document, number, str(path), panels=stack.count)
+            save_document(setup.config, document)
+            residual[number], known[number] = max(curve.residual for curve in curves), True
+            setup.say(
+                f"panel {number}: taken, {100 * residual[number]:.2f}% of the range off, gamma {curves[1].gamma:.2f}"
+            )
+            number += 1
+    if not any(known):
+        setup.say("no panel has a curve: gammas stay as they are configured")
+        raise Stopped
+    figures: Figures = {"panels": [n for n, has in enumerate(known) if has], "residual": residual}
+    return figures | grey_worth(setup.settings)
 
 
 def sensor(setup: Setup) -> Figures:
@@ -250,12 +313,29 @@ def calibration(setup: Setup) -> Figures:
     document = read_document(_made(setup.config))
     put(document, "calibration", {"file": str(target.resolve())})
     save_document(setup.config, document)
+    from calib.setup_worth import calibration_worth
+
     return {
         "eye_error_mm": summary["eye_error_mm"],
+        "expected_db": calibration_worth(setup.settings, eye_error_m=summary["eye_error_mm"] / 1e3),
         "rms_mm": summary["rms_mm"],
         "pairs": summary["pairs"],
         "warnings": summary["warnings"],
     }
+
+
+def service(setup: Setup) -> Figures:
+    """A folder with all that the service reads, and the commands that install it: they ask for another's rights."""
+    from calib.setup_service import gather
+
+    files = gather(setup.config, setup.out / "service")
+    folder = (setup.out / "service").resolve()
+    commands = [
+        f"sudo install -D -m 644 -t {SERVICE_FOLDER} {folder}/*",
+        "sudo systemctl enable --now phasestack",
+    ]
+    setup.say("the service reads its own copy of all this; it is installed by\n  " + "\n  ".join(commands))
+    return {"files": files, "commands": commands}
 
 
 STEPS = (
@@ -263,9 +343,11 @@ STEPS = (
     Step("geometry", "Sizes and distances", "how large the panels are, about how far apart, where viewers stand",
          geometry),
     Step("registration", "Where the panels truly are", "a dozen photographs of the boards, by hand", registration),
+    Step("grey", "What each panel makes of a grey", "two photographs of a chart, for each panel", grey),
     Step("sensor", "The depth sensor", "which one sees the viewer's eyes", sensor),
     Step("calibration", "Where the sensor stands", "you stand where lines fuse, and press Enter: 27 places, or 9 "
          "(q: enough)", calibration),
+    Step("service", "At every start", "what the service reads, gathered in a folder, and how it is installed", service),
 )  # fmt: skip
 
 

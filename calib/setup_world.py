@@ -12,19 +12,21 @@ import numpy as np
 
 from calib.board import board_layers
 from calib.detect_marks import SeenMarks, find_marks
-from calib.keys import Key
+from calib.keys import Key, first_of
 from calib.message import message_layers
 from calib.placed import PlacedPanel, in_frame_of, misplaced
 from calib.viewpoints import IPD_M, Viewpoint
 from runtime.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from runtime.config import Settings
 from runtime.errors import InputError, PanelLost
+from runtime.optics.malus import phase_from_intensity
 from runtime.optics.stack import PanelStack
 from runtime.panels.monitors import Monitor
-from runtime.records import EyePoints
+from runtime.records import F64, U8, EyePoints
 
 Poll = Callable[[], Key | None]
 Say = Callable[[str], None]
+GREY_PHOTOGRAPHS = 2
 POLL_NS = 20 * NS_PER_MS
 
 
@@ -57,6 +59,10 @@ class World(ABC):
     @abstractmethod
     def photographs(self, settings: Settings, *, poll: Poll, say: Say) -> tuple[list[SeenMarks], str]:
         """Photographs of the boards, their marks found, and what to call them. Raises InputError."""
+
+    @abstractmethod
+    def grey_photographs(self, settings: Settings, panel: int, *, poll: Poll, say: Say) -> list[tuple[str, U8]]:
+        """Photographs (h, w) of a panel's grey chart, each with its name. Raises InputError."""
 
     @abstractmethod
     def open_sensor(self, settings: Settings) -> str:
@@ -154,6 +160,43 @@ class RealWorld(World):
                 raise InputError("photographs", "", "stopped before there were any")
             panels.again()
         return look_at(photograph_files(folder), stack), str(folder)
+
+    def grey_photographs(self, settings: Settings, panel: int, *, poll: Poll, say: Say) -> list[tuple[str, U8]]:
+        from calib.bare_panels import BarePanels
+        from calib.charts import alone
+        from calib.grey_chart import grey_chart
+        from calib.photo_live import one_picture, open_video
+        from calib.photo_run import photograph_files, read_photograph
+
+        self._let_go()
+        stack = settings.stack.stack()
+        video = None if self._device is None else open_video(self._device)
+        panels = None
+        try:
+            panels = BarePanels(settings, stack, grey_curve=False)
+            poll = first_of(poll, panels.keys.poll)
+            panels.show(alone(grey_chart(stack, panel), stack, index=panel))
+            found: list[tuple[str, U8]] = []
+            folder = (self._photos or Path("photos")) / f"grey-{panel}"
+            while len(found) < GREY_PHOTOGRAPHS:
+                place = f"photograph {len(found) + 1} of {GREY_PHOTOGRAPHS}, each from another place"
+                asked = place if video is not None else f"put two or three photographs of it into {folder}"
+                say(f"panel {panel} shows its grey chart: {asked}, then Enter (q: stop)")
+                while (key := poll()) is not Key.ACCEPT:
+                    if key is Key.QUIT:
+                        raise InputError("photographs", "", "stopped before there were enough")
+                    panels.again()
+                    if video is not None:
+                        one_picture(video)  # else a buffer of old ones would be read
+                if video is None:
+                    return [(str(path), read_photograph(path)) for path in photograph_files(folder)]
+                found.append((f"photograph {len(found) + 1}", one_picture(video)))
+            return found
+        finally:
+            if panels is not None:
+                panels.close()
+            if video is not None:
+                video.release()
 
     def open_sensor(self, settings: Settings) -> str:
         from calib.capture_run import eye_finder
@@ -253,6 +296,8 @@ class Built:
     standing_m: float = 0.002  # how exactly a person finds the place where the lines fuse, an axis
     photographs: int = 8
     megapixels: float = 8.0
+    grey_gamma: float = 2.2  # of what a panel's monitor makes of a grey: of its light, about
+    grey_spread: float = 0.2
 
 
 class SimulatedWorld(World):
@@ -276,6 +321,7 @@ class SimulatedWorld(World):
             (int(self._random.choice([0, 180])), str(self._random.choice(["none", "horizontal"])))
             for _ in range(stack.count)
         ]
+        self.grey_gammas = self.built.grey_gamma + self._random.uniform(-1, 1, stack.count) * self.built.grey_spread
         self._stack = stack
         self._said: Say = lambda text: None
         self._now_ns = 0
@@ -318,6 +364,30 @@ class SimulatedWorld(World):
         )  # fmt: skip
         stack = settings.stack.stack()
         return [find_marks(p, stack, name=f"photograph {n + 1}") for n, p in enumerate(pictures)], "simulated"
+
+    def phase_of(self, panel: int, grey: F64) -> F64:
+        """(...) the phase that a panel truly has where it is sent a grey in [0, 1]."""
+        return phase_from_intensity(np.asarray(grey, dtype=np.float64) ** self.grey_gammas[panel], branch=1)
+
+    def grey_photographs(self, settings: Settings, panel: int, *, poll: Poll, say: Say) -> list[tuple[str, U8]]:
+        from calib.grey_chart import grey_chart
+        from calib.simulator import Exposure, Scene, camera_from_stack, phone, photograph, smaller
+
+        say(f"taking {GREY_PHOTOGRAPHS} simulated photographs of panel {panel}'s grey chart ...")
+        stack = settings.stack.stack()
+        layers = np.zeros((stack.count, stack.height_px, stack.width_px), np.uint8)
+        layers[panel] = np.rint(255 * self.phase_of(panel, np.arange(256) / 255)).astype(np.uint8)[
+            grey_chart(stack, panel)
+        ]
+        scene = Scene(stack, self.truth, layers)
+        lens = smaller(phone(random=self._random), 0.7)
+        places = np.array([[1.45, 0.0, 0.0], [1.5, 0.2, 0.1]]) * stack.width_m
+        exposure = Exposure(dark=0.004, gain=0.85, samples=3)
+        return [
+            (f"photograph {number + 1}", photograph(scene, lens, camera_from_stack(place, towards_m=np.zeros(3)),
+                                                    exposure, random=self._random))
+            for number, place in enumerate(places)
+        ]  # fmt: skip
 
     def open_sensor(self, settings: Settings) -> str:
         return "a simulated sensor, where the built-in recording's stands"

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from calib.checks import check_pairs, check_solution
+from calib.eye_separation import separation_scale
 from calib.pairs import Pairs, read_pairs
 from calib.similarity import Degenerate
 from calib.solution import METHODS, Solution, solve, solve_default
@@ -35,14 +36,26 @@ def solve_file(
     if method and method not in METHODS:
         raise InputError("calibrate solve", "--method", f"must be one of {', '.join(METHODS)}, not {method}")
     raw = read_pairs(pairs_path)
-    raw = replace(raw, sensor_m=raw.sensor_m * sensor_unit_m, stack_m=raw.stack_m * stack_unit_m)
+    raw = replace(
+        raw,
+        sensor_m=raw.sensor_m * sensor_unit_m,
+        stack_m=raw.stack_m * stack_unit_m,
+        separation_m=raw.separation_m * sensor_unit_m,
+    )
     checked = check_pairs(raw)
     pairs = checked.pairs
     try:
         chosen = (
             solve(pairs.sensor_m, pairs.stack_m, method=method, known_scale=known_scale, reason="asked for")
             if method
-            else solve_default(pairs.sensor_m, pairs.stack_m, scale_sigma=settings.calibration.scale_sigma)
+            else solve_default(
+                pairs.sensor_m,
+                pairs.stack_m,
+                scale_sigma=settings.calibration.scale_sigma,
+                separation=separation_scale(
+                    pairs.separation_m, ipd_m=settings.calibration.ipd_m, ipd_sigma_m=settings.calibration.ipd_sigma_m
+                ),
+            )
         )
     except Degenerate as problem:
         raise InputError(pairs.source, "pairs", str(problem)) from None

@@ -14,12 +14,14 @@ from calib.solution import Solution
 from runtime.errors import InputError
 from runtime.eyes.calibration import load_calibration
 from runtime.records import F64
+from runtime.support import foreign
 from runtime.support.artifacts import write_bytes, write_text
 
 if TYPE_CHECKING:
     from tomlkit.items import Array
 
 KEPT_VERSIONS = 20
+KEPT_BYTES_MAX = 64 << 20
 STORED_PAIRS = 500  # more are left in their own file
 
 
@@ -103,7 +105,7 @@ def save(path: Path, text: str) -> Path | None:
         past = history(path)
         number = int(past[-1].stem.rpartition(".")[2]) + 1 if past else 1
         kept = path.with_name(f"{path.stem}.{number}{path.suffix}")
-        write_bytes(kept, path.read_bytes())
+        write_bytes(kept, foreign.read_bytes(path, most_bytes=KEPT_BYTES_MAX))
         for old in past[: max(0, len(past) + 1 - KEPT_VERSIONS)]:
             old.unlink(missing_ok=True)
     write_text(path, text)
@@ -122,6 +124,8 @@ def roll_back(path: Path) -> Path:
     newest = past[-1]
     load_calibration(newest)
     if path.exists():
-        write_bytes(path.with_name(f"{path.stem}.undone{path.suffix}"), path.read_bytes())
+        write_bytes(
+            path.with_name(f"{path.stem}.undone{path.suffix}"), foreign.read_bytes(path, most_bytes=KEPT_BYTES_MAX)
+        )
     newest.replace(path)
     return newest

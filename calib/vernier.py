@@ -16,6 +16,7 @@ from calib.registration import Setting, ideal_partner, through
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
+from runtime.support import foreign
 from runtime.support.artifacts import write_text
 
 COLUMNS = (
@@ -229,14 +230,14 @@ def write_settings(path: Path, settings: Sequence[Setting]) -> None:
 def read_settings(path: Path, stack: PanelStack) -> list[Setting]:
     """Settings from CSV. Raises InputError, naming the row and the column."""
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with io.StringIO(foreign.read_text(path), newline="") as file:
             reader = csv.DictReader(file, skipinitialspace=True)
             missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
             if missing:
                 raise InputError(path, missing[0], "column is missing (wanted: " + ", ".join(COLUMNS) + ")")
             return [_setting(path, reader.line_num, row, stack) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, "", f"cannot be read ({getattr(error, 'strerror', None) or error})") from None
+    except csv.Error as error:
+        raise InputError(path, "", f"malformed: {error}") from None
 
 
 def _setting(path: Path, line: int, row: dict[str, str | None], stack: PanelStack) -> Setting:

@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from calib.capture import EyeWindow, Measured
 from calib.guidance import rough_similarity, way_to
 from calib.keys import Key
@@ -15,7 +17,12 @@ from calib.viewpoints import Viewpoint
 from runtime.clock import NS_PER_S
 from runtime.records import F64, EyePoints
 
+HERE = "here: till the lines fuse; then hold still, or Enter"
 GUIDE_NS = NS_PER_S // 2  # between two words of guidance
+HOLD_S = 1.5  # eyes that were still for so long are taken without a key
+DRIFT_M = 0.005  # that still eyes may wander meanwhile: noise and breath
+REACH_M = 0.06  # of the viewpoint, as the pairs so far tell it: nearer, holding still means that the lines fuse
+MOVED_M = 0.02  # since the last pair or its undoing: a person who has not moved does not mean this viewpoint
 
 
 def accept(measured: Measured | None, viewpoint: Viewpoint, *, max_spread_m: float) -> CapturedPair | str:
@@ -37,6 +44,7 @@ def captured(measured: Measured, stack_m: F64, name: str) -> CapturedPair:
         viewpoint=name,
         spread_mm=measured.spread_m * 1e3,
         samples=measured.samples,
+        separation_m=measured.separation_m,
         accepted_at=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     )
 
@@ -54,11 +62,18 @@ class Walk:
         max_spread_m: float,
         say: Callable[[str], None],
         chart: Any = None,
+        hold_s: float = HOLD_S,
     ) -> None:
-        """chart: has `show(viewpoint)` and `caption(text)`; None: the person follows the charts elsewhere."""
+        """chart: has `show(viewpoint)` and `caption(text)`; None: the person follows the charts elsewhere.
+
+        hold_s: how long eyes are still before they are taken by themselves, as soon as three pairs tell roughly where
+        they are; 0: never.
+        """
         self._file, self._say, self._chart = file, say, chart
         self._left = [v for v in viewpoints if again or v.name not in file.viewpoints]
         self._window, self._max_spread_m = EyeWindow(window_s), max_spread_m
+        self._held = EyeWindow(hold_s) if hold_s else None
+        self._before_m: F64 | None = None  # where the eyes were when this viewpoint came up, frame `sensor`
         self._index = 0
         self._serial = ""
         self._accepted = 0
@@ -83,6 +98,10 @@ class Walk:
         """Take in a sample in frame `sensor`."""
         self._window.add(capture_ns, eyes)
         self._serial = serial
+        if self._held is not None and not self.finished:
+            self._held.add(capture_ns, eyes)
+            if self._holds_still():
+                self._accept(self._held, how="held still, ")
         if capture_ns - self._guided_ns >= GUIDE_NS and not self.finished:
             self._tell_way(capture_ns)
 
@@ -93,7 +112,7 @@ class Walk:
         if key is Key.QUIT:
             self.finished = True
         elif key is Key.ACCEPT:
-            self._accept()
+            self._accept(self._window)
         elif key is Key.UNDO:
             self._undo()
         elif key in (Key.NEXT, Key.RIGHT):
@@ -111,16 +130,28 @@ class Walk:
             "skipped": [viewpoint.name for viewpoint in self._left if viewpoint.name not in names],
         }
 
-    def _accept(self) -> None:
+    def _holds_still(self) -> bool:
+        """Whether a person stands about where they should, has come there, and does not move any more."""
+        if self._held is None or self._rough is None or not self._held.still(DRIFT_M):
+            return False
+        measured = self._held.measure()
+        if measured is None or measured.spread_m > self._max_spread_m:
+            return False
+        if self._before_m is not None and np.linalg.norm(measured.midpoint_m - self._before_m) < MOVED_M:
+            return False
+        off_m = self._rough.points(measured.midpoint_m[None])[0] - self._left[self._index].midpoint_m
+        return float(np.linalg.norm(off_m)) <= REACH_M
+
+    def _accept(self, window: EyeWindow, *, how: str = "") -> None:
         viewpoint = self._left[self._index]
-        result = accept(self._window.measure(), viewpoint, max_spread_m=self._max_spread_m)
+        result = accept(window.measure(), viewpoint, max_spread_m=self._max_spread_m)
         if isinstance(result, str):
             self._say(f"{viewpoint.name}: not taken: {result}")
             return
         self._file.accept(replace(result, sensor_serial=self._serial))
         self._accepted += 1
         self._rough = rough_similarity(*self._file.points())
-        self._say(f"{viewpoint.name}: taken, spread {result.spread_mm:.1f} mm, {len(self._file)} pairs in all")
+        self._say(f"{viewpoint.name}: {how}taken, spread {result.spread_mm:.1f} mm, {len(self._file)} pairs in all")
         if self._index + 1 == len(self._left):
             self.finished = True
         else:
@@ -135,6 +166,7 @@ class Walk:
         self._accepted = max(0, self._accepted - 1)
         self._say(f"{name}: taken back, {len(self._file)} pairs in all")
         places = [viewpoint.name for viewpoint in self._left]
+        self._forget()
         if name in places:
             self._go(places.index(name) - self._index)
 
@@ -145,7 +177,7 @@ class Walk:
             return
         self._guided_ns = now_ns
         eyes_m = self._rough.points(measured.midpoint_m[None])[0]
-        way = way_to(self._left[self._index].midpoint_m, eyes_m) or "here: till the lines fuse; hold still, Enter"
+        way = way_to(self._left[self._index].midpoint_m, eyes_m) or HERE
         if way != self._guide:
             self._guide = way
             self._say(way)
@@ -156,8 +188,17 @@ class Walk:
         index = min(max(self._index + step, 0), len(self._left) - 1)
         if index != self._index:
             self._index = index
-            self._window.clear()
+            self._forget()
             self._announce()
+
+    def _forget(self) -> None:
+        """What was seen so far does not belong to the viewpoint that comes."""
+        measured = self._window.measure()
+        if measured is not None:
+            self._before_m = measured.midpoint_m
+        self._window.clear()
+        if self._held is not None:
+            self._held.clear()
 
     def _announce(self) -> None:
         viewpoint = self._left[self._index]
@@ -165,7 +206,8 @@ class Walk:
         self._say(
             f"{viewpoint.name} ({self._index + 1} of {len(self._left)}): {x * 100:.0f} cm before the display, "
             f"{abs(y) * 100:.0f} cm to its {'right' if y > 0 else 'left'}, {z * 100:.0f} cm up; "
-            "Enter: fused, n: next, p: previous, u: undo, q: stop"
+            f"Enter: fused{', or hold still' if self._held is not None and self._rough is not None else ''}, n: next, "
+            "p: previous, u: undo, q: stop"
         )
         if self._chart is not None:
             self._chart.show(viewpoint)

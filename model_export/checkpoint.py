@@ -34,7 +34,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     data = foreign.read_bytes(path, most_bytes=FILE_BYTES_MAX)
     try:
         with torch.serialization.safe_globals([argparse.Namespace]):
-            table = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+            table: dict[str, Any] = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged pickle can raise anything
         raise InputError(path, "", f"is no checkpoint of plain weights ({_first_line(error)})") from None
     state = table.get("model") if isinstance(table, dict) else None

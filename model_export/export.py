@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from model_export import eyereal, network
-from model_export.checkpoint import load_eyereal, load_spectral, solver_of
+from model_export.checkpoint import FILE_BYTES_MAX, load_eyereal, load_spectral, solver_of
 from model_export.eyereal import LEAST_PX, OFFSET, PICTURE_FOV_DEG, EyeRealNet
 from model_export.network import SpectralSolver
 from model_export.onnx_files import eyereal_bytes, half_precision, ports, quantised, spectral_bytes, with_contract
@@ -21,6 +21,7 @@ from model_export.validate import OPSETS, Report, check_model
 from runtime.errors import InputError
 from runtime.model.contract import Contract
 from runtime.model.predictor import SHIPPED
+from runtime.support import foreign
 from runtime.support.artifacts import write_bytes
 
 CALIBRATION_PAIRS = 8
@@ -114,7 +115,7 @@ def eyereal_model(request: ExportRequest) -> tuple[bytes, nn.Module]:
     """The published network with a checkpoint's weights, or untrained ones."""
     if request.checkpoint is not None:
         net = load_eyereal(request.checkpoint)
-        origin = hashlib.sha256(request.checkpoint.read_bytes())
+        origin = hashlib.sha256(foreign.read_bytes(request.checkpoint, most_bytes=FILE_BYTES_MAX))
     else:
         torch.manual_seed(request.random_init or 0)
         net = EyeRealNet(request.base_width).eval()

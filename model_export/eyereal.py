@@ -35,7 +35,8 @@ class Up(nn.Module):
         up = functional.interpolate(deep, scale_factor=2, mode="bilinear", align_corners=True)
         rows, columns = skip.shape[2] - up.shape[2], skip.shape[3] - up.shape[3]
         up = functional.pad(up, [columns // 2, columns - columns // 2, rows // 2, rows - rows // 2])
-        return self.conv(torch.cat([skip, up], dim=1))
+        result: Tensor = self.conv(torch.cat([skip, up], dim=1))
+        return result
 
 
 class UNet(nn.Module):
@@ -62,7 +63,8 @@ class UNet(nn.Module):
         y = skips.pop()
         for up in (self.up1, self.up2, self.up3, self.up4, self.up5):
             y = up(y, skips.pop())
-        return self.out_conv(y)
+        result: Tensor = self.out_conv(y)
+        return result
 
 
 class EyeRealNet(nn.Module):

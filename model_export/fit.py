@@ -25,6 +25,7 @@ from model_export.export import spectral_file
 from model_export.recipe import Recipe, read_recipe
 from model_export.stills import random_still
 from runtime.config import ModelSettings
+from runtime.evaluation.displayed import Picture
 from runtime.model.predictor import load_predictor
 from runtime.model.still import solve_still
 from runtime.optics.malus import HALF_PI
@@ -133,13 +134,13 @@ def fitted(
     return best
 
 
-def _sight(eye_m: F64, picture: U8, stack: PanelStack, fov_deg: float) -> Sight:
+def _sight(eye_m: F64, picture: Picture, stack: PanelStack, fov_deg: float) -> Sight:
     height, width = picture.shape[:2]
-    view = {"width_px": width, "height_px": height, "fov_deg": fov_deg}
-    mask = ray_mask(eye_m, stack, **view)  # type: ignore[arg-type]
+    mask = ray_mask(eye_m, stack, width_px=width, height_px=height, fov_deg=fov_deg)
     places = []
     for index in range(stack.count):
-        u, v = (np.broadcast_to(part, mask.shape) for part in panel_positions(eye_m, stack, index=index, **view))  # type: ignore[arg-type]
+        positions = panel_positions(eye_m, stack, index=index, width_px=width, height_px=height, fov_deg=fov_deg)
+        u, v = (np.broadcast_to(part, mask.shape) for part in positions)
         mask = mask & (u > 0.5) & (u < stack.width_px - 0.5) & (v > 0.5) & (v < stack.height_px - 0.5)
         place = np.stack([u * 2 / stack.width_px - 1, v * 2 / stack.height_px - 1], axis=-1).astype(np.float32)
         places.append(torch.from_numpy(place)[None])
@@ -148,7 +149,7 @@ def _sight(eye_m: F64, picture: U8, stack: PanelStack, fov_deg: float) -> Sight:
 
 
 def _seen_db(layers: U8, sights: Sequence[Sight]) -> float:
-    """Displayed PSNR pooled over sights (seed 6, 7), in single precision."""
+    """Displayed PSNR pooled over sights (EyeReal supplement, (6), (7)), in single precision."""
     panels = [torch.from_numpy(np.ascontiguousarray(layer[..., :3])).permute(2, 0, 1)[None].float() for layer in layers]
     squared, count = 0.0, 0
     for sight in sights:

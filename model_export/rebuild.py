@@ -60,7 +60,8 @@ class Weights:
         if scale.ndim == 1:
             shape[axis if value.ndim > 1 else 0] = -1
             scale, zero = scale.reshape(shape), zero.reshape(shape)
-        return ((value.astype(np.float64) - zero) * scale).astype(np.float32)
+        real: np.ndarray = ((value.astype(np.float64) - zero) * scale).astype(np.float32)
+        return real
 
 
 def rebuilt(model: onnx.ModelProto, contract: Contract, *, source: str) -> nn.Module:

@@ -10,6 +10,7 @@ import numpy as np
 from runtime.records import U8
 
 Random = np.random.Generator
+Texture = Callable[[Random, int, int], U8]
 WORDS = ["AaBb", "Phase", "3D", "0123", "light", "Stack", "eye", "&", "field", "42%", "panel", "Wg#?", "depth"]
 
 
@@ -109,7 +110,8 @@ def wires(random: Random, width: int, height: int) -> U8:
 
 def blob(random: Random, width: int, height: int) -> U8:
     """A textured patch with an irregular outline."""
-    picture = random.choice([noise, shapes, checker])(random, width, height)  # type: ignore[arg-type]
+    texture: Texture = random.choice([noise, shapes, checker])  # type: ignore[arg-type]
+    picture = texture(random, width, height)
     angles = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     radius = 0.42 * (0.75 + 0.25 * np.sin(angles * int(random.integers(2, 7)) + random.uniform(0, 6)))
     points = np.stack([(0.5 + radius * np.cos(angles)) * width, (0.5 + radius * np.sin(angles)) * height], axis=-1)
@@ -128,8 +130,8 @@ def glint(random: Random, width: int, height: int) -> U8:
     return picture
 
 
-BACKDROPS: tuple[Callable[[Random, int, int], U8], ...] = (noise, noise, noise, shapes, gradient, checker)
-OBJECTS: tuple[Callable[[Random, int, int], U8], ...] = (
+BACKDROPS: tuple[Texture, ...] = (noise, noise, noise, shapes, gradient, checker)
+OBJECTS: tuple[Texture, ...] = (
     noise,
     checker,
     gradient,

@@ -19,7 +19,7 @@ from model_export.onnx_files import Feeds
 from model_export.rebuild import rebuilt
 from model_export.stress import ORDINARY, eyereal_cases, spectral_cases
 from runtime.errors import InputError
-from runtime.model.contract import Contract, parse_contract
+from runtime.model.contract import VERSION, Contract, parse_contract
 from runtime.model.transfer import FULL
 from runtime.support import foreign
 
@@ -86,7 +86,7 @@ def check_model(data: bytes, *, source: str, reference: nn.Module | None = None)
     contract = parse_contract({item.key: item.value for item in model.metadata_props}, source=source)
     opset = next((item.version for item in model.opset_import if item.domain in ("", "ai.onnx")), 0)
     checks = [
-        Check("contract", f"{contract.arch} {contract.name} {contract.precision}", "version 1", True),
+        Check("contract", f"{contract.arch} {contract.name} {contract.precision}", f"version {VERSION}", True),
         Check("opset", str(opset), f"{OPSETS[0]} to {OPSETS[-1]}", opset in OPSETS),
     ]
     options = onnxruntime.SessionOptions()

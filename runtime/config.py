@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from runtime.errors import InputError
-from runtime.optics.stack import PanelStack
+from runtime.optics.stack import PanelStack, Tilt
 from runtime.support import foreign
 from runtime.support.plausible import check_text, nearest, socket_path, within
 
@@ -42,6 +42,7 @@ NonNegative = Annotated[float, Field(ge=0, le=MOST)]
 Unit = Annotated[float, Field(ge=0, le=1)]
 SocketPath = Annotated[str, AfterValidator(socket_path)]
 Entry = Annotated[float, Field(ge=-MOST, le=MOST)]  # of a matrix
+Slope = Annotated[float, Field(ge=-0.2, le=0.2)]  # of a panel that should stand upright
 Place = Annotated[float, within(-50.0, 50.0, "m")]  # a coordinate of an eye
 Offset = Annotated[float, within(-10.0, 10.0, "m")]  # of a scene
 Turn = Annotated[float, within(-360.0, 360.0, "degrees")]
@@ -65,6 +66,23 @@ class StackGeometry(Section):
         1.0, description="width of a pixel over its height; the configuration's sizes must agree with it to 3%"
     )
 
+    tilt: Annotated[tuple[tuple[Slope, Slope], ...], Field(max_length=8)] = Field(
+        (),
+        description="per panel, how much farther out it stands per metre to the viewer's right, and per metre up; "
+        "written by `calibrate panels photo`; empty: the panels are parallel",
+    )
+    registered_from_m: tuple[Place, Place, Place] = Field(
+        (0.5, 0.0, 0.0), description="where the homographies make tilted panels look parallel from, frame `stack`"
+    )
+
+    @model_validator(mode="after")
+    def _tilted(self) -> StackGeometry:
+        if len(self.tilt) not in (0, len(self.x_m)):
+            raise ValueError(f"tilt: has {len(self.tilt)} panels, x_m has {len(self.x_m)}")
+        if any(any(slopes) for slopes in self.tilt) and self.registered_from_m[0] <= self.x_m[-1]:
+            raise ValueError("registered_from_m: is not before the front panel")
+        return self
+
     @model_validator(mode="after")
     def _ascending(self) -> StackGeometry:
         gaps = [b - a for a, b in zip(self.x_m, self.x_m[1:], strict=False)]
@@ -87,7 +105,10 @@ class StackGeometry(Section):
 
     def stack(self) -> PanelStack:
         """The geometry as optics wants it."""
-        return PanelStack(self.width_m, self.height_m, self.x_m, self.width_px, self.height_px)
+        tilt = None
+        if any(any(slopes) for slopes in self.tilt):
+            tilt = Tilt(tuple((0.0, right, up) for right, up in self.tilt), self.registered_from_m)
+        return PanelStack(self.width_m, self.height_m, self.x_m, self.width_px, self.height_px, tilt)
 
 
 class SensorSettings(Section):
@@ -205,6 +226,10 @@ class CalibrationSettings(Section):
     ipd_m: Annotated[float, within(0.04, 0.08, "m", zero=True)] = Field(
         0.0, description="the viewer's known eye separation, metres, 0: unknown; checks for drift"
     )
+    ipd_sigma_m: Annotated[float, within(0.0001, 0.02, "m")] = Field(
+        0.001,
+        description="how exactly ipd_m is known (a standard deviation): `calibrate solve` learns the scale from it",
+    )
     ipd_tolerance: Positive = Field(0.04, description="warn where the measured one parts by more than this share")
     viewing_m: tuple[Annotated[float, within(0.05, 20.0, "m")], Annotated[float, within(0.05, 20.0, "m")]] = Field(
         (0.4, 0.6), description="nearest and farthest viewer: charts and registration are for there"
@@ -300,8 +325,10 @@ class ModelSettings(Section):
 
     name: str = Field("balanced", description="fast, balanced, best, sart, or an ONNX file with our contract")
     provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = Field("cpu", description="execution provider")
-    backend: Literal["auto", "opencv"] = Field(
-        "auto", description="what does all that surrounds the network; auto: the one there is"
+    backend: Literal["auto", "opencv", "gl"] = Field(
+        "auto",
+        description="what does all that surrounds the network: OpenCV on the processor, or OpenGL's shaders; "
+        "auto: both are measured at the start, and the faster one is taken",
     )
     threads: Annotated[int, Field(ge=0, le=256)] = Field(2, description="inference threads; 0: all cores")
     eye_sigma_mm: Literal["auto"] | NonNegative = Field(
@@ -312,7 +339,6 @@ class ModelSettings(Section):
     pupil_mm: Annotated[float, within(0.0, 20.0, "mm")] = Field(
         4.0, description="diameter of a pupil, millimetres, for eye_sigma_mm = auto"
     )
-    transfer: Literal["code", "srgb"] = Field("code", description="panel luminance: code values, or linear via sRGB")
     budget_ms: NonNegative = Field(0.0, description="time for one frame; 0: none. Picks model and resolution")
 
 

@@ -8,9 +8,9 @@ PART_CHARACTERS_MAX = 300  # of a message: a foreign name must not fill the scre
 
 
 def one_line(text: str, *, most: int = PART_CHARACTERS_MAX) -> str:
-    """Text on one line: what can't be printed (line breaks, escapes, NUL) becomes `?`, a long one's middle `...`.
+    r"""Text on one line: what can't be printed (line breaks, escapes, NUL) becomes `?`, a long one's middle `...`.
 
-    >>> one_line("a\\nb"), one_line("x" * 9, most=7)
+    >>> one_line("a\nb"), one_line("x" * 9, most=7)
     ('a?b', 'xx...xx')
     """
     if len(text) > most:
@@ -65,6 +65,10 @@ class ContentFailure(TransientError):
 
 class ModelFailure(TransientError):
     """Inference failed or answered something that is not a picture: the last good layers stay."""
+
+
+class ContextLost(TransientError):
+    """The solver's GL context is gone: whatever is in it is made anew, from the settings."""
 
 
 class PanelLost(TransientError):

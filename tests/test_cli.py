@@ -21,15 +21,19 @@ def phasestack(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.fixture
-def pair(tmp_path: Path) -> Path:
-    """A folder with a small stereo pair and its panels."""
+def pair_in(folder: Path) -> Path:
+    """The folder, with a small stereo pair and its panels in it."""
     rng = np.random.default_rng(1)
     for name in ("left", "right"):
         coarse = rng.integers(0, 255, (12, 20, 3)).astype(np.uint8)
-        write_png(tmp_path / f"{name}.png", coarse.repeat(9, 0).repeat(9, 1)[:108, :176].copy())
-    (tmp_path / "panels.json").write_text(json.dumps(PANELS))
-    return tmp_path
+        write_png(folder / f"{name}.png", coarse.repeat(9, 0).repeat(9, 1)[:108, :176].copy())
+    (folder / "panels.json").write_text(json.dumps(PANELS))
+    return folder
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> Path:
+    return pair_in(tmp_path)
 
 
 def solve_arguments(folder: Path, **changes: object) -> list[str]:

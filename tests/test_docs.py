@@ -16,7 +16,7 @@ from runtime.sensor.known_devices import KNOWN_DEVICES
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
-PAGES = sorted([ROOT / "README.md", *DOCS.rglob("*.md")])
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")])
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 
 
@@ -87,6 +87,13 @@ def test_every_file_and_module_that_a_page_names_is_there(page: Path) -> None:
     gone = [name for name in files if not any(list(ROOT.glob(one)) for one in alternatives(name.rstrip("/.")))]
     gone += [name for name in modules if importlib.util.find_spec(name) is None]
     assert gone == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_target_of_make_that_a_page_names_is_there(page: Path) -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    calls = re.findall(r"(?:^    |`)make ([a-z][a-z -]*)", page.read_text(encoding="utf-8"), re.MULTILINE)
+    assert {target for call in calls for target in call.split()} <= targets
 
 
 def alternatives(name: str) -> list[str]:

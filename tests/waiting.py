@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 
-def eventually(holds: Callable[[], bool], *, within_s: float = 10.0) -> bool:
+def eventually(holds: Callable[[], bool], *, within_s: float = 60.0) -> bool:
     """True as soon as it holds; False if it doesn't in all that time."""
     deadline = time.monotonic() + within_s
     while not holds():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -65,9 +66,10 @@ class BlackBoxFile:
         finally:
             self._file.close()
 
-    def discard(self) -> None:
-        """It can't be finished: what is under its hidden name goes."""
-        self._file.close()
+    def abandon(self) -> None:
+        """It can't be written any more: close it as it is. What has its name stays, what is hidden goes."""
+        with suppress(OSError):  # what it still held back finds no room either
+            self._file.close()
         self._part.unlink(missing_ok=True)
 
     def _channel(self, topic: str) -> int:

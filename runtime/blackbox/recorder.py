@@ -264,8 +264,8 @@ class Recorder:
         self._to_file(BlackBoxFile.flush)
         if self._file is not None and self._file.bytes_written > self._plan.record_bytes:
             log.warning("%s: is as large as it may be (sensor.record_max_mib): it ends here", self._file.path)
-            file, self._file = self._file, None
-            file.finish()
+            self._to_file(BlackBoxFile.finish)
+            self._file = None
 
     def _to_file(self, do: Callable[[BlackBoxFile], None]) -> None:
         assert self._file is not None
@@ -273,7 +273,8 @@ class Recorder:
             do(self._file)
         except OSError as error:
             log.error("%s: cannot be written (%s): it ends here", self._file.path, error.strerror)
-            self._file = None  # what was flushed stays: it is read up to the break
+            self._file.abandon()  # what was flushed stays: it is read up to the break
+            self._file = None
 
     def _make_pictures(self) -> None:
         latest, now_ns = self._latest, self._clock.now_ns()
@@ -349,7 +350,7 @@ def _written(folder: Path, messages: list[Message], header: RecordingHeader, *, 
         file.write_all(messages)
         file.finish()
     except BaseException:
-        file.discard()
+        file.abandon()
         raise
     return path
 

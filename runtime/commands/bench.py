@@ -20,6 +20,7 @@ app = typer.Typer()
 def bench(
     context: typer.Context,
     out: Annotated[Path | None, typer.Option(help="write the regression file here (JSON)")] = None,
+    backend: Annotated[str, typer.Option(help="what surrounds the network: opencv, gl or auto")] = "opencv",
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
     """Measure what a frame costs, or compare two measurements.
@@ -28,16 +29,20 @@ def bench(
 
     Example: phasestack bench --out bench.json
 
+    Example: phasestack bench --backend gl --out gl.json
+
     Example: phasestack bench compare old.json new.json
     """
     if context.invoked_subcommand is not None:
         return
+    from runtime.config import Settings, changed
     from runtime.report import benchmark
     from runtime.report.progress import status_line
     from runtime.support.artifacts import to_json, write_json
 
+    wanted = changed(Settings(), "model", {"backend": backend}, source="--backend").model.backend
     with status_line("bench") as tell:
-        record = benchmark.measured(progress=tell)
+        record = benchmark.measured(backend=wanted, progress=tell)
     if out is not None:
         write_json(out, record)
     if as_json:
@@ -90,6 +95,46 @@ def compare(
         )
     if worse:
         raise typer.Exit(1)
+
+
+@app.command()
+def passes(
+    model: Annotated[
+        list[str] | None, typer.Option(help="shipped name or ONNX file; may be repeated (all shipped ones)")
+    ] = None,
+    width: Annotated[int, typer.Option(min=64, max=16384, help="columns of a panel")] = 1920,
+    height: Annotated[int, typer.Option(min=64, max=16384, help="rows of a panel")] = 1080,
+    each: Annotated[bool, typer.Option("--each", help="every pass of every solution")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
+) -> None:
+    """What the OpenGL backend reads and writes for a solution, and how long memories of three speeds take for that.
+
+    Counted while it solves: the driver's own time does not matter. The network itself is not in it.
+
+    Example: phasestack bench passes --model balanced
+    """
+    from dataclasses import asdict
+
+    from runtime.report import passes as account
+    from runtime.report.frontier import check_models
+    from runtime.report.progress import status_line
+    from runtime.support.artifacts import to_json
+
+    names = list(dict.fromkeys(model or SHIPPED))
+    check_models([name for name in names if name not in SHIPPED])
+    with status_line("passes"):
+        found = account.counted(names, width_px=width, height_px=height)
+    if as_json:
+        rows = [asdict(one) | {"moved_bytes": one.moved_bytes} for one in found]
+        print(to_json({"width_px": width, "height_px": height, "solutions": rows}))
+        return
+    print("\n".join(account.table(found)))
+    for one in found if each else ():
+        print(f"\n{one.model}, eyes unsure by {one.eye_sigma_mm:g} mm:")
+        for step in one.passes:
+            crosses = "  crosses" if step.crosses else ""
+            moved = f"reads {step.read_bytes / 1e6:8.2f} MB, writes {step.written_bytes / 1e6:8.2f} MB"
+            print(f"  {step.name:16} {step.width_px:5}x{step.height_px:<5} {moved}{crosses}")
 
 
 @app.command()

@@ -107,19 +107,27 @@ def usb(settings: Settings) -> Iterator[Row]:
 
 def opengl(settings: Settings) -> Iterator[Row]:
     """OpenGL without a screen, for the content and offscreen panels."""
+    from runtime.model.gl.speed import measured_speed
     from runtime.support.gl import describe, offscreen_context
 
     context = offscreen_context()
-    found = describe(context)
-    context.release()
-    software = "llvmpipe" in found["renderer"].lower() or "softpipe" in found["renderer"].lower()
+    try:
+        found, speed = describe(context), measured_speed(context)
+        widest = context.info["GL_MAX_TEXTURE_SIZE"]
+    finally:
+        context.release()
     for node in sorted(Path("/dev/dri").glob("renderD*")):
         if not os.access(node, os.R_OK | os.W_OK):
             yield Row("opengl", "warn", f"{node} may not be opened by this user", "join the groups video and render")
-    slow = software and settings.output.kind != "offscreen"
+    problem = ""
+    if speed.slow:
+        problem = "slow: its shaders are a processor's, or nearly; install the GPU's driver where there is one"
+    bad = speed.slow and (settings.output.kind != "offscreen" or settings.model.backend == "gl")
     yield Row(
-        "opengl", "warn" if slow else "ok", f"{found['renderer']}, {found['version']} ({found['vendor']})",
-        "pictures are drawn by the processor: install the GPU's driver" if slow else "",
+        "opengl", "warn" if bad else "ok",
+        f"{found['renderer']}, {found['version']} ({found['vendor']}): shaders copy {speed.copy_gb_s:.1f} GB/s, "
+        f"{speed.down_gb_s:.1f} GB/s are read back, textures to {widest} pixels",
+        problem,
     )  # fmt: skip
 
 
@@ -161,16 +169,37 @@ def monitors(settings: Settings) -> Iterator[Row]:
 
 def model(settings: Settings) -> Iterator[Row]:
     """The network loads, its contract fits the stack, and the provider is there."""
+    from runtime.model.backends import choose
     from runtime.model.predictor import load_predictor
+    from runtime.model.session import told_nodes
+    from runtime.support.gl import offscreen_context
 
     predictor = load_predictor(settings.model.name, settings.stack.stack(), settings.model)
     name = predictor.name
-    predictor.close()
+    contexts: list[Any] = []
+
+    def context() -> Any:
+        contexts.append(offscreen_context())
+        return contexts[-1]
+
+    try:
+        choice = choose(settings.model.backend, predictor, context)
+    finally:
+        predictor.close()
+        for made in contexts:
+            made.release()
     other = settings.model.name not in name and "/" not in settings.model.name
     yield Row(
         "model", "warn" if other else "ok", f"{name} on {settings.model.provider}",
         f"{settings.model.name} was asked for and does not fit this stack" if other else "",
     )  # fmt: skip
+    if predictor.fell_back:
+        count, which = told_nodes(predictor.fell_back)
+        yield Row(
+            "provider", "warn", f"{settings.model.provider} leaves {count} to another: {which}",
+            "they cross to the processor and back: model.provider = \"cpu\" may be faster",
+        )  # fmt: skip
+    yield Row("backend", "ok", f"{choice.backend.name} around the network: {choice.why}")
 
 
 def calibration(settings: Settings) -> Iterator[Row]:

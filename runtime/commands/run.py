@@ -39,7 +39,9 @@ def run(
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
     scale: Annotated[float, typer.Option(min=0.05, max=2.0, help="panel resolution, times the configured one")] = 1.0,
     budget_ms: Annotated[float | None, typer.Option(min=0, help="time for a frame; picks model and size")] = None,
-    backend: Annotated[str | None, typer.Option(help="what surrounds the network: auto or opencv")] = None,
+    backend: Annotated[
+        str | None, typer.Option(help="what surrounds the network: auto (the faster one here), opencv or gl")
+    ] = None,
     keep_light: Annotated[
         int, typer.Option(min=0, help="with --out: every so many refreshes leave what the panels show; 0: none")
     ] = 0,

@@ -26,7 +26,10 @@ def solve(
     eye_sigma_mm: Annotated[
         float, typer.Option(min=0, max=1000, help="how unsure the eyes are, mm an axis; 1: a pupil; 0: two points")
     ] = 1.0,
-    backend: Annotated[str | None, typer.Option(help="what surrounds the network: auto or opencv")] = None,
+    backend: Annotated[
+        str | None,
+        typer.Option(help="what surrounds the network: opencv, gl, or auto: the faster one here, from --repeat 10 on"),
+    ] = None,
     no_plan: Annotated[bool, typer.Option("--no-plan", help="leave nothing out, whatever the pictures allow")] = False,
     config: Annotated[Path | None, typer.Option(help="configuration, for the model's settings")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="solve.json's object on stdout")] = False,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,9 @@ from runtime.content.base import ContentInfo
 from runtime.errors import InputError
 from runtime.evaluation.displayed import Look, Picture, displayed, expected_db
 from runtime.evaluation.trials import timed, timed_in_turn
+from runtime.model.backends import choose
 from runtime.model.predictor import Prediction, Predictor, load_predictor
+from runtime.model.schedule import Backend
 from runtime.model.still import solve_still
 from runtime.optics.carried import intensities
 from runtime.optics.retina import as_codes
@@ -28,6 +31,7 @@ from runtime.records import F64, U8, PlanItem
 from runtime.support.artifacts import OutputFolder, in_8_bits, read_picture, write_json, write_png
 
 SEPARATION_MIN_M = 0.005
+MEASURED_FROM = 10  # runs that are worth a look at which backend is faster
 COMPARED = 3  # timed runs with and without the plan
 
 
@@ -72,23 +76,46 @@ def solve_pair(request: SolveRequest) -> dict[str, Any]:
     model_settings = model_settings.model_copy(update={"name": request.model})
     settings = settings.model_copy(update={"model": model_settings})
     predictor = planned_predictor(settings, stack)
-    try:
+    with ExitStack() as contexts, ExitStack() as cleanup:
+        cleanup.callback(predictor.close)
+        backend = _backend(model_settings, predictor, request, contexts)
+        predictor.surround_with(backend)
         prediction, timing = _timed(pictures, eyes_m, request, predictor)
         with OutputFolder(request.out) as folder:
             measured = _write(folder.staging, prediction.layers, stored, eyes_m, stack, request)
-            plan = _left_out(pictures, stored, eyes_m, request, predictor, model_settings, measured["psnr_db"])
+            plain = load_predictor(model_settings.name, stack, model_settings)
+            cleanup.callback(plain.close)
+            plain.surround_with(backend)
+            plan = _left_out(pictures, stored, eyes_m, request, predictor, plain, measured["psnr_db"])
             named = {
                 "model": predictor.name,
                 "provider": predictor.provider,
-                "backend": "opencv",
+                "backend": predictor.backend,
                 "eye_sigma_mm": request.eye_sigma_mm,
                 "plan": [asdict(item) for item in plan],
             }
             result = measured | timing | named
             write_json(folder.staging / "solve.json", result)
-    finally:
-        predictor.close()
     return result
+
+
+def _backend(settings: ModelSettings, predictor: Predictor, request: SolveRequest, contexts: ExitStack) -> Backend:
+    """What surrounds the network: one solution is sooner made than two backends are measured.
+
+    contexts: releases what was made, once nothing uses it any more.
+    """
+
+    def context() -> Any:
+        from runtime.support.gl import offscreen_context
+
+        made = offscreen_context()
+        contexts.callback(made.release)
+        return made
+
+    wanted = settings.backend
+    if wanted == "auto" and request.repeat < MEASURED_FROM:
+        wanted = "opencv"
+    return choose(wanted, predictor, context).backend
 
 
 def _left_out(
@@ -97,7 +124,7 @@ def _left_out(
     eyes_m: F64,
     request: SolveRequest,
     predictor: Predictor,
-    settings: ModelSettings,
+    plain: Predictor,
     planned_db: float,
 ) -> list[PlanItem]:
     """What the model left out of these pictures, and what that saved and cost against a model that leaves out nothing.
@@ -110,7 +137,6 @@ def _left_out(
     if not network_items(info, numbers):
         return []
     stack = predictor.stack
-    plain = load_predictor(settings.name, stack, settings)
     part = focused_part(predictor)
     # In colour, or unfocused, one saving is all there is.
     between = part.whole if part is not None and numbers.channels == 1 and numbers.active_fraction < 1 else None
@@ -120,10 +146,7 @@ def _left_out(
         return lambda _: _solved(pictures, eyes_m, request, way).layers
 
     calls = {name: solved_by(way) for name, way in ways.items()}
-    try:
-        done = timed_in_turn(calls, runs=COMPARED, keep=lambda layers: layers.copy())
-    finally:
-        plain.close()
+    done = timed_in_turn(calls, runs=COMPARED, keep=lambda layers: layers.copy())
     shown_db = {
         name: planned_db if name == "planned" else _shown(way.answer, stored, eyes_m, stack, request).quality.psnr_db
         for name, way in done.items()

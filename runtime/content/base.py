@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from runtime.errors import ContentFailure
 from runtime.optics.rect import PixelRect
 from runtime.records import F64, U8
+
+if TYPE_CHECKING:
+    from runtime.support.gl import DrawnPicture
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +44,7 @@ class ContentSource(ABC):
     """A scene, a picture or another program's pictures. One thread, the one with its GL context, uses it."""
 
     info: ContentInfo
+    draws_in: object = None  # the GL context that its textures are in; None: it has arrays
 
     @abstractmethod
     def render(self, view: View, *, time_ns: int) -> U8:
@@ -51,6 +55,11 @@ class ContentSource(ABC):
         side, and the other side's call leaves it alone. `time_ns` is the run's clock, for content that moves.
         Raises ContentFailure: the last picture stays.
         """
+
+    def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
+        """The same picture left in a texture, until the next of its side; None: there is none, `render` has to be
+        asked. Raises ContentFailure."""
+        return None
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
         """A box of the view's pixels beside which only the background shows, told without drawing; None: not known."""
@@ -82,3 +91,13 @@ class ContentSource(ABC):
 
     def close(self) -> None:  # noqa: B027 - most sources hold nothing
         """Release GL objects and files. May be called twice."""
+
+
+class DrawingSource(ContentSource):
+    """A source that draws with OpenGL: its pictures are read back only where somebody wants the pixels."""
+
+    @abstractmethod
+    def draw(self, view: View, *, time_ns: int) -> DrawnPicture: ...
+
+    def render(self, view: View, *, time_ns: int) -> U8:
+        return self.draw(view, time_ns=time_ns).pixels()

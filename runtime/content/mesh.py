@@ -14,7 +14,7 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.config import LimitSettings
 from runtime.content import camera
-from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.base import ContentInfo, DrawingSource, View
 from runtime.content.gltf import LARGEST_TEXTURE_PX, GltfScene, load_gltf
 from runtime.content.gltf_header import file_of
 from runtime.content.ply import check_counts
@@ -25,6 +25,7 @@ from runtime.errors import InputError, MissingPart, one_line
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64, U8
 from runtime.support import foreign, progress
+from runtime.support.gl import DrawnPicture
 from runtime.support.picture_header import check_picture
 
 UNCOLOURED = (0.70, 0.74, 0.80)  # of an STL, which has no colours
@@ -320,7 +321,7 @@ def _names_texture(line: str) -> bool:
     return line.lower().startswith("map_kd ") and len(line.split()) > 1
 
 
-class MeshSource(ContentSource):
+class MeshSource(DrawingSource):
     """A loaded mesh at its place in the stack frame, and moving where its file says so."""
 
     def __init__(
@@ -334,6 +335,7 @@ class MeshSource(ContentSource):
         parts: Sequence[ReadyPart] | None = None,
     ) -> None:
         """parts: those of `data`, where they were made ready on another thread."""
+        self.draws_in = context
         self._painter = TrianglePainter(parts or data.parts, context=context, background=background, samples=samples)
         self._data, self._rig = data, data.rig
         self._stack_from_scene = stack_from_scene
@@ -351,7 +353,7 @@ class MeshSource(ContentSource):
             left_out=tuple(text for feature, text in names.items() if feature not in used),
         )
 
-    def render(self, view: View, *, time_ns: int) -> U8:
+    def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         return self._painter.paint(view, self._places(time_ns))
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect:

@@ -20,6 +20,7 @@ from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
 from runtime.records import F64, U8
+from runtime.support.gl import DrawnPicture
 
 FIELDS = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # of ContentSettings
 NS_PER_MIN = 60 * NS_PER_S
@@ -143,6 +144,16 @@ class PlacedSource(ContentSource):
     @property
     def problem(self) -> str:
         return self.source.problem
+
+    @property
+    def draws_in(self) -> object:  # type: ignore[override]
+        return self.source.draws_in
+
+    def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
+        try:
+            return self.source.draw(self._seen_from_scene(view, time_ns), time_ns=time_ns)
+        except ValueError:  # `render` has the background then
+            return None
 
     def render(self, view: View, *, time_ns: int) -> U8:
         try:

@@ -20,6 +20,7 @@ from runtime.errors import InputError
 from runtime.optics.rect import PixelRect
 from runtime.records import U8
 from runtime.support import foreign
+from runtime.support.gl import DrawnPicture
 
 ENTRIES_MAX = 64
 SECONDS_LEAST, SECONDS_MOST = 0.5, 86_400.0
@@ -137,6 +138,14 @@ class PlaylistSource(ContentSource):
         rounds, within = divmod(index, len(self._sources))
         self._begin_ns = time_ns - rounds * self._ends_ns[-1] - self._ends_ns[within]
         return True
+
+    @property
+    def draws_in(self) -> object:  # type: ignore[override]
+        return self._sources[self._number % len(self._sources)].draws_in
+
+    def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
+        source, since_ns = self._source(time_ns)
+        return source.draw(view, time_ns=since_ns)
 
     def render(self, view: View, *, time_ns: int) -> U8:
         source, since_ns = self._source(time_ns)

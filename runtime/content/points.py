@@ -12,12 +12,13 @@ from scipy.spatial import cKDTree
 
 from runtime.config import LimitSettings
 from runtime.content import camera
-from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.base import ContentInfo, DrawingSource, View
 from runtime.content.canvas import Canvas
 from runtime.content.ply import Table, read_vertices
 from runtime.errors import InputError
 from runtime.optics.rect import PixelRect
-from runtime.records import F32, F64, U8
+from runtime.records import F32, F64
+from runtime.support.gl import DrawnPicture
 
 COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 GREY = (0.45, 0.45, 0.45)  # of points without a colour
@@ -95,7 +96,7 @@ def _gap(positions: F32) -> float:
     return float(np.median(distances))
 
 
-class PointSource(ContentSource):
+class PointSource(DrawingSource):
     """A cloud at its place in the stack frame."""
 
     def __init__(
@@ -113,7 +114,7 @@ class PointSource(ContentSource):
         gap_m = cloud.gap * float(np.cbrt(abs(np.linalg.det(linear))))
         # Two points, or many at one place, have no gap that says how large they are.
         self._disc_m = DISC_PER_GAP * min(max(gap_m, extent_m / 1000), max(extent_m / 20, 1e-4)) or 1e-3
-        self._context = context
+        self._context = self.draws_in = context
         self._canvas = Canvas(context, samples=1, background=background)
         self._program = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
         self._buffer = context.buffer(np.concatenate([positions, cloud.colours], axis=1, dtype=np.float32))
@@ -130,7 +131,7 @@ class PointSource(ContentSource):
             left_out=("lights", "textures", "sorting"),
         )
 
-    def render(self, view: View, *, time_ns: int) -> U8:
+    def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         size = {"width_px": view.width_px, "height_px": view.height_px}
         bounds = camera.depth_bounds(view.pixels_from_stack, self._corners_m)
         box = self._box(view) if bounds else PixelRect(0, 0, 0, 0)

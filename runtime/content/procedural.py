@@ -9,12 +9,13 @@ import numpy as np
 
 from runtime.clock import NS_PER_S
 from runtime.content import shapes, textures
-from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.base import ContentInfo, DrawingSource, View
 from runtime.content.scenes import Scene, Thing, scene
 from runtime.content.triangles import Part, ReadyPart, TrianglePainter, ready
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, U8
+from runtime.records import F64
+from runtime.support.gl import DrawnPicture
 
 MODELLED_HEIGHT_M = 0.2916  # the display for which the scenes' lengths are written
 
@@ -45,7 +46,7 @@ def ready_scene(built_in: str | Scene, *, samples: int = 0) -> ReadyScene:
     return ReadyScene(chosen, tuple(ready(part, samples=samples) for part in parts))
 
 
-class ProceduralSource(ContentSource):
+class ProceduralSource(DrawingSource):
     """A built-in scene, scaled to the display's height."""
 
     def __init__(
@@ -61,6 +62,7 @@ class ProceduralSource(ContentSource):
         made = built_in if isinstance(built_in, ReadyScene) else ready_scene(built_in, samples=samples)
         self._scene = made.scene
         self._scale = stack.height_m / MODELLED_HEIGHT_M
+        self.draws_in = context
         self._painter = TrianglePainter(made.parts, context=context, background=background, samples=samples)
         self._still = [self._placed(thing, 0.0) for thing in self._scene.things]
         corners = self._painter.corners_m(self._still)
@@ -73,7 +75,7 @@ class ProceduralSource(ContentSource):
             flat_x_m=0.0 if self._scene.flat else None,
         )
 
-    def render(self, view: View, *, time_ns: int) -> U8:
+    def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         """The scene through the view's projection; the same bytes for the same view and time."""
         return self._painter.paint(view, self._places(time_ns))
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.base import ContentInfo, DrawingSource, View
 from runtime.content.images import rgba_from_rgb
 from runtime.content.pictures import screen
 from runtime.content.shapes import I32, Shape
@@ -22,6 +22,7 @@ from runtime.errors import InputError
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
+from runtime.support.gl import DrawnPicture
 
 COLUMNS = 320  # of the surface where it is smooth: as fine as depth cameras see, and quick without a graphics card
 FINEST_COLUMNS = 1600  # of the surface beside an edge
@@ -200,7 +201,7 @@ def _edge_to_edge(index: Any, count: int) -> F64:
     return np.where(index == 0, 0.0, np.where(index == count - 1, float(count), place))
 
 
-class RgbdSource(ContentSource):
+class RgbdSource(DrawingSource):
     """A picture with depth between two planes of the stack frame."""
 
     def __init__(
@@ -218,6 +219,7 @@ class RgbdSource(ContentSource):
         colour, depth = split_rgbd(rgb, path)
         parts = surfaces(colour, depth, stack=stack, depth_m=depth_m)
         # Outlines of a torn surface run through its inside: no ramps there.
+        self.draws_in = context
         self._painter = TrianglePainter(parts, context=context, background=background, samples=samples or SAMPLES)
         self._places = [np.eye(4)] * len(parts)
         x_m = parts[0].shape.positions_m[:, 0]
@@ -226,7 +228,7 @@ class RgbdSource(ContentSource):
             name=path.stem, depth_range_m=(low, high), background=background, left_out=("lights", "sorting")
         )
 
-    def render(self, view: View, *, time_ns: int) -> U8:
+    def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         return self._painter.paint(view, self._places)
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect:

@@ -7,11 +7,12 @@ from typing import Any
 import moderngl
 import numpy as np
 
-from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.base import ContentInfo, DrawingSource, View
 from runtime.content.canvas import Canvas
 from runtime.content.gaussians import Gaussians, colours_towards, moved, seen_splats
 from runtime.optics.rect import PixelRect
-from runtime.records import F64, U8
+from runtime.records import F64
+from runtime.support.gl import DrawnPicture
 
 OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
 FLOATS = 8  # a corner: place in clip space (2), place in standard deviations (2), colour and opacity (4)
@@ -41,7 +42,7 @@ void main() {
 """
 
 
-class SplatSource(ContentSource):
+class SplatSource(DrawingSource):
     """A scene of splats at its place in the stack frame."""
 
     def __init__(
@@ -56,7 +57,7 @@ class SplatSource(ContentSource):
         self._gaussians = moved(gaussians, stack_from_scene)
         linear = stack_from_scene[:3, :3]
         self._scene_from_stack_rotation = (np.linalg.inv(linear) * np.cbrt(np.linalg.det(linear))).astype(np.float32)
-        self._context = context
+        self._context = self.draws_in = context
         self._canvas = Canvas(context, samples=0, background=background, deep=True)
         self._program = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
         count = len(gaussians.centres)
@@ -77,7 +78,7 @@ class SplatSource(ContentSource):
             left_out=("lights", "textures") + (("harmonics",) if gaussians.harmonics.shape[1] == 1 else ()),
         )
 
-    def render(self, view: View, *, time_ns: int) -> U8:
+    def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         """Every splat that the eye can see, farthest first."""
         count = self._prepare(view)
 

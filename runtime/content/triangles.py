@@ -19,6 +19,7 @@ from runtime.content.fringe import Edges, edges_of, ramps, silhouette
 from runtime.content.shapes import Shape
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64, U8
+from runtime.support.gl import DrawnPicture
 
 MOST_OUTLINED = 200_000  # triangles of a part; beyond, finding its outline costs more than drawing it
 MOST_PROJECTED = 5000  # vertices of a part that are projected to tell where it lies; beyond, its box is
@@ -204,7 +205,7 @@ class TrianglePainter:
             item.edges = item.edges.moved(shape)
         item.corners_m = camera.box_corners(shape.positions_m.min(0), shape.positions_m.max(0))
 
-    def paint(self, view: View, stack_from_parts: Sequence[F64]) -> U8:
+    def paint(self, view: View, stack_from_parts: Sequence[F64]) -> DrawnPicture:
         """The parts at their places (4x4 each, a similarity), over the background."""
         size = {"width_px": view.width_px, "height_px": view.height_px}
         corners = self.corners_m(stack_from_parts).reshape(-1, 8, 3)

@@ -71,8 +71,8 @@ class Run:
         return {
             **self.presenter.summary(simulated=self.simulated),
             **self.observer.means.summary(),
+            "backend": self.presenter.run_cell.state.predictor.backend,
             "scene": self.presenter.run_cell.state.content.info.name,
-            "backend": "opencv",
             "plan": self.plan_items(),
         }
 

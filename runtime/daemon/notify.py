@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from typing import Any
 
 import sdnotify
 
@@ -20,8 +21,10 @@ class Notifier:
     def __init__(self, clock: Clock, environment: Mapping[str, str] = os.environ) -> None:
         """`environment` only says whether and how often the watchdog wants to be fed (sd_watchdog_enabled)."""
         self._clock = clock
-        self._channel = sdnotify.SystemdNotifier()
-        if self._channel.socket is not None:
+        self._channel: Any = None
+        if "NOTIFY_SOCKET" in os.environ:  # sdnotify leaves a socket open where there is nobody to tell
+            self._channel = sdnotify.SystemdNotifier()
+        if self._channel is not None and self._channel.socket is not None:
             self._channel.socket.setblocking(False)
         self._watchdog_ns = watchdog_ns(environment)
         self._fed_ns = -self._watchdog_ns
@@ -31,7 +34,7 @@ class Notifier:
     @property
     def supervised(self) -> bool:
         """True under a supervisor: wait for what is missing, rather than refuse."""
-        return self._channel.socket is not None
+        return self._channel is not None and self._channel.socket is not None
 
     def ready(self) -> None:
         """The first frame is on the panels. Later calls do nothing."""
@@ -83,12 +86,13 @@ class Notifier:
 
     def close(self) -> None:
         """Release the socket. May be called twice."""
-        if self._channel.socket is not None:
+        if self.supervised:
             self._channel.socket.close()
             self._channel.socket = None
 
     def _send(self, message: str) -> None:
-        self._channel.notify(message)
+        if self._channel is not None:
+            self._channel.notify(message)
 
 
 def may_restart(environment: Mapping[str, str] = os.environ) -> bool:

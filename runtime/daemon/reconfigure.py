@@ -9,6 +9,7 @@ from runtime.config import Settings
 from runtime.content.base import ContentSource
 from runtime.content.loader import ContentLoader
 from runtime.daemon.solver_parts import RunningSolver, ready_predictor
+from runtime.errors import PhasestackError
 from runtime.eyes.calibration import load_calibration
 from runtime.model.predictor import Predictor
 from runtime.optics.stack import PanelStack
@@ -64,7 +65,11 @@ class Reconfiguration:
             return True
         if self._loader is not None or (self._model is not None and not self._model.done):
             return False
-        self._commit(parts)
+        try:
+            self._commit(parts)
+        except PhasestackError as error:  # another backend was asked for, and can't be had
+            self.problem = str(error)
+            self._discard()
         self.finished = True
         return True
 
@@ -75,6 +80,12 @@ class Reconfiguration:
     def _commit(self, parts: RunningSolver) -> None:
         """Take over what is ready: one new state, and what it replaces is closed."""
         predictor = self._model.take() if self._model is not None else None
+        if predictor is not None:
+            try:
+                parts.surround(predictor, self.settings)
+            except PhasestackError:
+                predictor.close()
+                raise
         changes: dict[str, Any] = {"settings": self.settings, "calibration": self._calibration}
         if self._source is not None:
             changes["content"] = self._source

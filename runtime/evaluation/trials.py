@@ -25,10 +25,6 @@ class Timed(Generic[T]):
     def median_ms(self) -> float:
         return float(np.median(self.times_ms))
 
-    @property
-    def p99_ms(self) -> float:
-        return float(np.percentile(self.times_ms, 99))
-
 
 def timed(
     call: Callable[[], T],

@@ -118,7 +118,7 @@ class Calibration:
         return float(np.cbrt(np.linalg.det(self.stack_from_sensor[:3, :3])))
 
     def points(self, sensor_m: ArrayLike) -> F64:
-        """(..., 3) points in `stack`, metres, from (..., 3) points in `sensor` (seed 28)."""
+        """(..., 3) points in `stack`, metres, from (..., 3) points in `sensor` (EyeReal supplement, (28))."""
         points = np.asarray(sensor_m, dtype=np.float64)
         return points @ self.stack_from_sensor[:3, :3].T + self.stack_from_sensor[:3, 3]
 

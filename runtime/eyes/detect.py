@@ -186,7 +186,8 @@ def _is_same(face: Face, last: Face) -> bool:
 def _depth_scale(frame: SensorFrame) -> F64:
     """(2,) depth pixels per colour pixel: registered images may differ in size."""
     assert frame.colour is not None and frame.depth_mm is not None
-    return np.array(frame.depth_mm.shape[::-1]) / np.array(frame.colour.shape[1::-1])
+    result: F64 = np.array(frame.depth_mm.shape[::-1]) / np.array(frame.colour.shape[1::-1])
+    return result
 
 
 def _resized(picture: U8, scale: float) -> U8:

@@ -103,7 +103,8 @@ class HaarFaces:
                 best = eyes
             if np.isfinite(best).all():
                 break
-        return best / scale + np.array([x, top])
+        result: F64 = best / scale + np.array([x, top])
+        return result
 
 
 def choose_eyes(centres: F64, *, width: float) -> F64:

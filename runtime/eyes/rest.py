@@ -131,7 +131,8 @@ class RestWatch:
         shift = _lateral(np.median(recent, axis=0)[None], place)
         # The place itself is the median of a third as many.
         unsure_m = 1.25 * self.noise_m * (4 / len(recent)) ** 0.5
-        return float(np.abs(shift).max()) > self._most_m + 2 * unsure_m
+        most_m: float = self._most_m + 2 * unsure_m
+        return float(np.abs(shift).max()) > most_m
 
 
 def _lateral(eyes_m: F64, place: F64) -> F64:

@@ -83,14 +83,6 @@ class Means:
         return {**means, "quality_frames": len(self.values.get("psnr_db", []))}
 
 
-class ContentHolder(Protocol):
-    """The part of a solver that can draw."""
-
-    @property
-    def content(self) -> ContentSource:
-        """What is drawn at present."""
-
-
 class RunObserver:
     """Takes in samples and refreshes; `finish` ends it."""
 

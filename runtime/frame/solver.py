@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from runtime.content.base import View
-from runtime.errors import ContentFailure, ModelFailure
+from runtime.errors import ContentFailure, ContextLost, ModelFailure
 from runtime.frame.buffers import LayerBuffers
 from runtime.frame.policy import FramePolicy, Made
 from runtime.frame.run_state import RunCell, RunState
@@ -59,7 +59,10 @@ class Solver:
         self._failed_for: Made | None = None
 
     def step(self, request: SolveRequest) -> Step:
-        """Do what the request calls for, if anything. A part that fails is named; what there is stays good."""
+        """Do what the request calls for, if anything. A part that fails is named; what there is stays good.
+
+        Raises ContextLost: this solver is of no more use.
+        """
         state = self.run.state
         self._replan(state, request.eyes_m)
         time_ns = request.time_ns
@@ -89,6 +92,8 @@ class Solver:
         stages: dict[str, float] = {}
         try:
             images = drawn_for(state.predictor, state.content, eyes_m, time_ns=request.time_ns)
+        except ContextLost:  # content and model are in it: whoever made this solver makes another
+            raise
         except Exception as error:
             return Step(missing=self._failed("content", error, expected=ContentFailure))
         stages["render"] = watch.lap_ms()
@@ -97,6 +102,8 @@ class Solver:
         )
         try:
             prediction = state.predictor.predict(images, eyes_m, eye_sigma_mm=sigma_mm)
+        except ContextLost:
+            raise
         except Exception as error:
             return Step(missing=self._failed("model", error, expected=ModelFailure))
         layers = self._buffers.copy_of(prediction.layers)

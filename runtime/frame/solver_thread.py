@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable
 
 from runtime.clock import NS_PER_S, Clock
-from runtime.errors import PhasestackError
+from runtime.errors import ContextLost, PhasestackError
 from runtime.frame.solver_host import COST_GAIN, FIRST_REQUEST, News, SolverHost, SolverParts, Task, taken_in, total_ns
 from runtime.records import SolveRequest
 from runtime.support.priority import SOLVER_NICENESS, set_niceness
@@ -143,6 +143,9 @@ class SolverThread(SolverHost):
                 request = self._next_request()
                 if request is not None:
                     self._step(attempt, parts, request)
+        except ContextLost as error:
+            log.error("solver: %s", error)
+            attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
         except Exception as error:  # beside what a step answers with: a bug of ours, or a library's
             log.exception("solver: unexpected error")
             attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()

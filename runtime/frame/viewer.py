@@ -67,11 +67,6 @@ class Viewer:
         return self._tracker.outliers
 
     @property
-    def resting(self) -> bool:
-        """True while the head rests."""
-        return self._rest is not None and self._rest.place is not None
-
-    @property
     def rate_hz(self) -> float | None:
         """Samples a second, by the newest ones' captures; None before there are two."""
         if len(self._captures_ns) < 2 or self._captures_ns[-1] <= self._captures_ns[0]:

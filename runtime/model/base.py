@@ -5,10 +5,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from runtime.optics.pupil import POINT_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
+
+if TYPE_CHECKING:
+    from runtime.model.schedule import Backend
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +30,20 @@ class Predictor(ABC):
     provider: str
     parameters: int
     stack: PanelStack
+    backend: str = "opencv"  # what does all that surrounds the network at present
+    fell_back: tuple[str, ...] = ()  # nodes of the network that run on another provider than the wished one
     channels: int = 3  # that the last pictures were solved in: one, where grey ones may be
+
+    def reads_textures_of(self, context: object) -> bool:
+        """Whether `predict` takes pictures that were left in textures of a GL context (`DrawnPicture`)."""
+        return False
+
+    def on_panels(self, stack: PanelStack) -> Predictor | None:
+        """The same model for other panels of the same kind, to measure backends with; None: it has one backend."""
+        return None
+
+    def surround_with(self, backend: Backend) -> None:  # noqa: B027 - most have one backend
+        """Have what surrounds the network done in another way from the next call on. On the thread that predicts."""
 
     @abstractmethod
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:

@@ -77,8 +77,7 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
     """
     middle = eyes_m.mean(axis=0)
     half = (eyes_m[1] - eyes_m[0]) / 2
-    gap_m = stack.x_m[-1] - stack.x_m[1]
-    plane_m = stack.x_m[1] + gap_m**2 / (middle[0] - stack.x_m[1])
+    plane_m = _equal_parallax_m(stack, middle[0])
     reach = (stack.x_m[-1] - plane_m) / (middle[0] - stack.x_m[-1])
     step_y_m, step_z_m = half[1:] * (reach / cell_px)
     if abs(step_y_m) < 1e-12:
@@ -102,6 +101,13 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
         ]
     )
     return ChainFrame(plane_m, plane_from_raster, cells, cell_px, rows, middle)
+
+
+def _equal_parallax_m(stack: PanelStack, eye_x_m: float) -> float:
+    """x of the plane on which both outer panels have the same parallax: a²/ex before the centre of even gaps a."""
+    rear_m, front_m, far_m = stack.x_m[1] - stack.x_m[0], stack.x_m[2] - stack.x_m[1], eye_x_m - stack.x_m[1]
+    ahead = 2 * rear_m * front_m + far_m * (front_m - rear_m)
+    return float(stack.x_m[1] + ahead / (2 * far_m + (rear_m - front_m)))
 
 
 def _common_extent(middle: F64, stack: PanelStack, *, plane_m: float, axis: int) -> tuple[float, float]:

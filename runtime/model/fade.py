@@ -7,11 +7,12 @@ the energy altogether.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from runtime.model.pyramid_level import I16, PyramidLevel
+from runtime.model.pyramid_level import I16
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64
 
@@ -48,14 +49,15 @@ class Fade:
             weights = weights * np.clip(inside / over_px, 0.0, 1.0)
         return np.asarray(weights, np.float32)[..., None]
 
-    def soften(self, level: PyramidLevel, centre_from_raster: F64) -> None:
-        """Take back, towards the edges, what the eyes lack: no correction must drive the panels beyond them."""
+    def soften(self, residual: Sequence[I16], centre_from_raster: F64) -> None:
+        """Take back, towards the edges, what the eyes lack (per eye, in place): no correction must drive the panels
+        beyond them."""
         m = centre_from_raster
-        height, width = level.residual[0].shape[:2]
+        height, width = residual[0].shape[:2]
         u = m[0, 0] * (np.arange(width) + 0.5) + m[0, 2]
         v = m[1, 1] * (np.arange(height) + 0.5) + m[1, 2]
         along, down = (over_px * CORRECTED_SHARE for over_px in self.over_px)
-        for image in level.residual:
+        for image in residual:
             for inside, over_px in self._across(u, along):
                 columns, weights = _ramp(inside, over_px)
                 _scale(image[:, columns], weights[None])

@@ -33,6 +33,7 @@ class NetworkPredictor(Predictor):
         contract = session.contract
         self.session, self.stack = session, stack
         self.name, self.provider, self.parameters = contract.name, session.provider, contract.parameters
+        self.fell_back = session.fell_back
         for given, wanted, name in (
             (contract.width_px, stack.width_px, "width_px"),
             (contract.height_px, stack.height_px, "height_px"),

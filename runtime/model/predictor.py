@@ -44,8 +44,8 @@ def shipped_sha256(name: str) -> str:
 def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None = None) -> Predictor:
     """The model `name` (shipped name, `sart` or an ONNX file) for a stack.
 
-    A stack that the network was not made for (not three evenly spaced panels) is served by `sart` where a
-    shipped name was asked for; `Predictor.name` says so. Raises InputError, MissingPart.
+    A stack that the network was not made for (not three panels, or none that are evenly spaced, to `UNEVEN_MOST`) is
+    served by `sart` where a shipped name was asked for; `Predictor.name` says so. Raises InputError, MissingPart.
     """
     keep_freed_memory()
     settings = settings or ModelSettings()

@@ -18,6 +18,7 @@ from runtime.model.rows import RowPool, Work
 from runtime.model.transfer import FULL, SUBCODE
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.tilt import coarse_layer_from_seen, layer_pixels_from_seen
 from runtime.records import F64, U8
 
 I16 = NDArray[np.int16]
@@ -37,6 +38,7 @@ class PyramidLevel:
 
     def __init__(self, stack: PanelStack, *, reduction: int, rows: RowPool, channels: int = 3) -> None:
         self.reduction = reduction
+        self._stack = stack
         self._rows = rows
         self._tail = () if channels == 1 else (channels,)
         height, width = -(-stack.height_px // reduction), -(-stack.width_px // reduction)
@@ -55,23 +57,20 @@ class PyramidLevel:
 
     def crop(self, boxes: Sequence[PixelRect], stack: PanelStack) -> None:
         """Cut every raster and buffer to what the eyes look through."""
-        self.rasters = tuple(_coarser(box.cut(stack.panel(n)), self.reduction) for n, box in enumerate(boxes))
+        self.rasters = tuple(coarser(box.cut(stack.panel(n)), self.reduction) for n, box in enumerate(boxes))
         self.outer = {n: self._view("outer", n, 0, on=n) for n in OUTER}
         self.seen = {(n, side): self._view("seen", n, side, on=CENTRE) for n in OUTER for side in EYES}
         self.residual = tuple(self._view("residual", CENTRE, side, on=CENTRE) for side in EYES)
         self._back = {n: tuple(self._view("back", CENTRE, side, on=n) for side in EYES) for n in OUTER}
 
+    def layer_from_seen(self, panel: int, eye_m: F64) -> F64:
+        """3x3: where a panel's layer has what an eye sees at (y, z, 1) of the ideal panel: moved where it is tilted."""
+        return coarse_layer_from_seen(self._stack, panel, eye_m)
+
     def set_eye_sigma(self, eyes_m: F64, *, eye_sigma_mm: float) -> None:
         """Correct for eyes (2, 3) that err by so much, an axis: what is left of the outer panels in the mean counts,
         and what moves of them is noise. Spreads too small to be felt on this raster are none."""
-        eye_x_m, centre_x_m = eyes_m[:, 0].mean(), self.rasters[CENTRE].x_m
-        self.spread = {}
-        for n in OUTER:
-            raster = self.rasters[n]
-            moved_m = eye_sigma_mm / 1e3 * abs(raster.x_m - centre_x_m) / (eye_x_m - centre_x_m)
-            spread = min(moved_m / raster.pitch_u_m, MOST_SPREAD), min(moved_m / raster.pitch_v_m, MOST_SPREAD)
-            if max(spread) >= LEAST_SPREAD:
-                self.spread[n] = spread
+        self.spread = spreads(self.rasters, eyes_m, eye_sigma_mm=eye_sigma_mm)
 
     def project(self, panels: Sequence[int], eyes_m: F64) -> None:
         """See outer panels anew through the centre panel's pixels: in the mean, where the eyes are unsure."""
@@ -177,11 +176,32 @@ class PyramidLevel:
 
     def _between(self, image: I16, eye_m: F64, *, of: int, on: int, out: I16) -> I16:
         """Panel `of`'s pixels on panel `on`'s raster, as an eye sees them in line."""
-        matrix = target_from_source(eye_m, source=self.rasters[on], target=self.rasters[of])
+        source, target = self.rasters[on], self.rasters[of]
+        matrix = target_from_source(eye_m, source=source, target=target)
+        if self._stack.tilt is not None:
+            if of == CENTRE:
+                back: F64 = np.linalg.inv(self.layer_from_seen(on, eye_m)).astype(np.float64)
+                matrix = matrix @ layer_pixels_from_seen(source, back)
+            else:
+                matrix = layer_pixels_from_seen(target, self.layer_from_seen(of, eye_m)) @ matrix
+            matrix /= matrix[2, 2]
         return resample(image, image_from_result=matrix, out=out, outside=0 if of == CENTRE else START)
 
 
-def _coarser(raster: PlaneRaster, reduction: int) -> PlaneRaster:
+def spreads(rasters: Sequence[PlaneRaster], eyes_m: F64, *, eye_sigma_mm: float) -> dict[int, tuple[float, float]]:
+    """Per outer panel whose pixels move by enough to be felt for eyes (2, 3) that err by so much: right and down."""
+    eye_x_m, centre_x_m = eyes_m[:, 0].mean(), rasters[CENTRE].x_m
+    found = {}
+    for n in OUTER:
+        raster = rasters[n]
+        moved_m = eye_sigma_mm / 1e3 * abs(raster.x_m - centre_x_m) / (eye_x_m - centre_x_m)
+        spread = min(moved_m / raster.pitch_u_m, MOST_SPREAD), min(moved_m / raster.pitch_v_m, MOST_SPREAD)
+        if max(spread) >= LEAST_SPREAD:
+            found[n] = spread
+    return found
+
+
+def coarser(raster: PlaneRaster, reduction: int) -> PlaneRaster:
     """The same rectangle in fewer pixels."""
     if reduction == 1:
         return raster

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from math import prod
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,8 @@ STRIP = 192 * 1024  # numbers of 16 bits: with what it is made from, a strip sta
 WORTH_A_THREAD = 2 * STRIP  # an image of fewer numbers is done before another thread has woken
 
 Work = Callable[[slice, NDArray[np.int16]], None]
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 class RowPool:
@@ -46,6 +49,10 @@ class RowPool:
             share(0, 1)
         else:
             list(self._pool.map(share, range(self._threads), [self._threads] * self._threads))
+
+    def map(self, work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+        """`work` of every item, at once where there are threads: for OpenCV's functions that use one thread only."""
+        return [work(item) for item in items] if self._pool is None else list(self._pool.map(work, items))
 
     def close(self) -> None:
         """End the threads. May be called twice."""

@@ -20,6 +20,7 @@ from runtime.model.timing import Stopwatch
 from runtime.optics.malus import phase_from_intensity
 from runtime.optics.pupil import POINT_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.tilt import coarse_layer_from_seen, layer_pixels_from_seen
 from runtime.records import F32, F64, U8
 
 ITERATIONS = 10
@@ -42,14 +43,13 @@ class SartPredictor(Predictor):
 
     def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> Prediction:
         watch = Stopwatch()
-        stack, middle = self.stack, self.rasters(eyes_m)[0]
+        stack = self.stack
         table = phase_from_intensity(np.arange(256, dtype=np.float32) / np.float32(255)).astype(np.float32)
         wanted = [cv2.LUT(np.ascontiguousarray(image[0][..., :3]), table) for image in images]
         shape = (stack.height_px, stack.width_px, 3)
         panels: list[NDArray[np.float32]] = [np.full(shape, self._start, np.float32) for _ in range(stack.count)]
-        rasters = [stack.panel(n) for n in range(stack.count)]
-        forward = [[self._matrix(eye, source=middle, target=raster) for raster in rasters] for eye in eyes_m]
-        back = [[self._matrix(eye, source=raster, target=middle) for raster in rasters] for eye in eyes_m]
+        forward = [[self._panel_from_middle(eye, n) for n in range(stack.count)] for eye in eyes_m]
+        back = [[np.linalg.inv(matrix) for matrix in matrices] for matrices in forward]
         watch.lap("prepare")
         for _ in range(self.iterations):
             for side in range(2):
@@ -66,18 +66,19 @@ class SartPredictor(Predictor):
         watch.lap("finish")
         return Prediction(layers, watch.stage_ms)
 
-    @staticmethod
-    def _matrix(eye_m: F64, *, source: PlaneRaster, target: PlaneRaster) -> F64:
-        matrix = target_from_source(eye_m, source=source, target=target)[:2].copy()
-        matrix[:, 2] += matrix[:, :2] @ (0.5, 0.5) - 0.5  # OpenCV puts pixel centres at integers
-        return matrix
+    def _panel_from_middle(self, eye_m: F64, index: int) -> F64:
+        """3x3: a layer's pixels from the middle panel's, as an eye sees them in line; OpenCV's pixel centres."""
+        source, target = self.rasters(eye_m)[0], self.stack.panel(index)
+        matrix = target_from_source(eye_m, source=source, target=target)
+        if self.stack.tilt is not None:
+            matrix = layer_pixels_from_seen(target, coarse_layer_from_seen(self.stack, index, eye_m)) @ matrix
+        to_corners = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+        to_centres = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])
+        return np.asarray(to_centres @ matrix @ to_corners, dtype=np.float64)
 
 
-def _warp(image: F32, matrix: F64) -> Any:
-    return cv2.warpAffine(
-        image,
-        matrix,
-        image.shape[1::-1],
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+def _warp(image: F32, matrix: Any) -> Any:
+    size, flags, edge = image.shape[1::-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_REPLICATE
+    if matrix[2, 0] == 0.0 and matrix[2, 1] == 0.0:
+        return cv2.warpAffine(image, matrix[:2] / matrix[2, 2], size, flags=flags, borderMode=edge)
+    return cv2.warpPerspective(image, matrix, size, flags=flags, borderMode=edge)

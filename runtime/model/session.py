@@ -27,6 +27,8 @@ PROVIDERS = {
     "tensorrt": ("TensorrtExecutionProvider", "onnxruntime-gpu and TensorRT"),
     "openvino": ("OpenVINOExecutionProvider", "onnxruntime-openvino"),
 }
+RECORD_NODES = "session.record_ep_graph_assignment_info"
+NODES_TOLD = 5
 TYPES = {"tensor(float)": np.float32, "tensor(int16)": np.int16}
 Shape = tuple[int, ...]
 
@@ -48,6 +50,7 @@ class ModelSession:
         # A spinning pool eats the cores that the camera and the renderer need.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 3
+        options.add_session_config_entry(RECORD_NODES, "1")
         data = _checked(path, sha256)
         try:
             self._session = ort.InferenceSession(data, options, providers=[name])
@@ -56,7 +59,12 @@ class ModelSession:
             raise InputError(path, "metadata", "is no UTF-8 text") from None
         except Exception as error:  # onnxruntime raises its own hierarchy of undocumented exceptions
             raise InputError(path, "", f"is no model that onnxruntime can load ({_first_line(error)})") from None
+        if name not in self._session.get_providers():  # onnxruntime goes on without, and says so to stderr alone
+            raise MissingPart(f"model.provider: {provider} is installed and does not start here: {package}, its driver")
         self.provider: str = provider
+        self.fell_back = nodes_elsewhere(self._session, name)  # nodes of the graph that another provider runs
+        if self.fell_back:
+            log.warning("provider %s leaves %s to another: %s", provider, *told_nodes(self.fell_back))
         self.contract: Contract = parse_contract(metadata, source=path)
         if self.contract.graph_sha256 and self.contract.graph_sha256 != digest(data):
             raise InputError(path, "contract.graph_sha256", "does not fit: the file was changed after its export")
@@ -108,6 +116,25 @@ class ModelSession:
             found = {item.name: len(item.shape) for item in items}
             if declared != found:
                 raise InputError(path, f"contract.{field}", f"declares {_named(declared)}, the graph {_named(found)}")
+
+
+def nodes_elsewhere(session: Any, provider: str) -> tuple[str, ...]:
+    """Names (or kinds, where they have none) of a graph's nodes that run on another provider than the wished one.
+
+    session: made with RECORD_NODES. As onnxruntime assigned them after its basic optimizations.
+    """
+    return tuple(
+        node.name or node.op_type
+        for part in session.get_provider_graph_assignment_info()
+        if part.ep_name != provider
+        for node in part.get_nodes()
+    )
+
+
+def told_nodes(names: tuple[str, ...]) -> tuple[str, str]:
+    """How many nodes, and the first of them, for people."""
+    more = ", ..." if len(names) > NODES_TOLD else ""
+    return f"{len(names)} node{'s' * (len(names) != 1)}", ", ".join(names[:NODES_TOLD]) + more
 
 
 def _checked(path: Path, sha256: str) -> bytes:

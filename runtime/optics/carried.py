@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from runtime.optics.quality import Quality, psnr_db, quality, squared_error
 from runtime.optics.retina import Rays, Retina, checked_eye, through_layers
 from runtime.optics.stack import PanelStack
+from runtime.optics.tilt import layer_from_seen, layer_pixels_from_seen
 from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8, U16
 
@@ -45,15 +46,23 @@ class CarriedView:
         return through_layers(layers, lambda rows: self._positions(true, rows), toward_panels, self._stack)
 
     def _positions(self, true_m: F64, rows: slice) -> Iterator[tuple[F64, F64]]:
-        """On every panel: where the lines from the true eye through the centre panel's points cross it (seed 3)."""
+        """On every panel: where the lines from the true eye through the centre panel's points cross it (section 3)."""
         stack = self._stack
         centre = stack.panel(stack.count // 2)
         u, v = self._rays.on(centre, rows)
         u_true = (true_m[1] - centre.left_m) / centre.pitch_u_m
         v_true = (centre.top_m - true_m[2]) / centre.pitch_v_m
-        for x_m in stack.x_m:
+        for index, x_m in enumerate(stack.x_m):
             share = (x_m - true_m[0]) / (centre.x_m - true_m[0])
-            yield u * share + u_true * (1 - share), v * share + v_true * (1 - share)
+            x, y = u * share + u_true * (1 - share), v * share + v_true * (1 - share)
+            if stack.tilt is not None:
+                h = layer_pixels_from_seen(stack.panel(index), layer_from_seen(stack, index, true_m))
+                weight = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+                x, y = (
+                    (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / weight,
+                    (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / weight,
+                )
+            yield x, y
 
 
 def carried_quality(

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from runtime.optics.malus import intensity_from_phase
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.tilt import layer_from_seen, layer_pixels_from_seen
 from runtime.optics.views import image_from_stack
 from runtime.records import F32, F64, U8
 
@@ -110,9 +111,14 @@ class Rays:
     def shape(self) -> tuple[int, int]:
         return len(self.v), len(self.u)
 
-    def on(self, raster: PlaneRaster, rows: slice = slice(None)) -> tuple[F64, F64]:
-        """(h, w) where some rows' rays cross a plane, in its raster's pixels (M_RPU)."""
+    def on(self, raster: PlaneRaster, rows: slice = slice(None), *, moved: F64 | None = None) -> tuple[F64, F64]:
+        """(h, w) where some rows' rays cross a plane, in its raster's pixels (M_RPU).
+
+        moved: (3, 3) of those pixels, what is done to them afterwards.
+        """
         h = panel_from_image(self.from_stack, raster)
+        if moved is not None:
+            h = moved @ h
         u, v = self.u, self.v[rows]
         with np.errstate(divide="ignore", invalid="ignore"):
             weight = h[2, 0] * u + h[2, 1] * v + h[2, 2]
@@ -129,8 +135,9 @@ class Rays:
 def panel_positions(
     eye_m: ArrayLike, stack: PanelStack, *, index: int, width_px: int, height_px: int, fov_deg: float
 ) -> tuple[F32, F32]:
-    """Where the rays of an eye's image cross panel `index`: (h, w) u and v in that panel's pixels (M_RPU)."""
-    u, v = Rays.of_eye(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg).on(stack.panel(index))
+    """Where the rays of an eye's image cross panel `index`: (h, w) u and v in its layer's pixels (M_RPU)."""
+    rays = Rays.of_eye(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
+    u, v = rays.on(stack.panel(index), moved=_moved(stack, index, np.asarray(eye_m, dtype=np.float64)))
     return u.astype(np.float32), v.astype(np.float32)
 
 
@@ -149,7 +156,7 @@ def seen_by(
     height_px: int | None = None,
     step: int = 1,
 ) -> Retina:
-    """What a pinhole eye sees (seed 6, 7): panel values summed along each ray, then sin².
+    """What a pinhole eye sees (EyeReal supplement, (6), (7)): panel values summed along each ray, then sin².
 
     layers: (N, H, W, 3 or 4), rear to front, uint8 code values or float in [0, 1]; a fourth channel is ignored.
     The image has the layers' size unless told; step: only every so-manieth ray of every so-manieth row of it.
@@ -158,8 +165,17 @@ def seen_by(
     eye = checked_eye(eye_m, stack)
     width, height = width_px or layers.shape[2], height_px or layers.shape[1]
     rays = Rays.of_eye(eye, width_px=width, height_px=height, fov_deg=fov_deg, step=step)
-    panels = [stack.panel(index) for index in range(stack.count)]
-    return through_layers(layers, lambda rows: (rays.on(panel, rows) for panel in panels), rays.toward_panels(), stack)
+    panels = [(stack.panel(index), _moved(stack, index, eye)) for index in range(stack.count)]
+    return through_layers(
+        layers, lambda rows: (rays.on(panel, rows, moved=m) for panel, m in panels), rays.toward_panels(), stack
+    )
+
+
+def _moved(stack: PanelStack, index: int, eye_m: F64) -> F64 | None:
+    """(3, 3) a layer's pixels from the ideal panel's, as an eye sees them; None where they are the same."""
+    if stack.tilt is None:
+        return None
+    return layer_pixels_from_seen(stack.panel(index), layer_from_seen(stack, index, eye_m))
 
 
 def checked_eye(eye_m: ArrayLike, stack: PanelStack) -> F64:
@@ -209,7 +225,7 @@ def pupil_points(diameter_m: float, rings: int = 2) -> F64:
 
 
 def average(images: Iterable[F32]) -> F32:
-    """Mean of equally sized images: a finite pupil sees the average of what its points see (seed 1.4)."""
+    """Mean of equally sized images: a finite pupil sees the average of what its points see (section 1.4)."""
     total: F32 | None = None
     count = 0
     for image in images:

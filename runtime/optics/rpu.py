@@ -1,4 +1,7 @@
-"""Reverse perspective uniform: panel pixels from an eye's image pixels (seed 3.2, 40-47, errata applied)."""
+"""Reverse perspective uniform: panel pixels from an eye's image pixels (EyeReal supplement, 3.2, (40)-(47)).
+
+Its misprints are listed and mended in docs/mathematics.md.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +16,13 @@ from runtime.records import F64
 
 
 def panel_corners_px(raster: PlaneRaster) -> F64:
-    """(4, 2) outer corners Q_n in the seed's order 0-3: (0, 0), (W, 0), (W, H), (0, H)."""
+    """(4, 2) outer corners Q_n in the EyeReal supplement's order 0-3: (0, 0), (W, 0), (W, H), (0, H)."""
     width, height = float(raster.width_px), float(raster.height_px)
     return np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
 
 
 def image_from_panel_four_points(corners_px: ArrayLike, *, width_px: float, height_px: float) -> F64:
-    """H of seed (40) from the images of a panel's four corners, in closed form (seed 42-46, corrected).
+    """H of equation (40) from the images of a panel's four corners, in closed form (equations (42) to (46), corrected).
 
     corners_px: (4, 2) image pixels of the corners in the order of `panel_corners_px`.
     Returns 3x3 with h33 = 1. Raises ValueError where the quadrilateral is degenerate: corners that are not finite,
@@ -68,7 +71,7 @@ def corners_in_front(image_from_stack: F64, raster: PlaneRaster) -> bool:
 
 
 def panel_from_image(image_from_stack: F64, raster: PlaneRaster) -> F64:
-    """M_RPU (seed 47): 3x3 panel pixels from an eye's image pixels; the inverse of the plane-induced homography.
+    """M_RPU (equation (47)): 3x3 panel pixels from an eye's image pixels; the inverse of the plane-induced homography.
 
     Built without a numerical inverse: the ray of an image pixel is cut with the panel's plane, so that it
     stays exact at grazing angles. Scaled so that its largest entry is 1.
@@ -82,4 +85,5 @@ def panel_from_image(image_from_stack: F64, raster: PlaneRaster) -> F64:
     noise = 64 * np.finfo(np.float64).eps * float(terms @ np.abs(adjugate[2]))
     if not np.isfinite(scale) or scale == 0.0 or abs(adjugate[2] @ h[:, 2]) <= noise:
         raise ValueError("the eye lies in the panel's plane: its view of the panel is singular")
-    return adjugate / scale
+    result: F64 = adjugate / scale
+    return result

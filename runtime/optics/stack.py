@@ -8,6 +8,8 @@ import numpy as np
 
 from runtime.records import F64
 
+UNEVEN_MOST = 0.15  # of the mean gap, between the largest and the smallest: docs/models.md
+
 
 @dataclass(frozen=True, slots=True)
 class PlaneRaster:
@@ -45,14 +47,29 @@ class PlaneRaster:
 
 
 @dataclass(frozen=True, slots=True)
+class Tilt:
+    """How panels that are not quite parallel stand, and the place from which their layers look as if they were."""
+
+    depth: tuple[tuple[float, float, float], ...]  # per panel (d, r, u): it stands d + r·y + u·z before its x_m, metres
+    seen_from_m: tuple[float, float, float]  # frame `stack`
+
+    def moved(self, y_m: float, z_m: float) -> Tilt:
+        """The same in a frame whose origin lies at (0, y_m, z_m)."""
+        x, y, z = self.seen_from_m
+        depth = tuple((d + r * y_m + u * z_m, r, u) for d, r, u in self.depth)
+        return Tilt(depth, (x, y - y_m, z - z_m))
+
+
+@dataclass(frozen=True, slots=True)
 class PanelStack:
-    """Geometry of the display: parallel panels of one size, rear (0) to front (N-1)."""
+    """Geometry of the display: parallel panels of one size, rear (0) to front (N-1), or nearly parallel ones."""
 
     width_m: float
     height_m: float
     x_m: tuple[float, ...]  # ascending; frame `stack`
     width_px: int
     height_px: int
+    tilt: Tilt | None = None  # None: the panels are parallel
 
     @property
     def count(self) -> int:
@@ -60,9 +77,17 @@ class PanelStack:
 
     @property
     def is_evenly_spaced(self) -> bool:
-        """True where neighbours are equally far apart, to a part in a thousand."""
+        """True where neighbours are equally far apart, as nearly as the shipped networks serve as well as even ones."""
         gaps = np.diff(self.x_m)
-        return bool(gaps.size == 0 or np.ptp(gaps) <= 1e-3 * gaps.mean())
+        return bool(gaps.size == 0 or np.ptp(gaps) <= UNEVEN_MOST * gaps.mean())
+
+    def turned(self) -> PanelStack:
+        """The panels with rows for columns: what was down (-z) is to the right (+y), what was right is down."""
+        tilt = self.tilt
+        if tilt is not None:
+            x, y, z = tilt.seen_from_m
+            tilt = Tilt(tuple((d, -u, -r) for d, r, u in tilt.depth), (x, -z, -y))
+        return PanelStack(self.height_m, self.width_m, self.x_m, self.height_px, self.width_px, tilt)
 
     def panel(self, index: int) -> PlaneRaster:
         """The pixel grid of panel `index`."""

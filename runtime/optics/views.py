@@ -1,4 +1,4 @@
-"""Eye poses and projections (seed 2.1 and 3.1, with the errata of the design applied)."""
+"""Eye poses and projections (EyeReal supplement, 2.1 and 3.1, errata applied)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from runtime.records import F64
 
 
 def stack_from_eye(eye_m: ArrayLike) -> F64:
-    """4x4 pose of an eye that looks at the stack's origin (seed 10-14).
+    """4x4 pose of an eye that looks at the stack's origin (EyeReal supplement, (10)-(14)).
 
     Axes: x right and parallel to the ground, y up, z from the scene towards the eye. On the vertical
     axis, where the limits differ, the limit from +x is taken: r_x = +y.
@@ -37,13 +37,13 @@ def stack_from_eye(eye_m: ArrayLike) -> F64:
 
 
 def image_from_camera(*, width_px: int, height_px: int, fov_deg: float) -> F64:
-    """3x3 intrinsic matrix of square pixels and centred principal point (seed 36); fov is horizontal."""
+    """3x3 intrinsic matrix of square pixels and centred principal point (equation (36)); fov is horizontal."""
     focal_px = width_px / 2 / math.tan(math.radians(fov_deg) / 2)
     return np.array([[focal_px, 0.0, width_px / 2], [0.0, focal_px, height_px / 2], [0.0, 0.0, 1.0]])
 
 
 def image_from_stack(eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float) -> F64:
-    """3x4 projection of `stack` points to an eye's image: K · diag(1, -1, -1) · R_e^T · [I | -e] (seed 31-39).
+    """3x4 projection of `stack` points to an eye's image: K · diag(1, -1, -1) · R_e^T · [I | -e] (equations (31)-(39)).
 
     The third homogeneous coordinate is the distance along the gaze in metres, positive before the eye.
     """
@@ -70,11 +70,12 @@ def raster_from_stack(eye_m: ArrayLike, raster: PlaneRaster) -> F64:
             [-1.0, 0.0, 0.0, eye[0]],
         ]
     )
-    return raster.raster_from_plane() @ plane_from_stack
+    result: F64 = raster.raster_from_plane() @ plane_from_stack
+    return result
 
 
 def image_from_raster(image_from_stack: F64, raster: PlaneRaster) -> F64:
-    """3x3 plane-induced homography: an eye's image pixels from a plane's pixels (H of seed 40-42)."""
+    """3x3 plane-induced homography: an eye's image pixels from a plane's pixels (H of equations (40)-(42))."""
     return image_from_stack[:, :3] @ raster.stack_from_raster() + np.outer(image_from_stack[:, 3], [0.0, 0.0, 1.0])
 
 

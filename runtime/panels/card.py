@@ -18,20 +18,21 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 def identity_card(width_px: int, height_px: int, *, title: str, lines: Sequence[str]) -> U8:
     """(height_px, width_px, 4) RGBA, upright for the viewer: title, lines, an arrow up, colour bars, grey steps.
 
-    A line of one pixel runs along every edge: where one is missing, the panel is cropped or misaligned.
+    A line of one pixel runs along every edge: where one is missing, the panel is cropped or misaligned. Words keep
+    off the edges: before a front panel's rim, seen from nearby, no panel behind it lets light through.
     """
     card = np.empty((height_px, width_px, 4), np.uint8)
     card[:] = PAPER
     unit = min(width_px, height_px) / 100
-    _bars(card, top=round(height_px * 0.80))
-    _arrow(card, x_px=round(width_px * 0.86), top=round(height_px * 0.10), bottom=round(height_px * 0.70), unit=unit)
-    room = 0.72 * width_px
-    baseline = round(height_px * 0.22)
-    _text(card, title, x_px=round(4 * unit), y_px=baseline, height=14 * unit, room=room)
+    _bars(card, top=round(height_px * 0.76))
+    _arrow(card, x_px=round(width_px * 0.78), top=round(height_px * 0.13), bottom=round(height_px * 0.63), unit=unit)
+    left, room = round(0.12 * width_px), 0.56 * width_px
+    baseline = round(height_px * 0.26)
+    _text(card, title, x_px=left, y_px=baseline, height=14 * unit, room=room)
     baseline += round(3 * unit)
     for line in lines:
-        baseline += round(9.5 * unit)
-        _text(card, line, x_px=round(4 * unit), y_px=baseline, height=5 * unit, room=room)
+        baseline += round(8.5 * unit)
+        _text(card, line, x_px=left, y_px=baseline, height=5 * unit, room=room)
     edge = ((0, 0), (width_px - 1, height_px - 1))
     cv2.rectangle(card, *edge, INK, 1)
     corner = round(3 * unit)

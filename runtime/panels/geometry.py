@@ -39,7 +39,8 @@ def panel_from_screen(*, screen_width_px: int, screen_height_px: int, rotation_d
         "horizontal": np.array([[-1.0, 0.0, columns], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
         "vertical": np.array([[1.0, 0.0, 0.0], [0.0, -1.0, rows], [0.0, 0.0, 1.0]]),
     }[mirror]
-    return mirrored @ np.array(turned)
+    result: F64 = mirrored @ np.array(turned)
+    return result
 
 
 def layer_from_screen(
@@ -67,7 +68,8 @@ def layer_from_screen(
         screen_width_px=screen_width_px, screen_height_px=screen_height_px, rotation_deg=rotation_deg, mirror=mirror
     )
     layer_from_ideal = np.diag([layer_width_px / columns, layer_height_px / rows, 1.0])
-    return layer_from_ideal @ np.linalg.solve(true_from_ideal, true_from_screen)
+    result: F64 = layer_from_ideal @ np.linalg.solve(true_from_ideal, true_from_screen)
+    return result
 
 
 def permutes_pixels(matrix: F64) -> bool:

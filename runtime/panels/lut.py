@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import io
 from pathlib import Path
 
 import numpy as np
 
 from runtime.errors import InputError
 from runtime.records import F32
+from runtime.support import foreign
 
 ENTRIES = 256
 COLUMNS = ("phase", "red", "green", "blue")
@@ -32,10 +34,10 @@ def measured_curve(path: Path) -> F32:
     Raises InputError, naming the file and the row or column.
     """
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with io.StringIO(foreign.read_text(path), newline="") as file:
             rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, "", f"cannot be read ({getattr(error, 'strerror', None) or error})") from None
+    except csv.Error as error:
+        raise InputError(path, "", f"malformed: {error}") from None
     header = tuple(name.strip().lower() for name in rows[0]) if rows else ()
     if header not in (COLUMNS, ("phase", "grey")):
         raise InputError(path, "columns", "must be phase, red, green, blue (or phase, grey)")

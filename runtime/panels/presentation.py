@@ -27,7 +27,8 @@ void main() {
 """
 
 # runtime.optics.alignment.shown_layers is the reference for what `shown` answers. Aligned layers are sampled with
-# weights of full precision, which hardware's filters (1/256) have not, and are even beside their edge.
+# weights of full precision, which hardware's filters (1/256) have not, and are even beside their edge. Layers that a
+# homography moves are sampled with cubic weights, once for registration and alignment: bilinear ones cost 0.15 dB more.
 FRAGMENT = """#version 330 core
 uniform sampler2DArray solved;
 uniform sampler2DArray flat_picture;
@@ -55,12 +56,34 @@ vec3 aligned_at(vec2 px) {
     return mix(mix(solved_texel(at), solved_texel(at + ivec2(1, 0)), weight.x),
                mix(solved_texel(at + ivec2(0, 1)), solved_texel(at + ivec2(1, 1)), weight.x), weight.y);
 }
+vec4 cubic(float t) {  // of four neighbours, as OpenCV's INTER_CUBIC has them (a = -3/4)
+    vec4 d = vec4(1.0 + t, t, 1.0 - t, 2.0 - t);
+    vec4 near = (1.25 * d - 2.25) * d * d + 1.0;
+    vec4 far = ((-0.75 * d + 3.75) * d - 6.0) * d + 3.0;
+    return vec4(far.x, near.y, near.z, far.w);
+}
+vec3 registered_at(vec2 px) {
+    vec2 place = (aligned ? px * solved_from_shown.xy + solved_from_shown.zw : px) - 0.5;
+    place = clamp(place, vec2(-2.0), size_px + 1.0);
+    vec2 low = floor(place);
+    vec4 across = cubic(place.x - low.x), down = cubic(place.y - low.y);
+    vec3 total = vec3(0.0);
+    for (int j = 0; j < 4; j++) {
+        for (int i = 0; i < 4; i++) {
+            ivec2 at = ivec2(low) + ivec2(i - 1, j - 1);
+            vec3 texel = aligned ? solved_texel(at)
+                : texelFetch(solved, ivec3(clamp(at, ivec2(0), ivec2(size_px) - 1), layer), 0).rgb;
+            total += across[i] * down[j] * texel;
+        }
+    }
+    return clamp(total, 0.0, 1.0);
+}
 vec3 as_it_is(sampler2DArray layers, vec2 px) {
     return exact ? texelFetch(layers, ivec3(floor(px), layer), 0).rgb : texture(layers, vec3(px / size_px, layer)).rgb;
 }
 vec3 shown(vec2 px) {
     if (flatness >= 1.0) return as_it_is(flat_picture, px);
-    vec3 phase = aligned ? aligned_at(px) : as_it_is(solved, px);
+    vec3 phase = !exact ? registered_at(px) : aligned ? aligned_at(px) : as_it_is(solved, px);
     return flatness > 0.0 ? mix(phase, as_it_is(flat_picture, px), flatness) : phase;
 }
 void main() {

@@ -177,9 +177,10 @@ def window_of(box: PixelRect, eyes_m: F64, stack: PanelStack, *, steep: float = 
 def cut_out(box: PixelRect, stack: PanelStack, *, steps: float = WAVE_STEPS[1]) -> Window:
     """The panels behind a box of pixels, as a stack of their own."""
     pitch_u, pitch_v = stack.width_m / stack.width_px, stack.height_m / stack.height_px
-    cut = PanelStack(pitch_u * box.width_px, pitch_v * box.height_px, stack.x_m, box.width_px, box.height_px)
     y_m = ((box.u0 + box.u1) / 2 - stack.width_px / 2) * pitch_u
     z_m = (stack.height_px / 2 - (box.v0 + box.v1) / 2) * pitch_v
+    tilt = None if stack.tilt is None else stack.tilt.moved(y_m, z_m)
+    cut = PanelStack(pitch_u * box.width_px, pitch_v * box.height_px, stack.x_m, box.width_px, box.height_px, tilt)
     return Window(box, cut, np.array([0.0, y_m, z_m]), steps)
 
 

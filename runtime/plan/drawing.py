@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 
 from runtime.content.base import ContentSource, View
+from runtime.errors import ContextLost, PhasestackError
 from runtime.model.predictor import Predictor
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack, raster_from_stack
 from runtime.plan.planner import focused_part
 from runtime.records import F64, U8
+from runtime.support.gl import DrawnPicture
 
 
 def raster_views(eyes_m: F64, raster: PlaneRaster) -> tuple[View, View]:
@@ -43,18 +48,39 @@ def retina_pictures(
     return left, right
 
 
-def drawn_for(predictor: Predictor, content: ContentSource, eyes_m: F64, *, time_ns: int) -> list[list[U8]]:
+def drawn_for(predictor: Predictor, content: ContentSource, eyes_m: F64, *, time_ns: int) -> list[list[Any]]:
     """images[side][raster] that a model wants for eyes (2, 3), aimed where the content lies.
 
-    Copied only where a source's array would be drawn over by the next raster: else they are the source's own.
+    They stay in textures where the model reads those. Arrays are copied only where a source's own would be drawn over
+    by the next raster: else they are the source's.
     """
-    images: list[list[U8]] = [[], []]
+    images: list[list[Any]] = [[], []]
     part = focused_part(predictor)
     if part is not None:
         part.aim(content, eyes_m, time_ns=time_ns)
     rasters = predictor.rasters(eyes_m)
     for raster in rasters:
         for view in raster_views(eyes_m, raster):
+            if len(rasters) == 1 and (drawn := _drawn(predictor, content, view, time_ns=time_ns)) is not None:
+                images[view.side].append(drawn)
+                continue
             picture = content.render(view, time_ns=time_ns)
             images[view.side].append(picture.copy() if len(rasters) > 1 else picture)
     return images
+
+
+def _drawn(predictor: Predictor, content: ContentSource, view: View, *, time_ns: int) -> DrawnPicture | None:
+    """A picture that is left in a texture which the model reads; None: there is none, or it reads arrays.
+
+    Raises ContentFailure, ContextLost.
+    """
+    if content.draws_in is None or not predictor.reads_textures_of(content.draws_in):
+        return None
+    try:
+        picture = content.draw(view, time_ns=time_ns)
+    except PhasestackError:
+        raise
+    except Exception as error:  # a lost context answers with whatever moderngl has at hand
+        raise ContextLost(f"OpenGL: {error}") from error
+    plain = content.info.background is None or len(set(content.info.background)) == 1
+    return picture and replace(picture, grey=content.info.grey and plain)

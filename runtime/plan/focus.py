@@ -20,6 +20,7 @@ from runtime.content.camera import union
 from runtime.model.fade import Fade
 from runtime.model.predictor import Prediction, Predictor
 from runtime.model.pyramid_level import NEUTRAL
+from runtime.model.schedule import Backend, Picture
 from runtime.model.transfer import SUBCODE, phase_codes, pre_emphasised
 from runtime.model.unrolled import UnrolledPredictor
 from runtime.optics.pupil import POINT_MM
@@ -38,6 +39,7 @@ from runtime.plan.active import (
     window_of,
 )
 from runtime.records import F64, U8
+from runtime.support.gl import DrawnPicture
 
 SIZES_KEPT = 6
 
@@ -63,6 +65,20 @@ class FocusedPredictor(Predictor):
         self._background: tuple[int, ...] | None = None  # that fills the centre panel beside the aimed window
         self.window: Window | None = None  # of the last frame
         self.active_fraction = 1.0  # of the panel's pixels that went through the model
+
+    @property
+    def backend(self) -> str:  # type: ignore[override]
+        return self.whole.backend
+
+    def reads_textures_of(self, context: object) -> bool:
+        return self.whole.reads_textures_of(context)
+
+    def on_panels(self, stack: PanelStack) -> Predictor | None:
+        return self.whole.on_panels(stack)
+
+    def surround_with(self, backend: Backend) -> None:
+        for part in (self.whole, *self._parts.values()):
+            part.surround_with(backend)
 
     def aim(self, content: ContentSource, eyes_m: F64, *, time_ns: int) -> None:
         """Ask the content where it lies, so that only that is drawn and solved."""
@@ -117,12 +133,19 @@ class FocusedPredictor(Predictor):
             ),
         )
 
-    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> Prediction:
+    def predict(
+        self, images: Sequence[Sequence[Picture]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM
+    ) -> Prediction:
         begin_ns = perf_counter_ns()
         left, right = images[0][0], images[1][0]
         aimed, self._aimed = self._aimed, None
         if aimed is not None:
             window, cut = aimed, [[left], [right]]
+        elif isinstance(left, DrawnPicture) or isinstance(right, DrawnPicture):  # nobody looked where they differ
+            self.window, self.active_fraction = None, 1.0
+            prediction = self.whole.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
+            self.channels = self.whole.channels
+            return prediction
         else:
             # A coarse look tells for next to nothing what is too large; only the rest is worth a close one.
             for look in (coarse_box, differing_box):
@@ -149,8 +172,8 @@ class FocusedPredictor(Predictor):
         if aimed is not None:
             self._even_out(but=window.box)
             self._paint_background(self._wanted_background)
-        else:
-            self._fill_with(left, but=window.box)
+        elif not isinstance(left, DrawnPicture):
+            self._fill_with(left, but=window.box, solved=whole_rays(window, eyes_m, self.stack))
         return self._place(window, solved, eyes_m, found_ms + (perf_counter_ns() - begin_ns) / 1e6)
 
     def _around(self, box: PixelRect, picture: U8, eyes_m: F64) -> Window | None:
@@ -176,17 +199,22 @@ class FocusedPredictor(Predictor):
 
     def _filled(self, picture: U8, begin_ns: int) -> Prediction:
         """Layers of which the centre panel alone carries the picture, for both eyes."""
-        self._fill_with(picture, but=None)
+        self._fill_with(picture, but=None, solved=None)
         self.window, self.active_fraction, self.channels = None, 0.0, 3
         filled_ms = (perf_counter_ns() - begin_ns) / 1e6
         return Prediction(self._layers, {"prepare": filled_ms, "inference": 0.0, "finish": 0.0})
 
-    def _fill_with(self, picture: U8, *, but: PixelRect | None) -> None:
+    def _fill_with(self, picture: U8, *, but: PixelRect | None, solved: PixelRect | None) -> None:
         """The picture on the centre panel, as both eyes see it where they agree."""
         self._even_out(but=but)
         self._background = None
-        sharp = pre_emphasised(picture, self.whole.pre_emphasis)
-        cv2.LUT(sharp, _centre_codes(self.stack.count), dst=self._layers[self.stack.count // 2])
+        centre, codes = self._layers[self.stack.count // 2], _centre_codes(self.stack.count)
+        for part in _around(solved, width_px=self.stack.width_px, height_px=self.stack.height_px):
+            grown = PixelRect(max(0, part.u0 - 1), max(0, part.v0 - 1), part.u1 + 1, part.v1 + 1)
+            sharp = pre_emphasised(picture[grown.slices], self.whole.pre_emphasis)
+            rows = slice(part.v0 - grown.v0, part.v1 - grown.v0)
+            columns = slice(part.u0 - grown.u0, part.u1 - grown.u0)
+            centre[part.slices] = cv2.LUT(np.ascontiguousarray(sharp[rows, columns]), codes)
 
     def _place(self, window: Window, solved: Prediction, eyes_m: F64, filled_ms: float) -> Prediction:
         """The window's layers among the rest."""
@@ -244,6 +272,19 @@ class FocusedPredictor(Predictor):
                 self._parts.pop(next(iter(self._parts))).close()
             self._parts[size] = self._make(stack)
         return self._parts[size]
+
+
+def _around(hole: PixelRect | None, *, width_px: int, height_px: int) -> list[PixelRect]:
+    """A panel's pixels but for a hole."""
+    if hole is None:
+        return [PixelRect(0, 0, width_px, height_px)]
+    parts = (
+        PixelRect(0, 0, width_px, hole.v0),
+        PixelRect(0, hole.v1, width_px, height_px),
+        PixelRect(0, hole.v0, hole.u0, hole.v1),
+        PixelRect(hole.u1, hole.v0, width_px, hole.v1),
+    )
+    return [part for part in parts if part.width_px and part.height_px]
 
 
 def _fill(layer: U8, area: PixelRect, codes: Sequence[int]) -> None:

@@ -23,6 +23,7 @@ def focused(predictor: Predictor, settings: ModelSettings) -> FocusedPredictor |
             part,
             threads=settings.threads,
             one_channel=predictor.one_channel,
+            surroundings=predictor.surroundings,
         )
 
     return FocusedPredictor(predictor, make)

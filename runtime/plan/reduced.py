@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from time import perf_counter_ns
+from typing import Any
 
 import cv2
 import numpy as np
 
 from runtime.config import Settings
 from runtime.model.predictor import Prediction, Predictor
+from runtime.model.schedule import Backend
 from runtime.optics.pupil import POINT_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.plan.predictors import planned_predictor
-from runtime.records import F64, U8
+from runtime.records import F64
 
 
 class ReducedPredictor(Predictor):
@@ -26,6 +28,19 @@ class ReducedPredictor(Predictor):
         self.name, self.provider, self.parameters = small.name, small.provider, small.parameters
         self._layers = np.empty((stack.count, stack.height_px, stack.width_px, 4), np.uint8)
 
+    @property
+    def backend(self) -> str:  # type: ignore[override]
+        return self.small.backend
+
+    def reads_textures_of(self, context: object) -> bool:
+        return self.small.reads_textures_of(context)
+
+    def on_panels(self, stack: PanelStack) -> Predictor | None:
+        return self.small.on_panels(stack)
+
+    def surround_with(self, backend: Backend) -> None:
+        self.small.surround_with(backend)
+
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         return self.small.rasters(eyes_m)
 
@@ -36,7 +51,7 @@ class ReducedPredictor(Predictor):
     def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
         return self.small.windows(eyes_m)
 
-    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> Prediction:
+    def predict(self, images: Sequence[Sequence[Any]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> Prediction:
         solved = self.small.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
         begin_ns = perf_counter_ns()
         size = (self.stack.width_px, self.stack.height_px)

@@ -15,6 +15,7 @@ from runtime.clock import NS_PER_MS
 from runtime.config import ModelSettings, StackGeometry, read_table
 from runtime.errors import InputError
 from runtime.evaluation.trials import timed
+from runtime.model.backends import Wanted
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import drawn_for
 from runtime.records import F64
@@ -56,16 +57,20 @@ def scatter(values: Sequence[float]) -> float:
     """How far a median of these may be off, relative: 1.4826·MAD·1.25/sqrt(n)."""
     middle = float(np.median(values))
     deviation = float(np.median(np.abs(np.asarray(values) - middle)))
-    return 1.4826 * 1.2533 * deviation / middle / len(values) ** 0.5
+    relative: float = 1.4826 * 1.2533 * deviation / middle / len(values) ** 0.5
+    return relative
 
 
-def stage_times(model: str, stack: PanelStack, eyes_m: F64) -> dict[str, Any]:
+def stage_times(model: str, stack: PanelStack, eyes_m: F64, *, backend: Wanted = "opencv") -> dict[str, Any]:
     """Medians of what a frame costs, stage by stage, drawn and predicted as the daemon does."""
+    from runtime.model.backends import choose
     from runtime.model.predictor import load_predictor
 
     predictor = load_predictor(model, stack, ModelSettings())
     stages: dict[str, list[float]] = {}
     with Painter("demo", stack) as painter:
+        # Drawn and solved in one context, as the daemon does.
+        predictor.surround_with(choose(backend, predictor, lambda: painter.context).backend)
 
         def frame() -> None:
             start_ns = perf_counter_ns()
@@ -76,9 +81,10 @@ def stage_times(model: str, stack: PanelStack, eyes_m: F64) -> dict[str, Any]:
                 stages.setdefault(name, []).append(value)
 
         done = timed(frame, runs=RUNS, warm_up=2)
-    predictor.close()
+        predictor.close()
     return {
         "name": model,
+        "backend": predictor.backend,
         "width_px": stack.width_px,
         "height_px": stack.height_px,
         "stage_ms": {name: float(np.median(values[-RUNS:])) for name, values in stages.items()},
@@ -88,7 +94,10 @@ def stage_times(model: str, stack: PanelStack, eyes_m: F64) -> dict[str, Any]:
 
 
 def measured(
-    *, sizes: Sequence[tuple[int, int]] = SIZES, progress: Callable[[str], None] = lambda text: None
+    *,
+    sizes: Sequence[tuple[int, int]] = SIZES,
+    backend: Wanted = "opencv",
+    progress: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
     """The regression file's content. Takes about a minute."""
     yardsticks, stages, methods = [yardstick_ms()], [], []
@@ -100,8 +109,8 @@ def measured(
             pair = painter.pair("demo", eyes, stack, fov_deg=FOV_DEG, off_mm=(2,))
         for model in MODELS:
             progress(f"{model} {width}x{height}")
-            stages.append(stage_times(model, stack, eyes))
-            result = measure([Method(model, "network", model)], [pair])[0]
+            stages.append(stage_times(model, stack, eyes, backend=backend))
+            result = measure([Method(model, "network", model, backend=backend)], [pair])[0]
             methods.append({key: value for key, value in result.record().items() if key != "pairs"})
             yardsticks.append(yardstick_ms())
     return {

@@ -30,6 +30,7 @@ class Seen:
 
 
 def as_intensity(image: Picture) -> F32:
+    """(h, w, 3) intensities in [0, 1] of a picture of 8 or 16 bits, or of one that is intensities already."""
     return intensities(image)
 
 

@@ -1,4 +1,4 @@
-"""Focal parallax (seed 1.4): an eye with a pupil of finite size focuses through the solved layers.
+"""Focal parallax (EyeReal supplement, 1.4): an eye with a pupil of finite size focuses through the solved layers.
 
 A pupil sees the mean of what its points see, and focusing at a distance means that those pictures are laid on each
 other so that they agree there. From a point of the pupil (right, up) the picture is that of a pinhole, shifted by
@@ -76,7 +76,8 @@ def projection(eye_m: F64, point: F64, *, focus_m: float) -> F64:
     camera = image_from_camera(width_px=WIDTH_PX, height_px=HEIGHT_PX, fov_deg=FOV_DEG)
     camera[0, 2] += camera[0, 0] * point[0] / focus_m
     camera[1, 2] -= camera[1, 1] * point[1] / focus_m
-    return camera @ np.column_stack([rotation, -rotation @ place])
+    result: F64 = camera @ np.column_stack([rotation, -rotation @ place])
+    return result
 
 
 def through_layers(matrix: F64, layers: U8, stack: PanelStack) -> tuple[F32, Mask]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from runtime.model.backends import Wanted
 from runtime.optics.pupil import POINT_MM
 from runtime.records import U8
 from runtime.report.pairs import StillPair
@@ -31,6 +32,7 @@ class Method:
     iterations: int = 0
     eye_sigma_mm: float = POINT_MM  # that networks solve for
     scale: float = 1.0  # a network works at this share of the panels' columns and rows; its layers are enlarged
+    backend: Wanted = "opencv"  # what surrounds a network
     trained: bool = True  # where not, time and memory are the network's, its picture is nobody's
 
 
@@ -90,8 +92,10 @@ def _plain(method: Method) -> Opened:
 def _predictor(method: Method, pair: StillPair, threads: int) -> Predictor:
     """Raises InputError, MissingPart."""
     from runtime.config import ModelSettings
+    from runtime.model.backends import choose
     from runtime.model.predictor import load_predictor
     from runtime.plan.reduced import ReducedPredictor
+    from runtime.support.gl import offscreen_context
 
     if method.source == "sart":
         from runtime.model.sart import SartPredictor
@@ -99,7 +103,10 @@ def _predictor(method: Method, pair: StillPair, threads: int) -> Predictor:
         return SartPredictor(pair.stack, iterations=method.iterations)
     settings = ModelSettings(threads=threads)
     if method.scale == 1.0:
-        return load_predictor(method.source, pair.stack, settings)
+        predictor = load_predictor(method.source, pair.stack, settings)
+        if method.backend != "opencv":
+            predictor.surround_with(choose(method.backend, predictor, offscreen_context).backend)
+        return predictor
     small = replace(
         pair.stack,
         width_px=round(pair.stack.width_px * method.scale),

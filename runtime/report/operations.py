@@ -110,7 +110,7 @@ def predictor_multiply_adds(predictor: Predictor, pair: StillPair, *, path: Path
         return predictor_multiply_adds(predictor.small, pair, path=path) + enlarged
     windows = predictor.windows(pair.eyes_m)
     drawn = sum((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in windows)
-    total = EYES * RGBA * drawn * (CUBIC if predictor.interpolation == "cubic" else LINEAR)
+    total: int = EYES * RGBA * drawn * (CUBIC if predictor.interpolation == "cubic" else LINEAR)
     if isinstance(predictor, SartPredictor):
         return total + sart_multiply_adds(predictor.stack, iterations=predictor.iterations)
     if path is None:

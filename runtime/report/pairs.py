@@ -142,15 +142,15 @@ class Painter:
         from runtime.content.procedural import ProceduralSource
         from runtime.support.gl import offscreen_context
 
-        self._context = offscreen_context()
-        self.content = ProceduralSource(scene, stack=stack, context=self._context)
+        self.context = offscreen_context()
+        self.content = ProceduralSource(scene, stack=stack, context=self.context)
 
     def __enter__(self) -> Painter:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.content.close()
-        self._context.release()
+        self.context.release()
 
     def draw(self, eye_m: ArrayLike, pixels_from_stack: F64, *, width_px: int, height_px: int) -> U8:
         """(h, w, 4) the scene through any projection."""

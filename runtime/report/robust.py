@@ -175,7 +175,7 @@ def _write(path: Path, pair: StillPair, reference: Shown) -> None:
 
 
 def _read(path: Path) -> tuple[StillPair, Shown]:
-    with np.load(path, allow_pickle=False) as file:
+    with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:  # numpy leaves a broken one open
         left, right = file["images"]
         width_m, height_m = map(float, file["size_m"])
         stack = PanelStack(width_m, height_m, tuple(map(float, file["x_m"])), left.shape[1], left.shape[0])

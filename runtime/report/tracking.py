@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
 
@@ -232,21 +232,3 @@ def jitter_and_lag(*, rate_hz: int = 60, seconds: float = 16.0) -> list[Trade]:
         for cutoff in (0.3, 0.6, 1.2, 2.5, 5.0, 10.0, 20.0)
     ]
     return rows
-
-
-def update_cost_us(*, samples: int = 2000) -> float:
-    """Median time of one update of the tracker, in microseconds on this machine, now."""
-    import time
-
-    observed = observe("walk", seconds=samples / 60, rate_hz=60)
-    tracker, times = Tracker(), []
-    for sample in observed:
-        begin = time.perf_counter_ns()
-        tracker.update(sample.points, capture_ns=sample.capture_ns)
-        times.append(time.perf_counter_ns() - begin)
-    return float(np.median(times)) / 1000
-
-
-def benchmark_table(rows: Sequence[Row]) -> list[dict[str, object]]:
-    """The rows as plain objects, for JSON."""
-    return [asdict(row) for row in rows]

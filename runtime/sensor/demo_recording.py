@@ -62,7 +62,8 @@ def sensor_from_stack(points_m: F64) -> F64:
     tilt = np.deg2rad(SENSOR_TILT_DOWN_DEG)
     c, s = np.cos(tilt), np.sin(tilt)
     axes = np.array([[0.0, -1.0, 0.0], [-s, 0.0, -c], [c, 0.0, -s]])  # rows: the sensor's axes in `stack`
-    return (points_m - np.array(SENSOR_POSITION_M)) @ axes.T
+    result: F64 = (points_m - np.array(SENSOR_POSITION_M)) @ axes.T
+    return result
 
 
 def samples() -> Iterator[SensorFrame]:

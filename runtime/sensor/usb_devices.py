@@ -120,26 +120,6 @@ def reset_device(device: UsbDevice) -> None:
         usb.util.dispose_resources(device.handle)
 
 
-class DeviceWatch:
-    """Hot-plugging: what came and went between two looks."""
-
-    def __init__(self, backend: Any = None) -> None:
-        self._backend = backend
-        self._present = {self._key(device): device for device in find_devices(backend)}
-
-    @staticmethod
-    def _key(device: UsbDevice) -> tuple[Any, ...]:
-        return device.usb_id, device.serial, device.bus, device.address
-
-    def changes(self) -> tuple[list[UsbDevice], list[UsbDevice]]:
-        """Devices that arrived and devices that left since the last look."""
-        now = {self._key(device): device for device in find_devices(self._backend)}
-        arrived = [device for key, device in now.items() if key not in self._present]
-        left = [device for key, device in self._present.items() if key not in now]
-        self._present = now
-        return arrived, left
-
-
 def usb_report(backend: Any = None) -> list[dict[str, Any]]:
     """For the doctor: one object a known device, with its problems. Raises MissingPart, SensorLost."""
     return [

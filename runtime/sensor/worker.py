@@ -58,7 +58,7 @@ class SensorWorker:
         self._attempt: _Attempt | None = None
         self._hung: list[_Attempt] = []
         self._state, self.reason = SensorState.STOPPED, ""
-        self._passed_over = self._overtaken = self._missed = 0
+        self._passed_over = self._overtaken = 0
         self._refused: Counter[str] = Counter()
         self._driver: SensorDriver | None = None
         self._serial = ""
@@ -105,11 +105,6 @@ class SensorWorker:
     def stale_inputs(self) -> int:
         """Samples that a newer one overtook and that `take` never handed out."""
         return self._passed_over + self._overtaken + (self._driver.overtaken if self._driver else 0)
-
-    @property
-    def missed_inputs(self) -> int:
-        """Samples that the device counted and that never arrived."""
-        return self._missed + (self._driver.missed if self._driver else 0)
 
     @property
     def refused_inputs(self) -> Mapping[str, int]:
@@ -174,7 +169,6 @@ class SensorWorker:
         with self._lock:
             if driver is not None and driver is self._driver:
                 self._overtaken += driver.overtaken
-                self._missed += driver.missed
                 self._refused.update(driver.refused)
                 self._driver = None
 

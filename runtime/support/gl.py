@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import moderngl
 
 from runtime.errors import MissingPart
+from runtime.records import U8
 
 DEBIAN_PACKAGES = "libegl1 libgl1-mesa-dri libgles2 libgl1"
 MINIMUM_VERSION = 330
@@ -45,6 +47,27 @@ def finish() -> None:
     hold every other thread up for tens of milliseconds.
     """
     _gl_finish()()
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnPicture:
+    """An RGBA picture of 8 bits that is left where it was drawn; row 0 is the top."""
+
+    texture: moderngl.Texture
+    target: moderngl.Framebuffer  # that the texture is in
+    held: U8  # (h, w, 4) of whoever drew it, for those who want the pixels
+    grey: bool = False  # whether it is known to be without colour
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(h, w, 4)."""
+        return self.held.shape
+
+    def pixels(self) -> U8:
+        """Read back, on the thread of its context: what was drawn, until the next is drawn."""
+        finish()
+        self.target.read_into(self.held, components=4)
+        return self.held
 
 
 def describe(context: moderngl.Context) -> dict[str, str]:

@@ -184,6 +184,8 @@ def test_a_full_disk_ends_the_file_and_not_the_run(tmp_path: Path, caplog: Any) 
         rig.refresh_until(lambda: recorder.describe()["recording"] is None)
         rig.refreshes(5)
         recorder.close()
+    assert any("cannot be written" in record.getMessage() for record in caplog.records)
+    assert [left.name for left in tmp_path.iterdir() if left.name.startswith(".")] == []
 
 
 def test_an_eye_sees_the_display_the_right_way_round() -> None:

@@ -181,6 +181,75 @@ def test_after_three_pairs_a_person_is_told_where_to_go(tmp_path: Path) -> None:
     assert said[-1].startswith("here")
 
 
+def guided(tmp_path: Path, said: list[str], **options) -> Walk:
+    """A walk whose first three pairs tell where the camera stands; the fourth viewpoint is shown."""
+    chosen = [grid()[number] for number in (0, 2, 6, 13, 20)]
+    person = Walk(PairsFile(tmp_path / "p.csv"), chosen, again=False, window_s=0.5, max_spread_m=0.01,
+                  say=said.append, **options)  # fmt: skip
+    for number, viewpoint in enumerate(chosen[:3]):
+        stand(person, viewpoint.midpoint_m, start_ns=number * NS_PER_S)
+        person.press(Key.ACCEPT)
+    return person
+
+
+def stand_long(at: Walk, place: np.ndarray, *, start_s: float, drift_m: float = 0.0, noise_m: float = 0.002) -> None:
+    """Two seconds at a place, from which the eyes wander by so much to the right."""
+    random = np.random.default_rng(0)
+    for number in range(60):
+        moved = np.array([0.0, drift_m * number / 60, 0.0])
+        at.see(round(start_s * NS_PER_S) + number * STEP_NS, eyes_at(place + moved, noise_m=noise_m, random=random),
+               serial="A1")  # fmt: skip
+
+
+def test_who_holds_still_at_the_viewpoint_is_taken_without_a_key(tmp_path: Path) -> None:
+    said: list[str] = []
+    person = guided(tmp_path, said)
+    stand_long(person, grid()[13].midpoint_m, start_s=10)
+    assert any(text.startswith(f"{grid()[13].name}: held still, taken") for text in said)
+    pairs = read_pairs(tmp_path / "p.csv")
+    assert len(pairs) == 4
+    np.testing.assert_allclose(pairs.sensor_m[3], eyes_at(grid()[13].midpoint_m).eyes_m.mean(0), atol=0.002)
+    assert person.current.name == grid()[20].name
+
+
+@pytest.mark.parametrize("away", [{"drift_m": 0.05}, {"noise_m": 0.02}])
+def test_who_moves_or_scatters_is_not_taken(tmp_path: Path, away) -> None:
+    person = guided(tmp_path, [])
+    stand_long(person, grid()[13].midpoint_m, start_s=10, **away)
+    assert len(read_pairs(tmp_path / "p.csv")) == 3
+
+
+def test_who_holds_still_elsewhere_is_not_taken(tmp_path: Path) -> None:
+    person = guided(tmp_path, [])
+    stand_long(person, grid()[13].midpoint_m + np.array([0.0, 0.1, 0.0]), start_s=10)
+    assert len(read_pairs(tmp_path / "p.csv")) == 3
+
+
+def test_before_three_pairs_only_a_key_takes(tmp_path: Path) -> None:
+    person = walk(tmp_path / "p.csv", [])
+    stand_long(person, grid()[0].midpoint_m, start_s=0)
+    assert not (tmp_path / "p.csv").exists()
+
+
+def test_what_was_undone_is_not_taken_again_before_the_person_has_moved(tmp_path: Path) -> None:
+    said: list[str] = []
+    person = guided(tmp_path, said)
+    place = grid()[13].midpoint_m
+    stand_long(person, place, start_s=10)
+    person.press(Key.UNDO)
+    assert person.current.name == grid()[13].name
+    stand_long(person, place, start_s=20)
+    assert len(read_pairs(tmp_path / "p.csv")) == 3
+    stand_long(person, place + np.array([0.0, 0.03, 0.0]), start_s=30)
+    assert len(read_pairs(tmp_path / "p.csv")) == 4
+
+
+def test_taking_by_itself_can_be_switched_off(tmp_path: Path) -> None:
+    person = guided(tmp_path, [], hold_s=0.0)
+    stand_long(person, grid()[13].midpoint_m, start_s=10)
+    assert len(read_pairs(tmp_path / "p.csv")) == 3
+
+
 def test_next_and_previous_do_not_run_off_the_ends(tmp_path: Path) -> None:
     said: list[str] = []
     person = walk(tmp_path / "pairs.csv", said)
@@ -266,7 +335,7 @@ def test_a_person_at_the_terminal_takes_pairs_from_a_sensor(tmp_path: Path) -> N
     with contextlib.suppress(BrokenPipeError):
         running.stdin.close()
     running.stdout.close()
-    assert running.wait(timeout=10) == 0
+    assert running.wait(timeout=60) == 0
     assert told["accepted"] == 1
     pairs = read_pairs(out)
     np.testing.assert_allclose(pairs.sensor_m, [eyes_at(viewpoint.midpoint_m).eyes_m.mean(0)], atol=1e-6)

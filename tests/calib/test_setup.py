@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +21,14 @@ from calib.registration import through
 from calib.setup_run import progress_path, read_progress, walk_through
 from calib.setup_steps import STEPS, Setup, geometry, identify
 from calib.setup_world import SimulatedWorld
-from calib.viewpoints import eyes_at, grid, viewing_place_m
+from calib.viewpoints import IPD_M, eyes_at, grid, viewing_place_m
 from runtime.config import Settings, load_settings
 from runtime.errors import InputError
 from runtime.eyes.calibration import load_calibration
 from runtime.eyes.demo_geometry import demo_stack_from_sensor
 from runtime.optics.carried import CarriedView
 from runtime.optics.quality import psnr_db
+from runtime.panels import lut
 from runtime.support.artifacts import read_image
 
 STACK = Settings().stack.stack()
@@ -56,8 +59,10 @@ def every_key(seed: int) -> str:
         "\n" + answers_of(world),
         "\n" + DOWN + RIGHT + LEFT + "\n",
         "\n",
+        "\n" + "\n" * len(STACK.x_m),
         "\n\n",
-        "\n" + "\n" * len(grid()),
+        "\n" + "\n\n\nu" + "\n" * (len(grid()) - 2),
+        "p" + "n" + "\n",
     ]
     return "".join(steps)
 
@@ -124,13 +129,30 @@ class TrueStackView(CarriedView):
             yield places[:, 0].reshape(u.shape), places[:, 1].reshape(v.shape)
 
 
-def carried_db(light: Path, settings: Settings, panels, *, registered: bool) -> float:
-    """Displayed dB (design 5.5) of what a run left of a refresh's light, on panels that stand where they do."""
+def sent_through(layers: np.ndarray, settings: Settings, world: SimulatedWorld, *, curves: bool) -> np.ndarray:
+    """(N, h, w, 3) codes of the phases that the simulated panels turn to for layers, by their configured curves."""
+    found = np.empty_like(layers)
+    for index, panel in enumerate(settings.output.panels):
+        greys = np.rint(255 * (lut.measured_curve(Path(panel.lut)) if curves else lut.identity()))[:, 0] / 255
+        found[index] = np.rint(255 * world.phase_of(index, greys)).astype(np.uint8)[layers[index]]
+    return found
+
+
+def carried_db(
+    light: Path, settings: Settings, panels, *, registered: bool, world: SimulatedWorld | None = None,
+    curves: bool = True,
+) -> float:  # fmt: skip
+    """Displayed dB (design 5.5) of what a run left of a refresh's light, on panels that stand where they do.
+
+    world: whose panels turn to what their monitors make of a grey; none: they follow exactly.
+    """
     told = json.loads((light / "light.json").read_text())
-    stack = settings.stack.stack()
+    stack = replace(settings.stack.stack(), tilt=None)
     layers = np.stack([read_image(light / f"layer-{index}.png") for index in range(stack.count)])
     if registered:
         layers = corrected(layers, [np.array(panel.homography) for panel in settings.output.panels])
+    if world is not None:
+        layers = sent_through(layers, settings, world, curves=curves)
     errors = []
     for side, name in enumerate(("left", "right")):
         drawn = read_image(light / f"drawn-{name}.png")
@@ -158,8 +180,21 @@ def test_a_run_of_it_shows_the_eyes_within_a_decibel_of_a_perfect_stack(set_up, 
     ideal = tuple(ideal_panel(settings.stack.stack(), index) for index in range(3))
     perfect = carried_db(light, settings, ideal, registered=False)
     assert perfect > 28.0
-    assert perfect - carried_db(light, settings, world.true_panels(), registered=True) < 1.0
-    assert perfect - carried_db(light, settings, world.true_panels(), registered=False) > 5.0
+    true = world.true_panels()
+    assert perfect - carried_db(light, settings, true, registered=True, world=world) < 1.0
+    assert perfect - carried_db(light, settings, true, registered=False, world=world) > 5.0
+    assert perfect - carried_db(light, settings, true, registered=True, world=world, curves=False) > 5.0
+
+
+@pytest.mark.slow
+def test_what_the_service_reads_is_gathered_and_stands_by_itself(set_up, tmp_path) -> None:
+    folder, _, _ = set_up
+    there = shutil.copytree(folder / "out" / "service", tmp_path / "etc")
+    settings = load_settings(there / "phasestack.toml")
+    assert Path(settings.calibration.file) == there / "calibration.toml"
+    assert [Path(panel.lut) for panel in settings.output.panels] == [there / f"panel-{n}.csv" for n in range(3)]
+    load_calibration(Path(settings.calibration.file))
+    assert str(folder) not in (there / "phasestack.toml").read_text()
 
 
 class Scripted:
@@ -184,7 +219,7 @@ def test_a_step_that_is_done_is_where_it_goes_on_after(tmp_path) -> None:
     second.setup.done.update(done)
     walk_through(second.setup)
     shown = [text.splitlines()[1][:11] for text in second.said if text.startswith("\nStep")]
-    assert shown == ["Step 1 of 5", "Step 2 of 5", "Step 3 of 5", "Step 2 of 5"]
+    assert shown == ["Step 1 of 7", "Step 2 of 7", "Step 3 of 7", "Step 2 of 7"]
     assert "(done before)" in second.said[1]
 
 
@@ -192,7 +227,7 @@ def test_a_step_that_is_stopped_writes_nothing_and_is_offered_again(tmp_path) ->
     scripted = Scripted(tmp_path, [Key.ACCEPT, Key.ACCEPT, Key.QUIT, Key.QUIT])
     assert not walk_through(scripted.setup)
     assert not (tmp_path / "c.toml").exists()
-    assert any("nothing of this step" in text for text in scripted.said)
+    assert any("what was not finished is not written" in text for text in scripted.said)
     assert len([text for text in scripted.said if text.startswith("\nStep 1")]) == 2
 
 
@@ -206,6 +241,16 @@ def test_sizes_are_set_with_arrows_and_measured_distances_stay(tmp_path) -> None
     assert found.x_m == (-0.0601, 0.0, 0.0593)
     geometry(Scripted(tmp_path, [Key.DOWN, Key.DOWN, Key.LEFT, Key.ACCEPT]).setup)
     assert load_settings(config).stack.x_m == pytest.approx((-0.0587, 0.0, 0.0587))
+
+
+def test_who_knows_the_distance_of_their_eyes_says_so_and_may_take_it_back(tmp_path) -> None:
+    down = [Key.DOWN] * 5
+    geometry(Scripted(tmp_path, [*down, Key.RIGHT, Key.RIGHT, Key.ACCEPT]).setup)
+    assert load_settings(tmp_path / "c.toml").calibration.ipd_m == pytest.approx(IPD_M + 0.0005)
+    geometry(Scripted(tmp_path, [*down, Key.ACCEPT]).setup)
+    assert load_settings(tmp_path / "c.toml").calibration.ipd_m == pytest.approx(IPD_M + 0.0005)
+    geometry(Scripted(tmp_path, [*down, *[Key.LEFT] * 40, Key.ACCEPT]).setup)
+    assert load_settings(tmp_path / "c.toml").calibration.ipd_m == 0.0
 
 
 def test_panels_already_known_keep_their_registration_when_they_are_identified_again(tmp_path) -> None:

@@ -63,7 +63,7 @@ def test_keys_lead_through_cards_words_and_boards_on_the_panels(screen, tmp_path
                 alone = [index == monitor for index in range(3)]
                 assert eventually(lambda alone=alone: lit() == alone, within_s=60)
                 press("\n" + up + "\n")
-            lines = ["Step 2 of 5: Sizes and distances", STEPS[1].what, "(not done yet)"]
+            lines = ["Step 2 of 7: Sizes and distances", STEPS[1].what, "(not done yet)"]
             words = message_layers(STACK, [*lines, "Enter: do it   n: skip   p: back   q: stop"])
             assert eventually(lambda: np.array_equal(screen.panel(1), words[1, ..., :3]), within_s=60)
             assert lit() == [False, True, False]
@@ -81,8 +81,8 @@ def test_keys_lead_through_cards_words_and_boards_on_the_panels(screen, tmp_path
     assert running.returncode == 0
     assert "it did not work:" in output
     assert "photographs can be used, at least 5 are needed" in output
-    assert output.count("Step 3 of 5") == 2
-    assert "not done: geometry, registration, sensor, calibration" in output
+    assert output.count("Step 3 of 7") == 2
+    assert "not done: geometry, registration, grey, sensor, calibration, service" in output
     settings = load_settings(config)
     assert [panel.connector for panel in settings.output.panels] == ["DUMMY0", "DUMMY1", "DUMMY2"]
     assert settings.output.kind == "windows"

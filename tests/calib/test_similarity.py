@@ -56,7 +56,7 @@ def test_the_seeds_scale_lies_between_the_two_optima(seed, sigma_m) -> None:
 
 
 def test_least_squares_is_the_minimum_of_the_seeds_objective() -> None:
-    """Against a general minimiser that knows nothing of SVD (seed 20)."""
+    """Against a general minimiser that knows nothing of SVD (EyeReal supplement, (20))."""
     points = cloud(3)
     sensor = camera(points, rotation=Rotation.from_rotvec([0.4, -1.0, 0.3]), scale=2.0, shift=np.array([0.1, 0, 0]))
     sensor = sensor + np.random.default_rng(0).normal(scale=0.01, size=points.shape)
@@ -106,13 +106,14 @@ def test_mirrored_points_never_give_a_mirrored_rotation() -> None:
         assert np.linalg.det(fit(points * (1 - 2 * axis), points, rule="inverse").rotation) == pytest.approx(1.0)
 
 
-def test_weights_count_like_repetitions() -> None:
+@pytest.mark.parametrize("rule", RULES)
+def test_weights_count_like_repetitions(rule) -> None:
     points, random = cloud(6, 10), np.random.default_rng(0)
     sensor = points + random.normal(scale=0.01, size=points.shape)
     weights = random.integers(0, 4, 10).astype(float)
     repeated = np.repeat(np.arange(10), weights.astype(int))
-    once = fit(sensor[repeated], points[repeated], rule="inverse")
-    np.testing.assert_allclose(fit(sensor, points, rule="inverse", weights=weights).matrix, once.matrix, atol=1e-12)
+    once = fit(sensor[repeated], points[repeated], rule=rule)
+    np.testing.assert_allclose(fit(sensor, points, rule=rule, weights=weights).matrix, once.matrix, atol=1e-12)
 
 
 @pytest.mark.parametrize(

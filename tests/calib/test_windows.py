@@ -67,7 +67,7 @@ def phasestack(screen, tmp_path):
         if process.poll() is None:
             process.kill()
         process.stdin.close()
-        process.wait(timeout=10)
+        process.wait(timeout=60)
 
 
 def press(screen: xserver.XServer, symbol: int) -> None:
@@ -102,7 +102,7 @@ def test_charts_are_shown_one_after_the_other(screen, phasestack) -> None:
     assert shows(screen, 1, charts[2])
     assert not screen.panel(0).any()
     press(screen, Q)
-    assert running.wait(timeout=30) == 0
+    assert running.wait(timeout=60) == 0
 
 
 def test_a_vernier_is_nudged_with_the_keyboard_and_kept(screen, phasestack, tmp_path: Path) -> None:
@@ -113,6 +113,6 @@ def test_a_vernier_is_nudged_with_the_keyboard_and_kept(screen, phasestack, tmp_
     press(screen, RETURN)
     assert eventually(out.exists)
     running.stdin.close()
-    assert running.wait(timeout=30) == 0
+    assert running.wait(timeout=60) == 0
     asked, (taken,) = nominal((0.5, 0.0, 0.0), STACK, reference=1)[0], read_settings(out, STACK)
     assert taken.panel_px == pytest.approx((asked.panel_px[0] + 1.0, asked.panel_px[1]))

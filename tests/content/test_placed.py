@@ -40,6 +40,16 @@ def test_a_scene_that_is_not_placed_is_the_source_itself(context: Any, stack: Pa
     source.close()
 
 
+def test_a_placed_scene_can_be_left_in_a_texture(context: Any, stack: PanelStack) -> None:
+    source = open_content(ContentSettings(scene="sparse", offset_m=(0.0, 0.05, 0.0)), stack, context)
+    view = panel_view(EYE, stack.panel(1))
+    assert isinstance(source, PlacedSource) and source.draws_in is context
+    left = source.draw(view, time_ns=0)
+    assert left is not None
+    assert (left.pixels().copy() == source.render(view, time_ns=0)).all()
+    source.close()
+
+
 def test_an_offset_moves_it_to_where_the_projection_says(context: Any, stack: PanelStack) -> None:
     offset = np.array([0.03, 0.08, -0.05])
     there = middle_of(drawn(context, stack, offset_m=tuple(offset)))

@@ -1,4 +1,4 @@
-"""The 17 scenes of tables S1 and S2, in the seed's reading and in the published code's."""
+"""The 17 scenes of tables S1 and S2, in the EyeReal supplement's reading and in the published code's."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ class Rig:
         """What solves at present."""
         return self.presenter.run_cell.state.predictor
 
-    def refresh_until(self, wanted: str | Callable[[], Any], *, within_s: float = 30.0) -> RefreshAccount:
+    def refresh_until(self, wanted: str | Callable[[], Any], *, within_s: float = 90.0) -> RefreshAccount:
         """Refreshes until the state is called this, or until it holds. Raises AssertionError where it never does."""
         deadline = time.monotonic() + within_s
         machine = self.presenter.machine

@@ -93,7 +93,7 @@ def test_every_command_arrives(server, arguments, name, value):
     taken = []
 
     def loop():
-        taken.append(server.commands.get(timeout=5))
+        taken.append(server.commands.get(timeout=60))
         taken[0].done()
 
     thread = threading.Thread(target=loop)

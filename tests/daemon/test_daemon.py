@@ -26,6 +26,8 @@ name = "fast"
 threads = 1
 [loop]
 rate_hz = 60.0
+solver_late_s = 60.0  # a busy machine is no fault
+solver_abandon_s = 600.0
 [service]
 socket = "{folder}/status.sock"
 log_format = "json"
@@ -56,7 +58,7 @@ class Daemon:
             [*PHASESTACK, *arguments], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
 
-    def hears(self, message: str, *, within_s: float = 30.0) -> bool:
+    def hears(self, message: str, *, within_s: float = 90.0) -> bool:
         deadline = time.monotonic() + within_s
         while time.monotonic() < deadline:
             self.heard += self.supervisor.heard()
@@ -71,7 +73,7 @@ class Daemon:
         return ask([self.socket], {"command": "status"})
 
     def ends(self) -> tuple[int, str]:
-        _, errors = self.process.communicate(timeout=30)
+        _, errors = self.process.communicate(timeout=90)
         self.heard += self.supervisor.heard()
         return self.process.returncode, errors
 
@@ -79,7 +81,7 @@ class Daemon:
         if self.process.poll() is None:
             self.process.kill()
         if not self.process.stderr.closed:
-            self.process.communicate(timeout=30)
+            self.process.communicate(timeout=90)
         self.supervisor.close()
 
 

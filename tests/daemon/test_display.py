@@ -27,6 +27,8 @@ name = "fast"
 threads = 1
 [loop]
 rate_hz = 30.0
+solver_late_s = 60.0  # a busy machine is no fault
+solver_abandon_s = 600.0
 [service]
 socket = "{{folder}}/status.sock"
 [output]
@@ -86,11 +88,11 @@ def test_a_monitor_goes_and_returns_and_the_watchdog_stays_fed(daemon, x):
     assert eventually(lambda: state(daemon) == "degraded: panel")
     assert "DUMMY1" in daemon.status()["reason"]
     daemon.heard.clear()
-    assert daemon.hears("WATCHDOG=1", within_s=5.0)  # by completed turns: nothing can be presented
+    assert daemon.hears("WATCHDOG=1")  # by completed turns: nothing can be presented
     dropped = daemon.status()["dropped"]
     assert eventually(lambda: daemon.status()["dropped"] > dropped)
     x[0].plug(1)
-    assert eventually(lambda: state(daemon) in ("tracking", "holding", "flat"), within_s=15.0)
+    assert eventually(lambda: state(daemon) in ("tracking", "holding", "flat"))
     assert eventually(lambda: shows_something_on(x))
 
 

@@ -63,14 +63,14 @@ def test_a_command_that_was_refused_as_too_late_is_never_done(server, path, monk
     answer = ask([path], {"command": "pause"})
     assert not answer["ok"]
     assert "nothing was done" in answer["error"]
-    assert not server.commands.get(timeout=5).take()
+    assert not server.commands.get(timeout=60).take()
 
 
 def test_a_command_that_was_taken_in_time_is_waited_for_and_not_given_up(server, path, monkeypatch):
     monkeypatch.setattr(server_module, "LOOP_ANSWERS_WITHIN_S", 0.05)
 
     def loop():
-        command = server.commands.get(timeout=5)
+        command = server.commands.get(timeout=60)
         assert command.take()
         time.sleep(0.3)
         command.done()
@@ -130,9 +130,9 @@ def test_while_it_starts_the_status_says_what_it_waits_for(server, path):
 def test_when_the_daemon_stops_who_waits_is_told_and_nothing_is_done_later(server, path):
     with ThreadPoolExecutor(1) as pool:
         asked = pool.submit(ask, [path], {"command": "pause"})
-        command = server.commands.get(timeout=5)
+        command = server.commands.get(timeout=60)
         server.close()
-        assert "stops: nothing was done" in asked.result(timeout=20)["error"]
+        assert "stops: nothing was done" in asked.result(timeout=60)["error"]
     assert not command.take()
 
 
@@ -204,10 +204,10 @@ def test_tricklers_lock_out_nobody(server, path):
         assert all(ask([path], STATUS)["ok"] for _ in range(20))
         with ThreadPoolExecutor(1) as pool:
             asked = pool.submit(ask, [path], {"command": "reload"})
-            command = server.commands.get(timeout=10)
+            command = server.commands.get(timeout=60)
             command.take()
             command.done()
-            assert asked.result(timeout=20) == {"ok": True}
+            assert asked.result(timeout=60) == {"ok": True}
         assert server._server.connections <= server_module.CLIENTS_MAX
     finally:
         stop.set()
@@ -436,7 +436,7 @@ def sent_scene(server, name: str):
     taken = []
 
     def loop():
-        taken.append(server.commands.get(timeout=10))
+        taken.append(server.commands.get(timeout=60))
         taken[0].done()
 
     thread = threading.Thread(target=loop)

@@ -154,7 +154,9 @@ def packages(lock: str) -> dict[str, tuple[str, list[str]]]:
     return found
 
 
-@pytest.mark.parametrize(("lock", "least"), [("runtime.lock", 40), ("page.lock", 6), ("test.lock", 40)])
+@pytest.mark.parametrize(
+    ("lock", "least"), [("runtime.lock", 40), ("page.lock", 6), ("test.lock", 40), ("mutation.lock", 15)]
+)
 def test_every_pin_has_the_hashes_of_its_files(lock, least):
     found = packages(lock)
     assert len(found) > least
@@ -167,6 +169,8 @@ def test_every_pin_has_the_hashes_of_its_files(lock, least):
 def test_all_locks_mean_the_same_files():
     runtime, test = packages("runtime.lock") | packages("page.lock"), packages("test.lock")
     assert {name: test.get(name) for name in runtime} == runtime
+    mutation = packages("mutation.lock")
+    assert {name: test[name] for name in mutation if name in test} == {n: mutation[n] for n in mutation if n in test}
 
 
 def test_torch_alone_is_left_out_and_the_lock_says_why():

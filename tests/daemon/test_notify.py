@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import socket
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 
 import pytest
 
-from runtime.clock import NS_PER_MS, SimulatedClock
+from runtime.clock import NS_PER_MS, Clock, SimulatedClock
 from runtime.daemon.notify import Notifier
 from runtime.records import State
 
@@ -31,7 +33,7 @@ class Supervisor:
 
 
 @pytest.fixture(params=["path", "abstract"])
-def supervisor(request, tmp_path, monkeypatch):
+def supervisor(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Supervisor]:
     name = f"{tmp_path}/notify"
     made = Supervisor(name if request.param == "path" else "\0" + name)
     monkeypatch.setenv("NOTIFY_SOCKET", name if request.param == "path" else "@" + name)
@@ -39,54 +41,77 @@ def supervisor(request, tmp_path, monkeypatch):
     made.close()
 
 
-def watched(clock, period_ms=1000):
-    return Notifier(clock, {"WATCHDOG_USEC": str(period_ms * 1000), "WATCHDOG_PID": str(os.getpid())})
+@pytest.fixture
+def notifier_of() -> Iterator[Callable[..., Notifier]]:
+    """Makes notifiers and releases their sockets."""
+    made: list[Notifier] = []
+
+    def make(clock: Clock | None = None, environment: Mapping[str, str] | None = None) -> Notifier:
+        made.append(Notifier(clock or SimulatedClock(), environment or {}))
+        return made[-1]
+
+    yield make
+    for notifier in made:
+        notifier.close()
 
 
-def test_ready_is_said_once(supervisor):
-    notifier = Notifier(SimulatedClock(), {})
+WATCHED = {"WATCHDOG_USEC": "1000000", "WATCHDOG_PID": str(os.getpid())}
+
+
+def test_ready_is_said_once(supervisor: Supervisor, notifier_of: Callable[..., Notifier]) -> None:
+    notifier = notifier_of()
     assert notifier.supervised
     notifier.ready()
     notifier.ready()
     assert supervisor.heard() == ["READY=1"]
 
 
-def test_a_status_is_said_when_it_changes_and_on_one_line(supervisor):
-    notifier = Notifier(SimulatedClock(), {})
+def test_a_status_is_said_when_it_changes_and_on_one_line(
+    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
+) -> None:
+    notifier = notifier_of()
     for text in ("tracking", "tracking", "degraded:\n sensor"):
         notifier.status(text)
     assert supervisor.heard() == ["STATUS=tracking", "STATUS=degraded: sensor"]
 
 
-def test_the_start_can_be_extended_until_it_is_over(supervisor):
-    notifier = Notifier(SimulatedClock(), {})
+def test_the_start_can_be_extended_until_it_is_over(
+    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
+) -> None:
+    notifier = notifier_of()
     notifier.extend_start(2.5)
     notifier.ready()
     notifier.extend_start(2.5)
     assert supervisor.heard() == ["EXTEND_TIMEOUT_USEC=2500000", "READY=1"]
 
 
-def test_presented_frames_feed_the_watchdog_four_times_a_period_at_most(supervisor):
+def test_presented_frames_feed_the_watchdog_four_times_a_period_at_most(
+    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
+) -> None:
     clock = SimulatedClock()
-    notifier = watched(clock)
+    notifier = notifier_of(clock, WATCHED)
     for _ in range(100):  # a second of 100 frames/s
         notifier.refreshed(State.TRACKING, (), presented=True)
         clock.advance_ns(10 * NS_PER_MS)
     assert supervisor.heard() == ["WATCHDOG=1"] * 4
 
 
-def test_refreshes_that_present_nothing_starve_the_watchdog(supervisor):
+def test_refreshes_that_present_nothing_starve_the_watchdog(
+    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
+) -> None:
     clock = SimulatedClock()
-    notifier = watched(clock)
+    notifier = notifier_of(clock, WATCHED)
     for state, missing in ((State.TRACKING, ()), (State.DEGRADED, ("sensor",)), (State.STARTING, ("panel",))):
         clock.advance_ns(2000 * NS_PER_MS)
         notifier.refreshed(state, missing, presented=False)
     assert supervisor.heard() == []
 
 
-def test_while_a_panel_is_missing_completed_refreshes_feed_it(supervisor):
+def test_while_a_panel_is_missing_completed_refreshes_feed_it(
+    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
+) -> None:
     clock = SimulatedClock()
-    notifier = watched(clock)
+    notifier = notifier_of(clock, WATCHED)
     notifier.refreshed(State.DEGRADED, ("sensor", "panel"), presented=False)
     assert supervisor.heard() == ["WATCHDOG=1"]
 
@@ -94,13 +119,15 @@ def test_while_a_panel_is_missing_completed_refreshes_feed_it(supervisor):
 @pytest.mark.parametrize(
     "environment", [{}, {"WATCHDOG_USEC": "x"}, {"WATCHDOG_USEC": "0"}, {"WATCHDOG_USEC": "9", "WATCHDOG_PID": "1"}]
 )
-def test_a_watchdog_that_is_not_ours_is_not_fed(supervisor, environment):
-    Notifier(SimulatedClock(), environment).refreshed(State.TRACKING, (), presented=True)
+def test_a_watchdog_that_is_not_ours_is_not_fed(
+    supervisor: Supervisor, notifier_of: Callable[..., Notifier], environment: dict[str, str]
+) -> None:
+    notifier_of(environment=environment).refreshed(State.TRACKING, (), presented=True)
     assert supervisor.heard() == []
 
 
-def test_reloading_and_stopping_are_announced(supervisor):
-    notifier = Notifier(SimulatedClock(5_000_000), {})
+def test_reloading_and_stopping_are_announced(supervisor: Supervisor, notifier_of: Callable[..., Notifier]) -> None:
+    notifier = notifier_of(SimulatedClock(5_000_000))
     notifier.ready()
     notifier.reloading()
     notifier.reloaded()
@@ -110,26 +137,37 @@ def test_reloading_and_stopping_are_announced(supervisor):
     ]  # fmt: skip
 
 
-def test_a_reload_before_the_first_frame_does_not_make_it_ready(supervisor):
-    notifier = Notifier(SimulatedClock(), {})
+def test_a_reload_before_the_first_frame_does_not_make_it_ready(
+    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
+) -> None:
+    notifier = notifier_of()
     notifier.reloading()
     notifier.reloaded()
     assert supervisor.heard() == []
 
 
-def test_a_supervisor_that_does_not_listen_blocks_nobody(supervisor):
+def test_a_supervisor_that_does_not_listen_blocks_nobody(
+    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
+) -> None:
     clock = SimulatedClock()
-    notifier = watched(clock)
+    notifier = notifier_of(clock, WATCHED)
     for _ in range(5000):  # far more than a datagram socket holds
         clock.advance_ns(1000 * NS_PER_MS)
         notifier.refreshed(State.TRACKING, (), presented=True)
+    heard = supervisor.heard()
+    assert 0 < len(heard) < 5000  # what did not fit was left out, and nobody waited
+    assert set(heard) == {"WATCHDOG=1"}
     notifier.close()
     notifier.close()
+    heard = supervisor.heard()
+    assert 0 < len(heard) < 5000 and set(heard) == {"WATCHDOG=1"}  # those that found room; the rest was let go
 
 
-def test_without_a_supervisor_everything_is_silent(monkeypatch):
+def test_without_a_supervisor_everything_is_silent(
+    monkeypatch: pytest.MonkeyPatch, notifier_of: Callable[..., Notifier]
+) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    notifier = Notifier(SimulatedClock(), {})
+    notifier = notifier_of()
     assert not notifier.supervised
     notifier.ready()
     notifier.stopping("end")

@@ -73,7 +73,7 @@ def test_many_questions_on_one_connection(server, path):
 
 def answered_by_loop(server, respond):
     def loop():
-        respond(server.commands.get(timeout=5))
+        respond(server.commands.get(timeout=60))
 
     thread = threading.Thread(target=loop)
     thread.start()

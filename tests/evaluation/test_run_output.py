@@ -152,13 +152,14 @@ class FullDisk:
 
 
 def test_a_full_disk_abandons_the_files_once_and_the_run_goes_on(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    disk = FullDisk()
+    disk, opened = FullDisk(), Path.open
+    monkeypatch.setattr(
+        Path, "open", lambda path, *a, **k: disk if path.name == "frames.jsonl" else opened(path, *a, **k)
+    )
     layers, drawn = pictures()
     with RunOutput(tmp_path) as output:
-        output._lines.close()
-        output._lines = disk
         for frame in range(200):
             output.refresh(line(frame))
         output.light(0, layers=layers, drawn=drawn, info={})
@@ -196,12 +197,15 @@ def test_a_mistake_in_the_sheet_does_not_end_the_run(tmp_path: Path, monkeypatch
     assert list(tmp_path.iterdir()) == []
 
 
-def test_where_not_every_line_must_be_kept_a_slow_disk_makes_nobody_wait(tmp_path: Path) -> None:
+def test_where_not_every_line_must_be_kept_a_slow_disk_makes_nobody_wait(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import threading
 
-    go_on = threading.Event()
+    go_on, layers = threading.Event(), pictures()[0]
+    monkeypatch.setattr(run_output, "write_png", lambda *_: go_on.wait(60.0))
     with RunOutput(tmp_path, every_one=False) as output:
-        output._later(lambda: go_on.wait() and None)
+        output.light(0, layers=layers, drawn=None, info={})
         for frame in range(run_output.WAITING + 50):
             output.refresh(line(frame))
         assert output.left_out >= 49

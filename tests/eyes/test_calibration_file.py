@@ -60,6 +60,45 @@ def test_eyes_keep_their_confidence_and_their_separation() -> None:
     assert moved.eyes_m[0][1] < moved.eyes_m[1][1], "the left eye is on the viewer's left"
 
 
+def test_a_file_tells_all_that_it_holds(tmp_path: Path) -> None:
+    file = tmp_path / "c.toml"
+    spread = (np.diag([1.0, 2, 3, 4, 5, 6, 7]) * 1e-6).tolist()
+    file.write_text(
+        toml(np.eye(4))
+        + """method = "robust"
+date = 2026-11-21
+sensor_driver = "openni2"
+sensor_serial = "A1"
+panel_ids = ["rear", "front"]
+pairs = 27
+condition = 3.5
+[residuals]
+rms_m = 0.001
+max_m = 0.004
+axis_rms_m = [0.0005, 0.0006, 0.0007]
+[covariance]
+pivot_m = [0.5, 0.1, 0.2]
+"""
+        + f"matrix = {spread}\n"
+    )
+    told = load_calibration(file)
+    assert (told.method, told.date, told.sensor_driver, told.sensor_serial) == ("robust", "2026-11-21", "openni2", "A1")
+    assert (told.panel_ids, told.pairs, told.condition, told.source) == (("rear", "front"), 27, 3.5, str(file))
+    assert told.residuals is not None and told.pivot_m is not None
+    assert (told.residuals.rms_m, told.residuals.max_m, told.residuals.leave_one_out_rms_m) == (0.001, 0.004, None)
+    assert told.residuals.axis_rms_m.tolist() == [0.0005, 0.0006, 0.0007]
+    assert told.pivot_m.tolist() == [0.5, 0.1, 0.2]
+    np.testing.assert_array_equal(told.covariance, spread)
+
+
+def test_points_in_single_precision_or_whole_metres_are_taken_as_doubles() -> None:
+    calibration = load_calibration(None)
+    for points in (np.array([[0.1, 0.2, 0.7]], np.float32), np.array([[0, 0, 1]])):
+        mapped = calibration.points(points)
+        assert mapped.dtype == np.float64
+        assert np.array_equal(mapped, calibration.points(points.astype(np.float64)))
+
+
 def test_the_published_prototype_matrix_is_a_similarity_to_its_printed_digits(tmp_path: Path) -> None:
     file = tmp_path / "published.toml"
     file.write_text(PUBLISHED)

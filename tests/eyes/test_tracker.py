@@ -244,3 +244,23 @@ def test_five_percent_outliers_hardly_move_it():
 def test_only_one_model_is_a_plain_kalman_filter_and_works():
     tracker, last = fed(count=60, motion=moving, settings=TrackerSettings(acceleration=(0.1,)))
     np.testing.assert_allclose(tracker.at(last).eyes_m, moving(59), atol=1e-3)
+
+
+def test_every_refused_sample_is_counted():
+    tracker, last = fed(motion=moving)
+    for k in range(1, 4):
+        tracker.update(points(STILL * 1.4), capture_ns=last + k * PERIOD)  # eyes 87 mm apart are no person's
+    assert tracker.outliers == 3
+
+
+@pytest.mark.parametrize("since_ms", [40, 60, 90, 119])
+def test_lost_eyes_go_on_until_the_loss_and_then_come_to_rest_with_the_time_constant(since_ms):
+    settings = TrackerSettings()
+    tracker, last = fed(60, moving)
+    speed = (tracker.at(last + 10 * MS).eyes_m - tracker.at(last).eyes_m) / 0.010
+    tracker.update(None, capture_ns=last + PERIOD)
+    held = tracker.at(last + since_ms * MS)
+    known, rest = PERIOD / 1e9, settings.decay_s
+    gone = known + rest * (1 - np.exp(-(since_ms / 1e3 - known) / rest))
+    assert held.label == "held"
+    np.testing.assert_allclose(held.eyes_m - tracker.at(last).eyes_m, speed * gone, atol=1e-9)

@@ -138,13 +138,13 @@ class FakeParts:
     """`SolverParts` whose steps are a test's own function."""
 
     def __init__(self, step: Callable[[SolveRequest], Step], stage_ms: dict[str, float] | None = None) -> None:
-        self._step, self.stage_ms = step, stage_ms or {}
+        self.behave, self.stage_ms = step, stage_ms or {}
         self.asked: list[SolveRequest] = []
         self.closed: list[bool] = []  # with `abandoned`, each time
 
     def step(self, request: SolveRequest) -> Step:
         self.asked.append(request)
-        return self._step(request)
+        return self.behave(request)
 
     def simulated_stage_ms(self) -> dict[str, float]:
         return self.stage_ms

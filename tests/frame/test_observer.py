@@ -20,6 +20,7 @@ from runtime.optics.alignment import align, shown_layers
 from runtime.optics.carried import carried_quality
 from runtime.plan.drawing import drawn_for, retina_pictures
 from runtime.records import PanelFrame, RefreshAccount, SensorFrame, Solution, State
+from runtime.support.background import wait_for_all
 from tests.frame.conftest import SMALL
 from tests.frame.fakes import EYES, FakeSolver, aside
 
@@ -87,9 +88,11 @@ def sample(time_ns: int, *, y_m: float | None = 0.0) -> SensorFrame:
     return SensorFrame(1, time_ns, true_eyes_m=None if y_m is None else aside(y_m))
 
 
-def looking(content: Any, *, at_once: bool = True, simulated: bool = True, **how: Any) -> tuple[RunObserver, Kept]:
+def looking(
+    content: Any, *, solver: Drawing | None = None, simulated: bool = True, **how: Any
+) -> tuple[RunObserver, Kept]:
     kept = Kept()
-    solver = Drawing(content, at_once=at_once)
+    solver = solver or Drawing(content)
     return RunObserver(SMALL, solver, fov_deg=FOV_DEG, output=kept, simulated=simulated, **how), kept
 
 
@@ -237,15 +240,13 @@ def test_a_short_run_measures_its_last_refresh(content, solved):
 
 
 def test_in_real_time_one_measurement_is_under_way_at_a_time_and_no_refresh_waits_for_it(content, solved):
-    observer, _ = looking(content, at_once=False, simulated=False, measure=True, evaluate_every=1)
+    solver = Drawing(content, at_once=False)
+    observer, _ = looking(content, solver=solver, simulated=False, measure=True, evaluate_every=1)
     for number in range(10):
         observer.refreshed(refresh(number, solved))
-    tasks = observer._solver.tasks
-    assert len(tasks) == 1  # the solver's thread draws when it comes to it
-    assert tasks[0](observer._solver) is True
-    job = observer._job
-    assert job is not None
-    job._thread.join(20.0)
+    assert len(solver.tasks) == 1  # the solver's thread draws when it comes to it
+    assert solver.tasks[0](solver) is True
+    assert wait_for_all(20.0) == 0
     observer.refreshed(refresh(10, solved))
     assert observer.means.summary()["quality_frames"] == 1
 
@@ -260,7 +261,7 @@ def test_comparing_is_not_the_presenter_s_nor_the_solver_s_work(content, solved,
     )
     observer, _ = looking(content, simulated=False, measure=True, evaluate_every=1)
     observer.refreshed(refresh(0, solved))
-    observer._job._thread.join(20.0)
+    assert wait_for_all(20.0) == 0
     assert threads == ["quality"]
 
 

@@ -135,11 +135,11 @@ def test_what_failed_is_told_and_the_last_solution_stays(parts, host, clock):
     host.post(wish(1))
     clock.advance_ns(SUM_NS)
     good = host.news().solution
-    parts._step = lambda request: Step(missing={"model": "out of memory"})
+    parts.behave = lambda request: Step(missing={"model": "out of memory"})
     host.post(wish(2))
     assert host.news().missing == {"model": "out of memory"}
     assert host.news().solution is good
-    parts._step = Solving()
+    parts.behave = Solving()
     host.post(wish(3))
     clock.advance_ns(SUM_NS)
     assert host.news().missing == {}

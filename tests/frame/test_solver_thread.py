@@ -15,6 +15,7 @@ from runtime.frame.solver import Step
 from runtime.frame.solver_thread import ABANDONED_MAX, SolverThread
 from runtime.records import SolveRequest
 from tests.frame.fakes import FakeParts, aside, solution
+from tests.waiting import eventually
 
 LATE_S, ABANDON_S = 0.5, 10.0
 PATIENCE_S = 20.0  # of a test with another thread, on a busy machine
@@ -44,6 +45,7 @@ class Workshop:
         self.all: list[FakeParts] = []
         self.begun: queue.Queue[SolveRequest] = queue.Queue()
         self.gates: list[threading.Event] = []  # of steps that hang
+        self.hung: list[threading.Thread] = []  # that are, or were, in such a step
         self.closed: queue.Queue[str] = queue.Queue()  # names of the threads that closed parts
         self.host = SolverThread(self._make, self.clock, late_s=LATE_S, abandon_s=ABANDON_S, first_cost_ns=7)
 
@@ -65,6 +67,7 @@ class Workshop:
     def hang(self, request: SolveRequest) -> Step:
         """A step that returns when its gate is opened; what it made is number 99."""
         gate = threading.Event()
+        self.hung.append(threading.current_thread())
         self.gates.append(gate)
         assert gate.wait(PATIENCE_S)
         return Step(solution=solution(99))
@@ -95,7 +98,7 @@ class Workshop:
         self.pass_s(ABANDON_S + 0.1)
         self.host.news()
         self.made.get(timeout=PATIENCE_S)
-        assert self.host._attempt.ready.wait(PATIENCE_S)
+        self.settle()  # its first step, the flat picture, is complete
 
     def close(self) -> None:
         self.open.set()
@@ -291,10 +294,9 @@ def test_those_that_returned_after_all_count_no_more(shop):
     for number in range(1, ABANDONED_MAX + 1):
         shop.post(number)
         shop.left()
-    hung = [attempt.thread for attempt in shop.host._hung]
     for gate in shop.gates:
         gate.set()
-    for thread in hung:
+    for thread in shop.hung[:ABANDONED_MAX]:
         thread.join(PATIENCE_S)
     shop.post(ABANDONED_MAX + 1)
     shop.left()
@@ -325,9 +327,7 @@ def test_where_it_can_t_be_made_anew_that_is_told_and_tried_again(shop):
     shop.post(1)
     shop.refuse = RuntimeError("no memory")
     shop.pass_s(ABANDON_S + 0.1)
-    shop.host.news()
-    assert shop.host._attempt.ready.wait(PATIENCE_S)
-    assert "no memory" in shop.host.news().missing["model"]
+    assert eventually(lambda: "no memory" in shop.host.news().missing.get("model", ""), within_s=PATIENCE_S)
     shop.refuse, shop.behave = None, solves
     shop.left()
     shop.solve(2)

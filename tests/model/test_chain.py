@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.model.chain import chain_frame, chain_modes
+from runtime.model.chain import BLOCK_ROWS, ROWS_STEP, chain_frame, chain_modes
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import relative_scale_shift
 from tests.model.scenes import STACK, eyes
@@ -97,3 +99,57 @@ def test_a_far_viewer_of_a_thin_stack_meets_the_limit_of_cells_not_of_memory() -
     thin = PanelStack(0.5184, 0.2916, (-0.0005, 0.0, 0.0005), 1920, 1080)
     frame = chain_frame(eyes(10.0), thin, cell_px=4, reduction=2)
     assert frame.cells <= 1024
+
+
+TILTED, UPRIGHT = eyes(0.55, 0.12, 0.09, roll_deg=15), eyes(0.7, -0.1, 0.05)
+
+
+@pytest.mark.parametrize("pair", [TILTED, UPRIGHT], ids=["tilted", "upright"])
+@pytest.mark.parametrize("x_m", [-0.06, 0.0, 0.06])
+def test_a_pixel_is_met_where_the_eye_s_ray_through_it_crosses_a_panel(pair: np.ndarray, x_m: float) -> None:
+    frame = chain_frame(pair, STACK, cell_px=4, reduction=2)
+    for pixel in ([0.0, 0.0], [100.0, 30.0], [frame.width_px - 1.0, frame.rows / 2]):
+        y_m, z_m, _ = frame.plane_from_raster @ [*pixel, 1.0]
+        for eye_m in (*pair, frame.middle_m):
+            step = np.array([frame.x_m, y_m, z_m]) - eye_m
+            hit = eye_m + step * (x_m - eye_m[0]) / step[0]
+            assert (frame.plane_from_frame(eye_m, x_m=x_m) @ [*pixel, 1.0])[:2] == pytest.approx(hit[1:], abs=1e-12)
+
+
+@pytest.mark.parametrize("pair", [TILTED, UPRIGHT], ids=["tilted", "upright"])
+@pytest.mark.parametrize("x_m", [-0.06, 0.0, 0.06])
+def test_the_way_from_a_panel_back_to_the_raster_is_the_inverse_from_between_the_eyes(
+    pair: np.ndarray, x_m: float
+) -> None:
+    frame = chain_frame(pair, STACK, cell_px=4, reduction=2)
+    there_and_back = frame.frame_from_plane(x_m=x_m) @ frame.plane_from_frame(frame.middle_m, x_m=x_m)
+    np.testing.assert_allclose(there_and_back / there_and_back[2, 2], np.eye(3), atol=1e-9)
+
+
+@pytest.mark.parametrize("reduction", [1, 2, 4])
+@pytest.mark.parametrize("pair", [TILTED, UPRIGHT], ids=["tilted", "upright"])
+def test_rows_are_panel_rows_and_cover_the_centre_panel(pair: np.ndarray, reduction: int) -> None:
+    frame = chain_frame(pair, STACK, cell_px=4, reduction=reduction)
+    from_panel = frame.frame_from_plane(x_m=0.0)
+    half_y, half_z, high = STACK.width_m / 2, STACK.height_m / 2, STACK.height_px / reduction
+    # Straight above each other on the panel, both ends of any column are as many rows apart as it has.
+    for y_m in (-half_y / 3, 0.0, half_y / 3):
+        top, bottom = (from_panel @ [y_m, z_m, 1.0] for z_m in (half_z, -half_z))
+        assert bottom[1] / bottom[2] - top[1] / top[2] == pytest.approx(high)
+        assert top[1] / top[2] >= -1e-6 and bottom[1] / bottom[2] <= frame.rows + 1e-6
+    middle = from_panel @ [0.0, 0.0, 1.0]
+    if pair is UPRIGHT:
+        assert middle[1] / middle[2] == pytest.approx(frame.rows / 2)
+        assert frame.rows % BLOCK_ROWS == 0 and frame.rows - high < BLOCK_ROWS
+    else:
+        assert frame.rows % ROWS_STEP == 0 and frame.rows > high
+
+
+def test_where_the_origin_lies_along_x_changes_nothing() -> None:
+    aside = np.array([0.2, 0.0, 0.0])
+    moved = replace(STACK, x_m=tuple(x_m + 0.2 for x_m in STACK.x_m))
+    here, there = (chain_frame(p, s, cell_px=4, reduction=2) for p, s in ((TILTED, STACK), (TILTED + aside, moved)))
+    assert there.x_m == pytest.approx(here.x_m + 0.2)
+    assert (there.cells, there.rows) == (here.cells, here.rows)
+    np.testing.assert_allclose(there.plane_from_raster, here.plane_from_raster, atol=1e-12)
+    np.testing.assert_allclose(there.doubt(moved, eye_sigma_mm=2.0), here.doubt(STACK, eye_sigma_mm=2.0), rtol=1e-6)

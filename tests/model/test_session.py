@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from runtime.errors import InputError
-from runtime.model import predictor
+from runtime.errors import InputError, MissingPart
+from runtime.model import predictor, session
 from runtime.model.contract import METADATA_KEY
 from runtime.model.onnx_bytes import digest, has_external_data
 from runtime.model.onnx_runtime import onnxruntime
@@ -115,3 +116,39 @@ def test_telemetry_is_off_before_onnxruntime_is_loaded(monkeypatch: pytest.Monke
     monkeypatch.delenv("ORT_DISABLE_TELEMETRY", raising=False)
     onnxruntime()
     assert os.environ["ORT_DISABLE_TELEMETRY"] == "1"
+
+
+def test_nodes_that_another_provider_runs_are_told_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """One that comes with onnxruntime and runs none of ours."""
+    path = model_path("fast")
+    assert path is not None
+    assert ModelSession(path).fell_back == ()
+    monkeypatch.setitem(session.PROVIDERS, "remote", ("AzureExecutionProvider", "onnxruntime"))
+    with caplog.at_level("WARNING"):
+        loaded = ModelSession(path, provider="remote")
+    assert len(loaded.fell_back) > 50
+    assert all(loaded.fell_back)
+    assert f"remote leaves {len(loaded.fell_back)} nodes to another: {loaded.fell_back[0]}, " in caplog.text
+
+
+def test_a_provider_that_is_installed_and_does_not_start_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """onnxruntime would go on without it."""
+    path = model_path("fast")
+    assert path is not None
+
+    class Module:
+        SessionOptions, InferenceSession = onnxruntime().SessionOptions, None
+
+        @staticmethod
+        def get_available_providers() -> list[str]:
+            return ["CUDAExecutionProvider"]
+
+    def on_the_processor(data: bytes, options: Any, providers: list[str]) -> Any:
+        return onnxruntime().InferenceSession(data, options, providers=["CPUExecutionProvider"])
+
+    Module.InferenceSession = staticmethod(on_the_processor)
+    monkeypatch.setattr(session, "onnxruntime", lambda: Module)
+    with pytest.raises(MissingPart, match=r"model\.provider: cuda is installed and does not start here"):
+        ModelSession(path, provider="cuda")

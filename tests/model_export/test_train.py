@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -132,13 +133,13 @@ def test_what_is_learned_gets_gradients_and_steps_down_the_loss() -> None:
         assert pair_loss(model, pair, recipe) < loss
 
 
-@pytest.fixture
-def tiny(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recipe that trains in seconds."""
     table = json.loads(read_recipe("fast").text())
     table.pop("weights", None)
     table["training"] |= SMALL | {"iterations": 4, "validate_every": 2, "validation_pairs": 2}
-    path = tmp_path / "tiny.json"
+    path = tmp_path_factory.mktemp("recipe") / "tiny.json"
     path.write_text(json.dumps(table))
     return path
 
@@ -150,20 +151,36 @@ def trained(
     return Recipe.model_validate_json((out / "recipe.json").read_text())
 
 
-def test_training_is_the_same_twice_and_leaves_its_files(tmp_path: Path, tiny: Path) -> None:
-    first, second = (trained(tmp_path / name, tiny) for name in ("a", "b"))
-    assert first.weights == second.weights
-    _, recipe = load_spectral(tmp_path / "a" / "checkpoint.pth", name="fast")
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, tiny: Path) -> tuple[Path, Recipe]:
+    """A training from its beginning to its end: the folder that it left, and its recipe."""
+    folder = tmp_path_factory.mktemp("whole") / "a"
+    return folder, trained(folder, tiny)
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory: pytest.TempPathFactory, tiny: Path) -> Path:
+    """A training of one step; for tests to copy."""
+    folder = tmp_path_factory.mktemp("begun") / "a"
+    trained(folder, tiny, iterations=1)
+    return folder
+
+
+def test_training_is_the_same_twice_and_leaves_its_files(
+    tmp_path: Path, tiny: Path, whole: tuple[Path, Recipe]
+) -> None:
+    folder, first = whole
+    assert trained(tmp_path / "b", tiny).weights == first.weights
+    _, recipe = load_spectral(folder / "checkpoint.pth", name="fast")
     assert recipe.steps == first.steps and recipe.weights == first.weights
-    rows = (tmp_path / "a" / "validation.csv").read_text().splitlines()
+    rows = (folder / "validation.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in rows] == ["iteration", "0", "2", "4"]
-    assert (tmp_path / "a" / "validation.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "validation.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_training_that_was_cut_off_and_resumed_ends_as_if_nothing_had_happened(
-    tmp_path: Path, tiny: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, tiny: Path, whole: tuple[Path, Recipe], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = trained(tmp_path / "whole", tiny)
     with monkeypatch.context() as patch:
 
         def save_and_stop(*arguments: object) -> None:
@@ -175,9 +192,8 @@ def test_a_training_that_was_cut_off_and_resumed_ends_as_if_nothing_had_happened
         with pytest.raises(KeyboardInterrupt):
             trained(tmp_path / "cut", tiny)
     assert torch.load(tmp_path / "cut" / "checkpoint.pth", weights_only=True)["iteration"] == 2
-    assert trained(tmp_path / "cut", tiny, resume=True).weights == whole.weights
-    curves = [(tmp_path / name / "validation.csv").read_text() for name in ("whole", "cut")]
-    assert curves[0] == curves[1]
+    assert trained(tmp_path / "cut", tiny, resume=True).weights == whole[1].weights
+    assert (tmp_path / "cut" / "validation.csv").read_text() == (whole[0] / "validation.csv").read_text()
 
 
 def folder_of_pairs(folder: Path, count: int) -> Path:
@@ -229,17 +245,17 @@ NOBODY = {"state": {99: {"step": 1.0, "exp_avg": torch.zeros(1)}}, "param_groups
     ],
 )
 def test_a_checkpoint_that_nothing_can_be_resumed_from_is_one_line(
-    tmp_path: Path, tiny: Path, change: dict[str, object], said: str
+    tmp_path: Path, tiny: Path, begun: Path, change: dict[str, object], said: str
 ) -> None:
-    trained(tmp_path / "a", tiny, iterations=1)
+    shutil.copytree(begun, tmp_path / "a")
     path = tmp_path / "a" / "checkpoint.pth"
     torch.save(torch.load(path, weights_only=True) | change, path)
     with pytest.raises(InputError, match=said):
         trained(tmp_path / "a", tiny, resume=True)
 
 
-def test_resuming_something_else_is_refused(tmp_path: Path, tiny: Path) -> None:
-    trained(tmp_path / "a", tiny, iterations=1)
+def test_resuming_something_else_is_refused(tmp_path: Path, begun: Path) -> None:
+    shutil.copytree(begun, tmp_path / "a")
     with pytest.raises(InputError, match="was trained as fast"):
         run_training(TrainRequest(tmp_path / "a", "balanced", (), "", None, None, "cpu", 1, True))
 

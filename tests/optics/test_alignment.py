@@ -116,6 +116,28 @@ def test_two_panels_meet_midway():
     assert rear[0, 2] == pytest.approx(-front[0, 2]) and rear[0, 2] > 1.0
 
 
+def test_four_panels_meet_midway_between_the_two_in_the_middle() -> None:
+    assert reference_x_m(PanelStack(0.5, 0.3, (0.01, 0.02, 0.04, 0.09), 64, 36)) == pytest.approx(0.03)
+    assert reference_x_m(PanelStack(0.5, 0.3, (0.01, 0.02, 0.09), 64, 36)) == 0.02
+
+
+@given(
+    x_m=st.sampled_from([(-0.06, 0.0, 0.06), (-0.05, -0.02, 0.01, 0.05), (-0.03, 0.03)]),
+    shift_m=floats(-0.5, 0.5),
+    step=st.tuples(floats(-0.5, 1.0), floats(-0.6, 0.6), floats(-0.6, 0.6)),
+)
+def test_the_origin_along_x_is_anybodys_choice(x_m, shift_m, step):
+    """At and beyond the limits too: the same stack and the same eyes, counted from elsewhere."""
+    stack = PanelStack(0.5184, 0.2916, x_m, 1920, 1080)
+    moved = replace(stack, x_m=tuple(x + shift_m for x in x_m))
+    aside = np.array([shift_m, 0.0, 0.0])
+    here = align(stack, solved_for_m=HEAD, eyes_m=HEAD + step)
+    there = align(moved, solved_for_m=HEAD + aside, eyes_m=HEAD + step + aside)
+    assert bool(here.limited) == bool(there.limited)
+    for a, b in zip(here.solved_from_shown, there.solved_from_shown, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+
+
 def test_a_step_to_the_right_moves_the_outer_panels_by_their_parallax():
     aligned = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 0.01, 0.0]))
     parallax_px = 0.01 * 0.06 / 0.6 * 1920 / 0.5184

@@ -1,4 +1,4 @@
-"""Malus' law against explicit products of Jones matrices (seed 1-7)."""
+"""Malus' law against explicit products of Jones matrices (EyeReal supplement, (1)-(7))."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The reverse perspective uniform: closed form, plane-induced and brute force agree (seed 40-47)."""
+"""The reverse perspective uniform: closed form, plane-induced and brute force agree (EyeReal supplement, (40)-(47))."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from runtime.optics.rpu import corners_in_front, image_from_panel_four_points, panel_corners_px, panel_from_image
-from runtime.optics.stack import PanelStack
+from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack
 from tests.optics import reference
 from tests.optics.strategies import eyes, floats, stacks
@@ -132,6 +132,34 @@ def test_an_eye_in_a_panels_plane_is_refused(y: float, z: float, x: float) -> No
     projection = image_from_stack([x, y, z], **IMAGE)
     with pytest.raises(ValueError, match="panel's plane"):
         panel_from_image(projection, stack.panel(2))
+
+
+def test_an_eye_in_a_panels_plane_is_refused_in_any_units_of_the_image() -> None:
+    """What is rounding error grows with the projection: a hundred thousand pixels, or a millionth of one."""
+    stack, random = PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 1920, 1080), np.random.default_rng(1)
+    for size in (1e-6, 1.0, 1e5):
+        for _ in range(50):
+            y_m, z_m = random.uniform(-1.0, 1.0, 2)
+            in_it, before_it = (
+                np.diag([size, size, 1.0]) @ image_from_stack([x_m, y_m, z_m], **IMAGE) for x_m in (0.06, 0.061)
+            )
+            with pytest.raises(ValueError, match="panel's plane"):
+                panel_from_image(in_it, stack.panel(2))
+            panel_from_image(before_it, stack.panel(2))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_projection_that_is_not_finite_is_refused(value: float) -> None:
+    projection = image_from_stack([0.6, 0.0, 0.0], **IMAGE)
+    projection[0, 1] = value
+    with np.errstate(invalid="ignore"), pytest.raises(ValueError, match="singular"):
+        panel_from_image(projection, PanelStack(0.5, 0.3, (-0.06, 0.06), 64, 36).panel(0))
+
+
+def test_an_image_whose_pixels_are_the_panels_own_needs_no_warp() -> None:
+    raster = PlaneRaster(0.0, 0.0, 0.0, 1.0, 1.0, 16, 16)
+    from_above = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    assert np.array_equal(panel_from_image(from_above, raster), np.eye(3))
 
 
 def test_a_corner_behind_the_eye_is_told() -> None:

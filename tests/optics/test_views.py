@@ -172,3 +172,17 @@ def test_between_panels_there_is_only_a_scale_and_a_shift(
 def test_an_eye_in_a_panels_plane_has_no_way_through_it() -> None:
     with pytest.raises(ValueError, match="sees nothing"):
         relative_scale_shift([0.03, 0.0, 0.0], from_x_m=0.03, to_x_m=0.0)
+
+
+def test_eyes_in_single_precision_or_whole_metres_are_taken_as_doubles() -> None:
+    raster = PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 64, 36).panel(0)
+    for eye in (np.array([0.61, 0.13, -0.07], np.float32), np.array([2, 1, 0])):
+        double = eye.astype(np.float64)
+        assert np.array_equal(stack_from_eye(eye), stack_from_eye(double))
+        assert np.array_equal(raster_from_stack(eye, raster), raster_from_stack(double, raster))
+        for one, other in zip(
+            relative_scale_shift(eye, from_x_m=0.01, to_x_m=-0.06),
+            relative_scale_shift(double, from_x_m=0.01, to_x_m=-0.06),
+            strict=True,
+        ):
+            assert np.array_equal(one, other) and np.asarray(one).dtype == np.float64

@@ -69,7 +69,7 @@ def page_of(socket: Path, folder: Path) -> Iterator[Page]:
             yield Page(int(found[1]), token_file.read_text().strip())
         finally:
             process.terminate()
-            process.wait(timeout=20)
+            process.wait(timeout=60)
 
 
 @contextmanager

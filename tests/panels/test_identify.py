@@ -159,7 +159,7 @@ def test_keys_go_from_panel_to_panel(x, config):
                 assert eventually(lambda monitor=monitor: lit(x) == [n == monitor for n in range(3)], within_s=20.0)
                 running.stdin.write(key)
                 running.stdin.flush()
-            assert running.wait(timeout=20) == 0
+            assert running.wait(timeout=60) == 0
         finally:
             running.kill()
 

@@ -283,7 +283,7 @@ def test_the_death_of_the_x_server_ends_the_process_at_once_with_a_reason(tmp_pa
         assert process.stdout.readline() == "presenting\n"
         time.sleep(0.03 * attempt)
         server.stop()
-        _, errors = process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=60)
     finally:
         process.kill()
         server.stop()

@@ -101,7 +101,7 @@ class XServer:
             self.plug(index)
 
     def xrandr(self, *arguments: str) -> None:
-        subprocess.run(["xrandr", "-d", self.name, *arguments], check=True, capture_output=True, timeout=20)
+        subprocess.run(["xrandr", "-d", self.name, *arguments], check=True, capture_output=True, timeout=60)
 
     def plug(self, index: int) -> None:
         """Monitor `index` at its place."""
@@ -128,7 +128,7 @@ class XServer:
         """(h, w, 3) RGB of the whole X screen."""
         command = ["xwd", "-root", "-silent", "-display", self.name]
         for _ in range(5):  # a window that closes while xwd lists it makes it fail
-            done = subprocess.run(command, check=False, capture_output=True, timeout=20)
+            done = subprocess.run(command, check=False, capture_output=True, timeout=60)
             if done.returncode == 0:
                 break
         done.check_returncode()
@@ -188,5 +188,5 @@ class XServer:
         """End it, as a crash would: at once."""
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGKILL)
-        self._process.wait(timeout=10)
+        self._process.wait(timeout=60)
         self._output.close()  # harmless when stopped twice

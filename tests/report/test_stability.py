@@ -73,7 +73,7 @@ def test_every_stage_has_its_impostors_and_they_fail_most_of_its_cases(record: t
     """Seen in the issue: an operator of zeros, grey layers, the mean of the targets, a tracker that repeats itself, one
     eye alone: each passed all there was."""
     found = {case["name"]: case for case in record[0]["cases"] if case["stage"] == "controls"}
-    assert {name.partition(":")[0] for name in found} == STAGES - {"unsure eyes"}  # it has no impostor yet
+    assert {name.partition(":")[0] for name in found} == STAGES
     for name in (
         "solve: an operator of zeros", "solve: grey layers", "solve: one eye alone", "solve: mean of targets",
         "network: mean of targets", "network: grey layers", "tracker: repeats its first sample",
@@ -144,6 +144,8 @@ def test_a_stage_whose_cases_cannot_be_made_is_one_failed_case(monkeypatch: pyte
 
     for name in ("networks", "solve", "controls", "calibration"):
         monkeypatch.setattr(getattr(suite, name), "trials", broken)
+    for name in ("retina", "tracking", "uncertainty"):  # others that go on, but the quick ones show it
+        monkeypatch.setattr(getattr(suite, name), "trials", lambda *_, **__: [])
     limits: dict[str, float] = {}
     cases = suite.run(list(suite.every_trial({}, lambda *_: None, full=False, limits=limits)), limits=limits)
     failed = {case.stage: case for case in cases if case.name == "its cases"}

@@ -1,11 +1,14 @@
 """The tracker against what offline tuning finds, on motions it cannot know beforehand."""
 
+import time
+import timeit
 from collections import defaultdict
 
 import numpy as np
 import pytest
 
 from runtime.eyes.motions import MOTIONS, observe, true_eyes
+from runtime.eyes.tracker import Tracker
 from runtime.report.tracking import (
     BEST,
     EURO,
@@ -13,11 +16,8 @@ from runtime.report.tracking import (
     SHIPPED,
     UNPREDICTED,
     benchmark,
-    benchmark_table,
     jitter_and_lag,
-    update_cost_us,
 )
-from runtime.report.tracking_plot import plot_benchmark
 
 
 @pytest.fixture(scope="module")
@@ -70,21 +70,19 @@ def test_its_jitter_lies_under_the_curve_of_single_filters_at_its_lag(trades):
     assert shipped.jitter_mm < np.interp(shipped.lag_ms, lags, jitters)
 
 
-def test_an_update_costs_at_most_50_microseconds_on_an_idle_machine():
-    # Machines differ: 50 us are some 1500 times what Python takes for a small call.
-    import timeit
-
-    call_us = min(timeit.repeat("f(1.0)", "f = abs", number=10_000, repeat=5)) / 10_000 * 1e6
-    assert min(update_cost_us(samples=400) for _ in range(3)) < 3000 * call_us
-
-
-def test_the_figure_is_written(rows, trades, tmp_path):
-    import cv2
-
-    plot_benchmark(rows, trades, tmp_path / "tracking.png")
-    picture = cv2.imread(str(tmp_path / "tracking.png"))
-    assert picture is not None and picture.std() > 10
-    assert benchmark_table(rows)[0]["motion"] == "lean"
+def test_an_update_costs_less_than_three_thousand_calls_of_a_small_function():
+    """In one process and in turns: some 50 us where a call takes 30 ns, and twice that is still allowed."""
+    observed, tracker = observe("walk", seconds=6.0, rate_hz=60), Tracker()
+    ratios = []
+    for part in np.array_split(np.arange(len(observed)), 6):
+        call_s = min(timeit.repeat("f(1.0)", "f = abs", number=1000, repeat=3)) / 1000
+        updates_s = []
+        for number in part:
+            begin = time.perf_counter()
+            tracker.update(observed[number].points, capture_ns=observed[number].capture_ns)
+            updates_s.append(time.perf_counter() - begin)
+        ratios.append(np.median(updates_s) / call_s)
+    assert min(ratios) < 3000
 
 
 @pytest.mark.parametrize("motion", MOTIONS)

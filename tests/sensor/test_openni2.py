@@ -130,7 +130,7 @@ driver.close()
 """
 
 
-def test_the_librarys_dummy_device_delivers_both_streams():
+def test_the_dummy_device_of_the_library_delivers_both_streams():
     # In a process of its own: the Dummy is sample code, and has been seen to crash another device's process.
     answer = subprocess.run([sys.executable, "-c", DUMMY], capture_output=True, timeout=60, text=True)
     frames = json.loads(answer.stdout)

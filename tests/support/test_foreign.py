@@ -35,7 +35,8 @@ def test_only_regular_files_are_read_and_opening_never_waits(tmp_path: Path, kin
     elif kind == "folder":
         path.mkdir()
     elif kind == "socket":
-        socket.socket(socket.AF_UNIX).bind(str(path))
+        with socket.socket(socket.AF_UNIX) as bound:
+            bound.bind(str(path))
     elif kind == "loop":
         path.symlink_to(path)
     elif kind != "gone":

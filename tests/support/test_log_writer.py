@@ -19,21 +19,10 @@ from runtime.clock import NS_PER_S, SimulatedClock
 from runtime.config import ServiceSettings
 from runtime.support import logs
 from runtime.support.log_writer import LINE_MAX_BYTES, QUEUED_MAX
-from runtime.support.logs import BURST, ROOTS, configure
+from runtime.support.logs import BURST, configure
 
 ROOT = Path(__file__).parents[2]
 log = logging.getLogger("phasestack.test")
-
-
-@pytest.fixture(autouse=True)
-def restored():
-    loggers = [logging.getLogger(name) for name in ROOTS]
-    before = [(logger.handlers[:], logger.level, logger.propagate) for logger in loggers]
-    yield
-    for handler in logging.getLogger(ROOTS[0]).handlers:
-        handler.close()
-    for logger, (handlers, level, propagate) in zip(loggers, before, strict=True):
-        logger.handlers[:], logger.level, logger.propagate = handlers, level, propagate
 
 
 class Pipe:
@@ -45,7 +34,7 @@ class Pipe:
         self.text = ""
         self._stop = threading.Event()
 
-    def read_until(self, pattern: str, *, within_s: float = 20.0) -> re.Match[str]:
+    def read_until(self, pattern: str, *, within_s: float = 60.0) -> re.Match[str]:
         deadline_s = time.monotonic() + within_s
         os.set_blocking(self.out, False)
         while not (found := re.search(pattern, self.text)):

@@ -1,5 +1,7 @@
-"""The similarity from the sensor's frame to the stack's (seed 15-28): from pairs that hardly determine it, and from
-noisy ones by every rule, against closed forms of 50 digits."""
+"""The similarity from the sensor's frame to the stack's (EyeReal supplement, (15)-(28)).
+
+From pairs that hardly determine it, and from noisy ones by every rule, against closed forms of 50 digits.
+"""
 
 from __future__ import annotations
 

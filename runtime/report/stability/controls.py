@@ -20,7 +20,7 @@ from runtime.optics.views import image_from_stack
 from runtime.records import F32, F64, U8
 from runtime.report.baselines import EyeOperator, as_codes, conjugate_gradients, eye_operator, mean_of_targets
 from runtime.report.eyesight import as_intensity
-from runtime.report.stability import calibration, networks, phases, poses, retina, rpu, solve, tracking
+from runtime.report.stability import calibration, networks, phases, poses, retina, rpu, solve, tracking, uncertainty
 from runtime.report.stability.calibration import Fit
 from runtime.report.stability.limits import key_of
 from runtime.report.stability.trial import Answer, Trial, settle
@@ -142,6 +142,27 @@ def mean_network(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStac
     return as_codes(mean_of_targets(eyes_m, wanted, stack, fov_deg=networks.FOV_DEG))
 
 
+def even_answer(model: str, need: F64, doubt: uncertainty.Doubt) -> F64:
+    """Both outer panels half way, whatever is wanted."""
+    cell = 2 * uncertainty.loaded(model).session.contract.cell_px
+    return np.full((2, len(need), need.shape[1] + cell), 0.5)
+
+
+def even_panels(model: str, sigma_mm: float, separation_m: float = 0.062) -> U8:
+    """The same as layers."""
+    return np.full((3, uncertainty.STACK.height_px, uncertainty.STACK.width_px, 3), 128, np.uint8)
+
+
+def sure_answer(model: str, need: F64, doubt: uncertainty.Doubt) -> F64:
+    """What eyes that are exactly known would be shown."""
+    return uncertainty.answer_of(model, need, (0.0, 0.0, doubt[2]))
+
+
+def sure_panels(model: str, sigma_mm: float, separation_m: float = 0.062) -> U8:
+    """The same as layers."""
+    return uncertainty.layers_of(model, 0.0, separation_m)
+
+
 class FirstSample:
     """A tracker that repeats its first sample for ever."""
 
@@ -211,6 +232,9 @@ def controls(fits: Mapping[str, Fit]) -> Iterator[Control]:
         )
     for name, predict in (("grey layers", grey_network), ("mean of targets", mean_network)):
         yield Control(networks.STAGE, name, partial(networks.picture_trials, predict))
+    yield Control(uncertainty.STAGE, "even panels", partial(uncertainty.trials, even_answer, even_panels))
+    sure = partial(uncertainty.trials, sure_answer, sure_panels)
+    yield Control(uncertainty.STAGE, "never in doubt", partial(_doubtful, sure))
     for name, make in (("repeats its first sample", FirstSample), ("never sees anybody", Nobody)):
         yield Control(tracking.STAGE, name, partial(tracking.trials, tracking.Tracking(make, first_place)))
     yield Control(calibration.STAGE, "a shift alone", partial(calibration.trials, dict.fromkeys(fits, by_centres)))
@@ -227,6 +251,14 @@ def _of_stage(stage: str, make: Callable[[], Iterable[Trial]]) -> Iterator[Trial
 def _recorded(make: Callable[[], Iterable[Trial]]) -> Iterator[Trial]:
     """The cases in which a method plays a part."""
     return (trial for trial in make() if trial.recorded)
+
+
+def _doubtful(make: Callable[[], Iterable[Trial]]) -> Iterator[Trial]:
+    """The cases in which doubt is large enough to be felt."""
+    columns = tuple(f"doubt of {value} columns" for value in (1, 6, 100))
+    off = tuple(f"off by {value} mm" for value in (1, 2, 4, 10, 50))
+    felt = (*columns, *off, "to 50 columns", "NaN doubt", "infinite doubt")
+    return (trial for trial in make() if trial.name.endswith(felt))
 
 
 def _noisy(make: Callable[[], Iterable[Trial]]) -> Iterator[Trial]:

@@ -32,10 +32,12 @@ def vector(values: Sequence[float]) -> Vector:
 
 
 def dot(a: Vector, b: Vector) -> Any:
+    """Scalar product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def cross(a: Vector, b: Vector) -> Vector:
+    """Vector product."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
@@ -45,19 +47,21 @@ def combine(a: Vector, factor: Any, b: Vector) -> Vector:
 
 
 def unit(a: Vector) -> Vector:
+    """A vector of length 1 in the same direction."""
     length = mp.sqrt(dot(a, a))
     return (a[0] / length, a[1] / length, a[2] / length)
 
 
 @lru_cache(maxsize=256)
 def axes(eye: Vector) -> tuple[Vector, Vector, Vector]:
-    """Right, up and back of an eye that looks at the origin (seed 10-13); on the vertical axis the limit from +x."""
+    """Right, up and back of an eye that looks at the origin ((10)-(13)); on the vertical axis the limit from +x."""
     back = unit(eye)
     right = (mpf(0), mpf(1), mpf(0)) if eye[0] == 0 and eye[1] == 0 else unit((-eye[1], eye[0], mpf(0)))
     return right, cross(back, right), back
 
 
 def focal_px(width_px: int, fov_deg: float) -> Any:
+    """Focal length of a picture of this width and horizontal field of view, pixels."""
     return mpf(width_px) / 2 / mp.tan(mp.radians(mpf(fov_deg)) / 2)
 
 

@@ -17,6 +17,8 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 from runtime.report.eyesight import as_intensity, seen_rays
 from runtime.report.pairs import eyes_at
+from runtime.report.stability import exact
+from runtime.report.stability.retina import EDGE_PX, traced
 from runtime.report.stability.solve import Method, Problem
 from runtime.report.stability.trial import EPS32, Answer, Trial, refusal
 
@@ -26,6 +28,7 @@ FOV_DEG = 40.0
 MODELS = ("fast", "balanced", "best")
 
 
+RAYS = 150  # of each eye, traced
 FLOOR = 0.0005  # an eighth of a code: what another processor's rounding may move
 
 Check = Callable[[tuple[float, ...], tuple[float, ...], PanelStack], object]  # left and right eye; raises
@@ -113,6 +116,25 @@ def stressed(predict: Predict, model: str, images: Sequence[U8], eyes_m: F64, st
     return Answer(math.sqrt(squared_error(layers, images, eyes_m, stack)), 1.0)
 
 
+def scored(predict: Predict, model: str) -> Answer:
+    """What the other cases take for seen of a model's layers, against rays traced to 50 digits."""
+    images, eyes = pictures("coloured stripes, shifted by a third"), eyes_at(distance_m=0.6)
+    layers = predict(model, images, eyes, STACK)
+    height, width = images[0].shape[:2]
+    random, error, counted = np.random.default_rng(11), 0.0, 0
+    for eye in eyes:
+        seen, mask = seen_rays(eye, layers, STACK, width_px=width, height_px=height, fov_deg=FOV_DEG, step=1)
+        place = exact.vector(eye)
+        for row, column in zip(random.integers(0, height, RAYS), random.integers(0, width, RAYS), strict=True):
+            channel = int(row + column) % 3
+            truth, inside = traced(place, STACK, layers, int(column), int(row), channel, size=(width, height))
+            if abs(inside) > EDGE_PX and bool(mask[row, column]) != (inside > 0):
+                return Answer(1.0, 0.0, note=f"ray {column}, {row} counts and should not, or the other way round")
+            if inside > EDGE_PX and mask[row, column]:
+                error, counted = max(error, exact.distance(seen[row, column, channel], truth)), counted + 1
+    return Answer(error, 8 * EPS32 * width * STACK.count, note=f"{counted} rays")
+
+
 def repeatable(predict: Predict, model: str) -> Answer:
     """The same picture twice, with another in between: no state may be left behind."""
     eyes = eyes_at(distance_m=0.6)
@@ -196,6 +218,8 @@ def picture_trials(predict: Predict = predicted, *, full: bool = False) -> Itera
         for kind in KINDS:
             run = partial(stressed, predict, model, pictures(kind), eyes)
             yield Trial(STAGE, f"{model}: {kind}", run, measure="intensity", recorded=True, floor=FLOOR)
+        run = partial(scored, predict, model)
+        yield Trial(STAGE, f"{model}: what is seen of its layers", run, measure="intensity")
         yield Trial(
             STAGE, f"{model}: the same picture twice", partial(repeatable, predict, model), measure="grey levels"
         )

@@ -14,11 +14,11 @@ COLUMNS = 30
 NO_ROUNDING = {"solve", "network", "controls"}  # stages whose errors are no matter of rounding
 ABOUT = {
     "eye pose": "Where an eye is and how its head is turned: on and beside the vertical axis, in, between and behind "
-    "the panels, from 1e-200 to 1e200 m (seed 10-14).",
+    "the panels, from 1e-200 to 1e200 m (EyeReal supplement, (10)-(14)).",
     "RPU": "The mapping from an eye's image to a panel, against rays traced with 50 digits: up to 89.99 degrees, "
-    "down to 1e-11 m from a panel's plane, panels from a micrometre to a thousand kilometres (seed 40-47).",
+    "down to 1e-11 m from a panel's plane, panels from a micrometre to a thousand kilometres (equations (40)-(47)).",
     "phase": "From intensity to phase and back. The arcsine's slope is infinite at white, so the phase there loses "
-    "half its digits; the intensity, which is what is seen, loses none (seed 1-7).",
+    "half its digits; the intensity, which is what is seen, loses none (EyeReal supplement, (1)-(7)).",
     "Jones optics": "sin² of the summed phase against the product of the panels' Jones matrices.",
     "retina": "What eyes see, and PSNR, against a tracer of 50 digits: every ray of small pictures.",
     "solve": "The stiff part of the two-eye problem is the lowest frequency of the difference between the eyes. "
@@ -44,6 +44,7 @@ def spare_digits(case: Case) -> float:
 
 
 def stages_of(cases: Sequence[Case]) -> list[str]:
+    """Each stage once, in the order of its first case."""
     return list(dict.fromkeys(case.stage for case in cases))
 
 
@@ -136,6 +137,8 @@ def stiffness_plot(cases: Sequence[Case]) -> Figure:
 
 
 def row(case: Case) -> list[str]:
+    """A case as the cells of a table."""
+
     def shown(value: float) -> str:
         return "" if math.isnan(value) else "∞" if math.isinf(value) else f"{value:.1e}"
 

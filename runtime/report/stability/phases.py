@@ -1,4 +1,4 @@
-"""Malus' law at the ends of its range, where the arcsine's slope is infinite, and Jones products (seed 1-7)."""
+"""Malus' law where the arcsine's slope is infinite, and Jones products (EyeReal supplement, (1)-(7))."""
 
 from __future__ import annotations
 

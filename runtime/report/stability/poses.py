@@ -1,4 +1,4 @@
-"""Eye poses on and near their singularities (seed 10-14)."""
+"""Eye poses on and near their singularities (EyeReal supplement, (10)-(14))."""
 
 from __future__ import annotations
 

@@ -44,13 +44,15 @@ def layers_of(kind: str, stack: PanelStack) -> U8:
     return np.full(shape, 255, np.uint8)
 
 
-def traced(eye: Any, stack: PanelStack, layers: U8, column: int, row: int, channel: int) -> tuple[Any, float]:
+def traced(
+    eye: Any, stack: PanelStack, layers: U8, column: int, row: int, channel: int, size: tuple[int, int] = SIZE
+) -> tuple[Any, float]:
     """The intensity that a ray of the picture sees, and by how many pixels it crosses the panels inside what counts.
 
-    Bilinear between a panel's pixel centres, summed, sin² of pi/2 of it.
+    Bilinear between a panel's pixel centres, summed, sin² of pi/2 of it. size: columns and rows of the picture.
     """
     u, v = exact.mpf(column) + exact.mpf("0.5"), exact.mpf(row) + exact.mpf("0.5")
-    direction = exact.ray(eye, u, v, width_px=SIZE[0], height_px=SIZE[1], fov_deg=FOV_DEG)
+    direction = exact.ray(eye, u, v, width_px=size[0], height_px=size[1], fov_deg=FOV_DEG)
     if direction[0] >= 0:
         return exact.mpf(0), -math.inf
     total, inside = exact.mpf(0), math.inf

@@ -1,4 +1,4 @@
-"""The reverse perspective uniform at grazing angles, beside panels, and for panels of every size (seed 40-47)."""
+"""The reverse perspective uniform at grazing angles and for panels of every size (EyeReal supplement, (40)-(47))."""
 
 from __future__ import annotations
 
@@ -68,6 +68,7 @@ def traced(eye: Any, stack: PanelStack, index: int, u: float, v: float) -> tuple
 
 
 def mapped(m: F64, u: float, v: float) -> F64:
+    """(2,) where a homography (3, 3) puts a pixel position."""
     weighted = m @ [u, v, 1.0]
     return np.asarray(weighted[:2] / weighted[2])
 

@@ -35,7 +35,8 @@ Method = Callable[["Problem"], F32]  # (N, height, width, C) panel values in [0,
 def waves(parts: Sequence[tuple[int, float]]) -> F64:
     """(WIDTH_PX,) a sum of sines across the picture, their phases apart."""
     u = (np.arange(WIDTH_PX) + 0.5) / WIDTH_PX
-    return np.sum([size * np.sin(2 * np.pi * cycles * u + cycles - 1) for cycles, size in parts], axis=0)
+    result: F64 = np.sum([size * np.sin(2 * np.pi * cycles * u + cycles - 1) for cycles, size in parts], axis=0)
+    return result
 
 
 class Problem:
@@ -211,10 +212,12 @@ def converges(method: Method, gap_m: float, ipd_m: float, distance_m: float) -> 
 
 
 def cg(problem: Problem, *, iterations: int) -> F32:
+    """(N, height, width, C) panel values by conjugate gradients."""
     return conjugate_gradients(problem.operators, problem.wanted, problem.stack, iterations=iterations)
 
 
 def mean(problem: Problem) -> F32:
+    """(N, height, width, C) panel values that show both eyes the mean of what they should see."""
     return mean_of_targets(problem.eyes_m, problem.wanted, problem.stack, fov_deg=problem.fov_deg)
 
 

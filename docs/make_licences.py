@@ -1,0 +1,66 @@
+"""Writes THIRD_PARTY.md: what runs with phasestack, under which licences. In an environment made by `make test`.
+
+The packages are those of requirements/runtime.lock; pip-licenses reads what each says of itself.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "THIRD_PARTY.md"
+HEAD = """\
+# Third-party licences
+
+phasestack is licensed under Apache-2.0. A running phasestack uses the packages below; each is installed from
+PyPI, unchanged, and brings its licence texts along in its `*.dist-info`. Made by `python docs/make_licences.py` from
+`requirements/runtime.lock` and the packages' own metadata.
+
+| package | version | licence | home |
+| --- | --- | --- | --- |
+"""
+TAIL = """
+Wheels of binary packages bundle further libraries, each under the licence in that wheel's texts: among them
+OpenBLAS and the GCC runtime (numpy, scipy), FFmpeg under LGPL-2.1 (opencv), GLFW under Zlib (glfw).
+opencv's wheel also carries the Haar cascades that find faces (Intel License Agreement, BSD-like, in the files).
+
+The schemas of black boxes (`runtime/blackbox/schemas/foxglove.*.json`) are those of the npm package @foxglove/schemas
+2.1.0 (MIT, Foxglove Technologies Inc; its text is beside them).
+
+At run time phasestack loads, and does not ship, the system's OpenGL and EGL (Mesa: MIT), Xlib and RandR (MIT),
+libusb (LGPL-2.1) and OpenNI2 (Apache-2.0).
+"""
+
+
+def locked() -> dict[str, str]:
+    """Name and version of every package of the runtime."""
+    text = (ROOT / "requirements" / "runtime.lock").read_text(encoding="utf-8")
+    return dict(re.findall(r"^([A-Za-z0-9._-]+)==([^ \\\n]+)", text, re.MULTILINE))
+
+
+def licences(names: list[str]) -> list[dict[str, str]]:
+    """Name, Version, License and URL of installed packages, as pip-licenses tells them."""
+    command = [
+        Path(sys.executable).parent / "pip-licenses",
+        "--from=mixed",
+        "--with-urls",
+        "--format=json",
+        "--packages",
+    ]
+    done = subprocess.run([*command, *names], capture_output=True, text=True, check=True)
+    found: list[dict[str, str]] = json.loads(done.stdout)
+    return sorted(found, key=lambda package: package["Name"].lower())
+
+
+def page(packages: list[dict[str, str]]) -> str:
+    """The whole page."""
+    rows = [[package[key].replace("|", "/") for key in ("Name", "Version", "License", "URL")] for package in packages]
+    return HEAD + "".join(f"| {' | '.join(row)} |\n" for row in rows) + TAIL
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(licences(list(locked()))), encoding="utf-8")

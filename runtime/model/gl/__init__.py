@@ -1,0 +1,1 @@
+"""What surrounds the network, by fragment shaders of OpenGL 3.3 core."""

@@ -1,0 +1,161 @@
+"""Fragment shaders that draw from images into images, and an account of what they read and write."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from typing import Any
+
+import moderngl
+
+INCLUDE = re.compile(r'^#include "([a-z_]+\.glsl)"$', re.MULTILINE)
+SHADERS = "runtime.model.gl"
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """The part of a texture that is in use, from its first row and column on."""
+
+    texture: Any  # moderngl.Texture
+    width_px: int
+    height_px: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.width_px, self.height_px
+
+    @property
+    def texel_bytes(self) -> int:
+        width = {"f1": 1, "i2": 2}[self.texture.dtype]
+        components: int = self.texture.components
+        return components * width
+
+    @property
+    def bytes(self) -> int:
+        return self.width_px * self.height_px * self.texel_bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Pass:
+    """One draw, or one transfer between GPU and processor."""
+
+    name: str
+    width_px: int
+    height_px: int
+    read_bytes: int  # every image that is looked into, once
+    written_bytes: int
+    crosses: bool = False  # the bus
+    gpu_ms: float | None = None  # by a timer query, where asked for
+
+
+@dataclass
+class Account:
+    """What was drawn and what crossed the bus, one pass after the other."""
+
+    timed: bool = False  # by timer queries, which hold every pass up until it is complete
+    passes: list[Pass] = field(default_factory=list)
+
+
+def source(name: str) -> str:
+    """A shader with what it includes."""
+
+    def read(file: str) -> str:
+        return (resources.files(SHADERS) / "shaders" / file).read_text(encoding="ascii")
+
+    return INCLUDE.sub(lambda found: read(found[1]), read(name))
+
+
+class Passes:
+    """The programs of one context. Every one is compiled when it is first used."""
+
+    def __init__(self, context: moderngl.Context) -> None:
+        self.context = context
+        self.account: Account | None = None
+        self._vertex = source("whole.vert.glsl")
+        self._programs: dict[str, tuple[Any, Any, dict[str, Any]]] = {}
+        self._targets: dict[tuple[int, ...], Any] = {}
+
+    def draw(
+        self,
+        name: str,
+        outputs: Sequence[Image],
+        inputs: Mapping[str, Image],
+        uniforms: Mapping[str, Any],
+    ) -> None:
+        """Draw the first output's size into all of them. Inputs and uniforms are named as in the shader; what it
+        has no use for is left out."""
+        program, array, held = self._program(name)
+        for unit, (key, image) in enumerate(inputs.items()):
+            image.texture.use(unit)
+            self._set(program, held, key, unit)
+        for key, value in uniforms.items():
+            self._set(program, held, key, value)
+        target = self._target(outputs)
+        target.viewport = (0, 0, *outputs[0].size)
+        target.use()
+        if self.account is not None and self.account.timed:
+            query = self.context.query(time=True)
+            with query:
+                array.render(moderngl.TRIANGLES, vertices=3)
+            self._enter(name, outputs, inputs, gpu_ms=query.elapsed / 1e6)
+            return
+        array.render(moderngl.TRIANGLES, vertices=3)
+        if self.account is not None:
+            self._enter(name, outputs, inputs, gpu_ms=None)
+
+    def crossed(self, name: str, image: Image, *, bytes_px: int, to_gpu: bool) -> None:
+        """Note a transfer of so many bytes a pixel."""
+        if self.account is not None:
+            count = image.width_px * image.height_px * bytes_px
+            self.account.passes.append(
+                Pass(name, *image.size, 0 if to_gpu else count, count if to_gpu else 0, crosses=True)
+            )
+
+    def target(self, outputs: Sequence[Image]) -> Any:
+        """The framebuffer of some images."""
+        return self._target(outputs)
+
+    def forget(self, texture: Any) -> None:
+        """Release a texture and the framebuffers that it is in."""
+        self.context.detect_framebuffer(0).use()  # moderngl binds the last one again: it must not be one that is gone
+        for key in [key for key in self._targets if texture.glo in key]:
+            self._targets.pop(key).release()
+        texture.release()
+
+    def release(self) -> None:
+        """Programs and framebuffers; textures are their owners'."""
+        self.context.detect_framebuffer(0).use()
+        for target in self._targets.values():
+            target.release()
+        for program, array, _ in self._programs.values():
+            array.release()
+            program.release()
+        self._targets, self._programs = {}, {}
+
+    def _program(self, name: str) -> tuple[Any, Any, dict[str, Any]]:
+        if name not in self._programs:
+            program = self.context.program(vertex_shader=self._vertex, fragment_shader=source(f"{name}.frag.glsl"))
+            self._programs[name] = program, self.context.vertex_array(program, []), {}
+        return self._programs[name]
+
+    @staticmethod
+    def _set(program: Any, held: dict[str, Any], key: str, value: Any) -> None:
+        if held.get(key) == value and type(held.get(key)) is type(value):
+            return
+        if key in program:
+            program[key] = value
+        held[key] = value
+
+    def _target(self, outputs: Sequence[Image]) -> Any:
+        key = tuple(output.texture.glo for output in outputs)
+        if key not in self._targets:
+            self._targets[key] = self.context.framebuffer([output.texture for output in outputs])
+        return self._targets[key]
+
+    def _enter(self, name: str, outputs: Sequence[Image], inputs: Mapping[str, Image], *, gpu_ms: float | None) -> None:
+        assert self.account is not None
+        looked = {image.texture.glo: image.bytes for image in inputs.values()}
+        written = sum(output.bytes for output in outputs)
+        self.account.passes.append(Pass(name, *outputs[0].size, sum(looked.values()), written, gpu_ms=gpu_ms))

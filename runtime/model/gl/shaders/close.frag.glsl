@@ -1,0 +1,47 @@
+#version 330 core
+// All three panels in 8-bit codes: the centre one the best for the outer ones, per pixel; even beside the boxes.
+uniform isampler2D wanted_left, wanted_right;
+uniform isampler2D rear, front;                      // as they are
+uniform isampler2D rear_mean, front_mean;            // as eyes that are unsure see them
+uniform ivec2 rear_size, front_size, centre_size;
+uniform ivec2 rear_origin, front_origin, centre_origin;
+uniform vec4 rear_from_left, rear_from_right, front_from_left, front_from_right;
+uniform int even, neutral;
+uniform bool grey;
+layout(location = 0) out vec4 rear_codes;
+layout(location = 1) out vec4 centre_codes;
+layout(location = 2) out vec4 front_codes;
+#include "sample.glsl"
+
+ivec4 through(isampler2D image, ivec2 size, vec4 scale_shift, vec2 at) {
+    return crossed(image, size, at * scale_shift.xy + scale_shift.zw, even);
+}
+
+bool within(ivec2 place, ivec2 size) {
+    return all(greaterThanEqual(place, ivec2(0))) && all(lessThan(place, size));
+}
+
+vec4 coloured(ivec4 codes) {
+    return vec4((grey ? vec3(codes.r) : vec3(codes.rgb)) / 255.0, 1.0);
+}
+
+vec4 outer(isampler2D image, ivec2 place, ivec2 size) {
+    if (!within(place, size)) return coloured(ivec4(neutral));
+    return coloured(rounded(vec4(texelFetch(image, place, 0)) / 16.0));
+}
+
+vec4 centre(ivec2 place) {
+    if (!within(place, centre_size)) return coloured(ivec4(neutral));
+    vec2 at = vec2(place) + 0.5;
+    ivec4 best = texelFetch(wanted_left, place, 0) + texelFetch(wanted_right, place, 0) + 16;
+    best -= through(rear_mean, rear_size, rear_from_left, at) + through(rear_mean, rear_size, rear_from_right, at);
+    best -= through(front_mean, front_size, front_from_left, at) + through(front_mean, front_size, front_from_right, at);
+    return coloured(clamp(best >> 5, 0, 255));
+}
+
+void main() {
+    ivec2 place = ivec2(gl_FragCoord.xy);
+    rear_codes = outer(rear, place - rear_origin, rear_size);
+    centre_codes = centre(place - centre_origin);
+    front_codes = outer(front, place - front_origin, front_size);
+}

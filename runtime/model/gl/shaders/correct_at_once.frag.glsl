@@ -1,0 +1,31 @@
+#version 330 core
+// `residual` and `correct` in one: no image in between, but four looks an eye for each pixel of the panel.
+uniform isampler2D panel;
+uniform ivec2 size;         // of the centre panel's raster
+uniform vec4 centre_from_left, centre_from_right;
+uniform int eighths;
+out ivec4 corrected;
+#include "sample.glsl"
+#include "lacks.glsl"
+#include "shown.glsl"
+
+ivec4 lacked(vec4 scale_shift, bool by_left) {
+    vec2 place = gl_FragCoord.xy * scale_shift.xy + scale_shift.zw;
+    if (beside(place, size)) return ivec4(0);
+    vec2 low = floor(place - 0.5), weight = place - 0.5 - low;
+    vec4 lines[2];
+    for (int down = 0; down < 2; down++) {
+        vec4 values[2];
+        for (int across = 0; across < 2; across++) {
+            Look found = look(clamp(ivec2(low) + ivec2(across, down), ivec2(0), size - 1));
+            values[across] = vec4(by_left ? found.left : found.right);
+        }
+        lines[down] = mix(values[0], values[1], weight.x);
+    }
+    return rounded(mix(lines[0], lines[1], weight.y));
+}
+
+void main() {
+    ivec4 lacks = lacked(centre_from_left, true) + lacked(centre_from_right, false);
+    corrected = kept(texelFetch(panel, ivec2(gl_FragCoord.xy), 0) + (lacks >> 3) * eighths);
+}

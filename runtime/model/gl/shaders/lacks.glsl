@@ -1,0 +1,39 @@
+// What each eye lacks at a pixel of the centre panel when that panel is the best one for the outer ones.
+uniform isampler2D wanted_left, wanted_right, rear, front;
+uniform ivec2 rear_size, front_size;
+uniform vec4 rear_from_left, rear_from_right, front_from_left, front_from_right;  // of the centre's pixels: scale, shift
+uniform int even;
+// How a part of larger panels ends: nothing beyond `kept_box` (left, top, right, bottom) drives the panels.
+uniform vec4 kept_box;
+uniform vec4 over;              // pixels over which each side fades; 0: it does not
+uniform vec4 centre_from_here;  // the whole centre panel's pixels: scale, shift
+
+struct Look {
+    ivec4 left, right;  // what the eyes lack
+    ivec4 rear_left, rear_right, front_left, front_right;  // how they see the outer panels
+};
+
+ivec4 faded(ivec4 value, ivec2 place) {
+    if (over == vec4(0.0)) return value;
+    vec2 at = (vec2(place) + 0.5) * centre_from_here.xy + centre_from_here.zw;
+    float inside[4] = float[4](at.x - kept_box.x, kept_box.z - at.x, at.y - kept_box.y, kept_box.w - at.y);
+    float reach[4] = float[4](over.x, over.z, over.y, over.w);
+    for (int side = 0; side < 4; side++)
+        if (reach[side] > 0.0) value = (value * int(clamp(roundEven(inside[side] / reach[side] * 4.0), 0.0, 4.0))) >> 2;
+    return value;
+}
+
+Look look(ivec2 place) {
+    Look found;
+    vec2 at = vec2(place) + 0.5;
+    found.rear_left = crossed(rear, rear_size, at * rear_from_left.xy + rear_from_left.zw, even);
+    found.rear_right = crossed(rear, rear_size, at * rear_from_right.xy + rear_from_right.zw, even);
+    found.front_left = crossed(front, front_size, at * front_from_left.xy + front_from_left.zw, even);
+    found.front_right = crossed(front, front_size, at * front_from_right.xy + front_from_right.zw, even);
+    ivec4 left = texelFetch(wanted_left, place, 0) - found.rear_left - found.front_left;
+    ivec4 right = texelFetch(wanted_right, place, 0) - found.rear_right - found.front_right;
+    ivec4 best = clamp((left + right) >> 1, 0, 4080);
+    found.left = faded(left - best, place);
+    found.right = faded(right - best, place);
+    return found;
+}

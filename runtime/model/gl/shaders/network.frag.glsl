@@ -1,0 +1,28 @@
+#version 330 core
+// What each eye lacks while the outer panels are even, half the difference of what both want, on the network's raster.
+uniform isampler2D wanted_left, wanted_right;
+uniform ivec2 size;
+uniform mat3 left_from_raster, right_from_raster;
+uniform bool sheared;       // rasters that are: their edge is repeated
+layout(location = 0) out ivec4 lacks_left;
+layout(location = 1) out ivec4 lacks_right;
+#include "sample.glsl"
+
+vec4 half_difference(ivec2 place) {
+    return vec4((texel(wanted_right, place, size) - texel(wanted_left, place, size)) >> 1);
+}
+
+ivec4 sampled(mat3 matrix, float sign) {
+    vec2 place = (matrix * vec3(gl_FragCoord.xy, 1.0)).xy;
+    if (!sheared && beside(place, size)) return ivec4(0);
+    vec2 low = floor(place - 0.5), weight = place - 0.5 - low;
+    ivec2 at = ivec2(low);
+    vec4 above = mix(half_difference(at), half_difference(at + ivec2(1, 0)), weight.x);
+    vec4 below = mix(half_difference(at + ivec2(0, 1)), half_difference(at + ivec2(1, 1)), weight.x);
+    return rounded(sign * mix(above, below, weight.y));
+}
+
+void main() {
+    lacks_left = sampled(left_from_raster, -1.0);
+    lacks_right = sampled(right_from_raster, 1.0);
+}

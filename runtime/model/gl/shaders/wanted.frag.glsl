@@ -1,0 +1,59 @@
+#version 330 core
+// The phase sums that two pictures ask for: sharpened, averaged to a coarser raster, looked up.
+uniform sampler2D left, right;
+uniform isampler2D table;   // 256 phases
+uniform ivec2 origin;       // of the box, in the pictures
+uniform ivec2 box;          // its size
+uniform vec2 reduction;     // pixels of the box to one of the result
+uniform float emphasis;
+uniform bool grey;
+layout(location = 0) out ivec4 wanted_left;
+layout(location = 1) out ivec4 wanted_right;
+
+vec3 code(sampler2D picture, ivec2 place) {
+    ivec2 last = box - 1;
+    place = abs(place);                      // mirrored about the outermost pixel
+    place = min(last - abs(last - place), last);
+    return texelFetch(picture, origin + max(place, ivec2(0)), 0).rgb * 255.0;
+}
+
+vec3 sharp(sampler2D picture, ivec2 place) {
+    if (emphasis == 0.0) return code(picture, place);
+    float middle = 1.0 + 2.0 * emphasis;
+    vec3 line[3];
+    for (int row = 0; row < 3; row++) {
+        ivec2 at = place + ivec2(0, row - 1);
+        vec3 beside = code(picture, at - ivec2(1, 0)) + code(picture, at + ivec2(1, 0));
+        line[row] = middle * code(picture, at) - emphasis * beside;
+    }
+    return clamp(roundEven(middle * line[1] - emphasis * (line[0] + line[2])), 0.0, 255.0);
+}
+
+vec3 averaged(sampler2D picture) {
+    vec2 low = floor(gl_FragCoord.xy) * reduction, high = min(low + reduction, vec2(box));
+    ivec2 first = ivec2(floor(low + 1e-4)), last = ivec2(ceil(high - 1e-4)) - 1;
+    vec3 sum = vec3(0.0);
+    float total = 0.0;
+    for (int v = first.y; v <= last.y; v++)
+        for (int u = first.x; u <= last.x; u++) {
+            vec2 at = vec2(u, v), share = min(at + 1.0, high) - max(at, low);
+            float weight = share.x * share.y;
+            sum += weight * sharp(picture, ivec2(u, v));
+            total += weight;
+        }
+    vec3 mean = sum / total;
+    return reduction == floor(reduction) ? floor(mean + 0.5) : roundEven(mean);  // as OpenCV rounds
+}
+
+ivec4 phases(sampler2D picture) {
+    bool same = reduction == vec2(1.0);
+    ivec3 codes = ivec3(same ? sharp(picture, ivec2(gl_FragCoord.xy)) : averaged(picture));
+    int red = texelFetch(table, ivec2(codes.r, 0), 0).r;
+    if (grey) return ivec4(red);
+    return ivec4(red, texelFetch(table, ivec2(codes.g, 0), 0).r, texelFetch(table, ivec2(codes.b, 0), 0).r, 0);
+}
+
+void main() {
+    wanted_left = phases(left);
+    wanted_right = phases(right);
+}

@@ -1,0 +1,425 @@
+"""The steps around the network as passes of fragment shaders, and the images that live from frame to frame.
+
+Images are signed 16-bit sixteenths of a code, as OpenCV's are: one number a pixel where there is one channel, else
+four, of which one is unused (three can't be drawn into). Only the network's raster, its answer and, where they are
+asked for, the layers cross the bus.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from math import ceil
+from typing import Any
+
+import cv2
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.errors import ContextLost, InputError, ModelFailure, PhasestackError
+from runtime.model.contract import Contract
+from runtime.model.fade import CORRECTED_SHARE
+from runtime.model.gl.programs import Image, Passes
+from runtime.model.pyramid_level import CENTRE, FRONT, I16, NEUTRAL, OUTER, REAR, START, spreads
+from runtime.model.resample import target_from_source
+from runtime.model.schedule import Picture, Problem, reductions
+from runtime.model.transfer import phase_codes
+from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.records import F64, U8
+from runtime.support.gl import DrawnPicture, finish
+
+EYES = ("left", "right")
+NAMES = {REAR: "rear", FRONT: "front"}
+KERNEL = 64  # entries of the blur's uniform
+
+Spread = dict[int, tuple[float, float]]
+
+
+class GlSurround:
+    """A `Surround`. Used on the thread of its context, which is current whenever a frame begins."""
+
+    def __init__(self, passes: Passes, contract: Contract, stack: PanelStack, *, at_once: bool = False) -> None:
+        """passes: of a context that others may use too. at_once: residuals and corrections in one pass, where eyes are
+        sure: half the bytes, five times the looks. Raises InputError where a panel is too large for the driver."""
+        check_size(passes.context, stack)
+        self._passes, self._contract, self._stack = passes, contract, stack
+        self._textures: dict[tuple[Any, ...], Any] = {}
+        table = phase_codes(contract.branch).reshape(256, -1)[:, 0].astype(np.int16)
+        self._table = Image(self._texture("table", 256, 1, 1, data=table), 256, 1)
+        self._layers: U8 = np.empty((3, stack.height_px, stack.width_px, 4), np.uint8)
+        self._read: dict[tuple[int, ...], tuple[I16, I16]] = {}
+        self._closed = False
+        self._at_once = at_once
+
+    @contextmanager
+    def begin(self, pictures: Sequence[Picture], problem: Problem) -> Iterator[None]:
+        try:
+            self._passes.context.enable_only(moderngl.NOTHING)
+            self._problem = problem
+            self._grey = problem.channels == 1
+            needed = reductions(self._contract) | {self._contract.reduction}
+            self._rasters = {reduction: problem.rasters(reduction) for reduction in needed}
+            self._spread: dict[int, Spread] = {
+                reduction: spreads(rasters, problem.eyes_m, eye_sigma_mm=problem.eye_sigma_mm)
+                for reduction, rasters in self._rasters.items()
+            }
+            self._outer: dict[tuple[int, int], str] = {}  # which of two images a panel is in
+            self._want(self._taken(pictures))
+            yield
+            fault = self._passes.context.error
+        except PhasestackError:
+            raise
+        except Exception as error:  # a lost context answers with whatever moderngl has at hand
+            raise ContextLost(f"OpenGL: {error}") from error
+        if fault != "GL_NO_ERROR":
+            raise ContextLost(f"OpenGL: {fault}")
+
+    def network_pictures(self) -> tuple[I16, I16]:
+        problem, frame, reduction = self._problem, self._problem.frame, self._contract.reduction
+        seen = tuple(self._grown(f"network {side}", frame.width_px, frame.rows) for side in EYES)
+        matrices = [problem.reduced_from_frame(side) for side in range(2)]
+        self._passes.draw(
+            "network",
+            seen,
+            self._wanted(reduction),
+            {
+                "size": problem.reduced_size,
+                "left_from_raster": _mat3(matrices[0]),
+                "right_from_raster": _mat3(matrices[1]),
+                "sheared": any(_is_sheared(matrix) for matrix in matrices),
+            },
+        )
+        return self._read_back(seen)
+
+    def set_panel(self, reduction: int, panel: int, codes: I16, *, shown: bool) -> None:
+        rows, columns = codes.shape[:2]
+        answer = self._grown(f"answer {panel}", columns, rows, components=self._problem.channels)
+        answer.texture.write(np.ascontiguousarray(codes), viewport=(0, 0, columns, rows), alignment=1)
+        self._passes.crossed("answer up", answer, bytes_px=2 * self._problem.channels, to_gpu=True)
+        matrix = self._problem.answer_from_raster(panel, self._rasters[reduction][panel])
+        self._resample(answer, reduction, panel, matrix, shown=shown)
+
+    def project(self, reduction: int, panels: Sequence[int]) -> None:
+        for n in panels:
+            if n in self._spread[reduction]:
+                outer, half = self._panel(reduction, n), self._image(reduction, n, "half")
+                self._blur(reduction, n, {"first": outer, "second": outer}, (half,))
+                mean = self._image(reduction, n, "mean")
+                self._blur(reduction, n, {"first": half, "second": half}, (mean,), down=True)
+
+    def correct(self, reduction: int, panel: int, *, size: float, shown: bool) -> None:
+        rasters = self._rasters[reduction]
+        places: dict[str, Any] = {
+            f"centre_from_{eye}": _scale_shift(eye_m, source=rasters[panel], target=rasters[CENTRE])
+            for eye, eye_m in zip(EYES, self._problem.eyes_m, strict=True)
+        }
+        places["size"] = _size(rasters[CENTRE])
+        outer, result = self._panel(reduction, panel), self._spare(reduction, panel)
+        how = {"eighths": round(size * 8), "shown": shown}
+        unsure = bool(self._spread[reduction])
+        if self._at_once and not unsure:
+            seen = {**self._through(reduction), **self._fade(reduction)}
+            looked = {**self._wanted(reduction), **self._means(reduction), "panel": outer}
+            self._passes.draw("correct_at_once", (result,), looked, {**seen, **places, **how})
+            self._swap(reduction, panel)
+            return
+        left, right = self._residuals(reduction, panel)
+        lacks = {"left": left, "right": right}
+        if not unsure:
+            self._passes.draw("correct", (result,), {**lacks, "panel": outer}, {**places, **how})
+        else:
+            back = self._image(reduction, panel, "back")
+            self._passes.draw("back", (back,), lacks, places)
+            across = (self._image(reduction, panel, "half"), self._image(reduction, panel, "half mean"))
+            mean = self._mean(reduction, panel)
+            self._blur(reduction, panel, {"first": back, "second": mean}, across)
+            self._passes.draw(
+                "correct_unsure",
+                (result,),
+                {"panel": outer, "half_blurred_lacks": across[0], "half_blurred_mean": across[1]},
+                {**how, **self._kernel(reduction, panel, down=True), "size": result.size},
+            )
+        self._swap(reduction, panel)
+
+    def upsample(self, coarser_reduction: int, reduction: int, *, shown: bool) -> None:
+        for n in OUTER:
+            coarse = self._panel(coarser_reduction, n)
+            fine = self._rasters[reduction][n]
+            matrix = np.diag([coarse.width_px / fine.width_px, coarse.height_px / fine.height_px, 1.0])
+            self._resample(coarse, reduction, n, matrix, shown=shown)
+
+    def finish(self) -> U8:
+        images = self._drawn_layers()
+        finish()
+        for image, layer in zip(images, self._layers, strict=True):
+            self._passes.target((image,)).read_into(layer, components=4)
+            self._passes.crossed("layer down", image, bytes_px=4, to_gpu=False)
+        return self._layers
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            with suppress(Exception):  # of a context that is lost there is nothing to release
+                for texture in self._textures.values():
+                    self._passes.forget(texture)
+            self._textures = {}
+
+    def _drawn_layers(self) -> tuple[Image, ...]:
+        """The solution: one image a panel, RGBA in 8 bits."""
+        boxes, width, height = self._problem.boxes, self._stack.width_px, self._stack.height_px
+        images = tuple(
+            Image(self._texture(("layer", n), width, height, 4, dtype="f1"), width, height) for n in range(3)
+        )
+        outer = {NAMES[n]: self._panel(1, n) for n in OUTER} | {f"{NAMES[n]}_mean": self._mean(1, n) for n in OUTER}
+        where: dict[str, Any] = {
+            f"{name}_origin": (boxes[n].u0, boxes[n].v0) for n, name in ((CENTRE, "centre"), *NAMES.items())
+        }
+        where["centre_size"] = _size(self._rasters[1][CENTRE])
+        self._passes.draw(
+            "close",
+            images,
+            {**self._wanted(1), **outer},
+            {**self._through(1), **where, "neutral": NEUTRAL, "grey": self._grey},
+        )
+        return images
+
+    def _taken(self, pictures: Sequence[Picture]) -> list[Image]:
+        """The pictures where they were drawn, or their box, uploaded."""
+        box = self._problem.boxes[CENTRE]
+        taken = []
+        self._origin = (0, 0)
+        for eye, picture in zip(EYES, pictures, strict=True):
+            if isinstance(picture, DrawnPicture):
+                self._origin = (box.u0, box.v0)
+                taken.append(Image(picture.texture, box.width_px, box.height_px))
+                continue
+            texture = self._texture(("picture", eye), self._stack.width_px, self._stack.height_px, 4, dtype="f1")
+            image = Image(texture, box.width_px, box.height_px)
+            texture.write(np.ascontiguousarray(picture[box.slices]), viewport=(0, 0, *image.size))
+            self._passes.crossed("picture up", image, bytes_px=4, to_gpu=True)
+            taken.append(image)
+        return taken
+
+    def _want(self, pictures: Sequence[Image]) -> None:
+        """Both eyes' phase sums on every raster."""
+        box = self._problem.boxes[CENTRE]
+        for reduction, rasters in self._rasters.items():
+            width, height = _size(rasters[CENTRE])
+            wanted = self._wanted(reduction)
+            self._passes.draw(
+                "wanted",
+                tuple(wanted.values()),
+                {"left": pictures[0], "right": pictures[1], "table": self._table},
+                {
+                    "origin": self._origin,
+                    "box": (box.width_px, box.height_px),
+                    "reduction": (box.width_px / width, box.height_px / height),
+                    "emphasis": self._contract.emphasis,
+                    "grey": self._grey,
+                },
+            )
+
+    def _residuals(self, reduction: int, panel: int) -> tuple[Image, Image]:
+        """What each eye lacks, and what moves of the panel that is not corrected where the eyes are unsure."""
+        left, right = (self._image(reduction, CENTRE, f"lacks {eye}") for eye in EYES)
+        unsure = bool(self._spread[reduction])
+        seen = tuple(self._image(reduction, CENTRE, f"seen {eye}") for eye in EYES) if unsure else ()
+        self._passes.draw(
+            "residual",
+            (left, right, *seen),
+            {**self._wanted(reduction), **self._means(reduction)},
+            {**self._through(reduction), **self._fade(reduction), "of_front": panel == REAR},
+        )
+        if not seen:
+            return left, right
+        half = tuple(self._image(reduction, CENTRE, f"half {eye}") for eye in EYES)
+        self._blur(reduction, panel, {"first": seen[0], "second": seen[1]}, half, twice=True)
+        joined = tuple(self._image(reduction, CENTRE, f"joined {eye}") for eye in EYES)
+        self._passes.draw(
+            "noise",
+            joined,
+            {
+                "left": left,
+                "right": right,
+                "seen_left": seen[0],
+                "seen_right": seen[1],
+                "half_blurred_left": half[0],
+                "half_blurred_right": half[1],
+            },
+            {**self._kernel(reduction, panel, down=True, twice=True), "size": left.size},
+        )
+        return joined[0], joined[1]
+
+    def _through(self, reduction: int) -> dict[str, Any]:
+        """How the eyes see the outer panels through the centre panel's pixels."""
+        rasters = self._rasters[reduction]
+        found: dict[str, Any] = {"even": START}
+        for n, name in NAMES.items():
+            found[f"{name}_size"] = _size(rasters[n])
+            for eye, eye_m in zip(EYES, self._problem.eyes_m, strict=True):
+                found[f"{name}_from_{eye}"] = _scale_shift(eye_m, source=rasters[CENTRE], target=rasters[n])
+        return found
+
+    def _fade(self, reduction: int) -> dict[str, Any]:
+        fade = self._problem.fade
+        if fade is None:
+            return {"over": (0.0, 0.0, 0.0, 0.0)}
+        along, down = (float(over_px * CORRECTED_SHARE) for over_px in fade.over_px)
+        raster = self._rasters[reduction][CENTRE]
+        matrix = self._problem.centre_from(raster.plane_from_raster())
+        return {
+            "kept_box": tuple(map(float, (fade.kept.u0, fade.kept.v0, fade.kept.u1, fade.kept.v1))),
+            "over": (along * fade.left, down * fade.top, along * fade.right, down * fade.bottom),
+            "centre_from_here": _as_scale_shift(matrix),
+        }
+
+    def _resample(self, image: Image, reduction: int, panel: int, matrix: F64, *, shown: bool) -> None:
+        """An outer panel drawn anew from another raster."""
+        self._passes.draw(
+            "resample",
+            (self._spare(reduction, panel),),
+            {"image": image},
+            {
+                "size": image.size,
+                "image_from_panel": _mat3(matrix),
+                "sheared": _is_sheared(matrix),
+                "outside": START,
+                "shown": shown,
+            },
+        )
+        self._swap(reduction, panel)
+
+    def _blur(
+        self,
+        reduction: int,
+        panel: int,
+        inputs: dict[str, Image],
+        outputs: tuple[Image, ...],
+        *,
+        down: bool = False,
+        twice: bool = False,
+    ) -> None:
+        kernel = self._kernel(reduction, panel, down=down, twice=twice)
+        self._passes.draw("blur", outputs, inputs, {**kernel, "size": outputs[0].size})
+
+    def _kernel(self, reduction: int, panel: int, *, down: bool = False, twice: bool = False) -> dict[str, Any]:
+        """The mean over where the eyes may be, as an outer panel's pixels move, along one direction."""
+        spread = self._spread[reduction].get(panel)
+        weights = [1.0]
+        if spread is not None:
+            u, v = (s * np.sqrt(2.0) if twice else s for s in spread)
+            reach = ceil(3 * max(u, v))
+            weights = cv2.getGaussianKernel(2 * reach + 1, v if down else u)[reach:, 0].tolist()
+        padded = tuple(weights) + (0.0,) * (KERNEL - len(weights))
+        return {"kernel": padded, "reach": len(weights) - 1, "along": (0, 1) if down else (1, 0)}
+
+    def _wanted(self, reduction: int) -> dict[str, Image]:
+        return {f"wanted_{eye}": self._image(reduction, CENTRE, f"wanted {eye}") for eye in EYES}
+
+    def _mean(self, reduction: int, panel: int) -> Image:
+        """An outer panel as eyes that are unsure see it."""
+        if panel in self._spread[reduction]:
+            return self._image(reduction, panel, "mean")
+        return self._panel(reduction, panel)
+
+    def _means(self, reduction: int) -> dict[str, Image]:
+        return {NAMES[n]: self._mean(reduction, n) for n in OUTER}
+
+    def _panel(self, reduction: int, panel: int) -> Image:
+        return self._image(reduction, panel, self._outer.get((reduction, panel), "outer"))
+
+    def _spare(self, reduction: int, panel: int) -> Image:
+        """Where a panel is drawn that is made from itself."""
+        return self._image(reduction, panel, _other(self._outer.get((reduction, panel), "outer")))
+
+    def _swap(self, reduction: int, panel: int) -> None:
+        self._outer[reduction, panel] = _other(self._outer.get((reduction, panel), "outer"))
+
+    def _image(self, reduction: int, panel: int, name: str) -> Image:
+        """The box's part of an image as large as a whole panel: boxes follow the viewer, textures don't."""
+        width, height = -(-self._stack.width_px // reduction), -(-self._stack.height_px // reduction)
+        texture = self._texture((name, reduction, panel), width, height, 1 if self._grey else 4)
+        return Image(texture, *_size(self._rasters[reduction][panel]))
+
+    def _grown(self, name: str, width_px: int, height_px: int, *, components: int | None = None) -> Image:
+        """An image of the network's raster, whose size follows the viewer; its texture only grows."""
+        components = components or (1 if self._grey else 4)
+        key = (name, components)
+        held = self._textures.get(key)
+        if held is None or held.width < width_px or held.height < height_px:
+            width, height = (max(width_px, held.width), max(height_px, held.height)) if held else (width_px, height_px)
+            check_raster(self._passes.context, width, height)
+            if held is not None:
+                self._passes.forget(self._textures.pop(key))
+            held = self._texture(key, width, height, components)
+        return Image(held, width_px, height_px)
+
+    def _texture(
+        self, key: Any, width: int, height: int, components: int, *, dtype: str = "i2", data: NDArray[Any] | None = None
+    ) -> Any:
+        key = key if isinstance(key, tuple) and len(key) == 2 else (key, components)
+        if key not in self._textures:
+            made = self._passes.context.texture((width, height), components, data, dtype=dtype, alignment=1)
+            made.filter = (moderngl.NEAREST, moderngl.NEAREST)
+            made.repeat_x = made.repeat_y = False
+            self._textures[key] = made
+        return self._textures[key]
+
+    def _read_back(self, seen: Sequence[Image]) -> tuple[I16, I16]:
+        """The one thing that crosses to the processor: the network's raster."""
+        finish()
+        channels, (width, height) = self._problem.channels, seen[0].size
+        tail = () if channels == 1 else (channels,)
+        if (key := (height, width, channels)) not in self._read:
+            self._read = {key: (np.empty((height, width, *tail), np.int16), np.empty((height, width, *tail), np.int16))}
+        for index, (image, array) in enumerate(zip(seen, self._read[key], strict=True)):
+            self._passes.target(seen).read_into(
+                array, viewport=(0, 0, width, height), components=channels, attachment=index, alignment=1, dtype="i2"
+            )
+            self._passes.crossed("network down", image, bytes_px=2 * channels, to_gpu=False)
+        return self._read[key]
+
+
+def check_size(context: moderngl.Context, stack: PanelStack) -> None:
+    """Raises InputError where a panel is wider or higher than the driver allows, or tilted."""
+    if stack.tilt is not None:
+        raise InputError("stack", "tilt", 'tilted panels are solved for by model.backend = "opencv" alone')
+    most = int(context.info["GL_MAX_TEXTURE_SIZE"])
+    most_wide, most_high = (min(most, int(value)) for value in context.info["GL_MAX_VIEWPORT_DIMS"])
+    for name, value, limit in (("width_px", stack.width_px, most_wide), ("height_px", stack.height_px, most_high)):
+        if value > limit:
+            raise InputError("stack", name, f'{value}: this OpenGL driver allows {limit}; set model.backend = "opencv"')
+
+
+def check_raster(context: moderngl.Context, width_px: int, height_px: int) -> None:
+    """Raises ModelFailure where the network's raster is larger than the driver allows."""
+    most = int(context.info["GL_MAX_TEXTURE_SIZE"])
+    if max(width_px, height_px) > most:
+        raise ModelFailure(f"OpenGL: the network's raster is {width_px}x{height_px}, the driver allows {most}")
+
+
+def _other(name: str) -> str:
+    return "outer" if name == "spare" else "spare"
+
+
+def _size(raster: PlaneRaster) -> tuple[int, int]:
+    return raster.width_px, raster.height_px
+
+
+def _is_sheared(matrix: F64) -> bool:
+    return bool(matrix[0, 1] != 0.0 or matrix[1, 0] != 0.0)
+
+
+def _mat3(matrix: F64) -> tuple[float, ...]:
+    """Column by column, as OpenGL has it."""
+    return tuple(matrix.T.ravel().tolist())
+
+
+def _as_scale_shift(matrix: F64) -> tuple[float, float, float, float]:
+    return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
+
+
+def _scale_shift(eye_m: F64, *, source: PlaneRaster, target: PlaneRaster) -> tuple[float, float, float, float]:
+    """Pixels of `target` from those of `source`, as an eye sees them in line."""
+    return _as_scale_shift(target_from_source(eye_m, source=source, target=target))

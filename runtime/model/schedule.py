@@ -1,0 +1,164 @@
+"""The unrolled solver's schedule, stated once, and what has to surround the network to carry it out.
+
+What surrounds it can be done in more than one way (`opencv_surround`): a way carries out single
+steps, and knows neither their order nor when a panel is rounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from runtime.model.chain import ChainFrame
+from runtime.model.contract import Contract, Step
+from runtime.model.fade import Fade
+from runtime.model.pyramid_level import CENTRE, FRONT, I16, OUTER, REAR, coarser
+from runtime.optics.rect import PixelRect
+from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.tilt import coarse_layer_from_seen
+from runtime.records import F64, U8
+from runtime.support.gl import DrawnPicture
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """What one solution is for."""
+
+    contract: Contract
+    stack: PanelStack
+    boxes: tuple[PixelRect, ...]  # per panel, what the eyes look through
+    eyes_m: F64  # (2, 3) left and right, frame `stack`
+    frame: ChainFrame  # the network's raster
+    eye_sigma_mm: float  # standard deviation of where light enters the eyes, an axis
+    channels: int  # 1 or 3
+    fade: Fade | None  # how the panels end, where they are a part of larger ones
+
+    def rasters(self, reduction: int) -> tuple[PlaneRaster, ...]:
+        """The panels' pixels within their boxes, so much coarser."""
+        return tuple(coarser(box.cut(self.stack.panel(n)), reduction) for n, box in enumerate(self.boxes))
+
+    @property
+    def reduced_size(self) -> tuple[int, int]:
+        """(width, height) of the centre panel's pixels that the network's pictures are taken from."""
+        reduction, box = self.contract.reduction, self.boxes[CENTRE]
+        return max(1, box.width_px // reduction), max(1, box.height_px // reduction)
+
+    def reduced_from_frame(self, side: int) -> F64:
+        """3x3: those pixels from the network's raster, as one eye sees them in line."""
+        width, height = self.reduced_size
+        centre = self.boxes[CENTRE].cut(self.stack.panel(CENTRE))
+        reduced_from_full = np.diag([width / centre.width_px, height / centre.height_px, 1.0])
+        reduced_from_plane = reduced_from_full @ centre.raster_from_plane()
+        return reduced_from_plane @ self.frame.plane_from_frame(self.eyes_m[side], x_m=self.stack.x_m[CENTRE])
+
+    def answer_from_raster(self, panel: int, raster: PlaneRaster) -> F64:
+        """3x3: the network's answer's pixels from an outer panel's, in line as seen from between the eyes."""
+        seen_from_layer = np.linalg.inv(coarse_layer_from_seen(self.stack, panel, self.frame.middle_m))
+        matrix = self.frame.frame_from_plane(x_m=raster.x_m) @ seen_from_layer @ raster.plane_from_raster()
+        matrix /= matrix[2, 2]
+        matrix[0, 2] += self.frame.cell_px  # the answer begins one parallax before the first column
+        return matrix
+
+    def faded(self, panel: I16, *, start: int) -> I16:
+        """(rows, columns[, 3]) the network's answer that ends, at `start`, within a part of the panels."""
+        if self.fade is None:
+            return panel
+        frame = self.frame
+        plane_from_wave = frame.plane_from_frame(frame.middle_m, x_m=self.stack.x_m[CENTRE])
+        plane_from_wave = plane_from_wave @ np.array([[1.0, 0.0, -frame.cell_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        rows, columns = panel.shape[:2]
+        weights = self.fade.wave_weights(self.centre_from(plane_from_wave), rows=rows, columns=columns)
+        return np.asarray((panel - start) * (weights if panel.ndim == 3 else weights[..., 0]) + start, np.int16)
+
+    def centre_from(self, plane_from_raster: F64) -> F64:
+        """3x3: the centre panel's pixels from a raster's on its plane."""
+        return self.stack.panel(CENTRE).raster_from_plane() @ plane_from_raster
+
+
+Picture = U8 | DrawnPicture
+Answer = Mapping[int, I16]  # per outer panel, (rows, columns[, 3]) on the network's raster, sixteenths of a code
+Network = Callable[[tuple[I16, I16]], Answer]
+
+
+class Surround(Protocol):
+    """What surrounds the network. State lives from frame to frame; one thread uses it."""
+
+    def begin(self, pictures: Sequence[Picture], problem: Problem) -> AbstractContextManager[None]:
+        """Take two pictures (h, w, 4) of the centre panel's pixels: cut to its box, the phase sums that the eyes want,
+        on every raster that the steps need. The steps are done within what it answers."""
+
+    def network_pictures(self) -> tuple[I16, I16]:
+        """What each eye lacks while the outer panels are even, on the network's raster: (rows, columns[, 3])."""
+
+    def set_panel(self, reduction: int, panel: int, codes: I16, *, shown: bool) -> None:
+        """An outer panel as the network wants it; shown: rounded to what 8 bits can show."""
+
+    def project(self, reduction: int, panels: Sequence[int]) -> None:
+        """See outer panels anew through the centre panel's pixels."""
+
+    def correct(self, reduction: int, panel: int, *, size: float, shown: bool) -> None:
+        """Change one outer panel by what both eyes lack along the rays through each of its pixels, when the centre
+        panel is the best one for the outer panels."""
+
+    def upsample(self, coarser_reduction: int, reduction: int, *, shown: bool) -> None:
+        """Take the outer panels over from a coarser raster."""
+
+    def finish(self) -> U8:
+        """(N, h, w, 4): the centre panel closed on every pixel, all of them in 8-bit codes, even beside the boxes;
+        the surround's own until the next frame."""
+
+    def close(self) -> None:
+        """Release threads and textures. May be called twice."""
+
+
+class Backend(Protocol):
+    """One way of doing what surrounds the network."""
+
+    name: str  # as `model.backend` calls it
+    context: object  # of OpenGL, whose textures it reads; None: it reads arrays
+
+    def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> Surround:
+        """One for a model and a stack. Raises InputError where the stack does not fit."""
+
+
+def carry_out(steps: Sequence[Step], surround: Surround, network: Network) -> U8:
+    """The layers of the problem that was begun: every step in its order.
+
+    The first steps may work on coarser rasters. An outer panel is rounded to what 8 bits show where it is changed
+    last, so that the centre panel, closed at the end, answers to what the eyes will really see.
+    """
+    last = {n: _last_change(steps, n) for n in OUTER}
+    reduction = steps[0].reduction
+    for index, step in enumerate(steps):
+        if step.reduction != reduction:
+            surround.upsample(reduction, step.reduction, shown=False)
+            reduction = step.reduction
+            surround.project(reduction, OUTER)
+        shown = {n: index == last[n] for n in OUTER}
+        changed: tuple[int, ...] = OUTER
+        if step.kind == "chain":
+            for n, codes in network(surround.network_pictures()).items():
+                surround.set_panel(reduction, n, codes, shown=shown[n])
+        else:
+            changed = (FRONT if step.kind == "front" else REAR,)
+            surround.correct(reduction, changed[0], size=step.size, shown=shown[changed[0]])
+        surround.project(reduction, changed)
+    if reduction != 1:
+        surround.upsample(reduction, 1, shown=True)
+        surround.project(1, OUTER)
+    return surround.finish()
+
+
+def reductions(contract: Contract) -> frozenset[int]:
+    """Those of the rasters that a model's steps work on, and the panels' own."""
+    return frozenset({1} | {step.reduction for step in contract.steps})
+
+
+def _last_change(steps: Sequence[Step], panel: int) -> int:
+    """The last step that changes an outer panel on every pixel; none if all are coarser."""
+    kinds = {"chain", "front" if panel == FRONT else "rear"}
+    return max((index for index, step in enumerate(steps) if step.kind in kinds and step.reduction == 1), default=-1)

@@ -1,0 +1,127 @@
+"""What is played: which recording, with which settings, and what an operator or a fault does on the way."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from runtime.daemon.reconfigure import Reconfiguration
+from runtime.errors import ModelFailure
+from runtime.frame.presenter import Presenter
+from tests.golden.recordings import path_to
+
+Action = Callable[[Presenter], None]
+LOADED_WITHIN_S = 60.0  # of the machine's time; the simulated clock stands meanwhile
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One golden run."""
+
+    recording: str
+    tables: dict[str, dict[str, Any]] = field(default_factory=dict)  # settings beside SMALL
+    actions: dict[int, Action] = field(default_factory=dict)  # before the refresh of that number
+    pictures: tuple[int, ...] = ()  # refreshes whose panels are kept
+
+    @property
+    def mounted(self) -> bool:
+        """Whether panels show their layers turned, mirrored or through a curve."""
+        return "output" in self.tables
+
+    def settings(self) -> dict[str, Any]:
+        """Tables of the configuration."""
+        tables = {name: dict(values) for name, values in SMALL.items()}
+        for name, values in self.tables.items():
+            tables[name] = tables.get(name, {}) | values
+        tables["sensor"] = {"driver": "replay", "source": str(path_to(self.recording))}
+        return tables
+
+
+SMALL: dict[str, dict[str, Any]] = {
+    "stack": {"width_px": 96, "height_px": 54},
+    "model": {"name": "balanced", "threads": 1},
+    "loop": {"evaluate_every": 20},
+}
+
+
+def change_scene(name: str) -> Action:
+    """`ctl scene`, complete before the simulated clock goes on."""
+
+    def do(presenter: Presenter) -> None:
+        present = presenter.run_cell.state.settings
+        settings = present.model_copy(update={"content": present.content.model_copy(update={"scene": name})})
+        change = Reconfiguration(settings, present, presenter.stack, reload_content=True)
+        deadline_s = time.monotonic() + LOADED_WITHIN_S
+
+        def load(parts: Any) -> bool:
+            while not change.advance(parts):
+                assert time.monotonic() < deadline_s, "the scene does not load"
+                time.sleep(0.005)
+            return True
+
+        presenter.solver.do(load)
+        assert change.finished and not change.problem, change.problem
+
+    return do
+
+
+def ask_flat(presenter: Presenter) -> None:
+    """`ctl flat`."""
+    presenter.flat_asked = True
+
+
+def resume(presenter: Presenter) -> None:
+    """`ctl resume`."""
+    presenter.paused = presenter.flat_asked = False
+
+
+def pause(presenter: Presenter) -> None:
+    """`ctl pause`."""
+    presenter.paused = True
+
+
+def break_model(presenter: Presenter) -> None:
+    """From now on the model raises."""
+
+    def predict(*_: Any, **__: Any) -> Any:
+        raise ModelFailure("a golden run's model is broken")
+
+    vars(presenter.run_cell.state.predictor)["predict"] = predict
+
+
+def mend_model(presenter: Presenter) -> None:
+    """The model answers again."""
+    del vars(presenter.run_cell.state.predictor)["predict"]
+
+
+# Each panel mounted another way: none shows its layer as it is.
+MOUNTED: list[dict[str, Any]] = [
+    {"rotation_deg": 180, "gamma": 2.0},
+    {"mirror": "horizontal"},
+    {"rotation_deg": 180, "mirror": "vertical"},
+    {"homography": ((0.98, 0.03, 1.0), (-0.01, 1.01, 0.5), (0.0001, 0.0, 1.0))},
+]
+
+CASES = {
+    "still": Case("still", pictures=(60, 110)),
+    "walk": Case("walk", {"model": {"name": "fast"}, "content": {"scene": "moving"}}, pictures=(40, 75)),
+    "loss-and-return": Case("loss-and-return", {"model": {"name": "best"}}, pictures=(60, 130)),
+    "scenes": Case(
+        "nod",
+        {"content": {"scene": "texture"}},
+        {30: change_scene("demo"), 60: ask_flat, 85: resume, 105: pause},
+        pictures=(25, 50, 84, 110),
+    ),
+    "fault": Case("lean", {}, {25: break_model, 50: mend_model}, pictures=(48, 70)),
+    "four-panels": Case(
+        "lean",
+        {
+            "stack": {"x_m": (-0.05, -0.02, 0.01, 0.05)},
+            "content": {"scene": "demo"},
+            "output": {"panels": MOUNTED},
+        },
+        pictures=(50,),
+    ),
+}

@@ -1,0 +1,95 @@
+"""The golden runs: nothing of a recorded run moves unless somebody meant it to (`make golden` renews them)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.golden.cases import CASES
+from tests.golden.compare import PICTURE_FAR, as_lines, compare_picture, compare_text
+from tests.golden.recordings import DATA, HEADS, path_to, write
+from tests.golden.references import check, stored_text
+
+MOST_BYTES = 1_000_000  # of all references and recordings
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_recorded_run_is_as_it_is_stored(case: str, tmp_path: Path) -> None:
+    lines = check(case, pictures=tmp_path)
+    assert not lines, "\n".join(["", *lines, "if that is meant: make golden, and say why in the commit"])
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_a_kept_recording_is_the_one_that_its_seed_makes(head: str, tmp_path: Path) -> None:
+    """So that `--record` changes nothing by itself. Samples, not bytes: a writer may pack them another way."""
+    from runtime.sensor.recording import Recording
+
+    write(head, tmp_path / "again.mcap")
+    kept, again = (list(Recording(path).samples()) for path in (path_to(head), tmp_path / "again.mcap"))
+    assert [sample.capture_ns for sample in kept] == [sample.capture_ns for sample in again]
+    for one, other in zip(kept, again, strict=True):
+        assert (one.eyes is None) == (other.eyes is None)
+        if one.eyes is not None and other.eyes is not None:
+            np.testing.assert_allclose(one.eyes.eyes_m, other.eyes.eyes_m, atol=1e-9)
+
+
+def test_together_the_runs_pass_every_state_and_label_but_the_end() -> None:
+    lines = [line for case in CASES for line in (stored_text(case) or [])[1:]]
+    assert {line["state"] for line in lines} == {"flat", "tracking", "holding", "degraded"}
+    assert {line["eyes_label"] for line in lines} >= {"predicted", "held", "rested", "none"}
+    assert {line["inference"] for line in lines} == {"ran", "reused", "skipped"}
+    assert any(0 < line["flatness"] < 1 for line in lines)
+
+
+def test_the_references_are_small() -> None:
+    assert sum(path.stat().st_size for path in DATA.iterdir()) < MOST_BYTES
+
+
+def told(stored: object, now: object) -> list[str]:
+    """The lines for one refresh's field `eyes_m`, as stored and now."""
+    return as_lines("walk", compare_text([{}, {"eyes_m": stored}], [{}, {"eyes_m": now}]))
+
+
+def test_a_difference_is_told_with_run_refresh_field_and_both_values() -> None:
+    assert told([[0.5, 0.1]], [[0.5, 0.100002]]) == [
+        "walk: refresh 0 eyes_m[0][1]: stored 0.1, now 0.100002 (off by 2e-06, tolerance 1e-06)"
+    ]
+    assert told([[0.5]], None) == ["walk: refresh 0 eyes_m: stored [[0.5]], now None"]
+
+
+def test_within_its_tolerance_a_value_has_not_moved_and_a_nan_always_has() -> None:
+    assert told([0.1], [0.1 + 9e-7]) == []
+    assert told([0.1], [float("nan")]) != []
+
+
+def test_labels_counts_and_fields_without_a_tolerance_must_be_equal() -> None:
+    stored, now = {"state": "flat", "frame": 3, "new": 1.0}, {"state": "flat", "frame": 4, "new": 1.0 + 1e-12}
+    assert [moved.field for moved in compare_text([stored], [now])] == ["frame", "new"]
+    assert [moved.field for moved in compare_text([{"a": 1}], [{}])] == ["a"]
+
+
+def test_a_run_of_another_length_has_moved() -> None:
+    assert [moved.field for moved in compare_text([{}, {}], [{}])] == ["refreshes"]
+
+
+def test_many_differences_of_a_field_are_one_line_with_the_first_and_the_largest() -> None:
+    stored = [{}, *({"psnr_db": 20.0} for _ in range(5))]
+    now = [{}, *({"psnr_db": 20.0 + 0.1 * n} for n in range(5))]
+    (line,) = as_lines("walk", compare_text(stored, now))
+    assert line.startswith("walk: refresh 1 psnr_db: stored 20, now 20.1")
+    assert "4 values in 4 refreshes, most at refresh 4 by 0.4" in line
+
+
+def test_a_picture_has_moved_where_its_mean_has_or_where_a_few_pixels_have_by_much() -> None:
+    stored = np.full((3, 54, 96, 3), 100, np.uint8)
+    assert compare_picture(stored, stored, number=1, what="panels") == []
+    far = stored.copy()
+    far[1, 0, :40] += np.uint8(PICTURE_FAR + 1)
+    assert [moved.field for moved in compare_picture(stored, far, number=1, what="panels")] == [
+        f"panels[1] share off by more than {PICTURE_FAR} codes"
+    ]
+    assert {moved.where for moved in compare_picture(stored, stored + np.uint8(1), number=7, what="panels")} == {7}
+    assert compare_picture(None, stored, number=1, what="panels") != []
+    assert compare_picture(stored[:2], stored, number=1, what="panels") != []

@@ -1,0 +1,51 @@
+"""The 2D picture, and the tables between codes and phases that every solver uses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from runtime.model.flat import flat_layers
+from runtime.model.transfer import FULL, SUBCODE, phase_codes, pre_emphasised
+from runtime.optics.malus import intensity_from_phase
+from runtime.optics.stack import PanelStack
+
+
+@pytest.mark.parametrize("panels", [2, 3, 4])
+def test_every_eye_sees_the_picture_whatever_it_looks_through(panels: int) -> None:
+    """The outer panels are even, so that a ray meets the same phases beside the middle one wherever it comes from."""
+    stack = PanelStack(0.5, 0.3, tuple(np.linspace(-0.06, 0.06, panels)), 256, 16)
+    picture = np.zeros((16, 256, 4), np.uint8)
+    picture[..., :3] = np.arange(256)[None, :, None]
+    layers = flat_layers(picture, stack)
+    assert layers.shape == (panels, 16, 256, 4)
+    others = [n for n in range(panels) if n != panels // 2]
+    assert all(np.ptp(layers[n, ..., :3]) == 0 for n in others)
+    seen = intensity_from_phase(layers[..., :3].astype(np.float64).sum(axis=0) / 255) * 255
+    assert np.abs(seen - picture[..., :3]).max() < 1.0  # half a code of the middle panel, at sin²'s steepest
+    assert (layers[..., 3] == 255).all()
+
+
+def test_colours_stay_in_their_channels() -> None:
+    stack = PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 32, 16)
+    picture = np.full((16, 32, 4), (200, 100, 30, 255), np.uint8)
+    codes = flat_layers(picture, stack).astype(np.float64)[..., :3].sum(axis=0) / 255
+    assert intensity_from_phase(codes[0, 0]) * 255 == pytest.approx([200, 100, 30], abs=1.0)
+
+
+@pytest.mark.parametrize("branch", [1, 2])
+def test_phase_codes_are_the_phases_of_every_code_in_sixteenths_of_a_panel_code(branch: int) -> None:
+    table = phase_codes(branch)  # type: ignore[arg-type]
+    assert table.shape == (256,) and table.dtype == np.int16
+    assert np.abs(intensity_from_phase(table / FULL) * 255 - np.arange(256)).max() < 0.8 / SUBCODE
+    low, high = (0, FULL) if branch == 1 else (FULL, 2 * FULL)
+    assert table.min() == low and table.max() == high
+
+
+def test_pre_emphasis_sharpens_edges_and_keeps_even_parts() -> None:
+    picture = np.full((12, 12, 3), 100, np.uint8)
+    picture[:, 6:] = 140
+    assert np.array_equal(pre_emphasised(picture, 0.0), picture)
+    sharp = pre_emphasised(picture, 0.1)
+    assert sharp[6, 5].tolist() == [96] * 3 and sharp[6, 6].tolist() == [144] * 3  # a tenth of the step, either side
+    assert (sharp[:, :5] == 100).all() and (sharp[:, 7:] == 140).all()

@@ -1,0 +1,275 @@
+"""The backend in OpenGL does what the one in OpenCV does: code for code where both sample exactly, and by the eye."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import runtime.model.opencv_surround
+import runtime.model.pyramid_level
+from model_export.stills import random_still
+from runtime.config import ModelSettings, Settings
+from runtime.errors import ContextLost, InputError, MissingPart
+from runtime.evaluation.displayed import displayed, expected_db
+from runtime.model.backends import choose
+from runtime.model.fade import Fade
+from runtime.model.gl.backend import GlBackend
+from runtime.model.gl.programs import Account
+from runtime.model.predictor import SHIPPED, Predictor, load_predictor
+from runtime.model.still import solve_still
+from runtime.model.unrolled import UnrolledPredictor
+from runtime.optics.rect import PixelRect
+from runtime.optics.stack import PanelStack
+from runtime.plan.predictors import planned_predictor
+from runtime.records import F64, U8
+from runtime.support.gl import offscreen_context
+from tests.model.exact import exact_resample
+from tests.model.scenes import FOV_DEG, card_scene, eyes
+
+STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 240, 135)
+WITHIN_ONE = 0.999  # of all codes
+LEAST_DB = -0.05  # of displayed quality, against OpenCV
+HALF_TURN = np.radians(30)
+POSES = {
+    "straight": eyes(0.6),
+    "beside and above": eyes(0.7, 0.2, 0.1),
+    "near": eyes(0.35, -0.05),
+    "rolled by 20 degrees": eyes(0.6, roll_deg=20),
+    "turned by 30 degrees": np.array([[0.6, 0.0, 0.0]])
+    + np.outer((-0.031, 0.031), (np.sin(HALF_TURN), np.cos(HALF_TURN), 0.0)),
+    "one eye for both": np.array([[0.6, 0.0, 0.0], [0.6, 0.0, 0.0]]),
+    "above each other": np.array([[0.6, 0.0, -0.031], [0.6, 0.0, 0.031]]),
+}
+
+
+@pytest.fixture(scope="module")
+def made() -> Iterator[tuple[Any, GlBackend]]:
+    context = offscreen_context()
+    yield context, GlBackend(context, STACK)
+    context.__enter__()
+    context.release()
+
+
+@pytest.fixture
+def gl(made: tuple[Any, GlBackend]) -> Iterator[GlBackend]:
+    context, backend = made
+    with context:
+        backend.passes.account = None
+        yield backend
+
+
+@pytest.fixture
+def exactly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV's steps sample by the definition: its own sampling is off by up to a twelfth of a pixel."""
+    for module in (runtime.model.opencv_surround, runtime.model.pyramid_level):
+        monkeypatch.setattr(module, "resample", exact_resample)
+
+
+def both(name: str, stack: PanelStack, gl: GlBackend) -> tuple[UnrolledPredictor, UnrolledPredictor]:
+    """The model surrounded by OpenCV, and by OpenGL."""
+    opencv = load_predictor(name, stack, ModelSettings(threads=1))
+    assert isinstance(opencv, UnrolledPredictor)
+    return opencv, UnrolledPredictor(opencv.session, stack, surroundings=gl)
+
+
+def cards(pair: F64, stack: PanelStack, *, grey: bool = False) -> tuple[U8, U8]:
+    left, right = (card_scene(eye, width_px=stack.width_px, height_px=stack.height_px) for eye in pair)
+    return (left[..., :1].repeat(3, 2), right[..., :1].repeat(3, 2)) if grey else (left, right)
+
+
+def layers_of(
+    predictor: Predictor, pictures: tuple[U8, U8], pair: F64, *, sigma_mm: float = 1.0, fov_deg: float = FOV_DEG
+) -> U8:
+    how: Any = {"eyes_m": pair, "fov_deg": fov_deg, "eye_sigma_mm": sigma_mm}
+    layers: U8 = solve_still(*pictures, predictor=predictor, **how).layers.copy()
+    return layers
+
+
+def within_one(first: U8, second: U8) -> float:
+    return float((np.abs(first.astype(np.int16) - second)[..., :3] <= 1).mean())
+
+
+@pytest.mark.usefixtures("exactly")
+@pytest.mark.parametrize("sigma_mm", [0.0, 3.0])
+@pytest.mark.parametrize("pose", POSES)
+@pytest.mark.parametrize("name", SHIPPED)
+def test_codes_are_those_of_exact_sampling(name: str, pose: str, sigma_mm: float, gl: GlBackend) -> None:
+    opencv, opengl = both(name, STACK, gl)
+    pictures, pair = cards(POSES[pose], STACK), POSES[pose]
+    wanted, found = (layers_of(p, pictures, pair, sigma_mm=sigma_mm) for p in (opencv, opengl))
+    assert within_one(wanted, found) >= WITHIN_ONE
+    assert (found[..., 3] == 255).all()
+
+
+@pytest.mark.usefixtures("exactly")
+@pytest.mark.parametrize("gap_m", [0.01, 0.03, 0.2])
+def test_codes_at_every_gap(gap_m: float, gl: GlBackend) -> None:
+    stack, pair = replace(STACK, x_m=(-gap_m, 0.0, gap_m)), eyes(0.9)
+    wanted, found = (layers_of(p, cards(pair, stack), pair) for p in both("balanced", stack, gl))
+    assert within_one(wanted, found) >= WITHIN_ONE
+
+
+@pytest.mark.usefixtures("exactly")
+@pytest.mark.parametrize("sigma_mm", [0.0, 3.0])
+def test_grey_pictures_in_one_channel(sigma_mm: float, gl: GlBackend) -> None:
+    pair, layers = eyes(0.6), []
+    for predictor in both("balanced", STACK, gl):
+        predictor.one_channel = True
+        layers.append(layers_of(predictor, cards(pair, STACK, grey=True), pair, sigma_mm=sigma_mm))
+        assert predictor.channels == 1
+    assert within_one(*layers) >= WITHIN_ONE
+
+
+def test_corrections_in_one_pass_are_those_in_two(gl: GlBackend, monkeypatch: pytest.MonkeyPatch) -> None:
+    pair, found, passes = eyes(0.6), [], []
+    for at_once in (False, True):
+        monkeypatch.setattr(gl, "at_once", at_once)
+        _, predictor = both("balanced", STACK, gl)
+        predictor.fade = Fade(PixelRect(30, 15, 200, 120), over_px=(40.0, 10.0))
+        gl.passes.account = account = Account()
+        found.append(layers_of(predictor, cards(pair, STACK), pair, sigma_mm=0.0))
+        passes.append([one.name for one in account.passes])
+    assert (found[0] == found[1]).all()
+    corrections = sum(step.kind != "chain" for step in predictor.session.contract.steps)
+    assert passes[0].count("residual") == passes[0].count("correct") == corrections
+    assert passes[1].count("correct_at_once") == corrections
+    assert "residual" not in passes[1]
+
+
+@pytest.mark.usefixtures("exactly")
+def test_a_part_of_larger_panels_ends_gently(gl: GlBackend) -> None:
+    pair, layers = eyes(0.6), []
+    for predictor in both("balanced", STACK, gl):
+        predictor.fade = Fade(PixelRect(30, 15, 200, 120), over_px=(40.0, 10.0), bottom=False)
+        layers.append(layers_of(predictor, cards(pair, STACK), pair))
+    assert within_one(*layers) >= WITHIN_ONE
+
+
+@pytest.mark.usefixtures("exactly")
+def test_windows_of_the_plan(gl: GlBackend) -> None:
+    """A sparse picture is solved in a window of its own."""
+    stack = replace(STACK, width_px=480, height_px=270)
+    pictures = tuple(np.full((270, 480, 3), 255, np.uint8) for _ in range(2))
+    for picture, shift in zip(pictures, (4, -4), strict=True):
+        picture[110:150, 220 + shift : 260 + shift] = np.random.default_rng(0).integers(0, 200, (40, 40, 3))
+    layers = []
+    for backend in (None, gl):
+        predictor: Any = planned_predictor(Settings(), stack)
+        if backend is not None:
+            predictor.surround_with(backend)
+        layers.append(layers_of(predictor, (pictures[0], pictures[1]), eyes(0.6)))
+        assert 0 < predictor.active_fraction < 1
+        assert predictor.backend == ("opencv" if backend is None else "gl")
+    assert within_one(*layers) >= WITHIN_ONE
+
+
+@pytest.mark.usefixtures("exactly")
+@pytest.mark.parametrize("number", range(12))
+def test_codes_on_random_pairs(number: int, gl: GlBackend) -> None:
+    """Panels, gaps, places and heads of the whole design range."""
+    pair = random_still(7, number, width_px=STACK.width_px, height_px=STACK.height_px)
+    found = [layers_of(p, pair.images, pair.eyes_m, fov_deg=pair.fov_deg) for p in both("balanced", pair.stack, gl)]
+    assert within_one(*found) >= WITHIN_ONE
+
+
+@pytest.mark.parametrize("pose", ["straight", "rolled by 20 degrees", "turned by 30 degrees"])
+def test_the_eyes_see_no_less_than_with_opencv(pose: str, gl: GlBackend) -> None:
+    pair = POSES[pose]
+    pictures, shown = cards(pair, STACK), []
+    for predictor in both("balanced", STACK, gl):
+        layers = layers_of(predictor, pictures, pair)
+        look = displayed(layers, pictures, STACK, eyes_m=pair, fov_deg=FOV_DEG, similarity=False)
+        expected = expected_db(look, layers, STACK, eyes_m=pair, fov_deg=FOV_DEG)
+        shown.append([look.quality.psnr_db, *(value for value in expected.values() if value is not None)])
+    assert len(shown[0]) == 3
+    assert (np.array(shown[1]) - shown[0] >= LEAST_DB).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SHIPPED)
+def test_at_1920x1080(name: str, gl: GlBackend, monkeypatch: pytest.MonkeyPatch) -> None:
+    stack, pair = replace(STACK, width_px=1920, height_px=1080), eyes(0.6)
+    pictures = cards(pair, stack)
+    opencv, opengl = both(name, stack, gl)
+    found = layers_of(opengl, pictures, pair)
+    shown_db = [
+        displayed(layers, pictures, stack, eyes_m=pair, fov_deg=FOV_DEG, similarity=False).quality.psnr_db
+        for layers in (layers_of(opencv, pictures, pair), found)
+    ]
+    assert abs(shown_db[1] - shown_db[0]) <= 0.05
+    for module in (runtime.model.opencv_surround, runtime.model.pyramid_level):
+        monkeypatch.setattr(module, "resample", exact_resample)
+    assert within_one(layers_of(opencv, pictures, pair), found) >= WITHIN_ONE
+
+
+def test_a_panel_wider_than_the_driver_allows_is_refused(gl: GlBackend) -> None:
+    widest = int(gl.passes.context.info["GL_MAX_TEXTURE_SIZE"])
+    stack = replace(STACK, width_px=widest + 8)
+    predictor = load_predictor("fast", STACK)
+    assert isinstance(predictor, UnrolledPredictor)
+    with pytest.raises(InputError, match=rf"stack: width_px: {widest + 8}: this OpenGL driver allows {widest}"):
+        choose("gl", predictor.on_panels(stack), lambda: gl.passes.context)
+
+
+def test_only_the_network_s_raster_and_the_layers_cross(gl: GlBackend) -> None:
+    """Down: what the network looks at, and the layers where arrays are asked for. Up: pictures, and its answer."""
+    _, opengl = both("balanced", STACK, gl)
+    gl.passes.account = account = Account()
+    layers_of(opengl, cards(eyes(0.6), STACK), eyes(0.6))
+    crossed = [one.name for one in account.passes if one.crosses]
+    assert crossed == ["picture up"] * 2 + ["network down"] * 2 + ["answer up"] * 2 + ["layer down"] * 3
+
+
+def test_automatic_takes_the_faster_one_and_says_what_was_measured(gl: GlBackend) -> None:
+    choice = choose("auto", load_predictor("fast", STACK), lambda: gl.passes.context)
+    assert choice.why.startswith("measured at ")
+    opencv_ms, gl_ms = (float(part.split(" ms")[0].split()[-1]) for part in choice.why.split(", "))
+    assert choice.backend.name == ("gl" if gl_ms < opencv_ms else "opencv")
+
+
+def test_without_opengl_automatic_is_opencv_and_gl_is_refused() -> None:
+    def nothing() -> Any:
+        raise MissingPart("no OpenGL without a screen")
+
+    predictor = load_predictor("fast", STACK)
+    choice = choose("auto", predictor, nothing)
+    assert choice.backend.name == "opencv"
+    assert "no OpenGL" in choice.why
+    with pytest.raises(MissingPart):
+        choose("gl", predictor, nothing)
+
+
+def test_a_model_that_has_one_backend_keeps_it() -> None:
+    predictor = load_predictor("sart", STACK)
+    assert choose("gl", predictor, offscreen_context).backend.name == predictor.backend == "opencv"
+
+
+def test_a_lost_context_is_told_and_another_takes_over(gl: GlBackend) -> None:
+    pair, lost = eyes(0.6), offscreen_context()
+    predictor = load_predictor("fast", STACK)
+    predictor.surround_with(GlBackend(lost, STACK))
+    before = layers_of(predictor, cards(pair, STACK), pair)
+    lost.release()
+    with pytest.raises(ContextLost):
+        layers_of(predictor, cards(pair, STACK), pair)
+    with gl.passes.context:
+        predictor.surround_with(gl)
+        assert (layers_of(predictor, cards(pair, STACK), pair) == before).all()
+
+
+def test_nothing_grows_while_a_viewer_walks(gl: GlBackend) -> None:
+    _, opengl = both("balanced", STACK, gl)
+    places = [eyes(0.5 + 0.01 * step, 0.02 * step, roll_deg=2.0 * step) for step in range(8)]
+    for pair in places:
+        layers_of(opengl, cards(pair, STACK), pair, sigma_mm=3.0)
+    held = len(opengl._made._textures)  # type: ignore[union-attr]
+    targets = len(gl.passes._targets)
+    for pair in reversed(places):
+        layers_of(opengl, cards(pair, STACK), pair, sigma_mm=3.0)
+    assert (len(opengl._made._textures), len(gl.passes._targets)) == (held, targets)  # type: ignore[union-attr]
+    opengl.close()
+    assert len(gl.passes._targets) < targets

@@ -1,0 +1,108 @@
+"""Panels that are not quite parallel: what an eye sees of them, against rays that are traced one by one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from runtime.optics.retina import panel_positions, seen_by
+from runtime.optics.stack import PanelStack, Tilt
+from runtime.optics.tilt import UNSEEN_PX, coarse_layer_from_seen, layer_from_seen
+
+STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 1920, 1080)
+PLACE = (0.5, 0.02, -0.01)
+TILTED = replace(STACK, tilt=Tilt(((0.001, 0.012, -0.006), (0.0, 0.0, 0.0), (-0.002, 0.004, 0.015)), PLACE))
+EYES = ((0.5, 0.03, 0.0), (0.42, -0.1, 0.05), (0.7, 0.2, -0.1))
+
+
+def traced(stack, index, eye_m, place_m):
+    """(2,) where the layer has what an eye sees at (y, z) of the ideal panel: two rays and a plane."""
+    offset, right, up = stack.tilt.depth[index]
+    normal, far = np.array([1.0, -right, -up]), stack.x_m[index] + offset
+    ray = np.array([stack.x_m[index], *place_m]) - eye_m
+    point = eye_m + ray * (far - normal @ eye_m) / (normal @ ray)
+    origin = np.array(stack.tilt.seen_from_m)
+    back = point - origin
+    return (origin + back * (stack.x_m[index] - origin[0]) / back[0])[1:]
+
+
+@pytest.mark.parametrize("eye", EYES)
+@pytest.mark.parametrize("index", [0, 2])
+def test_a_tilted_panel_is_where_two_rays_and_a_plane_put_it(eye, index):
+    matrix = layer_from_seen(TILTED, index, np.array(eye))
+    for place in ((0.0, 0.0), (0.2, 0.1), (-0.25, -0.14)):
+        found = matrix @ [*place, 1.0]
+        np.testing.assert_allclose(found[:2] / found[2], traced(TILTED, index, np.array(eye), place), atol=1e-12)
+
+
+def test_from_the_place_of_registration_every_panel_looks_parallel():
+    for index in range(3):
+        np.testing.assert_allclose(layer_from_seen(TILTED, index, np.array(PLACE)), np.eye(3), atol=1e-12)
+
+
+def test_a_panel_that_is_not_tilted_moves_for_nobody():
+    assert np.array_equal(layer_from_seen(TILTED, 1, np.array(EYES[0])), np.eye(3))
+    assert np.array_equal(layer_from_seen(STACK, 2, np.array(EYES[0])), np.eye(3))
+
+
+@pytest.mark.parametrize("eye", EYES)
+def test_what_is_simplified_stays_within_what_is_not_seen(eye):
+    u, v = np.meshgrid(np.linspace(-0.259, 0.259, 9), np.linspace(-0.145, 0.145, 9))
+    places = np.column_stack([u.ravel(), v.ravel(), np.ones(u.size)])
+    for scale in (1e-3, 0.05, 1.0):
+        depth = tuple((d * scale, r * scale, up * scale) for d, r, up in TILTED.tilt.depth)
+        stack = replace(STACK, tilt=Tilt(depth, PLACE))
+        exact, simple = (
+            np.apply_along_axis(lambda row: row[:2] / row[2], 1, places @ of(stack, 2, np.array(eye)).T)
+            for of in (layer_from_seen, coarse_layer_from_seen)
+        )
+        assert np.abs(exact - simple).max() < 1.5 * UNSEEN_PX * STACK.width_m / STACK.width_px
+
+
+def test_a_tilt_that_nobody_sees_costs_nothing():
+    hardly = replace(STACK, tilt=Tilt(((0.0, 1e-5, 1e-5),) * 3, PLACE))
+    assert np.array_equal(coarse_layer_from_seen(hardly, 2, np.array(EYES[0])), np.eye(3))
+
+
+def test_a_tilt_about_the_upright_alone_is_a_scale_and_a_shift():
+    stack = replace(STACK, tilt=Tilt(((0.0, 0.01, 0.0),) * 3, (0.5, 0.0, 0.0)))
+    matrix = coarse_layer_from_seen(stack, 2, np.array([0.5, 0.031, 0.0]))
+    assert matrix[0, 0] != 1.0
+    assert not matrix[[0, 1, 2, 2], [1, 0, 0, 1]].any()
+
+
+def test_a_cut_out_part_and_the_whole_agree():
+    y_m, z_m, eye = 0.08, -0.05, np.array([0.5, 0.03, 0.01])
+    part = replace(TILTED, tilt=TILTED.tilt.moved(y_m, z_m))
+    whole = layer_from_seen(TILTED, 2, eye) @ [0.1, 0.02, 1.0]
+    found = layer_from_seen(part, 2, eye - [0.0, y_m, z_m]) @ [0.1 - y_m, 0.02 - z_m, 1.0]
+    np.testing.assert_allclose(found[:2] / found[2] + [y_m, z_m], whole[:2] / whole[2], atol=1e-12)
+
+
+def test_a_stack_that_is_turned_tilts_the_other_way_about():
+    eye, (y, z) = np.array([0.5, 0.03, 0.01]), (0.1, 0.02)
+    turned_eye = np.array([eye[0], -eye[2], -eye[1]])
+    whole = layer_from_seen(TILTED, 2, eye) @ [y, z, 1.0]
+    found = layer_from_seen(TILTED.turned(), 2, turned_eye) @ [-z, -y, 1.0]
+    np.testing.assert_allclose(found[:2] / found[2], [-whole[1] / whole[2], -whole[0] / whole[2]], atol=1e-12)
+
+
+def test_the_simulated_retina_looks_through_tilted_panels():
+    small = replace(TILTED, width_px=192, height_px=108)
+    flat = replace(small, tilt=None)
+    view = {"fov_deg": 40.0, "width_px": 192, "height_px": 108}
+    eye = np.array([0.5, -0.1, 0.02])
+    u, v = panel_positions(eye, small, index=2, **view)
+    ideal_u, ideal_v = panel_positions(eye, flat, index=2, **view)
+    row, column = 30, 50
+    pitch = small.width_m / small.width_px
+    place = ideal_u[row, column] * pitch - small.width_m / 2, small.height_m / 2 - ideal_v[row, column] * pitch
+    y, z = traced(small, 2, eye, place)
+    assert u[row, column] == pytest.approx((y + small.width_m / 2) / pitch, abs=1e-3)
+    assert v[row, column] == pytest.approx((small.height_m / 2 - z) / pitch, abs=1e-3)
+    layers = np.random.default_rng(0).integers(0, 255, (3, 108, 192, 3), np.uint8)
+    assert (
+        np.abs(seen_by(eye, layers, small, fov_deg=40).image - seen_by(eye, layers, flat, fov_deg=40).image).max() > 0.1
+    )

@@ -1,0 +1,49 @@
+"""The page of third-party licences is complete and up to date."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / "THIRD_PARTY.md").read_text(encoding="utf-8")
+
+
+def script() -> Any:
+    spec = importlib.util.spec_from_file_location("make_licences", ROOT / "docs" / "make_licences.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def plain(name: str) -> str:
+    return name.lower().replace("_", "-")
+
+
+def listed() -> dict[str, list[str]]:
+    """Version, licence and home by name, as the page has them."""
+    rows = [
+        row.strip("| ").split(" | ") for row in TEXT.partition("| --- |")[2].splitlines()[1:] if row.startswith("|")
+    ]
+    return {plain(name): rest for name, *rest in rows}
+
+
+def test_the_page_lists_every_package_of_the_runtime_s_lock_and_no_other() -> None:
+    locked = {plain(name): version for name, version in script().locked().items()}
+    assert {name: rest[0] for name, rest in listed().items()} == locked
+
+
+def test_every_dependency_is_locked() -> None:
+    dependencies = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    assert len(dependencies) > 10
+    assert {plain(re.split(r"[\[=]", dependency)[0]) for dependency in dependencies} <= listed().keys()
+
+
+def test_every_licence_is_known_and_as_the_package_says() -> None:
+    assert all(licence not in {"", "UNKNOWN"} for _, licence, _ in listed().values())
+    (told,) = script().licences(["numpy"])
+    assert listed()["numpy"][1:] == [told["License"], told["URL"]]

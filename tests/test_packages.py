@@ -1,0 +1,69 @@
+"""The wheel and the sdist: everything that a clean machine needs for the demo, and nothing of this checkout."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tarfile
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+DEMO_FILES = {"contact-sheet.png", "layer-0.png", "layer-1.png", "layer-2.png", "frames.jsonl", "summary.json"}
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+
+
+def done(*command: str | Path, cwd: Path) -> str:
+    """What a command prints; it knows nothing of this checkout."""
+    environment = {name: value for name, value in os.environ.items() if name not in {"PYTHONPATH", "VIRTUAL_ENV"}}
+    result = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=1500)
+    assert result.returncode == 0, result.stderr[-2000:]
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with both, made of the files that git knows as they are here."""
+    folder = tmp_path_factory.mktemp("packages")
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for name in filter(None, listed.split("\0")):
+        if (ROOT / name).is_file():
+            (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / "source" / name).write_bytes((ROOT / name).read_bytes())
+    done(sys.executable, "-m", "build", "--outdir", folder / "dist", cwd=folder / "source")
+    return folder / "dist"
+
+
+def test_the_wheel_holds_every_file_of_the_packages_and_the_sdist_too(packages: Path) -> None:
+    (wheel,), (sdist,) = packages.glob("*.whl"), packages.glob("*.tar.gz")
+    in_wheel = set(zipfile.ZipFile(wheel).namelist())
+    with tarfile.open(sdist) as archive:
+        in_sdist = {name.partition("/")[2] for name in archive.getnames()}
+    wanted = {
+        str(path.relative_to(ROOT))
+        for package in ("runtime", "calib", "model_export")
+        for path in (ROOT / package).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert len(wanted) > 300
+    assert wanted - in_wheel == set()
+    assert wanted - in_sdist == set()
+    assert not [name for name in in_wheel if name.startswith(("tests/", "docs/"))]
+
+
+def test_a_clean_environment_with_the_wheel_alone_runs_the_demo(packages: Path, tmp_path: Path) -> None:
+    venv.create(tmp_path / "clean", with_pip=True)
+    python = tmp_path / "clean" / "bin" / "python"
+    (wheel,) = packages.glob("*.whl")
+    done(python, "-m", "pip", "install", "-q", "-r", ROOT / "requirements" / "runtime.lock", cwd=tmp_path)
+    done(python, "-m", "pip", "install", "-q", "--no-deps", wheel, cwd=tmp_path)
+    command = tmp_path / "clean" / "bin" / "phasestack"
+    done(command, "demo", "--frames", "12", "--scale", "0.1", "--out", "out", cwd=tmp_path)
+    assert {path.name for path in (tmp_path / "out").iterdir()} >= DEMO_FILES
+    where = done(python, "-c", "import runtime; print(runtime.__file__)", cwd=tmp_path)
+    assert where.startswith(str(tmp_path))
