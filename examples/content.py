@@ -46,11 +46,13 @@ def ball_and_ground(width: int, height: int, eye_x: float = 0.0) -> tuple[Image.
 
 
 def picture(folder: Path) -> Made:
+    """A picture, flat."""
     ball_and_ground(960, 540)[0].save(folder / "picture.png")
     return str(folder / "picture.png"), ""
 
 
 def side_by_side(folder: Path, *, half: bool = False) -> Made:
+    """Two views beside each other."""
     left, right = (ball_and_ground(960, 540, eye_x=x)[0] for x in (-12, 12))
     pair = Image.new("RGB", (1920, 540))
     pair.paste(left, (0, 0))
@@ -61,10 +63,12 @@ def side_by_side(folder: Path, *, half: bool = False) -> Made:
 
 
 def half_side_by_side(folder: Path) -> Made:
+    """The same in half the columns."""
     return side_by_side(folder, half=True)
 
 
 def quilt(folder: Path) -> Made:
+    """Views of 24 cameras in one picture."""
     columns, rows, wide, high = 8, 3, 240, 135
     sheet = Image.new("RGB", (columns * wide, rows * high))
     for number in range(columns * rows):
@@ -75,6 +79,7 @@ def quilt(folder: Path) -> Made:
 
 
 def rgbd(folder: Path) -> Made:
+    """A picture and its depth."""
     colour, depth = ball_and_ground(960, 540)
     both = Image.new("RGB", (1920, 540))
     both.paste(colour, (0, 0))
@@ -84,6 +89,7 @@ def rgbd(folder: Path) -> Made:
 
 
 def film(folder: Path) -> Made:
+    """Two views beside each other, moving."""
     import cv2
 
     writer = cv2.VideoWriter(str(folder / "film_sbs.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 25, (960, 270))
@@ -101,6 +107,7 @@ def live(folder: Path) -> Made:
 
 
 def mesh(folder: Path, suffix: str) -> Made:
+    """Two coloured shapes."""
     import trimesh
 
     parts = [trimesh.creation.torus(1.0, 0.35), trimesh.creation.icosphere(subdivisions=3, radius=0.5)]
@@ -113,14 +120,17 @@ def mesh(folder: Path, suffix: str) -> Made:
 
 
 def obj(folder: Path) -> Made:
+    """A mesh with vertex colours."""
     return mesh(folder, ".obj")
 
 
 def stl(folder: Path) -> Made:
+    """A mesh without colours."""
     return mesh(folder, ".stl")
 
 
 def points(folder: Path) -> Made:
+    """A cloud of coloured points."""
     import trimesh
 
     u, v = np.random.default_rng(0).random((2, 60_000)) * 2 * np.pi
@@ -194,6 +204,7 @@ def gltf(folder: Path) -> Made:
 
 
 def playlist(folder: Path) -> Made:
+    """Three scenes, half a second each."""
     stl(folder)
     rgbd(folder)
     (folder / "evening.toml").write_text(
@@ -214,6 +225,7 @@ def data_set(folder: Path) -> Made:
 
 
 def placed(folder: Path) -> Made:
+    """The demo scene, smaller, moved and turning."""
     return "demo", "scale = 0.8\noffset_m = [0.02, 0.0, 0.01]\nturntable_per_min = 10"
 
 
@@ -225,6 +237,7 @@ KINDS: dict[str, Callable[[Path], Made]] = {
 
 
 def main() -> int:
+    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kind", nargs="*", choices=[*KINDS, []], help="which kinds; all where none is named")
     parser.add_argument("--out", type=Path, default=Path("out/content"), help="a folder a kind is made in it")
