@@ -40,7 +40,7 @@ class Chart:
     """What all panels show together at one step."""
 
     viewpoint: Viewpoint
-    label: str  # which eye and panel, for the seed's kind; else empty
+    label: str  # which eye and panel, for the EyeReal supplement's kind; else empty
     layers: U8  # (N, H, W, 4) rear to front
 
 
@@ -53,7 +53,7 @@ class Drawer:
         self._predictor: Predictor | None = None
 
     def charts(self, viewpoint: Viewpoint) -> Iterator[Chart]:
-        """One chart of the solved kind, one for each panel and eye of the seed's. Raises InputError, MissingPart."""
+        """One chart of the solved kind, one for each panel and eye of the EyeReal's. Raises InputError, MissingPart."""
         if self.kind == "seed":
             for index in range(self.stack.count):
                 for side, eye in enumerate(EYE_NAMES):
@@ -83,7 +83,7 @@ class Drawer:
 
 
 def fused_psnr_db(layers: U8, viewpoint: Viewpoint, *, stack: PanelStack, ipd_m: float) -> float:
-    """How well both eyes see the line picture from the viewpoint (design 5.5)."""
+    """How well both eyes see the line picture from the viewpoint (docs/contracts.md)."""
     wanted = line_picture(width_px=stack.width_px, height_px=stack.height_px).astype(np.float32) / np.float32(255)
     seen = [seen_by(eye, layers, stack, fov_deg=chart_fov_deg(viewpoint, stack)) for eye in viewpoint.eyes_m(ipd_m)]
     return quality([r.image for r in seen], [wanted, wanted], [r.mask for r in seen]).psnr_db
@@ -182,7 +182,7 @@ def make_charts(out: Path, viewpoints: Sequence[Viewpoint], drawer: Drawer, *, c
 
 def _pictures(chart: Chart) -> Iterator[tuple[str, U8]]:
     stem = f"chart-{chart.viewpoint.name}"
-    if chart.label:  # the other panels of the seed's charts show nothing
+    if chart.label:  # the other panels of the EyeReal supplement's charts show nothing
         index = int(chart.label.split("-")[1])
         yield f"{stem}-{chart.label}.png", np.ascontiguousarray(chart.layers[index, ..., 0])
         return

@@ -1,4 +1,4 @@
-"""Calibration charts as arrays: black lines on white at the thirds of each eye's image (seed 2.3, figure S4)."""
+"""Calibration charts as arrays: black lines on white at the thirds of each eye's image (EyeReal, 2.3, figure S4)."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def line_picture(*, width_px: int, height_px: int) -> U8:
 
 
 def eye_chart(viewpoint: Viewpoint, stack: PanelStack, *, side: int, index: int, ipd_m: float) -> U8:
-    """(H, W) the seed's own chart: panel `index` alone shows the lines to one eye (0: left, 1: right).
+    """(H, W) the EyeReal supplement's own chart: panel `index` alone shows the lines to one eye (0: left, 1: right).
 
-    Panel pixels look up the eye's image through H (seed 40), so the lines are straight, and at the thirds, only
+    Panel pixels look up the eye's image through H (EyeReal, (40)), so the lines are straight, and at the thirds, only
     from that eye's place. Raises ValueError where a corner of the panel is behind the eye.
     """
     raster = stack.panel(index)

@@ -13,7 +13,7 @@ from calib.solution import Solution
 from runtime.errors import InputError
 from runtime.records import F64
 
-RESIDUAL_LIMIT_M = 0.05  # the seed's (its figure S5)
+RESIDUAL_LIMIT_M = 0.05  # the EyeReal supplement's (its figure S5)
 SENSOR_NOISE_FLOOR_M = 0.001  # no depth camera does better on a face
 REFUSE_EYE_ERROR_M = 0.05
 WARN_EYE_ERROR_M = 0.01

@@ -191,7 +191,7 @@ def methods(
     pairs_max: Annotated[int, typer.Option(help="most pairs in the timing", min=27, max=1_000_000)] = 100_000,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare the methods on the seed's synthetic experiment: error at the eye, and time, for each of them.
+    """Compare the methods on the EyeReal's synthetic experiment: error at the eye, and time, for each of them.
 
     Example: phasestack calibrate methods --out methods
     """

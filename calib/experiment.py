@@ -1,4 +1,4 @@
-"""The seed's synthetic experiment (section 2.3), repeated for every method: error at the eye against noise."""
+"""The EyeReal's synthetic experiment (section 2.3), repeated for every method: error at the eye against noise."""
 
 from __future__ import annotations
 

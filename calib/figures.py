@@ -45,7 +45,7 @@ def finish(axes: Any, *, x: str, y: str, title: str, which: str = "major") -> No
 
 
 def residual_figure(residual_m: F64, used: Any, *, limit_m: float) -> bytes:
-    """X, Y, Z error of every calibration point (the seed's figure S5), millimetres."""
+    """X, Y, Z error of every calibration point (the EyeReal supplement's figure S5), millimetres."""
     canvas, axes = figure(9, 6.5, nrows=3, sharex=True, sharey=True)
     numbers = np.arange(1, len(residual_m) + 1)
     largest = 1e3 * max(float(np.abs(residual_m[used]).max(initial=0.0)), 1e-6)

@@ -1,7 +1,7 @@
 """A panel's grey curve: from a short series of luminances to phase against grey, and its inverse, the LUT.
 
 Between crossed polarizers, with the other panels at zero, a panel of phase p shows L = dark + range·sin²(pi/2·p)
-(seed 4). Either the phase or the intensity sin²(pi/2·p) is modelled as B(g^gamma), whichever explains the series
+(EyeReal, (4)). Either the phase or the intensity sin²(pi/2·p) is modelled as B(g^gamma), whichever explains the series
 with fewer parameters: a bare panel is smooth in the one, a monitor with its own tone curve in the other. B is a
 polynomial in Bernstein form whose coefficients ascend from 0 to 1: monotone and smooth whatever the noise. Dark and
 range are fitted too. That full white is a phase of 1 is assumed: luminance alone cannot tell a panel that does not

@@ -70,7 +70,7 @@ def displayed_quality(
     *,
     fov_deg: float,
 ) -> Quality:
-    """Quality of both eyes' pictures (design 5.5) on a stack with such panels; `wanted`: two (h, w, 3 or 4)."""
+    """Quality of both eyes' pictures (docs/contracts.md) on a stack with such panels; `wanted`: two (h, w, 3 or 4)."""
     height, width = wanted[0].shape[:2]
     seen = [
         seen_through(eye, layers, stack, true_from_ideal, fov_deg=fov_deg, width_px=width, height_px=height)

@@ -27,7 +27,7 @@ def seen_db(
     *,
     fov_deg: float,
 ) -> float:
-    """Displayed PSNR (design 5.5) of layers that were made for `stack` on panels that truly stand elsewhere."""
+    """Displayed PSNR (docs/contracts.md) of layers that were made for `stack` on panels that truly stand elsewhere."""
     height, width = wanted[0].shape[:2]
     seen = []
     for eye in eyes_m:

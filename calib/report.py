@@ -96,7 +96,7 @@ def _pictures(
             Picture(
                 "residuals.png",
                 residual_figure(points.residual_m, points.used, limit_m=RESIDUAL_LIMIT_M),
-                "X, Y and Z error of every calibration point (the seed's figure S5)",
+                "X, Y and Z error of every calibration point (the EyeReal supplement's figure S5)",
             )
         )
     found.append(

@@ -1,10 +1,10 @@
-"""Closed-form similarities from pairs of points (seed 19-27, with its scale and two better ones).
+"""Closed-form similarities from pairs of points (EyeReal supplement, (19)-(27), with its scale and two better ones).
 
 A similarity maps a sensor point c to the stack as  w = s·R·c + t.  Every rule finds the same rotation, the one that
 maximises the correlation of the centred points (Kabsch, Umeyama 1991), and differs in the scale:
 
-* `seed`: ratio of the RMS radii (seed 22). The geometric mean of the two below, the best of neither objective;
-* `least-squares`: minimises the error in the stack (seed 20, Umeyama). Noise on the sensor's side shrinks it;
+* `seed`: ratio of the RMS radii (EyeReal, (22)). The geometric mean of the two below, the best of neither objective;
+* `least-squares`: minimises the error in the stack (EyeReal, (20), Umeyama). Noise on the sensor's side shrinks it;
 * `inverse`: minimises the error in the sensor, that is, fitted from stack to sensor and inverted: consistent when
   the stack's points are known and the sensor's are noisy, as here;
 * a number: the scale is known.

@@ -1,7 +1,7 @@
 """What a camera sees of a stack whose panels are not where they should be.
 
 Every ray of the camera crosses every panel where that panel truly is; the panels' phases along it add up and
-sin² of the sum is what is seen (seed 7). The lens distorts (Brown), darkens the corners and is out of focus; the
+sin² of the sum is what is seen (EyeReal, (7)). The lens distorts (Brown), darkens the corners and is out of focus; the
 panels' pixel grids beat with each other and with the sensor's (moiré); the sensor adds shot and read noise; the
 picture has a tone curve, eight bits and JPEG's losses. Glass shifts what lies behind it.
 """

@@ -1,4 +1,4 @@
-"""Where viewers stand: the grid of calibration viewpoints (seed 2.3, for any distance), and the volume of errors."""
+"""Where viewers stand: the calibration viewpoints (EyeReal, 2.3, for any distance), and the volume of errors."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Viewpoint:
 
 
 def spherical_m(radius_m: float, *, phi_deg: float, theta_deg: float) -> F64:
-    """(3,) point in `stack` from the seed's polar angles."""
+    """(3,) point in `stack` from the EyeReal supplement's polar angles."""
     phi, theta = np.radians(phi_deg), np.radians(theta_deg)
     return radius_m * np.array([np.sin(phi) * np.sin(theta), np.sin(phi) * np.cos(theta), np.cos(phi)])
 
@@ -56,7 +56,7 @@ def viewing_place_m(viewing: CalibrationSettings) -> F64:
 
 
 def grid(viewing: CalibrationSettings = USUAL) -> tuple[Viewpoint, ...]:
-    """The 27 viewpoints of a configured viewing range, nearest first, row by row; the seed's for the usual one."""
+    """The 27 viewpoints of a configured viewing range, nearest first, row by row; the EyeReal's for the usual one."""
     low_deg, high_deg = viewing.viewing_up_deg
     radii_cm = np.rint(100 * np.linspace(*viewing.viewing_m, 3)).astype(int)
     phi_deg = np.rint(90 - np.linspace(high_deg, low_deg, 3)).astype(int)

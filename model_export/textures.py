@@ -33,7 +33,7 @@ def _colour(random: Random) -> np.ndarray:
 
 
 def noise(random: Random, width: int, height: int) -> U8:
-    """Noise whose power falls with frequency: 1/f to some exponent from white to clouds."""
+    """(height, width, 4) noise whose power falls with frequency: 1/f to some exponent from white to clouds."""
     exponent = random.uniform(0.3, 2.0)
     fu, fv = np.fft.rfftfreq(width), np.fft.fftfreq(height)[:, None]
     gain = 1 / np.maximum(np.hypot(fu, fv), 1 / max(width, height)) ** exponent
@@ -49,7 +49,7 @@ def noise(random: Random, width: int, height: int) -> U8:
 
 
 def checker(random: Random, width: int, height: int) -> U8:
-    """Squares of two colours, turned."""
+    """(height, width, 4) squares of two colours, turned."""
     v, u = np.mgrid[0:height, 0:width]
     angle, size = random.uniform(0, np.pi), random.uniform(4, 40)
     a = np.floor((u * np.cos(angle) + v * np.sin(angle)) / size)
@@ -58,7 +58,7 @@ def checker(random: Random, width: int, height: int) -> U8:
 
 
 def gradient(random: Random, width: int, height: int) -> U8:
-    """A smooth run between two colours, nearly without detail."""
+    """(height, width, 4) a smooth run between two colours, nearly without detail."""
     v, u = np.mgrid[0:height, 0:width]
     angle = random.uniform(0, np.pi)
     t = 0.5 + (u / width - 0.5) * np.cos(angle) + (v / height - 0.5) * np.sin(angle)
@@ -66,7 +66,7 @@ def gradient(random: Random, width: int, height: int) -> U8:
 
 
 def shapes(random: Random, width: int, height: int) -> U8:
-    """Discs, boxes and lines of all sizes over one another."""
+    """(height, width, 4) discs, boxes and lines of all sizes over one another."""
     picture = _opaque(np.tile(_colour(random), (height, width, 1)))
     for _ in range(int(random.integers(10, 60))):
         colour = [int(c * 255) for c in _colour(random)] + [255]
@@ -84,7 +84,7 @@ def shapes(random: Random, width: int, height: int) -> U8:
 
 
 def text(random: Random, width: int, height: int) -> U8:
-    """Lines of words on a plate."""
+    """(height, width, 4) lines of words on a plate."""
     picture = _opaque(np.tile(_colour(random), (height, width, 1)))
     colour = [int(c * 255) for c in _colour(random)] + [255]
     y = 0
@@ -97,7 +97,7 @@ def text(random: Random, width: int, height: int) -> U8:
 
 
 def wires(random: Random, width: int, height: int) -> U8:
-    """Thin structures with nothing between them."""
+    """(height, width, 4) thin structures with nothing between them."""
     picture = np.zeros((height, width, 4), np.uint8)
     picture[..., :3] = np.rint(_colour(random) * 255)
     alpha = np.zeros((height, width), np.uint8)
@@ -109,7 +109,7 @@ def wires(random: Random, width: int, height: int) -> U8:
 
 
 def blob(random: Random, width: int, height: int) -> U8:
-    """A textured patch with an irregular outline."""
+    """(height, width, 4) a textured patch with an irregular outline."""
     texture: Texture = random.choice([noise, shapes, checker])  # type: ignore[arg-type]
     picture = texture(random, width, height)
     angles = np.linspace(0, 2 * np.pi, 40, endpoint=False)
@@ -122,7 +122,7 @@ def blob(random: Random, width: int, height: int) -> U8:
 
 
 def glint(random: Random, width: int, height: int) -> U8:
-    """A specular highlight: white, brightest in its middle."""
+    """(height, width, 4) a specular highlight: white, brightest in its middle."""
     v, u = np.mgrid[0:height, 0:width]
     radius = np.hypot(u / width - 0.5, v / height - 0.5) * 2
     picture = np.full((height, width, 4), 255, np.uint8)

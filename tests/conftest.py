@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from runtime.support.background import wait_for_all
 from runtime.support.logs import ROOTS
 
 settings.register_profile("untimed", deadline=None)  # a busy machine must not fail a property
@@ -45,3 +46,8 @@ def logs_as_they_were() -> Iterator[None]:
             handler.close()
     for logger, (handlers, level, propagate) in zip(loggers, before, strict=True):
         logger.handlers[:], logger.level, logger.propagate = handlers, level, propagate
+
+
+def pytest_sessionfinish() -> None:
+    """A process that ends while a job measures or loads is ended by the libraries in it, with another exit code."""
+    wait_for_all(60.0)

@@ -55,7 +55,7 @@ class SolveRequest:
 
 
 def solve_pair(request: SolveRequest) -> dict[str, Any]:
-    """Layers, what the eyes see of them, and solve.json (design 5.2). Raises InputError."""
+    """Layers, what the eyes see of them, and solve.json (docs/contracts.md). Raises InputError."""
     settings = Overrides(backend=request.backend).applied(load_settings(request.config))
     if request.no_plan:
         settings = changed(settings, "plan", {"enabled": False}, source="--no-plan")

@@ -28,6 +28,7 @@ from runtime.support import foreign, progress
 from runtime.support.gl import DrawnPicture
 from runtime.support.picture_header import check_picture
 
+UNCOLOURED = (0.70, 0.74, 0.80)  # of an STL, which has no colours
 GLTF = (".glb", ".gltf")
 STL_HEAD, STL_FACET = 84, 50  # bytes of a binary file's head and of each of its triangles
 LIBRARY_BYTES_MAX = 16 << 20  # of an OBJ's materials
@@ -72,7 +73,9 @@ def load_mesh(path: Path, *, limits: LimitSettings | None = None, animation: str
     parts = []
     for number, mesh in enumerate(meshes):
         progress.tell(f"{path.name}: parts", number, len(meshes))
-        parts.append(_part(mesh, path, pictures))
+        part = _part(mesh, path, pictures)
+        # White before white is hard to see.
+        parts.append(replace(part, colour=UNCOLOURED) if path.suffix.lower() == ".stl" else part)
     _refuse_empty(path, parts)
     return _boxed(path, parts, [part.shape.positions_m for part in parts])
 

@@ -23,7 +23,8 @@ from runtime.support.gl import DrawnPicture
 COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 GREY = (0.45, 0.45, 0.45)  # of points without a colour
 MEASURED = 2000  # points whose neighbours are looked for
-DISC_PER_GAP = 1.5  # so that the surface closes
+NEIGHBOURS = 8  # the farthest of so many says how dense points lie, on a grid as at random
+DISC_PER_GAP = 1.25  # so that the surface closes
 LARGEST_COORDINATE = 1e15
 LARGEST_PX = 64.0
 VERTEX = """
@@ -57,7 +58,7 @@ class Cloud:
 
     positions: F32  # (n, 3)
     colours: F32  # (n, 3), 0-1
-    gap: float  # median distance to the nearest neighbour
+    gap: float  # median distance to the farthest of the nearest neighbours
 
 
 def load_points(path: Path, *, limits: LimitSettings | None = None) -> Cloud:
@@ -90,7 +91,8 @@ def _gap(positions: F32) -> float:
     if len(positions) < 2:
         return 0.0
     chosen = np.random.default_rng(0).choice(len(positions), min(MEASURED, len(positions)), replace=False)
-    distances = cKDTree(positions).query(positions[chosen], k=2)[0][:, 1]
+    count = min(NEIGHBOURS + 1, len(positions))
+    distances = cKDTree(positions).query(positions[chosen], k=count)[0][:, -1]
     return float(np.median(distances))
 
 

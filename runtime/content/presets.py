@@ -1,4 +1,4 @@
-"""The paper's 17 scenes: scale, pose and depth of each, in the seed's reading and in the published code's."""
+"""The paper's 17 scenes: scale, pose and depth of each, in the EyeReal's reading and in the published code's."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Published(Section):
 class SceneTable(Section):
     """One scene of the data file."""
 
-    title: str = Field(description="name in the seed's tables")
+    title: str = Field(description="name in the EyeReal supplement's tables")
     scale_per_cm: Positive = Field(description="r_p2d")
     thickness_cm: Positive = Field(description="d_thick: from the first panel to the last")
     rotation_deg: Triple = Field(description="about x, y, z")

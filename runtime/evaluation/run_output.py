@@ -1,4 +1,4 @@
-"""The files of a run (design 5.2). They are for looking at afterwards: losing them must not stop what they tell of."""
+"""The files of a run (contracts). They are for looking at afterwards: losing them must not stop what they tell of."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ class OneEuro:
         self.velocity: F64 = np.zeros(0)
 
     def update(self, measured: F64, *, dt_s: float) -> F64:
-        """The filtered position; dt_s > 0 since the sample before, of no meaning for the first."""
+        """(...) the filtered positions; dt_s > 0 since the sample before, of no meaning for the first."""
         if self.position is None:
             self.position, self.velocity = measured.copy(), np.zeros_like(measured)
             return self.position

@@ -17,7 +17,7 @@ class LayerBuffers:
         self._buffers: list[tuple[U8, Callable[[], U8 | None]]] = []
 
     def copy_of(self, layers: U8) -> U8:
-        """The same values in a buffer that is nobody else's as long as the answer lives."""
+        """(...) the same values in a buffer that is nobody else's as long as the answer lives."""
         held = [holder() is not None for _, holder in self._buffers]
         index = held.index(False) if False in held else len(held)
         if index == len(held):

@@ -1,4 +1,4 @@
-"""What a model file says about itself (design 5.4), checked at load."""
+"""What a model file says about itself (docs/contracts.md), checked at load."""
 
 from __future__ import annotations
 

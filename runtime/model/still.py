@@ -26,7 +26,7 @@ def solve_still(
     """Layers for two pictures (h, w, 3 or 4) that a left and a right eye (2, 3), frame `stack`, should see.
 
     The pictures' horizontal field of view is `fov_deg`; each eye looks at the stack's origin. Warps each picture
-    to the rasters that the predictor wants (seed 47). Its prepare time includes the warps.
+    to the rasters that the predictor wants (EyeReal supplement, (47)). Its prepare time includes the warps.
     """
     import cv2
 

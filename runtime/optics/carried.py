@@ -1,4 +1,4 @@
-"""What eyes see that are not where the layers were solved for: carried and expected quality (design 5.5).
+"""What eyes see that are not where the layers were solved for: carried and expected quality (docs/contracts.md).
 
 The picture that the layers were solved for is carried along on the centre panel: the ray of each of its pixels is
 replaced by the one from the true eye through the same point of that panel. So ghosts and colour fringes count, and
@@ -101,7 +101,7 @@ def expected_psnr_db(
     sigma_mm: float,
     step: int = 1,
 ) -> float:
-    """PSNR of the carried squared error expected over normal errors of the eyes' common place (design 5.5).
+    """PSNR of the carried squared error expected over normal errors of the eyes' common place (docs/contracts.md).
 
     Standard deviation `sigma_mm` to the right and up, by five points: no error with weight 1/2, two standard
     deviations to either side with 1/8 each, which is exact for second moments. eyes_m: (2, 3), solved for.

@@ -39,7 +39,7 @@ def intensity_from_phase(phase: NDArray[T]) -> NDArray[T]:
 
 
 def phase_from_intensity(intensity: NDArray[T], branch: Branch = 2) -> NDArray[T]:
-    """The phase sum (units of pi/2) whose sin² is `intensity`, which is clipped to [0, 1].
+    """(...) the phase sum (units of pi/2) whose sin² is `intensity`, which is clipped to [0, 1].
 
     Branch 1 lies in [0, 1], branch 2 in [1, 2]: with three panels it keeps every panel far from its limits.
     Whole numbers are taken as doubles.

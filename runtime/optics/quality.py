@@ -1,4 +1,4 @@
-"""Displayed quality (design 5.5): PSNR and SSIM of what an eye sees after clipping and 8 bits."""
+"""Displayed quality (docs/contracts.md): PSNR and SSIM of what an eye sees after clipping and 8 bits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Simulated retinas: what an eye sees through the layers (design 5.5), pinhole and with a pupil of finite size."""
+"""Simulated retinas: what an eye sees through the layers (contracts), pinhole and with a pupil of finite size."""
 
 from __future__ import annotations
 
@@ -210,7 +210,7 @@ def through_layers(
 
 
 def as_codes(image: F32) -> U8:
-    """8-bit code values of intensities, clipped to [0, 1]."""
+    """(...) 8-bit code values of intensities, clipped to [0, 1]."""
     return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
@@ -225,7 +225,7 @@ def pupil_points(diameter_m: float, rings: int = 2) -> F64:
 
 
 def average(images: Iterable[F32]) -> F32:
-    """Mean of equally sized images: a finite pupil sees the average of what its points see (section 1.4)."""
+    """(h, w, C) mean of equally sized images: a finite pupil sees the average of what its points see (section 1.4)."""
     total: F32 | None = None
     count = 0
     for image in images:

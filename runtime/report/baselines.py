@@ -165,5 +165,5 @@ def mean_of_targets(
 
 
 def as_codes(layers: F32) -> U8:
-    """Panel values as 8-bit grey levels, rounded to the nearest."""
+    """(...) panel values as 8-bit grey levels, rounded to the nearest."""
     return np.rint(layers * 255).astype(np.uint8)

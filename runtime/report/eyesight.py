@@ -65,6 +65,6 @@ def single_psnr_db(
 def seen_rays(
     eye_m: ArrayLike, layers: U8, stack: PanelStack, *, width_px: int, height_px: int, fov_deg: float, step: int
 ) -> tuple[F32, Mask]:
-    """`seen_by` for some of an image's rays: every `step`-th column and row, from the first."""
+    """(h, w, C) and (h, w): `seen_by` for some of an image's rays: every `step`-th column and row, from the first."""
     retina = seen_by(eye_m, layers, stack, width_px=width_px, height_px=height_px, fov_deg=fov_deg, step=step)
     return retina.image, retina.mask

@@ -38,14 +38,17 @@ class KeptParts:
 
     def part(self, name: str, make: Callable[[], T]) -> T:
         """The part of that name: as an earlier run left it, or made now and kept."""
-        path = self._folder / (re.sub(r"[^A-Za-z0-9.-]+", "-", name)[:100] + ".pickle")
+        # The digest tells names apart that are alike but for what a file's name can't hold.
+        readable = re.sub(r"[^A-Za-z0-9.-]+", "-", name)[:80]
+        path = self._folder / f"{readable}-{digest([], name)}.pickle"
         with contextlib.suppress(OSError, EOFError, pickle.UnpicklingError, AttributeError, ImportError):
             if self._is_ours():
                 found: T = pickle.loads(path.read_bytes())
                 self.earlier.append(name)
                 return found
         made = make()
-        with contextlib.suppress(OSError):  # a full disk costs what was kept, not what is measured
+        # A full disk, or a part that can't be kept, costs what was kept, not what is measured.
+        with contextlib.suppress(OSError, pickle.PicklingError, TypeError, AttributeError):
             self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
             self._folder.chmod(0o700)
             write_bytes(path, pickle.dumps(made))

@@ -49,7 +49,7 @@ class StillPair:
 
     @property
     def wanted(self) -> tuple[Picture, Picture]:
-        """What the eyes should see, in all the bits that are known of it."""
+        """(h, w, 3) for each eye: what it should see, in all the bits that are known of it."""
         return self.stored or self.images
 
 
@@ -128,7 +128,7 @@ def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0,
 
 
 def beside(eye_m: ArrayLike, mm: float, directions: int = 4) -> list[F64]:
-    """Places `mm` beside an eye: right, up, left, down (or more) in its own frame."""
+    """(3,) places `mm` away from an eye: right, up, left, down (or more) in its own frame."""
     pose = stack_from_eye(eye_m)
     angles = [2 * math.pi * index / directions for index in range(directions)]
     return [pose[:3, 3] + mm / 1000 * (math.cos(a) * pose[:3, 0] + math.sin(a) * pose[:3, 1]) for a in angles]

@@ -60,7 +60,7 @@ class Tolerance:
 
 
 def tolerance_map(simulation: Simulation, eyes_m: F64, offsets_mm: Sequence[float]) -> Tolerance:
-    """Both eyes pooled, moved together to the right and up: carried (design 5.5), so that ghosts and fringes count."""
+    """Both eyes pooled, moved together to the right and up: carried (contracts), so that ghosts and fringes count."""
     layers = simulation.layers(eyes_m)
     table = np.full((len(offsets_mm), len(offsets_mm)), np.nan)
     if layers is None:

@@ -109,7 +109,7 @@ def candidates() -> Iterable[tuple[str, Callable[[], Predictor]]]:
 def errors_mm(
     make: Callable[[], Predictor], observed: Sequence[Observation], motion: str, horizons_ms: Sequence[float]
 ) -> dict[float, F64]:
-    """Distance of the worse eye from the truth, each sample's instant plus each horizon, dropouts included.
+    """(n,) for each horizon: distance of the worse eye from the truth at each sample plus that, dropouts included.
 
     Each horizon is a run of its own: a display has one.
     """

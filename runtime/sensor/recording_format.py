@@ -210,7 +210,7 @@ def colour_message(colour: U8, *, capture_ns: int) -> bytes:
 
 
 def colour_from_message(data: bytes, *, most_pixels: int = 1 << 26) -> U8:
-    """Back from `colour_message` (JPEG is lossy). Raises ValueError."""
+    """(h, w, 3) back from `colour_message` (JPEG is lossy). Raises ValueError."""
     import cv2
 
     coded = _coded_bytes(_table(data))
@@ -232,7 +232,7 @@ def depth_message(depth_mm: U16, *, capture_ns: int) -> bytes:
 
 
 def depth_from_message(data: bytes) -> U16:
-    """Back from `depth_message`, exactly. Raises ValueError."""
+    """(h, w) millimetres back from `depth_message`, exactly. Raises ValueError."""
     record = _table(data)
     width, height = (
         whole(record.get(name), least=1, most=IMAGE_SIDE_MAX_PX, problem=_of(name)) for name in ("width", "height")

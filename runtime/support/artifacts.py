@@ -94,7 +94,7 @@ def read_image(path: Path) -> U8:
 
 
 def in_8_bits(picture: U8 | U16) -> U8:
-    """The nearest 8-bit code values."""
+    """(...) the nearest 8-bit code values."""
     if picture.dtype == np.uint8:
         return np.asarray(picture, np.uint8)
     return ((picture.astype(np.uint32) + 128) // 257).astype(np.uint8)

@@ -64,7 +64,7 @@ class DrawnPicture:
         return self.held.shape
 
     def pixels(self) -> U8:
-        """Read back, on the thread of its context: what was drawn, until the next is drawn."""
+        """(h, w, 4) what was drawn, read back on the thread of its context; until the next is drawn."""
         finish()
         self.target.read_into(self.held, components=4)
         return self.held

@@ -199,3 +199,19 @@ def test_guidance_is_read_through_the_stack_from_about_the_viewpoint(name: str, 
         assert words[place].sum() > 100
         assert np.median(light[words[place]]) > 0.6
         assert np.percentile(light[paper[place]], 90) < 0.1
+
+
+def test_what_check_finds_is_printed() -> None:
+    from calib.commands import _fused
+
+    assert _fused({"psnr_db": []}) == ""
+    told = _fused({"psnr_db": [20.0, 18.5, 21.25], "viewpoints": ["near", "middle", "far"]})
+    assert "fused: 20.00 dB at the median viewpoint, 18.50 dB at the worst (middle)" in told
+    assert "far" in told and "21.25 dB" in told
+    one = _fused({"psnr_db": [19.0], "viewpoints": ["near"]})
+    assert one == "\nfused: 19.00 dB at the median viewpoint, 19.00 dB at the worst (near)"
+
+
+def test_check_without_solved_charts_that_are_written_is_refused(tmp_path: Path) -> None:
+    done = run.invoke(app, ["charts", "--out", str(tmp_path / "c"), "--kind", "seed", "--check"])
+    assert done.exit_code != 0 and "--check" in str(done.exception)

@@ -1,4 +1,4 @@
-"""The seed's synthetic experiment: which method is best at the eye (fewer noise samples than the command's 200)."""
+"""The EyeReal's synthetic experiment: which method is best at the eye (fewer noise samples than the command's 200)."""
 
 from __future__ import annotations
 

@@ -145,7 +145,7 @@ def carried_db(
     light: Path, settings: Settings, panels, *, registered: bool, world: SimulatedWorld | None = None,
     curves: bool = True,
 ) -> float:  # fmt: skip
-    """Displayed dB (design 5.5) of what a run left of a refresh's light, on panels that stand where they do.
+    """Displayed dB (docs/contracts.md) of what a run left of a refresh's light, on panels that stand where they do.
 
     world: whose panels turn to what their monitors make of a grey; none: they follow exactly.
     """

@@ -1,4 +1,4 @@
-"""The grid of the seed's section 2.3."""
+"""The grid of the EyeReal supplement's section 2.3."""
 
 from __future__ import annotations
 

@@ -77,9 +77,19 @@ def test_a_torn_part_is_made_again_and_one_that_others_may_write_is_not_read(tmp
     work(parts())
     (folder,) = {path.parent for path in (tmp_path / "cache").rglob("*.pickle")}
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    (folder / "c.pickle").write_bytes(b"\x80\x04torn")
+    (torn,) = folder.glob("c-*.pickle")
+    torn.write_bytes(b"\x80\x04torn")
     work(parts())
     assert work.made.count("c") == 2 and work.made.count("a 1") == 1
     folder.chmod(0o777)
     work(parts())
     assert work.made.count("a 1") == 2
+
+
+def test_names_that_are_alike_in_a_files_name_are_different_parts_and_what_cannot_be_kept_is_made() -> None:
+    assert [parts().part(name, lambda name=name: name) for name in ("fast ½", "fast ¾", "fast/½")] == [
+        "fast ½", "fast ¾", "fast/½",
+    ]  # fmt: skip
+    assert parts().part("fast ¾", lambda: "anew") == "fast ¾"
+    assert parts().part("odd", lambda: lambda: 1)() == 1
+    assert parts().part("odd", lambda: lambda: 2)() == 2

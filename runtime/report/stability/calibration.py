@@ -35,7 +35,7 @@ def rotation(quaternion: tuple[int, int, int, int]) -> list[list[Any]]:
 
 
 def cloud(*, aspect: float = 1.0, size_m: float = 0.3, count: int = 27) -> F64:
-    """Points spread over `size_m` along one axis and over `aspect` of it along the others."""
+    """(n, 3) points spread over `size_m` along one axis and over `aspect` of it along the others."""
     return np.random.default_rng(11).uniform(-1, 1, (count, 3)) * [size_m, size_m * aspect, size_m * aspect]
 
 

@@ -64,7 +64,7 @@ def nothing(*_: object, **__: object) -> Any:
 
 
 def first_pose(eye: Any) -> F64:
-    """The pose of an eye straight ahead, wherever the eye is."""
+    """(4, 4) the pose of an eye straight ahead, wherever the eye is."""
     pose = np.eye(4)
     pose[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
     pose[:3, 3] = eye
@@ -72,12 +72,12 @@ def first_pose(eye: Any) -> F64:
 
 
 def straight_projection(eye: Any, *, width_px: int, height_px: int, fov_deg: float) -> F64:
-    """As if every eye were straight ahead."""
+    """(3, 4) as if every eye were straight ahead."""
     return image_from_stack([0.6, 0.0, 0.0], width_px=width_px, height_px=height_px, fov_deg=fov_deg)
 
 
 def unmoved(eye: Any, *, from_x_m: float, to_x_m: float) -> tuple[float, F64]:
-    """No parallax."""
+    """Scale and (2,) shift without a parallax."""
     return 1.0, np.zeros(2)
 
 
@@ -122,22 +122,22 @@ def no_operator(eye: Any, stack: PanelStack, *, width_px: int, height_px: int, f
 
 
 def grey_layers(problem: solve.Problem) -> F32:
-    """Every panel half way."""
+    """(N, h, w, C) every panel half way."""
     return np.full((problem.stack.count, solve.HEIGHT_PX, solve.WIDTH_PX, 3), 0.5, np.float32)
 
 
 def one_eye(problem: solve.Problem) -> F32:
-    """The left eye's picture alone, as well as it can be shown."""
+    """(N, h, w, C) the left eye's picture alone, as well as it can be shown."""
     return conjugate_gradients(problem.operators[:1], problem.wanted[:1], problem.stack, iterations=30)
 
 
 def grey_network(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack) -> U8:
-    """Every panel half way, whatever is wanted."""
+    """(N, h, w, 3) every panel half way, whatever is wanted."""
     return np.full((stack.count, stack.height_px, stack.width_px, 3), 128, np.uint8)
 
 
 def mean_network(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack) -> U8:
-    """The mean of the warped targets: nothing of the difference between the eyes."""
+    """(N, h, w, 3) the mean of the warped targets: nothing of the difference between the eyes."""
     wanted = [as_intensity(image) for image in images]
     return as_codes(mean_of_targets(eyes_m, wanted, stack, fov_deg=networks.FOV_DEG))
 
@@ -189,14 +189,14 @@ def first_place(places: F64, dt_s: float, *, q: float, noise_m: float) -> tuple[
 
 
 def by_centres(sensor_m: F64, stack_m: F64) -> F64:
-    """A shift alone, of the middles on each other."""
+    """(4, 4) a shift alone, of the middles on each other."""
     matrix = np.eye(4)
     matrix[:3, 3] = stack_m.mean(0) - sensor_m.mean(0)
     return matrix
 
 
 def without_shift(fit: Fit, sensor_m: F64, stack_m: F64) -> F64:
-    """The right turn and scale, and no shift."""
+    """(4, 4) the right turn and scale, and no shift."""
     matrix = fit(sensor_m, stack_m)
     matrix[:3, 3] = 0
     return matrix

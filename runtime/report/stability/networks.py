@@ -42,7 +42,7 @@ def ready(model: str, stack: PanelStack) -> Predictor:
 
 
 def predicted(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack) -> U8:
-    """Layers, copied out of the predictor: the code under trial; `controls` puts impostors in its place."""
+    """(N, h, w, 3) layers, copied out of the predictor: the code under trial, for which `controls` puts impostors."""
     done = solve_still(images[0], images[1], eyes_m=eyes_m, fov_deg=FOV_DEG, predictor=ready(model, stack))
     return np.array(done.layers[..., :3])
 
@@ -61,7 +61,7 @@ def squared_error(layers: U8, images: Sequence[U8], eyes_m: F64, stack: PanelSta
 
 
 def pictures(kind: str, stack: PanelStack = STACK) -> list[U8]:
-    """Two pictures that solvers dislike."""
+    """(h, w, 3) for each eye: two pictures that solvers dislike."""
     height, width = stack.height_px, stack.width_px
     left = np.zeros((height, width, 3), np.uint8)
     right = left.copy()
@@ -192,7 +192,7 @@ def modes(cells: int) -> Answer:
 
 
 def smooth(stack: PanelStack) -> list[U8]:
-    """An ordinary picture and its like, a little aside."""
+    """(h, w, 3) for each eye: an ordinary picture and its like, a little aside."""
     y, x = np.mgrid[0 : stack.height_px, 0 : stack.width_px]
     wave = 128 + 90 * np.sin(x / stack.width_px * 19) * np.cos(y / stack.height_px * 11)
     left = np.repeat(wave[..., None], 3, axis=2).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""What an eye sees, and how good that is: simulated retinas and PSNR against a tracer of 50 digits (design 5.5)."""
+"""What an eye sees, and how good that is: simulated retinas and PSNR against a tracer of 50 digits (contracts)."""
 
 from __future__ import annotations
 

@@ -1,0 +1,283 @@
+"""One scene of each kind, made from nothing and run: the file, the three layers, what each eye sees, a contact sheet.
+
+    python examples/content.py gltf --out out/content        # or any other kind; without one: all of them
+
+It leaves the file that was shown beside the run's pictures, so that it can be shown on a display, too:
+
+    phasestack run --scene out/content/gltf/bar.gltf
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+Made = tuple[str, str]  # the scene, as --scene takes it; further lines of [content]
+
+
+def ball_and_ground(width: int, height: int, eye_x: float = 0.0) -> tuple[Image.Image, Image.Image]:
+    """A picture and its depth (white nearest): a ball and bars before a ground; eye_x: sideways, for a second view."""
+    colour, depth = Image.new("RGB", (width, height), (235, 225, 205)), Image.new("L", (width, height), 50)
+    pen, deep = ImageDraw.Draw(colour), ImageDraw.Draw(depth)
+    for row in range(0, height, height // 9):
+        for column in range(0, width, width // 16):
+            if (row // (height // 9) + column // (width // 16)) % 2:
+                x = column - eye_x * 0.2
+                pen.rectangle([x, row, x + width // 16, row + height // 9], fill=(120, 160, 180))
+    for bar in range(3):
+        x = width * (0.12 + 0.08 * bar) - eye_x * 0.6
+        box = [x, height * 0.15, x + width * 0.025, height * 0.9]
+        pen.rectangle(box, fill=(40, 120, 60))
+        deep.rectangle(box, fill=150)
+    x, y, r = width * 0.62 - eye_x, height * 0.5, height * 0.26
+    pen.ellipse([x - r, y - r, x + r, y + r], fill=(210, 60, 40))
+    pen.ellipse([x - r * 0.6, y - r * 0.7, x - r * 0.1, y - r * 0.2], fill=(240, 140, 120))
+    deep.ellipse([x - r, y - r, x + r, y + r], fill=230)
+    return colour, depth
+
+
+def picture(folder: Path) -> Made:
+    """A picture, flat."""
+    ball_and_ground(960, 540)[0].save(folder / "picture.png")
+    return str(folder / "picture.png"), ""
+
+
+def side_by_side(folder: Path, *, half: bool = False) -> Made:
+    """Two views beside each other."""
+    left, right = (ball_and_ground(960, 540, eye_x=x)[0] for x in (-12, 12))
+    pair = Image.new("RGB", (1920, 540))
+    pair.paste(left, (0, 0))
+    pair.paste(right, (960, 0))
+    name = "pair_hsbs.png" if half else "pair_sbs.png"
+    (pair.resize((960, 540)) if half else pair).save(folder / name)
+    return str(folder / name), ""
+
+
+def half_side_by_side(folder: Path) -> Made:
+    """The same in half the columns."""
+    return side_by_side(folder, half=True)
+
+
+def quilt(folder: Path) -> Made:
+    """Views of 24 cameras in one picture."""
+    columns, rows, wide, high = 8, 3, 240, 135
+    sheet = Image.new("RGB", (columns * wide, rows * high))
+    for number in range(columns * rows):
+        view = ball_and_ground(480, 270, eye_x=(number - (columns * rows - 1) / 2) * 3)[0].resize((wide, high))
+        sheet.paste(view, (number % columns * wide, (rows - 1 - number // columns) * high))
+    sheet.save(folder / f"views_qs{columns}x{rows}a1.78.png")
+    return str(folder / f"views_qs{columns}x{rows}a1.78.png"), "cone_deg = 40"
+
+
+def rgbd(folder: Path) -> Made:
+    """A picture and its depth."""
+    colour, depth = ball_and_ground(960, 540)
+    both = Image.new("RGB", (1920, 540))
+    both.paste(colour, (0, 0))
+    both.paste(depth.convert("RGB"), (960, 0))
+    both.save(folder / "ball_rgbd.png")
+    return str(folder / "ball_rgbd.png"), ""
+
+
+def film(folder: Path) -> Made:
+    """Two views beside each other, moving."""
+    import cv2
+
+    writer = cv2.VideoWriter(str(folder / "film_sbs.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 25, (960, 270))
+    for number in range(50):
+        swing = 8 * np.sin(number / 25 * np.pi)
+        views = [np.asarray(ball_and_ground(480, 270, eye_x=swing + x)[0]) for x in (-6, 6)]
+        writer.write(np.ascontiguousarray(np.concatenate(views, axis=1)[..., ::-1]))
+    writer.release()
+    return str(folder / "film_sbs.mp4"), ""
+
+
+def live(folder: Path) -> Made:
+    """The same film as a stream would be: decoded beside the run, its newest picture."""
+    return f"live:{film(folder)[0]}", ""
+
+
+def mesh(folder: Path, suffix: str) -> Made:
+    """Two coloured shapes."""
+    import trimesh
+
+    parts = [trimesh.creation.torus(1.0, 0.35), trimesh.creation.icosphere(subdivisions=3, radius=0.5)]
+    for part, colour in zip(parts, ([60, 120, 210, 255], [230, 120, 40, 255]), strict=True):
+        part.visual.vertex_colors = np.tile(colour, (len(part.vertices), 1))
+        part.apply_transform(trimesh.transformations.rotation_matrix(0.9, [1, 0.4, 0]))
+    path = folder / f"ring{suffix}"
+    trimesh.util.concatenate(parts).export(path)
+    return str(path), ""
+
+
+def obj(folder: Path) -> Made:
+    """A mesh with vertex colours."""
+    return mesh(folder, ".obj")
+
+
+def stl(folder: Path) -> Made:
+    """A mesh without colours."""
+    return mesh(folder, ".stl")
+
+
+def points(folder: Path) -> Made:
+    """A cloud of coloured points."""
+    import trimesh
+
+    u, v = np.random.default_rng(0).random((2, 60_000)) * 2 * np.pi
+    cloud = np.column_stack([0.35 * np.sin(v), (1 + 0.35 * np.cos(v)) * np.cos(u), (1 + 0.35 * np.cos(v)) * np.sin(u)])
+    colours = np.column_stack([127 + 120 * np.cos(u), 127 + 120 * np.sin(u), 127 + 120 * np.cos(v), 255 + 0 * u])
+    trimesh.PointCloud(cloud, colors=colours.astype(np.uint8)).export(folder / "ring.ply")
+    return str(folder / "ring.ply"), "rotation_deg = [0, 25, 20]"
+
+
+def splats(folder: Path) -> Made:
+    """A ring of Gaussians, in the reference implementation's PLY."""
+    rng = np.random.default_rng(0)
+    count = 4000
+    u, v = rng.random((2, count)) * 2 * np.pi
+    centres = np.column_stack(
+        [0.35 * np.sin(v), (1 + 0.35 * np.cos(v)) * np.cos(u), (1 + 0.35 * np.cos(v)) * np.sin(u)]
+    )
+    colours = (np.column_stack([np.cos(u), np.sin(u), np.cos(v)]) * 0.45) / 0.2820948
+    table = np.column_stack(
+        [centres, colours, np.full(count, 2.0), np.full((count, 3), np.log(0.035)), rng.normal(size=(count, 4))]
+    )
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
+    names += ["rot_0", "rot_1", "rot_2", "rot_3"]
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n"
+    head += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    (folder / "splats.ply").write_bytes(head.encode() + table.astype("<f4").tobytes())
+    return str(folder / "splats.ply"), "rotation_deg = [0, 25, 20]"
+
+
+def gltf(folder: Path) -> Made:
+    """A bar of two bones that bends, with a colour at each corner."""
+    heights = np.repeat(np.linspace(0, 4, 33), 4)
+    corners = np.tile([[-0.4, -0.4], [0.4, -0.4], [0.4, 0.4], [-0.4, 0.4]], (33, 1))
+    positions = np.column_stack([corners[:, 0], heights, corners[:, 1]]).astype("<f4")
+    colours = np.column_stack([heights / 4, 0.5 + corners[:, 0], 0.5 + corners[:, 1], 1 + 0 * heights]).astype("<f4")
+    share = np.clip((heights - 1.2) / 1.6, 0, 1)
+    weights = np.column_stack([1 - share, share, 0 * share, 0 * share]).astype("<f4")
+    joints = np.tile(np.array([0, 1, 0, 0], np.uint8), (len(heights), 1))
+    faces = [[4 * k + a, 4 * k + b, 4 * k + 4 + a, 4 * k + b, 4 * k + 4 + b, 4 * k + 4 + a]
+             for k in range(32) for a, b in ((0, 3), (3, 2), (2, 1), (1, 0))]  # fmt: skip
+    faces += [[0, 1, 2, 0, 2, 3], [128, 130, 129, 128, 131, 130]]
+    down = np.eye(4, dtype="<f4")
+    down[3, 1] = -2.0  # its columns, as the file has them
+    turn = np.array([[0, 0, 0, 1], [0, 0, 0.5, 0.8660254], [0, 0, -0.5, 0.8660254], [0, 0, 0, 1]], "<f4")
+    arrays: list[tuple[np.ndarray, str, int]] = [
+        (positions, "VEC3", 5126), (colours, "VEC4", 5126), (joints, "VEC4", 5121), (weights, "VEC4", 5126),
+        (np.concatenate(faces).astype("<u2").reshape(-1, 1), "SCALAR", 5123),
+        (np.stack([np.eye(4, dtype="<f4").ravel(), down.ravel()]), "MAT4", 5126),
+        (np.array([[0.0], [1.0], [3.0], [4.0]], "<f4"), "SCALAR", 5126), (turn, "VEC4", 5126),
+    ]  # fmt: skip
+    data, views, accessors = b"", [], []
+    for number, (array, kind, component) in enumerate(arrays):
+        data += b"\0" * (-len(data) % 4)
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes})
+        accessors.append({"bufferView": number, "componentType": component, "type": kind, "count": len(array)})
+        data += np.ascontiguousarray(array).tobytes()
+    names = ("POSITION", "COLOR_0", "JOINTS_0", "WEIGHTS_0")
+    primitive = {"attributes": {name: number for number, name in enumerate(names)}, "indices": 4}
+    table: dict[str, Any] = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0, 1]}],
+        "nodes": [{"mesh": 0, "skin": 0}, {"children": [2]}, {"translation": [0, 2, 0]}],
+        "meshes": [{"primitives": [primitive]}], "skins": [{"joints": [1, 2], "inverseBindMatrices": 5}],
+        "animations": [{"name": "bend", "samplers": [{"input": 6, "output": 7}],
+                        "channels": [{"sampler": 0, "target": {"node": 2, "path": "rotation"}}]}],
+        "accessors": accessors, "bufferViews": views,
+        "buffers": [{"byteLength": len(data),
+                     "uri": "data:application/octet-stream;base64," + base64.b64encode(data).decode()}],
+    }  # fmt: skip
+    (folder / "bar.gltf").write_text(json.dumps(table))
+    return str(folder / "bar.gltf"), "rotation_deg = [0, 0, 25]"
+
+
+def playlist(folder: Path) -> Made:
+    """Three scenes, half a second each."""
+    stl(folder)
+    rgbd(folder)
+    (folder / "evening.toml").write_text(
+        "[[show]]\nscene = 'ring.stl'\nseconds = 0.5\nturntable_per_min = 20\n\n"
+        "[[show]]\nscene = 'ball_rgbd.png'\nseconds = 0.5\ndepth_m = [-0.06, 0.06]\n\n"
+        "[[show]]\nscene = 'demo'\nseconds = 0.5\nscale = 0.8\n"
+    )
+    return str(folder / "evening.toml"), ""
+
+
+def data_set(folder: Path) -> Made:
+    """A pair as the published data set names it, in a folder of any name."""
+    pairs = folder / "pairs"
+    pairs.mkdir(exist_ok=True)
+    for half, y, shift in ((1, -0.263, -20), (0, 0.237, 20)):
+        ball_and_ground(960, 540, eye_x=shift)[0].save(pairs / f"pair0_x6.486_y{y}_z2.004_{half}.png")
+    return str(pairs), ""
+
+
+def placed(folder: Path) -> Made:
+    """The demo scene, smaller, moved and turning."""
+    return "demo", "scale = 0.8\noffset_m = [0.02, 0.0, 0.01]\nturntable_per_min = 10"
+
+
+KINDS: dict[str, Callable[[Path], Made]] = {
+    "picture": picture, "side-by-side": side_by_side, "half-side-by-side": half_side_by_side, "quilt": quilt,
+    "rgbd": rgbd, "film": film, "live": live, "obj": obj, "stl": stl, "points": points, "splats": splats,
+    "gltf": gltf, "playlist": playlist, "data-set": data_set, "placed": placed,
+}  # fmt: skip
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("kind", nargs="*", choices=[*KINDS, []], help="which kinds; all where none is named")
+    parser.add_argument("--out", type=Path, default=Path("out/content"), help="a folder a kind is made in it")
+    parser.add_argument("--frames", type=int, default=45, help="refreshes of each run")
+    parser.add_argument("--scale", default="0.25", help="of the panels' pixels")
+    given = parser.parse_args()
+    for kind in given.kind or KINDS:
+        folder = (given.out / kind).absolute()
+        folder.mkdir(parents=True, exist_ok=True)
+        scene, further = KINDS[kind](folder)
+        config = folder / "phasestack.toml"
+        config.write_text(f"[content]\nscene = {json.dumps(scene)}\n{further}\n")
+        command = [
+            sys.executable,
+            "-m",
+            "runtime.cli",
+            "run",
+            "--config",
+            str(config),
+            "--replay",
+            "demo",
+            "--headless",
+        ]
+        command += [
+            "--max-speed",
+            "--frames",
+            str(given.frames),
+            "--scale",
+            given.scale,
+            "--out",
+            str(folder),
+            "--json",
+        ]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+        if done.returncode:
+            return done.returncode
+        told = json.loads(done.stdout)
+        print(f"{kind:18} {told['psnr_db']:6.2f} dB  {told['scene']}  {folder / 'contact-sheet.png'}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
