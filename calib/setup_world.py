@@ -380,9 +380,9 @@ class SimulatedWorld(World):
             grey_chart(stack, panel)
         ]
         scene = Scene(stack, self.truth, layers)
-        lens = smaller(phone(random=self._random), 0.6)
+        lens = smaller(phone(random=self._random), 0.7)
         places = np.array([[1.45, 0.0, 0.0], [1.5, 0.2, 0.1]]) * stack.width_m
-        exposure = Exposure(dark=0.004, gain=0.85, samples=2)
+        exposure = Exposure(dark=0.004, gain=0.85, samples=3)
         return [
             (f"photograph {number + 1}", photograph(scene, lens, camera_from_stack(place, towards_m=np.zeros(3)),
                                                     exposure, random=self._random))
