@@ -106,6 +106,7 @@ def spectral_file(
         reduction=recipe.reduction,
         emphasis=recipe.emphasis,
         interpolation=recipe.interpolation,
+        least_spread_px=recipe.least_spread_px,
         steps=recipe.steps,
     )
     return with_contract(data, contract)

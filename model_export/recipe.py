@@ -11,7 +11,7 @@ from pydantic import Field
 
 from runtime.config import Section, validated
 from runtime.errors import InputError
-from runtime.model.contract import Steps, TrainedFor
+from runtime.model.contract import LEAST_SPREAD_PX, LeastSpread, Steps, TrainedFor
 from runtime.model.predictor import SHIPPED
 from runtime.support import foreign
 
@@ -47,6 +47,7 @@ class Recipe(Section):
         description="strength of the sharpening that undoes the blur of interpolation, on the way in and in the eye",
     )
     interpolation: Literal["linear", "cubic"] = Field("linear", description="how still pictures are warped")
+    least_spread_px: LeastSpread = LEAST_SPREAD_PX
     steps: Annotated[Steps, Field(min_length=1)]
     training: Training = Training()
     weights: dict[str, Any] | None = Field(None, description="state_dict as nested lists; none: the analytic start")

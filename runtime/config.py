@@ -15,6 +15,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.support import foreign
+from runtime.support.live import LIVE
 from runtime.support.plausible import check_text, nearest, socket_path, within
 
 TABLE_BYTES_MAX = 4 << 20
@@ -602,14 +603,6 @@ PATHS = (
     ("content", "library"),    ("content", "external"), ("service", "socket"), ("service", "blackbox_folder"),
 )  # fmt: skip
 NAMES_OR_PATHS = (("content", "scene"), ("model", "name"))
-
-
-LIVE = "live:"  # before a scene: a stream, a capture card or a file, its newest picture
-
-
-def is_live(scene: str) -> bool:
-    """True for a stream's URL, a capture card, or a file behind the mark."""
-    return scene.startswith((LIVE, "/dev/video")) or "://" in scene
 
 
 def located(name: str, folder: Path) -> str:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from runtime.config import ContentSettings, LimitSettings, is_live
+from runtime.config import ContentSettings, LimitSettings
 from runtime.content.base import ContentSource
 from runtime.content.placed import placed_source, placing_of
 from runtime.content.presets import Preset, preset, preset_names
@@ -15,6 +15,7 @@ from runtime.content.scenes import SCENES
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.support import foreign, progress
+from runtime.support.live import is_live
 
 MESHES = (".glb", ".gltf", ".obj", ".stl")
 PLAYLISTS = (".toml", ".json")

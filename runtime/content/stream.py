@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from runtime.clock import NS_PER_S
-from runtime.config import LIVE, ContentSettings, LimitSettings
+from runtime.config import ContentSettings, LimitSettings
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.images import WarpedPicture
 from runtime.content.pictures import CONTAINERS, layout_of, pixel_aspect, quilt_size, screen, split
@@ -27,6 +27,7 @@ from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import U8
 from runtime.support import foreign
+from runtime.support.live import LIVE
 from runtime.support.picture_header import check_size
 
 log = logging.getLogger("phasestack.content")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from runtime.errors import InputError
+from runtime.support.live import LIVE, is_live
 from runtime.support.plausible import nearest
 
 if TYPE_CHECKING:
@@ -51,21 +53,19 @@ def scene_from_here(name: str) -> str:
 
     What is neither known nor there is left as it is: the daemon says what it knows.
     """
-    from runtime.config import LIVE
-
     if name.startswith(LIVE):
-        return LIVE + _from_here(name.removeprefix(LIVE), ())
-    return _from_here(name, scene_names())
+        return LIVE + _from_here(name.removeprefix(LIVE), tuple)
+    return _from_here(name, scene_names)
 
 
 def model_from_here(name: str) -> str:
     """The same of a model."""
-    return _from_here(name, model_names())
+    return _from_here(name, model_names)
 
 
-def _from_here(name: str, known: tuple[str, ...]) -> str:
+def _from_here(name: str, known: Callable[[], tuple[str, ...]]) -> str:
     try:
-        if not Path(name).exists() or (Path(name).name == name and name in known):
+        if not Path(name).exists() or (Path(name).name == name and name in known()):
             return name
         return str(Path(name).absolute())
     except (OSError, ValueError):  # too long, or a NUL character
@@ -74,7 +74,6 @@ def _from_here(name: str, known: tuple[str, ...]) -> str:
 
 def check_names(settings: Settings, *, source: str | Path) -> None:
     """Raise InputError for the first name that nobody knows, or file that is not there, naming its field."""
-    from runtime.config import is_live
     from runtime.eyes.calibration import load_calibration
     from runtime.sensor.registry import driver_names
 

@@ -116,9 +116,13 @@ class SolverMaker:
             settings = self.run.state.settings if self.run is not None else self._settings
             predictor = ready_predictor(settings, self._stack)
             try:
-                backend = self._chosen(predictor, made, simulated=simulated)
-                predictor.surround_with(backend.backend)
                 content = open_content(settings.content, self._stack, made, limits=settings.limits)
+                try:
+                    backend = self._chosen(predictor, made, simulated=simulated)
+                    predictor.surround_with(backend.backend)
+                except BaseException:
+                    content.close()
+                    raise
             except BaseException:
                 predictor.close()
                 raise

@@ -38,6 +38,18 @@ def checked_steps(steps: tuple[Step, ...]) -> tuple[Step, ...]:
 Steps = Annotated[tuple[Step, ...], AfterValidator(checked_steps)]
 
 
+LEAST_SPREAD_PX = 0.5  # below, care for unsure eyes costs most models more time than it gains
+LeastSpread = Annotated[
+    float,
+    Field(
+        gt=0,
+        le=8,
+        description="corrections care for unsure eyes where those move an outer panel's picture by so many pixels, "
+        "one standard deviation",
+    ),
+]
+
+
 class TrainedFor(Section):
     """The range of poses that the model was trained on."""
 
@@ -90,6 +102,7 @@ class Contract(Section):
         0.0, description="horizontal view of the pictures it was trained on, black beside them; 0: whatever is drawn"
     )
     interpolation: Literal["linear", "cubic"] = Field("linear", description="how still pictures are warped")
+    least_spread_px: LeastSpread = LEAST_SPREAD_PX
     steps: Steps = ()
 
     @model_validator(mode="after")

@@ -61,7 +61,9 @@ class OpenCvSurround:
         self._pictures = self._rows.map(prepared, arrays)
         for level in self._workspace.levels.values():
             level.wanted = [np.asarray(phases, np.int16) for phases in self._phases(level.size)]
-            level.set_eye_sigma(problem.eyes_m, eye_sigma_mm=problem.eye_sigma_mm)
+            level.set_eye_sigma(
+                problem.eyes_m, eye_sigma_mm=problem.eye_sigma_mm, least_px=self._contract.least_spread_px
+            )
         return nullcontext()
 
     def network_pictures(self) -> tuple[I16, I16]:

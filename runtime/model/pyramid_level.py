@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.model.contract import LEAST_SPREAD_PX
 from runtime.model.resample import buffer, resample, target_from_source
 from runtime.model.rows import RowPool, Work
 from runtime.model.transfer import FULL, SUBCODE
@@ -26,7 +27,7 @@ REAR, CENTRE, FRONT = 0, 1, 2
 OUTER = (REAR, FRONT)
 EYES = (0, 1)
 START = FULL // 2  # of every outer panel: the middle of its range
-LEAST_SPREAD, MOST_SPREAD = 0.5, 8.0  # pixels; below half a pixel care costs more time than it gains
+MOST_SPREAD = 8.0  # pixels
 NEUTRAL = (START + SUBCODE // 2) // SUBCODE  # the same in 8-bit codes, rounded as what is shown is
 
 
@@ -67,10 +68,10 @@ class PyramidLevel:
         """3x3: where a panel's layer has what an eye sees at (y, z, 1) of the ideal panel: moved where it is tilted."""
         return coarse_layer_from_seen(self._stack, panel, eye_m)
 
-    def set_eye_sigma(self, eyes_m: F64, *, eye_sigma_mm: float) -> None:
+    def set_eye_sigma(self, eyes_m: F64, *, eye_sigma_mm: float, least_px: float = LEAST_SPREAD_PX) -> None:
         """Correct for eyes (2, 3) that err by so much, an axis: what is left of the outer panels in the mean counts,
         and what moves of them is noise. Spreads too small to be felt on this raster are none."""
-        self.spread = spreads(self.rasters, eyes_m, eye_sigma_mm=eye_sigma_mm)
+        self.spread = spreads(self.rasters, eyes_m, eye_sigma_mm=eye_sigma_mm, least_px=least_px)
 
     def project(self, panels: Sequence[int], eyes_m: F64) -> None:
         """See outer panels anew through the centre panel's pixels: in the mean, where the eyes are unsure."""
@@ -188,7 +189,9 @@ class PyramidLevel:
         return resample(image, image_from_result=matrix, out=out, outside=0 if of == CENTRE else START)
 
 
-def spreads(rasters: Sequence[PlaneRaster], eyes_m: F64, *, eye_sigma_mm: float) -> dict[int, tuple[float, float]]:
+def spreads(
+    rasters: Sequence[PlaneRaster], eyes_m: F64, *, eye_sigma_mm: float, least_px: float
+) -> dict[int, tuple[float, float]]:
     """Per outer panel whose pixels move by enough to be felt for eyes (2, 3) that err by so much: right and down."""
     eye_x_m, centre_x_m = eyes_m[:, 0].mean(), rasters[CENTRE].x_m
     found = {}
@@ -196,7 +199,7 @@ def spreads(rasters: Sequence[PlaneRaster], eyes_m: F64, *, eye_sigma_mm: float)
         raster = rasters[n]
         moved_m = eye_sigma_mm / 1e3 * abs(raster.x_m - centre_x_m) / (eye_x_m - centre_x_m)
         spread = min(moved_m / raster.pitch_u_m, MOST_SPREAD), min(moved_m / raster.pitch_v_m, MOST_SPREAD)
-        if max(spread) >= LEAST_SPREAD:
+        if max(spread) >= least_px:
             found[n] = spread
     return found
 

@@ -8,7 +8,7 @@ from math import erf
 import numpy as np
 import pytest
 
-from runtime.model.pyramid_level import CENTRE, FRONT, LEAST_SPREAD, MOST_SPREAD, OUTER, REAR, START, PyramidLevel
+from runtime.model.pyramid_level import CENTRE, FRONT, LEAST_SPREAD_PX, MOST_SPREAD, OUTER, REAR, START, PyramidLevel
 from runtime.model.rows import RowPool
 from runtime.model.transfer import FULL, SUBCODE
 from runtime.optics.rect import PixelRect
@@ -67,7 +67,7 @@ def test_a_spread_is_how_many_pixels_a_panel_moves_for_an_eye_that_is_off_by_one
 
 def test_spreads_too_small_to_be_felt_are_none_and_there_is_a_largest(rows: RowPool) -> None:
     level = level_of(rows)
-    metres = LEAST_SPREAD * 0.005 * 0.6 / 0.06
+    metres = LEAST_SPREAD_PX * 0.005 * 0.6 / 0.06
     level.set_eye_sigma(PAIR, eye_sigma_mm=metres * 1e3 * 0.99)
     assert level.spread == {}
     level.set_eye_sigma(PAIR, eye_sigma_mm=metres * 1e3 * 1.01)

@@ -61,7 +61,12 @@ class GlSurround:
             needed = reductions(self._contract) | {self._contract.reduction}
             self._rasters = {reduction: problem.rasters(reduction) for reduction in needed}
             self._spread: dict[int, Spread] = {
-                reduction: spreads(rasters, problem.eyes_m, eye_sigma_mm=problem.eye_sigma_mm)
+                reduction: spreads(
+                    rasters,
+                    problem.eyes_m,
+                    eye_sigma_mm=problem.eye_sigma_mm,
+                    least_px=self._contract.least_spread_px,
+                )
                 for reduction, rasters in self._rasters.items()
             }
             self._outer: dict[tuple[int, int], str] = {}  # which of two images a panel is in
