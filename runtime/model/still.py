@@ -75,16 +75,18 @@ def _warped(
     """
     import cv2
 
-    out = np.zeros((raster.height_px, raster.width_px, 4), np.uint8)
+    whole = (rows.stop - rows.start, columns.stop - columns.start) == (raster.height_px, raster.width_px)
+    out: U8 = (np.empty if whole else np.zeros)((raster.height_px, raster.width_px, 4), np.uint8)
     if cubic and _source_px(image_from_raster, rows=rows, columns=columns) < FINE_ENOUGH:
         rgba, finer_from_image = _finer(rgba, image_from_raster, rows=rows, columns=columns)
         image_from_raster = finer_from_image @ image_from_raster
     # OpenCV puts pixel centres at integers.
     matrix = _shifted(-0.5, -0.5) @ image_from_raster @ _shifted(columns.start + 0.5, rows.start + 0.5)
-    out[rows, columns] = cv2.warpPerspective(
+    cv2.warpPerspective(
         rgba,
         matrix,
         (columns.stop - columns.start, rows.stop - rows.start),
+        dst=out[rows, columns],
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_CONSTANT if black_beside else cv2.BORDER_REPLICATE,
     )
