@@ -8,6 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
 from runtime.support.artifacts import write_bytes, write_text
 
 COLUMNS = ("iteration", "training_loss_db", "held_out_exact_db", "held_out_expected_db", "held_out_loss_db")
@@ -37,9 +40,6 @@ def write_curves(out: Path, points: Sequence[Point], *, name: str) -> None:
 
 
 def _picture(points: Sequence[Point], name: str) -> bytes:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(8, 4.2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()

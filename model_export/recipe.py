@@ -46,7 +46,11 @@ class Recipe(Section):
         0.0,
         description="strength of the sharpening that undoes the blur of interpolation, on the way in and in the eye",
     )
-    interpolation: Literal["linear", "cubic"] = Field("linear", description="how still pictures are warped")
+    interpolation: Literal["linear", "finer", "cubic"] = Field(
+        "linear",
+        description="how still pictures are warped: linear; finer: linear samples of a picture that a cubic kernel "
+        "makes twice as fine; cubic: its kernel on small rasters, and as finer on large ones",
+    )
     least_spread_px: LeastSpread = LEAST_SPREAD_PX
     steps: Annotated[Steps, Field(min_length=1)]
     training: Training = Training()

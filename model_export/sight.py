@@ -58,7 +58,7 @@ def sight_of(pair: TrainingPair, recipe: Recipe, *, device: torch.device) -> Sig
     def through(image: np.ndarray, eye_m: F64) -> np.ndarray:
         out = buffer(frame.rows, frame.width_px)
         matrix = reduced @ frame.plane_from_frame(eye_m, x_m=pair.stack.x_m[CENTRE])
-        return resample(image, image_from_result=matrix, out=out)
+        return resample(image, image_from_result=matrix, out=out, result_columns=frame.columns)
 
     seen = [
         torch.from_numpy(through(need, eye).reshape(frame.rows, frame.cells, -1).copy())
@@ -125,7 +125,7 @@ def _intensity(phase: Tensor) -> Tensor:
 
 def _inside(reduced: F64, frame: ChainFrame, x_m: float, size: tuple[int, int]) -> np.ndarray:
     m = reduced @ frame.plane_from_frame(frame.middle_m, x_m=x_m)
-    u, v = np.arange(frame.width_px) + 0.5, (np.arange(frame.rows) + 0.5)[:, None]
-    x, y = m[0, 0] * u + m[0, 1] * v + m[0, 2], m[1, 0] * u + m[1, 1] * v + m[1, 2]
-    inside: np.ndarray = (x > 1) & (x < size[0] - 1) & (y > 1) & (y < size[1] - 1)
+    t = frame.columns.homography_from_column(np.arange(frame.width_px) + 0.5)
+    x, y, w = (row[0] * t + row[1] * (np.arange(frame.rows) + 0.5)[:, None] + row[2] for row in m)
+    inside: np.ndarray = (x > w) & (x < (size[0] - 1) * w) & (y > w) & (y < (size[1] - 1) * w)
     return inside

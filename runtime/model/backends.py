@@ -19,6 +19,7 @@ from runtime.records import U8
 
 if TYPE_CHECKING:
     from runtime.model.gl.backend import GlBackend
+    from runtime.support.gl_sharing import ShareGroup
 
 log = logging.getLogger("phasestack.model")
 
@@ -38,10 +39,13 @@ class Choice:
     why: str  # one line, with what was measured
 
 
-def choose(wanted: Wanted, predictor: Predictor, context: Callable[[], Any]) -> Choice:
+def choose(
+    wanted: Wanted, predictor: Predictor, context: Callable[[], Any], *, group: ShareGroup | None = None
+) -> Choice:
     """The backend for a model that is loaded. Tells the log what it found.
 
     context: an OpenGL context, current on this thread, asked for where one is needed; it may raise MissingPart.
+    group: the context's, where solutions are shown from its textures.
     auto: whichever is faster here, whatever it is called; OpenCV where OpenGL can't be had or used.
     Raises MissingPart (gl without OpenGL), InputError (a panel too large for the driver), ModelFailure.
     """
@@ -50,17 +54,17 @@ def choose(wanted: Wanted, predictor: Predictor, context: Callable[[], Any]) -> 
     elif wanted == "opencv":
         choice = Choice(OpenCvBackend(), "as asked for")
     elif wanted == "gl":
-        choice = Choice(_settled(_gl(context(), predictor.stack), predictor), "as asked for")
+        choice = Choice(_settled(_gl(context(), predictor.stack, group), predictor), "as asked for")
     else:
-        choice = _faster(predictor, context)
+        choice = _faster(predictor, lambda: _gl(context(), predictor.stack, group))
     log.info("backend: %s (%s)", choice.backend.name, choice.why)
     return choice
 
 
-def _gl(context: Any, stack: PanelStack) -> GlBackend:
+def _gl(context: Any, stack: PanelStack, group: ShareGroup | None) -> GlBackend:
     from runtime.model.gl.backend import GlBackend
 
-    return GlBackend(context, stack)
+    return GlBackend(context, stack, group=group)
 
 
 def _settled(backend: GlBackend, predictor: Predictor) -> GlBackend:
@@ -92,10 +96,10 @@ def _settled(backend: GlBackend, predictor: Predictor) -> GlBackend:
     return backend
 
 
-def _faster(predictor: Predictor, context: Callable[[], Any]) -> Choice:
+def _faster(predictor: Predictor, made: Callable[[], GlBackend]) -> Choice:
     opencv: Backend = OpenCvBackend()
     try:
-        gl = _gl(context(), predictor.stack)
+        gl = made()
         for share, runs in ((FIRST_SHARE, RUNS), (1, 1)):
             stack = _smaller(predictor.stack, share)
             opencv_ms, gl_ms = (_solution_ms(predictor, stack, backend, runs=runs) for backend in (opencv, gl))
@@ -106,13 +110,13 @@ def _faster(predictor: Predictor, context: Callable[[], Any]) -> Choice:
             return Choice(_settled(gl, predictor), f"measured at {found}")
     except PhasestackError as error:
         return Choice(opencv, f"OpenGL can't be used: {error}")
-    gl.passes.release()
+    gl.close()
     return Choice(opencv, f"measured at {found}")
 
 
 def _smaller(stack: PanelStack, share: int) -> PanelStack:
     width_px, height_px = (max(64, size // share) for size in (stack.width_px, stack.height_px))
-    return replace(stack, tilt=None, width_px=width_px, height_px=height_px)
+    return replace(stack, width_px=width_px, height_px=height_px)
 
 
 def _solution_ms(predictor: Predictor, stack: PanelStack, backend: Backend, *, runs: int) -> float:

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from runtime.optics.pupil import POINT_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
-from runtime.records import F64, U8
+from runtime.records import F64, U8, Layers, pixels_of
 
 if TYPE_CHECKING:
     from runtime.model.schedule import Backend
@@ -19,8 +21,13 @@ if TYPE_CHECKING:
 class Prediction:
     """The layers for two eyes, and what they took."""
 
-    layers: U8  # (N, height_px, width_px, 4) RGBA, rear to front; the predictor's own until its next call
+    made: Layers  # (N, height_px, width_px, 4) RGBA, rear to front; an array is the predictor's until its next call
     stage_ms: dict[str, float] = field(default_factory=dict)  # prepare, inference (the network alone), finish
+
+    @property
+    def layers(self) -> U8:
+        """What was made, as an array. Raises ContextLost."""
+        return pixels_of(self.made)
 
 
 class Predictor(ABC):
@@ -51,7 +58,7 @@ class Predictor(ABC):
 
     @property
     def interpolation(self) -> str:
-        """How still pictures are to be warped for it: `linear` or `cubic`."""
+        """How still pictures are to be warped for it: `linear`, `finer` or `cubic` (`Contract.interpolation`)."""
         return "linear"
 
     @property
@@ -80,8 +87,6 @@ class Predictor(ABC):
 
     def warm_up(self, eyes_m: F64) -> None:
         """Run once on grey pictures, so that the first frame does not pay for allocation."""
-        import numpy as np
-
         rasters = self.rasters(eyes_m)
         grey = [np.full((raster.height_px, raster.width_px, 4), 128, np.uint8) for raster in rasters]
         self.predict([grey, grey], eyes_m)

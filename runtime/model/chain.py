@@ -3,15 +3,22 @@
 With +g on the front and -g on the rear panel, the difference between the eyes' phases is
 D(p) = 2·[g(p + s) - g(p - s)]. On a raster whose columns make s a whole number K, columns 2K apart form chains
 that don't interact: D = A·g along each, with one bidiagonal A for all of them.
+
+Where one eye is nearer to the panels than the other, s is no constant: seen through a plane parallel to the panels,
+an outer panel is scaled about the point F where the line through the eyes meets that plane, by as much for one eye as
+the other way for the other. On columns that are spaced by the logarithm of the distance from F, and rows that run
+towards it, the scale is a shift again.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from math import ceil
+from math import atanh, ceil, sqrt
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64
@@ -20,6 +27,35 @@ CELLS_STEP = 8  # chains' lengths are rounded up to this, so that a moving viewe
 ROWS_STEP = 64
 CELLS_MAX = 1024
 BLOCK_ROWS = 8  # that the network transforms together: the raster has whole blocks
+NEAREST_F = 0.8  # the raster's half width by F's distance from its middle: nearer to F it is not laid
+FARTHEST_F = 0.01  # and beyond, s changes by less than a hundredth of itself: columns may as well be even
+
+Columns = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnLaw:
+    """How a raster's columns u are spaced: t = middle + (1 - exp(-bend·(u - middle)))/bend is what a homography takes
+    for u; evenly where bend is 0."""
+
+    bend: float = 0.0  # per column
+    middle: float = 0.0  # column where both are the same
+
+    def homography_from_column(self, u: Columns) -> Columns:
+        """t for columns u, of any shape."""
+        if not self.bend:
+            return u
+        return np.asarray(self.middle - np.expm1(-self.bend * (u - self.middle)) / self.bend)
+
+    def column_from_homography(self, t: Columns) -> Columns:
+        """u for t, of any shape; far outside beyond F."""
+        if not self.bend:
+            return t
+        return np.asarray(self.middle - np.log(np.maximum(1 - self.bend * (t - self.middle), BEYOND_F)) / self.bend)
+
+
+EVEN_COLUMNS = ColumnLaw()
+BEYOND_F = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,34 +63,27 @@ class ChainFrame:
     """The raster on the plane where both outer panels have the same parallax, seen from between the eyes."""
 
     x_m: float  # of the plane: a²/ex
-    plane_from_raster: F64  # 3x3, (y, z, 1) from (u, v, 1); u along the line of the eyes
+    plane_from_raster: F64  # 3x3, (y, z, 1) from (t, v, 1); t by `columns` from u, along the line of the eyes
+    columns: ColumnLaw
     cells: int  # chain cells a row; the raster has cells·2K columns
     cell_px: int  # K
     rows: int
-    middle_m: F64  # (3,) between the eyes, frame `stack`
+    middle_m: F64  # (3,) between the eyes, frame `stack`: where their parallaxes are opposite
 
     @property
     def width_px(self) -> int:
         return self.cells * 2 * self.cell_px
 
     def plane_from_frame(self, eye_m: F64, *, x_m: float) -> F64:
-        """3x3: (y, z, 1) on a parallel plane hit by an eye's rays through this raster's pixels."""
+        """3x3: (y, z, 1) on a parallel plane hit by an eye's rays through this raster's (t, v, 1)."""
         t = (x_m - self.x_m) / (eye_m[0] - self.x_m)
         across = np.array([[1 - t, 0.0, eye_m[1] * t], [0.0, 1 - t, eye_m[2] * t], [0.0, 0.0, 1.0]])
         return across @ self.plane_from_raster
 
     def frame_from_plane(self, *, x_m: float) -> F64:
-        """3x3: this raster's pixels from (y, z, 1) on a parallel plane, in line as seen from between the eyes."""
-        t = (x_m - self.x_m) / (self.middle_m[0] - self.x_m)
-        back = np.array([[1.0, 0.0, -self.middle_m[1] * t], [0.0, 1.0, -self.middle_m[2] * t], [0.0, 0.0, 1.0 - t]]) / (
-            1 - t
-        )
-        p = self.plane_from_raster
-        determinant = p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]
-        linear = np.array([[p[1, 1], -p[0, 1]], [-p[1, 0], p[0, 0]]]) / determinant
-        inverse = np.eye(3)
-        inverse[:2, :2], inverse[:2, 2] = linear, -linear @ p[:2, 2]
-        return inverse @ back
+        """3x3: this raster's (t, v, 1) from (y, z, 1) on a parallel plane, in line as seen from between the eyes."""
+        found = np.linalg.inv(self.plane_from_frame(self.middle_m, x_m=x_m))
+        return np.asarray(found / found[2, 2], np.float64)
 
     def doubt(self, stack: PanelStack, *, eye_sigma_mm: float) -> F32:
         """(3,): how far the outer panels' pictures move, columns and rows, for eyes off by one standard deviation to
@@ -62,10 +91,17 @@ class ChainFrame:
         reach = (stack.x_m[-1] - self.x_m) / (self.middle_m[0] - stack.x_m[-1])
         centre = (self.x_m - stack.x_m[1]) / (self.middle_m[0] - stack.x_m[1])
         moved_m = eye_sigma_mm / 1e3 * reach
-        (across_m, _), (along_m, down_m) = self.plane_from_raster[:2, :2]
+        across_m, along_m, down_m = self._steps_m()
         columns = moved_m / abs(across_m)
         rows = moved_m * np.hypot(1.0, along_m / across_m) / abs(down_m)
         return np.array([columns, rows, self.cell_px * centre / reach], np.float32)
+
+    def _steps_m(self) -> tuple[float, float, float]:
+        """To the right for a column, up for a column and for a row, in the raster's middle."""
+        raster = self.plane_from_raster
+        at = raster @ (self.columns.middle, self.rows / 2, 1.0)
+        by_column, by_row = ((raster[:2, k] - at[:2] / at[2] * raster[2, k]) / at[2] for k in (0, 1))
+        return float(by_column[0]), float(by_column[1]), float(by_row[1])
 
 
 def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int) -> ChainFrame:
@@ -75,32 +111,48 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
     rows high and sheared along the line of the eyes. It covers what both see of all panels, and a margin.
     Raises ValueError where the eyes have no horizontal separation.
     """
-    middle = eyes_m.mean(axis=0)
-    half = (eyes_m[1] - eyes_m[0]) / 2
-    plane_m = _equal_parallax_m(stack, middle[0])
-    reach = (stack.x_m[-1] - plane_m) / (middle[0] - stack.x_m[-1])
-    step_y_m, step_z_m = half[1:] * (reach / cell_px)
-    if abs(step_y_m) < 1e-12:
-        raise ValueError("the line of the eyes is vertical or has no length")
+    between, half = eyes_m.mean(axis=0), (eyes_m[1] - eyes_m[0]) / 2
+    plane_m = _equal_parallax_m(stack, between[0])
+    ahead_m, nearer_m = between[0] - plane_m, half[0]
+    middle = between - half * (nearer_m / ahead_m)
     low, high = _common_extent(middle, stack, plane_m=plane_m, axis=1)
-    cells = ceil((high - low) / (2 * abs(step_y_m) * cell_px)) + 1
+    bottom, top = _panel_extent(middle, stack, plane_m=plane_m)
+    # The line of the eyes meets the plane at F = towards / nearer, anywhere up to infinity.
+    towards = nearer_m * between[1:] - ahead_m * half[1:]
+    from_f = nearer_m * np.array([low + high, bottom + top]) / 2 - towards
+    by_column = (stack.x_m[-1] - plane_m) / (middle[0] - stack.x_m[-1]) / (cell_px * ahead_m)
+    if abs(from_f[0] * by_column) < 1e-12:
+        raise ValueError("the line of the eyes is vertical or has no length")
+    half_m = (high - low) / 2
+    ratio = half_m * nearer_m / from_f[0]
+    if abs(ratio) > NEAREST_F:
+        ratio, nearer_m, towards = 0.0, 0.0, -from_f
+    elif abs(ratio) < FARTHEST_F:  # level eyes keep level rows, which are sampled better
+        ratio, nearer_m, towards = 0.0, 0.0, -ahead_m * half[1:]
+        from_f = -towards
+    half_columns = half_m / abs(from_f[0] * by_column) * (atanh(ratio) / ratio if ratio else 1.0)
+    cells = ceil(half_columns / cell_px) + 1
     cells = min(CELLS_MAX, CELLS_STEP * ceil(cells / CELLS_STEP))
     width = cells * 2 * cell_px
-    middle_y = (low + high) / 2
-    bottom, top = _panel_extent(middle, stack, plane_m=plane_m)
+    bend, (bend_y_m, bend_z_m) = nearer_m * by_column, towards * by_column
+    columns = ColumnLaw(float(bend), width / 2)
+    middle_y = (low + high) / 2 - half_m * ratio / (1 + sqrt(1 - ratio * ratio))
     pitch_v_m = (top - bottom) / (stack.height_px / reduction)
-    rise_m = abs(step_z_m) * width
+    # In the raster's middle, what is to be seen at either end of its rows.
+    ends = columns.homography_from_column(np.array([0.0, width])) - width / 2
+    reached = [z * (1 - bend * end) + bend_z_m * end for z in (bottom, top) for end in ends]
+    rise_m = max(reached) - min(reached) - (top - bottom)
     step = ROWS_STEP if rise_m / pitch_v_m > 0.01 else BLOCK_ROWS
     rows = step * ceil((stack.height_px / reduction + rise_m / pitch_v_m) / step)
-    middle_z = (bottom + top) / 2
+    middle_z = (min(reached) + max(reached)) / 2
     plane_from_raster = np.array(
         [
-            [step_y_m, 0.0, middle_y - step_y_m * width / 2],
-            [step_z_m, -pitch_v_m, middle_z - step_z_m * width / 2 + pitch_v_m * rows / 2],
-            [0.0, 0.0, 1.0],
+            [-bend_y_m, 0.0, middle_y + bend_y_m * width / 2],
+            [-bend_z_m, -pitch_v_m, middle_z + pitch_v_m * rows / 2 + bend_z_m * width / 2],
+            [-bend, 0.0, 1.0 + bend * width / 2],
         ]
     )
-    return ChainFrame(plane_m, plane_from_raster, cells, cell_px, rows, middle)
+    return ChainFrame(plane_m, plane_from_raster, columns, cells, cell_px, rows, middle)
 
 
 def _equal_parallax_m(stack: PanelStack, eye_x_m: float) -> float:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
 from runtime.model.pyramid_level import I16
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64
@@ -36,14 +37,16 @@ class Fade:
         box = PixelRect(self.kept.v0, self.kept.u0, self.kept.v1, self.kept.u1)
         return Fade(box, self.over_px[::-1], left=self.top, top=self.left, right=self.bottom, bottom=self.right)
 
-    def wave_weights(self, centre_from_raster: F64, *, rows: int, columns: int) -> F32:
-        """(rows or 1, columns, 1): 0 beside what is kept to 1 inside, on a raster; 3x3, affine."""
+    def wave_weights(self, centre_from_raster: F64, *, rows: int, columns: int, law: ColumnLaw = EVEN_COLUMNS) -> F32:
+        """(rows or 1, columns, 1): 0 beside what is kept to 1 inside, on a raster with columns by a law; 3x3."""
         m = centre_from_raster
-        u = m[0, 0] * (np.arange(columns) + 0.5) + m[0, 2]
-        v = m[1, 1] * (np.arange(rows) + 0.5)[:, None] + m[1, 2]
-        if m[0, 1] or m[1, 0]:
-            u = u + m[0, 1] * (np.arange(rows) + 0.5)[:, None]
-            v = v + m[1, 0] * (np.arange(columns) + 0.5)
+        t, v = law.homography_from_column(np.arange(columns) + 0.5), (np.arange(rows) + 0.5)[:, None]
+        down: F64 = np.asarray(m[1, 1] * v + m[1, 2])
+        across: F64 = np.asarray(m[0, 0] * t + m[0, 2])
+        if m[0, 1] or m[1, 0] or m[2, 0]:
+            w = m[2, 0] * t + m[2, 2]
+            across, down = (across + m[0, 1] * v) / w, (down + m[1, 0] * t) / w
+        u, v = across, down
         weights = np.ones((1, columns))
         for inside, over_px in (*self._across(u, self.over_px[0]), *self._down(v, self.over_px[1])):
             weights = weights * np.clip(inside / over_px, 0.0, 1.0)

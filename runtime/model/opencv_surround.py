@@ -32,6 +32,9 @@ class OpenCvBackend:
     def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> OpenCvSurround:
         return OpenCvSurround(contract, stack, threads=threads)
 
+    def close(self) -> None:
+        """It holds nothing."""
+
 
 class OpenCvSurround:
     """A `Surround`."""
@@ -73,12 +76,14 @@ class OpenCvSurround:
         half = (np.asarray(right, np.int16) - np.asarray(left, np.int16)) >> 1
         seen = self._workspace.chain_buffers(problem.frame)
         for side, lacks in enumerate((-half, half)):
-            resample(lacks, image_from_result=problem.reduced_from_frame(side), out=seen[side])
+            matrix = problem.reduced_from_frame(side)
+            resample(lacks, image_from_result=matrix, out=seen[side], result_columns=problem.frame.columns)
         return seen
 
     def set_panel(self, reduction: int, panel: int, codes: I16, *, shown: bool) -> None:
-        level = self._workspace.levels[reduction]
-        level.set_panel(panel, codes, self._problem.answer_from_raster(panel, level.rasters[panel]), shown=shown)
+        level, problem = self._workspace.levels[reduction], self._problem
+        matrix = problem.answer_from_raster(panel, level.rasters[panel])
+        level.set_panel(panel, codes, matrix, columns=problem.answer_columns, shown=shown)
 
     def project(self, reduction: int, panels: Sequence[int]) -> None:
         self._workspace.levels[reduction].project(panels, self._problem.eyes_m)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
 from runtime.model.contract import LEAST_SPREAD_PX
 from runtime.model.resample import buffer, resample, target_from_source
 from runtime.model.rows import RowPool, Work
@@ -63,10 +64,6 @@ class PyramidLevel:
         self.seen = {(n, side): self._view("seen", n, side, on=CENTRE) for n in OUTER for side in EYES}
         self.residual = tuple(self._view("residual", CENTRE, side, on=CENTRE) for side in EYES)
         self._back = {n: tuple(self._view("back", CENTRE, side, on=n) for side in EYES) for n in OUTER}
-
-    def layer_from_seen(self, panel: int, eye_m: F64) -> F64:
-        """3x3: where a panel's layer has what an eye sees at (y, z, 1) of the ideal panel: moved where it is tilted."""
-        return coarse_layer_from_seen(self._stack, panel, eye_m)
 
     def set_eye_sigma(self, eyes_m: F64, *, eye_sigma_mm: float, least_px: float = LEAST_SPREAD_PX) -> None:
         """Correct for eyes (2, 3) that err by so much, an axis: what is left of the outer panels in the mean counts,
@@ -124,10 +121,14 @@ class PyramidLevel:
 
         self._each(panel, work)
 
-    def set_panel(self, panel: int, codes: I16, codes_from_raster: F64, *, shown: bool) -> None:
-        """An outer panel as it was drawn on a raster of its own."""
+    def set_panel(
+        self, panel: int, codes: I16, codes_from_raster: F64, *, columns: ColumnLaw = EVEN_COLUMNS, shown: bool
+    ) -> None:
+        """An outer panel as it was drawn on a raster of its own, with columns by a law."""
         outer = self.outer[panel]
-        resample(codes, image_from_result=codes_from_raster, out=outer, outside=START, cubic=True)
+        resample(
+            codes, image_from_result=codes_from_raster, out=outer, outside=START, cubic=True, image_columns=columns
+        )
         self._each(panel, lambda rows, _: _clamp_and_quantise(outer[rows], outer[rows], shown=shown))
 
     def upsample(self, coarser: PyramidLevel, *, shown: bool) -> None:
@@ -177,16 +178,25 @@ class PyramidLevel:
 
     def _between(self, image: I16, eye_m: F64, *, of: int, on: int, out: I16) -> I16:
         """Panel `of`'s pixels on panel `on`'s raster, as an eye sees them in line."""
-        source, target = self.rasters[on], self.rasters[of]
-        matrix = target_from_source(eye_m, source=source, target=target)
-        if self._stack.tilt is not None:
-            if of == CENTRE:
-                back: F64 = np.linalg.inv(self.layer_from_seen(on, eye_m)).astype(np.float64)
-                matrix = matrix @ layer_pixels_from_seen(source, back)
-            else:
-                matrix = layer_pixels_from_seen(target, self.layer_from_seen(of, eye_m)) @ matrix
-            matrix /= matrix[2, 2]
+        matrix = pixels_in_line(self._stack, self.rasters, eye_m, of=of, on=on)
         return resample(image, image_from_result=matrix, out=out, outside=0 if of == CENTRE else START)
+
+
+def pixels_in_line(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: F64, *, of: int, on: int) -> F64:
+    """3x3, last entry 1: panel `of`'s pixels from panel `on`'s, as an eye (3,) sees them in line; one is the centre.
+
+    A scale and a shift, but where panels are tilted (`optics.tilt`).
+    """
+    source, target = rasters[on], rasters[of]
+    matrix = target_from_source(eye_m, source=source, target=target)
+    if stack.tilt is not None:
+        if of == CENTRE:
+            back: F64 = np.linalg.inv(coarse_layer_from_seen(stack, on, eye_m)).astype(np.float64)
+            matrix = matrix @ layer_pixels_from_seen(source, back)
+        else:
+            matrix = layer_pixels_from_seen(target, coarse_layer_from_seen(stack, of, eye_m)) @ matrix
+        matrix /= matrix[2, 2]
+    return matrix
 
 
 def spreads(

@@ -2,7 +2,8 @@
 
 OpenCV's `resize` is two to four times as fast as its `warpAffine`, and finer (1/2048 against 1/32 pixel), but
 knows no shift. So the result is begun at a pixel whose place in the source is nearly a whole number; what lies
-beside it is warped. Rasters that are also sheared (a tilted head, a tilted panel) are warped altogether.
+beside it is warped. Rasters that are also sheared (a tilted head, a tilted panel) are warped altogether, and those
+whose columns are not evenly spaced (a turned head) by a map of every pixel.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
 from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import relative_scale_shift
 from runtime.records import F64
@@ -31,7 +33,8 @@ def target_from_source(eye_m: ArrayLike, *, source: PlaneRaster, target: PlaneRa
     """3x3: pixels of `target` hit by the eye's rays through pixels of `source`; both parallel to the panels."""
     scale, shift_m = relative_scale_shift(eye_m, from_x_m=source.x_m, to_x_m=target.x_m)
     across = np.array([[scale, 0.0, shift_m[0]], [0.0, scale, shift_m[1]], [0.0, 0.0, 1.0]])
-    return target.raster_from_plane() @ across @ source.plane_from_raster()
+    found: F64 = target.raster_from_plane() @ across @ source.plane_from_raster()
+    return found
 
 
 def buffer(height_px: int, width_px: int, dtype: Any = np.int16, *, channels: int = 3) -> Image:
@@ -43,20 +46,43 @@ def buffer(height_px: int, width_px: int, dtype: Any = np.int16, *, channels: in
     return np.zeros(shape if channels == 1 else (*shape, channels), dtype)[:height_px, :width_px]
 
 
-def resample(image: Image, *, image_from_result: F64, out: Image, outside: int = 0, cubic: bool = False) -> Image:
+def resample(
+    image: Image,
+    *,
+    image_from_result: F64,
+    out: Image,
+    outside: int = 0,
+    cubic: bool = False,
+    image_columns: ColumnLaw = EVEN_COLUMNS,
+    result_columns: ColumnLaw = EVEN_COLUMNS,
+) -> Image:
     """Bilinear (or bicubic) samples of an (h, w, C) or (h, w) image at the positions of a raster, into `out`.
 
-    image_from_result: 3x3, last entry 1, pixel centres at half-integers. `out` comes from `buffer`. Beside the image
-    the result is `outside` (axis-aligned rasters) or its repeated edge (sheared ones): no ray through there crosses
-    every panel, so that nobody sees it.
+    image_from_result: 3x3, last entry 1, pixel centres at half-integers, between what the two laws make of columns.
+    `out` comes from `buffer`. Beside the image the result is `outside` (axis-aligned rasters) or its repeated edge
+    (all others): no ray through there crosses every panel, so that nobody sees it.
     """
     flags = cv2.INTER_CUBIC if cubic else cv2.INTER_LINEAR
+    if image_columns.bend or result_columns.bend:
+        places = _places(image_from_result, out.shape[:2], image_columns, result_columns)
+        out[...] = cv2.remap(image, *places, interpolation=flags, borderMode=cv2.BORDER_REPLICATE)
+        return out
     if np.count_nonzero(image_from_result[_BESIDE_SCALE_AND_SHIFT]) == 0:
         across = _whole_place(image_from_result[0, 0], image_from_result[0, 2], image.shape[1], out.shape[1])
         down = _whole_place(image_from_result[1, 1], image_from_result[1, 2], image.shape[0], out.shape[0])
         if across is not None and down is not None:
             return _resized(image, image_from_result, out, across, down, flags, outside)
     return _warped(image, image_from_result, out, 0, 0, *out.shape[1::-1])
+
+
+def _places(
+    matrix: F64, size: tuple[int, ...], image_columns: ColumnLaw, result_columns: ColumnLaw
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(h, w) each: columns and rows of the image for every pixel of the result, with pixel centres at integers."""
+    u, v = result_columns.homography_from_column(np.arange(size[1]) + 0.5), (np.arange(size[0]) + 0.5)[:, None]
+    x, y, w = (row[0] * u + row[1] * v + row[2] for row in matrix)
+    columns = image_columns.column_from_homography(x / w)
+    return (columns - 0.5).astype(np.float32), (y / w - 0.5).astype(np.float32)
 
 
 def _whole_place(scale: float, shift: float, source_px: int, result_px: int) -> tuple[int, int, int, int] | None:

@@ -13,14 +13,14 @@ from typing import Protocol
 
 import numpy as np
 
-from runtime.model.chain import ChainFrame
+from runtime.model.chain import ChainFrame, ColumnLaw
 from runtime.model.contract import Contract, Step
 from runtime.model.fade import Fade
 from runtime.model.pyramid_level import CENTRE, FRONT, I16, OUTER, REAR, coarser
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen
-from runtime.records import F64, U8
+from runtime.records import F64, U8, Layers
 from runtime.support.gl import DrawnPicture
 
 
@@ -48,7 +48,7 @@ class Problem:
         return max(1, box.width_px // reduction), max(1, box.height_px // reduction)
 
     def reduced_from_frame(self, side: int) -> F64:
-        """3x3: those pixels from the network's raster, as one eye sees them in line."""
+        """3x3: those pixels from the network's raster (`ChainFrame.columns`), as one eye sees them in line."""
         width, height = self.reduced_size
         centre = self.boxes[CENTRE].cut(self.stack.panel(CENTRE))
         reduced_from_full = np.diag([width / centre.width_px, height / centre.height_px, 1.0])
@@ -56,12 +56,19 @@ class Problem:
         return reduced_from_plane @ self.frame.plane_from_frame(self.eyes_m[side], x_m=self.stack.x_m[CENTRE])
 
     def answer_from_raster(self, panel: int, raster: PlaneRaster) -> F64:
-        """3x3: the network's answer's pixels from an outer panel's, in line as seen from between the eyes."""
+        """3x3: the network's answer's pixels (`answer_columns`) from an outer panel's, in line as seen from between the
+        eyes."""
         seen_from_layer = np.linalg.inv(coarse_layer_from_seen(self.stack, panel, self.frame.middle_m))
         matrix = self.frame.frame_from_plane(x_m=raster.x_m) @ seen_from_layer @ raster.plane_from_raster()
-        matrix /= matrix[2, 2]
-        matrix[0, 2] += self.frame.cell_px  # the answer begins one parallax before the first column
-        return matrix
+        # The answer begins one parallax before the first column.
+        shifted = np.array([[1.0, 0.0, self.frame.cell_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) @ matrix
+        return np.asarray(shifted / shifted[2, 2], np.float64)
+
+    @property
+    def answer_columns(self) -> ColumnLaw:
+        """Of the network's answer."""
+        law = self.frame.columns
+        return ColumnLaw(law.bend, law.middle + self.frame.cell_px)
 
     def faded(self, panel: I16, *, start: int) -> I16:
         """(rows, columns[, 3]) the network's answer that ends, at `start`, within a part of the panels."""
@@ -71,7 +78,9 @@ class Problem:
         plane_from_wave = frame.plane_from_frame(frame.middle_m, x_m=self.stack.x_m[CENTRE])
         plane_from_wave = plane_from_wave @ np.array([[1.0, 0.0, -frame.cell_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
         rows, columns = panel.shape[:2]
-        weights = self.fade.wave_weights(self.centre_from(plane_from_wave), rows=rows, columns=columns)
+        weights = self.fade.wave_weights(
+            self.centre_from(plane_from_wave), rows=rows, columns=columns, law=self.answer_columns
+        )
         return np.asarray((panel - start) * (weights if panel.ndim == 3 else weights[..., 0]) + start, np.int16)
 
     def centre_from(self, plane_from_raster: F64) -> F64:
@@ -107,9 +116,9 @@ class Surround(Protocol):
     def upsample(self, coarser_reduction: int, reduction: int, *, shown: bool) -> None:
         """Take the outer panels over from a coarser raster."""
 
-    def finish(self) -> U8:
+    def finish(self) -> Layers:
         """(N, h, w, 4): the centre panel closed on every pixel, all of them in 8-bit codes, even beside the boxes;
-        the surround's own until the next frame."""
+        an array is the surround's own until the next frame."""
 
     def close(self) -> None:
         """Release threads and textures. May be called twice."""
@@ -124,8 +133,11 @@ class Backend(Protocol):
     def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> Surround:
         """One for a model and a stack. Raises InputError where the stack does not fit."""
 
+    def close(self) -> None:
+        """Release what its surrounds shared, once they are closed. May be called twice."""
 
-def carry_out(steps: Sequence[Step], surround: Surround, network: Network) -> U8:
+
+def carry_out(steps: Sequence[Step], surround: Surround, network: Network) -> Layers:
     """The layers of the problem that was begun: every step in its order.
 
     The first steps may work on coarser rasters. An outer panel is rounded to what 8 bits show where it is changed

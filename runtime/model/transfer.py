@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,7 +29,6 @@ def pre_emphasised(picture: U8, strength: float) -> U8:
     """
     if not strength:
         return picture
-    import cv2
 
     kernel = np.array([-strength, 1 + 2 * strength, -strength], np.float32)
     return np.asarray(cv2.sepFilter2D(picture, -1, kernel, kernel), np.uint8)

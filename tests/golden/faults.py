@@ -108,8 +108,8 @@ FAULTS = {
     "panels-swapped-by-the-shader": Fault(
         "panels swapped",
         "runtime.panels.presentation",
-        'self._program["layer"] = index',
-        'self._program["layer"] = 2 - index',
+        "textures.use(frame, index)",
+        "textures.use(frame, 2 - index)",
     ),
     "mm-for-m-of-the-tracker": Fault("mm for m", "runtime.optics.pupil", "tracker_sigma_m * 1e3)", "tracker_sigma_m)"),
     "mm-for-m-of-the-doubt": Fault(

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from runtime.model.chain import BLOCK_ROWS, ROWS_STEP, chain_frame, chain_modes
+from runtime.model.chain import BLOCK_ROWS, ROWS_STEP, ColumnLaw, chain_frame, chain_modes
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import relative_scale_shift
+from runtime.report.pairs import eyes_at
 from tests.model.scenes import STACK, eyes
 
 
@@ -77,6 +78,59 @@ def test_both_outer_panels_are_seen_one_cell_beside_the_middle_view(
             # Beyond the plane a ray from the right eye goes on to the left.
             assert moved[0] == pytest.approx(-direction * sign * frame.cell_px, rel=1e-6)
             assert moved[1] == pytest.approx(0.0, abs=1e-6)
+
+
+@given(
+    distance_m=st.floats(0.4, 3.0),
+    angle_deg=st.floats(5, 60),
+    mirrored=st.booleans(),
+    height_m=st.floats(-0.2, 0.2),
+    ipd_m=st.floats(0.02, 0.07),
+)
+def test_one_eye_may_be_nearer_than_the_other(
+    distance_m: float, angle_deg: float, mirrored: bool, height_m: float, ipd_m: float
+) -> None:
+    angle_deg = -angle_deg if mirrored else angle_deg
+    pair = eyes_at(distance_m=distance_m, angle_deg=angle_deg, height_m=height_m, ipd_m=ipd_m)
+    frame = chain_frame(pair, STACK, cell_px=4, reduction=2)
+    assume(frame.columns.bend)
+    # One viewpoint stands for both eyes' parallaxes to the second order of how much nearer one is.
+    within = 0.002 + 3 * ((pair[1, 0] - pair[0, 0]) / 2 / (frame.middle_m[0] - frame.x_m)) ** 2
+    for u in (0.0, frame.width_px / 3, float(frame.width_px)):
+        for v in (0.0, frame.rows * 0.7):
+            t = float(frame.columns.homography_from_column(np.array(u)))
+            for x_m in (STACK.x_m[0], STACK.x_m[2]):
+                ways = [frame.plane_from_frame(eye, x_m=x_m) @ (t, v, 1.0) for eye in pair]
+                back = [frame.frame_from_plane(x_m=x_m) @ (way / way[2]) for way in ways]
+                columns = [float(frame.columns.column_from_homography(np.array(b[0] / b[2]))) - u for b in back]
+                rows = [b[1] / b[2] - v for b in back]
+                assert abs(columns[0]) == pytest.approx(frame.cell_px, rel=within)  # over the whole of the raster
+                assert columns[1] == pytest.approx(-columns[0], rel=2 * within)
+                assert rows == pytest.approx([0.0, 0.0], abs=1e-6)
+
+
+def test_a_raster_s_column_law_goes_back_and_forth_and_is_even_where_nothing_bends() -> None:
+    u = np.linspace(0.0, 400.0, 9)
+    for bend in (-2e-3, 1e-9, 2e-3):
+        law = ColumnLaw(bend, 200.0)
+        assert law.column_from_homography(law.homography_from_column(u)) == pytest.approx(u, abs=1e-6)
+    assert ColumnLaw(1e-9, 200.0).homography_from_column(u) == pytest.approx(u, abs=1e-3)
+    assert ColumnLaw().homography_from_column(u) is u
+
+
+def test_the_raster_covers_what_is_seen_of_all_panels_from_the_side_too() -> None:
+    for angle_deg in (-50, -20, 20, 50):
+        frame = chain_frame(eyes_at(distance_m=0.7, angle_deg=angle_deg), STACK, cell_px=4, reduction=2)
+        scale, shift = relative_scale_shift(frame.middle_m, from_x_m=STACK.x_m[1], to_x_m=frame.x_m)
+        raster_from_plane = np.linalg.inv(frame.plane_from_raster)
+        for y in (-0.5, 0.5):
+            for z in (-0.5, 0.5):
+                corner = np.array([y * STACK.width_m, z * STACK.height_m]) * scale + shift
+                t, v, w = raster_from_plane @ (*corner, 1.0)
+                assert -1 < v / w < frame.rows + 1
+                # Beside it is only what no ray through all panels reaches.
+                column = float(frame.columns.column_from_homography(np.array(t / w)))
+                assert -0.2 * frame.width_px < column < 1.2 * frame.width_px
 
 
 def test_the_raster_covers_what_is_seen_of_all_panels() -> None:

@@ -23,7 +23,7 @@ from runtime.model.predictor import SHIPPED, Predictor, load_predictor
 from runtime.model.still import solve_still
 from runtime.model.unrolled import UnrolledPredictor
 from runtime.optics.rect import PixelRect
-from runtime.optics.stack import PanelStack
+from runtime.optics.stack import PanelStack, Tilt
 from runtime.plan.predictors import planned_predictor
 from runtime.records import F64, U8
 from runtime.support.gl import offscreen_context
@@ -31,6 +31,7 @@ from tests.model.exact import exact_resample
 from tests.model.scenes import FOV_DEG, card_scene, eyes
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 240, 135)
+TILT = Tilt(((0.001, 0.012, -0.006), (0.0, 0.0, 0.0), (-0.002, 0.004, 0.015)), (1.0, 0.1, -0.05))
 WITHIN_ONE = 0.999  # of all codes
 LEAST_DB = -0.05  # of displayed quality, against OpenCV
 HALF_TURN = np.radians(30)
@@ -111,6 +112,26 @@ def test_codes_at_every_gap(gap_m: float, gl: GlBackend) -> None:
     stack, pair = replace(STACK, x_m=(-gap_m, 0.0, gap_m)), eyes(0.9)
     wanted, found = (layers_of(p, cards(pair, stack), pair) for p in both("balanced", stack, gl))
     assert within_one(wanted, found) >= WITHIN_ONE
+
+
+@pytest.mark.usefixtures("exactly")
+@pytest.mark.parametrize("sigma_mm", [0.0, 3.0])
+@pytest.mark.parametrize("pose", ["straight", "rolled by 20 degrees", "above each other"])
+def test_codes_on_tilted_panels(pose: str, sigma_mm: float, gl: GlBackend) -> None:
+    stack, pair = replace(STACK, tilt=TILT), POSES[pose]
+    pictures = cards(pair, stack)
+    wanted, found = (layers_of(p, pictures, pair, sigma_mm=sigma_mm) for p in both("balanced", stack, gl))
+    assert within_one(wanted, found) >= WITHIN_ONE
+    _, even = both("balanced", STACK, gl)
+    assert within_one(layers_of(even, pictures, pair, sigma_mm=sigma_mm), found) < 0.9  # the tilt is felt
+
+
+def test_corrections_in_one_pass_on_tilted_panels(gl: GlBackend, monkeypatch: pytest.MonkeyPatch) -> None:
+    stack, pair, found = replace(STACK, tilt=TILT), eyes(0.6), []
+    for at_once in (False, True):
+        monkeypatch.setattr(gl, "at_once", at_once)
+        found.append(layers_of(both("fast", stack, gl)[1], cards(pair, stack), pair, sigma_mm=0.0))
+    assert (found[0] == found[1]).all()
 
 
 @pytest.mark.usefixtures("exactly")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ FOV = 40.0
 TILT = Tilt(((0.0, 0.04, -0.03), (0.0, 0.0, 0.0), (0.0, -0.03, 0.04)), (0.5, 0.0, 0.0))
 
 
-def pictures():
+def pictures() -> Any:
     """Two smooth pictures that differ."""
     v, u = np.mgrid[0 : STACK.height_px, 0 : STACK.width_px]
     found = []
@@ -31,7 +32,7 @@ def pictures():
     return found
 
 
-def displayed_db(solved_for, seen_on, *, model="balanced", eyes=EYES):
+def displayed_db(solved_for: Any, seen_on: Any, *, model: str = "balanced", eyes: Any = EYES) -> Any:
     left, right = pictures()
     predictor = load_predictor(model, solved_for)
     try:
@@ -44,7 +45,7 @@ def displayed_db(solved_for, seen_on, *, model="balanced", eyes=EYES):
 
 
 @pytest.mark.parametrize("share", [-0.14, -0.05, 0.05, 0.14])
-def test_gaps_that_differ_a_little_are_served_by_the_network_as_well_as_even_ones(share):
+def test_gaps_that_differ_a_little_are_served_by_the_network_as_well_as_even_ones(share: float) -> None:
     uneven = replace(STACK, x_m=(-0.06 * (1 - share / 2), 0.0, 0.06 * (1 + share / 2)))
     predictor = load_predictor("balanced", uneven)
     assert predictor.name == "balanced"
@@ -52,20 +53,20 @@ def test_gaps_that_differ_a_little_are_served_by_the_network_as_well_as_even_one
     assert displayed_db(uneven, uneven) > displayed_db(STACK, STACK) - 0.5
 
 
-def test_gaps_that_differ_more_are_served_by_sart_and_the_name_says_so():
+def test_gaps_that_differ_more_are_served_by_sart_and_the_name_says_so() -> None:
     predictor = load_predictor("balanced", replace(STACK, x_m=(-0.06, 0.0, 0.03)))
     assert predictor.name.startswith("sart")
 
 
 @pytest.mark.parametrize("x_m", [(-0.06, 0.0, 0.06), (-0.058, 0.001, 0.065)])
-def test_the_chain_runs_where_both_outer_panels_have_one_parallax(x_m):
+def test_the_chain_runs_where_both_outer_panels_have_one_parallax(x_m: tuple[float, float, float]) -> None:
     frame = chain_frame(EYES, replace(STACK, x_m=x_m), cell_px=4, reduction=2)
     rear, front = (abs(x - frame.x_m) / (EYES[0, 0] - x) for x in (x_m[0], x_m[2]))
     assert rear == pytest.approx(front, rel=1e-12)
 
 
 @pytest.mark.parametrize("model", ["balanced", "sart"])
-def test_tilts_that_are_known_are_solved_for(model):
+def test_tilts_that_are_known_are_solved_for(model: str) -> None:
     tilted = replace(STACK, tilt=TILT)
     known, unknown, parallel = (
         displayed_db(a, b, model=model) for a, b in ((tilted, tilted), (STACK, tilted), (STACK, STACK))
@@ -74,13 +75,13 @@ def test_tilts_that_are_known_are_solved_for(model):
     assert known > parallel - 2.0
 
 
-def test_eyes_above_each_other_see_tilted_panels_too():
+def test_eyes_above_each_other_see_tilted_panels_too() -> None:
     upright = np.array([[0.5, 0.0, 0.031], [0.5, 0.0, -0.031]])
     tilted = replace(STACK, tilt=TILT)
     assert displayed_db(tilted, tilted, eyes=upright) > displayed_db(STACK, tilted, eyes=upright) + 0.5
 
 
-def test_a_perspective_is_resampled_where_it_belongs():
+def test_a_perspective_is_resampled_where_it_belongs() -> None:
     v, u = np.mgrid[0:60, 0:90].astype(np.float64) + 0.5
     image = np.rint(10 * u + 7 * v).astype(np.int16)
     matrix = np.array([[1.01, 0.02, 2.0], [-0.01, 0.99, 1.5], [1e-4, -2e-4, 1.0]])

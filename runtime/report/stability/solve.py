@@ -16,6 +16,8 @@ from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
+from scipy.optimize import lsq_linear
+from scipy.sparse import csr_matrix
 
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64
@@ -110,8 +112,6 @@ class Problem:
 @lru_cache(maxsize=64)
 def exact_operator(gap_m: float, ipd_m: float, distance_m: float) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
     """Each eye's rays that cross every panel, by 50 digits: (rays, N·h·w) bilinear weights, and their columns."""
-    from scipy.sparse import csr_matrix
-
     fov_deg = math.degrees(2 * math.atan(WIDTH_M / 2 / distance_m))
     half, found = exact.mpf("0.5"), []
     for sign in (-1, 1):
@@ -154,8 +154,6 @@ def _mirrored(index: int) -> int:
 
 @lru_cache(maxsize=64)
 def _optimum(gap_m: float, ipd_m: float, distance_m: float) -> float:
-    from scipy.optimize import lsq_linear
-
     problem = Problem(gap_m=gap_m, ipd_m=ipd_m, distance_m=distance_m - gap_m)
     parts = exact_operator(gap_m, ipd_m, distance_m)
     half = [len(columns) // 2 for _, columns in parts]  # the other half is its mirror image, and wants the same

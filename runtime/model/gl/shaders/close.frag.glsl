@@ -5,7 +5,7 @@ uniform isampler2D rear, front;                      // as they are
 uniform isampler2D rear_mean, front_mean;            // as eyes that are unsure see them
 uniform ivec2 rear_size, front_size, centre_size;
 uniform ivec2 rear_origin, front_origin, centre_origin;
-uniform vec4 rear_from_left, rear_from_right, front_from_left, front_from_right;
+uniform mat3 rear_from_left, rear_from_right, front_from_left, front_from_right;
 uniform int even, neutral;
 uniform bool grey;
 layout(location = 0) out vec4 rear_codes;
@@ -13,8 +13,8 @@ layout(location = 1) out vec4 centre_codes;
 layout(location = 2) out vec4 front_codes;
 #include "sample.glsl"
 
-ivec4 through(isampler2D image, ivec2 size, vec4 scale_shift, vec2 at) {
-    return crossed(image, size, at * scale_shift.xy + scale_shift.zw, even);
+ivec4 through(isampler2D image, ivec2 size, mat3 image_from_here, vec2 at) {
+    return crossed(image, size, image_from_here, at, even);
 }
 
 bool within(ivec2 place, ivec2 size) {

@@ -2,16 +2,16 @@
 // `residual` and `correct` in one: no image in between, but four looks an eye for each pixel of the panel.
 uniform isampler2D panel;
 uniform ivec2 size;         // of the centre panel's raster
-uniform vec4 centre_from_left, centre_from_right;
+uniform mat3 centre_from_left, centre_from_right;
 uniform int eighths;
 out ivec4 corrected;
 #include "sample.glsl"
 #include "lacks.glsl"
 #include "shown.glsl"
 
-ivec4 lacked(vec4 scale_shift, bool by_left) {
-    vec2 place = gl_FragCoord.xy * scale_shift.xy + scale_shift.zw;
-    if (beside(place, size)) return ivec4(0);
+ivec4 lacked(mat3 centre_from_here, bool by_left) {
+    vec2 place = moved(centre_from_here, gl_FragCoord.xy);
+    if (beside(place, size) && !sheared(centre_from_here)) return ivec4(0);
     vec2 low = floor(place - 0.5), weight = place - 0.5 - low;
     vec4 lines[2];
     for (int down = 0; down < 2; down++) {

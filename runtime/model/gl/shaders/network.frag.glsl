@@ -3,18 +3,18 @@
 uniform isampler2D wanted_left, wanted_right;
 uniform ivec2 size;
 uniform mat3 left_from_raster, right_from_raster;
-uniform bool sheared;       // rasters that are: their edge is repeated
 layout(location = 0) out ivec4 lacks_left;
 layout(location = 1) out ivec4 lacks_right;
 #include "sample.glsl"
+#include "columns.glsl"
 
 vec4 half_difference(ivec2 place) {
     return vec4((texel(wanted_right, place, size) - texel(wanted_left, place, size)) >> 1);
 }
 
 ivec4 sampled(mat3 matrix, float sign) {
-    vec2 place = (matrix * vec3(gl_FragCoord.xy, 1.0)).xy;
-    if (!sheared && beside(place, size)) return ivec4(0);
+    vec2 place = moved(matrix, vec2(homography_from_column(gl_FragCoord.x), gl_FragCoord.y));
+    if (beside(place, size) && !sheared(matrix)) return ivec4(0);
     vec2 low = floor(place - 0.5), weight = place - 0.5 - low;
     ivec2 at = ivec2(low);
     vec4 above = mix(half_difference(at), half_difference(at + ivec2(1, 0)), weight.x);

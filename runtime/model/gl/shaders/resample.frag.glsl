@@ -3,15 +3,17 @@
 uniform isampler2D image;
 uniform ivec2 size;
 uniform mat3 image_from_panel;
-uniform bool sheared;
 uniform int outside;
 out ivec4 panel;
 #include "sample.glsl"
+#include "columns.glsl"
 #include "cubic.glsl"
 #include "shown.glsl"
 
 void main() {
-    vec2 place = (image_from_panel * vec3(gl_FragCoord.xy, 1.0)).xy;
-    if (sheared) panel = kept(bilinear(image, size, place));
+    vec2 place = moved(image_from_panel, gl_FragCoord.xy);
+    place.x = column_from_homography(place.x);
+    if (bend != 0.0) panel = kept(cubic(image, size, place));
+    else if (sheared(image_from_panel)) panel = kept(bilinear(image, size, place));
     else panel = kept(beside(place, size) ? ivec4(outside) : cubic(image, size, place));
 }

@@ -22,7 +22,19 @@ ivec4 bilinear(isampler2D image, ivec2 size, vec2 place) {
     return rounded(mix(above, below, weight.y));
 }
 
-// What a ray meets that leaves an image is `outside`: nobody sees it, for it does not cross every panel.
-ivec4 crossed(isampler2D image, ivec2 size, vec2 place, int outside) {
-    return beside(place, size) ? ivec4(outside) : bilinear(image, size, place);
+// Images are mapped by 3x3 matrices: a scale and a shift, or more where heads or panels are tilted.
+vec2 moved(mat3 matrix, vec2 at) {
+    vec3 place = matrix * vec3(at, 1.0);
+    return place.xy / place.z;
+}
+
+bool sheared(mat3 matrix) {
+    return matrix[1].x != 0.0 || matrix[0].y != 0.0 || matrix[0].z != 0.0 || matrix[1].z != 0.0;
+}
+
+// What a ray meets that leaves an image is `outside`, or where that is sheared its repeated edge: nobody sees it, for
+// it does not cross every panel.
+ivec4 crossed(isampler2D image, ivec2 size, mat3 image_from_here, vec2 at, int outside) {
+    vec2 place = moved(image_from_here, at);
+    return beside(place, size) && !sheared(image_from_here) ? ivec4(outside) : bilinear(image, size, place);
 }
