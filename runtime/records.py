@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,29 @@ U16 = NDArray[np.uint16]
 
 EyesLabel = Literal["exact", "interpolated", "predicted", "held", "rested", "none"]
 Inference = Literal["ran", "reused", "skipped"]
+
+
+class HeldLayers(Protocol):
+    """Layers (N, h, w, 4) that lie elsewhere than in memory: in textures (`support.gl_sharing`)."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(N, h, w, 4)."""
+
+    @property
+    def lost(self) -> bool:
+        """Whether they are no more."""
+
+    def pixels(self) -> U8:
+        """The same as an array, brought here when it is first asked for. Raises ContextLost."""
+
+
+Layers = U8 | HeldLayers
+
+
+def pixels_of(layers: Layers) -> U8:
+    """(N, h, w, 4) layers as an array. Raises ContextLost."""
+    return layers if isinstance(layers, np.ndarray) else layers.pixels()
 
 
 class State(StrEnum):
@@ -80,10 +103,10 @@ class PanelFrame:
     """What all panels show together at one refresh: a solution aligned to the eyes, the flat picture, or both mixed."""
 
     number: int  # of the refresh: all panels show the same
-    solved: U8 | None  # (N, height_px, width_px, 4) RGBA, rear to front; layers solved for two eyes; None: none yet
+    solved: Layers | None  # (N, height_px, width_px, 4) RGBA, rear to front; layers solved for two eyes; None: none yet
     solved_version: int  # another number whenever `solved` holds other values
     solved_from_shown: tuple[F64, ...] = ()  # per panel (3, 3): pixels of `solved` from shown ones; (): as they are
-    flat: U8 | None = None  # the same shape: the picture for eyes anywhere; never aligned
+    flat: Layers | None = None  # the same shape: the picture for eyes anywhere; never aligned
     flat_version: int = 0
     flatness: float = 0.0  # 0: `solved` alone, 1: `flat` alone, between: mixed linearly, code by code
 
@@ -135,13 +158,18 @@ class Solution:
     """Layers for one pair of eyes, or the flat picture; whoever holds it reads values that never change."""
 
     number: int  # counts up from 1, flat pictures and solutions together
-    layers: U8  # (N, height_px, width_px, 4) RGBA, rear to front
+    made: Layers  # (N, height_px, width_px, 4) RGBA, rear to front
     solved_for_m: F64 | None  # (2, 3) left, right; frame `stack`; None: flat, for eyes anywhere
     solved_for_ns: int  # the instant that it was made for; its content is of that instant
     seeing: tuple[bool, bool] = (True, True)  # left, right: an eye that can't see the display gave way to the other
     eye_sigma_mm: float | None = None  # how far off the eyes it was made to hold: pupil and tracker together
     stage_ms: dict[str, float] = field(default_factory=dict)  # render, prepare, inference, finish; the run's clock
     machine_ms: dict[str, float] = field(default_factory=dict)  # the same on the machine's clock
+
+    @property
+    def layers(self) -> U8:
+        """What was made, as an array: brought from textures when it is first asked for. Raises ContextLost."""
+        return pixels_of(self.made)
 
 
 @dataclass(frozen=True, slots=True)

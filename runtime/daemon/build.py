@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock, SimulatedClock
 from runtime.config import OutputSettings, Settings
 from runtime.records import RefreshAccount
+from runtime.support.memory import settled
 from runtime.support.priority import PRESENTER_NICENESS, niceness
 
 if TYPE_CHECKING:
@@ -159,7 +160,7 @@ def build_run(
         output_settings = output_settings.model_copy(update={"allow_rescaling": True})
     panels = _open_panels(output_settings, stack, clock, context, wait_for_panels)
     cleanup.callback(panels.close)
-    maker = SolverMaker(settings, stack, calibration, on_start=on_start)
+    maker = SolverMaker(settings, stack, calibration, on_start=on_start, panels_group=lambda: panels.group)
     solver: SolverHost
     if simulated:
         solver = SimulatedSolver(maker(context=context, simulated=True), clock)
@@ -175,7 +176,7 @@ def build_run(
         )
         solver = thread
         cleanup.callback(solver.close)
-        thread.wait_ready(lambda: on_start("loading content and model"))
+        thread.wait_ready(lambda: on_start("loading content and model"), most_s=settings.limits.start_s)
         samples = LiveSamples(make_driver, settings.sensor, clock)
         cleanup.callback(samples.close)
     run = maker.run
@@ -212,6 +213,7 @@ def build_run(
         in_stack_frame = driver.capabilities.in_stack_frame
         recorder.watches(presenter, stack=stack, simulated=simulated, in_stack_frame=in_stack_frame)
     if not simulated:
+        cleanup.enter_context(settled())
         cleanup.enter_context(niceness(PRESENTER_NICENESS))  # this thread's, once all others have been started
     return Run(presenter, observer, solver, lambda: _newest(maker), simulated)
 

@@ -12,6 +12,7 @@ import numpy as np
 from runtime.config import Settings
 from runtime.content.base import ContentSource
 from runtime.content.registry import open_content
+from runtime.errors import ContextLost
 from runtime.eyes.calibration import Calibration
 from runtime.frame.run_state import RunCell, RunState
 from runtime.frame.solver import Solver, Step
@@ -24,8 +25,11 @@ from runtime.plan.predictors import planned_predictor
 from runtime.plan.savings import Saving
 from runtime.records import SolveRequest
 from runtime.support.gl import offscreen_context
+from runtime.support.gl_sharing import ShareGroup, leave_context
 
 log = logging.getLogger("phasestack.solver")
+
+PanelsGroup = Callable[[], ShareGroup | None]  # that panels show textures of at present
 
 WARM_EYES_M = ((0.6, -0.031, 0.0), (0.6, 0.031, 0.0))
 
@@ -34,11 +38,22 @@ class RunningSolver:
     """`SolverParts` of a real run; made and used on one thread."""
 
     def __init__(
-        self, run: RunCell, stack: PanelStack, *, context: Any, owns_context: bool, backend: Choice, simulated: bool
+        self,
+        run: RunCell,
+        stack: PanelStack,
+        *,
+        context: Any,
+        owns_context: bool,
+        group: ShareGroup | None,
+        panels_group: PanelsGroup,
+        backend: Choice,
+        simulated: bool,
     ) -> None:
-        """context: current on this thread; owns_context: it is released with the rest. backend: of every model."""
+        """context: current on this thread; owns_context: it is released with the rest. group: the context's, if any;
+        panels_group: the one that panels show textures of at present. backend: of every model."""
         self.run, self.context, self.backend = run, context, backend
         self._owns_context = owns_context
+        self._group, self._panels_group = group, panels_group
         self._wanted_backend = run.state.settings.model.backend
         self._held: RunState = run.state
         self.solver = Solver(run, stack)
@@ -59,11 +74,13 @@ class RunningSolver:
 
         Raises PhasestackError where that can't be had; nothing has changed then.
         """
-        wanted = settings.model.backend
+        wanted, before = settings.model.backend, self.backend
         if wanted != self._wanted_backend:
-            self.backend = choose(wanted, predictor, lambda: self.context)
+            self.backend = choose(wanted, predictor, lambda: self.context, group=self._group)
             self._wanted_backend = wanted
         predictor.surround_with(self.backend.backend)
+        if before is not self.backend:
+            before.backend.close()
 
     def use(self, predictor: Predictor) -> Predictor:
         """Another model from the next solution on. Answers the one before it, which is the caller's to close."""
@@ -75,6 +92,8 @@ class RunningSolver:
         self.solver.measured = replace(self.solver.measured, level=label, level_saving=saving)
 
     def step(self, request: SolveRequest) -> Step:
+        if self._panels_group() is not self._group or (self._group is not None and self._group.lost):
+            raise ContextLost("the panels have another OpenGL context")
         self._held = self.run.state
         step = self.solver.step(request)
         solution = step.solution
@@ -88,37 +107,60 @@ class RunningSolver:
 
     def close(self, *, abandoned: bool = False) -> None:
         self.budget.close()
+        stand_in = self._stand_in()
         state = self._held if abandoned else self.run.state
-        for release in (state.content.close, state.predictor.close, *([self.context.release] * self._owns_context)):
+        own = [leave_context, self.context.release] if self._owns_context else []
+        own += [] if stand_in is None else [stand_in.release]
+        for release in (state.content.close, state.predictor.close, self.backend.backend.close, *own):
             try:
                 release()
             except Exception as error:  # of a context that is lost there is nothing to release
                 log.warning("solver: closing it: %s", error)
+
+    def _stand_in(self) -> Any:
+        """A context of the group, current: textures outlive the solver's own, which may be lost, and are released in
+        this one. None: they go with their context."""
+        if not self._owns_context or self._group is None or self._group.lost:
+            return None
+        try:
+            return self._group.context()
+        except Exception as error:
+            log.warning("solver: its textures stay: %s", error)
+            return None
 
 
 class SolverMaker:
     """Makes a solver on the thread that calls; again, with the settings of then, where the one before it hung."""
 
     def __init__(
-        self, settings: Settings, stack: PanelStack, calibration: Calibration, *, on_start: Callable[[str], bool]
+        self,
+        settings: Settings,
+        stack: PanelStack,
+        calibration: Calibration,
+        *,
+        on_start: Callable[[str], bool],
+        panels_group: PanelsGroup = lambda: None,
     ) -> None:
-        """on_start: told what takes long before the first solution; False: leave it."""
+        """on_start: told what takes long before the first solution; False: leave it. panels_group: the share group
+        that solutions are shown from, asked from any thread."""
         self._settings, self._stack, self._calibration, self._on_start = settings, stack, calibration, on_start
         self.run: RunCell | None = None  # from the first solver on
         self.parts: RunningSolver | None = None  # the newest
         self._wanted: Wanted = settings.model.backend
+        self._panels_group = panels_group
 
     def __call__(self, *, context: Any = None, simulated: bool = False) -> RunningSolver:
-        """context: one to share; None: one of this thread's own. Raises FatalError; leaves nothing open then."""
-        own = context is None
-        made = offscreen_context() if own else context
+        """context: one to use together with the panels; None: one of this thread's own, which shares textures with
+        theirs where that can be. Raises FatalError; leaves nothing open then."""
+        own, group = context is None, self._shared_group()
+        made = context if context is not None else own_context(group)
         try:
             settings = self.run.state.settings if self.run is not None else self._settings
             predictor = ready_predictor(settings, self._stack)
             try:
                 content = open_content(settings.content, self._stack, made, limits=settings.limits)
                 try:
-                    backend = self._chosen(predictor, made, simulated=simulated)
+                    backend = self._chosen(predictor, made, group, simulated=simulated)
                     predictor.surround_with(backend.backend)
                 except BaseException:
                     content.close()
@@ -135,21 +177,38 @@ class SolverMaker:
         else:
             self.run.replace(content=content, predictor=predictor)
         parts = RunningSolver(
-            self.run, self._stack, context=made, owns_context=own, backend=backend, simulated=simulated
+            self.run,
+            self._stack,
+            context=made,
+            owns_context=own,
+            group=group,
+            panels_group=self._shared_group,
+            backend=backend,
+            simulated=simulated,
         )
         parts.budget.start(self._on_start)
         self.parts = parts
         return parts
 
-    def _chosen(self, predictor: Predictor, context: Any, *, simulated: bool) -> Choice:
+    def _shared_group(self) -> ShareGroup | None:
+        """Of the panels, where solutions may be left in textures; a solver that never draws any is kept apart."""
+        group = None if self._settings.model.backend == "opencv" else self._panels_group()
+        return None if group is None or group.lost else group
+
+    def _chosen(self, predictor: Predictor, context: Any, group: ShareGroup | None, *, simulated: bool) -> Choice:
         """The backend; the one that was found before, where a solver is made anew.
 
         Simulated time has no use for a faster one, and two of its runs are the same to the byte.
         """
         wanted = "opencv" if simulated and self._wanted == "auto" else self._wanted
-        choice = choose(wanted, predictor, lambda: context)
+        choice = choose(wanted, predictor, lambda: context, group=group)
         self._wanted = "gl" if choice.backend.name == "gl" else "opencv"
         return choice
+
+
+def own_context(group: ShareGroup | None) -> Any:
+    """A context for this thread, current on it, of a group if there is one. Raises MissingPart."""
+    return offscreen_context() if group is None else group.context()
 
 
 def ready_predictor(settings: Settings, stack: PanelStack) -> Predictor:

@@ -171,7 +171,7 @@ class Daemon:
             case "playlist":
                 try:
                     path = self._written_playlist(command.value)
-                except (OSError, ValueError) as error:  # no room, or a name that is no text
+                except (OSError, ValueError, InputError) as error:  # no room, or a name that is no text
                     command.refuse(f"the playlist can't be written ({one_line(str(error), most=120)})")
                 else:
                     self._show(presenter, str(path), command)
@@ -340,7 +340,7 @@ def _with_budget(settings: Settings, budget_ms: float) -> Settings:
 def snapshot(run: Run | None, presenter: Presenter, account: RefreshAccount) -> dict[str, Any]:
     """What `status` answers."""
     machine, stats, state = presenter.machine, presenter.stats, presenter.run_cell.state
-    counted = stats.summary(stale_inputs=presenter.samples.stale_inputs)
+    counted = stats.summary(stale_inputs=presenter.samples.stale_inputs, nearly=True)
     return {
         "state": machine.name,
         "reason": machine.reason,

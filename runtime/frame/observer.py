@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from runtime.content.base import ContentSource
+from runtime.errors import ContextLost
 from runtime.evaluation.displayed import EyeViews, displayed
 from runtime.frame.presenter import Refresh
 from runtime.frame.solver_host import SolverHost
@@ -27,6 +28,7 @@ from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import retina_pictures
 from runtime.records import F64, U8, RefreshAccount, SensorFrame, State
 from runtime.support.background import Job
+from runtime.support.waiting import wait_for
 
 log = logging.getLogger("phasestack.quality")
 
@@ -224,7 +226,7 @@ class RunObserver:
         account = refresh.account
         try:
             layers = shown_layers(refresh.frame)
-        except ValueError:
+        except (ValueError, ContextLost):
             return None
         if self._keep_light and account.frame % self._keep_light == self._keep_light - 1 and self._output is not None:
             info = {
@@ -269,8 +271,6 @@ class RunObserver:
         jobs: list[dict[str, tuple[U8, U8]]] = []
         self._on_solver(lambda content: jobs.append(self._drawn(content, refresh, known_m)))
         if not self._simulated:
-            from runtime.support.waiting import wait_for
-
             wait_for(lambda: bool(jobs), timeout_s=10.0)
         return self._compared(refresh, known_m, jobs[0]) if jobs else None
 

@@ -19,7 +19,7 @@ from runtime.frame.pacing import Pacer
 from runtime.frame.policy import Flatness, wants_flat
 from runtime.frame.run_state import RunCell
 from runtime.frame.samples import Samples
-from runtime.frame.solver_host import News, SolverHost
+from runtime.frame.solver_host import News, SolverHost, still_there
 from runtime.frame.states import Conditions, Part, StateMachine
 from runtime.frame.stats import RunStats
 from runtime.frame.timing import SOLVING_STAGES, RefreshTimes
@@ -162,7 +162,7 @@ class Presenter:
         self._receive(woke_ns)
         times.lap("sensor")
         eyes = self.viewer.at(timing.photon_ns)
-        news = self.solver.news()
+        news = still_there(self.solver.news())
         frame, limited = self._compose(timing, eyes, news)
         times.lap("track")
         report, lost = self._present(frame)
@@ -208,10 +208,10 @@ class Presenter:
         matrices, limited = self._alignment(eyes, solution)
         frame = PanelFrame(
             timing.id,
-            solution.layers if solution is not None else None,
+            solution.made if solution is not None else None,
             solution.number if solution is not None else 0,
             matrices,
-            flat.layers if flat is not None else None,
+            flat.made if flat is not None else None,
             flat.number if flat is not None else 0,
             flatness,
         )

@@ -56,7 +56,6 @@ class Solver:
         self._flat: Made | None = None
         self._middle_m: F64 = np.array(FLAT_EYE_M)
         self._missing: dict[str, str] = {}
-        self._failed_for: Made | None = None
 
     def step(self, request: SolveRequest) -> Step:
         """Do what the request calls for, if anything. A part that fails is named; what there is stays good.
@@ -106,7 +105,9 @@ class Solver:
             raise
         except Exception as error:
             return Step(missing=self._failed("model", error, expected=ModelFailure))
-        layers = self._buffers.copy_of(prediction.layers)
+        made = prediction.made
+        if isinstance(made, np.ndarray):
+            made = self._buffers.copy_of(made)
         rest_ms = max(0.0, watch.lap_ms() - sum(prediction.stage_ms.values()))
         stages |= prediction.stage_ms
         stages["finish"] = stages.get("finish", 0.0) + rest_ms
@@ -115,7 +116,7 @@ class Solver:
         self._middle_m = eyes_m.mean(axis=0)
         solution = Solution(
             self.run.next_number(),
-            layers,
+            made,
             eyes_m,
             request.time_ns,
             seeing=self.plan.eyes if self.plan is not None else (True, True),

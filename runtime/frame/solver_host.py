@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
+import numpy as np
+
 from runtime.clock import NS_PER_MS, Clock
 from runtime.frame.solver import Step
 from runtime.frame.timing import SOLVING_STAGES
@@ -77,6 +79,14 @@ def taken_in(news: News, step: Step) -> News:
         step.missing,
         news.solutions + (step.solution is not None),
     )
+
+
+def still_there(news: News) -> News:
+    """The news without a solution whose textures went with their context: the flat picture is shown until the next."""
+    solution = news.solution
+    if solution is None or isinstance(solution.made, np.ndarray) or not solution.made.lost:
+        return news
+    return replace(news, solution=None)
 
 
 def total_ns(stage_ms: Mapping[str, float]) -> int:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import logging
+import math
 import queue
 import threading
 from collections.abc import Callable
 
 from runtime.clock import NS_PER_S, Clock
-from runtime.errors import ContextLost, PhasestackError
+from runtime.errors import ContextLost, FatalError, PhasestackError
 from runtime.frame.solver_host import COST_GAIN, FIRST_REQUEST, News, SolverHost, SolverParts, Task, taken_in, total_ns
 from runtime.records import SolveRequest
 from runtime.support.priority import SOLVER_NICENESS, set_niceness
@@ -53,14 +54,17 @@ class SolverThread(SolverHost):
         self.restarts = 0
         self._attempt = self._begin(1)
 
-    def wait_ready(self, tell: Callable[[], bool] = lambda: True) -> None:
+    def wait_ready(self, tell: Callable[[], bool] = lambda: True, *, most_s: float = math.inf) -> None:
         """Until the solver can be asked. tell: called now and then; False: stop waiting.
 
-        Raises whatever making it raised.
+        Raises whatever making it raised, and FatalError after `most_s`.
         """
+        begun_ns = self._clock.now_ns()
         while not self._attempt.ready.wait(0.1):
             if not tell():
                 return
+            if self._clock.now_ns() - begun_ns > most_s * NS_PER_S:
+                raise FatalError(f"content and model: not ready after {most_s:g} s (limits.start_s)")
         if self._attempt.error is not None:
             raise self._attempt.error
 
@@ -124,10 +128,13 @@ class SolverThread(SolverHost):
 
     def _run(self, attempt: _Attempt) -> None:
         set_niceness(SOLVER_NICENESS)
+        parts: SolverParts | None = None
         try:
             parts = self._make()
             first = parts.step(FIRST_REQUEST)
         except BaseException as error:
+            if parts is not None:
+                parts.close(abandoned=attempt.abandoned.is_set())
             attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
             attempt.ready.set()
             if attempt.number > 1 and not isinstance(error, PhasestackError):

@@ -7,7 +7,6 @@ from time import perf_counter_ns
 
 from runtime.clock import NS_PER_MS, Clock, SimulatedClock
 
-REFRESH_STAGES = ("sensor", "track", "present", "wait")
 SOLVING_STAGES = ("render", "prepare", "inference", "finish")
 STAGES = ("sensor", "track", *SOLVING_STAGES, "present", "wait")
 

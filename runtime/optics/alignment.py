@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.optics.stack import PanelStack
-from runtime.records import F32, F64, U8, PanelFrame
+from runtime.records import F32, F64, U8, PanelFrame, pixels_of
 
 EVEN_CODE = 128  # the middle of a panel's range: what lies beside the solution
 FARTHEST_M = 1e6  # of any coordinate: what is farther counts as not finite
@@ -87,22 +87,22 @@ def shown_layers(frame: PanelFrame) -> U8:
     The reference for the presentation shader: bilinear with exact weights (for moved eyes bicubic was never better by
     more than 0.05 dB: docs/mathematics.md), `EVEN_CODE` beside the solution, mixed with the flat picture before it is
     rounded. Where nothing is to be done the frame's own array is answered.
-    Raises ValueError for a frame that has nothing to show.
+    Raises ValueError for a frame that has nothing to show, ContextLost where its layers' textures are no more.
     """
-    solved, flat, flatness = frame.solved, frame.flat, frame.flatness
-    if solved is None:
-        flatness = 1.0
-    if flatness > 0.0 and flat is None:
+    flatness = 1.0 if frame.solved is None else frame.flatness
+    if flatness > 0.0 and frame.flat is None:
         raise ValueError("a frame without its flat picture")
-    if flatness >= 1.0 or solved is None:
+    flat = None if frame.flat is None or flatness <= 0.0 else pixels_of(frame.flat)
+    if flatness >= 1.0 or frame.solved is None:
         assert flat is not None
         return flat
+    solved = pixels_of(frame.solved)
     maps = frame.solved_from_shown or (np.eye(3),) * len(solved)
     if flatness <= 0.0 and all(is_identity(matrix) for matrix in maps):
         return solved
     out = np.empty_like(solved)
     for n, matrix in enumerate(maps):
-        mixed = None if flat is None or flatness <= 0.0 else flat[n]
+        mixed = None if flat is None else flat[n]
         if mixed is None and is_identity(matrix):
             out[n] = solved[n]
             continue

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from runtime.optics.retina import Mask, strips
@@ -29,7 +30,6 @@ def psnr_db(mean_squared_error: float) -> float:
 
 def ssim(a: F32, b: F32, mask: Mask) -> float:
     """Mean structural similarity over a mask: 11x11 Gaussian window of sigma 1.5 (Wang et al. 2004)."""
-    import cv2
 
     def blur(x: F32) -> F32:
         return np.asarray(cv2.GaussianBlur(x, (11, 11), 1.5), dtype=np.float32)[inside]

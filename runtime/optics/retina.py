@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -69,8 +70,6 @@ class _Samples:
 
     def of(self, plane: F32) -> F32:
         """(h, w) samples of (H, W)."""
-        import cv2
-
         right, below = self._right, self._below
         no_second_map: Any = None  # OpenCV's own stubs forget that there may be none
         top, top_right, bottom, bottom_right = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 
 from runtime.records import PanelFrame, PresentReport
+from runtime.support.gl_sharing import ShareGroup
 
 
 class PanelSink(ABC):
@@ -15,6 +16,12 @@ class PanelSink(ABC):
     @property
     def period_ns(self) -> int | None:
         """Between two vertical blanks, as the monitor that sets the pace says; None: there is none, or unknown."""
+        return None
+
+    @property
+    def group(self) -> ShareGroup | None:
+        """The share group whose textures are shown as they are; another one when its context was lost and made anew;
+        None: there is none, frames carry arrays. Any thread may ask."""
         return None
 
     @abstractmethod

@@ -14,6 +14,7 @@ from runtime.errors import MissingPart, PanelLost
 from runtime.panels import edid, xlib
 from runtime.panels.monitors import Monitor, in_order
 from runtime.support.gl import MINIMUM_VERSION
+from runtime.support.gl_sharing import ShareGroup, shared
 
 log = logging.getLogger("phasestack.panels")
 
@@ -70,6 +71,7 @@ class Display:
         self._windows: list[Window] = []
         self._closed = False
         self._outputs: dict[str, int] = {}
+        self.group: ShareGroup | None = None  # of the root's context, once there is one
         try:
             if glfw.platform_supported(glfw.PLATFORM_X11):
                 glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
@@ -99,6 +101,7 @@ class Display:
                 self._adopt(glfw.create_window(16, 16, "phasestack", None, None))
             except glfw.GLFWError as error:
                 raise PanelLost(f"no OpenGL on the X server: {_text(error)}") from None
+            self.group = shared()
         return self._windows[0]
 
     def monitors(self) -> tuple[Monitor, ...]:
@@ -132,12 +135,24 @@ class Display:
         faults = self.faults + [fault for window in self._windows for fault in window.faults]
         return "; ".join(faults)
 
+    def close_windows(self) -> None:
+        """Close all but the root: its group's textures stay, and with them what a solver has in them."""
+        for window in self._windows[1:]:
+            window.context.release()
+            glfw.destroy_window(window.handle)
+        self._windows = self._windows[:1]
+        self.faults.clear()
+        if self._windows:
+            self._windows[0].make_current()
+
     def close(self) -> None:
         """Close every window and the connection. May be called twice."""
         if self._closed:
             return
         self._closed = True
         self._watch.stop()
+        if self.group is not None:
+            self.group.close()
         for window in self._windows:
             window.context.release()
         if self._windows:
@@ -207,8 +222,8 @@ class Display:
 
     @property
     def has_windows(self) -> bool:
-        """True once anything was made that needs OpenGL."""
-        return bool(self._windows)
+        """Whether there are any but the hidden root."""
+        return len(self._windows) > 1
 
 
 def connected_monitors() -> tuple[Monitor, ...]:

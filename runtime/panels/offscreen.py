@@ -11,6 +11,7 @@ from runtime.errors import PanelLost
 from runtime.panels.base import PanelSink
 from runtime.panels.presentation import FrameTextures, Mounting, Painter, check
 from runtime.records import U8, PanelFrame, PresentReport
+from runtime.support.gl_sharing import ShareGroup, shared
 
 
 class OffscreenPanels(PanelSink):
@@ -38,8 +39,9 @@ class OffscreenPanels(PanelSink):
         self._size = (width_px, height_px)
         self._count = len(panels)
         self._frame: PanelFrame | None = None
+        self._group = shared()
         self._textures: FrameTextures | None = FrameTextures(
-            context, width_px=width_px, height_px=height_px, count=self._count
+            context, width_px=width_px, height_px=height_px, count=self._count, group=self._group
         )
         self._painters: list[Painter] = []
         self._targets: list[moderngl.Framebuffer] = []
@@ -55,6 +57,10 @@ class OffscreenPanels(PanelSink):
             )
             self._painters.append(Painter(context, mounting))
             self._targets.append(context.framebuffer([context.texture(screen, 4)]))
+
+    @property
+    def group(self) -> ShareGroup | None:
+        return self._group
 
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
         """Keep it (and draw, if asked to at construction); skew is between the first and the last panel drawn."""
@@ -96,6 +102,8 @@ class OffscreenPanels(PanelSink):
             target.release()
         if self._textures is not None:
             self._textures.release()
+        if self._group is not None:
+            self._group.close()
         self._textures, self._painters, self._targets = None, [], []
 
     def _drawn(self, frame: PanelFrame) -> list[int]:

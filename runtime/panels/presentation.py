@@ -11,7 +11,8 @@ from runtime.config import PanelSettings
 from runtime.optics.alignment import EVEN_CODE, is_identity, scale_and_shift
 from runtime.panels import lut
 from runtime.panels.geometry import layer_from_screen, permutes_pixels
-from runtime.records import F32, F64, PanelFrame
+from runtime.records import F32, F64, Layers, PanelFrame, pixels_of
+from runtime.support.gl_sharing import LayerTextures, ShareGroup, lies_in
 
 VERTEX = """#version 330 core
 // One triangle that covers the framebuffer; pixel: the monitor's pixels, top left origin, v down.
@@ -30,10 +31,9 @@ void main() {
 # weights of full precision, which hardware's filters (1/256) have not, and are neutral outside. Layers that a
 # homography moves are sampled with cubic weights, once for registration and alignment: bilinear ones cost 0.15 dB more.
 FRAGMENT = """#version 330 core
-uniform sampler2DArray solved;
-uniform sampler2DArray flat_picture;
+uniform sampler2D solved;        // this panel's
+uniform sampler2D flat_picture;
 uniform sampler2D curve;
-uniform int layer;
 uniform vec2 size_px;
 uniform bool exact;              // the mounting takes pixels to pixels
 uniform bool aligned;
@@ -47,7 +47,7 @@ float grey(float phase, int channel) {
 }
 vec3 solved_texel(ivec2 at) {
     bool inside = all(greaterThanEqual(at, ivec2(0))) && all(lessThan(at, ivec2(size_px)));
-    return inside ? texelFetch(solved, ivec3(at, layer), 0).rgb : vec3(even);
+    return inside ? texelFetch(solved, at, 0).rgb : vec3(even);
 }
 vec3 aligned_at(vec2 px) {
     vec2 place = clamp(px * solved_from_shown.xy + solved_from_shown.zw - 0.5, vec2(-2.0), size_px + 1.0);
@@ -72,14 +72,14 @@ vec3 registered_at(vec2 px) {
         for (int i = 0; i < 4; i++) {
             ivec2 at = ivec2(low) + ivec2(i - 1, j - 1);
             vec3 texel = aligned ? solved_texel(at)
-                : texelFetch(solved, ivec3(clamp(at, ivec2(0), ivec2(size_px) - 1), layer), 0).rgb;
+                : texelFetch(solved, clamp(at, ivec2(0), ivec2(size_px) - 1), 0).rgb;
             total += across[i] * down[j] * texel;
         }
     }
     return clamp(total, 0.0, 1.0);
 }
-vec3 as_it_is(sampler2DArray layers, vec2 px) {
-    return exact ? texelFetch(layers, ivec3(floor(px), layer), 0).rgb : texture(layers, vec3(px / size_px, layer)).rgb;
+vec3 as_it_is(sampler2D picture, vec2 px) {
+    return exact ? texelFetch(picture, ivec2(floor(px)), 0).rgb : texture(picture, px / size_px).rgb;
 }
 vec3 shown(vec2 px) {
     if (flatness >= 1.0) return as_it_is(flat_picture, px);
@@ -135,50 +135,66 @@ class Mounting:
 
 
 class FrameTextures:
-    """The layers of the newest frame in one share group: uploaded where their version is another one."""
+    """The layers of the newest frame in one share group: uploaded where they are not in it and their version is
+    another one."""
 
-    def __init__(self, context: moderngl.Context, *, width_px: int, height_px: int, count: int) -> None:
-        self._shape = (count, height_px, width_px, 4)
-        self._solved, self._flat = (context.texture_array((width_px, height_px, count), 4) for _ in range(2))
-        for array in (self._solved, self._flat):
-            array.filter = (moderngl.LINEAR, moderngl.LINEAR)
-            array.repeat_x = array.repeat_y = False
+    def __init__(
+        self, context: moderngl.Context, *, width_px: int, height_px: int, count: int, group: ShareGroup | None = None
+    ) -> None:
+        """group: the context's; layers that lie in its textures are shown from there."""
+        self._context, self._group = context, group
+        self.size_px = (width_px, height_px)  # of a layer
+        self._count = count
+        self._solved: tuple[moderngl.Texture, ...] = ()
+        self._flat: tuple[moderngl.Texture, ...] = ()
         self._solved_version: int | None = None
         self._flat_version: int | None = None
-
-    @property
-    def size_px(self) -> tuple[int, int]:
-        """Columns and rows of a layer."""
-        return self._shape[2], self._shape[1]
 
     def lacks(self, frame: PanelFrame) -> tuple[bool, bool]:
         """Whether its solution, and its flat picture, are seen and not here yet."""
         return (
-            shows_solved(frame) and frame.solved_version != self._solved_version,
-            shows_flat(frame) and frame.flat_version != self._flat_version,
+            shows_solved(frame)
+            and frame.solved_version != self._solved_version
+            and not lies_in(frame.solved, self._group),
+            shows_flat(frame) and frame.flat_version != self._flat_version and not lies_in(frame.flat, self._group),
         )
 
     def upload(self, frame: PanelFrame) -> None:
-        """Take in what the frame shows and is not here yet. It fits (`check`)."""
+        """Take in what the frame shows and is not here yet. It fits (`check`). Raises ContextLost."""
         lacks_solved, lacks_flat = self.lacks(frame)
         if lacks_solved and frame.solved is not None:
             self._solved_version = None  # until it is here as a whole
-            self._solved.write(np.ascontiguousarray(frame.solved))
+            self._solved = self._written(self._solved, frame.solved)
             self._solved_version = frame.solved_version
         if lacks_flat and frame.flat is not None:
             self._flat_version = None
-            self._flat.write(np.ascontiguousarray(frame.flat))
+            self._flat = self._written(self._flat, frame.flat)
             self._flat_version = frame.flat_version
 
-    def use(self) -> None:
-        """Bind them where a Painter looks for them, in the context that is current."""
-        self._solved.use(0)
-        self._flat.use(1)
+    def use(self, frame: PanelFrame, index: int) -> None:
+        """Bind one panel's where a Painter looks for them, in the context that is current."""
+        for unit, (layers, uploaded) in enumerate(((frame.solved, self._solved), (frame.flat, self._flat))):
+            if isinstance(layers, LayerTextures) and lies_in(layers, self._group):
+                layers.textures[index].use(unit)
+            elif uploaded:
+                uploaded[index].use(unit)
 
     def release(self) -> None:
         """Give the GL objects back."""
-        self._solved.release()
-        self._flat.release()
+        for texture in (*self._solved, *self._flat):
+            texture.release()
+        self._solved = self._flat = ()
+
+    def _written(self, held: tuple[moderngl.Texture, ...], layers: Layers) -> tuple[moderngl.Texture, ...]:
+        """One texture a panel, made when the first layers come."""
+        if not held:
+            held = tuple(self._context.texture(self.size_px, 4) for _ in range(self._count))
+            for texture in held:
+                texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
+                texture.repeat_x = texture.repeat_y = False
+        for texture, layer in zip(held, pixels_of(layers), strict=True):
+            texture.write(np.ascontiguousarray(layer))
+        return held
 
 
 def shows_solved(frame: PanelFrame) -> bool:
@@ -226,12 +242,11 @@ class Painter:
     def draw(self, textures: FrameTextures, frame: PanelFrame, index: int) -> None:
         """Panel `index` of the frame that was uploaded, over the whole of the framebuffer in use."""
         matrix = frame.solved_from_shown[index] if frame.solved_from_shown else np.eye(3)
-        self._program["layer"] = index
         self._program["size_px"] = tuple(map(float, textures.size_px))
         self._program["aligned"] = not is_identity(matrix)
         self._program["solved_from_shown"] = scale_and_shift(matrix)
         self._program["flatness"] = 1.0 if frame.solved is None else float(frame.flatness)
-        textures.use()
+        textures.use(frame, index)
         self._curve.use(2)
         self._array.render(moderngl.TRIANGLES, vertices=3)
 

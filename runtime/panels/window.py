@@ -11,7 +11,7 @@ import moderngl
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
 from runtime.config import OutputSettings, PanelSettings
-from runtime.errors import PanelLost
+from runtime.errors import ContextLost, PanelLost
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.panels.display import Display, Window, glfw
@@ -20,6 +20,7 @@ from runtime.panels.monitors import Monitor, bind, check_shape
 from runtime.panels.presentation import FrameTextures, Mounting, Painter, check
 from runtime.panels.watch import Place, PlacementWatch
 from runtime.records import PanelFrame, PresentReport
+from runtime.support.gl_sharing import ShareGroup
 
 log = logging.getLogger("phasestack.panels")
 
@@ -54,9 +55,10 @@ class WindowPanels(PanelSink):
     what it can't know is how far the monitors' own blanks lie apart (`kind = "span"` has one swap).
 
     Once a second every window and monitor is compared with what was bound (a question a refresh, some 0.1 ms).
-    Where a monitor, a window or the context is lost or became another, everything is closed, `present` raises
+    Where a monitor, a window or the context is lost or became another, every window is closed, `present` raises
     PanelLost, and a later `present` builds it anew: half a second later, or as soon as X says that a missing
-    monitor is there. The death of the X server ends the process with exit status 75, to be started again.
+    monitor is there. A hidden window's context, which all share, stays unless it is what was lost: what a solver
+    has in its textures stays, too. The death of the X server ends the process with exit status 75, to be started again.
     Uses GLFW, so: one thread, the main one. The `content` context is current again after every call.
     """
 
@@ -79,6 +81,7 @@ class WindowPanels(PanelSink):
         self._retry_ns, self._lost = 0, ""
         self._shown = False  # these windows show the frame before
         self._away = False  # another context than content's may be current
+        self._context_lost = False
         self.monitors: tuple[Monitor, ...] = ()
         try:
             self._open()
@@ -94,6 +97,11 @@ class WindowPanels(PanelSink):
         refresh_hz = self.monitors[0].refresh_hz if self.monitors else 0.0
         return round(NS_PER_S / refresh_hz) if refresh_hz else None
 
+    @property
+    def group(self) -> ShareGroup | None:
+        display = self._display
+        return None if display is None else display.group
+
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
         """Show a frame on every panel at once; an unchanged one stays as it is, where it is still shown.
 
@@ -106,8 +114,9 @@ class WindowPanels(PanelSink):
                 self._open()
                 log.info("panels are back: %s", ", ".join(str(monitor) for monitor in self.monitors))
             return self._present(frame, unchanged)
-        except (PanelLost, glfw.GLFWError, moderngl.Error) as error:
+        except (PanelLost, ContextLost, glfw.GLFWError, moderngl.Error) as error:
             self._lost = str(error)
+            self._context_lost = self._context_lost or not isinstance(error, PanelLost)
             self._retreat()
             raise PanelLost(self._lost) from error
         finally:
@@ -162,6 +171,7 @@ class WindowPanels(PanelSink):
             spot.painter.draw(textures, frame, spot.index)
         context.finish()
         if fault := _reset_status() or _error(context):
+            self._context_lost = True
             raise PanelLost(f"the GL context of panel {surface.spots[0].index}: {fault}")
 
     def _swap(self, surface: Surface) -> int:
@@ -194,6 +204,7 @@ class WindowPanels(PanelSink):
             width_px=self._stack.width_px,
             height_px=self._stack.height_px,
             count=len(self._panels),
+            group=display.group,
         )
         spanning = self._settings.kind == "span"
         self._surfaces = [self._span(display)] if spanning else self._windows(display)
@@ -246,18 +257,38 @@ class WindowPanels(PanelSink):
         return Spot(index, viewport, Painter(window.context, mounting))
 
     def _retreat(self) -> None:
-        """After a failure: keep a connection that only looks for monitors, close anything more."""
-        if self._display is None or self._display.has_windows:
+        """After a failure: keep the connection, and where it is sound the context that all windows share."""
+        if self._display is None or self._context_lost:
             self._drop()
+        elif self._display.has_windows:
+            self._close_windows(self._display)
         else:
             self._retry_ns = self._clock.now_ns() + LOOK_NS
+
+    def _close_windows(self, display: Display) -> None:
+        self._away = True
+        try:
+            display.root.make_current()
+            for surface in self._surfaces:
+                surface.window.make_current()
+                for spot in surface.spots:
+                    spot.painter.release()
+            display.root.make_current()
+            if self._textures is not None:
+                self._textures.release()
+            display.close_windows()
+        except Exception:
+            log.exception("closing windows")
+            self._drop()
+        self._surfaces, self._textures, self._watch, self._shown = [], None, None, False
+        self._retry_ns = self._clock.now_ns() + RETRY_NS
 
     def _drop(self) -> None:
         self._away = True
         display, self._display = self._display, None
         self._surfaces, self._textures, self._watch = [], None, None
         self._retry_ns = self._clock.now_ns() + RETRY_NS
-        self._shown = False
+        self._shown = self._context_lost = False
         if display is not None:
             try:
                 display.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,14 +19,14 @@ def layers(value: int) -> np.ndarray:
     return np.full(SHAPE, value, np.uint8)
 
 
-def test_the_copy_has_the_same_values_and_can_t_be_written_to():
+def test_the_copy_has_the_same_values_and_can_t_be_written_to() -> None:
     copy = LayerBuffers().copy_of(layers(7))
     assert np.array_equal(copy, layers(7))
     with pytest.raises(ValueError, match="read-only"):
         copy[:] = 0
 
 
-def test_the_predictor_s_own_array_may_change_afterwards():
+def test_the_predictor_s_own_array_may_change_afterwards() -> None:
     own = layers(1)
     copy = LayerBuffers().copy_of(own)
     own[:] = 2
@@ -33,7 +34,7 @@ def test_the_predictor_s_own_array_may_change_afterwards():
 
 
 @given(st.lists(st.sets(st.integers(0, 5)), max_size=30))
-def test_whatever_is_held_stays_as_it_was_and_no_more_buffers_are_made_than_are_held_at_once(story):
+def test_whatever_is_held_stays_as_it_was_and_no_more_buffers_are_made_than_are_held_at_once(story: Any) -> None:
     """story: which of the copies that are held are let go before each next one."""
     buffers, held, most = LayerBuffers(), [], 0
     for value, letting_go in enumerate(story):
@@ -46,7 +47,7 @@ def test_whatever_is_held_stays_as_it_was_and_no_more_buffers_are_made_than_are_
         del copy
 
 
-def test_a_solution_written_a_newest_and_a_shown_one_take_three_buffers():
+def test_a_solution_written_a_newest_and_a_shown_one_take_three_buffers() -> None:
     buffers = LayerBuffers()
     shown = newest = None
     for value in range(20):
@@ -59,7 +60,7 @@ def test_a_solution_written_a_newest_and_a_shown_one_take_three_buffers():
     assert (shown == 18).all()
 
 
-def test_a_part_of_it_holds_all_of_it():
+def test_a_part_of_it_holds_all_of_it() -> None:
     buffers = LayerBuffers()
     part = buffers.copy_of(layers(1))[0, :2]
     buffers.copy_of(layers(2))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from runtime.clock import NS_PER_MS, NS_PER_S
+from runtime.content.base import ContentSource
 from runtime.evaluation.displayed import displayed
 from runtime.frame import observer as observer_module
 from runtime.frame.observer import RunObserver
@@ -99,7 +100,9 @@ def looking(
 # --- lines -------------------------------------------------------------------------------------------------------
 
 
-def test_a_line_waits_until_the_recording_has_told_where_the_eyes_were_at_its_light_and_tells_it(content):
+def test_a_line_waits_until_the_recording_has_told_where_the_eyes_were_at_its_light_and_tells_it(
+    content: ContentSource,
+) -> None:
     observer, kept = looking(content)
     observer.sampled(sample(NS_PER_S))
     observer.refreshed(refresh(1, None))
@@ -112,7 +115,7 @@ def test_a_line_waits_until_the_recording_has_told_where_the_eyes_were_at_its_li
     assert set(kept.lines[0]) == CONTRACT
 
 
-def test_lines_come_in_order_each_once_whatever_they_wait_for(content):
+def test_lines_come_in_order_each_once_whatever_they_wait_for(content: ContentSource) -> None:
     observer, kept = looking(content)
     random = np.random.default_rng(1)
     next_ns = NS_PER_S
@@ -125,14 +128,14 @@ def test_lines_come_in_order_each_once_whatever_they_wait_for(content):
     assert [line["frame"] for line in kept.lines] == list(range(60))
 
 
-def test_a_recording_without_truth_holds_nothing_up(content):
+def test_a_recording_without_truth_holds_nothing_up(content: ContentSource) -> None:
     observer, kept = looking(content)
     observer.sampled(sample(NS_PER_S, y_m=None))
     observer.refreshed(refresh(1, None))
     assert [line["true_eyes_m"] for line in kept.lines] == [None]
 
 
-def test_what_the_recording_never_told_is_null_at_the_end(content):
+def test_what_the_recording_never_told_is_null_at_the_end(content: ContentSource) -> None:
     observer, kept = looking(content)
     observer.sampled(sample(NS_PER_S))
     observer.refreshed(refresh(0, None))
@@ -141,7 +144,7 @@ def test_what_the_recording_never_told_is_null_at_the_end(content):
     assert [line["true_eyes_m"] is None for line in kept.lines] == [False, True]
 
 
-def test_lines_that_wait_are_bounded(content, monkeypatch):
+def test_lines_that_wait_are_bounded(content: ContentSource, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(observer_module, "WAITING_MAX", 16)
     observer, kept = looking(content)
     observer.sampled(sample(NS_PER_S))
@@ -151,7 +154,7 @@ def test_lines_that_wait_are_bounded(content, monkeypatch):
     assert {line["true_eyes_m"] for line in kept.lines} == {None}
 
 
-def test_every_account_is_told_at_once_to_who_shows_progress(content):
+def test_every_account_is_told_at_once_to_who_shows_progress(content: ContentSource) -> None:
     told = []
     observer, _ = looking(content, on_account=told.append)
     observer.sampled(sample(NS_PER_S))
@@ -162,7 +165,7 @@ def test_every_account_is_told_at_once_to_who_shows_progress(content):
 # --- sampled quality ---------------------------------------------------------------------------------------------
 
 
-def test_nothing_measured_is_null(content, solved):
+def test_nothing_measured_is_null(content: ContentSource, solved: Solution) -> None:
     observer, _ = looking(content)
     observer.refreshed(refresh(1, solved))
     observer.finish()
@@ -173,7 +176,9 @@ def test_nothing_measured_is_null(content, solved):
     assert observer.eye_views is None
 
 
-def test_without_truth_the_true_eyes_quality_is_null_and_the_other_is_not(content, solved):
+def test_without_truth_the_true_eyes_quality_is_null_and_the_other_is_not(
+    content: ContentSource, solved: Solution
+) -> None:
     observer, _ = looking(content, measure=True, evaluate_every=1)
     observer.refreshed(refresh(1, solved))
     summary = observer.means.summary()
@@ -183,7 +188,9 @@ def test_without_truth_the_true_eyes_quality_is_null_and_the_other_is_not(conten
     assert summary["carried_db_true_eyes"] is None
 
 
-def test_quality_is_of_what_the_panels_show_at_the_eyes_used_and_at_the_true_ones(content, solved):
+def test_quality_is_of_what_the_panels_show_at_the_eyes_used_and_at_the_true_ones(
+    content: ContentSource, solved: Solution
+) -> None:
     observer, _ = looking(content, measure=True, evaluate_every=1)
     used, true = aside(0.015), aside(0.012)
     seen = refresh(1, solved, eyes_m=used)
@@ -204,7 +211,9 @@ def test_quality_is_of_what_the_panels_show_at_the_eyes_used_and_at_the_true_one
     assert summary["quality_frames"] == 1
 
 
-def test_every_so_many_refreshes_are_sampled_while_tracking_and_no_others(content, solved):
+def test_every_so_many_refreshes_are_sampled_while_tracking_and_no_others(
+    content: ContentSource, solved: Solution
+) -> None:
     observer, _ = looking(content, measure=True, evaluate_every=5)
     for number in range(30):
         state = State.TRACKING if number < 15 else State.HOLDING
@@ -215,7 +224,9 @@ def test_every_so_many_refreshes_are_sampled_while_tracking_and_no_others(conten
 
 
 @pytest.mark.parametrize("change", [{"presented": False}, {"eyes_m": None}])
-def test_what_no_eye_saw_is_not_measured(content, solved, change):
+def test_what_no_eye_saw_is_not_measured(
+    content: ContentSource, solved: Solution, change: dict[str, bool | None]
+) -> None:
     observer, _ = looking(content, measure=True, evaluate_every=1)
     seen = refresh(1, solved)
     observer.refreshed(replace(seen, account=replace(seen.account, **change)))
@@ -223,7 +234,7 @@ def test_what_no_eye_saw_is_not_measured(content, solved, change):
     assert observer.means.summary()["psnr_db"] is None
 
 
-def test_a_mixture_with_the_flat_picture_is_not_measured(content, solved):
+def test_a_mixture_with_the_flat_picture_is_not_measured(content: ContentSource, solved: Solution) -> None:
     observer, _ = looking(content, measure=True, evaluate_every=1)
     seen = refresh(1, solved)
     mixed = replace(seen.frame, flatness=0.5, flat=solved.layers, flat_version=2)
@@ -231,7 +242,7 @@ def test_a_mixture_with_the_flat_picture_is_not_measured(content, solved):
     assert observer.means.summary()["psnr_db"] is None
 
 
-def test_a_short_run_measures_its_last_refresh(content, solved):
+def test_a_short_run_measures_its_last_refresh(content: ContentSource, solved: Solution) -> None:
     observer, _ = looking(content, measure=True, evaluate_every=50)
     observer.refreshed(refresh(1, solved))
     observer.finish()
@@ -239,7 +250,9 @@ def test_a_short_run_measures_its_last_refresh(content, solved):
     assert observer.eye_views is not None
 
 
-def test_in_real_time_one_measurement_is_under_way_at_a_time_and_no_refresh_waits_for_it(content, solved):
+def test_in_real_time_one_measurement_is_under_way_at_a_time_and_no_refresh_waits_for_it(
+    content: ContentSource, solved: Solution
+) -> None:
     solver = Drawing(content, at_once=False)
     observer, _ = looking(content, solver=solver, simulated=False, measure=True, evaluate_every=1)
     for number in range(10):
@@ -251,7 +264,9 @@ def test_in_real_time_one_measurement_is_under_way_at_a_time_and_no_refresh_wait
     assert observer.means.summary()["quality_frames"] == 1
 
 
-def test_comparing_is_not_the_presenter_s_nor_the_solver_s_work(content, solved, monkeypatch):
+def test_comparing_is_not_the_presenter_s_nor_the_solver_s_work(
+    content: ContentSource, solved: Solution, monkeypatch: pytest.MonkeyPatch
+) -> None:
     threads = []
     real = observer_module.displayed
     monkeypatch.setattr(
@@ -268,7 +283,9 @@ def test_comparing_is_not_the_presenter_s_nor_the_solver_s_work(content, solved,
 # --- kept light --------------------------------------------------------------------------------------------------
 
 
-def test_every_nth_refresh_leaves_what_the_panels_show_and_what_the_judge_needs(content, solved):
+def test_every_nth_refresh_leaves_what_the_panels_show_and_what_the_judge_needs(
+    content: ContentSource, solved: Solution
+) -> None:
     observer, kept = looking(content, keep_light=4)
     shown = {}
     for number in range(12):
@@ -289,7 +306,7 @@ def test_every_nth_refresh_leaves_what_the_panels_show_and_what_the_judge_needs(
         assert info["fov"] == FOV_DEG
 
 
-def test_light_without_a_solution_has_no_drawn_pictures(content):
+def test_light_without_a_solution_has_no_drawn_pictures(content: ContentSource) -> None:
     observer, kept = looking(content, keep_light=1)
     flat = np.full((3, 108, 192, 4), 200, np.uint8)
     seen = refresh(0, None)

@@ -42,17 +42,17 @@ def refresh(pacer: Pacer, display: Display, now_ns: int, *, work_ns: int) -> tup
     return timing, blank_ns
 
 
-def test_the_first_refresh_comes_at_once_and_its_light_after_the_scan_out():
+def test_the_first_refresh_comes_at_once_and_its_light_after_the_scan_out() -> None:
     timing = pacer(work_ns=2 * NS_PER_MS).predict(1000)
     assert timing == FrameTiming(0, 1000, 1000 + 2 * NS_PER_MS, 1000 + 2 * NS_PER_MS + PHOTON_NS)
 
 
-def test_a_period_must_be_positive():
+def test_a_period_must_be_positive() -> None:
     with pytest.raises(ValueError, match="period"):
         pacer(period_ns=0)
 
 
-def test_in_time_every_slot_of_the_grid_is_taken():
+def test_in_time_every_slot_of_the_grid_is_taken() -> None:
     paced, now_ns, presents = pacer(), 0, []
     for _ in range(50):
         timing = paced.predict(now_ns)
@@ -64,7 +64,9 @@ def test_in_time_every_slot_of_the_grid_is_taken():
 
 
 @pytest.mark.parametrize(("late_periods", "skipped"), [(0.4, 0), (0.6, 1), (1.4, 1), (1.6, 2), (10.6, 11)])
-def test_who_comes_too_late_for_a_slot_takes_a_later_one_and_every_slot_between_is_missed(late_periods, skipped):
+def test_who_comes_too_late_for_a_slot_takes_a_later_one_and_every_slot_between_is_missed(
+    late_periods: float, skipped: int
+) -> None:
     paced = pacer()
     first = paced.predict(0)
     now_ns = first.wake_ns + PERIOD_NS + round(late_periods * PERIOD_NS)
@@ -75,7 +77,9 @@ def test_who_comes_too_late_for_a_slot_takes_a_later_one_and_every_slot_between_
 
 
 @given(st.lists(st.tuples(SHORT_NS, st.integers(0, 3 * PERIOD_NS)), max_size=60), st.integers(0, PERIOD_NS))
-def test_whatever_happens_slots_ascend_on_one_grid_none_is_lost_and_none_begins_far_too_late(story, work_ns):
+def test_whatever_happens_slots_ascend_on_one_grid_none_is_lost_and_none_begins_far_too_late(
+    story: list[tuple[int, int]], work_ns: int
+) -> None:
     """story: for each refresh, how long it worked, and what else held it up."""
     paced, now_ns = pacer(work_ns=work_ns), 12_345
     first = last = None
@@ -96,13 +100,13 @@ def test_whatever_happens_slots_ascend_on_one_grid_none_is_lost_and_none_begins_
         now_ns += held_up_ns
 
 
-def test_without_blanks_the_light_is_told_from_when_presenting_was_done():
+def test_without_blanks_the_light_is_told_from_when_presenting_was_done() -> None:
     paced = pacer()
     timing = paced.predict(0)
     assert paced.presented(timing, woke_ns=0, done_ns=5 * NS_PER_MS) == 5 * NS_PER_MS + PHOTON_NS
 
 
-def test_the_time_that_a_refresh_works_is_learnt_and_it_wakes_so_much_earlier():
+def test_the_time_that_a_refresh_works_is_learnt_and_it_wakes_so_much_earlier() -> None:
     paced, now_ns = pacer(), 0
     for _ in range(40):
         timing = paced.predict(now_ns)
@@ -112,7 +116,7 @@ def test_the_time_that_a_refresh_works_is_learnt_and_it_wakes_so_much_earlier():
     assert abs(lead(paced) - 4 * NS_PER_MS) < NS_PER_MS / 10
 
 
-def test_one_very_long_refresh_does_not_wake_all_others_early():
+def test_one_very_long_refresh_does_not_wake_all_others_early() -> None:
     paced = pacer()
     timing = paced.predict(0)
     paced.presented(timing, woke_ns=0, done_ns=100 * PERIOD_NS)
@@ -121,7 +125,9 @@ def test_one_very_long_refresh_does_not_wake_all_others_early():
 
 
 @given(st.floats(0, 1), st.floats(0.998, 1.002))
-def test_refreshes_follow_the_display_s_own_blanks_wherever_they_lie_and_as_they_drift(phase, pace):
+def test_refreshes_follow_the_display_s_own_blanks_wherever_they_lie_and_as_they_drift(
+    phase: float, pace: float
+) -> None:
     """The configured period is a nominal one; a monitor's own differs, and its phase is anything."""
     display = Display(period_ns=pace * PERIOD_NS, phase_ns=phase * PERIOD_NS)
     paced, now_ns = pacer(), 0
@@ -133,7 +139,7 @@ def test_refreshes_follow_the_display_s_own_blanks_wherever_they_lie_and_as_they
     assert np.abs(errors[200:]).max() <= 0.025 * PERIOD_NS
 
 
-def test_a_blank_that_was_missed_is_counted_once_and_the_next_refresh_keeps_off_it():
+def test_a_blank_that_was_missed_is_counted_once_and_the_next_refresh_keeps_off_it() -> None:
     display, paced = Display(PERIOD_NS), pacer(work_ns=NS_PER_MS)
     now_ns, blanks = 0, []
     for number in range(60):
@@ -147,7 +153,7 @@ def test_a_blank_that_was_missed_is_counted_once_and_the_next_refresh_keeps_off_
     assert paced.missed >= lost
 
 
-def test_the_margin_grows_with_a_missed_blank_and_shrinks_again_by_and_by():
+def test_the_margin_grows_with_a_missed_blank_and_shrinks_again_by_and_by() -> None:
     paced = pacer()
     first = paced.predict(0)
     paced.presented(first, woke_ns=0, done_ns=first.present_ns, blank_ns=first.present_ns)
@@ -170,7 +176,7 @@ def lead(paced: Pacer) -> int:
 
 
 @pytest.mark.parametrize("work_ms", [0.5, 3.0, 6.0])
-def test_a_display_that_is_drawn_for_long_before_its_blank_misses_next_to_none_once_it_is_known(work_ms):
+def test_a_display_that_is_drawn_for_long_before_its_blank_misses_next_to_none_once_it_is_known(work_ms: float) -> None:
     display, paced, now_ns = Display(PERIOD_NS, phase_ns=5 * NS_PER_MS), pacer(), 0
     blanks = []
     for _ in range(4000):
@@ -180,7 +186,7 @@ def test_a_display_that_is_drawn_for_long_before_its_blank_misses_next_to_none_o
     assert np.mean(intervals > 1.5) <= 0.004
 
 
-def test_a_refresh_that_was_left_out_on_purpose_keeps_its_slot_and_is_no_missed_blank():
+def test_a_refresh_that_was_left_out_on_purpose_keeps_its_slot_and_is_no_missed_blank() -> None:
     display, paced, now_ns = Display(PERIOD_NS), pacer(), 0
     for _ in range(20):
         _, now_ns = refresh(paced, display, now_ns, work_ns=NS_PER_MS // 4)
@@ -200,7 +206,7 @@ def test_a_refresh_that_was_left_out_on_purpose_keeps_its_slot_and_is_no_missed_
     assert paced.missed == missed
 
 
-def test_work_is_not_forgotten_while_pictures_are_left_out():
+def test_work_is_not_forgotten_while_pictures_are_left_out() -> None:
     """After a rest the first motion must not miss blanks because nothing had to be drawn for a while."""
     display, paced, now_ns = Display(PERIOD_NS), pacer(), 0
     for _ in range(600):

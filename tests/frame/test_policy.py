@@ -51,43 +51,43 @@ class Told:
         return [self.asked(request).kind for request in requests]
 
 
-def test_the_flat_picture_comes_first_since_something_must_be_shown_to_nobody():
+def test_the_flat_picture_comes_first_since_something_must_be_shown_to_nobody() -> None:
     assert Told().kinds(wish(None, flat=True), wish(None, flat=True)) == ["flat", "nothing"]
 
 
-def test_the_flat_picture_is_there_before_it_is_needed_and_then_eyes_are_solved_for():
+def test_the_flat_picture_is_there_before_it_is_needed_and_then_eyes_are_solved_for() -> None:
     assert Told().kinds(wish(), wish(), wish()) == ["flat", "solve", "nothing"]
 
 
-def test_eyes_that_are_where_they_were_are_solved_for_once_and_any_others_anew():
+def test_eyes_that_are_where_they_were_are_solved_for_once_and_any_others_anew() -> None:
     told = Told()
     assert told.kinds(wish(), wish(), wish(EYES.copy()), wish(aside(1e-9)), wish(aside(1e-9))) == [
         "flat", "solve", "nothing", "solve", "nothing",
     ]  # fmt: skip
 
 
-def test_a_fixed_dead_band_lets_eyes_move_within_it_from_where_they_were_solved_for():
+def test_a_fixed_dead_band_lets_eyes_move_within_it_from_where_they_were_solved_for() -> None:
     told = Told(plan=Plan(True, False, (True, True), dead_band_m=0.002))
     told.kinds(wish(), wish())
     steps = [told.asked(wish(aside(k * 0.0009))).kind for k in range(1, 7)]
     assert steps == ["nothing", "nothing", "solve", "nothing", "nothing", "solve"]  # drift does not add up
 
 
-def test_without_a_plan_for_it_the_band_counts_for_nothing():
+def test_without_a_plan_for_it_the_band_counts_for_nothing() -> None:
     told = Told(plan=Plan(False, False, (True, True), dead_band_m=0.002))
     told.kinds(wish(), wish())
     assert told.asked(wish(aside(0.0001))).kind == "solve"
 
 
 @pytest.mark.parametrize("what", ["version", "revision"])
-def test_other_settings_and_other_content_are_solved_for_though_the_head_rests(what):
+def test_other_settings_and_other_content_are_solved_for_though_the_head_rests(what: str) -> None:
     told = Told()
     told.kinds(wish(), wish())
     setattr(told, what, 1)
     assert told.kinds(wish(), wish()) == ["solve", "nothing"]
 
 
-def test_an_eye_that_can_t_see_gives_way_to_the_other():
+def test_an_eye_that_can_t_see_gives_way_to_the_other() -> None:
     told = Told(plan=Plan(True, False, (False, True), None))
     told.asked(wish())
     assert np.array_equal(told.asked(wish()).eyes_m, EYES[[1, 1]])
@@ -96,14 +96,14 @@ def test_an_eye_that_can_t_see_gives_way_to_the_other():
     assert told.asked(wish(moved)).kind == "nothing"
 
 
-def test_nobody_is_solved_for_where_nobody_is_seen():
+def test_nobody_is_solved_for_where_nobody_is_seen() -> None:
     told = Told()
     told.kinds(wish(), wish())
     told.version = 1
     assert told.asked(wish(None)).kind == "nothing"
 
 
-def test_paused_makes_nothing_new_whatever_changes_but_the_first_picture():
+def test_paused_makes_nothing_new_whatever_changes_but_the_first_picture() -> None:
     told = Told()
     assert told.kinds(wish(paused=True), wish(paused=True), wish(aside(0.1), paused=True)) == [
         "flat", "solve", "nothing",
@@ -113,7 +113,7 @@ def test_paused_makes_nothing_new_whatever_changes_but_the_first_picture():
     assert told.asked(wish(aside(0.1))).kind == "solve"
 
 
-def test_the_flat_picture_is_drawn_anew_each_time_that_it_comes_to_be_wanted_and_keeps_its_place_until_then():
+def test_the_flat_picture_is_drawn_anew_each_time_that_it_comes_to_be_wanted_and_keeps_its_place_until_then() -> None:
     told = Told()
     told.kinds(wish(), wish())
     assert told.kinds(wish(None, flat=True), wish(None, flat=True), wish(None, flat=True)) == [
@@ -123,7 +123,7 @@ def test_the_flat_picture_is_drawn_anew_each_time_that_it_comes_to_be_wanted_and
     assert told.kinds(wish(None, flat=True), wish(None, flat=True)) == ["flat", "nothing"]
 
 
-def test_while_both_are_wanted_solutions_and_flat_pictures_of_moving_content_take_turns():
+def test_while_both_are_wanted_solutions_and_flat_pictures_of_moving_content_take_turns() -> None:
     told, kinds = Told(), []
     for revision in range(12):
         told.revision = revision
@@ -138,7 +138,9 @@ def test_while_both_are_wanted_solutions_and_flat_pictures_of_moving_content_tak
         max_size=40,
     )
 )
-def test_what_is_asked_for_again_and_again_is_there_soon_and_then_nothing_is_done(story):
+def test_what_is_asked_for_again_and_again_is_there_soon_and_then_nothing_is_done(
+    story: list[tuple[float | None, bool, bool, int]],
+) -> None:
     told = Told()
     for y_m, flat, paused, revision in story:
         told.revision = revision
@@ -157,7 +159,7 @@ def eyes(label: str) -> EyesEstimate:
     return EyesEstimate(0, 0, None if label == "none" else EYES, label)
 
 
-def test_the_flat_picture_is_made_before_it_is_needed():
+def test_the_flat_picture_is_made_before_it_is_needed() -> None:
     assert wants_flat(eyes("held"), flat_asked=False, flatness=0.0)
     assert wants_flat(eyes("none"), flat_asked=False, flatness=0.0)
     assert wants_flat(eyes("predicted"), flat_asked=True, flatness=0.0)
@@ -165,19 +167,19 @@ def test_the_flat_picture_is_made_before_it_is_needed():
     assert not any(wants_flat(eyes(label), flat_asked=False, flatness=0.0) for label in ("exact", "rested"))
 
 
-def test_the_picture_goes_over_to_the_flat_one_evenly_and_back():
+def test_the_picture_goes_over_to_the_flat_one_evenly_and_back() -> None:
     flatness = Flatness(0.0)
     values = [flatness.toward(1.0, blend_s=0.1, now_ns=k * 20 * NS_PER_MS) for k in range(8)]
     assert values == pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.0, 1.0])
     assert flatness.toward(0.0, blend_s=0.1, now_ns=190 * NS_PER_MS) == pytest.approx(0.5)
 
 
-def test_without_a_blend_it_goes_over_at_once():
+def test_without_a_blend_it_goes_over_at_once() -> None:
     assert Flatness(0.0).toward(1.0, blend_s=0.0, now_ns=5) == 1.0
 
 
 @given(st.lists(st.tuples(st.sampled_from([0.0, 1.0]), st.integers(0, 500 * NS_PER_MS)), max_size=30))
-def test_it_never_leaves_its_range_nor_passes_where_it_goes(story):
+def test_it_never_leaves_its_range_nor_passes_where_it_goes(story: list[tuple[float, int]]) -> None:
     flatness, now_ns = Flatness(), 0
     for target, passed_ns in story:
         now_ns += passed_ns

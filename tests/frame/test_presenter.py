@@ -32,7 +32,7 @@ def stage() -> Stage:
 # --- alignment ---------------------------------------------------------------------------------------------------
 
 
-def test_every_refresh_is_aligned_to_the_eyes_of_its_own_light(stage):
+def test_every_refresh_is_aligned_to_the_eyes_of_its_own_light(stage: Stage) -> None:
     stage.eyes = moves
     for _ in range(40):
         (done,) = stage.refresh()
@@ -46,7 +46,7 @@ def test_every_refresh_is_aligned_to_the_eyes_of_its_own_light(stage):
     assert not np.array_equal(done.frame.solved_from_shown[0], np.eye(3))
 
 
-def test_the_alignment_of_a_refresh_is_from_the_eyes_of_the_solution_that_it_shows(stage):
+def test_the_alignment_of_a_refresh_is_from_the_eyes_of_the_solution_that_it_shows(stage: Stage) -> None:
     stage.eyes = moves
     stage.refresh(30)
     solved_for = aside(0.05)
@@ -59,7 +59,7 @@ def test_the_alignment_of_a_refresh_is_from_the_eyes_of_the_solution_that_it_sho
 
 
 @pytest.mark.parametrize("plan", [{"align": False}, {"enabled": False}])
-def test_alignment_can_be_switched_off_while_it_runs(stage, plan):
+def test_alignment_can_be_switched_off_while_it_runs(stage: Stage, plan: dict[str, bool]) -> None:
     stage.eyes = moves
     stage.change(**plan)
     (done,) = stage.refresh()
@@ -68,7 +68,7 @@ def test_alignment_can_be_switched_off_while_it_runs(stage, plan):
     assert len(stage.refresh()[0].frame.solved_from_shown) == STACK.count
 
 
-def test_eyes_that_are_too_far_from_the_solution_s_are_met_as_far_as_possible_and_that_is_told(stage):
+def test_eyes_that_are_too_far_from_the_solution_s_are_met_as_far_as_possible_and_that_is_told(stage: Stage) -> None:
     stage.eyes = lambda _: aside(3.0)
     stage.refresh(30)
     machine = stage.presenter.machine
@@ -81,7 +81,7 @@ def test_eyes_that_are_too_far_from_the_solution_s_are_met_as_far_as_possible_an
     assert "limit" not in machine.reason
 
 
-def test_eyes_behind_the_panels_are_none_and_the_picture_goes_flat(stage):
+def test_eyes_behind_the_panels_are_none_and_the_picture_goes_flat(stage: Stage) -> None:
     stage.eyes = lambda _: aside(x_m=-0.7)
     stage.refresh(30)
     assert stage.presenter.last.account.eyes_label == "none"
@@ -90,7 +90,7 @@ def test_eyes_behind_the_panels_are_none_and_the_picture_goes_flat(stage):
     assert "behind the display" in stage.presenter.machine.reason  # told, not a silent flat picture
 
 
-def test_an_eye_that_the_solution_was_not_made_for_moves_nothing(stage):
+def test_an_eye_that_the_solution_was_not_made_for_moves_nothing(stage: Stage) -> None:
     one = EYES[[0, 0]]
     stage.solver.hand_over(solved=solution(5, one, seeing=(True, False)))
     (done,) = stage.refresh()
@@ -99,7 +99,7 @@ def test_an_eye_that_the_solution_was_not_made_for_moves_nothing(stage):
     assert all(np.array_equal(a, b) for a, b in zip(done.frame.solved_from_shown, wanted, strict=True))
 
 
-def test_codes_never_change_at_rest_under_noise_and_do_when_the_same_head_moves():
+def test_codes_never_change_at_rest_under_noise_and_do_when_the_same_head_moves() -> None:
     """A 60 Hz head with 3 mm of noise: nothing shimmers."""
     from runtime.optics.alignment import shown_layers
 
@@ -124,7 +124,7 @@ def test_codes_never_change_at_rest_under_noise_and_do_when_the_same_head_moves(
 # --- the flat picture --------------------------------------------------------------------------------------------
 
 
-def test_before_the_first_solution_the_flat_picture_is_shown_whole():
+def test_before_the_first_solution_the_flat_picture_is_shown_whole() -> None:
     stage = Stage()
     stage.solver.hand_over(flat=solution(1, None))
     (done,) = stage.refresh()
@@ -134,7 +134,7 @@ def test_before_the_first_solution_the_flat_picture_is_shown_whole():
     assert done.account.presented
 
 
-def test_the_first_picture_is_not_faded_in():
+def test_the_first_picture_is_not_faded_in() -> None:
     stage = Stage()
     stage.solver.hand_over(flat=solution(1, None))
     stage.refresh(10)
@@ -144,14 +144,14 @@ def test_the_first_picture_is_not_faded_in():
     assert done.account.inference == "ran"
 
 
-def test_before_there_is_anything_nothing_is_presented_and_nothing_is_dropped_by_error():
+def test_before_there_is_anything_nothing_is_presented_and_nothing_is_dropped_by_error() -> None:
     stage = Stage()
     stage.refresh(3)
     assert stage.panels.shown == []
     assert stage.presenter.machine.state is State.STARTING
 
 
-def test_a_lost_viewer_is_held_then_the_picture_goes_flat_evenly_and_comes_back_evenly(stage):
+def test_a_lost_viewer_is_held_then_the_picture_goes_flat_evenly_and_comes_back_evenly(stage: Stage) -> None:
     stage.eyes = lambda s: EYES if s < 1.0 or s > 3.0 else None
     states, flatness = [], []
     for done in stage.refresh(5 * HZ):
@@ -167,7 +167,7 @@ def test_a_lost_viewer_is_held_then_the_picture_goes_flat_evenly_and_comes_back_
     assert all(done.account.presented for done in stage.watching.refreshes)
 
 
-def test_while_eyes_are_lost_the_last_alignment_stays(stage):
+def test_while_eyes_are_lost_the_last_alignment_stays(stage: Stage) -> None:
     stage.eyes = lambda s: moves(s) if s < 0.5 else None
     stage.refresh(HZ)
     held = [done for done in stage.watching.refreshes if done.account.eyes_m is not None][-1]
@@ -177,7 +177,7 @@ def test_while_eyes_are_lost_the_last_alignment_stays(stage):
         assert np.array_equal(one, other)
 
 
-def test_flat_can_be_asked_for_and_given_up(stage):
+def test_flat_can_be_asked_for_and_given_up(stage: Stage) -> None:
     stage.presenter.flat_asked = True
     stage.refresh(30)
     assert stage.panels.frame.flatness == 1.0
@@ -190,7 +190,7 @@ def test_flat_can_be_asked_for_and_given_up(stage):
     assert stage.presenter.machine.state is State.TRACKING
 
 
-def test_the_flat_picture_is_wanted_as_soon_as_eyes_are_held(stage):
+def test_the_flat_picture_is_wanted_as_soon_as_eyes_are_held(stage: Stage) -> None:
     stage.eyes = lambda s: EYES if s < 0.5 else None
     stage.refresh(HZ)
     labels = [done.account.eyes_label for done in stage.watching.refreshes]
@@ -202,7 +202,7 @@ def test_the_flat_picture_is_wanted_as_soon_as_eyes_are_held(stage):
 # --- pause -------------------------------------------------------------------------------------------------------
 
 
-def test_paused_makes_nothing_new_but_stays_aligned(stage):
+def test_paused_makes_nothing_new_but_stays_aligned(stage: Stage) -> None:
     stage.presenter.paused = True
     stage.eyes = moves
     matrices = [done.frame.solved_from_shown[0] for done in stage.refresh(HZ)]
@@ -214,7 +214,7 @@ def test_paused_makes_nothing_new_but_stays_aligned(stage):
 # --- unchanged ---------------------------------------------------------------------------------------------------
 
 
-def test_a_picture_is_vouched_to_be_unchanged_only_where_nothing_differs():
+def test_a_picture_is_vouched_to_be_unchanged_only_where_nothing_differs() -> None:
     stage = Stage(plan={"reuse": True})
     stage.solver.hand_over(flat=solution(1, None))
     stage.solver.hand_over(solved=solution(2))
@@ -238,13 +238,13 @@ def test_a_picture_is_vouched_to_be_unchanged_only_where_nothing_differs():
     assert not stage.panels.unchanged  # and now it is seen
 
 
-def test_moving_eyes_change_the_picture_at_every_refresh(stage):
+def test_moving_eyes_change_the_picture_at_every_refresh(stage: Stage) -> None:
     stage.eyes = moves
     stage.refresh(HZ)
     assert not any(unchanged for _, unchanged in stage.panels.shown[-HZ // 2 :])
 
 
-def test_after_a_lost_panel_nothing_is_vouched_for(stage):
+def test_after_a_lost_panel_nothing_is_vouched_for(stage: Stage) -> None:
     stage.change(align=False)
     stage.refresh(2)
     assert stage.panels.unchanged
@@ -258,7 +258,7 @@ def test_after_a_lost_panel_nothing_is_vouched_for(stage):
 # --- faults ------------------------------------------------------------------------------------------------------
 
 
-def test_a_lost_panel_drops_refreshes_says_so_and_comes_back_with_the_newest(stage):
+def test_a_lost_panel_drops_refreshes_says_so_and_comes_back_with_the_newest(stage: Stage) -> None:
     stage.panels.lost = "DUMMY1 was disconnected"
     lost = stage.refresh(3)
     assert [done.account.presented for done in lost] == [False] * 3
@@ -274,7 +274,7 @@ def test_a_lost_panel_drops_refreshes_says_so_and_comes_back_with_the_newest(sta
     assert stage.presenter.machine.state is State.TRACKING
 
 
-def test_a_solution_that_came_while_the_panel_was_lost_ran_with_the_refresh_that_first_showed_it(stage):
+def test_a_solution_that_came_while_the_panel_was_lost_ran_with_the_refresh_that_first_showed_it(stage: Stage) -> None:
     stage.panels.lost = "unplugged"
     stage.solver.hand_over(solved=solution(8))
     (lost,) = stage.refresh()
@@ -285,7 +285,9 @@ def test_a_solution_that_came_while_the_panel_was_lost_ran_with_the_refresh_that
 
 
 @pytest.mark.parametrize("part", ["content", "model"])
-def test_what_the_solver_lacks_is_named_once_as_a_fault_and_the_last_solution_stays_aligned(stage, part):
+def test_what_the_solver_lacks_is_named_once_as_a_fault_and_the_last_solution_stays_aligned(
+    stage: Stage, part: str
+) -> None:
     stage.solver.hand_over(**{part: "out of memory"})
     stage.eyes = moves
     done = stage.refresh(30)
@@ -299,7 +301,7 @@ def test_what_the_solver_lacks_is_named_once_as_a_fault_and_the_last_solution_st
     assert stage.presenter.machine.state is State.TRACKING
 
 
-def test_a_lost_sensor_is_named(stage):
+def test_a_lost_sensor_is_named(stage: Stage) -> None:
     stage.samples.why = "unplugged"
     stage.refresh()
     assert stage.presenter.machine.name == "degraded: sensor"
@@ -308,7 +310,7 @@ def test_a_lost_sensor_is_named(stage):
     assert stage.presenter.machine.state is State.TRACKING
 
 
-def test_no_refresh_waits_for_the_solver():
+def test_no_refresh_waits_for_the_solver() -> None:
     """Nothing is handed over for ten seconds: as many refreshes as there are slots, each with its own eyes."""
     stage = Stage()
     stage.solver.hand_over(flat=solution(1, None))
@@ -326,7 +328,9 @@ def test_no_refresh_waits_for_the_solver():
 # --- what the solver is asked ------------------------------------------------------------------------------------
 
 
-def test_the_solver_is_asked_for_the_eyes_in_the_middle_of_the_time_that_its_solution_will_be_shown(stage):
+def test_the_solver_is_asked_for_the_eyes_in_the_middle_of_the_time_that_its_solution_will_be_shown(
+    stage: Stage,
+) -> None:
     stage.eyes = moves
     for cost_ms in (1, 20, 60):
         stage.solver.solve_cost_ns = cost_ms * NS_PER_MS
@@ -339,7 +343,7 @@ def test_the_solver_is_asked_for_the_eyes_in_the_middle_of_the_time_that_its_sol
         assert request.sigma_m * 1000 == pytest.approx(done.account.eye_sigma_mm)
 
 
-def test_asking_for_eyes_ahead_changes_nothing_of_the_eyes_that_are_shown(monkeypatch):
+def test_asking_for_eyes_ahead_changes_nothing_of_the_eyes_that_are_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     def shown(*, ask: bool) -> list[np.ndarray]:
         stage = Stage()
         if not ask:
@@ -355,7 +359,7 @@ def test_asking_for_eyes_ahead_changes_nothing_of_the_eyes_that_are_shown(monkey
 # --- accounts ----------------------------------------------------------------------------------------------------
 
 
-def test_a_solution_ran_with_the_refresh_that_first_shows_it_and_is_reused_after_that(stage):
+def test_a_solution_ran_with_the_refresh_that_first_shows_it_and_is_reused_after_that(stage: Stage) -> None:
     stage.solver.hand_over(solved=solution(3, stage_ms={"render": 8.0, "inference": 3.0}))
     told = [done.account for done in stage.refresh(3)]
     assert [account.inference for account in told] == ["ran", "reused", "reused"]
@@ -365,7 +369,7 @@ def test_a_solution_ran_with_the_refresh_that_first_shows_it_and_is_reused_after
     assert set(told[1].stage_ms) == {"wait", "sensor", "track", "present"}
 
 
-def test_the_light_is_that_of_the_refresh_and_the_age_of_its_solution_is_told(stage):
+def test_the_light_is_that_of_the_refresh_and_the_age_of_its_solution_is_told(stage: Stage) -> None:
     stage.solver.hand_over(solved=solution(3, time_ns=stage.clock.now_ns()))
     made_ns = stage.clock.now_ns()
     (done,) = stage.refresh()
@@ -375,26 +379,26 @@ def test_the_light_is_that_of_the_refresh_and_the_age_of_its_solution_is_told(st
     assert account.solution_age_ms == pytest.approx((account.photon_ns - made_ns) / NS_PER_MS)
 
 
-def test_on_a_simulated_clock_a_refresh_is_presented_when_presenting_is_paid_for(stage):
+def test_on_a_simulated_clock_a_refresh_is_presented_when_presenting_is_paid_for(stage: Stage) -> None:
     """The scan-out is what lies between presenting and light (5.2: `predicted_for_ns` is the light)."""
     (done,) = stage.refresh()
     account = done.account
     assert account.photon_ns - account.present_ns == 8 * NS_PER_MS
 
 
-def test_frames_are_numbered_and_counted_and_a_run_ends_after_so_many(stage):
+def test_frames_are_numbered_and_counted_and_a_run_ends_after_so_many(stage: Stage) -> None:
     begun = stage.presenter.stats.frames
     assert stage.presenter.run(frames=begun + 5) == f"{begun + 5} frames done"
     assert [done.account.frame for done in stage.watching.refreshes] == list(range(begun + 5))
     assert stage.presenter.machine.state is State.STOPPING
 
 
-def test_a_recording_that_ends_ends_the_run(stage):
+def test_a_recording_that_ends_ends_the_run(stage: Stage) -> None:
     stage.samples.ends_ns = stage.clock.now_ns() + NS_PER_S
     assert stage.presenter.run() == "the recording has ended"
 
 
-def test_every_sample_reaches_the_viewer_and_the_observer_in_order():
+def test_every_sample_reaches_the_viewer_and_the_observer_in_order() -> None:
     stage = Stage(sensor_hz=240.0)
     stage.refresh(HZ)
     numbers = [sample.sequence for sample in stage.watching.samples]
@@ -403,7 +407,7 @@ def test_every_sample_reaches_the_viewer_and_the_observer_in_order():
     assert stage.viewer.rate_hz == pytest.approx(240.0, rel=0.01)
 
 
-def test_other_settings_reach_the_viewer_with_the_next_refresh(stage):
+def test_other_settings_reach_the_viewer_with_the_next_refresh(stage: Stage) -> None:
     settings = stage.cell.state.settings
     tracker = settings.tracker.model_copy(update={"hold_s": 0.0, "blend_s": 0.0})
     stage.cell.replace(settings=settings.model_copy(update={"tracker": tracker}))

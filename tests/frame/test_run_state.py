@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import threading
+from typing import Any
 
 import pytest
 
@@ -21,7 +22,7 @@ def cell() -> RunCell:
     return RunCell(Settings(), calibration=load_calibration(None), content=Part(), predictor=Part())
 
 
-def test_a_change_is_another_value_with_another_version_and_the_one_before_is_handed_back(cell):
+def test_a_change_is_another_value_with_another_version_and_the_one_before_is_handed_back(cell: RunCell) -> None:
     before, content = cell.state, Part()
     answered = cell.replace(content=content)
     assert answered is before
@@ -30,7 +31,7 @@ def test_a_change_is_another_value_with_another_version_and_the_one_before_is_ha
     assert cell.state.version == before.version + 1
 
 
-def test_what_a_reader_holds_does_not_change(cell):
+def test_what_a_reader_holds_does_not_change(cell: RunCell) -> None:
     held = cell.state
     cell.replace(settings=Settings())
     assert held.version == 0
@@ -38,18 +39,18 @@ def test_what_a_reader_holds_does_not_change(cell):
         held.content = Part()
 
 
-def test_a_part_that_there_is_not_changes_nothing(cell):
+def test_a_part_that_there_is_not_changes_nothing(cell: RunCell) -> None:
     before = cell.state
     with pytest.raises(TypeError):
         cell.replace(colour="red")
     assert cell.state is before
 
 
-def test_changes_from_many_threads_are_all_made_and_each_part_is_handed_back_once(cell):
+def test_changes_from_many_threads_are_all_made_and_each_part_is_handed_back_once(cell: RunCell) -> None:
     handed_back = []
     mine = [[Part() for _ in range(50)] for _ in range(4)]
 
-    def change(parts):
+    def change(parts: Any) -> None:
         handed_back.extend(cell.replace(content=part).content for part in parts)
 
     first = cell.state.content

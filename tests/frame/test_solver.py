@@ -9,11 +9,13 @@ import pytest
 
 from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings, Settings
+from runtime.content.base import ContentSource
 from runtime.content.registry import open_content
 from runtime.errors import ContentFailure, ModelFailure
 from runtime.eyes.calibration import load_calibration
 from runtime.frame.run_state import RunCell
 from runtime.frame.solver import Solver
+from runtime.model.predictor import Predictor
 from runtime.plan.drawing import drawn_for
 from runtime.plan.predictors import planned_predictor
 from runtime.records import SolveRequest
@@ -26,27 +28,27 @@ def wish(eyes_m: Any = EYES, *, time_ns: int = 0, sigma_m: float = 0.001, flat: 
 
 
 @pytest.fixture
-def cell(content, predictor) -> RunCell:
+def cell(content: ContentSource, predictor: Predictor) -> RunCell:
     settings = Settings.model_validate({"model": {"name": "fast", "threads": 1}})
     return RunCell(settings, calibration=load_calibration(None), content=content, predictor=predictor)
 
 
 @pytest.fixture
-def solver(cell) -> Solver:
+def solver(cell: RunCell) -> Solver:
     """With its flat picture drawn."""
     made = Solver(cell, SMALL)
     assert made.step(wish(None, flat=True)).flat is not None
     return made
 
 
-def test_the_flat_picture_is_for_eyes_anywhere_and_the_same_on_every_pixel_s_way(cell):
+def test_the_flat_picture_is_for_eyes_anywhere_and_the_same_on_every_pixel_s_way(cell: RunCell) -> None:
     flat = Solver(cell, SMALL).step(wish(None, flat=True)).flat
     assert flat.solved_for_m is None
     assert flat.layers.shape == (3, 108, 192, 4)
     assert set(flat.stage_ms) == {"render"}
 
 
-def test_a_solution_is_what_the_model_makes_of_what_the_content_shows_these_eyes(solver, cell):
+def test_a_solution_is_what_the_model_makes_of_what_the_content_shows_these_eyes(solver: Solver, cell: RunCell) -> None:
     state = cell.state
     solution = solver.step(wish(time_ns=77)).solution
     images = drawn_for(state.predictor, state.content, EYES, time_ns=77)
@@ -58,21 +60,21 @@ def test_a_solution_is_what_the_model_makes_of_what_the_content_shows_these_eyes
     assert solution.layers.std() > 5
 
 
-def test_its_stages_are_told_and_together_they_are_its_time(solver):
+def test_its_stages_are_told_and_together_they_are_its_time(solver: Solver) -> None:
     stages = solver.step(wish()).solution.stage_ms
     assert {"render", "inference", "finish"} <= set(stages) <= {"render", "prepare", "inference", "finish"}
     assert all(value >= 0.0 for value in stages.values())
     assert stages["render"] > 0 and stages["inference"] > 0
 
 
-def test_solutions_and_flat_pictures_are_numbered_together_and_upwards(solver):
+def test_solutions_and_flat_pictures_are_numbered_together_and_upwards(solver: Solver) -> None:
     made = [solver.step(wish(aside(k / 100), flat=k == 2)) for k in range(4)]
     numbers = [(step.solution or step.flat).number for step in made]
     assert numbers == sorted(set(numbers))
     assert numbers[0] == 2  # the flat picture was the first
 
 
-def test_a_solver_that_is_made_anew_gives_no_number_a_second_time(solver, cell):
+def test_a_solver_that_is_made_anew_gives_no_number_a_second_time(solver: Solver, cell: RunCell) -> None:
     """Sinks know layers by their number: the same one for other layers would leave the old ones on the panels."""
     numbers = [solver.step(wish(aside(k / 100))).solution.number for k in range(3)]
     anew = Solver(cell, SMALL)
@@ -80,7 +82,7 @@ def test_a_solver_that_is_made_anew_gives_no_number_a_second_time(solver, cell):
     assert min(first) > max(numbers)
 
 
-def test_a_solution_that_is_held_never_changes_whatever_is_solved_after_it(solver):
+def test_a_solution_that_is_held_never_changes_whatever_is_solved_after_it(solver: Solver) -> None:
     held = [solver.step(wish(aside(k / 50))).solution for k in range(3)]
     copies = [solution.layers.copy() for solution in held]
     for k in range(3, 8):
@@ -90,13 +92,13 @@ def test_a_solution_that_is_held_never_changes_whatever_is_solved_after_it(solve
     assert not np.array_equal(copies[0], copies[2])
 
 
-def test_the_same_eyes_and_content_are_not_solved_for_twice(solver):
+def test_the_same_eyes_and_content_are_not_solved_for_twice(solver: Solver) -> None:
     assert solver.step(wish()).solution is not None
     assert solver.step(wish(time_ns=NS_PER_S)).idle
     assert solver.step(wish(aside(0.001))).solution is not None
 
 
-def test_another_state_is_solved_for_with_its_own_parts(solver, cell, shared_context):
+def test_another_state_is_solved_for_with_its_own_parts(solver: Solver, cell: RunCell, shared_context: Any) -> None:
     first = solver.step(wish()).solution
     other = open_content(ContentSettings(scene="texture"), SMALL, shared_context)
     cell.replace(content=other)
@@ -106,7 +108,7 @@ def test_another_state_is_solved_for_with_its_own_parts(solver, cell, shared_con
     other.close()
 
 
-def test_content_that_moves_is_solved_for_at_its_instant(solver, cell, shared_context):
+def test_content_that_moves_is_solved_for_at_its_instant(solver: Solver, cell: RunCell, shared_context: Any) -> None:
     moving = open_content(ContentSettings(scene="moving"), SMALL, shared_context)
     cell.replace(content=moving)
     layers = [solver.step(wish(time_ns=t)).solution.layers for t in (0, NS_PER_S // 3)]
@@ -114,7 +116,7 @@ def test_content_that_moves_is_solved_for_at_its_instant(solver, cell, shared_co
     moving.close()
 
 
-def test_the_less_sure_the_eyes_the_more_the_solution_is_made_to_hold(solver):
+def test_the_less_sure_the_eyes_the_more_the_solution_is_made_to_hold(solver: Solver) -> None:
     sigmas = [solver.step(wish(aside(k / 100), sigma_m=k / 1000)).solution.eye_sigma_mm for k in range(4)]
     assert sigmas == sorted(sigmas)
     assert sigmas[0] == pytest.approx(1.0)  # a pupil alone (5.5)
@@ -124,7 +126,7 @@ def test_the_less_sure_the_eyes_the_more_the_solution_is_made_to_hold(solver):
 OFF_M = np.array([[0.123, 0.43, 0.0], [0.078, 0.47, 0.0]])  # the right eye is 80.6 degrees off the axis
 
 
-def test_an_eye_that_can_t_see_the_display_gives_way_to_the_other(solver, cell):
+def test_an_eye_that_can_t_see_the_display_gives_way_to_the_other(solver: Solver, cell: RunCell) -> None:
     planned = planned_predictor(cell.state.settings, SMALL)
     cell.replace(predictor=planned)
     solution = solver.step(wish(OFF_M)).solution
@@ -135,11 +137,11 @@ def test_an_eye_that_can_t_see_the_display_gives_way_to_the_other(solver, cell):
     planned.close()
 
 
-def test_one_eye_is_served_without_the_saving_of_windows_too(solver):
+def test_one_eye_is_served_without_the_saving_of_windows_too(solver: Solver) -> None:
     assert solver.step(wish(OFF_M)).missing == {}
 
 
-def test_the_flat_picture_is_drawn_from_the_middle_of_the_last_eyes(solver, cell):
+def test_the_flat_picture_is_drawn_from_the_middle_of_the_last_eyes(solver: Solver, cell: RunCell) -> None:
     solver.step(wish(aside(0.25)))
     aside_flat = solver.step(wish(None, flat=True)).flat.layers
     solver.step(wish(aside(-0.25)))
@@ -155,7 +157,9 @@ def broken(part: Any, name: str, fault: Exception, monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("fault", [ContentFailure("no such frame"), ZeroDivisionError("in a mesh")])
 @pytest.mark.parametrize("where", ["render", "revision"])
-def test_content_that_fails_is_named_with_its_reason_and_tried_again(solver, content, monkeypatch, fault, where):
+def test_content_that_fails_is_named_with_its_reason_and_tried_again(
+    solver: Solver, content: ContentSource, monkeypatch: pytest.MonkeyPatch, fault: Exception, where: str
+) -> None:
     with monkeypatch.context() as patch:
         broken(content, where, fault, patch)
         step = solver.step(wish())
@@ -168,14 +172,18 @@ def test_content_that_fails_is_named_with_its_reason_and_tried_again(solver, con
 
 
 @pytest.mark.parametrize("fault", [ModelFailure("out of memory"), RuntimeError("a library's own"), MemoryError()])
-def test_a_model_that_fails_is_named_and_tried_again(solver, predictor, monkeypatch, fault):
+def test_a_model_that_fails_is_named_and_tried_again(
+    solver: Solver, predictor: Predictor, monkeypatch: pytest.MonkeyPatch, fault: Exception
+) -> None:
     with monkeypatch.context() as patch:
         broken(predictor, "predict", fault, patch)
         assert solver.step(wish()).missing == {"model": str(fault) or "MemoryError"}
     assert solver.step(wish()).missing == {}
 
 
-def test_where_not_even_the_flat_picture_can_be_drawn_there_is_an_even_one(cell, content, monkeypatch):
+def test_where_not_even_the_flat_picture_can_be_drawn_there_is_an_even_one(
+    cell: RunCell, content: ContentSource, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with monkeypatch.context() as patch:
         broken(content, "render", ContentFailure("gone"), patch)
         solver = Solver(cell, SMALL)
@@ -187,7 +195,9 @@ def test_where_not_even_the_flat_picture_can_be_drawn_there_is_an_even_one(cell,
     assert step.flat.layers.std() > 1
 
 
-def test_a_fault_that_is_over_is_told_no_more_though_nothing_is_to_be_made(solver, content, monkeypatch):
+def test_a_fault_that_is_over_is_told_no_more_though_nothing_is_to_be_made(
+    solver: Solver, content: ContentSource, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A revision that could not be asked for once, while the head rests."""
     solver.step(wish())
     with monkeypatch.context() as patch:
@@ -196,6 +206,6 @@ def test_a_fault_that_is_over_is_told_no_more_though_nothing_is_to_be_made(solve
     assert solver.step(wish()).missing == {}
 
 
-def test_the_plan_is_told_while_another_thread_solves(solver):
+def test_the_plan_is_told_while_another_thread_solves(solver: Solver) -> None:
     solver.step(wish())
     assert "render and inference" in [item.what for item in solver.plan_items()]

@@ -47,22 +47,26 @@ def parts() -> FakeParts:
 
 
 @pytest.fixture
-def host(parts, clock) -> SimulatedSolver:
+def host(parts: FakeParts, clock: SimulatedClock) -> SimulatedSolver:
     return SimulatedSolver(parts, clock)
 
 
-def test_the_flat_picture_is_there_before_the_first_refresh_and_no_solution(host, parts):
+def test_the_flat_picture_is_there_before_the_first_refresh_and_no_solution(
+    host: SimulatedSolver, parts: FakeParts
+) -> None:
     assert parts.asked == [FIRST_REQUEST]
     assert host.news().flat is not None
     assert host.news().solution is None
     assert host.news().solutions == 0
 
 
-def test_what_a_solution_costs_is_the_sum_of_the_solver_s_stages_alone(host):
+def test_what_a_solution_costs_is_the_sum_of_the_solver_s_stages_alone(host: SimulatedSolver) -> None:
     assert host.solve_cost_ns == SUM_NS
 
 
-def test_a_solution_is_handed_over_when_its_cost_has_passed_and_not_before(host, clock):
+def test_a_solution_is_handed_over_when_its_cost_has_passed_and_not_before(
+    host: SimulatedSolver, clock: SimulatedClock
+) -> None:
     host.post(wish(5))
     clock.advance_ns(SUM_NS - 1)
     assert host.news().solution is None
@@ -73,7 +77,9 @@ def test_a_solution_is_handed_over_when_its_cost_has_passed_and_not_before(host,
     assert host.news().solutions == 1
 
 
-def test_of_several_wishes_while_it_is_busy_the_newest_is_solved_next_and_begins_where_the_last_one_ended(host, clock):
+def test_of_several_wishes_while_it_is_busy_the_newest_is_solved_next_and_begins_where_the_last_one_ended(
+    host: SimulatedSolver, clock: SimulatedClock
+) -> None:
     begun_ns = clock.now_ns()
     host.post(wish(1))
     for number in (2, 3, 4):
@@ -87,14 +93,14 @@ def test_of_several_wishes_while_it_is_busy_the_newest_is_solved_next_and_begins
     assert host.news().solutions == 2  # what was overtaken is never made
 
 
-def test_a_wish_that_comes_while_it_is_idle_begins_at_once(host, clock):
+def test_a_wish_that_comes_while_it_is_idle_begins_at_once(host: SimulatedSolver, clock: SimulatedClock) -> None:
     clock.advance_ns(5 * SUM_NS)
     host.post(wish(1))
     clock.advance_ns(SUM_NS)
     assert host.news().solution.solved_for_ns == 1
 
 
-def test_nothing_depends_on_when_it_is_looked_at(clock):
+def test_nothing_depends_on_when_it_is_looked_at(clock: SimulatedClock) -> None:
     """Looking more often passes no time and changes no result."""
 
     def run(looks: int) -> list[tuple[int, int]]:
@@ -113,7 +119,7 @@ def test_nothing_depends_on_when_it_is_looked_at(clock):
     assert run(0) == run(1) == run(7)
 
 
-def test_a_flat_picture_costs_its_drawing_alone(host, clock):
+def test_a_flat_picture_costs_its_drawing_alone(host: SimulatedSolver, clock: SimulatedClock) -> None:
     first = host.news().flat
     host.post(replace(wish(7), eyes_m=None))
     clock.advance_ns(8 * NS_PER_MS - 1)
@@ -122,7 +128,7 @@ def test_a_flat_picture_costs_its_drawing_alone(host, clock):
     assert host.news().flat.solved_for_ns == 7
 
 
-def test_where_there_is_nothing_to_do_no_time_passes(clock):
+def test_where_there_is_nothing_to_do_no_time_passes(clock: SimulatedClock) -> None:
     parts = FakeParts(lambda request: Step(), COST_MS)
     host = SimulatedSolver(parts, clock)
     host.post(wish(1))
@@ -131,7 +137,9 @@ def test_where_there_is_nothing_to_do_no_time_passes(clock):
     assert host.news().solution is None
 
 
-def test_what_failed_is_told_and_the_last_solution_stays(parts, host, clock):
+def test_what_failed_is_told_and_the_last_solution_stays(
+    parts: FakeParts, host: SimulatedSolver, clock: SimulatedClock
+) -> None:
     host.post(wish(1))
     clock.advance_ns(SUM_NS)
     good = host.news().solution
@@ -145,7 +153,9 @@ def test_what_failed_is_told_and_the_last_solution_stays(parts, host, clock):
     assert host.news().missing == {}
 
 
-def test_a_task_is_done_at_once_and_where_it_is_not_done_again_at_every_step(host, parts):
+def test_a_task_is_done_at_once_and_where_it_is_not_done_again_at_every_step(
+    host: SimulatedSolver, parts: FakeParts
+) -> None:
     seen: list[Any] = []
 
     def task(given: Any) -> bool:
@@ -159,7 +169,7 @@ def test_a_task_is_done_at_once_and_where_it_is_not_done_again_at_every_step(hos
     assert seen == [parts] * 3
 
 
-def test_a_cost_that_changes_is_told(host, parts, clock):
+def test_a_cost_that_changes_is_told(host: SimulatedSolver, parts: FakeParts, clock: SimulatedClock) -> None:
     """The budget has chosen a lighter level."""
     parts.stage_ms = {"render": 2.0, "inference": 1.0}
     host.post(wish(1))
@@ -168,13 +178,13 @@ def test_a_cost_that_changes_is_told(host, parts, clock):
     assert host.solve_cost_ns == 3 * NS_PER_MS
 
 
-def test_it_is_closed_once(host, parts):
+def test_it_is_closed_once(host: SimulatedSolver, parts: FakeParts) -> None:
     host.close()
     host.close()
     assert parts.closed == [False]
 
 
-def test_the_eyes_of_a_solution_are_those_that_it_was_asked_for(host, clock):
+def test_the_eyes_of_a_solution_are_those_that_it_was_asked_for(host: SimulatedSolver, clock: SimulatedClock) -> None:
     host.post(SolveRequest(3, EYES, "rested", 0.0, flat_wanted=False))
     clock.advance_ns(SUM_NS)
     assert np.array_equal(host.news().solution.solved_for_m, EYES)

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from runtime.clock import NS_PER_MS, NS_PER_S, SimulatedClock
-from runtime.errors import InputError
+from runtime.clock import NS_PER_MS, NS_PER_S, MonotonicClock, SimulatedClock
+from runtime.errors import FatalError, InputError
 from runtime.frame.solver import Step
 from runtime.frame.solver_thread import ABANDONED_MAX, SolverThread
 from runtime.records import SolveRequest
@@ -129,13 +129,13 @@ def shop() -> Iterator[Workshop]:
     made.close()
 
 
-def test_the_flat_picture_is_there_when_it_is_ready_and_no_solution(shop):
+def test_the_flat_picture_is_there_when_it_is_ready_and_no_solution(shop: Workshop) -> None:
     assert shop.host.news().flat is not None
     assert shop.host.news().solution is None
     assert shop.host.solve_cost_ns == 7
 
 
-def test_parts_are_made_used_and_closed_on_one_thread_that_is_not_the_presenter_s(shop):
+def test_parts_are_made_used_and_closed_on_one_thread_that_is_not_the_presenter_s(shop: Workshop) -> None:
     threads = []
     shop.behave = lambda request: (threads.append(threading.current_thread().name), solves(request))[1]
     shop.solve(1)
@@ -146,20 +146,20 @@ def test_parts_are_made_used_and_closed_on_one_thread_that_is_not_the_presenter_
     assert shop.host.left_behind == 0
 
 
-def test_a_solution_is_handed_over_and_counted(shop):
+def test_a_solution_is_handed_over_and_counted(shop: Workshop) -> None:
     shop.solve(1)
     assert shop.host.news().solution.solved_for_ns == 1
     assert shop.host.news().solutions == 1
     assert shop.host.news().missing == {}
 
 
-def test_what_a_solution_costs_is_a_running_mean_whose_first_is_believed_by_a_part(shop):
+def test_what_a_solution_costs_is_a_running_mean_whose_first_is_believed_by_a_part(shop: Workshop) -> None:
     for number in range(1, 60):
         shop.solve(number)
     assert shop.host.solve_cost_ns == pytest.approx(20 * NS_PER_MS, rel=0.01)
 
 
-def test_what_can_t_be_made_is_raised_to_who_waits_for_it():
+def test_what_can_t_be_made_is_raised_to_who_waits_for_it() -> None:
     shop = Workshop.__new__(Workshop)
 
     def refuse() -> Any:
@@ -171,7 +171,21 @@ def test_what_can_t_be_made_is_raised_to_who_waits_for_it():
     shop.host.close(PATIENCE_S)
 
 
-def test_who_waits_for_it_may_stop_waiting():
+def test_who_waits_for_one_that_is_never_ready_gives_up() -> None:
+    gate = threading.Event()
+    host = SolverThread(
+        lambda: FakeParts(lambda _: Step()) if gate.wait(PATIENCE_S) else None,
+        MonotonicClock(),
+        late_s=LATE_S,
+        abandon_s=ABANDON_S,
+    )
+    with pytest.raises(FatalError, match=r"not ready after 0\.2 s \(limits\.start_s\)"):
+        host.wait_ready(most_s=0.2)
+    gate.set()
+    host.close(PATIENCE_S)
+
+
+def test_who_waits_for_it_may_stop_waiting() -> None:
     gate = threading.Event()
     host = SolverThread(
         lambda: FakeParts(lambda _: Step()) if gate.wait(PATIENCE_S) else None,
@@ -186,7 +200,7 @@ def test_who_waits_for_it_may_stop_waiting():
     host.close(PATIENCE_S)
 
 
-def test_asking_and_looking_never_wait_for_a_step_that_does_not_return(shop):
+def test_asking_and_looking_never_wait_for_a_step_that_does_not_return(shop: Workshop) -> None:
     shop.solve(1)
     shop.behave = shop.hang
     shop.post(2)
@@ -196,7 +210,7 @@ def test_asking_and_looking_never_wait_for_a_step_that_does_not_return(shop):
         shop.host.do(lambda parts: True)
 
 
-def test_of_the_wishes_that_came_meanwhile_only_the_newest_is_solved(shop):
+def test_of_the_wishes_that_came_meanwhile_only_the_newest_is_solved(shop: Workshop) -> None:
     shop.behave = shop.hang
     shop.post(1)
     shop.behave = solves
@@ -209,7 +223,7 @@ def test_of_the_wishes_that_came_meanwhile_only_the_newest_is_solved(shop):
     assert shop.begun.empty()
 
 
-def test_what_is_late_is_told_with_its_seconds_while_the_last_solution_stays(shop):
+def test_what_is_late_is_told_with_its_seconds_while_the_last_solution_stays(shop: Workshop) -> None:
     shop.solve(1)
     shop.behave = shop.hang
     shop.post(2)
@@ -220,7 +234,7 @@ def test_what_is_late_is_told_with_its_seconds_while_the_last_solution_stays(sho
     assert shop.host.news().solution.solved_for_ns == 1
 
 
-def test_late_is_told_until_a_step_is_in_time_again(shop):
+def test_late_is_told_until_a_step_is_in_time_again(shop: Workshop) -> None:
     shop.behave = shop.hang
     shop.post(1)
     shop.pass_s(2.0)
@@ -232,7 +246,7 @@ def test_late_is_told_until_a_step_is_in_time_again(shop):
     assert shop.host.news().missing == {}
 
 
-def test_where_nothing_is_to_be_done_nothing_is_late(shop):
+def test_where_nothing_is_to_be_done_nothing_is_late(shop: Workshop) -> None:
     """A head that came to rest after one slow solution is not told of it for ever."""
     shop.behave = shop.hang
     shop.post(1)
@@ -244,7 +258,7 @@ def test_where_nothing_is_to_be_done_nothing_is_late(shop):
     assert shop.host.news().missing == {}
 
 
-def test_a_step_that_does_not_return_is_left_behind_and_the_solver_made_anew_serves(shop):
+def test_a_step_that_does_not_return_is_left_behind_and_the_solver_made_anew_serves(shop: Workshop) -> None:
     shop.solve(1)
     shop.behave = shop.hang
     shop.post(2)
@@ -258,7 +272,7 @@ def test_a_step_that_does_not_return_is_left_behind_and_the_solver_made_anew_ser
     assert shop.host.news().missing == {}
 
 
-def test_what_a_step_that_was_left_behind_makes_after_all_counts_no_more(shop):
+def test_what_a_step_that_was_left_behind_makes_after_all_counts_no_more(shop: Workshop) -> None:
     shop.behave = shop.hang
     shop.post(1)
     shop.left()
@@ -271,7 +285,7 @@ def test_what_a_step_that_was_left_behind_makes_after_all_counts_no_more(shop):
     assert shop.host.news().solutions == 1
 
 
-def test_a_solver_that_hangs_again_and_again_leaves_no_more_than_a_few_threads(shop):
+def test_a_solver_that_hangs_again_and_again_leaves_no_more_than_a_few_threads(shop: Workshop) -> None:
     shop.behave = shop.hang
     for number in range(1, ABANDONED_MAX + 1):
         shop.post(number)
@@ -289,7 +303,7 @@ def test_a_solver_that_hangs_again_and_again_leaves_no_more_than_a_few_threads(s
     assert shop.host.news().solution.solved_for_ns == 50
 
 
-def test_those_that_returned_after_all_count_no_more(shop):
+def test_those_that_returned_after_all_count_no_more(shop: Workshop) -> None:
     shop.behave = shop.hang
     for number in range(1, ABANDONED_MAX + 1):
         shop.post(number)
@@ -303,7 +317,7 @@ def test_those_that_returned_after_all_count_no_more(shop):
     assert shop.host.restarts == ABANDONED_MAX + 1
 
 
-def test_a_step_that_raises_is_told_at_once_and_the_solver_made_anew(shop):
+def test_a_step_that_raises_is_told_at_once_and_the_solver_made_anew(shop: Workshop) -> None:
     """`Solver.step` answers with what is missing; what is raised beside it must not end solving silently."""
     shop.solve(1)
 
@@ -322,7 +336,7 @@ def test_a_step_that_raises_is_told_at_once_and_the_solver_made_anew(shop):
     assert shop.host.news().missing == {}
 
 
-def test_where_it_can_t_be_made_anew_that_is_told_and_tried_again(shop):
+def test_where_it_can_t_be_made_anew_that_is_told_and_tried_again(shop: Workshop) -> None:
     shop.behave = shop.hang
     shop.post(1)
     shop.refuse = RuntimeError("no memory")
@@ -334,7 +348,7 @@ def test_where_it_can_t_be_made_anew_that_is_told_and_tried_again(shop):
     assert shop.host.news().missing == {}
 
 
-def test_a_task_that_raises_is_done_and_nothing_else_is_lost(shop, caplog):
+def test_a_task_that_raises_is_done_and_nothing_else_is_lost(shop: Workshop, caplog: pytest.LogCaptureFixture) -> None:
     def fail(parts: Any) -> bool:
         raise RuntimeError("in a task")
 
@@ -345,7 +359,7 @@ def test_a_task_that_raises_is_done_and_nothing_else_is_lost(shop, caplog):
     assert sum("a task failed" in record.getMessage() for record in caplog.records) == 1
 
 
-def test_a_task_is_asked_again_after_every_step_until_it_is_done(shop):
+def test_a_task_is_asked_again_after_every_step_until_it_is_done(shop: Workshop) -> None:
     asked = []
     shop.host.do(lambda parts: bool(asked.append(parts)) or len(asked) >= 3)
     for number in range(1, 6):
@@ -353,7 +367,7 @@ def test_a_task_is_asked_again_after_every_step_until_it_is_done(shop):
     assert asked == [shop.all[0]] * 3
 
 
-def test_tasks_that_wait_behind_a_hung_step_are_done_by_the_solver_made_anew(shop):
+def test_tasks_that_wait_behind_a_hung_step_are_done_by_the_solver_made_anew(shop: Workshop) -> None:
     shop.behave = shop.hang
     shop.post(1)
     done: queue.Queue[Any] = queue.Queue()
@@ -362,7 +376,7 @@ def test_tasks_that_wait_behind_a_hung_step_are_done_by_the_solver_made_anew(sho
     assert done.get(timeout=PATIENCE_S) is shop.all[1]
 
 
-def test_closing_does_not_wait_for_ever_for_a_step_that_hangs(shop):
+def test_closing_does_not_wait_for_ever_for_a_step_that_hangs(shop: Workshop) -> None:
     shop.behave = shop.hang
     shop.post(1)
     shop.host.close(0.01)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from runtime.clock import NS_PER_MS, NS_PER_S
@@ -33,7 +34,7 @@ def told(accounts: list[RefreshAccount], *, overhead_ms: float = 0.5) -> RunStat
     return stats
 
 
-def test_refreshes_and_solutions_are_counted_apart():
+def test_refreshes_and_solutions_are_counted_apart() -> None:
     ran = {"inference": "ran", "stage_ms": {"render": 8.0, "inference": 3.0}}
     stats = told([account(k, **(ran if k % 5 == 0 else {})) for k in range(51)])
     summary = stats.summary(stale_inputs=7)
@@ -48,7 +49,7 @@ def test_refreshes_and_solutions_are_counted_apart():
     assert stats.reuse_saves_ms() == 11.0
 
 
-def test_what_was_not_measured_is_none():
+def test_what_was_not_measured_is_none() -> None:
     summary = told([]).summary(stale_inputs=0)
     for name in ("fps", "solutions_per_s", "interval_ms", "photon_ms", "overhead_ms", "skew_ms", "solution_age_ms"):
         assert summary[name] is None, name
@@ -59,14 +60,14 @@ def test_what_was_not_measured_is_none():
     assert (alone["fps"], alone["photon_ms"], alone["solution_age_ms"], alone["eye_sigma_mm"]) == (None,) * 4
 
 
-def test_a_refresh_that_should_have_shown_a_picture_and_did_not_is_dropped_and_parts_two_intervals():
+def test_a_refresh_that_should_have_shown_a_picture_and_did_not_is_dropped_and_parts_two_intervals() -> None:
     stats = told([account(k, presented=k != 5) for k in range(11)])
     summary = stats.summary(stale_inputs=0)
     assert (summary["presented"], summary["dropped"]) == (10, 1)
     assert summary["interval_ms"]["p99"] == 20.0  # none of 40 ms is made up
 
 
-def test_overhead_leaves_out_the_first_refresh_which_pays_for_what_is_made_once():
+def test_overhead_leaves_out_the_first_refresh_which_pays_for_what_is_made_once() -> None:
     stats = RunStats()
     stats.add(account(0), overhead_ms=500.0)
     assert stats.summary(stale_inputs=0)["overhead_ms"] is None
@@ -74,12 +75,12 @@ def test_overhead_leaves_out_the_first_refresh_which_pays_for_what_is_made_once(
     assert stats.summary(stale_inputs=0)["overhead_ms"] == {"p50": 0.25, "p99": 0.25}
 
 
-def test_in_simulated_time_every_figure_is_the_run_s_clock_s():
+def test_in_simulated_time_every_figure_is_the_run_s_clock_s() -> None:
     stats = told([account(k) for k in range(5)], overhead_ms=123.456)
     assert stats.summary(stale_inputs=0, simulated=True)["overhead_ms"]["p50"] == pytest.approx(0.3)
 
 
-def test_rates_now_are_of_the_last_second_and_those_of_the_run_are_not():
+def test_rates_now_are_of_the_last_second_and_those_of_the_run_are_not() -> None:
     slow = [account(k, present_ns=k * NS_PER_S // 5) for k in range(100)]
     fast = [account(k, present_ns=20 * NS_PER_S + k * PERIOD_NS, inference="ran") for k in range(200)]
     stats = told(slow + fast)
@@ -87,14 +88,14 @@ def test_rates_now_are_of_the_last_second_and_those_of_the_run_are_not():
     assert stats.summary(stale_inputs=0)["fps"] < 15
 
 
-def test_faults_are_counted_by_part():
+def test_faults_are_counted_by_part() -> None:
     stats = told([])
     for part in ("model", "panel", "model"):
         stats.fault(part)
     assert stats.summary(stale_inputs=0)["faults"] == {"model": 2, "panel": 1}
 
 
-def test_memory_is_bounded_and_quantiles_are_of_the_newest():
+def test_memory_is_bounded_and_quantiles_are_of_the_newest() -> None:
     ring = Ring(4)
     assert ring.quantiles(("p50",)) is None
     for value in range(100):
@@ -103,6 +104,37 @@ def test_memory_is_bounded_and_quantiles_are_of_the_newest():
     assert WINDOW >= 60 * 60  # a minute of refreshes
 
 
-def test_the_capture_to_light_is_of_the_light_as_it_was_presented():
+@pytest.mark.parametrize("count", [1, 2, 3, 64, 1000])
+def test_quantiles_are_those_of_numpy(count: int) -> None:
+    ring, values = Ring(), np.random.default_rng(1).normal(size=count)
+    for value in values:
+        ring.add(value)
+    known = {f"p{share}": round(float(np.percentile(values, share)), 4) for share in (5, 50, 95, 99)}
+    assert ring.quantiles((*known, "max")) == {**known, "max": round(float(values.max()), 4)}
+
+
+def test_quantiles_that_are_asked_for_often_may_be_without_the_newest_values_but_not_without_many() -> None:
+    ring = Ring(640)
+    for value in range(640):
+        ring.add(float(value))
+    asked = ring.quantiles(("max",))
+    for value in range(640, 650):
+        ring.add(float(value))
+    assert ring.quantiles(("max",), nearly=True) == asked == {"max": 639.0}
+    assert ring.quantiles(("p50",), nearly=True) == {"p50": 329.5}  # not asked for before
+    ring.add(650.0)  # more than a sixty-fourth
+    assert ring.quantiles(("max",), nearly=True) == {"max": 650.0}
+    ring.add(651.0)
+    assert ring.quantiles(("max",)) == {"max": 651.0}  # who wants to know it exactly does
+
+
+def test_the_first_values_are_told_at_once() -> None:
+    ring = Ring()
+    for value in range(3):
+        ring.add(float(value))
+        assert ring.quantiles(("max",), nearly=True) == {"max": float(value)}
+
+
+def test_the_capture_to_light_is_of_the_light_as_it_was_presented() -> None:
     late = [account(k, photon_ns=1 + k * PERIOD_NS + 70 * NS_PER_MS) for k in range(3)]
     assert told(late).summary(stale_inputs=0)["photon_ms"] == {"p50": 70.0, "p99": 70.0}

@@ -22,51 +22,51 @@ def truth() -> TrueEyes:
     return made
 
 
-def test_a_recording_that_knows_no_truth_answers_none():
+def test_a_recording_that_knows_no_truth_answers_none() -> None:
     truth = TrueEyes()
     assert not truth.known
     assert truth.at(5) is None
 
 
-def test_at_a_sample_it_is_the_sample_s_and_between_two_it_lies_between(truth):
+def test_at_a_sample_it_is_the_sample_s_and_between_two_it_lies_between(truth: TrueEyes) -> None:
     assert truth.known
     assert np.array_equal(truth.at(50 * NS_PER_MS), eyes(0.005))
     assert truth.at(53 * NS_PER_MS) == pytest.approx(eyes(0.0053))
     assert np.array_equal(truth.at(100 * NS_PER_MS), eyes(0.010))  # the newest
 
 
-def test_after_the_newest_sample_it_is_not_known_yet_and_once_that_has_come_it_is(truth):
+def test_after_the_newest_sample_it_is_not_known_yet_and_once_that_has_come_it_is(truth: TrueEyes) -> None:
     asked_ns = 105 * NS_PER_MS
     assert truth.at(asked_ns) is UNKNOWN
     truth.add(110 * NS_PER_MS, eyes(0.011))
     assert truth.at(asked_ns) == pytest.approx(eyes(0.0105))
 
 
-def test_when_the_recording_has_ended_it_will_never_be_known(truth):
+def test_when_the_recording_has_ended_it_will_never_be_known(truth: TrueEyes) -> None:
     truth.end()
     assert truth.at(105 * NS_PER_MS) is None
     assert np.array_equal(truth.at(100 * NS_PER_MS), eyes(0.010))
 
 
-def test_before_the_first_sample_it_will_never_be_known():
+def test_before_the_first_sample_it_will_never_be_known() -> None:
     truth = TrueEyes()
     truth.add(NS_PER_S, eyes(0.0))
     assert truth.at(NS_PER_S - 1) is None
 
 
-def test_nothing_is_made_up_for_a_gap(truth):
+def test_nothing_is_made_up_for_a_gap(truth: TrueEyes) -> None:
     newest_ns = 100 * NS_PER_MS
     truth.add(newest_ns + GAP_NS + 1, eyes(0.5))
     assert truth.at(newest_ns + GAP_NS // 2) is None
     assert np.array_equal(truth.at(newest_ns + GAP_NS + 1), eyes(0.5))
 
 
-def test_samples_that_come_out_of_order_are_no_truth(truth):
+def test_samples_that_come_out_of_order_are_no_truth(truth: TrueEyes) -> None:
     truth.add(20 * NS_PER_MS, eyes(9.0))
     assert np.array_equal(truth.at(20 * NS_PER_MS), eyes(0.002))
 
 
-def test_it_remembers_so_much_and_no_more():
+def test_it_remembers_so_much_and_no_more() -> None:
     truth = TrueEyes()
     for k in range(3 * KEPT):
         truth.add(k * NS_PER_MS, eyes(k / 1e6))

@@ -49,7 +49,7 @@ def watched(
 
 
 @pytest.mark.parametrize("noise_mm", [0.0, 1.0, 3.0])
-def test_a_head_at_rest_is_rested_and_its_eyes_stay_to_the_last_bit_whatever_the_noise(noise_mm):
+def test_a_head_at_rest_is_rested_and_its_eyes_stay_to_the_last_bit_whatever_the_noise(noise_mm: float) -> None:
     told = watched(viewer(), 6.0, noise_m=noise_mm / 1000)[2 * DISPLAY_HZ :]
     assert {estimate.label for estimate in told} == {"rested"}
     assert len({estimate.eyes_m.tobytes() for estimate in told}) == 1
@@ -57,13 +57,13 @@ def test_a_head_at_rest_is_rested_and_its_eyes_stay_to_the_last_bit_whatever_the
     assert all(0.0 < estimate.sigma_m < 0.003 for estimate in told)
 
 
-def test_a_moving_head_is_predicted_and_its_eyes_differ_from_refresh_to_refresh():
+def test_a_moving_head_is_predicted_and_its_eyes_differ_from_refresh_to_refresh() -> None:
     told = watched(viewer(), 3.0, noise_m=0.003, y_m=lambda s: 0.1 * np.sin(2 * s))[DISPLAY_HZ:]
     assert {estimate.label for estimate in told} == {"predicted"}
     assert all((a.eyes_m != b.eyes_m).any() for a, b in pairwise(told))
 
 
-def test_a_head_that_sets_off_is_let_go():
+def test_a_head_that_sets_off_is_let_go() -> None:
     told = watched(viewer(), 4.0, noise_m=0.001, y_m=lambda s: 0.2 * max(0.0, s - 2.5))
     labels = [estimate.label for estimate in told]
     assert labels[round(2.4 * DISPLAY_HZ)] == "rested"
@@ -71,13 +71,13 @@ def test_a_head_that_sets_off_is_let_go():
 
 
 @pytest.mark.parametrize("plan", [{"reuse": False}, {"enabled": False}, {"most_band_mm": 0.0}])
-def test_where_the_plan_may_not_let_it_rest_every_refresh_is_predicted_anew(plan):
+def test_where_the_plan_may_not_let_it_rest_every_refresh_is_predicted_anew(plan: dict[str, float]) -> None:
     told = watched(viewer(plan=plan), 3.0, noise_m=0.003)[2 * DISPLAY_HZ :]
     assert {estimate.label for estimate in told} == {"predicted"}
     assert len({estimate.eyes_m.tobytes() for estimate in told}) == len(told)
 
 
-def test_eyes_that_are_lost_while_they_rest_are_held_where_they_rested_and_then_none():
+def test_eyes_that_are_lost_while_they_rest_are_held_where_they_rested_and_then_none() -> None:
     seen = viewer(tracker={"hold_s": 0.4})
     told = watched(seen, 3.0, noise_m=0.003, lost=lambda s: s > 2.0)
     held = [estimate for estimate in told if estimate.label == "held"]
@@ -88,7 +88,7 @@ def test_eyes_that_are_lost_while_they_rest_are_held_where_they_rested_and_then_
 
 
 @pytest.mark.parametrize("x_m", [0.065, 0.0, -0.5])
-def test_eyes_behind_or_in_the_panels_are_none_counted_by_reason(x_m):
+def test_eyes_behind_or_in_the_panels_are_none_counted_by_reason(x_m: float) -> None:
     seen = viewer()
     for number in range(5):
         place = aside(x_m=x_m - EYES[0, 0])
@@ -98,14 +98,14 @@ def test_eyes_behind_or_in_the_panels_are_none_counted_by_reason(x_m):
     assert seen.dropped == {"not in front of the panels": 5}
 
 
-def test_one_eye_behind_the_front_panel_is_enough():
+def test_one_eye_behind_the_front_panel_is_enough() -> None:
     seen = viewer()
     place = np.array([[0.03, -0.03, 0.0], [0.083, 0.0, 0.0]])
     seen.take(SensorFrame(0, NS_PER_S, EyePoints(place, np.ones(2))), serial="")
     assert seen.at(NS_PER_S).eyes_m is None
 
 
-def test_what_the_tracker_refuses_is_counted_apart():
+def test_what_the_tracker_refuses_is_counted_apart() -> None:
     seen = viewer()
     for number, place in enumerate([EYES, EYES, aside(0.5), EYES, EYES * 10]):
         frame = SensorFrame(number, NS_PER_S + number * NS_PER_S // 30, EyePoints(place, np.ones(2)))
@@ -114,7 +114,7 @@ def test_what_the_tracker_refuses_is_counted_apart():
     assert not seen.dropped
 
 
-def test_looking_ahead_for_the_solver_changes_nothing_of_what_is_shown():
+def test_looking_ahead_for_the_solver_changes_nothing_of_what_is_shown() -> None:
     """Eyes return after a loss: they fade from where they were *shown* last, however far ahead the solver asked."""
     story: dict[str, Any] = {
         "noise_m": 0.001, "y_m": lambda s: 0.2 * np.sin(3 * s), "lost": lambda s: 1.0 < s < 1.3,
@@ -126,21 +126,21 @@ def test_looking_ahead_for_the_solver_changes_nothing_of_what_is_shown():
         assert one.eyes_m is None or (one.eyes_m == other.eyes_m).all()
 
 
-def test_looking_ahead_counts_no_dropped_eyes():
+def test_looking_ahead_counts_no_dropped_eyes() -> None:
     seen = viewer()
     seen.take(SensorFrame(0, NS_PER_S, EyePoints(aside(x_m=-1.0), np.ones(2))), serial="")
     seen.ahead(NS_PER_S)
     assert not seen.dropped
 
 
-def test_the_sensor_s_rate_is_that_of_its_captures():
+def test_the_sensor_s_rate_is_that_of_its_captures() -> None:
     seen = viewer()
     assert seen.rate_hz is None
     watched(seen, 3.0, noise_m=0.001)
     assert seen.rate_hz == pytest.approx(SENSOR_HZ, rel=0.01)
 
 
-def test_other_settings_of_the_plan_keep_what_the_tracker_knows_and_other_ones_of_its_own_do_not():
+def test_other_settings_of_the_plan_keep_what_the_tracker_knows_and_other_ones_of_its_own_do_not() -> None:
     seen = viewer()
     watched(seen, 1.0, noise_m=0.001)
     calibration = load_calibration(None)
@@ -150,7 +150,7 @@ def test_other_settings_of_the_plan_keep_what_the_tracker_knows_and_other_ones_o
     assert seen.at(2 * NS_PER_S).eyes_m is None
 
 
-def test_samples_of_a_sensor_in_its_own_frame_go_through_the_calibration():
+def test_samples_of_a_sensor_in_its_own_frame_go_through_the_calibration() -> None:
     calibration = load_calibration(None)
     seen = Viewer(Settings(), calibration, front_m=FRONT_M)
     sensor_m = (np.linalg.inv(calibration.stack_from_sensor) @ np.c_[EYES, np.ones(2)].T).T[:, :3]
@@ -158,7 +158,7 @@ def test_samples_of_a_sensor_in_its_own_frame_go_through_the_calibration():
     assert seen.at(NS_PER_S).eyes_m == pytest.approx(EYES, abs=1e-9)
 
 
-def test_another_sensor_than_the_calibrated_one_is_told_once(caplog):
+def test_another_sensor_than_the_calibrated_one_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
     calibration = load_calibration(None)
     seen = Viewer(Settings(), calibration, front_m=FRONT_M)
     for number in range(3):
@@ -175,7 +175,9 @@ def test_another_sensor_than_the_calibrated_one_is_told_once(caplog):
         (lambda eyes_m: eyes_m * 1000.0, "in millimetres, not metres"),
     ],
 )
-def test_eyes_that_can_not_be_a_viewer_s_are_told_and_counted_by_reason(change, reason) -> None:
+def test_eyes_that_can_not_be_a_viewer_s_are_told_and_counted_by_reason(
+    change: Callable[..., Any], reason: str
+) -> None:
     seen = viewer()
     for number in range(30):
         points = EyePoints(change(aside(0.001 * number)), np.ones(2))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from runtime.model.pyramid_level import NEUTRAL
 from runtime.optics.alignment import (
@@ -57,7 +59,9 @@ def moved_px(matrix: np.ndarray, px: np.ndarray) -> np.ndarray:
 
 
 @given(stack=ANY_STACK, old=heads(), new=heads(), y=floats(-0.5, 0.5), z=floats(-0.5, 0.5))
-def test_the_ray_from_the_new_middle_through_any_reference_point_meets_what_the_old_one_met(stack, old, new, y, z):
+def test_the_ray_from_the_new_middle_through_any_reference_point_meets_what_the_old_one_met(
+    stack: PanelStack, old: NDArray[np.float64], new: NDArray[np.float64], y: float, z: float
+) -> None:
     aligned = align(stack, solved_for_m=old, eyes_m=new)
     assume(not aligned.limited)
     point = (reference_x_m(stack), y * stack.width_m, z * stack.height_m)
@@ -70,7 +74,9 @@ def test_the_ray_from_the_new_middle_through_any_reference_point_meets_what_the_
 @given(
     stack=ANY_STACK, middle=eyes(), half_m=floats(0.0, 0.04), step=st.tuples(floats(-0.05, 0.05), floats(-0.05, 0.05))
 )
-def test_a_head_that_moves_parallel_to_the_panels_is_aligned_exactly_for_each_of_its_eyes(stack, middle, half_m, step):
+def test_a_head_that_moves_parallel_to_the_panels_is_aligned_exactly_for_each_of_its_eyes(
+    stack: PanelStack, middle: NDArray[np.float64], half_m: float, step: tuple[float, float]
+) -> None:
     old = middle + np.array([[0.0, -half_m, 0.0], [0.0, half_m, 0.0]])
     new = old + np.array([0.0, *step])
     aligned = align(stack, solved_for_m=old, eyes_m=new)
@@ -83,7 +89,9 @@ def test_a_head_that_moves_parallel_to_the_panels_is_aligned_exactly_for_each_of
 
 
 @given(stack=ANY_STACK, first=heads(), second=heads(), third=heads())
-def test_two_steps_one_after_the_other_are_one_step(stack, first, second, third):
+def test_two_steps_one_after_the_other_are_one_step(
+    stack: PanelStack, first: NDArray[np.float64], second: NDArray[np.float64], third: NDArray[np.float64]
+) -> None:
     """Solved from shown at third, by way of what would be shown at second."""
     to_second = align(stack, solved_for_m=first, eyes_m=second)
     to_third = align(stack, solved_for_m=second, eyes_m=third)
@@ -94,7 +102,7 @@ def test_two_steps_one_after_the_other_are_one_step(stack, first, second, third)
 
 
 @given(stack=ANY_STACK, head=heads())
-def test_eyes_that_have_not_moved_change_no_bit(stack, head):
+def test_eyes_that_have_not_moved_change_no_bit(stack: PanelStack, head: NDArray[np.float64]) -> None:
     aligned = align(stack, solved_for_m=head, eyes_m=head.copy())
     assert aligned.limited == ""
     for matrix in aligned.solved_from_shown:
@@ -102,14 +110,16 @@ def test_eyes_that_have_not_moved_change_no_bit(stack, head):
 
 
 @given(stack=ANY_STACK, old=heads(), new=heads())
-def test_a_panel_in_the_reference_plane_never_moves(stack, old, new):
+def test_a_panel_in_the_reference_plane_never_moves(
+    stack: PanelStack, old: NDArray[np.float64], new: NDArray[np.float64]
+) -> None:
     if stack.count % 2 == 0:
         stack = replace(stack, x_m=stack.x_m[1:])
     matrices = align(stack, solved_for_m=old, eyes_m=new).solved_from_shown
     assert matrices[stack.count // 2].tobytes() == np.eye(3).tobytes()
 
 
-def test_two_panels_meet_midway():
+def test_two_panels_meet_midway() -> None:
     stack = replace(STACK, x_m=(-0.06, 0.06))
     assert reference_x_m(stack) == 0.0
     rear, front = align(stack, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 0.008, 0.0])).solved_from_shown
@@ -126,7 +136,9 @@ def test_four_panels_meet_midway_between_the_two_in_the_middle() -> None:
     shift_m=floats(-0.5, 0.5),
     step=st.tuples(floats(-0.5, 1.0), floats(-0.6, 0.6), floats(-0.6, 0.6)),
 )
-def test_the_origin_along_x_is_anybodys_choice(x_m, shift_m, step):
+def test_the_origin_along_x_is_anybodys_choice(
+    x_m: tuple[float, ...], shift_m: float, step: tuple[float, float, float]
+) -> None:
     """At and beyond the limits too: the same stack and the same eyes, counted from elsewhere."""
     stack = PanelStack(0.5184, 0.2916, x_m, 1920, 1080)
     moved = replace(stack, x_m=tuple(x + shift_m for x in x_m))
@@ -138,7 +150,7 @@ def test_the_origin_along_x_is_anybodys_choice(x_m, shift_m, step):
         np.testing.assert_allclose(a, b, atol=1e-6)
 
 
-def test_a_step_to_the_right_moves_the_outer_panels_by_their_parallax():
+def test_a_step_to_the_right_moves_the_outer_panels_by_their_parallax() -> None:
     aligned = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 0.01, 0.0]))
     parallax_px = 0.01 * 0.06 / 0.6 * 1920 / 0.5184
     for panel, sign in ((0, 1.0), (2, -1.0)):
@@ -153,7 +165,7 @@ def test_a_step_to_the_right_moves_the_outer_panels_by_their_parallax():
 @example(stack=STACK, old=HEAD, new=[1e308] * 6)
 @example(stack=STACK, old=HEAD, new=[FARTHEST_M, 0.0, 0.0] * 2)
 @example(stack=STACK, old=HEAD, new=[0.06, 0.0, 0.0] * 2)
-def test_no_eyes_whatever_give_more_than_the_limits(stack, old, new):
+def test_no_eyes_whatever_give_more_than_the_limits(stack: Any, old: Any, new: Any) -> None:
     aligned = align(stack, solved_for_m=old, eyes_m=np.array(new).reshape(2, 3))
     centre = np.array([stack.width_px / 2, stack.height_px / 2])
     for matrix in aligned.solved_from_shown:
@@ -163,7 +175,7 @@ def test_no_eyes_whatever_give_more_than_the_limits(stack, old, new):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])
-def test_eyes_that_are_nowhere_leave_the_layers_as_they_are(bad):
+def test_eyes_that_are_nowhere_leave_the_layers_as_they_are(bad: float) -> None:
     new = HEAD.copy()
     new[1, 2] = bad
     aligned = align(STACK, solved_for_m=HEAD, eyes_m=new)
@@ -173,7 +185,7 @@ def test_eyes_that_are_nowhere_leave_the_layers_as_they_are(bad):
 
 
 @pytest.mark.parametrize("x_m", [-1.0, 0.0, 0.06, 0.06 + 0.9 * NEAREST_M])
-def test_an_eye_at_or_behind_the_front_panel_holds_the_nearest_place_on_its_way(x_m):
+def test_an_eye_at_or_behind_the_front_panel_holds_the_nearest_place_on_its_way(x_m: float) -> None:
     new = HEAD.copy()
     new[0, 0] = x_m
     aligned = align(STACK, solved_for_m=HEAD, eyes_m=new)
@@ -184,21 +196,23 @@ def test_an_eye_at_or_behind_the_front_panel_holds_the_nearest_place_on_its_way(
     assert same(aligned, nearest)
 
 
-def test_eyes_far_from_those_solved_for_hold_where_an_outer_panel_would_leave_the_line():
+def test_eyes_far_from_those_solved_for_hold_where_an_outer_panel_would_leave_the_line() -> None:
     beyond = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 4.0, 0.0]))
     assert "panel 0 is no longer in line" in beyond.limited and "4 m from where" in beyond.limited
     assert beyond.solved_from_shown[0][0, 2] == pytest.approx(MOST_SHIFT * 1920)
     assert same(beyond, align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 8.0, 0.0])))
 
 
-def test_a_solution_for_eyes_that_see_no_panel_is_shown_as_it_is():
+def test_a_solution_for_eyes_that_see_no_panel_is_shown_as_it_is() -> None:
     behind = HEAD - np.array([0.7, 0.0, 0.0])
     aligned = align(STACK, solved_for_m=behind, eyes_m=HEAD)
     assert all(is_identity(matrix) for matrix in aligned.solved_from_shown) and aligned.limited
 
 
 @given(stack=ANY_STACK, old=heads(), direction=st.tuples(*[floats(-1.0, 1.0)] * 3), turn=floats(-0.02, 0.02))
-def test_at_a_limit_nothing_jumps(stack, old, direction, turn):
+def test_at_a_limit_nothing_jumps(
+    stack: PanelStack, old: NDArray[np.float64], direction: tuple[float, float, float], turn: float
+) -> None:
     """Along a straight way, out to far beyond any limit: a small step of the eyes is a small step of the panels."""
     assume(np.linalg.norm(direction) > 0.1)
 
@@ -254,35 +268,37 @@ def slow_sample(layer: np.ndarray, m: np.ndarray, row: int, column: int) -> np.n
         matrix(shift_v=500.0),
     ],
 )
-def test_a_shown_pixel_is_the_bilinear_sample_of_the_solution_and_even_beside_it(layers, m):
+def test_a_shown_pixel_is_the_bilinear_sample_of_the_solution_and_even_beside_it(
+    layers: np.ndarray, m: NDArray[np.float64]
+) -> None:
     shown = shown_layers(PanelFrame(1, layers, 1, (np.eye(3), np.eye(3), m)))
     assert np.array_equal(shown[:2], layers[:2])
     expected = np.array([[slow_sample(layers[2], m, row, column) for column in range(70)] for row in range(90)])
     assert np.abs(shown[2, ..., :3] - expected).max() <= 0.501
 
 
-def test_whole_pixels_are_moved_to_the_bit(layers):
+def test_whole_pixels_are_moved_to_the_bit(layers: np.ndarray) -> None:
     shown = shown_layers(PanelFrame(1, layers, 1, (matrix(shift_u=4.0, shift_v=-2.0),) * 3))
     assert np.array_equal(shown[:, 2:, :-4, :3], layers[:, :-2, 4:, :3])
     assert (shown[:, :2, :, :3] == EVEN_CODE).all() and (shown[:, :, -4:, :3] == EVEN_CODE).all()
 
 
-def test_even_is_where_the_solver_starts_its_outer_panels():
+def test_even_is_where_the_solver_starts_its_outer_panels() -> None:
     assert EVEN_CODE == NEUTRAL
 
 
-def test_where_nothing_moves_nothing_is_resampled_or_copied(layers):
+def test_where_nothing_moves_nothing_is_resampled_or_copied(layers: np.ndarray) -> None:
     assert shown_layers(PanelFrame(1, layers, 1)) is layers
     assert shown_layers(PanelFrame(1, layers, 1, (np.eye(3),) * 3, layers[::-1], 1, 0.0)) is layers
 
 
-def test_the_flat_picture_alone_or_without_a_solution_is_itself(layers):
+def test_the_flat_picture_alone_or_without_a_solution_is_itself(layers: np.ndarray) -> None:
     assert shown_layers(PanelFrame(1, layers, 1, (matrix(shift_u=1.5),) * 3, layers[::-1], 1, 1.0)).base is layers
     flat = layers.copy()
     assert shown_layers(PanelFrame(1, None, 0, (), flat, 1, 0.0)) is flat
 
 
-def test_the_aligned_solution_is_mixed_with_the_flat_picture_that_never_moves(layers):
+def test_the_aligned_solution_is_mixed_with_the_flat_picture_that_never_moves(layers: np.ndarray) -> None:
     flat = layers[::-1].copy()
     m = matrix(1.01, 1.01, 2.25, -1.5)
     aligned = shown_layers(PanelFrame(1, layers, 1, (m,) * 3)).astype(float)
@@ -290,7 +306,7 @@ def test_the_aligned_solution_is_mixed_with_the_flat_picture_that_never_moves(la
     assert np.abs(shown - (0.75 * aligned + 0.25 * flat))[..., :3].max() <= 0.5 + 0.75 * 0.5
 
 
-def test_a_frame_that_has_nothing_to_show_or_more_than_scale_and_shift_is_refused(layers):
+def test_a_frame_that_has_nothing_to_show_or_more_than_scale_and_shift_is_refused(layers: np.ndarray) -> None:
     with pytest.raises(ValueError, match="flat"):
         shown_layers(PanelFrame(1, None, 0))
     with pytest.raises(ValueError, match="flat"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from random import Random
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ def test_what_an_eye_sees_is_the_jones_product_between_crossed_polarizers(values
 
 
 @given(panel_values, st.randoms(use_true_random=False))
-def test_the_order_of_the_panels_does_not_matter_to_a_single_ray(values: list[float], random) -> None:
+def test_the_order_of_the_panels_does_not_matter_to_a_single_ray(values: list[float], random: Random) -> None:
     shuffled = list(values)
     random.shuffle(shuffled)
     assert jones_intensity(values) == pytest.approx(jones_intensity(shuffled), abs=1e-14)
@@ -47,7 +48,7 @@ def test_a_rotator_turns_counter_clockwise_and_keeps_the_light(angle: float) -> 
 
 @pytest.mark.parametrize("branch", [1, 2])
 @given(intensity=floats(0.0, 1.0))
-def test_each_branch_inverts_malus_law_within_its_own_range(branch, intensity: float) -> None:
+def test_each_branch_inverts_malus_law_within_its_own_range(branch: int, intensity: float) -> None:
     phase = phase_from_intensity(np.array(intensity), branch)
     assert branch - 1 <= phase <= branch
     assert float(intensity_from_phase(phase)) == pytest.approx(intensity, abs=1e-15)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from runtime.optics.retina import average, panel_positions, pupil_points, ray_mask, sample_bilinear, seen_by
 from runtime.optics.stack import PanelStack
@@ -15,7 +16,9 @@ from tests.optics import reference
 from tests.optics.strategies import eyes, floats, stacks
 
 
-def traced(eye: np.ndarray, layers: np.ndarray, stack: PanelStack, *, size: tuple[int, int], fov_deg: float):
+def traced(
+    eye: np.ndarray, layers: np.ndarray, stack: PanelStack, *, size: tuple[int, int], fov_deg: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.float64]]:
     """(h, w) intensity, mask and margin of a grey stack by the reference, one ray at a time."""
     grey = [layer.tolist() for layer in layers.astype(float)]
     rows = [

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from runtime.optics.retina import panel_positions, seen_by
 from runtime.optics.stack import PanelStack, Tilt
@@ -17,7 +18,9 @@ TILTED = replace(STACK, tilt=Tilt(((0.001, 0.012, -0.006), (0.0, 0.0, 0.0), (-0.
 EYES = ((0.5, 0.03, 0.0), (0.42, -0.1, 0.05), (0.7, 0.2, -0.1))
 
 
-def traced(stack, index, eye_m, place_m):
+def traced(
+    stack: PanelStack, index: int, eye_m: NDArray[np.float64], place_m: tuple[float | np.float32, float | np.float32]
+) -> NDArray[np.float64]:
     """(2,) where the layer has what an eye sees at (y, z) of the ideal panel: two rays and a plane."""
     offset, right, up = stack.tilt.depth[index]
     normal, far = np.array([1.0, -right, -up]), stack.x_m[index] + offset
@@ -30,25 +33,25 @@ def traced(stack, index, eye_m, place_m):
 
 @pytest.mark.parametrize("eye", EYES)
 @pytest.mark.parametrize("index", [0, 2])
-def test_a_tilted_panel_is_where_two_rays_and_a_plane_put_it(eye, index):
+def test_a_tilted_panel_is_where_two_rays_and_a_plane_put_it(eye: tuple[float, float, float], index: int) -> None:
     matrix = layer_from_seen(TILTED, index, np.array(eye))
     for place in ((0.0, 0.0), (0.2, 0.1), (-0.25, -0.14)):
         found = matrix @ [*place, 1.0]
         np.testing.assert_allclose(found[:2] / found[2], traced(TILTED, index, np.array(eye), place), atol=1e-12)
 
 
-def test_from_the_place_of_registration_every_panel_looks_parallel():
+def test_from_the_place_of_registration_every_panel_looks_parallel() -> None:
     for index in range(3):
         np.testing.assert_allclose(layer_from_seen(TILTED, index, np.array(PLACE)), np.eye(3), atol=1e-12)
 
 
-def test_a_panel_that_is_not_tilted_moves_for_nobody():
+def test_a_panel_that_is_not_tilted_moves_for_nobody() -> None:
     assert np.array_equal(layer_from_seen(TILTED, 1, np.array(EYES[0])), np.eye(3))
     assert np.array_equal(layer_from_seen(STACK, 2, np.array(EYES[0])), np.eye(3))
 
 
 @pytest.mark.parametrize("eye", EYES)
-def test_what_is_simplified_stays_within_what_is_not_seen(eye):
+def test_what_is_simplified_stays_within_what_is_not_seen(eye: tuple[float, float, float]) -> None:
     u, v = np.meshgrid(np.linspace(-0.259, 0.259, 9), np.linspace(-0.145, 0.145, 9))
     places = np.column_stack([u.ravel(), v.ravel(), np.ones(u.size)])
     for scale in (1e-3, 0.05, 1.0):
@@ -61,19 +64,19 @@ def test_what_is_simplified_stays_within_what_is_not_seen(eye):
         assert np.abs(exact - simple).max() < 1.5 * UNSEEN_PX * STACK.width_m / STACK.width_px
 
 
-def test_a_tilt_that_nobody_sees_costs_nothing():
+def test_a_tilt_that_nobody_sees_costs_nothing() -> None:
     hardly = replace(STACK, tilt=Tilt(((0.0, 1e-5, 1e-5),) * 3, PLACE))
     assert np.array_equal(coarse_layer_from_seen(hardly, 2, np.array(EYES[0])), np.eye(3))
 
 
-def test_a_tilt_about_the_upright_alone_is_a_scale_and_a_shift():
+def test_a_tilt_about_the_upright_alone_is_a_scale_and_a_shift() -> None:
     stack = replace(STACK, tilt=Tilt(((0.0, 0.01, 0.0),) * 3, (0.5, 0.0, 0.0)))
     matrix = coarse_layer_from_seen(stack, 2, np.array([0.5, 0.031, 0.0]))
     assert matrix[0, 0] != 1.0
     assert not matrix[[0, 1, 2, 2], [1, 0, 0, 1]].any()
 
 
-def test_a_cut_out_part_and_the_whole_agree():
+def test_a_cut_out_part_and_the_whole_agree() -> None:
     y_m, z_m, eye = 0.08, -0.05, np.array([0.5, 0.03, 0.01])
     part = replace(TILTED, tilt=TILTED.tilt.moved(y_m, z_m))
     whole = layer_from_seen(TILTED, 2, eye) @ [0.1, 0.02, 1.0]
@@ -81,7 +84,7 @@ def test_a_cut_out_part_and_the_whole_agree():
     np.testing.assert_allclose(found[:2] / found[2] + [y_m, z_m], whole[:2] / whole[2], atol=1e-12)
 
 
-def test_a_stack_that_is_turned_tilts_the_other_way_about():
+def test_a_stack_that_is_turned_tilts_the_other_way_about() -> None:
     eye, (y, z) = np.array([0.5, 0.03, 0.01]), (0.1, 0.02)
     turned_eye = np.array([eye[0], -eye[2], -eye[1]])
     whole = layer_from_seen(TILTED, 2, eye) @ [y, z, 1.0]
@@ -89,7 +92,7 @@ def test_a_stack_that_is_turned_tilts_the_other_way_about():
     np.testing.assert_allclose(found[:2] / found[2], [-whole[1] / whole[2], -whole[0] / whole[2]], atol=1e-12)
 
 
-def test_the_simulated_retina_looks_through_tilted_panels():
+def test_the_simulated_retina_looks_through_tilted_panels() -> None:
     small = replace(TILTED, width_px=192, height_px=108)
     flat = replace(small, tilt=None)
     view = {"fov_deg": 40.0, "width_px": 192, "height_px": 108}

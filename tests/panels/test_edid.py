@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -9,31 +11,31 @@ from runtime.panels.edid import parse
 from tests.panels.edids import block
 
 
-def test_maker_model_and_serial_are_read():
+def test_maker_model_and_serial_are_read() -> None:
     edid = parse(block(serial_text="A1B2-0003"))
     assert (edid.maker, edid.name, edid.serial, edid.product) == ("EIZ", "CG2700X", "A1B2-0003", 0x2B7A)
 
 
-def test_without_a_serial_text_the_number_serves():
+def test_without_a_serial_text_the_number_serves() -> None:
     assert parse(block(serial_number=4711)).serial == "4711"
 
 
-def test_numbers_that_mean_none_are_none():
+def test_numbers_that_mean_none_are_none() -> None:
     assert parse(block(serial_number=0)).serial == ""
     assert parse(block(serial_number=0x01010101)).serial == ""
 
 
-def test_extensions_after_the_base_block_do_no_harm():
+def test_extensions_after_the_base_block_do_no_harm() -> None:
     assert parse(block(serial_text="X") + bytes(128)).serial == "X"
 
 
 @given(st.binary(max_size=300))
-def test_noise_is_no_edid(data):
+def test_noise_is_no_edid(data: Any) -> None:
     assert parse(data) is None
 
 
 @given(st.integers(0, 127), st.integers(1, 255))
-def test_one_wrong_byte_is_noticed(position, change):
+def test_one_wrong_byte_is_noticed(position: Any, change: Any) -> None:
     data = bytearray(block(serial_text="X"))
     data[position] = (data[position] + change) % 256
     assert parse(bytes(data)) is None

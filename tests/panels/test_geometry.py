@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,30 +16,30 @@ MOUNTED = st.sampled_from([0, 90, 180, 270])
 MIRRORED = st.sampled_from(["none", "horizontal", "vertical"])
 
 
-def apply(matrix, x, y):
+def apply(matrix: Any, x: Any, y: Any) -> Any:
     u, v, w = matrix @ np.array([x, y, 1.0])
     return u / w, v / w
 
 
-def test_a_panel_turned_a_quarter_counter_clockwise_has_its_top_edge_on_the_viewers_left():
+def test_a_panel_turned_a_quarter_counter_clockwise_has_its_top_edge_on_the_viewers_left() -> None:
     matrix = panel_from_screen(screen_width_px=1920, screen_height_px=1080, rotation_deg=90, mirror="none")
     assert apply(matrix, 0, 0) == (0, 1920)  # its top left corner is at the viewer's bottom left
     assert apply(matrix, 1920, 0) == (0, 0)
     assert apply(matrix, 0, 1080) == (1080, 1920)
 
 
-def test_a_panel_upside_down_has_its_corners_exchanged():
+def test_a_panel_upside_down_has_its_corners_exchanged() -> None:
     matrix = panel_from_screen(screen_width_px=1920, screen_height_px=1080, rotation_deg=180, mirror="none")
     assert apply(matrix, 0, 0) == (1920, 1080)
 
 
-def test_mirroring_is_the_viewers_left_and_right_even_on_a_turned_panel():
+def test_mirroring_is_the_viewers_left_and_right_even_on_a_turned_panel() -> None:
     matrix = panel_from_screen(screen_width_px=1920, screen_height_px=1080, rotation_deg=90, mirror="horizontal")
     assert apply(matrix, 0, 0) == (1080, 1920)
 
 
 @given(size=SIZES, rotation_deg=MOUNTED, mirror=MIRRORED)
-def test_without_registration_pixels_are_only_permuted(size, rotation_deg, mirror):
+def test_without_registration_pixels_are_only_permuted(size: Any, rotation_deg: Any, mirror: Any) -> None:
     width, height = size
     matrix = panel_from_screen(screen_width_px=width, screen_height_px=height, rotation_deg=rotation_deg, mirror=mirror)
     assert permutes_pixels(matrix)
@@ -47,7 +49,9 @@ def test_without_registration_pixels_are_only_permuted(size, rotation_deg, mirro
 
 
 @given(size=SIZES, rotation_deg=MOUNTED, mirror=MIRRORED, dx=st.floats(-20, 20), tilt=st.floats(-1e-5, 1e-5))
-def test_what_should_be_at_an_ideal_pixel_is_drawn_where_registration_found_it(size, rotation_deg, mirror, dx, tilt):
+def test_what_should_be_at_an_ideal_pixel_is_drawn_where_registration_found_it(
+    size: Any, rotation_deg: Any, mirror: Any, dx: Any, tilt: Any
+) -> None:
     width, height = size
     homography = np.array([[1.01, 0.002, dx], [-0.003, 0.99, 2.0], [tilt, 0.0, 1.0]])
     common = {"screen_width_px": width, "screen_height_px": height, "rotation_deg": rotation_deg, "mirror": mirror}
@@ -59,7 +63,7 @@ def test_what_should_be_at_an_ideal_pixel_is_drawn_where_registration_found_it(s
     assert apply(layer, *screen) == pytest.approx(ideal, abs=1e-6 * max(size))
 
 
-def test_layers_of_half_the_resolution_fill_the_panel():
+def test_layers_of_half_the_resolution_fill_the_panel() -> None:
     matrix = layer_from_screen(
         screen_width_px=1920, screen_height_px=1080, layer_width_px=960, layer_height_px=540,
         rotation_deg=0, mirror="none", homography=IDENTITY,
@@ -68,12 +72,12 @@ def test_layers_of_half_the_resolution_fill_the_panel():
     assert not permutes_pixels(matrix)
 
 
-def test_a_shift_by_half_a_pixel_is_no_permutation_and_one_by_a_pixel_is():
+def test_a_shift_by_half_a_pixel_is_no_permutation_and_one_by_a_pixel_is() -> None:
     assert not permutes_pixels(np.array([[1, 0, 0.5], [0, 1, 0], [0, 0, 1.0]]))
     assert permutes_pixels(np.array([[1, 0, 1.0], [0, 1, 0], [0, 0, 1.0]]))
 
 
-def test_a_singular_homography_is_refused():
+def test_a_singular_homography_is_refused() -> None:
     with pytest.raises(ValueError, match="invertible"):
         layer_from_screen(
             screen_width_px=16, screen_height_px=16, layer_width_px=16, layer_height_px=16,

@@ -7,11 +7,15 @@ import os
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import Popen
+from typing import Any
 
 import numpy as np
 import pytest
 import typer
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from calib.interview import Interview, identity
 from calib.keys import Key
@@ -25,7 +29,7 @@ from runtime.panels.monitors import Monitor
 from runtime.panels.mounting import mounting_of
 from runtime.support.artifacts import read_image
 from tests.panels.edids import block
-from tests.panels.xserver import HEIGHT_PX, WIDTH_PX
+from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, XServer
 from tests.waiting import eventually
 
 BOUND = f"""
@@ -44,14 +48,14 @@ connector = "DUMMY0"
 """
 
 
-def invoke(command, *arguments):
+def invoke(command: Callable[..., Any], *arguments: Any) -> Result:
     app = typer.Typer()
     app.command()(command)
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 @pytest.fixture
-def x(screen, monkeypatch):
+def x(screen: XServer, monkeypatch: pytest.MonkeyPatch) -> XServer:
     monkeypatch.setenv("DISPLAY", screen.name)
     screen.set_edid(0, bytes(128))
     screen.set_edid(1, block(serial_text="A1B2-0003"))
@@ -60,7 +64,7 @@ def x(screen, monkeypatch):
 
 
 @pytest.fixture
-def config(tmp_path):
+def config(tmp_path: Path) -> Path:
     path = tmp_path / "phasestack.toml"
     path.write_text(BOUND)
     return path
@@ -70,7 +74,7 @@ def card(title: str, *lines: str) -> np.ndarray:
     return identity_card(WIDTH_PX, HEIGHT_PX, title=title, lines=lines)
 
 
-def test_a_card_shows_its_edges_and_its_colours():
+def test_a_card_shows_its_edges_and_its_colours() -> None:
     picture = card("PANEL 0", "rear")
     for edge in (picture[0], picture[-1], picture[:, 0], picture[:, -1]):
         assert (edge == 255).all()
@@ -78,19 +82,19 @@ def test_a_card_shows_its_edges_and_its_colours():
     assert {tuple(colour) for colour in row.tolist()} >= set(BARS)
 
 
-def test_no_turning_or_mirroring_of_a_card_looks_like_it():
+def test_no_turning_or_mirroring_of_a_card_looks_like_it() -> None:
     picture = card("PANEL 0")
     for other in (picture[::-1], picture[:, ::-1], picture[::-1, ::-1]):
         assert not np.array_equal(picture, other)
 
 
 @pytest.mark.parametrize("size", [(64, 36), (1920, 1080), (1080, 1920)])
-def test_cards_fit_any_monitor(size):
+def test_cards_fit_any_monitor(size: tuple[int, int]) -> None:
     picture = identity_card(*size, title="DisplayPort-1-8 ä", lines=["a line that is far too long for it " * 5] * 5)
     assert picture.shape == (size[1], size[0], 4)
 
 
-def shown_during(command, *arguments, when):
+def shown_during(command: Callable[..., Any], *arguments: Any, when: Callable[..., Any]) -> tuple[Result, bool]:
     """The command's result, and whether `when` held while it ran."""
     held = []
     watcher = threading.Thread(target=lambda: held.append(eventually(when, within_s=8.0)))
@@ -101,7 +105,7 @@ def shown_during(command, *arguments, when):
 
 
 @pytest.mark.windows
-def test_without_a_configuration_every_monitor_tells_how_to_name_it(x):
+def test_without_a_configuration_every_monitor_tells_how_to_name_it(x: XServer) -> None:
     result, seen = shown_during(
         identify, "--all", "--seconds", 4, when=lambda: all((x.panel(index)[0] == 255).all() for index in range(3))
     )
@@ -113,7 +117,7 @@ def test_without_a_configuration_every_monitor_tells_how_to_name_it(x):
 
 
 @pytest.mark.windows
-def test_with_a_configuration_panels_are_shown_as_they_will_be(x, config):
+def test_with_a_configuration_panels_are_shown_as_they_will_be(x: XServer, config: Path) -> None:
     bars = round(HEIGHT_PX * 0.85)
 
     def upright_but_for_the_turned_one() -> bool:
@@ -129,7 +133,7 @@ def test_with_a_configuration_panels_are_shown_as_they_will_be(x, config):
 
 
 @pytest.mark.windows
-def test_one_panel_shows_its_card_and_the_others_are_clear(x, config):
+def test_one_panel_shows_its_card_and_the_others_are_clear(x: XServer, config: Path) -> None:
     def only_the_middle() -> bool:
         return x.panel(1).any() and not x.panel(0).any() and not x.panel(2).any()
 
@@ -138,20 +142,20 @@ def test_one_panel_shows_its_card_and_the_others_are_clear(x, config):
     assert seen
 
 
-def started(x, *arguments):
+def started(x: XServer, *arguments: Path | str) -> Popen[Any]:
     """The command in a process of its own, its keys in our hands."""
     command = [sys.executable, "-m", "runtime.cli", "identify", *map(str, arguments)]
     environment = os.environ | {"DISPLAY": x.name, "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
-def lit(x) -> list[bool]:
+def lit(x: XServer) -> list[bool]:
     screen = x.screenshot()
     return [bool(screen[:HEIGHT_PX, WIDTH_PX * n : WIDTH_PX * (n + 1)].any()) for n in range(3)]
 
 
 @pytest.mark.windows
-def test_keys_go_from_panel_to_panel(x, config):
+def test_keys_go_from_panel_to_panel(x: XServer, config: Path) -> None:
     with started(x, "--config", config) as running:
         try:
             # Rear to front lie on monitors 2, 1, 0.
@@ -165,7 +169,7 @@ def test_keys_go_from_panel_to_panel(x, config):
 
 
 @pytest.mark.windows
-def test_answers_write_the_configuration(x, tmp_path):
+def test_answers_write_the_configuration(x: XServer, tmp_path: Path) -> None:
     config = tmp_path / "new.toml"
     config.write_text(
         f"# mine\n[stack]\nwidth_px = {WIDTH_PX}\nheight_px = {HEIGHT_PX}\n"
@@ -190,7 +194,7 @@ def test_answers_write_the_configuration(x, tmp_path):
 
 
 @pytest.mark.windows
-def test_who_stops_before_the_last_answer_changes_nothing(x, config):
+def test_who_stops_before_the_last_answer_changes_nothing(x: XServer, config: Path) -> None:
     with started(x, "--config", config, "--ask") as running:
         running.communicate("n\nq", timeout=60)
         assert running.returncode == 0
@@ -200,12 +204,12 @@ def test_who_stops_before_the_last_answer_changes_nothing(x, config):
 MONITORS = [Monitor(f"HDMI-{n}", serial, "", 100 * n, 0, 100, 50, 60.0) for n, serial in enumerate(("S", "T", "T", ""))]
 
 
-def test_a_monitor_is_named_by_a_serial_of_its_own_or_else_by_its_connector():
+def test_a_monitor_is_named_by_a_serial_of_its_own_or_else_by_its_connector() -> None:
     named = [identity(monitor, MONITORS) for monitor in MONITORS]
     assert named == [{"edid_serial": "S"}, {"connector": "HDMI-1"}, {"connector": "HDMI-2"}, {"connector": "HDMI-3"}]
 
 
-def test_a_monitor_that_is_taken_is_not_offered_again_and_an_answer_can_be_taken_back():
+def test_a_monitor_that_is_taken_is_not_offered_again_and_an_answer_can_be_taken_back() -> None:
     said: list[str] = []
     interview = Interview(MONITORS, panels=2, say=said.append)
     for key in (Key.NEXT, Key.ACCEPT, Key.UP, Key.ACCEPT):
@@ -225,7 +229,7 @@ def test_a_monitor_that_is_taken_is_not_offered_again_and_an_answer_can_be_taken
 
 @pytest.mark.parametrize("rotation_deg", [0, 90, 180, 270])
 @pytest.mark.parametrize("mirror", ["none", "horizontal"])
-def test_the_mounting_that_is_answered_shows_the_card_upright(rotation_deg, mirror):
+def test_the_mounting_that_is_answered_shows_the_card_upright(rotation_deg: int, mirror: str) -> None:
     """A card sent bare to a panel that is so mounted, and what the arrow on it does: the answer gives the mounting."""
     card_points_up = np.array([0.0, -1.0])
     seen = panel_from_screen(screen_width_px=4, screen_height_px=3, rotation_deg=rotation_deg, mirror=mirror)
@@ -237,7 +241,9 @@ def test_the_mounting_that_is_answered_shows_the_card_upright(rotation_deg, mirr
 @pytest.mark.parametrize(
     "options", [["--ask"], ["--panel", "3", "--out", "cards"], ["--panel", "-2", "--out", "cards"]]
 )
-def test_wrong_requests_are_refused(tmp_path, config, monkeypatch, options):
+def test_wrong_requests_are_refused(
+    tmp_path: Path, config: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     chosen = [] if "--ask" in options else ["--config", config]
     result = invoke(identify, *chosen, *options)
@@ -245,7 +251,9 @@ def test_wrong_requests_are_refused(tmp_path, config, monkeypatch, options):
     assert not (tmp_path / "cards").exists()
 
 
-def test_it_can_write_pictures_where_there_is_no_screen(tmp_path, config, monkeypatch):
+def test_it_can_write_pictures_where_there_is_no_screen(
+    tmp_path: Path, config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     result = invoke(identify, "--config", config, "--out", tmp_path / "cards")
     assert result.exit_code == 0
@@ -255,7 +263,7 @@ def test_it_can_write_pictures_where_there_is_no_screen(tmp_path, config, monkey
     assert tuple(pictures[0][HEIGHT_PX - 1 - bars, -13]) == BARS[0]
 
 
-def test_without_a_screen_it_says_so_in_one_line(monkeypatch):
+def test_without_a_screen_it_says_so_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     result = invoke(identify, "--seconds", 1)
     assert isinstance(result.exception, InputError)
@@ -263,7 +271,7 @@ def test_without_a_screen_it_says_so_in_one_line(monkeypatch):
 
 
 @pytest.mark.windows
-def test_the_doctor_lists_monitors_and_their_binding(x, config):
+def test_the_doctor_lists_monitors_and_their_binding(x: XServer, config: Path) -> None:
     checks = json.loads(invoke(doctor, "--json", "--config", config).stdout)["checks"]
     monitors = [check["detail"] for check in checks if check["name"] == "monitor"]
     assert any("A1B2-0003" in monitor for monitor in monitors)
@@ -271,7 +279,7 @@ def test_the_doctor_lists_monitors_and_their_binding(x, config):
 
 
 @pytest.mark.windows
-def test_the_doctor_names_a_panel_whose_monitor_is_missing(x, config):
+def test_the_doctor_names_a_panel_whose_monitor_is_missing(x: XServer, config: Path) -> None:
     config.write_text(BOUND.replace("A1B2-0003", "ANOTHER"))
     result = invoke(doctor, "--json", "--config", config)
     failed = {check["name"]: check for check in json.loads(result.stdout)["checks"] if check["state"] == "fail"}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -9,16 +11,16 @@ from runtime.errors import InputError
 from runtime.panels.lut import curve, identity
 
 
-def test_without_a_curve_the_grey_is_the_phase():
+def test_without_a_curve_the_grey_is_the_phase() -> None:
     assert np.array_equal(np.rint(identity() * 255), np.repeat(np.arange(256)[:, None], 3, axis=1))
 
 
-def test_a_gamma_undoes_the_panels_own():
+def test_a_gamma_undoes_the_panels_own() -> None:
     grey = curve(lut="", gamma=2.2)
     assert np.allclose(grey[:, 0] ** 2.2, np.linspace(0, 1, 256), atol=1e-6)
 
 
-def test_a_measured_curve_is_read_per_channel_and_interpolated(tmp_path):
+def test_a_measured_curve_is_read_per_channel_and_interpolated(tmp_path: Path) -> None:
     path = tmp_path / "curve.csv"
     path.write_text("phase,red,green,blue\n0,0,0,0\n0.5,0.25,0.5,0.75\n1,1,1,1\n")
     grey = curve(lut=str(path), gamma=1.0)
@@ -26,7 +28,7 @@ def test_a_measured_curve_is_read_per_channel_and_interpolated(tmp_path):
     assert quarter == pytest.approx(np.array([0.5, 1.0, 1.5]) * 64 / 255, abs=1e-6)
 
 
-def test_one_grey_column_serves_all_channels(tmp_path):
+def test_one_grey_column_serves_all_channels(tmp_path: Path) -> None:
     path = tmp_path / "curve.csv"
     path.write_text("# measured\nphase,grey\n0,0.1\n1,0.9\n")
     assert curve(lut=str(path), gamma=1.0)[[0, 255]] == pytest.approx(np.array([[0.1] * 3, [0.9] * 3]))
@@ -45,7 +47,7 @@ def test_one_grey_column_serves_all_channels(tmp_path):
         ("phase,grey\n0,0\n1\n", "row 3"),
     ],
 )
-def test_a_wrong_curve_is_refused_by_file_and_field(tmp_path, text, field):
+def test_a_wrong_curve_is_refused_by_file_and_field(tmp_path: Path, text: str, field: str) -> None:
     path = tmp_path / "curve.csv"
     path.write_text(text)
     with pytest.raises(InputError) as caught:
@@ -54,6 +56,6 @@ def test_a_wrong_curve_is_refused_by_file_and_field(tmp_path, text, field):
     assert caught.value.field == field
 
 
-def test_a_missing_curve_is_named(tmp_path):
+def test_a_missing_curve_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.csv"):
         curve(lut=str(tmp_path / "none.csv"), gamma=1.0)

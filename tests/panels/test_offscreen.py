@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import gc
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 
+import moderngl
 import numpy as np
 import psutil
 import pytest
+from numpy.typing import NDArray
 
 from runtime.clock import SimulatedClock
 from runtime.config import OutputSettings, PanelSettings
@@ -15,18 +20,22 @@ from runtime.optics.alignment import align, shown_layers
 from runtime.optics.stack import PanelStack
 from runtime.panels.offscreen import OffscreenPanels
 from runtime.panels.registry import open_panels
-from runtime.records import PanelFrame
+from runtime.records import Layers, PanelFrame
 from runtime.support.gl import offscreen_context
+from runtime.support.gl_sharing import ShareGroup
+from tests.support.left_in_textures import on_a_thread_of_its_own
 
 WIDTH, HEIGHT = 48, 32
 
 
 @pytest.fixture
-def layers():
+def layers() -> NDArray[np.uint8]:
     return np.random.default_rng(7).integers(0, 256, (3, HEIGHT, WIDTH, 4), dtype=np.uint8)
 
 
-def shown(context, layers, *panels, clock=None, draw=False):
+def shown(
+    context: moderngl.Context, layers: NDArray[np.uint8], *panels: PanelSettings, clock: None = None, draw: bool = False
+) -> list[NDArray[np.uint8]] | None:
     sink = OffscreenPanels(
         context, clock=clock or SimulatedClock(), width_px=WIDTH, height_px=HEIGHT, panels=panels, draw=draw
     )
@@ -37,7 +46,9 @@ def shown(context, layers, *panels, clock=None, draw=False):
         sink.close()
 
 
-def test_by_default_every_panel_shows_its_layer_to_the_bit(context, layers):
+def test_by_default_every_panel_shows_its_layer_to_the_bit(
+    context: moderngl.Context, layers: NDArray[np.uint8]
+) -> None:
     pictures = shown(context, layers, PanelSettings(), PanelSettings(), PanelSettings())
     for picture, layer in zip(pictures, layers, strict=True):
         assert np.array_equal(picture, layer[..., :3])
@@ -46,21 +57,28 @@ def test_by_default_every_panel_shows_its_layer_to_the_bit(context, layers):
 @pytest.mark.parametrize(("rotation_deg", "clockwise_quarters"), [(0, 0), (90, 1), (180, 2), (270, 3)])
 @pytest.mark.parametrize(("mirror", "axis"), [("none", None), ("horizontal", 1), ("vertical", 0)])
 def test_a_mounted_panel_is_sent_its_picture_mirrored_then_turned_against_the_mounting(
-    context, layers, rotation_deg, clockwise_quarters, mirror, axis
-):
+    context: moderngl.Context,
+    layers: NDArray[np.uint8],
+    rotation_deg: int,
+    clockwise_quarters: int,
+    mirror: str,
+    axis: int | None,
+) -> None:
     (picture,) = shown(context, layers[:1], PanelSettings(rotation_deg=rotation_deg, mirror=mirror))
     seen = layers[0, ..., :3] if axis is None else np.flip(layers[0, ..., :3], axis)
     assert np.array_equal(picture, np.rot90(seen, -clockwise_quarters))
 
 
-def test_a_registered_panel_is_sent_its_picture_where_registration_found_it(context, layers):
+def test_a_registered_panel_is_sent_its_picture_where_registration_found_it(
+    context: moderngl.Context, layers: NDArray[np.uint8]
+) -> None:
     shift = ((1.0, 0.0, 5.0), (0.0, 1.0, -3.0), (0.0, 0.0, 1.0))
     (picture,) = shown(context, layers[:1], PanelSettings(homography=shift))
     assert np.array_equal(picture[:-3, 5:], layers[0, 3:, :-5, :3])
     assert not picture[:, :5].any() and not picture[-3:].any()  # beyond the layer there is no phase
 
 
-def test_half_a_pixel_of_registration_is_interpolated(context, layers):
+def test_half_a_pixel_of_registration_is_interpolated(context: moderngl.Context, layers: NDArray[np.uint8]) -> None:
     shift = ((1.0, 0.0, 0.5), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     (picture,) = shown(context, layers[:1], PanelSettings(homography=shift))
     before, left, right, after = (layers[0, :, k : WIDTH - 3 + k, :3].astype(float) for k in range(4))
@@ -68,7 +86,7 @@ def test_half_a_pixel_of_registration_is_interpolated(context, layers):
     assert np.abs(picture[:, 2:-1] - np.clip(cubic, 0, 255)).max() <= 1.0
 
 
-def test_a_perspective_registration_agrees_with_an_independent_warp(context):
+def test_a_perspective_registration_agrees_with_an_independent_warp(context: moderngl.Context) -> None:
     import cv2
 
     smooth = cv2.GaussianBlur(np.random.default_rng(3).integers(0, 256, (HEIGHT, WIDTH, 4)).astype(np.uint8), (0, 0), 4)
@@ -80,14 +98,16 @@ def test_a_perspective_registration_agrees_with_an_independent_warp(context):
     assert np.abs(picture[inner].astype(int) - expected[inner][..., :3]).max() <= 2
 
 
-def test_a_homography_may_have_either_sign(context, layers):
+def test_a_homography_may_have_either_sign(context: moderngl.Context, layers: NDArray[np.uint8]) -> None:
     negative = tuple(tuple(-float(i == j) for j in range(3)) for i in range(3))
     (picture,) = shown(context, layers[:1], PanelSettings(homography=negative))
     assert np.array_equal(picture, layers[0, ..., :3])
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_horizon_just_beyond_the_panel_darkens_nothing(context, layers, sign):
+def test_a_horizon_just_beyond_the_panel_darkens_nothing(
+    context: moderngl.Context, layers: NDArray[np.uint8], sign: float
+) -> None:
     """Below the picture, but nearer than twice its height: what counts is the panel's middle."""
     bent = sign * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1 / (1.5 * HEIGHT), 1.0]])
     settings = PanelSettings(homography=tuple(map(tuple, bent.tolist())))
@@ -95,7 +115,7 @@ def test_a_horizon_just_beyond_the_panel_darkens_nothing(context, layers, sign):
     assert (picture[: HEIGHT // 3, : WIDTH // 2] == 200).all()
 
 
-def test_each_channel_goes_through_its_own_curve(context, tmp_path):
+def test_each_channel_goes_through_its_own_curve(context: moderngl.Context, tmp_path: Path) -> None:
     path = tmp_path / "curve.csv"
     path.write_text("phase,red,green,blue\n0,0,1,0.5\n1,1,0,0.5\n")
     ramp = np.zeros((1, HEIGHT, WIDTH, 4), np.uint8)
@@ -106,7 +126,7 @@ def test_each_channel_goes_through_its_own_curve(context, tmp_path):
     assert np.abs(picture[..., 2] - 127.5).max() == 0.5
 
 
-def test_a_gamma_changes_greys_and_keeps_black_and_white(context):
+def test_a_gamma_changes_greys_and_keeps_black_and_white(context: moderngl.Context) -> None:
     ramp = np.repeat(np.arange(0, 256, 8, dtype=np.uint8)[:, None, None], WIDTH, axis=1).repeat(4, axis=2)[None]
     (picture,) = shown(context, ramp, PanelSettings(gamma=2.2))
     expected = 255 * (ramp[0, ..., :3] / 255) ** (1 / 2.2)
@@ -129,13 +149,13 @@ def smooth(seed: int) -> np.ndarray:
 
 
 @pytest.fixture
-def sink(context):
+def sink(context: moderngl.Context) -> Iterator[OffscreenPanels]:
     made = open_panels(OutputSettings(), STACK, SimulatedClock(), context)
     yield made
     made.close()
 
 
-def codes(pictures) -> np.ndarray:
+def codes(pictures: NDArray[np.uint8] | tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]) -> np.ndarray:
     return np.stack(pictures)[..., :3].astype(int)
 
 
@@ -143,7 +163,9 @@ def codes(pictures) -> np.ndarray:
 @pytest.mark.parametrize(
     "step_m", [(0.0, 0.004, 0.0), (0.01, 0.016, 0.008), (-0.3, -0.1, 0.05), (1.0, 0.9, -0.2), (0.0, 9.0, 0.0)]
 )
-def test_the_shader_shows_what_its_reference_says(sink, step_m, flatness):
+def test_the_shader_shows_what_its_reference_says(
+    sink: OffscreenPanels, step_m: tuple[float, float, float], flatness: float
+) -> None:
     matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array(step_m)).solved_from_shown
     frame = PanelFrame(1, smooth(1), 1, matrices, smooth(2), 1, flatness)
     sink.present(frame)
@@ -152,14 +174,14 @@ def test_the_shader_shows_what_its_reference_says(sink, step_m, flatness):
     assert (difference <= 1).mean() >= 0.999
 
 
-def test_a_panel_that_needs_no_alignment_is_fetched_to_the_bit_beside_those_that_do(sink):
+def test_a_panel_that_needs_no_alignment_is_fetched_to_the_bit_beside_those_that_do(sink: OffscreenPanels) -> None:
     frame = PanelFrame(1, smooth(1), 1, align(STACK, solved_for_m=HEAD, eyes_m=HEAD * 1.01).solved_from_shown)
     sink.present(frame)
     assert np.array_equal(codes(sink.read_back())[1], codes(frame.solved)[1])
     assert not np.array_equal(codes(sink.read_back())[0], codes(frame.solved)[0])
 
 
-def test_a_head_that_returns_is_shown_the_solution_to_the_bit_again(sink):
+def test_a_head_that_returns_is_shown_the_solution_to_the_bit_again(sink: OffscreenPanels) -> None:
     solved = smooth(1)
     for number, eyes_m in enumerate((HEAD, HEAD + 0.01, HEAD)):
         matrices = align(STACK, solved_for_m=HEAD, eyes_m=eyes_m).solved_from_shown
@@ -170,8 +192,8 @@ def test_a_head_that_returns_is_shown_the_solution_to_the_bit_again(sink):
 @pytest.mark.parametrize(("rotation_deg", "clockwise_quarters"), [(0, 0), (90, 1), (180, 2), (270, 3)])
 @pytest.mark.parametrize(("mirror", "axis"), [("none", None), ("horizontal", 2), ("vertical", 1)])
 def test_layers_are_aligned_as_the_viewer_sees_them_then_mirrored_and_turned(
-    context, rotation_deg, clockwise_quarters, mirror, axis
-):
+    context: moderngl.Context, rotation_deg: int, clockwise_quarters: int, mirror: str, axis: int | None
+) -> None:
     panels = (PanelSettings(rotation_deg=rotation_deg, mirror=mirror),) * 3
     sink = OffscreenPanels(
         context, clock=SimulatedClock(), width_px=STACK.width_px, height_px=STACK.height_px, panels=panels
@@ -186,7 +208,9 @@ def test_layers_are_aligned_as_the_viewer_sees_them_then_mirrored_and_turned(
     sink.close()
 
 
-def test_a_registered_panel_is_aligned_first_and_then_sent_where_registration_found_it(context):
+def test_a_registered_panel_is_aligned_first_and_then_sent_where_registration_found_it(
+    context: moderngl.Context,
+) -> None:
     shift = PanelSettings(homography=((1.0, 0.0, 5.0), (0.0, 1.0, -3.0), (0.0, 0.0, 1.0)))
     sink = OffscreenPanels(
         context, clock=SimulatedClock(), width_px=STACK.width_px, height_px=STACK.height_px, panels=(shift,) * 3
@@ -200,7 +224,7 @@ def test_a_registered_panel_is_aligned_first_and_then_sent_where_registration_fo
     sink.close()
 
 
-def test_a_gamma_is_applied_to_what_is_aligned_and_mixed(context):
+def test_a_gamma_is_applied_to_what_is_aligned_and_mixed(context: moderngl.Context) -> None:
     gamma = (PanelSettings(gamma=2.0),) * 3
     sink = OffscreenPanels(context, clock=SimulatedClock(), width_px=480, height_px=320, panels=gamma)
     matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 0.016, 0.03])).solved_from_shown
@@ -211,44 +235,38 @@ def test_a_gamma_is_applied_to_what_is_aligned_and_mixed(context):
     sink.close()
 
 
-def test_a_solution_is_uploaded_once_however_often_it_is_aligned_and_shown(sink, monkeypatch):
-    written = []
-    for name in ("_solved", "_flat"):
-        array = getattr(sink._textures, name)
-        monkeypatch.setattr(sink._textures, name, Counting(array, name, written))
+def test_a_solution_is_uploaded_once_however_often_it_is_aligned_and_shown(
+    sink: OffscreenPanels, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written: list[Layers] = []
+    assert sink._textures is not None
+    write = sink._textures._written
+
+    def noted(held: tuple[moderngl.Texture, ...], layers: Layers) -> tuple[moderngl.Texture, ...]:
+        written.append(layers)
+        return write(held, layers)
+
+    monkeypatch.setattr(sink._textures, "_written", noted)
     solved, flat = smooth(1), smooth(2)
     for number in range(4):
         matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + 0.001 * number).solved_from_shown
         sink.present(PanelFrame(number, solved, 3, matrices, flat, 5, 0.25 * number))
         sink.read_back()
-    assert written == ["_solved", "_flat"]
+    assert [id(layers) for layers in written] == [id(solved), id(flat)]
     sink.present(PanelFrame(5, smooth(3), 4, (), flat, 5, 0.0))
-    sink.present(PanelFrame(6, smooth(3), 4, (), smooth(4), 6, 1.0))  # the solution isn't seen, the flat picture is
+    other = smooth(4)
+    sink.present(PanelFrame(6, smooth(3), 4, (), other, 6, 1.0))  # the solution isn't seen, the flat picture is
     sink.read_back()
-    assert written == ["_solved", "_flat", "_flat"]
+    assert [id(layers) for layers in written[2:]] == [id(other)]
 
 
-class Counting:
-    """A texture array that notes what is written to it."""
-
-    def __init__(self, array, name: str, written: list[str]) -> None:
-        self._array, self._name, self._written = array, name, written
-
-    def write(self, data) -> None:
-        self._written.append(self._name)
-        self._array.write(data)
-
-    def __getattr__(self, name: str):
-        return getattr(self._array, name)
-
-
-def test_a_new_solution_is_shown_where_only_its_version_tells_it_from_the_old(sink):
+def test_a_new_solution_is_shown_where_only_its_version_tells_it_from_the_old(sink: OffscreenPanels) -> None:
     for version in (1, 2):
         sink.present(PanelFrame(version, smooth(version), version))
         assert np.array_equal(codes(sink.read_back()), codes(smooth(version)))
 
 
-def test_presenting_touches_no_gl_where_nobody_looks(sink, monkeypatch):
+def test_presenting_touches_no_gl_where_nobody_looks(sink: OffscreenPanels, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sink, "_textures", object())
     matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + 0.01).solved_from_shown
     assert sink.present(PanelFrame(1, smooth(1), 1, matrices, smooth(2), 1, 0.5)).number == 1
@@ -265,12 +283,14 @@ def test_presenting_touches_no_gl_where_nobody_looks(sink, monkeypatch):
         (PanelFrame(1, smooth(1), 0, (np.eye(3),) * 2), "aligns 2 panels of 3"),
     ],
 )
-def test_a_frame_that_does_not_fit_is_a_mistake_of_the_caller(sink, frame, says):
+def test_a_frame_that_does_not_fit_is_a_mistake_of_the_caller(
+    sink: OffscreenPanels, frame: PanelFrame, says: str
+) -> None:
     with pytest.raises(ValueError, match=says):
         sink.present(frame)
 
 
-def test_the_report_tells_frame_time_and_skew(context, layers):
+def test_the_report_tells_frame_time_and_skew(context: moderngl.Context, layers: NDArray[np.uint8]) -> None:
     clock = SimulatedClock(5_000)
     sink = open_panels(OutputSettings(), PanelStack(0.5, 0.3, (-0.1, 0.0, 0.1), WIDTH, HEIGHT), clock, context)
     report = sink.present(PanelFrame(41, layers, 41))
@@ -287,14 +307,16 @@ class Ticking(SimulatedClock):
         return super().now_ns()
 
 
-def test_panels_drawn_one_after_the_other_have_a_skew(context, layers):
+def test_panels_drawn_one_after_the_other_have_a_skew(context: moderngl.Context, layers: NDArray[np.uint8]) -> None:
     panels = (PanelSettings(),) * 3
     sink = OffscreenPanels(context, clock=Ticking(), width_px=WIDTH, height_px=HEIGHT, panels=panels, draw=True)
     assert sink.present(PanelFrame(1, layers, 1)).skew_ms == 2.0
     sink.close()
 
 
-def test_a_later_frame_replaces_an_earlier_one_on_all_panels(context, layers):
+def test_a_later_frame_replaces_an_earlier_one_on_all_panels(
+    context: moderngl.Context, layers: NDArray[np.uint8]
+) -> None:
     sink = OffscreenPanels(
         context, clock=SimulatedClock(), width_px=WIDTH, height_px=HEIGHT, panels=(PanelSettings(),) * 3
     )
@@ -306,7 +328,7 @@ def test_a_later_frame_replaces_an_earlier_one_on_all_panels(context, layers):
     sink.close()
 
 
-def test_an_unchanged_frame_costs_nothing_and_stays(context, layers):
+def test_an_unchanged_frame_costs_nothing_and_stays(context: moderngl.Context, layers: NDArray[np.uint8]) -> None:
     sink = OffscreenPanels(
         context, clock=SimulatedClock(), width_px=WIDTH, height_px=HEIGHT, panels=(PanelSettings(),) * 3
     )
@@ -317,30 +339,71 @@ def test_an_unchanged_frame_costs_nothing_and_stays(context, layers):
     sink.close()
 
 
-def test_nothing_can_be_read_back_before_the_first_frame(context):
+def test_nothing_can_be_read_back_before_the_first_frame(context: moderngl.Context) -> None:
     sink = OffscreenPanels(context, clock=SimulatedClock(), width_px=WIDTH, height_px=HEIGHT, panels=(PanelSettings(),))
     with pytest.raises(ValueError, match="presented"):
         sink.read_back()
     sink.close()
 
 
-def test_layers_of_another_size_are_a_mistake_of_the_caller(context, layers):
+def test_layers_of_another_size_are_a_mistake_of_the_caller(
+    context: moderngl.Context, layers: NDArray[np.uint8]
+) -> None:
     with pytest.raises(ValueError, match="panels"):
         shown(context, layers, PanelSettings())
 
 
-def test_a_lost_context_is_a_lost_panel_not_a_crash(layers):
+def test_a_lost_context_is_a_lost_panel_not_a_crash(context: moderngl.Context, layers: NDArray[np.uint8]) -> None:
     own = offscreen_context()
     sink = OffscreenPanels(own, clock=SimulatedClock(), width_px=WIDTH, height_px=HEIGHT, panels=(PanelSettings(),) * 3)
     sink.present(PanelFrame(1, layers, 1))
-    sink._textures.release()  # what a driver's reset leaves behind: objects that are no more
+    sink.read_back()
+    assert sink._textures is not None
+    for texture in sink._textures._solved:  # what a driver's reset leaves behind: objects that are no more
+        texture.release()
     with pytest.raises(PanelLost):
         sink.read_back()
     sink.close()
     own.release()
+    context.__enter__()
 
 
-def test_opening_and_closing_gives_the_memory_back(context):
+def test_layers_that_another_thread_left_in_textures_are_shown_as_arrays_are(
+    sink: OffscreenPanels, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame = aligned(smooth(1), smooth(2))
+    sink.present(frame)
+    expected = sink.read_back()
+    assert sink.group is not None and sink._textures is not None
+    left = on_a_thread_of_its_own(sink.group, smooth(1))
+    monkeypatch.setattr(sink._textures, "_written", None)  # nothing is uploaded
+    sink.present(replace(frame, solved=left, solved_version=frame.solved_version + 1))
+    for one, other in zip(sink.read_back(), expected, strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_layers_of_another_group_are_uploaded(sink: OffscreenPanels, context: moderngl.Context) -> None:
+    frame = aligned(smooth(1), smooth(2))
+    sink.present(frame)
+    expected = sink.read_back()
+    with offscreen_context() as other:
+        left = on_a_thread_of_its_own(ShareGroup(), smooth(1))
+        context.__enter__()
+        sink.present(replace(frame, solved=left, solved_version=frame.solved_version + 1))
+        for one, another in zip(sink.read_back(), expected, strict=True):
+            assert np.array_equal(one, another)
+        other.__enter__()
+        left.group.close()
+    other.release()
+    context.__enter__()
+
+
+def aligned(solved: NDArray[np.uint8], flat: NDArray[np.uint8]) -> PanelFrame:
+    matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 0.016, 0.03])).solved_from_shown
+    return PanelFrame(1, solved, 1, matrices, flat, 1, 0.25)
+
+
+def test_opening_and_closing_gives_the_memory_back(context: moderngl.Context) -> None:
     def open_and_close() -> None:
         panels = (PanelSettings(),) * 3
         sink = OffscreenPanels(context, clock=SimulatedClock(), width_px=512, height_px=512, panels=panels)
@@ -359,7 +422,7 @@ def test_opening_and_closing_gives_the_memory_back(context):
     assert process.memory_info().rss - before < 8 * one_sink
 
 
-def test_a_wrong_number_of_panel_tables_is_refused(context):
+def test_a_wrong_number_of_panel_tables_is_refused(context: moderngl.Context) -> None:
     stack = PanelStack(0.5, 0.3, (-0.1, 0.0, 0.1), WIDTH, HEIGHT)
     with pytest.raises(InputError, match="output: panels"):
         open_panels(OutputSettings(panels=(PanelSettings(),)), stack, SimulatedClock(), context)

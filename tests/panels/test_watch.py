@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
+from typing import Any
 
+import moderngl
 import numpy as np
 import pytest
 
@@ -11,18 +14,21 @@ from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
 from runtime.config import OutputSettings, PanelSettings
 from runtime.errors import PanelLost
 from runtime.panels import xlib
-from runtime.panels.display import glfw
+from runtime.panels.display import Window, glfw
 from runtime.panels.registry import open_panels
 from runtime.panels.watch import PlacementWatch
+from runtime.panels.window import WindowPanels
+from runtime.panels.xlib import OutputState, WindowState
 from tests.panels.edids import block
 from tests.panels.test_windows import BY_CONNECTOR, STACK, frame, picture, presents, shows
+from tests.panels.xserver import XServer
 from tests.waiting import eventually
 
 pytestmark = pytest.mark.windows
 
 
 @pytest.fixture
-def x(screen, monkeypatch):
+def x(screen: XServer, monkeypatch: pytest.MonkeyPatch) -> Iterator[XServer]:
     monkeypatch.setenv("DISPLAY", screen.name)
     yield screen
     screen.place(0, 1, 2)
@@ -30,10 +36,10 @@ def x(screen, monkeypatch):
 
 
 @pytest.fixture
-def opened(x, context):
+def opened(x: XServer, context: moderngl.Context) -> Iterator[Callable[..., Any]]:
     sinks = []
 
-    def open_(*panels: PanelSettings, **settings):
+    def open_(*panels: PanelSettings, **settings: bool | str) -> WindowPanels:
         output = OutputSettings(**{"kind": "windows", "panels": panels, **settings})
         sinks.append(open_panels(output, STACK, MonotonicClock(), context))
         return sinks[-1]
@@ -43,7 +49,7 @@ def opened(x, context):
         sink.close()
 
 
-def lost(sink, *, unchanged: bool = False, within_s: float = 3.0) -> str:
+def lost(sink: WindowPanels, *, unchanged: bool = False, within_s: float = 3.0) -> str:
     """How the loss of a panel is told while the same sixty refreshes a second go on; empty: never."""
     deadline = time.monotonic() + within_s
     number = 1000
@@ -56,18 +62,20 @@ def lost(sink, *, unchanged: bool = False, within_s: float = 3.0) -> str:
     return ""
 
 
-def x11_window(sink, surface: int) -> int:
+def x11_window(sink: WindowPanels, surface: int) -> int:
     return glfw.get_x11_window(sink._surfaces[surface].window.handle)
 
 
-def comes_back(x, sink, *monitors: int) -> bool:
+def comes_back(x: XServer, sink: WindowPanels, *monitors: int) -> bool:
     return eventually(lambda: presents(sink, 7)) and all(
         shows(x, monitor, picture(7, index)) for index, monitor in enumerate(monitors)
     )
 
 
 @pytest.mark.parametrize("unchanged", [False, True])
-def test_a_window_that_somebody_destroyed_is_a_lost_panel_and_comes_back(x, opened, unchanged):
+def test_a_window_that_somebody_destroyed_is_a_lost_panel_and_comes_back(
+    x: XServer, opened: Callable[..., Any], unchanged: bool
+) -> None:
     sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
     x.do_to_window("XDestroyWindow", x11_window(sink, 1))
@@ -76,7 +84,9 @@ def test_a_window_that_somebody_destroyed_is_a_lost_panel_and_comes_back(x, open
 
 
 @pytest.mark.parametrize("kind", ["windows", "span"])
-def test_a_window_that_somebody_unmapped_is_a_lost_panel_and_comes_back(x, opened, kind):
+def test_a_window_that_somebody_unmapped_is_a_lost_panel_and_comes_back(
+    x: XServer, opened: Callable[..., Any], kind: str
+) -> None:
     sink = opened(*BY_CONNECTOR, kind=kind)
     assert presents(sink, 0)
     x.do_to_window("XUnmapWindow", x11_window(sink, -1))
@@ -86,7 +96,7 @@ def test_a_window_that_somebody_unmapped_is_a_lost_panel_and_comes_back(x, opene
     assert comes_back(x, sink, 2, 0, 1)
 
 
-def test_a_window_that_somebody_moved_is_a_lost_panel_and_comes_back(x, opened):
+def test_a_window_that_somebody_moved_is_a_lost_panel_and_comes_back(x: XServer, opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
     x.do_to_window("XMoveWindow", x11_window(sink, 0), 600, 7)
@@ -95,7 +105,7 @@ def test_a_window_that_somebody_moved_is_a_lost_panel_and_comes_back(x, opened):
 
 
 @pytest.mark.parametrize("kind", ["windows", "span"])
-def test_layers_follow_monitors_that_change_places(x, opened, kind):
+def test_layers_follow_monitors_that_change_places(x: XServer, opened: Callable[..., Any], kind: str) -> None:
     sink = opened(*BY_CONNECTOR, kind=kind)
     assert presents(sink, 0)
     x.place(1, 0, 2)
@@ -104,7 +114,9 @@ def test_layers_follow_monitors_that_change_places(x, opened, kind):
     assert [monitor.connector for monitor in sink.monitors] == ["DUMMY2", "DUMMY0", "DUMMY1"]
 
 
-def test_a_monitor_in_another_mode_of_the_same_shape_is_bound_anew_where_that_is_allowed(x, opened):
+def test_a_monitor_in_another_mode_of_the_same_shape_is_bound_anew_where_that_is_allowed(
+    x: XServer, opened: Callable[..., Any]
+) -> None:
     sink = opened(*BY_CONNECTOR, allow_rescaling=True)
     assert presents(sink, 0)
     x.set_mode(2, "half")
@@ -116,7 +128,9 @@ def test_a_monitor_in_another_mode_of_the_same_shape_is_bound_anew_where_that_is
 
 
 @pytest.mark.parametrize(("mode", "size"), [("tall", "160x180"), ("half", "160x90")])
-def test_a_monitor_in_a_mode_that_does_not_fit_is_held_and_named_until_it_is_put_right(x, opened, mode, size):
+def test_a_monitor_in_a_mode_that_does_not_fit_is_held_and_named_until_it_is_put_right(
+    x: XServer, opened: Callable[..., Any], mode: str, size: str
+) -> None:
     sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
     x.set_mode(0, mode)
@@ -126,7 +140,7 @@ def test_a_monitor_in_a_mode_that_does_not_fit_is_held_and_named_until_it_is_put
     assert comes_back(x, sink, 2, 0, 1)
 
 
-def test_another_rate_is_another_pace(x, opened):
+def test_another_rate_is_another_pace(x: XServer, opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
     x.set_mode(2, "slow")
@@ -135,7 +149,7 @@ def test_another_rate_is_another_pace(x, opened):
     assert sink.period_ns == pytest.approx(NS_PER_S / 50, rel=1e-3)
 
 
-def test_another_monitor_at_the_same_connector_is_noticed(x, opened):
+def test_another_monitor_at_the_same_connector_is_noticed(x: XServer, opened: Callable[..., Any]) -> None:
     x.set_edid(0, block(serial_text="ONE"))
     sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
@@ -146,22 +160,22 @@ def test_another_monitor_at_the_same_connector_is_noticed(x, opened):
 
 
 @pytest.mark.parametrize("kind", ["windows", "span"])
-def test_where_nothing_happens_nothing_is_lost(opened, kind):
+def test_where_nothing_happens_nothing_is_lost(opened: Callable[..., Any], kind: str) -> None:
     sink = opened(*BY_CONNECTOR, kind=kind)
     assert lost(sink, within_s=2.5) == ""
 
 
-def test_every_window_and_monitor_is_asked_about_once_a_second_one_a_refresh(opened):
+def test_every_window_and_monitor_is_asked_about_once_a_second_one_a_refresh(opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
     clock = SimulatedClock(5 * NS_PER_S)
     asked = []
 
     class Listening:
-        def window_state(self, window):
+        def window_state(self, window: Window) -> WindowState:
             asked.append(clock.now_ns())
             return sink._display.window_state(window)
 
-        def output_state(self, connector):
+        def output_state(self, connector: str) -> OutputState:
             asked.append(clock.now_ns())
             return sink._display.output_state(connector)
 
@@ -175,7 +189,7 @@ def test_every_window_and_monitor_is_asked_about_once_a_second_one_a_refresh(ope
     assert min(asked) >= 6 * NS_PER_S
 
 
-def test_a_refused_request_makes_it_look_at_everything_at_once(x, opened):
+def test_a_refused_request_makes_it_look_at_everything_at_once(x: XServer, opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
     watch = PlacementWatch(sink._display, sink.monitors, sink._places(), SimulatedClock())  # whose time never comes
     x.do_to_window("XDestroyWindow", x11_window(sink, 2))

@@ -6,9 +6,14 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
+import moderngl
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from runtime.clock import MonotonicClock
 from runtime.config import OutputSettings, PanelSettings
@@ -18,11 +23,12 @@ from runtime.optics.stack import PanelStack
 from runtime.panels import window
 from runtime.panels.display import glfw
 from runtime.panels.registry import open_panels
+from runtime.panels.window import WindowPanels
 from runtime.panels.xlib import SERVER_DIED
 from runtime.records import PanelFrame
 from tests.panels import xserver
 from tests.panels.edids import block
-from tests.panels.xserver import HEIGHT_PX, WIDTH_PX
+from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, XServer
 from tests.waiting import eventually
 
 pytestmark = pytest.mark.windows
@@ -43,7 +49,7 @@ def frame(number: int) -> PanelFrame:
 
 
 @pytest.fixture
-def x(screen, monkeypatch):
+def x(screen: xserver.XServer, monkeypatch: pytest.MonkeyPatch) -> Iterator[XServer]:
     monkeypatch.setenv("DISPLAY", screen.name)
     yield screen
     for index in range(3):
@@ -51,10 +57,10 @@ def x(screen, monkeypatch):
 
 
 @pytest.fixture
-def opened(x, context):
+def opened(x: XServer, context: moderngl.Context) -> Iterator[Callable[..., Any]]:
     sinks = []
 
-    def open_(*panels: PanelSettings, kind="windows"):
+    def open_(*panels: PanelSettings, kind: str = "windows") -> WindowPanels:
         sinks.append(open_panels(OutputSettings(kind=kind, panels=panels), STACK, MonotonicClock(), context))
         return sinks[-1]
 
@@ -66,12 +72,14 @@ def opened(x, context):
 BY_CONNECTOR = tuple(PanelSettings(connector=f"DUMMY{index}") for index in (2, 0, 1))
 
 
-def shows(x, monitor: int, expected: np.ndarray) -> bool:
+def shows(x: XServer, monitor: int, expected: np.ndarray) -> bool:
     return eventually(lambda: np.array_equal(x.panel(monitor), expected[..., :3]))
 
 
 @pytest.mark.parametrize("kind", ["windows", "span"])
-def test_every_panel_shows_its_own_layer_of_the_same_frame_at_its_place(x, opened, kind):
+def test_every_panel_shows_its_own_layer_of_the_same_frame_at_its_place(
+    x: XServer, opened: Callable[..., Any], kind: str
+) -> None:
     sink = opened(*BY_CONNECTOR, kind=kind)
     for number in range(5):
         assert sink.present(frame(number)).number == number
@@ -80,7 +88,9 @@ def test_every_panel_shows_its_own_layer_of_the_same_frame_at_its_place(x, opene
 
 
 @pytest.mark.parametrize("kind", ["windows", "span"])
-def test_a_panel_mounted_upside_down_and_one_mirrored_are_sent_what_sets_it_right(x, opened, kind):
+def test_a_panel_mounted_upside_down_and_one_mirrored_are_sent_what_sets_it_right(
+    x: XServer, opened: Callable[..., Any], kind: str
+) -> None:
     sink = opened(
         PanelSettings(connector="DUMMY0", rotation_deg=180),
         PanelSettings(connector="DUMMY1", mirror="horizontal"),
@@ -94,7 +104,7 @@ def test_a_panel_mounted_upside_down_and_one_mirrored_are_sent_what_sets_it_righ
     assert eventually(lambda: np.abs(x.panel(2) - expected).max() <= 0.51)
 
 
-def test_panels_are_found_by_edid_serial_wherever_they_are_plugged_in(x, opened):
+def test_panels_are_found_by_edid_serial_wherever_they_are_plugged_in(x: XServer, opened: Callable[..., Any]) -> None:
     for index, serial in enumerate(("MIDDLE", "FRONT", "REAR")):
         x.set_edid(index, block(serial_text=serial))
     sink = opened(*(PanelSettings(edid_serial=serial) for serial in ("REAR", "MIDDLE", "FRONT")))
@@ -104,14 +114,14 @@ def test_panels_are_found_by_edid_serial_wherever_they_are_plugged_in(x, opened)
     assert shows(x, 2, picture(0, 0))
 
 
-def test_a_panel_that_is_not_there_is_named_and_no_window_is_left(x, context):
+def test_a_panel_that_is_not_there_is_named_and_no_window_is_left(x: XServer, context: moderngl.Context) -> None:
     panels = (*BY_CONNECTOR[:2], PanelSettings(connector="HDMI-7"))
     with pytest.raises(PanelLost, match=r"panel 2: no monitor with connector HDMI-7 .*DUMMY0"):
         open_panels(OutputSettings(kind="windows", panels=panels), STACK, MonotonicClock(), context)
     assert eventually(lambda: not x.screenshot().any())
 
 
-def presents(sink, number: int) -> bool:
+def presents(sink: WindowPanels, number: int) -> bool:
     try:
         return sink.present(frame(number)).number == number
     except PanelLost:
@@ -119,7 +129,9 @@ def presents(sink, number: int) -> bool:
 
 
 @pytest.mark.parametrize("kind", ["windows", "span"])
-def test_a_monitor_that_goes_is_named_and_one_that_returns_is_used_again(x, opened, kind):
+def test_a_monitor_that_goes_is_named_and_one_that_returns_is_used_again(
+    x: XServer, opened: Callable[..., Any], kind: str
+) -> None:
     sink = opened(*BY_CONNECTOR, kind=kind)
     assert presents(sink, 0)
     x.unplug(1)
@@ -133,7 +145,7 @@ def test_a_monitor_that_goes_is_named_and_one_that_returns_is_used_again(x, open
     assert shows(x, 1, picture(51, 2))
 
 
-def test_a_closed_window_is_a_lost_panel_and_comes_back(x, opened):
+def test_a_closed_window_is_a_lost_panel_and_comes_back(x: XServer, opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
     x.ask_to_close(glfw.get_x11_window(sink._surfaces[1].window.handle))
@@ -158,14 +170,16 @@ def moved(number: int, *, flatness: float = 0.0) -> PanelFrame:
 
 
 @pytest.mark.parametrize("kind", ["windows", "span"])
-def test_the_aligned_picture_is_on_all_panels_in_the_same_frame(x, opened, kind):
+def test_the_aligned_picture_is_on_all_panels_in_the_same_frame(
+    x: XServer, opened: Callable[..., Any], kind: str
+) -> None:
     sink = opened(*BY_CONNECTOR, kind=kind)
     for number in range(6):
         frame = moved(number, flatness=0.2 * number)
         assert sink.present(frame).number == number
         expected = shown_layers(frame)[..., :3].astype(int)
 
-        def difference(expected=expected) -> np.ndarray:
+        def difference(expected: NDArray[np.int64] = expected) -> np.ndarray:
             screen = x.screenshot()  # one picture of all three monitors
             panels = [screen[:HEIGHT_PX, WIDTH_PX * monitor : WIDTH_PX * (monitor + 1)] for monitor in (2, 0, 1)]
             return np.abs(np.stack(panels) - expected)
@@ -174,7 +188,9 @@ def test_the_aligned_picture_is_on_all_panels_in_the_same_frame(x, opened, kind)
         assert (difference() <= 1).mean() >= 0.999
 
 
-def test_a_solution_that_is_shown_again_is_not_uploaded_again(opened, monkeypatch):
+def test_a_solution_that_is_shown_again_is_not_uploaded_again(
+    opened: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     sink = opened(*BY_CONNECTOR)
     sink.present(moved(0))
     monkeypatch.setattr(sink._textures, "upload", lambda frame: pytest.fail("uploaded again"))
@@ -182,7 +198,7 @@ def test_a_solution_that_is_shown_again_is_not_uploaded_again(opened, monkeypatc
         assert sink.present(moved(number)).number == number
 
 
-def test_the_pacer_is_told_when_the_blank_was_and_how_often_one_comes(opened):
+def test_the_pacer_is_told_when_the_blank_was_and_how_often_one_comes(opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
     assert sink.period_ns == pytest.approx(1e9 / 60, rel=1e-3)
     first, second = sink.present(moved(0)), sink.present(moved(1))
@@ -191,14 +207,16 @@ def test_the_pacer_is_told_when_the_blank_was_and_how_often_one_comes(opened):
     assert sink.present(moved(1), unchanged=True).vblank_ns is None  # nothing was swapped
 
 
-def test_without_vsync_nothing_is_known_of_blanks(x, context):
+def test_without_vsync_nothing_is_known_of_blanks(x: XServer, context: moderngl.Context) -> None:
     settings = OutputSettings(kind="windows", panels=BY_CONNECTOR, vsync=False)
     sink = open_panels(settings, STACK, MonotonicClock(), context)
     assert sink.present(moved(0)).vblank_ns is None
     sink.close()
 
 
-def test_a_fault_while_drawing_leaves_the_new_frame_on_no_panel(x, opened, monkeypatch):
+def test_a_fault_while_drawing_leaves_the_new_frame_on_no_panel(
+    x: XServer, opened: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
     with monkeypatch.context() as patch:
@@ -210,7 +228,7 @@ def test_a_fault_while_drawing_leaves_the_new_frame_on_no_panel(x, opened, monke
     assert eventually(lambda: presents(sink, 2))
 
 
-def test_skew_and_rate_are_reported(opened):
+def test_skew_and_rate_are_reported(opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
     reports = [sink.present(frame(number)) for number in range(20)]
     times = [report.present_ns for report in reports]
@@ -220,7 +238,9 @@ def test_skew_and_rate_are_reported(opened):
     assert 0 < skew_ms < interval_ms
 
 
-def test_an_unchanged_frame_stays_and_is_drawn_anew_where_the_windows_were_lost(x, opened):
+def test_an_unchanged_frame_stays_and_is_drawn_anew_where_the_windows_were_lost(
+    x: XServer, opened: Callable[..., Any]
+) -> None:
     sink = opened(*BY_CONNECTOR)
     sink.present(frame(0))
     assert sink.present(frame(1), unchanged=True).number == 1
@@ -241,7 +261,9 @@ def test_an_unchanged_frame_stays_and_is_drawn_anew_where_the_windows_were_lost(
     assert shows(x, 2, picture(50, 0))
 
 
-def test_content_can_draw_in_its_own_context_between_two_frames(context, opened):
+def test_content_can_draw_in_its_own_context_between_two_frames(
+    context: moderngl.Context, opened: Callable[..., Any]
+) -> None:
     sink = opened(*BY_CONNECTOR)
     target = context.simple_framebuffer((4, 4))
     for number, red in enumerate((0.0, 1.0, 0.0)):
@@ -272,7 +294,7 @@ for number in range(100_000):
 
 
 @pytest.mark.parametrize("attempt", range(3))
-def test_the_death_of_the_x_server_ends_the_process_at_once_with_a_reason(tmp_path, attempt):
+def test_the_death_of_the_x_server_ends_the_process_at_once_with_a_reason(tmp_path: Path, attempt: int) -> None:
     """In the middle of whatever call it happens to be: hence several attempts."""
     server = xserver.start_or_skip(tmp_path)
     process = subprocess.Popen(
@@ -292,7 +314,7 @@ def test_the_death_of_the_x_server_ends_the_process_at_once_with_a_reason(tmp_pa
     assert "Traceback" not in errors
 
 
-def test_the_cursor_is_hidden_and_windows_stay_when_focus_goes(opened):
+def test_the_cursor_is_hidden_and_windows_stay_when_focus_goes(opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
     for surface in sink._surfaces:
         handle = surface.window.handle

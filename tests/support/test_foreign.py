@@ -6,7 +6,9 @@ import json
 import os
 import socket
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -19,7 +21,7 @@ from runtime.support.foreign import nesting, parsed_json, real, whole, whole_fro
 HANG_S = 20  # on a busy machine; what hangs takes minutes, or for ever
 
 
-def refused(call, *arguments, **named) -> str:
+def refused(call: Callable[..., Any], *arguments: Any, **named: Any) -> str:
     with pytest.raises(InputError) as caught:
         call(*arguments, **named)
     line = str(caught.value)
@@ -27,7 +29,7 @@ def refused(call, *arguments, **named) -> str:
     return line
 
 
-@pytest.mark.parametrize("kind", ["fifo", "folder", "socket", "zero", "full", "null", "gone", "loop"])
+@pytest.mark.parametrize("kind", ["fifo", "folder", "socket", "zero", "full", "null", "gone", "loop", "status"])
 def test_only_regular_files_are_read_and_opening_never_waits(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "a"
     if kind == "fifo":
@@ -39,12 +41,15 @@ def test_only_regular_files_are_read_and_opening_never_waits(tmp_path: Path, kin
             bound.bind(str(path))
     elif kind == "loop":
         path.symlink_to(path)
+    elif kind == "status":
+        path.symlink_to("/proc/self/status")
     elif kind != "gone":
         path = Path("/dev") / kind
     start = time.monotonic()
     line = refused(foreign.read_bytes, path, most_bytes=1000)
     assert time.monotonic() - start < HANG_S
     told = {"fifo": "is a FIFO", "folder": "is a folder", "gone": "No such file", "loop": "symbolic links"}
+    told["status"] = "is the kernel's own"
     assert str(path) in line and told.get(kind, "") in line
 
 
@@ -52,6 +57,14 @@ def test_a_file_is_read_up_to_its_limit_and_refused_beyond_with_both_figures(tmp
     (tmp_path / "a").write_bytes(b"x" * 1000)
     assert foreign.read_bytes(tmp_path / "a", most_bytes=1000) == b"x" * 1000
     assert "has 1000 bytes; at most 999 bytes" in refused(foreign.read_bytes, tmp_path / "a", most_bytes=999)
+
+
+def test_whether_something_is_there_is_asked_of_names_that_can_be(tmp_path: Path) -> None:
+    assert foreign.is_there(tmp_path, folder=True) and foreign.is_there(tmp_path)
+    assert not foreign.is_there(tmp_path / "gone") and not foreign.is_there(tmp_path / "gone", folder=True)
+    for name in ("x" * 5000, "a\0b", "/".join(["d" * 200] * 40), "y" * 300):
+        with pytest.raises(InputError):
+            foreign.is_there(tmp_path / name)
 
 
 def test_no_descriptor_is_left_open(tmp_path: Path) -> None:
@@ -86,11 +99,11 @@ json_values = st.recursive(
 
 
 @given(json_values)
-def test_json_comes_back_as_it_is(value) -> None:
+def test_json_comes_back_as_it_is(value: Any) -> None:
     assert parsed_json(json.dumps(value), source="a") == value
 
 
-def depth_of(value) -> int:
+def depth_of(value: Any) -> int:
     if isinstance(value, dict):
         return 1 + max(map(depth_of, value.values()), default=0)
     if isinstance(value, list):
@@ -99,7 +112,7 @@ def depth_of(value) -> int:
 
 
 @given(json_values)
-def test_nesting_is_counted_outside_of_strings_alone(value) -> None:
+def test_nesting_is_counted_outside_of_strings_alone(value: Any) -> None:
     assert nesting(json.dumps(value).encode(), most=1000) == depth_of(value)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 from runtime.model.contract import Contract
@@ -9,6 +10,7 @@ from runtime.model.gl.programs import Passes
 from runtime.model.gl.surround import GlSurround, check_size
 from runtime.optics.stack import PanelStack
 from runtime.support.gl import describe
+from runtime.support.gl_sharing import LayerPool, ShareGroup
 
 
 class GlBackend:
@@ -16,14 +18,22 @@ class GlBackend:
 
     name = "gl"
 
-    def __init__(self, context: Any, stack: PanelStack) -> None:
-        """context: the content's, or one of the backend's own; whoever made it releases it. Raises InputError where
-        a panel of the stack is too large for the driver."""
+    def __init__(self, context: Any, stack: PanelStack, *, group: ShareGroup | None = None) -> None:
+        """context: the content's, or one of the backend's own; whoever made it releases it. group: of a context that
+        shows solutions from its textures: they are left there (`LayerTextures`). Raises InputError where a panel of
+        the stack is too large for the driver."""
         check_size(context, stack)
         self.context = context
         self.at_once = False  # corrections in one pass: found by trying (`backends`)
         self.passes = Passes(context)
+        self._pool = None if group is None else LayerPool(context, group)
         self.renderer = describe(context)["renderer"]
 
     def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> GlSurround:
-        return GlSurround(self.passes, contract, stack, at_once=self.at_once)
+        return GlSurround(self.passes, contract, stack, at_once=self.at_once, pool=self._pool)
+
+    def close(self) -> None:
+        with suppress(Exception):  # of a context that is lost there is nothing to release
+            self.passes.release()
+            if self._pool is not None:
+                self._pool.close()

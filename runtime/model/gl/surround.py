@@ -18,16 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.errors import ContextLost, InputError, ModelFailure, PhasestackError
+from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
 from runtime.model.contract import Contract
 from runtime.model.fade import CORRECTED_SHARE
 from runtime.model.gl.programs import Image, Passes
-from runtime.model.pyramid_level import CENTRE, FRONT, I16, NEUTRAL, OUTER, REAR, START, spreads
-from runtime.model.resample import target_from_source
+from runtime.model.pyramid_level import CENTRE, FRONT, I16, NEUTRAL, OUTER, REAR, START, pixels_in_line, spreads
 from runtime.model.schedule import Picture, Problem, reductions
 from runtime.model.transfer import phase_codes
 from runtime.optics.stack import PanelStack, PlaneRaster
-from runtime.records import F64, U8
+from runtime.records import F64, U8, Layers
 from runtime.support.gl import DrawnPicture, finish
+from runtime.support.gl_sharing import LayerPool, wait_until_drawn
 
 EYES = ("left", "right")
 NAMES = {REAR: "rear", FRONT: "front"}
@@ -39,15 +40,25 @@ Spread = dict[int, tuple[float, float]]
 class GlSurround:
     """A `Surround`. Used on the thread of its context, which is current whenever a frame begins."""
 
-    def __init__(self, passes: Passes, contract: Contract, stack: PanelStack, *, at_once: bool = False) -> None:
+    def __init__(
+        self,
+        passes: Passes,
+        contract: Contract,
+        stack: PanelStack,
+        *,
+        at_once: bool = False,
+        pool: LayerPool | None = None,
+    ) -> None:
         """passes: of a context that others may use too. at_once: residuals and corrections in one pass, where eyes are
-        sure: half the bytes, five times the looks. Raises InputError where a panel is too large for the driver."""
+        sure: half the bytes, five times the looks. pool: where solutions are left; None: they are read back.
+        Raises InputError where a panel is too large for the driver."""
         check_size(passes.context, stack)
         self._passes, self._contract, self._stack = passes, contract, stack
         self._textures: dict[tuple[Any, ...], Any] = {}
         table = phase_codes(contract.branch).reshape(256, -1)[:, 0].astype(np.int16)
         self._table = Image(self._texture("table", 256, 1, 1, data=table), 256, 1)
-        self._layers: U8 = np.empty((3, stack.height_px, stack.width_px, 4), np.uint8)
+        self._pool = pool
+        self._layers: U8 | None = None  # where they are read back
         self._read: dict[tuple[int, ...], tuple[I16, I16]] = {}
         self._closed = False
         self._at_once = at_once
@@ -92,7 +103,7 @@ class GlSurround:
                 "size": problem.reduced_size,
                 "left_from_raster": _mat3(matrices[0]),
                 "right_from_raster": _mat3(matrices[1]),
-                "sheared": any(_is_sheared(matrix) for matrix in matrices),
+                **_columns(frame.columns),
             },
         )
         return self._read_back(seen)
@@ -103,7 +114,7 @@ class GlSurround:
         answer.texture.write(np.ascontiguousarray(codes), viewport=(0, 0, columns, rows), alignment=1)
         self._passes.crossed("answer up", answer, bytes_px=2 * self._problem.channels, to_gpu=True)
         matrix = self._problem.answer_from_raster(panel, self._rasters[reduction][panel])
-        self._resample(answer, reduction, panel, matrix, shown=shown)
+        self._resample(answer, reduction, panel, matrix, columns=self._problem.answer_columns, shown=shown)
 
     def project(self, reduction: int, panels: Sequence[int]) -> None:
         for n in panels:
@@ -116,7 +127,7 @@ class GlSurround:
     def correct(self, reduction: int, panel: int, *, size: float, shown: bool) -> None:
         rasters = self._rasters[reduction]
         places: dict[str, Any] = {
-            f"centre_from_{eye}": _scale_shift(eye_m, source=rasters[panel], target=rasters[CENTRE])
+            f"centre_from_{eye}": _mat3(pixels_in_line(self._stack, rasters, eye_m, of=CENTRE, on=panel))
             for eye, eye_m in zip(EYES, self._problem.eyes_m, strict=True)
         }
         places["size"] = _size(rasters[CENTRE])
@@ -152,11 +163,25 @@ class GlSurround:
             coarse = self._panel(coarser_reduction, n)
             fine = self._rasters[reduction][n]
             matrix = np.diag([coarse.width_px / fine.width_px, coarse.height_px / fine.height_px, 1.0])
-            self._resample(coarse, reduction, n, matrix, shown=shown)
+            self._resample(coarse, reduction, n, matrix, columns=EVEN_COLUMNS, shown=shown)
 
-    def finish(self) -> U8:
-        images = self._drawn_layers()
+    def finish(self) -> Layers:
+        width, height = self._stack.width_px, self._stack.height_px
+        if self._pool is not None:
+            left = self._pool.taken(3, width_px=width, height_px=height)
+            for textures in self._pool.surplus():
+                for texture in textures:
+                    self._passes.forget(texture)
+            self._draw_layers(tuple(Image(texture, width, height) for texture in left.textures))
+            wait_until_drawn()
+            return left
+        images = tuple(
+            Image(self._texture(("layer", n), width, height, 4, dtype="f1"), width, height) for n in range(3)
+        )
+        self._draw_layers(images)
         finish()
+        if self._layers is None:
+            self._layers = np.empty((3, height, width, 4), np.uint8)
         for image, layer in zip(images, self._layers, strict=True):
             self._passes.target((image,)).read_into(layer, components=4)
             self._passes.crossed("layer down", image, bytes_px=4, to_gpu=False)
@@ -170,12 +195,9 @@ class GlSurround:
                     self._passes.forget(texture)
             self._textures = {}
 
-    def _drawn_layers(self) -> tuple[Image, ...]:
+    def _draw_layers(self, images: tuple[Image, ...]) -> None:
         """The solution: one image a panel, RGBA in 8 bits."""
-        boxes, width, height = self._problem.boxes, self._stack.width_px, self._stack.height_px
-        images = tuple(
-            Image(self._texture(("layer", n), width, height, 4, dtype="f1"), width, height) for n in range(3)
-        )
+        boxes = self._problem.boxes
         outer = {NAMES[n]: self._panel(1, n) for n in OUTER} | {f"{NAMES[n]}_mean": self._mean(1, n) for n in OUTER}
         where: dict[str, Any] = {
             f"{name}_origin": (boxes[n].u0, boxes[n].v0) for n, name in ((CENTRE, "centre"), *NAMES.items())
@@ -187,7 +209,6 @@ class GlSurround:
             {**self._wanted(1), **outer},
             {**self._through(1), **where, "neutral": NEUTRAL, "grey": self._grey},
         )
-        return images
 
     def _taken(self, pictures: Sequence[Picture]) -> list[Image]:
         """The pictures where they were drawn, or their box, uploaded."""
@@ -261,7 +282,7 @@ class GlSurround:
         for n, name in NAMES.items():
             found[f"{name}_size"] = _size(rasters[n])
             for eye, eye_m in zip(EYES, self._problem.eyes_m, strict=True):
-                found[f"{name}_from_{eye}"] = _scale_shift(eye_m, source=rasters[CENTRE], target=rasters[n])
+                found[f"{name}_from_{eye}"] = _mat3(pixels_in_line(self._stack, rasters, eye_m, of=n, on=CENTRE))
         return found
 
     def _fade(self, reduction: int) -> dict[str, Any]:
@@ -277,7 +298,9 @@ class GlSurround:
             "centre_from_here": _as_scale_shift(matrix),
         }
 
-    def _resample(self, image: Image, reduction: int, panel: int, matrix: F64, *, shown: bool) -> None:
+    def _resample(
+        self, image: Image, reduction: int, panel: int, matrix: F64, *, columns: ColumnLaw, shown: bool
+    ) -> None:
         """An outer panel drawn anew from another raster."""
         self._passes.draw(
             "resample",
@@ -286,9 +309,9 @@ class GlSurround:
             {
                 "size": image.size,
                 "image_from_panel": _mat3(matrix),
-                "sheared": _is_sheared(matrix),
                 "outside": START,
                 "shown": shown,
+                **_columns(columns),
             },
         )
         self._swap(reduction, panel)
@@ -385,9 +408,7 @@ class GlSurround:
 
 
 def check_size(context: moderngl.Context, stack: PanelStack) -> None:
-    """Raises InputError where a panel is wider or higher than the driver allows, or tilted."""
-    if stack.tilt is not None:
-        raise InputError("stack", "tilt", 'tilted panels are solved for by model.backend = "opencv" alone')
+    """Raises InputError where a panel is wider or higher than the driver allows."""
     most = int(context.info["GL_MAX_TEXTURE_SIZE"])
     most_wide, most_high = (min(most, int(value)) for value in context.info["GL_MAX_VIEWPORT_DIMS"])
     for name, value, limit in (("width_px", stack.width_px, most_wide), ("height_px", stack.height_px, most_high)):
@@ -410,8 +431,8 @@ def _size(raster: PlaneRaster) -> tuple[int, int]:
     return raster.width_px, raster.height_px
 
 
-def _is_sheared(matrix: F64) -> bool:
-    return bool(matrix[0, 1] != 0.0 or matrix[1, 0] != 0.0)
+def _columns(law: ColumnLaw) -> dict[str, float]:
+    return {"bend": law.bend, "middle": law.middle}
 
 
 def _mat3(matrix: F64) -> tuple[float, ...]:
@@ -421,8 +442,3 @@ def _mat3(matrix: F64) -> tuple[float, ...]:
 
 def _as_scale_shift(matrix: F64) -> tuple[float, float, float, float]:
     return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
-
-
-def _scale_shift(eye_m: F64, *, source: PlaneRaster, target: PlaneRaster) -> tuple[float, float, float, float]:
-    """Pixels of `target` from those of `source`, as an eye sees them in line."""
-    return _as_scale_shift(target_from_source(eye_m, source=source, target=target))

@@ -1,0 +1,63 @@
+"""Files that are written whole or not at all: what cannot be written is one line, and nothing new is left."""
+
+from __future__ import annotations
+
+import resource
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from runtime.errors import InputError
+from runtime.support.artifacts import OutputFolder, write_bytes
+
+
+@pytest.mark.parametrize("name", [".", "..", "folder", "/", "", "x" * 300, "/".join(["d" * 200] * 40)])
+def test_what_is_no_files_name_is_refused_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    place = tmp_path / "place"
+    (place / "folder").mkdir(parents=True)
+    monkeypatch.chdir(place)
+    with pytest.raises(InputError, match="cannot be written"):
+        write_bytes(Path(name), b"x")
+    assert [path.name for path in tmp_path.iterdir()] == ["place"]
+    assert [path.name for path in place.iterdir()] == ["folder"]
+
+
+@pytest.fixture
+def tiny() -> Iterator[None]:
+    """As on a full disk: no file of this process may become larger than 4 KiB."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    signal.signal(signal.SIGXFSZ, ignored)
+
+
+@pytest.mark.usefixtures("tiny")
+def test_what_the_disk_does_not_take_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"a: cannot be written \(File too large\)"):
+        write_bytes(tmp_path / "a", bytes(5000))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("tiny")
+def test_a_folder_that_does_not_fit_is_told_by_the_name_that_was_given(tmp_path: Path) -> None:
+    target = tmp_path / "new" / "out"
+    with pytest.raises(InputError) as caught, OutputFolder(target) as folder:
+        write_bytes(folder.staging / "small", b"x")
+        write_bytes(folder.staging / "sub" / "large", bytes(5000))
+    assert str(caught.value) == f"{target}/sub/large: cannot be written (File too large)"
+    with pytest.raises(InputError, match=r"out: cannot be written"), OutputFolder(target) as folder:
+        (folder.staging / "gone" / "a").write_bytes(b"x")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_replaces_another_whole(tmp_path: Path) -> None:
+    for data in (b"one", b"another"):
+        write_bytes(tmp_path / "new" / "a", data)
+        assert (tmp_path / "new" / "a").read_bytes() == data
+    assert len(list((tmp_path / "new").iterdir())) == 1
