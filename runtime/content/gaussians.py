@@ -16,7 +16,6 @@ from runtime.records import F32, F64
 
 LOW_PASS_PX2 = 0.3  # added to each splat's covariance: none falls between the pixels
 LEAST_ALPHA = 1 / 255
-MOST_ALPHA = 0.99
 LARGEST_RELATIVE_SCALE = 1000.0  # of a splat, in units of the scene's extent
 FARTHEST_RELATIVE = 1e6  # of a splat from the middle, in units of the median distance
 LARGEST_COEFFICIENT = 1e4  # of the harmonics: colours are blended as half floats, which end at 65504
@@ -213,6 +212,6 @@ def harmonic_basis(directions: F32, count: int) -> F32:
 def colours_towards(harmonics: F32, directions: F32) -> F32:
     """(n, 3) colours, not below 0, of (n, k, 3) coefficients seen along (n, 3) unit directions from the eye."""
     if harmonics.shape[1] == 1:
-        return np.maximum(harmonics[:, 0] * np.float32(0.28209479177387814) + np.float32(0.5), 0)
+        return np.asarray(np.maximum(harmonics[:, 0] * np.float32(0.28209479177387814) + np.float32(0.5), 0))
     basis = harmonic_basis(directions, harmonics.shape[1])
-    return np.maximum(np.einsum("nk,nkc->nc", basis, harmonics) + np.float32(0.5), 0)
+    return np.asarray(np.maximum(np.einsum("nk,nkc->nc", basis, harmonics) + np.float32(0.5), 0))

@@ -445,7 +445,8 @@ def smooth_normals(positions: F32, triangles: I32) -> F32:
     for place in range(3):
         np.add.at(sums, triangles[:, place], faces)
     length = np.linalg.norm(sums, axis=1, keepdims=True)
-    return np.divide(sums, length, out=np.zeros_like(sums), where=length > 0).astype(np.float32)
+    found: F32 = np.divide(sums, length, out=np.zeros_like(sums), where=length > 0).astype(np.float32)
+    return found
 
 
 def decoded_picture(coded: bytes) -> U8:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import cv2
 import numpy as np
 
-from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster
@@ -87,31 +84,3 @@ class WarpedPicture:
         chosen = self._levels[min(level, len(self._levels) - 1)]
         full = self._levels[0]
         return chosen, (chosen.shape[1] / full.shape[1], chosen.shape[0] / full.shape[0])
-
-
-class StereoPair(ContentSource):
-    """Two pictures, each with its projection: the left one for left eyes, the right one for right eyes."""
-
-    def __init__(
-        self,
-        left_rgb: U8,
-        right_rgb: U8,
-        *,
-        image_from_stack: Sequence[F64],
-        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
-        plane_x_m: float = 0.0,
-        name: str = "pair",
-    ) -> None:
-        """left_rgb, right_rgb: (h, w, 3) RGB; image_from_stack: the (3, 4) projection of each.
-
-        plane_x_m: the plane on which pictures hang for eyes other than those they were taken with.
-        """
-        self._pictures = [WarpedPicture(rgba_from_rgb(rgb), background=background) for rgb in (left_rgb, right_rgb)]
-        self._image_from_stack = [np.asarray(matrix, dtype=np.float64) for matrix in image_from_stack]
-        self._plane_x_m = plane_x_m
-        self.info = ContentInfo(name=name, background=background)
-
-    def render(self, view: View, *, time_ns: int) -> U8:
-        matrix = image_from_view(self._image_from_stack[view.side], view.pixels_from_stack, x_m=self._plane_x_m)
-        picture = self._pictures[view.side]
-        return picture.warped(matrix, width_px=view.width_px, height_px=view.height_px, side=view.side)

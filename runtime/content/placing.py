@@ -72,4 +72,5 @@ def stack_from_scene(
 
 def _corner_x(matrix: F64, low: F64, high: F64) -> F64:
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    return corners @ matrix[0, :3] + matrix[0, 3]
+    found: F64 = corners @ matrix[0, :3] + matrix[0, 3]
+    return found

@@ -79,7 +79,7 @@ def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
         try:
             entries.append(Entry(validated(ContentSettings, common | own, source=""), seconds))
         except InputError as error:
-            raise InputError(path, f"{field}.{error.field}", error.problem) from None
+            raise InputError(path, f"{field}.{error.field}".rstrip("."), error.problem) from None
     return Playlist(path, file.repeat, tuple(entries))
 
 

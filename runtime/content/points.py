@@ -83,7 +83,8 @@ def _colours(table: Table, names: tuple[str, ...]) -> F32:
         if all(name in names for name in three):
             columns = np.column_stack([table[name] for name in three])
             scale = np.iinfo(columns.dtype).max if columns.dtype.kind in "ui" else 1.0
-            return np.clip(np.nan_to_num(columns.astype(np.float32)) / np.float32(scale), 0.0, 1.0)
+            found: F32 = np.clip(np.nan_to_num(columns.astype(np.float32)) / np.float32(scale), 0.0, 1.0)
+            return found
     return np.tile(np.array(GREY, np.float32), (len(table), 1))
 
 

@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from runtime.config import ContentSettings, LimitSettings
 from runtime.content.base import ContentSource
 from runtime.content.placed import placed_source, placing_of
@@ -14,6 +16,7 @@ from runtime.content.presets import Preset, preset, preset_names
 from runtime.content.scenes import SCENES
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
+from runtime.records import F32, F64
 from runtime.support import foreign, progress
 from runtime.support.live import is_live
 
@@ -206,7 +209,6 @@ def _mesh(
     path: Path, settings: ContentSettings, stack: PanelStack, chosen: Preset | None, limits: LimitSettings
 ) -> Opener:
     from runtime.content.mesh import MeshSource, load_mesh
-    from runtime.content.placing import stack_from_scene
     from runtime.content.triangles import ready
 
     data = load_mesh(path, limits=limits, animation=settings.animation)
@@ -214,14 +216,7 @@ def _mesh(
     for number, part in enumerate(data.parts):
         progress.tell(f"{path.name}: outlines", number, len(data.parts))
         parts.append(ready(part, samples=settings.samples))
-    matrix = stack_from_scene(
-        data.low,
-        data.high,
-        settings=settings,
-        path=path,
-        stack=stack,
-        scene_from_stack=chosen.scene_from_stack if chosen else None,
-    )
+    matrix = _stack_from_scene(data.low, data.high, path, settings, stack, chosen)
     return lambda context: MeshSource(
         data,
         stack_from_scene=matrix,
@@ -235,23 +230,11 @@ def _mesh(
 def _splat(
     path: Path, settings: ContentSettings, stack: PanelStack, chosen: Preset | None, limits: LimitSettings
 ) -> Opener:
-    import numpy as np
-
     from runtime.content.gaussians import load_gaussians
-    from runtime.content.placing import stack_from_scene
     from runtime.content.splat import SplatSource
 
     gaussians = load_gaussians(path, limits=limits)
-    # A few stray splats must not decide the scale.
-    low, high = np.percentile(gaussians.centres.astype(np.float64), [1, 99], axis=0)
-    matrix = stack_from_scene(
-        low,
-        high,
-        settings=settings,
-        path=path,
-        stack=stack,
-        scene_from_stack=chosen.scene_from_stack if chosen else None,
-    )
+    matrix = _placed_cloud(gaussians.centres, 1.0, path, settings, stack, chosen)
     return lambda context: SplatSource(
         gaussians, stack_from_scene=matrix, context=context, background=settings.background, name=path.stem
     )
@@ -260,25 +243,30 @@ def _splat(
 def _points(
     path: Path, settings: ContentSettings, stack: PanelStack, chosen: Preset | None, limits: LimitSettings
 ) -> Opener:
-    import numpy as np
-
-    from runtime.content.placing import stack_from_scene
     from runtime.content.points import PointSource, load_points
 
     cloud = load_points(path, limits=limits)
-    # A few stray points must not decide the scale.
-    low, high = np.percentile(cloud.positions.astype(np.float64), [0.5, 99.5], axis=0)
-    matrix = stack_from_scene(
-        low,
-        high,
-        settings=settings,
-        path=path,
-        stack=stack,
-        scene_from_stack=chosen.scene_from_stack if chosen else None,
-    )
+    matrix = _placed_cloud(cloud.positions, 0.5, path, settings, stack, chosen)
     return lambda context: PointSource(
         cloud, stack_from_scene=matrix, context=context, background=settings.background, name=path.stem
     )
+
+
+def _placed_cloud(
+    places: F32, stray: float, path: Path, settings: ContentSettings, stack: PanelStack, chosen: Preset | None
+) -> F64:
+    """4x4 `stack_from_scene` of places (n, 3) in the scene; so many percent at either end do not decide the scale."""
+    low, high = np.percentile(places.astype(np.float64), [stray, 100 - stray], axis=0)
+    return _stack_from_scene(low, high, path, settings, stack, chosen)
+
+
+def _stack_from_scene(
+    low: F64, high: F64, path: Path, settings: ContentSettings, stack: PanelStack, chosen: Preset | None
+) -> F64:
+    from runtime.content.placing import stack_from_scene
+
+    scene_from_stack = chosen.scene_from_stack if chosen else None
+    return stack_from_scene(low, high, settings=settings, path=path, stack=stack, scene_from_stack=scene_from_stack)
 
 
 def _holds_splats(path: Path) -> bool:

@@ -76,7 +76,7 @@ class Channel:
         share = (time_s - times[before]) / span if span > 0 else 1.0
         first, second = self.values[before, middle], self.values[after, middle]
         if self.kind == "STEP":
-            return first
+            return np.asarray(first)
         if self.kind == "CUBICSPLINE":
             s2, s3 = share * share, share * share * share
             return self._unit(
@@ -87,7 +87,7 @@ class Channel:
             )
         if self.path == "rotation":
             return slerp(first, second, share)
-        return first + (second - first) * share
+        return np.asarray(first + (second - first) * share)
 
     def _unit(self, value: F64) -> F64:
         if self.path != "rotation":
@@ -176,7 +176,8 @@ def slerp(first: F64, second: F64, share: float) -> F64:
         mixed = first + (second - first) * share
         return mixed / np.linalg.norm(mixed)
     angle = np.arccos(cosine)
-    return (np.sin((1 - share) * angle) * first + np.sin(share * angle) * second) / np.sin(angle)
+    found: F64 = (np.sin((1 - share) * angle) * first + np.sin(share * angle) * second) / np.sin(angle)
+    return found
 
 
 def turn_of(quaternion: F64) -> F64:

@@ -1,4 +1,4 @@
-"""Live pictures: a stream, a capture card, or a file played as one; decoded on a thread of its own by PyAV.
+"""Live pictures: a stream, a capture card, or a file played as one; read and decoded alongside by PyAV.
 
 The newest whole picture is shown, for both eyes the same one. What ends is opened again, what stalls, changes its size
 or lies about its rate is told in one line, and the last good picture stays.
@@ -11,14 +11,16 @@ import re
 import threading
 import time
 import weakref
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings, LimitSettings
+from runtime.content.arrivals import Arrivals
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.images import WarpedPicture
 from runtime.content.pictures import CONTAINERS, layout_of, pixel_aspect, quilt_size, screen, split
@@ -35,6 +37,7 @@ log = logging.getLogger("phasestack.content")
 PROTOCOLS = ("rtsp", "rtsps", "rtp", "rtmp", "http", "https", "udp", "tcp", "srt")
 CARRIED_BY = "rtsp,rtsps,rtp,rtmp,http,https,udp,tcp,tls,srt,crypto,data"
 OPEN_S, READ_S = 5.0, 5.0  # a source that does not answer for so long is opened anew
+ANALYSED_US = "1000000"  # of a stream, before its first picture; FFmpeg would look at five seconds
 FIRST_PICTURE_S = 3.0  # that is waited for, where it comes soon
 STALLED_S = 2.0  # without a new picture it is told
 AGAIN_S, AGAIN_MOST_S = 0.5, 8.0  # between attempts; doubles
@@ -42,7 +45,6 @@ LONGEST_STEP_S = 2.0  # between two pictures of a file; a longer one is a lie
 USUAL_STEP_S = 1 / 30
 COUNTED = 50  # pictures over which a rate is measured
 RATE_DIFFERS = 1.5  # times, until it is told
-ENDS_WITHIN_S = 2.0
 
 
 class Target:
@@ -69,7 +71,12 @@ class Target:
             return dict(given)
         if self.is_file:
             return {"protocol_whitelist": "file", "format_whitelist": CONTAINERS + ",mpegts,h264,hevc,mjpeg"}
-        usual = {"fflags": "nobuffer", "protocol_whitelist": CARRIED_BY, "rtsp_transport": "tcp"}
+        usual = {
+            "fflags": "nobuffer",
+            "analyzeduration": ANALYSED_US,
+            "protocol_whitelist": CARRIED_BY,
+            "rtsp_transport": "tcp",
+        }
         return usual | given
 
 
@@ -147,6 +154,8 @@ class _Reader:
                 self._told = ""
         except InputError as error:
             return error.problem
+        except av.error.ExitError:  # a time limit has passed
+            return f"nothing came for {READ_S:g} s"
         except (OSError, ValueError, av.error.FFmpegError) as error:
             return one_line(getattr(error, "strerror", None) or type(error).__name__, most=120)
         except Exception as error:  # a decoder's own: the loop goes on
@@ -155,8 +164,9 @@ class _Reader:
         return ""
 
     def _pictures(self) -> Iterator[U8]:
-        """Every picture: of a file when it is due, of all else when it comes."""
+        """Every picture of a file when it is due; of all else the newest."""
         import av
+        from av.video.reformatter import VideoReformatter
 
         kind = "v4l2" if self._target.is_device else None
         options = self._target.options(self._options)
@@ -164,22 +174,44 @@ class _Reader:
             if not container.streams.video:
                 raise InputError(self._target.shown, "", "holds no pictures")
             stream = container.streams.video[0]
+            if stream.codec_context is None:  # a codec that FFmpeg does not know
+                raise InputError(self._target.shown, "", "holds pictures that cannot be decoded")
             self._check_size(stream.codec_context.width, stream.codec_context.height)
-            rate = _RateCheck(float(stream.average_rate or 0), self._target.shown, silent=self._target.is_file)
-            due_s, before_s = time.monotonic(), None
-            for frame in container.decode(stream):
+            # One for all pictures: made anew, with threads of its own, for each, it took longer than all the rest.
+            reformatter = VideoReformatter()
+            frames = self._when_due if self._target.is_file else self._as_they_come
+            with closing(frames(container, stream)) as these:  # before the container: nobody reads from it any more
+                for frame in these:
+                    yield np.asarray(reformatter.reformat(frame, format="rgba", threads=1).to_ndarray(), np.uint8)
+
+    def _when_due(self, container: Any, stream: Any) -> Generator[Any, None, None]:
+        """A file's frames, each at its time."""
+        due_s, before_s = time.monotonic(), None
+        for frame in container.decode(stream):
+            self._check_size(frame.width, frame.height)
+            due_s += _step_s(before_s, frame.time)
+            before_s = frame.time
+            due_s = max(due_s, time.monotonic() - LONGEST_STEP_S)  # a machine that slept does not race
+            if self._shared.ending.wait(max(0.0, due_s - time.monotonic())):
+                return
+            yield frame
+
+    def _as_they_come(self, container: Any, stream: Any) -> Generator[Any, None, None]:
+        """The newest frame of a stream, whenever there is one."""
+        rate = _RateCheck(float(stream.average_rate or 0), self._target.shown)
+        with closing(Arrivals(container, stream, arrived=rate.count)) as arrivals:
+            for packets, broken in arrivals.batches():
                 if self._shared.ending.is_set():
                     return
-                self._check_size(frame.width, frame.height)
-                if self._target.is_file:
-                    due_s += _step_s(before_s, frame.time)
-                    before_s = frame.time
-                    due_s = max(due_s, time.monotonic() - LONGEST_STEP_S)  # a machine that slept does not race
-                    if self._shared.ending.wait(max(0.0, due_s - time.monotonic())):
-                        return
-                picture: U8 = np.asarray(frame.to_ndarray(format="rgba"), np.uint8)
-                rate.count()
-                yield picture
+                if broken:
+                    stream.codec_context.flush_buffers()
+                newest = None
+                for packet in packets:
+                    for frame in packet.decode():
+                        self._check_size(frame.width, frame.height)
+                        newest = frame
+                if newest is not None:
+                    yield newest
 
     def _check_size(self, width_px: int, height_px: int) -> None:
         """Raises InputError for too many pixels; tells a change."""
@@ -201,12 +233,13 @@ class _Reader:
 class _RateCheck:
     """Pictures that come much faster or slower than the source says: told once, and shown as they come."""
 
-    def __init__(self, told_hz: float, name: str, *, silent: bool) -> None:
-        self._told_hz, self._name, self._silent = told_hz, name, silent
+    def __init__(self, told_hz: float, name: str) -> None:
+        """told_hz: 0 where it says nothing."""
+        self._told_hz, self._name = told_hz, name
         self._times_s: list[float] = []
 
     def count(self) -> None:
-        if self._silent or len(self._times_s) > COUNTED:
+        if self._told_hz <= 0 or len(self._times_s) > COUNTED:
             return
         self._times_s.append(time.monotonic())
         if len(self._times_s) <= COUNTED:

@@ -31,7 +31,8 @@ def _noise(seed: int, octaves: int = 4) -> F64:
         for _ in range(6):
             a, b = random.integers(-(2**octave) - 1, 2**octave + 2, 2)
             total += np.sin(2 * np.pi * (a * u + b * v + random.random())) / 2**octave
-    return (total - total.min()) / np.ptp(total)
+    found: F64 = (total - total.min()) / np.ptp(total)
+    return found
 
 
 def checker() -> U8:

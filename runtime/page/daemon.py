@@ -12,6 +12,7 @@ from runtime.daemon.client import NotRunning, ask
 from runtime.page.thumbnails import Thumbnails
 
 LOOKED_UP_AGAIN_S = {"status": 0.2, "pictures": 0.3, "log": 0.5, "about": 2.0}
+PICTURES_NEW_S = 2.0  # less than a scene is shown before its picture is kept
 LOOKED_UP_WITHIN_S = 3.0
 TOLD_WITHIN_S = 70.0  # a scene or a model is loaded first
 
@@ -33,9 +34,15 @@ class Daemon:
                 return answer
             answer = self._asked({"command": name}, timeout_s=LOOKED_UP_WITHIN_S)
             self._answers[name] = time.monotonic(), answer
-        if name == "pictures" and answer.get("ok"):
-            self.thumbnails.note(self.look_up("status"), answer)
+        if name == "status" and answer.get("ok"):
+            self._note(answer)
         return answer
+
+    def _note(self, status: dict[str, Any]) -> None:
+        """The pictures that were told shortly before this status may be of the scene that it names."""
+        asked_s, pictures = self._answers.get("pictures", (float("-inf"), {}))
+        if pictures.get("ok") and time.monotonic() - asked_s < PICTURES_NEW_S:
+            self.thumbnails.note(status, pictures)
 
     def tell(self, command: str, value: Any) -> dict[str, Any]:
         """One wish; what became of it."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 from collections.abc import Awaitable, Callable
 from functools import cache
 from importlib.resources import files
@@ -22,8 +21,10 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 from starlette.routing import Route
 
+from runtime.errors import InputError
 from runtime.page.daemon import LOOKED_UP_AGAIN_S, Daemon
 from runtime.page.token import cookie_of, same
+from runtime.support.foreign import parsed_json
 
 COOKIE = "phasestack"
 COMMANDS = (
@@ -81,10 +82,10 @@ def application(daemon: Daemon, token: str, *, any_host: bool) -> Starlette:
 
     async def do(request: Request) -> Response:
         try:
-            asked = json.loads(await _body(request))
+            asked = parsed_json(await _body(request), source="the request")
         except TooLong:
             return JSONResponse({"ok": False, "error": "the request is too long"}, 413)
-        except ValueError:
+        except (InputError, ValueError):
             asked = None
         if not isinstance(asked, dict) or asked.get("command") not in COMMANDS:
             return JSONResponse({"ok": False, "error": f"command: one of {', '.join(COMMANDS)}"}, 400)
@@ -95,7 +96,7 @@ def application(daemon: Daemon, token: str, *, any_host: bool) -> Starlette:
     async def login(request: Request) -> Response:
         try:
             fields = parse_qs((await _body(request)).decode("utf-8", "replace"))
-        except TooLong:
+        except ValueError:  # too long, or the client went away
             fields = {}
         if not same(fields.get("token", [""])[0].strip(), token):
             await anyio.sleep(WRONG_TOKEN_S)
@@ -157,7 +158,14 @@ class _Guard:
         if origin is None:
             given = request.headers.get("authorization", "").lower().startswith("bearer ")
             return "" if given else "a browser's request says where it comes from (Origin)"
-        return "" if urlsplit(origin).netloc == host else "from another site"
+        return "" if host and _place(origin) == host else "from another site"
+
+
+def _place(origin: str) -> str:
+    try:
+        return urlsplit(origin).netloc
+    except ValueError:
+        return ""
 
 
 def _name(host: str) -> str:

@@ -26,7 +26,7 @@ class Thumbnails:
         self._renewed: dict[str, float] = {}
 
     def note(self, status: dict[str, Any], pictures: dict[str, Any]) -> None:
-        """What the daemon tells, and the pictures that it told after that: perhaps one to keep."""
+        """What the daemon tells, and the pictures that it told shortly before that: perhaps one to keep."""
         scene, now_s = str(status.get("scene", "")), time.monotonic()
         shown = f"{scene}\0{status.get('content')}\0{status.get('placing')}"
         if shown != self._since[0]:

@@ -42,7 +42,7 @@ def _read(path: Path) -> str:
             raise InputError(path, "", "is not a file")
         if found.st_mode & 0o077:
             raise InputError(path, "", f"others may read it (mode {found.st_mode & 0o777:o}): chmod 600, or delete it")
-        token = opened.read(MOST_BYTES).decode("ascii", "replace").strip()
+        token = (opened.read(MOST_BYTES) or b"").decode("ascii", "replace").strip()
     if len(token) < LEAST_CHARACTERS or not token.isprintable() or " " in token:
         raise InputError(path, "", f"holds no token: at least {LEAST_CHARACTERS} characters on one line; or delete it")
     return token

@@ -6,7 +6,7 @@ import io
 import socket
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 
@@ -54,17 +54,16 @@ def transport_stream(pictures: int, **options: object) -> bytes:
     return held.getvalue()
 
 
-class StreamServer:
-    """Sends bytes to whoever connects, at a pace, until told to hold or to hang up."""
+class Served:
+    """Sends to whoever connects, one at a time, until told to hang up."""
 
-    def __init__(self, data: bytes) -> None:
-        self.data, self.hold, self.hang_up = data, threading.Event(), threading.Event()
-        self.pace_s = 0.01
+    def __init__(self) -> None:
+        self.hang_up = threading.Event()
         self.connections = 0
         self._listening = socket.create_server(("127.0.0.1", 0))
         self.url = f"tcp://127.0.0.1:{self._listening.getsockname()[1]}"
         self._closing = threading.Event()
-        threading.Thread(target=self._run, daemon=True).start()
+        threading.Thread(target=self._run, name="served", daemon=True).start()
 
     def close(self) -> None:
         self._closing.set()
@@ -78,8 +77,20 @@ class StreamServer:
                 return
             self.connections += 1
             self.hang_up.clear()
-            with client:
+            with client, suppress(OSError):  # who was served has gone
                 self._send(client)
+
+    def _send(self, client: socket.socket) -> None:
+        raise NotImplementedError
+
+
+class StreamServer(Served):
+    """Sends bytes at a pace, or holds."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.hold = data, threading.Event()
+        self.pace_s = 0.01
+        super().__init__()
 
     def _send(self, client: socket.socket) -> None:
         data, at, step = self.data, 0, 188 * 16
@@ -87,10 +98,7 @@ class StreamServer:
             if self.hold.is_set():
                 self._closing.wait(0.02)
                 continue
-            try:
-                client.sendall(data[at : at + step])
-            except OSError:
-                return
+            client.sendall(data[at : at + step])
             at += step
             self._closing.wait(self.pace_s)
 

@@ -15,6 +15,24 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
+CONFIGURATION = """
+[stack]
+width_px = {width}
+height_px = {height}
+[sensor]
+driver = "replay"
+source = "demo"
+loop = true
+[model]
+name = "fast"
+threads = 1
+[loop]
+rate_hz = 60.0
+solver_late_s = 10.0
+[service]
+socket = "s.sock"
+blackbox_folder = "boxes"
+"""
 
 
 class Page:

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from runtime.daemon.client import NotRunning, ask
-from tests.page.rig import ROOT, page_of, short_folder
+from tests.page.rig import CONFIGURATION, ROOT, page_of, short_folder
 from tests.waiting import eventually
 
 pytestmark = pytest.mark.slow
@@ -30,23 +30,6 @@ CONTROLS = (
     "from a playlist to a scene", "a wish without a daemon is refused",
     "it goes on when it is back", "fits 1280", "fits 390",
 )  # fmt: skip
-CONFIGURATION = """
-[stack]
-width_px = 480
-height_px = 270
-[sensor]
-driver = "replay"
-source = "demo"
-loop = true
-[model]
-name = "fast"
-threads = 1
-[loop]
-solver_late_s = 10.0
-[service]
-socket = "s.sock"
-blackbox_folder = "boxes"
-"""
 
 
 class RunningDaemon:
@@ -54,7 +37,7 @@ class RunningDaemon:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        (folder / "d.toml").write_text(CONFIGURATION)
+        (folder / "d.toml").write_text(CONFIGURATION.format(width=480, height=270))
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:

@@ -11,12 +11,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import anyio
 import pytest
 
 from runtime.clock import MonotonicClock
 from runtime.daemon.server import StatusServer
 from runtime.errors import InputError
 from runtime.page import thumbnails
+from runtime.page.daemon import Daemon
+from runtime.page.server import application
 from runtime.page.thumbnails import Thumbnails
 from runtime.page.token import cookie_of, token_of
 from tests.page.rig import ROOT, Page, page_of, short_folder
@@ -130,6 +133,33 @@ def test_another_sites_request_is_refused_though_the_browser_gives_the_cookie(pa
     assert code == 200 and loop.told == [("pause", None)]
 
 
+def test_an_origin_that_is_no_address_is_refused(page: Page, loop: Loop) -> None:
+    code, _, answer = page.ask("POST", "/do", body='{"command": "pause"}', Origin="http://[", **page.bearer)
+    assert (code, json.loads(answer)["error"], loop.told) == (403, "from another site", [])
+
+
+@pytest.mark.parametrize("path", ["/login", "/do"])
+def test_who_goes_away_while_asking_makes_no_error(tmp_path: Path, path: str) -> None:
+    sent: list[Any] = []
+
+    async def asked() -> None:
+        app = application(Daemon(lambda: (tmp_path / "s.sock",), Thumbnails(tmp_path)), "t" * 40, any_host=False)
+        host = b"localhost:8717"
+        headers = [(b"host", host), (b"origin", b"http://" + host), (b"authorization", b"Bearer " + b"t" * 40)]
+        scope = {"type": "http", "method": "POST", "path": path, "headers": headers, "query_string": b""}
+
+        async def receive() -> Any:
+            return {"type": "http.disconnect"}
+
+        async def send(message: Any) -> None:
+            sent.append(message)
+
+        await app(scope, receive, send)
+
+    anyio.run(asked)
+    assert sent[0]["status"] in (400, 401)
+
+
 def test_a_name_that_leads_here_and_is_not_this_machines_is_refused(page: Page, loop: Loop) -> None:
     assert page.ask("GET", "/now/status", **(page.bearer | {"Host": "elsewhere.example"}))[0] == 403
 
@@ -144,7 +174,9 @@ def test_wishes_reach_the_daemon_and_its_refusals_the_page(page: Page, loop: Loo
     assert loop.told == [("scene", "grey"), ("budget", 20.0), ("scene", "missing")]
 
 
-@pytest.mark.parametrize("body", ["", "[]", "{", '{"command": "status"}', '{"command": "exec"}', "x" * 70_000])
+@pytest.mark.parametrize(
+    "body", ["", "[]", "{", '{"command": "status"}', '{"command": "exec"}', "x" * 70_000, "[" * 60_000]
+)
 def test_what_is_no_wish_is_refused_in_one_line(page: Page, loop: Loop, body: str) -> None:
     code, _, answer = page.ask("POST", "/do", body=body, **page.bearer)
     assert code in (400, 413) and json.loads(answer)["ok"] is False and loop.told == []
@@ -229,6 +261,26 @@ def test_built_in_scenes_have_a_picture_and_others_the_one_that_was_seen(
     assert kept.jpeg("/srv/robot.glb") == b"\xff\xd8\xff"
     kept.note({**status, "scene": "other"}, {"jpegs": {"seen-left": "no base64!"}})
     assert kept.jpeg("other") is None
+
+
+def test_pictures_are_kept_by_the_status_that_is_asked_for_anyway(
+    folder: Path, loop: Loop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    def status() -> dict[str, Any]:
+        asked.append("status")
+        return {"state": "tracking", "scene": "/srv/robot.glb"}
+
+    loop.server.publish(status)
+    loop.server.lookups["pictures"] = lambda: {"frame": 7, "jpegs": {"seen-left": "/9j/"}}
+    monkeypatch.setattr(thumbnails, "SETTLED_S", 0.0)
+    kept = Thumbnails(tmp_path)
+    daemon = Daemon(lambda: (folder / "s.sock",), kept)
+    assert daemon.look_up("pictures")["frame"] == 7
+    assert asked == []
+    assert daemon.look_up("status")["scene"] == "/srv/robot.glb"
+    assert asked == ["status"] and kept.jpeg("/srv/robot.glb") == b"\xff\xd8\xff"
 
 
 def test_a_picture_is_given_with_the_token_alone(page: Page, loop: Loop) -> None:
