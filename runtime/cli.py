@@ -13,34 +13,27 @@ import os
 import signal
 import sys
 
+from runtime.support.interrupts import INTERRUPTED, imports_end_at_once
+
 TYPE_CHECKING = False  # typing's own would be one more import before the guard stands
 if TYPE_CHECKING:
-    from types import FrameType
     from typing import Any
 
-BAD_INPUT, OWN_ERROR, MAY_PASS, INTERRUPTED, NOBODY_READS = 2, 70, 75, 130, 141
-
-
-def _leave(number: int, frame: FrameType | None) -> None:
-    """While modules are imported nothing is open and nothing is written: an interrupt needs no unwinding."""
-    os._exit(INTERRUPTED)
+BAD_INPUT, OWN_ERROR, MAY_PASS, NOBODY_READS = 2, 70, 75, 141
 
 
 def main() -> None:
     """Run the command that the arguments name; never returns."""
     output = _fill_standard_descriptors()
-    before = signal.getsignal(signal.SIGINT)
-    if before is signal.default_int_handler:  # not where the shell has it ignored, for a job in the background
-        signal.signal(signal.SIGINT, _leave)
     try:
-        from runtime.commands.app import app
-        from runtime.support.crash import watch_threads
-        from runtime.support.privacy import keep_quiet
-        from runtime.support.progress import TerminalLine, listening
+        with imports_end_at_once():
+            from runtime.commands.app import app
+            from runtime.support.crash import watch_threads
+            from runtime.support.privacy import keep_quiet
+            from runtime.support.progress import TerminalLine, listening
 
         keep_quiet()
         watch_threads()
-        signal.signal(signal.SIGINT, before)
         with listening(TerminalLine(sys.stderr)):
             code = _code_of(app, output)
     except BaseException as error:
@@ -48,7 +41,19 @@ def main() -> None:
     code = _flushed(code, output)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt now would find the interpreter half taken down
+    if _has_hung_solver():  # taking down what a library's own thread still runs in would end in an abort
+        from runtime.support import logs
+
+        logs.flush()
+        os._exit(code)
     sys.exit(code)
+
+
+def _has_hung_solver() -> bool:
+    """Whether a solver's thread is in a call that did not return (`frame.solver_thread`)."""
+    import threading
+
+    return any(thread.name.startswith("solver-") for thread in threading.enumerate())
 
 
 def _code_of(app: Any, output: _Output) -> int:

@@ -463,6 +463,9 @@ class LimitSettings(Section):
     load_s: Annotated[float, within(0.01, 86_400.0, "s")] = Field(
         120.0, description="loading of one piece of content is given up after this"
     )
+    start_s: Annotated[float, within(1.0, 86_400.0, "s")] = Field(
+        600.0, description="a start is given up where content and model are not ready after this"
+    )
     recording_s: Annotated[float, Field(gt=0, le=1_000_000)] = Field(
         21_600.0, description="length of a recording that is replayed, seconds"
     )

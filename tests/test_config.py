@@ -73,6 +73,7 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         ("[model]\nnaem = 'fast'", "model.naem", "did you mean name?"),
         ("[[output.panels]]\nedid_seril = 'A'", "output.panels.0.edid_seril", "did you mean edid_serial?"),
         ("[loop]\nzebra = 1", "loop.zebra", "is no setting"),
+        ('[model]\ntransfer = "code"', "model.transfer", "is no setting"),  # nothing read it
     ],
 )
 def test_what_makes_no_sense_is_told_with_its_field_and_what_may_have_been_meant(

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+import runtime.config
 from runtime.sensor.known_devices import KNOWN_DEVICES
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -28,6 +29,27 @@ def script(name: str) -> Any:
     sys.modules[name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
     return module
+
+
+FIGURE = re.compile(r"(?<![\w.])\d+(?:\.\d+)? (?:dB|ms|us|px)\b")
+DAY = re.compile(
+    r"(?:January|February|March|April|May|June|July|August|September|October|November|December) 20\d\d|20\d\d-\d\d-\d\d"
+)
+BY = re.compile(
+    r"`(?:phasestack |calibrate |bench |photo-trial|setup |plan |run |report|pytest |make )|tests/\w|^    phasestack",
+    re.M,
+)
+REPORTED = {"models.md", "performance.md"}  # whose tables are remade with every model, and dated one by one
+
+
+def sections_with_unexplained_figures(text: str) -> list[str]:
+    """The headings of sections that tell decibels, milliseconds or pixels and not by what and when."""
+    sections = re.split(r"(?m)^(?=#{1,4} )", text)
+    return [
+        section.partition("\n")[0]
+        for section in sections
+        if FIGURE.search(section) and not (DAY.search(section) and BY.search(section))
+    ]
 
 
 def anchors(page: Path) -> set[str]:
@@ -94,6 +116,19 @@ def test_every_target_of_make_that_a_page_names_is_there(page: Path) -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     calls = re.findall(r"(?:^    |`)make ([a-z][a-z -]*)", page.read_text(encoding="utf-8"), re.MULTILINE)
     assert {target for call in calls for target in call.split()} <= targets
+
+
+@pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=lambda page: page.name)
+def test_a_figure_says_by_what_and_when_it_was_measured(page: Path) -> None:
+    if page.name not in REPORTED:
+        assert sections_with_unexplained_figures(page.read_text(encoding="utf-8")) == []
+
+
+def test_a_figure_without_a_day_or_without_a_command_is_found() -> None:
+    whole = "# A\n\n## B\n\n`phasestack bench` takes 12 ms (21 November 2026).\n"
+    assert sections_with_unexplained_figures(whole) == []
+    assert sections_with_unexplained_figures(whole.replace(" (21 November 2026)", "")) == ["## B"]
+    assert sections_with_unexplained_figures(whole.replace("`phasestack bench`", "It")) == ["## B"]
 
 
 def alternatives(name: str) -> list[str]:
@@ -170,3 +205,17 @@ def test_a_picture_that_cannot_be_made_leaves_the_gallery_as_it_was(tmp_path: Pa
     assert result.returncode != 0
     assert "vernier-1-2-layer-1.png" in result.stderr
     assert {path: path.read_bytes() for path in before} == before
+
+
+def test_the_first_change_that_contributing_leads_to_is_there_to_be_made() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    (name, section, before) = re.findall(r"find `(\w+)` \(of `(\w+)`\) and change its ([\d.]+) to", text)[0]
+    assert getattr(getattr(runtime.config, section)(), name) == float(before)
+    command = [sys.executable, "-m", "runtime.cli", "config"]
+    lines = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True
+    ).stdout.splitlines()
+    (place,) = [number for number, line in enumerate(lines) if line.startswith(name)]
+    assert lines[place] == f"{name} = {before}" and lines[place - 1].startswith("# ")
+    for run in re.findall(r"make golden GOLDEN_ARGS=(\S+)", text):
+        assert (ROOT / "tests" / "golden" / "data" / f"{run}.jsonl").is_file()

@@ -16,7 +16,7 @@ HANG_S = 60  # and then killed: a blocked open does not hear SIGTERM
 
 def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
     names = {name: folder / name for name in ("out", "config.toml", "deep.json", "deep.toml", "nul.toml", "start.toml")}
-    arguments = [part.format(out=names["out"], folder=folder) for part in command.split()]
+    arguments = [part.format(out=names["out"], folder=folder, long=folder / ("d" * 300)) for part in command.split()]
     code = "from runtime.cli import main; main()"
     return subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, timeout=HANG_S)
 
@@ -25,6 +25,8 @@ def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
 def folder(tmp_path: Path) -> Path:
     for name in ("fifo.png", "fifo.toml", "fifo.json", "fifo.mcap", "fifo.onnx", "fifo.csv", "fifo.pth"):
         os.mkfifo(tmp_path / name)
+    rows = "0.1,0.1,0.6,0.6,0.1,0.2\n0.2,0.1,0.6,0.6,0.2,0.2\n0.1,0.3,0.7,0.7,0.1,0.4\n"
+    (tmp_path / "good.csv").write_text("sensor_x,sensor_y,sensor_z,stack_x,stack_y,stack_z\n" + rows)
     (tmp_path / "deep.json").write_text("[" * 100_000)
     (tmp_path / "deep.toml").write_text("a = " + "[" * 100_000)
     (tmp_path / "nul.toml").write_text('[sensor]\nsource = "a\\u0000b"\n')
@@ -54,6 +56,10 @@ def folder(tmp_path: Path) -> Path:
         ("calibrate solve --pairs {folder}/deep.json --out {out}/a.toml", "deep.json: JSON is nested deeper than 64"),
         ("config --check {folder}/fifo.toml", "fifo.toml: is a FIFO"),
         ("status --config {folder}/fifo.toml", "fifo.toml: is a FIFO"),
+        ("calibrate panels photo --photos {long} --out {out}", "at most"),
+        ("calibrate capture --replay demo --out {long}.csv", "at most"),
+        ("calibrate solve --pairs {folder}/good.csv --out {long}.toml", "at most"),
+        ("identify --ask --config {long}.toml", "at most"),
         ("record --motion walk --out {folder}/a.txt", "a.txt: --out: must end in .mcap"),
     ],
 )

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ main()
 """
 
 
-def run(*arguments: str, code: str = MAIN, home: Path | None = None, **how) -> subprocess.CompletedProcess[str]:
+def run(*arguments: str, code: str = MAIN, home: Path | None = None, **how: Any) -> subprocess.CompletedProcess[str]:
     environment = dict(os.environ)
     if home is not None:
         environment = {k: v for k, v in environment.items() if not k.startswith("XDG_")} | {"HOME": str(home)}
@@ -33,7 +34,7 @@ def run(*arguments: str, code: str = MAIN, home: Path | None = None, **how) -> s
     return subprocess.run([sys.executable, "-c", code, *arguments], text=True, timeout=120, env=environment, **how)
 
 
-def broken(body: str, home: Path, **how) -> subprocess.CompletedProcess[str]:
+def broken(body: str, home: Path, **how: Any) -> subprocess.CompletedProcess[str]:
     return run("config", code=BROKEN.format(body=body), home=home, **how)
 
 

@@ -15,18 +15,19 @@ import time
 from base64 import b64encode
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from runtime.blackbox.file import BlackBoxFile
 from runtime.blackbox.messages import Message
-from runtime.blackbox.pictures import Pictures, pictures_of
+from runtime.blackbox.pictures import Pictures, pictures_of, what_shows
 from runtime.blackbox.ring import Ring
 from runtime.blackbox.transcript import Entry, Logged, Refreshed, Sampled, Transcript, line_of
 from runtime.clock import NS_PER_S, Clock
-from runtime.errors import PhasestackError, one_line
+from runtime.errors import ContextLost, PhasestackError, one_line
 from runtime.frame.presenter import Presenter, Refresh
 from runtime.optics.stack import PanelStack
 from runtime.records import SensorFrame
@@ -50,6 +51,19 @@ FAULTS_APART_NS = 60 * NS_PER_S  # a fault that repeats does not fill the disk
 WRITTEN_WITHIN_S = 5.0
 LINES_KEPT, STATES_KEPT = 200, 50  # for who looks in
 MIB = 1 << 20
+
+
+class _Line:
+    """A log line for who looks in: put into words when it is first asked for, not by who logs."""
+
+    def __init__(self, record: logging.LogRecord) -> None:
+        self._record = record
+
+    @cached_property
+    def told(self) -> dict[str, Any]:
+        record = self._record
+        text = one_line(line_of(record))
+        return {"time_s": round(record.created, 3), "level": record.levelname.lower(), "text": text}
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +99,10 @@ class Recorder:
         self._was_degraded = False
         self._pictured_ns = -NS_PER_S
         self._pictured_frame = -1
+        self._pictured: Any = None  # what the newest pictures show
         self._asked_ns = -ASKED_FOR_NS
         self.pictures: Pictures | None = None  # the newest
-        self._lines: deque[logging.LogRecord] = deque(maxlen=LINES_KEPT)
+        self._lines: deque[_Line] = deque(maxlen=LINES_KEPT)
         self._passed: deque[dict[str, Any]] = deque(maxlen=STATES_KEPT)
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -133,7 +148,7 @@ class Recorder:
 
     def _logged(self, record: logging.LogRecord) -> None:
         """On whichever thread logs."""
-        self._lines.append(record)
+        self._lines.append(_Line(record))
         self._put(Logged(self._clock.now_ns(), record))
 
     def _put(self, entry: Entry) -> None:
@@ -161,11 +176,7 @@ class Recorder:
 
     def look_at_log(self) -> dict[str, Any]:
         """The newest log lines and states, the oldest first; times since 1970."""
-        lines = [
-            {"time_s": round(record.created, 3), "level": record.levelname.lower(), "text": one_line(line_of(record))}
-            for record in list(self._lines)
-        ]
-        return {"lines": lines, "states": list(self._passed)}
+        return {"lines": [line.told for line in list(self._lines)], "states": list(self._passed)}
 
     def describe(self) -> dict[str, Any]:
         """For the status."""
@@ -284,7 +295,16 @@ class Recorder:
         if latest.account.frame == self._pictured_frame:
             return
         self._pictured_ns, self._pictured_frame = now_ns, latest.account.frame
-        self.pictures = made = pictures_of(latest, self._stack)
+        shows = what_shows(latest)
+        if self.pictures is not None and shows == self._pictured:  # of a resting head, of a flat picture: the same
+            account = latest.account
+            self.pictures = made = replace(self.pictures, frame=account.frame, time_ns=account.present_ns)
+        else:
+            try:
+                self.pictures = made = pictures_of(latest, self._stack)
+            except ContextLost:  # its layers were in textures: the next refresh has others
+                return
+        self._pictured = shows
         del latest
         if self._transcript is not None:
             for message in self._transcript.of(made, lost=self.lost):

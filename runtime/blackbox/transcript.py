@@ -147,8 +147,8 @@ class Transcript:
 
 
 def line_of(record: logging.LogRecord) -> str:
-    """A log record's message with its fields, and the exception that it tells of."""
-    text = record.getMessage() + "".join(f" {key}={value}" for key, value in getattr(record, "fields", {}).items())
+    """A log record's message, and the exception that it tells of."""
+    text = record.getMessage()
     if record.exc_info and record.exc_info[1] is not None:
         text += f": {type(record.exc_info[1]).__name__}: {record.exc_info[1]}"
     return text

@@ -40,10 +40,11 @@ def identify(
     """
     from runtime.config import load_settings
     from runtime.errors import InputError
+    from runtime.support.foreign import is_there
 
     if ask and config is None:
         raise InputError("identify", "--ask", "needs --config (it is made where it is not there)")
-    settings = load_settings(config if config is None or config.exists() or not ask else None)
+    settings = load_settings(config if config is None or not ask or is_there(config) else None)
     if out is not None:
         _write(settings, out, panel)
     elif ask:

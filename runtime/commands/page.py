@@ -45,7 +45,9 @@ def page(
     from runtime.page.daemon import Daemon
     from runtime.page.thumbnails import Thumbnails
     from runtime.page.token import token_of
+    from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
 
+    set_niceness(BACKGROUND_NICENESS)  # the display comes first; its threads are started after this
     sockets(config, socket)  # a bad configuration is told now
     path = token_file or state_folder() / "page-token"
     token = token_of(path)

@@ -35,7 +35,12 @@ def record(
     noise_mm: Annotated[
         float | None, typer.Option(min=0, max=100, help="with --motion: the sensor's noise, standard deviation an axis")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace a recording of the same name")] = False,
+    force: Annotated[
+        bool,
+        typer.Option(
+            "--force", help="replace a recording of the same name; one of --motion may always replace its like"
+        ),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="what was recorded as one JSON object on stdout")] = False,
 ) -> None:
     """Record eye positions with their times; pictures only with --images. Ctrl-C ends a recording properly.
@@ -46,7 +51,9 @@ def record(
 
     Example: phasestack record --motion walk --seed 3 --rate-hz 60 --out walk.mcap
     """
-    refuse_target(out, force=force or motion is not None)  # a motion is made again from its seed; a viewer is not
+    refuse_target(out, force=force or motion is not None)
+    if motion is not None and not force and not _is_motion(out):  # which is made again from its seed; a viewer is not
+        refuse_target(out, force=False)
     made = {"--seed": seed, "--rate-hz": rate_hz, "--noise-mm": noise_mm}
     if motion is not None:
         _refuse_with("--motion", {"--config": config, "--images": images or None})
@@ -77,6 +84,17 @@ def refuse_target(out: Path, *, force: bool, source: str = "record", field: str 
         raise InputError(out, "--out", "is there already: take another name, or --force to replace it")
 
 
+def _is_motion(out: Path) -> bool:
+    """Whether a recording there was made by --motion."""
+    from runtime.errors import InputError
+    from runtime.sensor.recording import Recording
+
+    try:
+        return Recording(out).header.driver == "motion"
+    except InputError:
+        return False
+
+
 def _refuse_with(what: str, options: dict[str, Any]) -> None:
     """Raises InputError for options that mean nothing with what is recorded."""
     from runtime.errors import InputError
@@ -89,7 +107,7 @@ def _refuse_with(what: str, options: dict[str, Any]) -> None:
 def _record_motion(
     out: Path, motion: str, *, seed: int | None, rate_hz: float | None, noise_mm: float | None, seconds: float | None
 ) -> dict[str, Any]:
-    from runtime.commands.motion_recording import write_motion
+    from runtime.evaluation.motion_recording import write_motion
 
     how = {"seed": seed, "rate_hz": rate_hz, "noise_mm": noise_mm, "seconds": seconds}
     given: dict[str, Any] = {name: value for name, value in how.items() if value is not None}
@@ -142,7 +160,7 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
         cleanup.callback(worker.stop)
         worker.start()
         try:
-            frame = _first(worker, clock.now_ns(), pending)
+            frame = _first(worker, clock.now_ns(), pending, driver=s.driver)
             first_ns = last_ns = frame.capture_ns
             writer = cleanup.enter_context(recording_to(out, _header(frame, s.driver, worker, images), limits=limits))
             tell = cleanup.enter_context(_progress(quiet, seconds))
@@ -188,13 +206,14 @@ def _header(frame: SensorFrame, driver: str, worker: SensorWorker, images: bool)
     )
 
 
-def _first(worker: SensorWorker, now_ns: int, pending: deque[SensorFrame]) -> SensorFrame:
+def _first(worker: SensorWorker, now_ns: int, pending: deque[SensorFrame], *, driver: str) -> SensorFrame:
     """The first sample. Raises FatalError where the sensor gives none."""
     from runtime.errors import FatalError
 
     frame = _next(worker, now_ns + round(FIRST_SAMPLE_S * 1e9), pending)
     if frame is None:
-        raise worker.error or FatalError(f"sensor: no sample ({worker.state}: {worker.reason or 'nothing came'})")
+        why = worker.reason or "nothing came"
+        raise worker.error or FatalError(f"sensor {driver}: no sample ({worker.state}: {why})")
     return frame
 
 

@@ -38,7 +38,7 @@ def report(
 
     from runtime.report.assemble import whole_report
     from runtime.report.progress import status_line
-    from runtime.support.artifacts import OutputFolder, to_json, write_json, write_text
+    from runtime.support.artifacts import to_json
 
     parts = ["phasestack report", *([f"--pairs {pairs.name}"] if pairs else []), *(["--focal"] if focal else [])]
     parts += [f"--model {Path(name).name}" for name in model or []] + (["--quick"] if quick else [])
@@ -54,11 +54,7 @@ def report(
             progress=tell,
             fresh=fresh,
         )
-    with OutputFolder(out) as folder:
-        write_json(folder.staging / "report.json", done.record)
-        write_text(folder.staging / "index.html", done.page.html())
-        for figure in done.page.figures():
-            (folder.staging / f"{figure.name}.png").write_bytes(figure.png)
+    done.page.write(out, record="report.json", data=done.record)
     done.forget()
     if as_json:
         print(to_json(done.record))

@@ -63,9 +63,12 @@ def run(
 
     Example: phasestack run --replay demo --headless --record out/run.mcap
     """
-    from runtime.config import Overrides
-    from runtime.daemon.supervise import run_daemon
-    from runtime.errors import InputError
+    from runtime.support.interrupts import imports_end_at_once
+
+    with imports_end_at_once():
+        from runtime.config import Overrides
+        from runtime.daemon.supervise import run_daemon
+        from runtime.errors import InputError
 
     if keep_light and out is None:
         raise InputError("run", "--keep-light", "needs --out")

@@ -8,8 +8,6 @@ from typing import Annotated
 
 import typer
 
-Point = tuple[float, float, float]
-
 
 def solve(
     left: Annotated[Path, typer.Option(help="picture for the left eye")],

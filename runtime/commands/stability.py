@@ -39,7 +39,7 @@ def stability(
     from runtime.report.stability import suite
     from runtime.report.stability.limits import load_limits, recorded
     from runtime.report.stability.page import stability_page, stages_of
-    from runtime.support.artifacts import OutputFolder, to_json, write_json, write_text
+    from runtime.support.artifacts import to_json, write_text
 
     started = time.perf_counter()
     limits = load_limits()
@@ -55,11 +55,7 @@ def stability(
     if out is not None:
         command = "phasestack stability" + (" --full" if full else "")
         page = stability_page(cases, machine=machine, seconds=seconds, command=command)
-        with OutputFolder(out) as folder:
-            write_json(folder.staging / "stability.json", result)
-            write_text(folder.staging / "index.html", page.html())
-            for figure in page.figures():
-                (folder.staging / f"{figure.name}.png").write_bytes(figure.png)
+        page.write(out, record="stability.json", data=result)
     if as_json:
         print(to_json(result))
     else:

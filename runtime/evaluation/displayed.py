@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
+
 from runtime.optics.carried import expected_psnrs_db, intensities
 from runtime.optics.quality import Quality, quality
 from runtime.optics.retina import Retina, seen_by
@@ -77,8 +79,6 @@ def on_panels_raster(picture: Picture, stack: PanelStack) -> Picture:
 
     A picture of another aspect would be stretched, and then no eye is meant to see it.
     """
-    import cv2
-
     height_px, width_px = picture.shape[:2]
     if (width_px, height_px) == (stack.width_px, stack.height_px):
         return picture

@@ -6,6 +6,7 @@ import logging
 from pathlib import Path
 from typing import Literal
 
+import cv2
 import numpy as np
 
 from runtime.clock import NS_PER_S
@@ -191,8 +192,6 @@ def _depth_scale(frame: SensorFrame) -> F64:
 
 
 def _resized(picture: U8, scale: float) -> U8:
-    import cv2
-
     if scale == 1.0:
         return np.ascontiguousarray(picture)
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR

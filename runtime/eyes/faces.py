@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 
 from runtime.errors import InputError, MissingPart
@@ -50,8 +51,6 @@ class FaceFinder(Protocol):
 
 
 def _cascade(name: str) -> Any:
-    import cv2
-
     place = Path(getattr(getattr(cv2, "data", None), "haarcascades", "/usr/share/opencv4/haarcascades")) / name
     cascade = cv2.CascadeClassifier(str(place)) if place.is_file() else None
     if cascade is None or cascade.empty():
@@ -68,8 +67,6 @@ class HaarFaces:
         self._open_eyes = _cascade("haarcascade_eye.xml")
 
     def find(self, picture: U8, *, smallest_px: int, largest_px: int) -> list[Face]:
-        import cv2
-
         grey: U8 = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         largest = min(largest_px, *grey.shape)
         boxes, _, weights = self._faces.detectMultiScale3(
@@ -88,8 +85,6 @@ class HaarFaces:
         return sorted(faces, key=lambda face: -face.width)
 
     def _find_eyes(self, grey: U8, box: tuple[int, int, int, int]) -> F64:
-        import cv2
-
         x, y, w, h = box
         top, bottom = y + round(EYES_BELOW * h), y + round(EYES_ABOVE * h)
         scale = EYE_WORK_PX / w
@@ -134,8 +129,6 @@ class YunetFaces:
 
     def __init__(self, model: Path) -> None:
         """Raises InputError where the file is not such a model."""
-        import cv2
-
         if not model.is_file():
             raise InputError("detector", "yunet_model", f"{model}: is not a file")
         try:
@@ -144,8 +137,6 @@ class YunetFaces:
             raise InputError("detector", "yunet_model", f"{model}: is not a YuNet model ({error.err})") from None
 
     def find(self, picture: U8, *, smallest_px: int, largest_px: int) -> list[Face]:
-        import cv2
-
         height, width = picture.shape[:2]
         self._detector.setInputSize((width, height))
         _, rows = self._detector.detect(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))

@@ -90,13 +90,3 @@ class SteppedDriver(SensorDriver):
     @abstractmethod
     def available_ns(self, frame: SensorFrame) -> int:
         """When a sample arrives, on the run's clock: the caller lets its clock pass until then."""
-
-    def take_until(self, time_ns: int) -> list[SensorFrame]:
-        """All samples that have arrived by a time of the run's clock, oldest first, each once; none: an empty list.
-
-        Where nothing is left, `peek` answers None. Raises SensorLost.
-        """
-        frames = []
-        while (following := self.peek()) is not None and self.available_ns(following) <= time_ns:
-            frames.append(self.next_sample())
-        return frames

@@ -23,7 +23,7 @@ SERIAL_PROPERTY = 3
 DEPTH_1_MM, DEPTH_100_UM, RGB888, GRAY8 = 100, 101, 200, 202
 PAIR_APART_US = 40_000  # depth and colour of one instant are no further apart: a period of a camera without sync
 PAIR_WAIT_S = 0.02
-DUMMY_STOPS_S = 0.1  # three periods of its threads
+DUMMY_STOPS_S = 0.5  # fifteen periods of its threads: on a busy machine three were too few (a crash in a test)
 DRAIN_MAX = 32  # frames that are passed over in one call: a queue can't keep us
 
 log = logging.getLogger(__name__)

@@ -49,7 +49,7 @@ class RecordingWriter:
     ) -> None:
         from mcap.writer import CompressionType, IndexType, Writer
 
-        self._file, self._limits, self._chunk_bytes = file, limits or RecordingLimits(), chunk_bytes
+        self._file, self._limits = file, limits or RecordingLimits()
         self._images, self._eye_points = header.colour or header.depth, header.eye_points
         # Eye points alone are so few that plain bytes, the same with every version of a library, are worth more.
         compression = CompressionType.LZ4 if self._images else CompressionType.NONE

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+import cv2
 import numpy as np
 
 from runtime.clock import NS_PER_S
@@ -200,8 +201,6 @@ def _coded_bytes(table: dict[str, Any]) -> bytes:
 
 def colour_message(colour: U8, *, capture_ns: int) -> bytes:
     """(h, w, 3) RGB as a JPEG in JSON."""
-    import cv2
-
     done, jpeg = cv2.imencode(".jpg", colour[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
         raise ValueError("JPEG encoding failed")
@@ -211,8 +210,6 @@ def colour_message(colour: U8, *, capture_ns: int) -> bytes:
 
 def colour_from_message(data: bytes, *, most_pixels: int = 1 << 26) -> U8:
     """(h, w, 3) back from `colour_message` (JPEG is lossy). Raises ValueError."""
-    import cv2
-
     coded = _coded_bytes(_table(data))
     width, height = picture_size(coded)
     if max(width, height) > IMAGE_SIDE_MAX_PX or width * height > most_pixels:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -24,8 +25,10 @@ PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file atomically, making its parents. Raises InputError where the folder can't be written."""
+    """Write a file atomically, making its parents. Raises InputError where it can't be written, or is a folder."""
     try:
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     except OSError as error:
@@ -35,8 +38,10 @@ def write_bytes(path: Path, data: bytes) -> None:
             file.write(data)
         Path(name).chmod(0o644)
         Path(name).replace(path)
-    except BaseException:
+    except BaseException as error:
         Path(name).unlink(missing_ok=True)
+        if isinstance(error, OSError):  # a full or failing disk
+            raise InputError(path, "", f"cannot be written ({error.strerror})") from None
         raise
 
 
@@ -47,21 +52,27 @@ def write_text(path: Path, text: str) -> None:
 
 def to_json(value: Any) -> str:
     """JSON text; arrays become lists, non-finite numbers null (JSON has none)."""
+    try:
+        return json.dumps(value, allow_nan=False, default=_listed)
+    except (ValueError, TypeError):  # there is such a number somewhere, or a key that is no text
+        return json.dumps(_finite(value), allow_nan=False)
 
-    def plain(item: Any) -> Any:
-        if isinstance(item, dict):
-            return {str(key): plain(child) for key, child in item.items()}
-        if isinstance(item, list | tuple):
-            return [plain(child) for child in item]
-        if isinstance(item, np.ndarray):
-            return plain(item.tolist())
-        if isinstance(item, np.generic):
-            return plain(item.item())
-        if isinstance(item, float) and not np.isfinite(item):
-            return None
-        return item
 
-    return json.dumps(plain(value), allow_nan=False)
+def _listed(item: Any) -> Any:
+    """What the encoder itself does not know."""
+    if isinstance(item, np.ndarray | np.generic):
+        return item.tolist()
+    raise TypeError(f"{type(item).__name__} is nothing that JSON has")
+
+
+def _finite(item: Any) -> Any:
+    if isinstance(item, dict):
+        return {str(key): _finite(child) for key, child in item.items()}
+    if isinstance(item, list | tuple):
+        return [_finite(child) for child in item]
+    if isinstance(item, np.ndarray | np.generic):
+        return _finite(item.tolist())
+    return None if isinstance(item, float) and not np.isfinite(item) else item
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -177,10 +188,16 @@ class OutputFolder:
         finally:
             self.discard()
             self._lock.close()
-        if kind is not None:
-            for folder in self._made:
-                if folder.is_dir() and not any(folder.iterdir()):
-                    folder.rmdir()
+        if kind is None:
+            return
+        for folder in self._made:
+            if folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
+        if isinstance(error, InputError) and error.source.startswith(str(self.staging)):  # a name that nobody gave
+            file = self.target / Path(error.source).relative_to(self.staging)
+            raise InputError(file, error.field, error.problem) from None
+        if isinstance(error, OSError) and str(error.filename or "").startswith(str(self.staging)):
+            raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
 
     def discard(self) -> None:
         """Remove what was staged so far, before the end."""

@@ -12,6 +12,7 @@ import os
 import re
 import stat
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -45,6 +46,15 @@ def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") 
     return Path(text)
 
 
+def is_there(path: str | Path, *, folder: bool = False) -> bool:
+    """Whether something, or a folder, is at a path. Raises InputError where that cannot be asked."""
+    checked = checked_path(path)
+    try:
+        return checked.is_dir() if folder else checked.exists()
+    except OSError as error:
+        raise InputError(path, "", f"cannot be read ({error.strerror})") from None
+
+
 def open_regular(
     path: str | Path, *, most_bytes: int | None = None, source: str | Path = "", field: str = ""
 ) -> IO[bytes]:
@@ -62,12 +72,21 @@ def open_regular(
         status = os.fstat(number)
         if not stat.S_ISREG(status.st_mode):
             raise InputError(whence, field, f"is {_kind(status.st_mode)}, not a file")
+        if _is_kernels(number):
+            raise InputError(whence, field, "is the kernel's own, not a file")
         if most_bytes is not None and status.st_size > most_bytes:
             raise InputError(whence, field, f"has {_size(status.st_size)}; at most {_size(most_bytes)}")
         return os.fdopen(number, "rb")
     except BaseException:
         os.close(number)
         raise
+
+
+def _is_kernels(number: int) -> bool:
+    """Whether an open file is one of /proc or /sys: regular by its kind, it may never begin or never end."""
+    with suppress(OSError):
+        return str(Path(f"/proc/self/fd/{number}").readlink()).startswith(("/proc/", "/sys/"))
+    return False
 
 
 def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", field: str = "") -> bytes:

@@ -36,25 +36,15 @@ CLOSE_S = 1.0  # so long the last lines are waited for
 LINE_MAX = 4000  # characters
 
 
-def event(logger: logging.Logger, level: int, message: str, **fields: Any) -> None:
-    """One structured line: a constant message (which the rate limit counts by) and named values."""
-    logger.log(level, message, extra={"fields": fields})
-
-
-def _fields(record: logging.LogRecord) -> dict[str, Any]:
-    return getattr(record, "fields", {})
-
-
 class TextFormat(logging.Formatter):
-    """`message key=value`; under journald with a priority and no time (it has its own), else with the time."""
+    """The message; under journald with a priority and no time (it has its own), else with the time."""
 
     def __init__(self, *, journald: bool) -> None:
         super().__init__()
         self._journald = journald
 
     def format(self, record: logging.LogRecord) -> str:
-        pairs = "".join(f" {key}={value}" for key, value in _fields(record).items())
-        text = one_line(record.getMessage() + pairs, most=LINE_MAX)  # nobody's name or message forges a line
+        text = one_line(record.getMessage(), most=LINE_MAX)  # nobody's name or message forges a line
         if record.exc_info and record.exc_info[1]:
             text += f": {written(record.exc_info[1])}"  # a traceback is for whoever mends it, not for the log
         if self._journald:
@@ -65,7 +55,7 @@ class TextFormat(logging.Formatter):
 
 
 class JsonFormat(logging.Formatter):
-    """One JSON object a line: time, level, logger, message, and the event's own fields."""
+    """One JSON object a line: time, level, logger, message."""
 
     def format(self, record: logging.LogRecord) -> str:
         line: dict[str, Any] = {
@@ -73,7 +63,6 @@ class JsonFormat(logging.Formatter):
             "level": record.levelname.lower(),
             "logger": record.name,
             "message": record.getMessage(),
-            **_fields(record),
         }
         if record.exc_info and record.exc_info[1]:
             line["exception"] = written(record.exc_info[1])

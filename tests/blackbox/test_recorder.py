@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,7 +16,7 @@ from runtime.blackbox import recorder as recording
 from runtime.blackbox.file import BlackBoxFile
 from runtime.blackbox.location import black_box_folder, state_folder
 from runtime.blackbox.messages import Message, state
-from runtime.blackbox.pictures import seen
+from runtime.blackbox.pictures import pictures_of, seen
 from runtime.blackbox.recorder import Plan, Recorder
 from runtime.blackbox.ring import OVERHEAD_BYTES, Ring
 from runtime.blackbox.schemas import STATE
@@ -209,6 +210,48 @@ def test_what_an_eye_sees_of_the_front_panel_shifts_with_the_eye() -> None:
     pixels = 0.1 * 0.06 / 0.54 / (0.5184 / 64)
     assert columns[0] - columns[1] == pytest.approx(pixels, abs=1.0)
     assert columns[1] - columns[2] == pytest.approx(pixels, abs=1.0)
+
+
+def refresh_of(frame: PanelFrame, *, number: int = 1, eyes_m: Any = None) -> Any:
+    return SimpleNamespace(frame=frame, account=SimpleNamespace(frame=number, present_ns=number, eyes_m=eyes_m))
+
+
+def decoded(jpeg: bytes) -> Any:
+    return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+
+
+@pytest.mark.parametrize("wider", [1, 8, 30])
+def test_a_layers_picture_has_its_colours_where_they_are(wider: int) -> None:
+    stack = PanelStack(0.5184, 0.2916, STACK.x_m, 64 * wider, 36 * wider)
+    layers = np.zeros((3, stack.height_px, stack.width_px, 4), np.uint8)
+    layers[0, :, : stack.width_px // 2] = (200, 100, 40, 255)
+    found = decoded(pictures_of(refresh_of(PanelFrame(1, layers, 1)), stack, width_px=64).jpegs["layer-0"])
+    assert found.shape == (36, 64, 3)
+    np.testing.assert_allclose(found[:, :28].mean((0, 1)), (200, 100, 40), atol=4)
+    assert found[:, 36:].max() < 20
+
+
+def test_pictures_are_made_anew_only_where_something_else_shows(monkeypatch: Any) -> None:
+    made: list[int] = []
+
+    def counted(refresh: Any, stack: PanelStack) -> Any:
+        made.append(refresh.account.frame)
+        return pictures_of(refresh, stack)
+
+    monkeypatch.setattr(recording, "pictures_of", counted)
+    monkeypatch.setattr(recording, "KEPT_PICTURES_EVERY_NS", 0)
+    layers = np.zeros((3, 36, 64, 4), np.uint8)
+    recorder = Recorder(Plan(minutes=1.0))
+    recorder._clock, recorder._stack = MonotonicClock(), STACK
+    eyes_m = np.array([[0.6, -0.03, 0.0], [0.6, 0.03, 0.0]])
+    shown = [PanelFrame(1, layers, 1), PanelFrame(2, layers, 1), PanelFrame(3, layers, 2)]
+    for number, frame in enumerate(shown, start=1):
+        recorder._latest = refresh_of(frame, number=number, eyes_m=eyes_m)
+        recorder._make_pictures()
+        assert recorder.look_at_pictures()["frame"] == number
+    recorder._latest = refresh_of(shown[-1], number=4, eyes_m=eyes_m + 0.01)
+    recorder._make_pictures()
+    assert made == [1, 3, 4]
 
 
 def test_black_boxes_go_where_the_service_may_write() -> None:

@@ -6,7 +6,9 @@ import json
 import math
 import struct
 import zlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -91,7 +93,7 @@ def test_an_error_that_would_take_an_eye_behind_the_display_has_no_expected_qual
 
 
 @pytest.fixture
-def solved(tmp_path: Path):
+def solved(tmp_path: Path) -> Callable[..., Any]:
     """Runs `solve` on two pictures' files; answers solve.json and the layers."""
 
     def run(left: Path, right: Path, *more: str) -> tuple[dict, np.ndarray]:
@@ -108,7 +110,9 @@ def solved(tmp_path: Path):
 
 
 @pytest.mark.parametrize("size", [(48, 27), (27, 48)], ids=["wider than the panels", "portrait"])
-def test_solve_tells_what_the_eyes_see_of_pictures_of_another_aspect(solved, tmp_path: Path, size) -> None:
+def test_solve_tells_what_the_eyes_see_of_pictures_of_another_aspect(
+    solved: Callable[..., Any], tmp_path: Path, size: tuple[int, int]
+) -> None:
     width, height = size
     targets = []
     for name, shift in (("left", 0), ("right", 2)):
@@ -126,7 +130,7 @@ def test_solve_tells_what_the_eyes_see_of_pictures_of_another_aspect(solved, tmp
     assert told["eye_sigma_mm"] == 1
 
 
-def test_solve_scores_16_bit_pictures_with_all_their_bits(solved, tmp_path: Path) -> None:
+def test_solve_scores_16_bit_pictures_with_all_their_bits(solved: Callable[..., Any], tmp_path: Path) -> None:
     targets = []
     for name in ("left", "right"):
         # Half a code above an 8-bit one: cut off to 8 bits, the target would be another by up to 255/256 of a code.
@@ -139,7 +143,7 @@ def test_solve_scores_16_bit_pictures_with_all_their_bits(solved, tmp_path: Path
     assert abs(told["psnr_db"] - cut_off) > 0.05, "this test must be able to fail"
 
 
-def test_solve_composes_transparent_pictures_on_white(solved, tmp_path: Path) -> None:
+def test_solve_composes_transparent_pictures_on_white(solved: Callable[..., Any], tmp_path: Path) -> None:
     targets = []
     for name in ("left", "right"):
         colour = (smooth(60, 80) * 255).astype(np.uint8)
@@ -164,7 +168,7 @@ def test_a_16_bit_file_is_read_with_its_low_byte_and_rounded_to_8(tmp_path: Path
 
 @pytest.mark.parametrize("suffix", ["png", "webp", "tiff"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_transparency_lets_white_through_in_every_format_that_has_it(tmp_path: Path, suffix: str, dtype) -> None:
+def test_transparency_lets_white_through_in_every_format_that_has_it(tmp_path: Path, suffix: str, dtype: type) -> None:
     if suffix == "webp" and dtype == np.uint16:
         pytest.skip("WebP has 8 bits")
     most = np.iinfo(dtype).max
@@ -212,7 +216,9 @@ def test_a_picture_that_would_not_fit_is_refused_by_its_header(tmp_path: Path, s
 
 
 @pytest.mark.parametrize("content", [b"", b"no picture", b"\x89PNG\r\n\x1a\nIHDR", png_of(8, 8)[:60]])
-def test_what_is_no_picture_is_refused_with_its_name(tmp_path: Path, content: bytes, capfd) -> None:
+def test_what_is_no_picture_is_refused_with_its_name(
+    tmp_path: Path, content: bytes, capfd: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "a.png").write_bytes(content)
     with pytest.raises(InputError, match=r"a\.png"):
         read_picture(tmp_path / "a.png")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -54,7 +56,7 @@ def test_several_ways_take_turns_and_the_last_answers_are_kept_beside_the_time(c
     order = []
     shared = np.zeros(1)
 
-    def way(name: str, cost_ms: int):
+    def way(name: str, cost_ms: int) -> Any:
         def call(run: int) -> np.ndarray:
             order.append((name, run))
             clock[0] += cost_ms * 10**6

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from runtime.errors import InputError
@@ -166,7 +167,12 @@ vectors = st.tuples(*[st.floats(-2, 2)] * 3).map(np.array)
 
 
 @given(vectors, vectors, vectors, st.tuples(*[st.floats(-1, 1)] * 7).map(np.array))
-def test_the_jacobian_is_the_derivative_of_the_similarity(rotation, point, pivot, direction) -> None:
+def test_the_jacobian_is_the_derivative_of_the_similarity(
+    rotation: NDArray[np.float64],
+    point: NDArray[np.float64],
+    pivot: NDArray[np.float64],
+    direction: NDArray[np.float64],
+) -> None:
     """A central difference of the real thing, not of its formula."""
 
     def moved(step: float) -> np.ndarray:

@@ -1,5 +1,9 @@
 """The filters behind the tracker: against a textbook Kalman filter, and safe where numbers are extreme."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,7 +14,7 @@ from runtime.eyes import imm
 ACCELERATION = (0.002, 0.03, 0.5)
 
 
-def textbook(measured, times, *, q, variance, speed):
+def textbook(measured: Any, times: Any, *, q: Any, variance: Any, speed: Any) -> Any:
     """A Kalman filter of [position, velocity] in matrices, one axis, Joseph form."""
     state, covariance = np.array([measured[0], 0.0]), np.diag([variance, speed**2])
     for z, dt in zip(measured[1:], np.diff(times)):
@@ -23,7 +27,7 @@ def textbook(measured, times, *, q, variance, speed):
     return state, covariance
 
 
-def test_one_model_is_the_textbooks_kalman_filter():
+def test_one_model_is_the_textbooks_kalman_filter() -> None:
     random = np.random.default_rng(0)
     times = np.cumsum(random.uniform(0.01, 0.05, 60))
     measured = np.cumsum(random.normal(0, 0.01, (60, 3)), axis=0)
@@ -42,9 +46,12 @@ def test_one_model_is_the_textbooks_kalman_filter():
     )
 
 
-def test_mixing_matches_the_published_equations():
+def test_mixing_matches_the_published_equations() -> None:
     random = np.random.default_rng(1)
-    models = tuple(imm.Model(*random.normal(size=6), 0.1 + i, 0.05, 1.0 + i, w) for i, w in enumerate((0.2, 0.3, 0.5)))
+    models = tuple(
+        imm.Model(*random.normal(size=6), 0.1 + i, 0.05, 1.0 + i, w)  # type: ignore[call-arg]
+        for i, w in enumerate((0.2, 0.3, 0.5))
+    )
     (mixed, *_), dt, stay_s = imm.predicted(models, 1e-9, acceleration=ACCELERATION, stay_s=1e-9), 1e-9, 1e-9
     stay = np.exp(-dt / stay_s)
     shares = np.array([0.2 * stay, 0.3 * (1 - stay) / 2, 0.5 * (1 - stay) / 2])
@@ -62,7 +69,7 @@ def test_mixing_matches_the_published_equations():
     steps=st.lists(st.floats(0, 1e4), min_size=30, max_size=30),
     variance=st.floats(1e-12, 1e3),
 )
-def test_covariances_stay_positive_and_everything_finite(places, steps, variance):
+def test_covariances_stay_positive_and_everything_finite(places: Any, steps: Any, variance: Any) -> None:
     models = imm.started(places[0], count=3, variance=variance, speed=0.3)
     for place, dt in zip(places[1:], steps):
         models = imm.predicted(models, dt, acceleration=ACCELERATION, stay_s=0.5)
@@ -73,10 +80,10 @@ def test_covariances_stay_positive_and_everything_finite(places, steps, variance
         assert sum(m.weight for m in models) == pytest.approx(1.0)
 
 
-def test_a_still_head_is_believed_calm_and_a_hasty_one_hasty():
+def test_a_still_head_is_believed_calm_and_a_hasty_one_hasty() -> None:
     random, dt = np.random.default_rng(2), 1 / 60
 
-    def weights(path):
+    def weights(path: Any) -> Any:
         models = imm.started(path[0], count=3, variance=4.5e-6, speed=0.3)
         for place in path[1:] + random.normal(0, 0.002, path[1:].shape):
             models = imm.predicted(models, dt, acceleration=ACCELERATION, stay_s=0.5)

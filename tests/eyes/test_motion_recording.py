@@ -1,15 +1,19 @@
 """A benchmark's motion as a recording: what the pipeline replays is what the benchmark's tracker sees."""
 
+from __future__ import annotations
+
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 import typer
+from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from runtime.commands.motion_recording import write_motion
 from runtime.commands.record import record
 from runtime.errors import InputError
+from runtime.evaluation.motion_recording import write_motion
 from runtime.eyes.demo_geometry import demo_stack_from_sensor
 from runtime.eyes.motions import MOTIONS, observe, path_of, true_eyes
 from runtime.sensor.recording import Recording
@@ -18,11 +22,11 @@ app = typer.Typer()
 app.command()(record)
 
 
-def truth_of(path):
+def truth_of(path: Path) -> NDArray[np.float64]:
     return np.array([frame.true_eyes_m for frame in Recording(path).samples()])
 
 
-def test_samples_are_the_observations_through_the_demos_calibration(tmp_path):
+def test_samples_are_the_observations_through_the_demos_calibration(tmp_path: Path) -> None:
     write_motion(tmp_path / "walk.mcap", "walk", seconds=5.0)
     frames = list(Recording(tmp_path / "walk.mcap").samples())
     pose = demo_stack_from_sensor()
@@ -36,7 +40,7 @@ def test_samples_are_the_observations_through_the_demos_calibration(tmp_path):
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_another_seed_is_another_path_and_not_only_other_noise(tmp_path, motion):
+def test_another_seed_is_another_path_and_not_only_other_noise(tmp_path: Path, motion: str) -> None:
     for seed in (1, 2):
         write_motion(tmp_path / f"{seed}.mcap", motion, seed=seed, seconds=4.0)
         write_motion(tmp_path / f"{seed}-again.mcap", motion, seed=seed, seconds=4.0)
@@ -47,7 +51,7 @@ def test_another_seed_is_another_path_and_not_only_other_noise(tmp_path, motion)
 
 @pytest.mark.parametrize("motion", MOTIONS)
 @pytest.mark.parametrize("seed", range(1, 9))
-def test_every_path_is_a_motion_of_its_kind(motion, seed):
+def test_every_path_is_a_motion_of_its_kind(motion: str, seed: int) -> None:
     eyes = true_eyes(motion, np.arange(0, 20, 1e-3), path=path_of(seed))
     np.testing.assert_allclose(np.linalg.norm(eyes[:, 1] - eyes[:, 0], axis=1), 0.063, atol=1e-9)
     speed = np.linalg.norm(np.diff(eyes.mean(1), axis=0), axis=1) / 1e-3
@@ -56,7 +60,7 @@ def test_every_path_is_a_motion_of_its_kind(motion, seed):
 
 
 @pytest.mark.parametrize("rate_hz", [15, 60, 240])
-def test_the_command_makes_any_of_them(tmp_path, rate_hz):
+def test_the_command_makes_any_of_them(tmp_path: Path, rate_hz: int) -> None:
     out = tmp_path / "new" / "nod.mcap"
     how = ["--motion", "nod", "--seed", "7", "--rate-hz", str(rate_hz), "--noise-mm", "0", "--seconds", "2"]
     answer = CliRunner().invoke(app, [*how, "--out", str(out), "--json"])
@@ -80,12 +84,12 @@ def test_the_command_makes_any_of_them(tmp_path, rate_hz):
         (["--motion", "walk", "--seconds", "1e9"], "--seconds"),
     ],
 )
-def test_what_makes_no_sense_is_refused_by_name_and_leaves_nothing(tmp_path, how, names):
+def test_what_makes_no_sense_is_refused_by_name_and_leaves_nothing(tmp_path: Path, how: list[str], names: str) -> None:
     answer = CliRunner().invoke(app, [*how, "--out", str(tmp_path / "a.mcap")])
     assert isinstance(answer.exception, InputError) and names in str(answer.exception)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_unknown_motion_is_refused_and_the_known_ones_are_listed(tmp_path):
+def test_an_unknown_motion_is_refused_and_the_known_ones_are_listed(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="lean"):
         write_motion(tmp_path / "a.mcap", "moonwalk")

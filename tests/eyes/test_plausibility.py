@@ -1,5 +1,7 @@
 """Eyes that can't be a viewer's are told with the mistake that they look like, and counted."""
 
+from __future__ import annotations
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -24,13 +26,13 @@ WRONG = {
 
 
 @pytest.mark.parametrize("reason", WRONG)
-def test_each_mistake_is_told_by_its_name(reason):
+def test_each_mistake_is_told_by_its_name(reason: str) -> None:
     assert p.reason_against(WRONG[reason], **PERSON) == reason
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
 @pytest.mark.parametrize("seed", range(4))
-def test_no_viewer_who_moves_is_suspected_but_an_exchange_of_their_eyes_is(motion, seed):
+def test_no_viewer_who_moves_is_suspected_but_an_exchange_of_their_eyes_is(motion: str, seed: int) -> None:
     for eyes in true_eyes(motion, np.arange(0, 20, 0.05), path=path_of(seed)):
         assert p.reason_against(eyes, **PERSON) == ""
         assert p.reason_against(eyes[::-1], **PERSON) == p.EXCHANGED
@@ -42,7 +44,9 @@ def test_no_viewer_who_moves_is_suspected_but_an_exchange_of_their_eyes_is(motio
     distance_m=st.floats(0.1, 10),
     roll_deg=st.floats(-90, 90),
 )
-def test_heads_that_are_rolled_up_to_a_right_angle_are_a_persons(azimuth_deg, height_m, distance_m, roll_deg):
+def test_heads_that_are_rolled_up_to_a_right_angle_are_a_persons(
+    azimuth_deg: float, height_m: float, distance_m: float, roll_deg: float
+) -> None:
     azimuth, roll = np.deg2rad(azimuth_deg), np.deg2rad(roll_deg)
     middle = np.array([distance_m * np.cos(azimuth), distance_m * np.sin(azimuth), height_m])
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0]) * np.cos(roll) + np.array([0, 0, 1]) * np.sin(roll)
@@ -50,11 +54,11 @@ def test_heads_that_are_rolled_up_to_a_right_angle_are_a_persons(azimuth_deg, he
 
 
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=6, max_size=6))
-def test_any_six_numbers_are_judged(numbers):
+def test_any_six_numbers_are_judged(numbers: list[float]) -> None:
     assert isinstance(p.reason_against(np.array(numbers).reshape(2, 3), **PERSON), str)
 
 
-def test_the_watch_tells_once_counts_by_reason_and_takes_it_back():
+def test_the_watch_tells_once_counts_by_reason_and_takes_it_back() -> None:
     watch = p.PlausibilityWatch(**PERSON)
     told = [watch.update(EYES[::-1]) for _ in range(100)]
     assert [line for line in told if line] == [watch.warning] and "left and right exchanged" in watch.warning
@@ -63,7 +67,7 @@ def test_the_watch_tells_once_counts_by_reason_and_takes_it_back():
     assert [line for line in told if line] == ["sensor: the eyes are plausible again"] and watch.warning == ""
 
 
-def test_a_few_bad_samples_are_counted_and_not_told():
+def test_a_few_bad_samples_are_counted_and_not_told() -> None:
     watch = p.PlausibilityWatch(**PERSON)
     assert not any([watch.update(EYES * (1000 if k % 5 == 0 else 1)) for k in range(200)])
     assert watch.counts == {p.MILLIMETRES: 40} and watch.warning == ""

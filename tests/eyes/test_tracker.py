@@ -1,9 +1,15 @@
 """The tracker answers where the eyes are at any instant, says how it knows, and is fooled by little."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from runtime.config import TrackerSettings
 from runtime.eyes.motions import observe, true_eyes
@@ -16,15 +22,19 @@ STILL = np.array([[0.6, -0.031, 0.03], [0.6, 0.031, 0.03]])
 SURE = np.ones(2)
 
 
-def points(eyes=STILL, *, confidence=1.0, completed=""):
+def points(
+    eyes: NDArray[np.float64] | list[list[float]] = STILL, *, confidence: float = 1.0, completed: str = ""
+) -> EyePoints:
     return EyePoints(np.asarray(eyes, dtype=float), SURE * confidence, completed)
 
 
-def moving(k, speed=(0.0, 0.3, 0.0)):
+def moving(k: float, speed: tuple[float, float, float] = (0.0, 0.3, 0.0)) -> NDArray[np.float64]:
     return STILL + np.array(speed) * (k * PERIOD / 1e9)
 
 
-def fed(count=30, motion=lambda k: STILL, settings=None):
+def fed(
+    count: int = 30, motion: Callable[..., Any] = lambda k: STILL, settings: TrackerSettings | None = None
+) -> tuple[Tracker, int]:
     tracker = Tracker(settings)
     for k in range(count):
         tracker.update(points(motion(k)), capture_ns=10**9 + k * PERIOD)
@@ -34,12 +44,12 @@ def fed(count=30, motion=lambda k: STILL, settings=None):
 # --- what an answer is called
 
 
-def test_before_the_first_sample_nobody_is_there():
+def test_before_the_first_sample_nobody_is_there() -> None:
     answer = Tracker().at(123)
     assert (answer.label, answer.eyes_m, answer.capture_ns, answer.time_ns) == ("none", None, 0, 123)
 
 
-def test_at_a_sample_the_answer_is_exact_between_two_interpolated_and_after_the_last_predicted():
+def test_at_a_sample_the_answer_is_exact_between_two_interpolated_and_after_the_last_predicted() -> None:
     tracker, last = fed(motion=moving)
     exact, between, after = tracker.at(last - PERIOD), tracker.at(last - PERIOD // 2), tracker.at(last + 60 * MS)
     assert (exact.label, between.label, after.label) == ("exact", "interpolated", "predicted")
@@ -48,19 +58,19 @@ def test_at_a_sample_the_answer_is_exact_between_two_interpolated_and_after_the_
     np.testing.assert_allclose(between.eyes_m, middle, atol=1e-6)
 
 
-def test_a_prediction_goes_on_with_the_heads_motion():
+def test_a_prediction_goes_on_with_the_heads_motion() -> None:
     tracker, last = fed(count=60, motion=moving)
     for ahead in (30, 60, 90):
         np.testing.assert_allclose(tracker.at(last + ahead * MS).eyes_m, moving(59 + ahead * MS / PERIOD), atol=1e-3)
 
 
-def test_it_never_predicts_further_than_the_horizon():
+def test_it_never_predicts_further_than_the_horizon() -> None:
     tracker, last = fed(count=60, motion=moving)
     limit = tracker.at(last + 120 * MS).eyes_m
     np.testing.assert_array_equal(tracker.at(last + 180 * MS).eyes_m, limit)
 
 
-def test_a_lost_face_is_held_coming_to_rest_then_nobody():
+def test_a_lost_face_is_held_coming_to_rest_then_nobody() -> None:
     tracker, last = fed(count=60, motion=moving)
     tracker.update(None, capture_ns=last + PERIOD)
     path = [tracker.at(last + PERIOD + ms * MS) for ms in range(0, 460, 10)]
@@ -71,7 +81,7 @@ def test_a_lost_face_is_held_coming_to_rest_then_nobody():
     assert tracker.at(last + 501 * MS).label == "none"
 
 
-def test_a_stalled_stream_is_held_even_without_word_of_a_loss():
+def test_a_stalled_stream_is_held_even_without_word_of_a_loss() -> None:
     tracker, last = fed()
     assert tracker.at(last + 190 * MS).label == "predicted"
     assert tracker.at(last + 210 * MS).label == "held"
@@ -79,7 +89,7 @@ def test_a_stalled_stream_is_held_even_without_word_of_a_loss():
 
 
 @given(ms=st.integers(-2000, 2000))
-def test_every_answer_is_for_the_instant_asked_and_eyes_are_there_unless_none(ms):
+def test_every_answer_is_for_the_instant_asked_and_eyes_are_there_unless_none(ms: int) -> None:
     tracker, last = fed()
     answer = tracker.at(last + ms * MS)
     assert answer.time_ns == last + ms * MS
@@ -105,7 +115,7 @@ def test_every_answer_is_for_the_instant_asked_and_eyes_are_there_unless_none(ms
     ],
     ids=["nan", "infinite", "too wide", "too narrow", "too far", "a blink", "no confidence", "absurd"],
 )
-def test_a_single_bad_sample_changes_nothing(bad):
+def test_a_single_bad_sample_changes_nothing(bad: EyePoints) -> None:
     tracker, last = fed()
     before = tracker.at(last + 80 * MS)
     tracker.update(bad, capture_ns=last + PERIOD)
@@ -114,7 +124,7 @@ def test_a_single_bad_sample_changes_nothing(bad):
     np.testing.assert_array_equal(after.eyes_m, before.eyes_m)
 
 
-def test_what_is_twice_elsewhere_is_believed():
+def test_what_is_twice_elsewhere_is_believed() -> None:
     tracker, last = fed()
     there = STILL + np.array([0.2, 0.1, 0.0])
     for k in (1, 2):
@@ -122,7 +132,7 @@ def test_what_is_twice_elsewhere_is_believed():
     np.testing.assert_allclose(tracker.at(last + 2 * PERIOD + 70 * MS).eyes_m, there, atol=0.003)
 
 
-def test_duplicates_and_late_samples_are_passed_over():
+def test_duplicates_and_late_samples_are_passed_over() -> None:
     tracker, last = fed()
     before = tracker.at(last + 50 * MS).eyes_m
     for capture_ns in (last, last - PERIOD, last - 900 * MS):
@@ -130,13 +140,13 @@ def test_duplicates_and_late_samples_are_passed_over():
     np.testing.assert_array_equal(tracker.at(last + 50 * MS).eyes_m, before)
 
 
-def test_a_clock_that_was_set_back_begins_anew():
+def test_a_clock_that_was_set_back_begins_anew() -> None:
     tracker, last = fed()
     tracker.update(points(), capture_ns=last - 5 * 10**9)
     assert tracker.at(last - 5 * 10**9).label == "exact"
 
 
-def test_an_unbroken_stream_of_nonsense_ends_in_nobody_not_in_nonsense():
+def test_an_unbroken_stream_of_nonsense_ends_in_nobody_not_in_nonsense() -> None:
     tracker, last = fed()
     for k in range(1, 60):
         tracker.update(points(STILL * np.nan), capture_ns=last + k * PERIOD)
@@ -147,7 +157,7 @@ def test_an_unbroken_stream_of_nonsense_ends_in_nobody_not_in_nonsense():
 
 
 @pytest.mark.parametrize("lost_s", [0.15, 0.3, 0.4])
-def test_eyes_that_return_are_followed_within_two_samples_and_without_a_jump(lost_s):
+def test_eyes_that_return_are_followed_within_two_samples_and_without_a_jump(lost_s: float) -> None:
     tracker, last = fed()
     ahead = 60 * MS
     back_ns = last + round(lost_s * 1e9)
@@ -166,7 +176,7 @@ def test_eyes_that_return_are_followed_within_two_samples_and_without_a_jump(los
     assert arrived - back_ns <= 2 * PERIOD + PERIOD // 3
 
 
-def test_after_nobody_the_first_sample_counts_at_once():
+def test_after_nobody_the_first_sample_counts_at_once() -> None:
     tracker, last = fed()
     tracker.update(None, capture_ns=last + PERIOD)
     back = last + 3 * 10**9
@@ -180,8 +190,8 @@ def test_after_nobody_the_first_sample_counts_at_once():
 # --- the head's pose
 
 
-def test_a_turning_and_tilting_head_is_followed_without_refusing_samples():
-    def turned(k):
+def test_a_turning_and_tilting_head_is_followed_without_refusing_samples() -> None:
+    def turned(k: float) -> NDArray[np.float64]:
         t = k * PERIOD / 1e9
         yaw, roll = np.radians(50) * np.sin(4 * t), np.radians(20) * np.sin(3 * t)
         half = 0.031 * np.array([-np.sin(yaw), np.cos(yaw) * np.cos(roll), np.sin(roll)])
@@ -193,8 +203,8 @@ def test_a_turning_and_tilting_head_is_followed_without_refusing_samples():
     assert np.linalg.norm(tracker.at(last + 60 * MS).eyes_m - turned(119 + 60 * MS / PERIOD), axis=1).max() < 0.012
 
 
-def test_an_eye_that_was_filled_in_pulls_less():
-    def pull(completed):
+def test_an_eye_that_was_filled_in_pulls_less() -> None:
+    def pull(completed: str) -> np.float64:
         tracker, last = fed()
         tracker.update(points(STILL + np.array([0.004, 0, 0]), completed=completed), capture_ns=last + PERIOD)
         return tracker.at(last + PERIOD).eyes_m[0, 0] - 0.6
@@ -205,7 +215,7 @@ def test_an_eye_that_was_filled_in_pulls_less():
 # --- properties
 
 
-def test_it_is_deterministic():
+def test_it_is_deterministic() -> None:
     runs = []
     for _ in range(2):
         tracker = Tracker()
@@ -216,7 +226,7 @@ def test_it_is_deterministic():
     assert all(np.array_equal(a, b) for a, b in zip(runs[:half], runs[half:]) if a is not None)
 
 
-def test_it_turns_and_shifts_with_the_frame():
+def test_it_turns_and_shifts_with_the_frame() -> None:
     turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
     shift = np.array([0.1, -0.2, 0.3])
     here, there = Tracker(), Tracker()
@@ -229,8 +239,8 @@ def test_it_turns_and_shifts_with_the_frame():
             np.testing.assert_allclose(one @ turn.T + shift, other, atol=1e-9)
 
 
-def test_five_percent_outliers_hardly_move_it():
-    def p95(outliers):
+def test_five_percent_outliers_hardly_move_it() -> None:
+    def p95(outliers: Any) -> Any:
         tracker, errors = Tracker(), []
         for o in observe("lean", seconds=20, rate_hz=60, outliers=outliers, dropout_every_s=0):
             tracker.update(o.points, capture_ns=o.capture_ns)
@@ -241,12 +251,12 @@ def test_five_percent_outliers_hardly_move_it():
     assert p95(0.05) < 1.15 * p95(0.0)
 
 
-def test_only_one_model_is_a_plain_kalman_filter_and_works():
+def test_only_one_model_is_a_plain_kalman_filter_and_works() -> None:
     tracker, last = fed(count=60, motion=moving, settings=TrackerSettings(acceleration=(0.1,)))
     np.testing.assert_allclose(tracker.at(last).eyes_m, moving(59), atol=1e-3)
 
 
-def test_every_refused_sample_is_counted():
+def test_every_refused_sample_is_counted() -> None:
     tracker, last = fed(motion=moving)
     for k in range(1, 4):
         tracker.update(points(STILL * 1.4), capture_ns=last + k * PERIOD)  # eyes 87 mm apart are no person's
@@ -254,7 +264,7 @@ def test_every_refused_sample_is_counted():
 
 
 @pytest.mark.parametrize("since_ms", [40, 60, 90, 119])
-def test_lost_eyes_go_on_until_the_loss_and_then_come_to_rest_with_the_time_constant(since_ms):
+def test_lost_eyes_go_on_until_the_loss_and_then_come_to_rest_with_the_time_constant(since_ms: int) -> None:
     settings = TrackerSettings()
     tracker, last = fed(60, moving)
     speed = (tracker.at(last + 10 * MS).eyes_m - tracker.at(last).eyes_m) / 0.010

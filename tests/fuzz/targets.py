@@ -6,8 +6,10 @@ import contextlib
 import io
 import json
 import struct
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from runtime.clock import SimulatedClock
 from runtime.config import ContentSettings, LimitSettings, Settings
 from runtime.errors import PhasestackError
 from runtime.optics.stack import PanelStack
+from tests.sensor.taken import taken_until
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 64, 36)
 LIMITS = LimitSettings(pixels=1 << 22, triangles=50_000, splats=50_000, instances=200, file_mib=16, chunk_mib=2)
@@ -70,7 +73,7 @@ def _recording(data: bytes, folder: Path) -> object:
 
     driver = ReplayDriver(str(_at(folder, "a.mcap", data)), SimulatedClock(), limits=LIMITS)
     driver.open()
-    return len(driver.take_until(1 << 62))
+    return len(taken_until(driver, 1 << 62))
 
 
 def _eye_packets() -> list[bytes]:
@@ -315,6 +318,88 @@ def _gltfs() -> list[bytes]:
     return [json.dumps(gltf()).encode(), json.dumps(textured(0, [{"source": 0}], [{"uri": PNG_URI}])).encode()]
 
 
+def _rigs() -> list[bytes]:
+    """Nodes that move, bones, morph targets."""
+    import tempfile
+
+    from tests.content.gltf_files import bending_bar, growing_square, moving_square
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.gltf"
+        return [make(path).read_bytes() for make in (moving_square, bending_bar, growing_square)]
+
+
+def _rig(data: bytes, folder: Path) -> object:
+    """Loaded, which asks for its places, and posed at a time that no key has."""
+    from runtime.content.mesh import load_mesh
+
+    mesh = load_mesh(_at(folder, "a.gltf", data), limits=LIMITS)
+    return None if mesh.rig is None else mesh.rig.pose(0.377)
+
+
+def _stls() -> list[bytes]:
+    text = _box("stl_ascii")
+    return [_box("stl"), text]
+
+
+def _clouds() -> list[bytes]:
+    random = np.random.default_rng(3)
+    values = np.zeros(30, [(axis, "<f4") for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")])
+    for axis in "xyz":
+        values[axis] = random.normal(size=30)
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 30\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz")
+    head += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
+    text = "ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty double y\nproperty double z\n"
+    return [head.encode() + values.tobytes(), (text + "end_header\n0 0 0\n1 2 3\n").encode()]
+
+
+def _cloud(data: bytes, folder: Path) -> object:
+    from runtime.content.points import load_points
+
+    return load_points(_at(folder, "a.ply", data), limits=LIMITS)
+
+
+def _playlists() -> list[bytes]:
+    text = (
+        "repeat = false\n[[show]]\nscene = 'demo'\nseconds = 2\nscale = 1.5\noffset_m = [0.0, 0.01, 0.0]\n"
+        "[[show]]\nscene = 'a.png'\nseconds = 0.5\nlayout = 'side-by-side'\n"
+        "[[show]]\nscene = 'lego_bulldozer'\nfile = 'a.ply'\nseconds = 86400\nup = '+y'\nout = '-x'\n"
+    )
+    return [text.encode(), json.dumps({"show": [{"scene": "flat", "seconds": 3}]}).encode()]
+
+
+def _playlist(data: bytes, folder: Path) -> object:
+    from runtime.content.playlist import read_playlist
+
+    path = _at(folder, "a.json" if data[:1] in b"[{" and data else "a.toml", data)
+    return read_playlist(path, ContentSettings())
+
+
+class _Hurried(threading.Event):
+    """Nothing is waited for."""
+
+    def wait(self, timeout: float | None = None) -> bool:
+        return self.is_set()
+
+
+def _stream(data: bytes, folder: Path) -> object:
+    """Decoded as a live film is, without its thread and its times."""
+    import av
+
+    from runtime.content.stream import Target as Live
+    from runtime.content.stream import _Reader, _Shared
+
+    shared = _Shared()
+    shared.ending = _Hurried()
+    live = Live(f"live:{_at(folder, 'a.mp4', data)}")
+    av.logging.set_level(av.logging.PANIC)
+    try:
+        return sum(1 for _ in islice(_Reader(live, ContentSettings(), LIMITS, shared)._pictures(), 5))
+    except (OSError, ValueError, av.error.FFmpegError) as error:  # which its loop tells and tries again
+        raise PhasestackError(str(error)[:100].replace("\n", " ")) from None
+
+
 def _plys() -> list[bytes]:
     import trimesh
 
@@ -444,7 +529,12 @@ TARGETS: dict[str, Target] = {
     "glb": Target(lambda: [_box("glb"), _box("glb", texture=True)], _mesh(".glb")),
     "obj": Target(lambda: [_box("obj")], _mesh(".obj")),
     "ply": Target(_plys, _mesh(".ply")),
+    "rig": Target(_rigs, _rig),
+    "stl": Target(_stls, _mesh(".stl")),
+    "cloud": Target(_clouds, _cloud),
     "splat": Target(_splats, _splat),
+    "playlist": Target(_playlists, _playlist),
+    "stream": Target(_videos, _stream),
     "external": Target(_handovers, _handover),
     "socket": Target(_requests, _request),
     "edid": Target(_edids, _edid),

@@ -1,5 +1,7 @@
 """A device's time is mapped on to the host's by the quickest of many deliveries."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from runtime.sensor.device_clock import DeviceClock
@@ -7,7 +9,7 @@ from runtime.sensor.device_clock import DeviceClock
 MS = 1_000_000
 
 
-def test_jitter_of_delivery_does_not_reach_the_capture_times():
+def test_jitter_of_delivery_does_not_reach_the_capture_times() -> None:
     random, clock, errors = np.random.default_rng(0), DeviceClock(), []
     for k in range(600):
         device_ns = k * 16 * MS
@@ -16,7 +18,7 @@ def test_jitter_of_delivery_does_not_reach_the_capture_times():
     assert max(abs(e) for e in errors[100:]) < 1 * MS
 
 
-def test_a_capture_is_never_after_its_arrival():
+def test_a_capture_is_never_after_its_arrival() -> None:
     random, clock, device_ns = np.random.default_rng(1), DeviceClock(), 0
     for k in range(2000):
         device_ns = max(0, device_ns + int(random.integers(-5 * MS, 40 * MS)))
@@ -24,7 +26,7 @@ def test_a_capture_is_never_after_its_arrival():
         assert clock.host_ns(device_ns, arrival_ns=arrival_ns) <= arrival_ns
 
 
-def test_drift_between_the_clocks_is_followed():
+def test_drift_between_the_clocks_is_followed() -> None:
     clock = DeviceClock()
     for k in range(4000):  # two minutes, 100 parts per million too fast: 12 ms in the end
         device_ns = round(k * 33 * MS * (1 + 1e-4))
@@ -32,7 +34,7 @@ def test_drift_between_the_clocks_is_followed():
     assert abs(error) < 2 * MS
 
 
-def test_a_restarted_device_begins_anew():
+def test_a_restarted_device_begins_anew() -> None:
     clock = DeviceClock()
     clock.host_ns(10**15, arrival_ns=10**9)
     assert clock.host_ns(5, arrival_ns=2 * 10**9) == 2 * 10**9

@@ -1,7 +1,10 @@
 """The eye-packet protocol finds its packets whatever stands between them, and counts what is missing."""
 
+from __future__ import annotations
+
 import struct
 import zlib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +25,9 @@ coordinates = st.floats(-5, 5, width=32)
     completed=st.sampled_from(["", "left", "right"]),
     face=st.booleans(),
 )
-def test_a_packet_comes_back_as_it_was_sent(sequence, time_us, numbers, completed, face):
+def test_a_packet_comes_back_as_it_was_sent(
+    sequence: Any, time_us: Any, numbers: Any, completed: Any, face: Any
+) -> None:
     points = EyePoints(np.array(numbers).reshape(2, 3), np.array([0.25, 1.0]), completed) if face else None
     (back,) = PacketReader().feed(encode(EyePacket(sequence, time_us, points)))
     assert (back.sequence, back.device_time_us, back.points is None) == (sequence, time_us, not face)
@@ -31,7 +36,7 @@ def test_a_packet_comes_back_as_it_was_sent(sequence, time_us, numbers, complete
         assert back.points.completed == completed
 
 
-def test_the_layout_is_the_documented_one():
+def test_the_layout_is_the_documented_one() -> None:
     data = encode(packet(7, time_us=1234))
     assert len(data) == PACKET_BYTES == 56
     assert struct.unpack_from("<4sBBHIQ", data) == (b"PSEY", 1, 1, 56, 7, 1234)
@@ -43,7 +48,7 @@ def test_the_layout_is_the_documented_one():
     junk=st.lists(st.one_of(st.binary(max_size=80), st.just(MAGIC), st.just(MAGIC + b"\x01")), max_size=6),
     cuts=st.lists(st.integers(1, 60), max_size=40),
 )
-def test_whole_packets_are_found_between_garbage_however_the_stream_is_cut(junk, cuts):
+def test_whole_packets_are_found_between_garbage_however_the_stream_is_cut(junk: Any, cuts: Any) -> None:
     stream, sent = b"", 0
     for piece in junk:
         sent += 1
@@ -56,7 +61,7 @@ def test_whole_packets_are_found_between_garbage_however_the_stream_is_cut(junk,
     assert [p.sequence for p in found] == list(range(1, sent + 1))
 
 
-def test_ten_seconds_of_garbage_leave_nothing_behind():
+def test_ten_seconds_of_garbage_leave_nothing_behind() -> None:
     random, reader = np.random.default_rng(1), PacketReader()
     for _ in range(300):
         assert reader.feed(random.bytes(4096)) == []
@@ -64,14 +69,14 @@ def test_ten_seconds_of_garbage_leave_nothing_behind():
     assert [p.sequence for p in reader.feed(b"\0" * PACKET_BYTES + encode(packet(3)))] == [3]
 
 
-def test_a_packet_with_one_wrong_bit_is_refused_and_the_next_is_taken():
+def test_a_packet_with_one_wrong_bit_is_refused_and_the_next_is_taken() -> None:
     for bit in range(0, PACKET_BYTES * 8, 7):
         data = bytearray(encode(packet(1)))
         data[bit // 8] ^= 1 << bit % 8
         assert [p.sequence for p in PacketReader().feed(bytes(data) + encode(packet(2)))] == [2]
 
 
-def test_gaps_are_counted_and_a_restart_is_not_a_gap():
+def test_gaps_are_counted_and_a_restart_is_not_a_gap() -> None:
     reader = PacketReader()
     for sequence in (1, 2, 5, 6, 1, 2, 2**32 - 1, 0, 1):
         reader.feed(encode(packet(sequence)))

@@ -1,8 +1,12 @@
 """The real OpenNI2 library: its Dummy device, and recordings that the test makes itself."""
 
+from __future__ import annotations
+
 import json
 import subprocess
 import sys
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +26,7 @@ except MissingPart as missing:
 
 
 @pytest.fixture(scope="module")
-def oni(tmp_path_factory):
+def oni(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Eight frames: depth rises by 10 mm a frame and has a hole; colour is red on the left."""
     path = tmp_path_factory.mktemp("oni") / "made.oni"
     depth = np.full((8, 120, 160), 700, np.uint16) + 10 * np.arange(8, dtype=np.uint16)[:, None, None]
@@ -33,11 +37,11 @@ def oni(tmp_path_factory):
     return path
 
 
-def driver_for(source, **more):
+def driver_for(source: Any, **more: Any) -> Any:
     return OpenNI2Driver(SensorSettings(driver="openni2", source=str(source), **more), MonotonicClock())
 
 
-def test_a_recording_delivers_depth_in_mm_and_colour_of_the_same_instant(oni):
+def test_a_recording_delivers_depth_in_mm_and_colour_of_the_same_instant(oni: Any) -> None:
     with driver_for(oni) as driver:
         frames = [driver.read_newest(0.5) for _ in range(4)]
         assert driver.capabilities.depth and driver.capabilities.colour
@@ -47,7 +51,7 @@ def test_a_recording_delivers_depth_in_mm_and_colour_of_the_same_instant(oni):
     assert frames[-1].colour[0, 0].tolist() == [200, 0, 0] and frames[-1].colour[0, 159].tolist() == [0, 0, 0]
 
 
-def test_intrinsics_follow_from_the_field_of_view(oni):
+def test_intrinsics_follow_from_the_field_of_view(oni: Any) -> None:
     with driver_for(oni) as driver:
         camera = driver.read_newest(0.5).intrinsics
     assert (camera.width_px, camera.height_px, camera.cx_px, camera.cy_px) == (160, 120, 80.0, 60.0)
@@ -55,7 +59,7 @@ def test_intrinsics_follow_from_the_field_of_view(oni):
     assert camera.fy_px == pytest.approx(60 / np.tan(0.4), rel=1e-6)
 
 
-def test_capture_times_advance_as_recorded_and_are_not_in_the_future(oni):
+def test_capture_times_advance_as_recorded_and_are_not_in_the_future(oni: Any) -> None:
     clock = MonotonicClock()
     with driver_for(oni) as driver:
         frames = []
@@ -66,7 +70,7 @@ def test_capture_times_advance_as_recorded_and_are_not_in_the_future(oni):
     assert np.median(steps) == pytest.approx(1e9 / 30, rel=0.1)
 
 
-def test_a_recording_ends_unless_it_is_looped(oni):
+def test_a_recording_ends_unless_it_is_looped(oni: Any) -> None:
     with driver_for(oni) as driver, pytest.raises(EndOfRecording):
         for _ in range(20):
             driver.read_newest(0.3)
@@ -75,7 +79,7 @@ def test_a_recording_ends_unless_it_is_looped(oni):
     assert sequence == sorted(set(sequence))
 
 
-def test_it_can_be_closed_twice_and_opened_again(oni):
+def test_it_can_be_closed_twice_and_opened_again(oni: Any) -> None:
     driver = driver_for(oni)
     for _ in range(3):
         driver.open()
@@ -86,7 +90,7 @@ def test_it_can_be_closed_twice_and_opened_again(oni):
         driver.read_newest(0.1)
 
 
-def test_it_runs_in_the_sensors_thread(oni):
+def test_it_runs_in_the_sensors_thread(oni: Any) -> None:
     settings = SensorSettings(driver="openni2", source=str(oni), loop=True)
     clock = MonotonicClock()
     worker = SensorWorker(lambda: OpenNI2Driver(settings, clock), settings, clock)
@@ -100,18 +104,18 @@ def test_it_runs_in_the_sensors_thread(oni):
 
 
 @pytest.mark.parametrize("content", [b"", b"not an oni file", b"NI10" + bytes(60)], ids=range(3))
-def test_what_is_no_recording_is_a_lost_sensor_that_says_so(tmp_path, content):
+def test_what_is_no_recording_is_a_lost_sensor_that_says_so(tmp_path: Path, content: Any) -> None:
     (tmp_path / "bad.oni").write_bytes(content)
     with pytest.raises(SensorLost, match="OpenNI2"):
         driver_for(tmp_path / "bad.oni").open()
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="none"):
         driver_for(tmp_path / "none.oni").open()
 
 
-def test_a_folder_without_the_library_is_named(tmp_path):
+def test_a_folder_without_the_library_is_named(tmp_path: Path) -> None:
     with pytest.raises(MissingPart, match=str(tmp_path)):
         find_library(str(tmp_path))
 
@@ -130,7 +134,7 @@ driver.close()
 """
 
 
-def test_the_dummy_device_of_the_library_delivers_both_streams():
+def test_the_dummy_device_of_the_library_delivers_both_streams() -> None:
     # In a process of its own: the Dummy is sample code, and has been seen to crash another device's process.
     answer = subprocess.run([sys.executable, "-c", DUMMY], capture_output=True, timeout=60, text=True)
     frames = json.loads(answer.stdout)
@@ -152,6 +156,6 @@ except SensorLost as error:
 """
 
 
-def test_without_a_camera_it_is_lost_and_names_the_serial():
+def test_without_a_camera_it_is_lost_and_names_the_serial() -> None:
     answer = subprocess.run([sys.executable, "-c", NO_CAMERA], capture_output=True, timeout=60, text=True)
     assert "no OpenNI2 camera" in answer.stdout and "SERIAL-1" in answer.stdout

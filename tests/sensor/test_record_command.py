@@ -1,10 +1,14 @@
 """`phasestack record` writes what the sensor saw: eyes always, pictures only on request."""
 
+from __future__ import annotations
+
 import json
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,11 +26,11 @@ app.command()(record)
 RUN = "import typer; from runtime.commands.record import record; typer.run(record)"
 
 
-def settings(**sensor) -> Settings:
+def settings(**sensor: Any) -> Settings:
     return validated(Settings, {"sensor": sensor}, source="test")
 
 
-def test_a_recording_of_the_demo_has_its_samples(tmp_path):
+def test_a_recording_of_the_demo_has_its_samples(tmp_path: Path) -> None:
     out = tmp_path / "new" / "a.mcap"
     answer = CliRunner().invoke(app, ["--out", str(out), "--seconds", "1", "--json"])
     summary = json.loads(answer.stdout)
@@ -36,17 +40,17 @@ def test_a_recording_of_the_demo_has_its_samples(tmp_path):
     assert frames[0].eyes is not None and frames[0].true_eyes_m is not None
 
 
-def test_a_source_that_ends_ends_the_recording(tmp_path):
+def test_a_source_that_ends_ends_the_recording(tmp_path: Path) -> None:
     summary = record_to(tmp_path / "a.mcap", settings(start_s=9.6), images=False, seconds=30, quiet=True)
     assert "no more samples" in summary["stopped"] and summary["samples"] >= 10
 
 
-def test_a_limit_in_the_settings_is_kept_and_told(tmp_path):
+def test_a_limit_in_the_settings_is_kept_and_told(tmp_path: Path) -> None:
     summary = record_to(tmp_path / "a.mcap", settings(record_max_s=0.3), images=False, seconds=None, quiet=True)
     assert "record_max_s" in summary["stopped"] and summary["seconds"] <= 0.3
 
 
-def test_ctrl_c_ends_it_properly(tmp_path):
+def test_ctrl_c_ends_it_properly(tmp_path: Path) -> None:
     out = tmp_path / "a.mcap"
     process = subprocess.Popen([sys.executable, "-c", RUN, "--out", str(out)], stderr=subprocess.DEVNULL)
     end = time.monotonic() + 20
@@ -58,14 +62,14 @@ def test_ctrl_c_ends_it_properly(tmp_path):
     assert Recording(out).is_whole
 
 
-def test_a_sensor_that_gives_nothing_leaves_nothing(tmp_path, monkeypatch):
+def test_a_sensor_that_gives_nothing_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("runtime.commands.record.FIRST_SAMPLE_S", 0.3)
     with pytest.raises(FatalError, match="usb-eyes"):
         record_to(tmp_path / "a.mcap", settings(driver="usb-eyes"), images=False, seconds=1, quiet=True)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_pictures_are_kept_only_with_images(tmp_path):
+def test_pictures_are_kept_only_with_images(tmp_path: Path) -> None:
     from tests.eyes.scene import IPD_M, camera, scene
     from tests.sensor.oni_file import write_oni
 
@@ -83,7 +87,7 @@ def test_pictures_are_kept_only_with_images(tmp_path):
         assert np.median(found) == pytest.approx(IPD_M, abs=0.004)
 
 
-def test_what_a_sensor_recorded_is_not_replaced_unless_told(tmp_path):
+def test_what_a_sensor_recorded_is_not_replaced_unless_told(tmp_path: Path) -> None:
     out = tmp_path / "a.mcap"
     make = ["--motion", "still", "--seconds", "1", "--out", str(out)]
     assert CliRunner().invoke(app, make).exit_code == 0
@@ -95,21 +99,36 @@ def test_what_a_sensor_recorded_is_not_replaced_unless_told(tmp_path):
     assert out.read_bytes() != before
 
 
+def test_a_motion_replaces_a_motion_and_no_viewer(tmp_path: Path) -> None:
+    """Seen: a sensor's recording was gone after `record --motion` to the same name, without a word."""
+    out = tmp_path / "a.mcap"
+    assert CliRunner().invoke(app, ["--seconds", "0.5", "--out", str(out)]).exit_code == 0
+    before = out.read_bytes()
+    motion = ["--motion", "still", "--seconds", "1", "--out", str(out)]
+    for what in (before, b"something else"):
+        out.write_bytes(what)
+        answer = CliRunner().invoke(app, motion)
+        assert isinstance(answer.exception, InputError) and "--force" in str(answer.exception)
+        assert out.read_bytes() == what
+    assert CliRunner().invoke(app, [*motion, "--force"]).exit_code == 0
+    assert CliRunner().invoke(app, motion).exit_code == 0
+
+
 @pytest.mark.parametrize("name", ["a.txt", "a", "a.mcap.bak", "x" * 5000 + ".mcap"])
-def test_a_name_that_is_not_a_recordings_is_refused_before_anything_is_recorded(tmp_path, name):
+def test_a_name_that_is_not_a_recordings_is_refused_before_anything_is_recorded(tmp_path: Path, name: str) -> None:
     answer = CliRunner().invoke(app, ["--motion", "still", "--out", f"{tmp_path}/{name}"])
     assert isinstance(answer.exception, InputError)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_images_of_a_sensor_that_has_none_are_not_claimed(tmp_path):
+def test_images_of_a_sensor_that_has_none_are_not_claimed(tmp_path: Path) -> None:
     answer = CliRunner().invoke(app, ["--images", "--seconds", "0.5", "--out", str(tmp_path / "a.mcap")])
     assert answer.exit_code == 0 and "no pictures (this sensor delivers none)" in answer.stdout
     assert "whoever was there" not in answer.stdout
 
 
-def test_a_fast_sensor_is_recorded_whole(tmp_path):
-    from runtime.commands.motion_recording import write_motion
+def test_a_fast_sensor_is_recorded_whole(tmp_path: Path) -> None:
+    from runtime.evaluation.motion_recording import write_motion
 
     write_motion(tmp_path / "fast.mcap", "walk", rate_hz=240, seconds=1.5)
     source = settings(source=str(tmp_path / "fast.mcap"))

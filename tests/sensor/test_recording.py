@@ -1,5 +1,7 @@
 """A recording comes back as it was, loses at most a chunk to a crash, and stays within its limits."""
 
+from __future__ import annotations
+
 import io
 import json
 import os
@@ -8,11 +10,14 @@ import subprocess
 import sys
 import time
 import tracemalloc
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from runtime.errors import InputError
 from runtime.records import EyePoints, Intrinsics, SensorFrame
@@ -25,12 +30,14 @@ WITH_IMAGES = RecordingHeader(driver="test", colour=True, depth=True)
 CAMERA = Intrinsics(64, 48, 60.0, 61.0, 32.5, 23.5)
 
 
-def sample(k: int, **parts) -> SensorFrame:
+def sample(k: int, **parts: Any) -> SensorFrame:
     eyes = EyePoints(np.array([[0.03, 0.0, 0.6 + k * 1e-4], [-0.03, 0.0, 0.6]]), np.array([0.9, 0.5]))
     return SensorFrame(k, 10**9 + k * 33_333_333, eyes, **parts)
 
 
-def write(path, frames, header=EYES_ONLY, limits=None):
+def write(
+    path: Path, frames: list[SensorFrame], header: RecordingHeader = EYES_ONLY, limits: RecordingLimits | None = None
+) -> list[bool]:
     with recording_to(path, header, limits=limits) as writer:
         return [writer.write(frame) for frame in frames]
 
@@ -46,7 +53,9 @@ finite = st.floats(-10, 10)
     truth=st.booleans(),
     face=st.booleans(),
 )
-def test_a_sample_comes_back_to_a_tenth_of_a_micrometre(values, sequence, capture_ns, completed, truth, face):
+def test_a_sample_comes_back_to_a_tenth_of_a_micrometre(
+    values: list[float], sequence: int, capture_ns: int, completed: str, truth: bool, face: bool
+) -> None:
     points = np.array(values).reshape(2, 3)
     eyes = EyePoints(points, np.array([0.25, 1.0]), completed) if face else None
     frame = SensorFrame(sequence, capture_ns, eyes, true_eyes_m=np.nan_to_num(points) if truth else None)
@@ -58,7 +67,7 @@ def test_a_sample_comes_back_to_a_tenth_of_a_micrometre(values, sequence, captur
     assert (back.true_eyes_m is not None) == truth
 
 
-def test_a_file_tells_its_sensor_and_all_its_samples(tmp_path):
+def test_a_file_tells_its_sensor_and_all_its_samples(tmp_path: Path) -> None:
     path = tmp_path / "new" / "a.mcap"
     assert all(write(path, [sample(k) for k in range(100)]))
     recording = Recording(path)
@@ -67,7 +76,7 @@ def test_a_file_tells_its_sensor_and_all_its_samples(tmp_path):
     assert [f.sequence for f in recording.samples()] == list(range(100))  # as often as one likes
 
 
-def test_other_tools_open_it(tmp_path):
+def test_other_tools_open_it(tmp_path: Path) -> None:
     from mcap.reader import make_reader
 
     write(tmp_path / "a.mcap", [sample(k) for k in range(50)])
@@ -78,7 +87,7 @@ def test_other_tools_open_it(tmp_path):
     assert found[3][3]["sequence"] == 3
 
 
-def test_images_are_recorded_only_with_a_header_that_says_so(tmp_path):
+def test_images_are_recorded_only_with_a_header_that_says_so(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     depth = random.integers(0, 65535, (48, 64), dtype=np.uint16)
     colour = np.full((48, 64, 3), (200, 100, 50), np.uint8)
@@ -94,7 +103,7 @@ def test_images_are_recorded_only_with_a_header_that_says_so(tmp_path):
     assert b"/colour" not in (tmp_path / "eyes.mcap").read_bytes()
 
 
-def test_images_do_not_pile_up_in_memory(tmp_path):
+def test_images_do_not_pile_up_in_memory(tmp_path: Path) -> None:
     depth = np.zeros((480, 640), np.uint16)
     write(tmp_path / "a.mcap", [sample(k, depth_mm=depth) for k in range(60)], WITH_IMAGES)
     tracemalloc.start()
@@ -104,7 +113,9 @@ def test_images_do_not_pile_up_in_memory(tmp_path):
     assert count == 60 and peak < 15 * depth.nbytes
 
 
-def test_a_truncated_file_opens_up_to_its_last_whole_chunk_and_says_so(tmp_path, caplog):
+def test_a_truncated_file_opens_up_to_its_last_whole_chunk_and_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     whole, path = demo_recording_bytes(), tmp_path / "cut.mcap"
     expected = list(samples())
     counts = []
@@ -127,7 +138,9 @@ def test_a_truncated_file_opens_up_to_its_last_whole_chunk_and_says_so(tmp_path,
 
 @settings(max_examples=25, deadline=None)
 @given(place=st.floats(0, 1, exclude_max=True), bits=st.integers(1, 255))
-def test_a_damaged_byte_loses_no_sample_before_it_and_never_invents_one(tmp_path_factory, place, bits):
+def test_a_damaged_byte_loses_no_sample_before_it_and_never_invents_one(
+    tmp_path_factory: pytest.TempPathFactory, place: Any, bits: Any
+) -> None:
     data = bytearray(demo_recording_bytes())
     data[int(place * len(data))] ^= bits
     path = tmp_path_factory.mktemp("damaged") / "a.mcap"
@@ -144,20 +157,20 @@ def test_a_damaged_byte_loses_no_sample_before_it_and_never_invents_one(tmp_path
 @pytest.mark.parametrize(
     "content", [b"", b"\x89MCAP0\r\n", b"not a recording", b"\x89MCAP0\r\n" * 2, b"\0" * 5000], ids=range(5)
 )
-def test_what_is_no_recording_is_refused_by_name(tmp_path, content):
+def test_what_is_no_recording_is_refused_by_name(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "bad.mcap"
     path.write_bytes(content)
     with pytest.raises(InputError, match="bad"):
         Recording(path)
 
 
-def test_a_missing_file_and_a_folder_are_refused_by_name(tmp_path):
+def test_a_missing_file_and_a_folder_are_refused_by_name(tmp_path: Path) -> None:
     for path in (tmp_path / "none.mcap", tmp_path):
         with pytest.raises(InputError, match=path.name):
             Recording(path)
 
 
-def test_a_recording_of_another_program_or_version_is_refused(tmp_path):
+def test_a_recording_of_another_program_or_version_is_refused(tmp_path: Path) -> None:
     from mcap.writer import Writer
 
     path = tmp_path / "other.mcap"
@@ -171,14 +184,14 @@ def test_a_recording_of_another_program_or_version_is_refused(tmp_path):
             Recording(path)
 
 
-def test_it_ends_before_it_is_too_long(tmp_path):
+def test_it_ends_before_it_is_too_long(tmp_path: Path) -> None:
     done = write(tmp_path / "a.mcap", [sample(k) for k in range(100)], limits=RecordingLimits(max_s=1.0))
     assert done.count(True) == 31 and not done[-1]  # 0 to 30/30 s
     assert len(list(Recording(tmp_path / "a.mcap").samples())) == 31
 
 
 @pytest.mark.parametrize("limit", [30_000, 200_000])
-def test_its_file_is_never_larger_than_allowed(tmp_path, limit):
+def test_its_file_is_never_larger_than_allowed(tmp_path: Path, limit: int) -> None:
     random = np.random.default_rng(0)
     depth = random.integers(0, 65535, (48, 64), dtype=np.uint16)
     frames = [sample(k, depth_mm=depth) for k in range(1500)]
@@ -188,13 +201,13 @@ def test_its_file_is_never_larger_than_allowed(tmp_path, limit):
         assert Recording(tmp_path / "a.mcap").is_whole
 
 
-def test_without_a_sample_an_older_file_stays_and_nothing_new_is_left(tmp_path):
+def test_without_a_sample_an_older_file_stays_and_nothing_new_is_left(tmp_path: Path) -> None:
     (tmp_path / "a.mcap").write_bytes(b"older")
     write(tmp_path / "a.mcap", [])
     assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("a.mcap", b"older")]
 
 
-def test_a_killed_recorder_leaves_all_but_its_last_chunk(tmp_path):
+def test_a_killed_recorder_leaves_all_but_its_last_chunk(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     code = f"""
 import pathlib, time
@@ -216,7 +229,7 @@ with recording_to(pathlib.Path({str(path)!r}), EYES_ONLY) as writer:
     assert not recording.is_whole and 170 <= count <= 200
 
 
-def test_a_full_disk_is_told_by_name_and_what_is_there_can_be_read(tmp_path):
+def test_a_full_disk_is_told_by_name_and_what_is_there_can_be_read(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     code = f"""
 import pathlib, resource
@@ -229,11 +242,11 @@ write(pathlib.Path({str(path)!r}), [sample(k) for k in range(1000)])
     assert len(list(Recording(path).samples())) > 50
 
 
-def test_a_writer_takes_no_longer_for_a_long_recording():
+def test_a_writer_takes_no_longer_for_a_long_recording() -> None:
     file = io.BytesIO()
     writer = RecordingWriter(file, EYES_ONLY, limits=RecordingLimits(max_s=1e6))
 
-    def batch(start):
+    def batch(start: int) -> float:
         begin = time.process_time()
         for k in range(start, start + 1500):
             writer.write(sample(k))
@@ -245,7 +258,9 @@ def test_a_writer_takes_no_longer_for_a_long_recording():
     assert last < 4 * first
 
 
-def pictures_alone(path, *, pairs, empty=False):
+def pictures_alone(
+    path: Path, *, pairs: list[tuple[int, NDArray[np.uint8], NDArray[np.uint16] | None]], empty: bool = False
+) -> None:
     """A recording of another program: colour and depth by time stamp, and no eyes."""
     from mcap.writer import Writer
 
@@ -266,7 +281,7 @@ def pictures_alone(path, *, pairs, empty=False):
         writer.finish()
 
 
-def test_a_recording_of_pictures_alone_needs_no_empty_messages(tmp_path):
+def test_a_recording_of_pictures_alone_needs_no_empty_messages(tmp_path: Path) -> None:
     colour, depth = np.full((48, 64, 3), 90, np.uint8), np.full((48, 64), 700, np.uint16)
     pictures_alone(tmp_path / "p.mcap", pairs=[(10, colour, depth), (20, colour, None), (30, colour, depth)])
     frames = list(Recording(tmp_path / "p.mcap").samples())
@@ -275,7 +290,7 @@ def test_a_recording_of_pictures_alone_needs_no_empty_messages(tmp_path):
     assert all(f.colour is not None and f.eyes is None and f.intrinsics == CAMERA for f in frames)
 
 
-def test_pictures_alone_are_written_without_eyes_and_come_back(tmp_path):
+def test_pictures_alone_are_written_without_eyes_and_come_back(tmp_path: Path) -> None:
     header = RecordingHeader(driver="test", eye_points=False, depth=True)
     depth = np.full((48, 64), 700, np.uint16)
     frames = [SensorFrame(k, 1000 * k, depth_mm=depth + np.uint16(k)) for k in range(1, 6)]
@@ -287,7 +302,7 @@ def test_pictures_alone_are_written_without_eyes_and_come_back(tmp_path):
     ]
 
 
-def bomb(path, *, kind, unpacked, says):
+def bomb(path: Path, *, kind: str, unpacked: int, says: int) -> int:
     """A recording that begins with a chunk which is small, and large when unpacked. Answers the chunk's size."""
     import lz4.frame
     import zstandard
@@ -307,7 +322,7 @@ def bomb(path, *, kind, unpacked, says):
 
 @pytest.mark.parametrize("kind", ["lz4", "zstd"])
 @pytest.mark.parametrize("says", [300 << 20, 100, 1 << 62])
-def test_a_small_chunk_that_becomes_a_large_one_takes_no_memory(tmp_path, kind, says):
+def test_a_small_chunk_that_becomes_a_large_one_takes_no_memory(tmp_path: Path, kind: str, says: int) -> None:
     size = bomb(tmp_path / "bomb.mcap", kind=kind, unpacked=300 << 20, says=says)
     assert size < 2 << 20
     code = f"""
@@ -330,7 +345,7 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - base) >> 10)
         assert "bomb.mcap" in told
 
 
-def test_a_stop_is_heard_while_messages_are_skipped(tmp_path):
+def test_a_stop_is_heard_while_messages_are_skipped(tmp_path: Path) -> None:
     from mcap.writer import Writer
 
     from runtime.support.progress import listening
@@ -346,7 +361,7 @@ def test_a_stop_is_heard_while_messages_are_skipped(tmp_path):
         writer.finish()
     told = []
 
-    def listener(what, done, total):
+    def listener(what: str, done: int, total: None) -> None:
         told.append(done)
         if done >= 3000:
             raise KeyboardInterrupt
@@ -359,7 +374,7 @@ def test_a_stop_is_heard_while_messages_are_skipped(tmp_path):
 
 
 @pytest.mark.parametrize("make", ["fifo", "folder", "zero", "nul", "long"])
-def test_only_files_are_opened_and_nothing_waits(tmp_path, make):
+def test_only_files_are_opened_and_nothing_waits(tmp_path: Path, make: str) -> None:
     path = tmp_path / "a.mcap"
     if make == "fifo":
         os.mkfifo(path)

@@ -1,5 +1,7 @@
 """Drivers are found by name, and their SDKs are not imported before they are asked for."""
 
+from __future__ import annotations
+
 import subprocess
 import sys
 
@@ -14,7 +16,7 @@ from runtime.sensor.registry import driver_names, open_sensor, register_driver
 EYES = ((0.6, -0.03, 0.0), (0.6, 0.03, 0.0))
 
 
-def test_no_sdk_is_imported_by_looking_drivers_up():
+def test_no_sdk_is_imported_by_looking_drivers_up() -> None:
     code = (
         "import sys; from runtime.sensor.registry import driver_names, open_sensor; from runtime.config import *;"
         "from runtime.clock import *; open_sensor(SensorSettings(driver='openni2'), MonotonicClock());"
@@ -24,19 +26,19 @@ def test_no_sdk_is_imported_by_looking_drivers_up():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_an_unknown_name_is_refused_and_the_known_ones_are_listed():
+def test_an_unknown_name_is_refused_and_the_known_ones_are_listed() -> None:
     with pytest.raises(InputError, match=r"sensor: driver: unknown: 'kinect'; known: replay, fixed, openni2, usb-eyes"):
         open_sensor(SensorSettings(driver="kinect"), SimulatedClock())
 
 
-def test_a_driver_can_be_registered():
+def test_a_driver_can_be_registered() -> None:
     made = object()
     register_driver("mine", lambda settings, clock, latency_ms: made)
     assert open_sensor(SensorSettings(driver="mine"), SimulatedClock()) is made
     assert "mine" in driver_names()
 
 
-def test_fixed_eyes_stand_where_the_configuration_says():
+def test_fixed_eyes_stand_where_the_configuration_says() -> None:
     clock = SimulatedClock(50)
     driver = open_sensor(SensorSettings(driver="fixed", fixed_eyes_m=EYES), clock)
     assert isinstance(driver, SteppedDriver) and driver.capabilities.in_stack_frame
@@ -49,6 +51,6 @@ def test_fixed_eyes_stand_where_the_configuration_says():
         assert late.sequence == 31 and driver.overtaken == 27 and late.capture_ns <= clock.now_ns()
 
 
-def test_fixed_without_eyes_is_refused():
+def test_fixed_without_eyes_is_refused() -> None:
     with pytest.raises(InputError, match="fixed_eyes_m"):
         open_sensor(SensorSettings(driver="fixed"), SimulatedClock())

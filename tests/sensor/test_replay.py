@@ -1,23 +1,27 @@
 """A replayed recording is a sensor: at its own pace, or sample after sample."""
 
+from __future__ import annotations
+
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
 from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
 from runtime.errors import EndOfRecording, InputError, SensorLost, SensorTimeout
+from runtime.records import SensorFrame
 from runtime.sensor.replay import ReplayDriver
 
 PERIOD_NS = NS_PER_S / 30
 
 
-def opened(clock, **options):
+def opened(clock: MonotonicClock | SimulatedClock, **options: float) -> ReplayDriver | None:
     driver = ReplayDriver("demo", clock, **options)
     driver.open()
     return driver
 
 
-def everything(driver, most=10_000):
+def everything(driver: ReplayDriver, most: int = 10_000) -> list[SensorFrame]:
     frames = []
     try:
         while len(frames) < most:
@@ -27,7 +31,7 @@ def everything(driver, most=10_000):
     return frames
 
 
-def test_every_sample_is_delivered_once_in_order_and_without_waiting():
+def test_every_sample_is_delivered_once_in_order_and_without_waiting() -> None:
     clock = SimulatedClock(777)
     driver = opened(clock, latency_ms=15.0)
     frames = everything(driver)
@@ -36,13 +40,13 @@ def test_every_sample_is_delivered_once_in_order_and_without_waiting():
     assert driver.available_ns(frames[5]) == frames[5].capture_ns + 15_000_000
 
 
-def test_two_replays_are_the_same():
+def test_two_replays_are_the_same() -> None:
     first, second = (everything(opened(SimulatedClock(5))) for _ in range(2))
     assert [(f.sequence, f.capture_ns) for f in first] == [(f.sequence, f.capture_ns) for f in second]
     assert all((a.eyes is None) == (b.eyes is None) for a, b in zip(first, second))
 
 
-def test_recorded_timing_is_kept_on_the_runs_clock():
+def test_recorded_timing_is_kept_on_the_runs_clock() -> None:
     clock = SimulatedClock(NS_PER_S)
     driver = opened(clock, latency_ms=20.0)
     for k in range(20):
@@ -51,7 +55,7 @@ def test_recorded_timing_is_kept_on_the_runs_clock():
         assert clock.now_ns() == frame.capture_ns + 20_000_000
 
 
-def test_who_comes_late_gets_the_newest_and_the_others_are_counted():
+def test_who_comes_late_gets_the_newest_and_the_others_are_counted() -> None:
     clock = SimulatedClock()
     driver = opened(clock)
     driver.read_newest(1.0)
@@ -59,7 +63,7 @@ def test_who_comes_late_gets_the_newest_and_the_others_are_counted():
     assert driver.read_newest(1.0).sequence == 11 and driver.overtaken == 9
 
 
-def test_waiting_ends_with_the_time_out():
+def test_waiting_ends_with_the_time_out() -> None:
     clock = SimulatedClock()
     driver = opened(clock, latency_ms=500.0)
     with pytest.raises(SensorTimeout):
@@ -67,24 +71,24 @@ def test_waiting_ends_with_the_time_out():
     assert clock.now_ns() == NS_PER_S // 10
 
 
-def test_it_starts_at_a_time():
+def test_it_starts_at_a_time() -> None:
     frames = everything(opened(SimulatedClock(9), start_s=9.5))
     assert [f.sequence for f in frames] == list(range(286, 301)) and frames[0].capture_ns == 9
 
 
-def test_a_start_after_the_end_is_refused():
+def test_a_start_after_the_end_is_refused() -> None:
     with pytest.raises(InputError, match="start"):
         opened(SimulatedClock(), start_s=11.0)
 
 
-def test_a_loop_goes_on_evenly_and_counts_on():
+def test_a_loop_goes_on_evenly_and_counts_on() -> None:
     frames = everything(opened(SimulatedClock(), loop=True, start_s=9.0), most=100)
     assert [f.sequence for f in frames] == list(range(271, 371))
     steps = {b.capture_ns - a.capture_ns for a, b in pairwise(frames)}
     assert max(steps) - min(steps) <= 1
 
 
-def test_it_can_be_opened_again_and_closed_twice():
+def test_it_can_be_opened_again_and_closed_twice() -> None:
     driver = opened(SimulatedClock())
     everything(driver)
     with pytest.raises(EndOfRecording):
@@ -97,7 +101,7 @@ def test_it_can_be_opened_again_and_closed_twice():
         driver.next_sample()
 
 
-def test_it_tells_its_sensor(tmp_path):
+def test_it_tells_its_sensor(tmp_path: Path) -> None:
     driver = opened(MonotonicClock())
     assert driver.serial == "demo" and driver.capabilities.eye_points and not driver.capabilities.colour
     with pytest.raises(InputError, match="none"):

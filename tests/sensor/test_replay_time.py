@@ -1,11 +1,16 @@
 """A recording of any rate and with any gap plays through once, at its own times; what is no sample is told."""
 
+from __future__ import annotations
+
 import json
 import threading
 import time
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
 from runtime.config import LimitSettings, SensorSettings
@@ -15,24 +20,33 @@ from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import OLDER, SAME_INSTANT, ReplayDriver
 from runtime.sensor.worker import SensorWorker
+from tests.sensor.taken import taken_until
 from tests.waiting import eventually
 
 HEADER = RecordingHeader(driver="test", serial="S")
 EYES = EyePoints(np.array([[0.03, 0.0, 0.6], [-0.03, 0.0, 0.6]]), np.ones(2))
 
 
-def recorded(path, times_s):
+def recorded(path: Path, times_s: Any) -> Path:
     with recording_to(path, HEADER) as writer:
         for k, t in enumerate(times_s, start=1):
             assert writer.write(SensorFrame(k, round(t * NS_PER_S), EYES))
     return path
 
 
-def evenly(rate_hz, seconds, start_s=1.0):
+def evenly(rate_hz: int, seconds: float, start_s: float = 1.0) -> NDArray[np.float64]:
     return start_s + np.arange(round(rate_hz * seconds)) / rate_hz
 
 
-def play(path, *, timeout_s=0.1, loop=False, latency_ms=0.0, busy_s=0.002, at_most_s=8.0):
+def play(
+    path: Path,
+    *,
+    timeout_s: float = 0.1,
+    loop: bool = False,
+    latency_ms: float = 0.0,
+    busy_s: float = 0.002,
+    at_most_s: float = 8.0,
+) -> tuple[list[tuple[SensorFrame, int]], set[str], SensorWorker]:
     """Every sample that a worker hands out, with the time at which the reader got it, and the worker."""
     clock = MonotonicClock()
     settings = SensorSettings(timeout_s=timeout_s, reopen_backoff_s=0.02)
@@ -51,7 +65,7 @@ def play(path, *, timeout_s=0.1, loop=False, latency_ms=0.0, busy_s=0.002, at_mo
     return got, states, worker
 
 
-def test_a_gap_longer_than_the_time_out_is_waited_for_once_and_nothing_is_reopened(tmp_path):
+def test_a_gap_longer_than_the_time_out_is_waited_for_once_and_nothing_is_reopened(tmp_path: Path) -> None:
     times = [*evenly(30, 0.5), *evenly(30, 0.5, start_s=3.0)]
     got, states, worker = play(recorded(tmp_path / "gap.mcap", times), latency_ms=20.0)
     assert [frame.sequence for frame, _ in got] == list(range(1, 31))
@@ -62,7 +76,7 @@ def test_a_gap_longer_than_the_time_out_is_waited_for_once_and_nothing_is_reopen
 
 
 @pytest.mark.parametrize("rate_hz", [60, 120, 240])
-def test_fast_recordings_are_delivered_whole_and_in_order_to_a_slow_reader(tmp_path, rate_hz):
+def test_fast_recordings_are_delivered_whole_and_in_order_to_a_slow_reader(tmp_path: Path, rate_hz: int) -> None:
     path = recorded(tmp_path / "fast.mcap", evenly(rate_hz, 1.5))
     got, _, worker = play(path, busy_s=1 / 30)  # a reader that is slower than the recording
     assert [frame.sequence for frame, _ in got] == list(range(1, 1 + round(1.5 * rate_hz)))
@@ -70,7 +84,7 @@ def test_fast_recordings_are_delivered_whole_and_in_order_to_a_slow_reader(tmp_p
 
 
 @pytest.mark.parametrize("rate_hz", [60, 120, 240])
-def test_a_reader_that_was_away_has_caught_up_with_its_next_answer(tmp_path, rate_hz):
+def test_a_reader_that_was_away_has_caught_up_with_its_next_answer(tmp_path: Path, rate_hz: int) -> None:
     """So no delay is ever carried on: every answer holds all that is due by the clock."""
     clock = SimulatedClock()
     driver = ReplayDriver(str(recorded(tmp_path / "fast.mcap", evenly(rate_hz, 3.0))), clock)
@@ -83,7 +97,7 @@ def test_a_reader_that_was_away_has_caught_up_with_its_next_answer(tmp_path, rat
     assert [frame.sequence for frame in got] == list(range(1, 1 + len(got)))
 
 
-def test_who_asks_for_the_newest_gets_it_and_the_others_are_counted(tmp_path):
+def test_who_asks_for_the_newest_gets_it_and_the_others_are_counted(tmp_path: Path) -> None:
     clock = MonotonicClock()
     path = recorded(tmp_path / "a.mcap", evenly(240, 1.0))
     worker = SensorWorker(lambda: ReplayDriver(str(path), clock), SensorSettings(), clock)
@@ -93,39 +107,41 @@ def test_who_asks_for_the_newest_gets_it_and_the_others_are_counted(tmp_path):
     worker.stop()
 
 
-def test_in_simulated_time_a_sample_has_arrived_by_its_capture_and_latency(tmp_path):
+def test_in_simulated_time_a_sample_has_arrived_by_its_capture_and_latency(tmp_path: Path) -> None:
     driver = ReplayDriver(
         str(recorded(tmp_path / "a.mcap", [0.0, 0.01, 0.02, 3.02, 3.03])), SimulatedClock(7), latency_ms=15.0
     )
     driver.open()
     assert driver.peek().sequence == 1 and driver.peek().sequence == 1
-    assert driver.take_until(7 + 14_999_999) == []
-    arrived = {t: [f.sequence for f in driver.take_until(7 + t)] for t in (25_000_000, 2 * NS_PER_S, 4 * NS_PER_S)}
+    assert taken_until(driver, 7 + 14_999_999) == []
+    arrived = {t: [f.sequence for f in taken_until(driver, 7 + t)] for t in (25_000_000, 2 * NS_PER_S, 4 * NS_PER_S)}
     assert arrived == {25_000_000: [1, 2], 2 * NS_PER_S: [3], 4 * NS_PER_S: [4, 5]}
-    assert driver.peek() is None and driver.take_until(9 * NS_PER_S) == []
+    assert driver.peek() is None and taken_until(driver, 9 * NS_PER_S) == []
     with pytest.raises(EndOfRecording):
         driver.next_sample()
 
 
-def test_samples_whose_time_goes_backwards_are_left_out_counted_by_reason_and_told_once(tmp_path, caplog):
+def test_samples_whose_time_goes_backwards_are_left_out_counted_by_reason_and_told_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     times = [1.0, 1.1, 1.05, 1.1, 1.2, 0.2, 0.3, 1.2, 1.3]
     driver = ReplayDriver(str(recorded(tmp_path / "a.mcap", times)), SimulatedClock())
     driver.open()
-    frames = driver.take_until(10 * NS_PER_S)
+    frames = taken_until(driver, 10 * NS_PER_S)
     assert [f.sequence for f in frames] == [1, 2, 5, 9]
     assert driver.refused == {OLDER: 3, SAME_INSTANT: 2}
     assert len(caplog.records) == 2
 
 
-def test_mixed_rates_are_played_by_their_own_times(tmp_path):
+def test_mixed_rates_are_played_by_their_own_times(tmp_path: Path) -> None:
     times = np.cumsum([0.0, *[1 / 240] * 24, *[1 / 15] * 6, *[1 / 60] * 12]) + 5
     driver = ReplayDriver(str(recorded(tmp_path / "a.mcap", times)), SimulatedClock())
     driver.open()
-    shown = [f.capture_ns for f in driver.take_until(10 * NS_PER_S)]
+    shown = [f.capture_ns for f in taken_until(driver, 10 * NS_PER_S)]
     np.testing.assert_allclose(shown, (times - 5) * NS_PER_S, atol=2)
 
 
-def test_a_looped_recording_of_equal_times_leaves_no_thread_behind(tmp_path):
+def test_a_looped_recording_of_equal_times_leaves_no_thread_behind(tmp_path: Path) -> None:
     path, before = recorded(tmp_path / "a.mcap", [1.0] * 50), threading.active_count()
     got, states, worker = play(path, loop=True, timeout_s=0.05, at_most_s=2.0)
     assert "hung" not in states and worker.reopened == 0 and len(got) > 10
@@ -133,17 +149,17 @@ def test_a_looped_recording_of_equal_times_leaves_no_thread_behind(tmp_path):
     assert [frame.sequence for frame, _ in got[:3]] == [1, 2, 3]
 
 
-def test_a_recording_longer_than_the_limit_is_refused_with_both_figures(tmp_path):
+def test_a_recording_longer_than_the_limit_is_refused_with_both_figures(tmp_path: Path) -> None:
     driver = ReplayDriver(
         str(recorded(tmp_path / "a.mcap", [0.0, 1.0, 500.0])), SimulatedClock(), limits=LimitSettings(recording_s=60)
     )
     with pytest.raises(InputError, match=r"500 s.*60.*limits.recording_s"):
         driver.open()
-        driver.take_until(10**15)
+        taken_until(driver, 10**15)
 
 
 @pytest.mark.parametrize("start_s", [1e300, 1e9, -1.0])
-def test_an_absurd_start_is_refused(start_s):
+def test_an_absurd_start_is_refused(start_s: float) -> None:
     with pytest.raises(InputError, match="start_s"):
         ReplayDriver("demo", SimulatedClock(), start_s=start_s)
 
@@ -152,7 +168,7 @@ HOSTILE_TIMES = ["Infinity", "-Infinity", "NaN", "1e999", str(2**70), "1e300", "
 
 
 @pytest.mark.parametrize("text", HOSTILE_TIMES, ids=lambda text: text[:12])
-def test_a_capture_time_that_is_none_is_refused_in_one_line(tmp_path, text):
+def test_a_capture_time_that_is_none_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     from mcap.writer import Writer
 
     path = tmp_path / "time.mcap"
@@ -169,5 +185,5 @@ def test_a_capture_time_that_is_none_is_refused_in_one_line(tmp_path, text):
     driver = ReplayDriver(str(path), SimulatedClock())
     with pytest.raises(InputError, match="time") as caught:
         driver.open()
-        driver.take_until(10**12)
+        taken_until(driver, 10**12)
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 400

@@ -1,5 +1,7 @@
 """The driver of streaming eye trackers, against a backend that plays one, faults included."""
 
+from __future__ import annotations
+
 import errno
 import time
 
@@ -25,36 +27,36 @@ def opened(device: FakeDevice) -> UsbEyesDriver:
     return driver
 
 
-def test_eyes_arrive_in_metres_with_their_serial():
+def test_eyes_arrive_in_metres_with_their_serial() -> None:
     driver = opened(FakeDevice(transfers=[encode(packet(4, x_m=0.1))]))
     frame = driver.read_newest(0.1)
     np.testing.assert_allclose(frame.eyes.eyes_m, [[0.131, 0, 0.6], [0.069, 0, 0.6]], atol=1e-6)
     assert frame.sequence == 4 and driver.serial == "A1"
 
 
-def test_the_newest_packet_wins_and_the_others_are_counted():
+def test_the_newest_packet_wins_and_the_others_are_counted() -> None:
     driver = opened(FakeDevice(transfers=[b"".join(encode(packet(k)) for k in (1, 2)), encode(packet(3))]))
     assert driver.read_newest(0.1).sequence == 3 and driver.overtaken == 2
 
 
-def test_no_face_is_a_sample_too():
+def test_no_face_is_a_sample_too() -> None:
     assert opened(FakeDevice(transfers=[encode(packet(1, face=False))])).read_newest(0.1).eyes is None
 
 
-def test_short_and_corrupt_packets_are_passed_over():
+def test_short_and_corrupt_packets_are_passed_over() -> None:
     good, bad = encode(packet(2)), bytearray(encode(packet(1)))
     bad[30] ^= 4
     driver = opened(FakeDevice(transfers=[bytes(bad), encode(packet(1))[:20], good[:9], good[9:]]))
     assert driver.read_newest(0.2).sequence == 2
 
 
-def test_gaps_in_the_devices_count_are_losses():
+def test_gaps_in_the_devices_count_are_losses() -> None:
     driver = opened(FakeDevice(transfers=[encode(packet(1)) + encode(packet(9))]))
     driver.read_newest(0.1)
     assert driver.missed == 7
 
 
-def test_silence_is_a_time_out_and_then_a_reset():
+def test_silence_is_a_time_out_and_then_a_reset() -> None:
     device = FakeDevice()
     driver = opened(device)
     with pytest.raises(SensorTimeout):
@@ -64,20 +66,20 @@ def test_silence_is_a_time_out_and_then_a_reset():
     assert device.resets == 1
 
 
-def test_a_stalled_endpoint_is_cleared():
+def test_a_stalled_endpoint_is_cleared() -> None:
     device = FakeDevice(transfers=[errno.EPIPE, encode(packet(1))])
     assert opened(device).read_newest(0.2).sequence == 1
     assert device.halts_cleared == 1
 
 
-def test_an_endpoint_that_stalls_again_and_again_is_reset():
+def test_an_endpoint_that_stalls_again_and_again_is_reset() -> None:
     device = FakeDevice(transfers=[errno.EPIPE] * 3)
     with pytest.raises(SensorLost, match="stalled"):
         opened(device).read_newest(0.2)
     assert device.resets == 1
 
 
-def test_unplugging_is_lost_and_closing_afterwards_is_quiet():
+def test_unplugging_is_lost_and_closing_afterwards_is_quiet() -> None:
     device = FakeDevice(transfers=[encode(packet(1))])
     bus = FakeUsb(device)
     driver = UsbEyesDriver(SETTINGS, MonotonicClock(), backend=bus)
@@ -89,7 +91,7 @@ def test_unplugging_is_lost_and_closing_afterwards_is_quiet():
     driver.close()
 
 
-def test_a_failed_open_leaves_nothing_open():
+def test_a_failed_open_leaves_nothing_open() -> None:
     device = FakeDevice(readable=False)
     driver = UsbEyesDriver(SETTINGS, MonotonicClock(), backend=FakeUsb(device))
     with pytest.raises(SensorLost, match=UDEV_RULE):
@@ -106,7 +108,7 @@ def watched(bus: FakeUsb) -> SensorWorker:
 
 
 @pytest.mark.parametrize("away_s", [1.0, pytest.param(60.0, marks=pytest.mark.slow)])
-def test_a_camera_unplugged_in_mid_stream_is_back_within_a_second_of_its_return(away_s):
+def test_a_camera_unplugged_in_mid_stream_is_back_within_a_second_of_its_return(away_s: float) -> None:
     device = FakeDevice(stream=Ticking())
     bus = FakeUsb(device, FakeDevice(serial="ANOTHER", ids=(0x8086, 0x0B07), address=9))
     worker = watched(bus)
@@ -127,7 +129,7 @@ def test_a_camera_unplugged_in_mid_stream_is_back_within_a_second_of_its_return(
     worker.stop()
 
 
-def test_after_ten_seconds_worth_of_garbage_a_reset_brings_the_device_back():
+def test_after_ten_seconds_worth_of_garbage_a_reset_brings_the_device_back() -> None:
     random = np.random.default_rng(0)
     device = FakeDevice(stream=lambda: random.bytes(4000) if not device.resets else ticking())
     ticking = Ticking()
@@ -137,7 +139,7 @@ def test_after_ten_seconds_worth_of_garbage_a_reset_brings_the_device_back():
     worker.stop()
 
 
-def test_a_stream_that_stalls_without_an_error_is_reset_and_comes_back():
+def test_a_stream_that_stalls_without_an_error_is_reset_and_comes_back() -> None:
     state = {"stalled": False}
     ticking = Ticking()
     device = FakeDevice(stream=lambda: b"" if state["stalled"] else ticking())

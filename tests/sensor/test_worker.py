@@ -1,8 +1,12 @@
 """The sensor's thread: the newest wins, what is lost comes back, and what hangs is left behind."""
 
+from __future__ import annotations
+
 import statistics
 import threading
 import time
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,30 +29,30 @@ class Scripted(SensorDriver):
     name = "scripted"
     capabilities = Capabilities(eye_points=True)
 
-    def __init__(self, act, log, *, on_open=None):
+    def __init__(self, act: Callable[..., Any], log: list[str], *, on_open: Callable[..., Any] | None = None) -> None:
         self._act, self._log, self._on_open = act, log, on_open
         self._count = 0
 
-    def open(self):
+    def open(self) -> None:
         self._log.append(f"open {self.serial}".strip())
         if self._on_open:
             self._on_open()
         self.serial = self.serial or "S7"
 
-    def read_newest(self, timeout_s):
+    def read_newest(self, timeout_s: float) -> SensorFrame | None:
         self._count += 1
         self._act()
         return SensorFrame(self._count, self._count)
 
-    def close(self):
+    def close(self) -> None:
         self._log.append("close")
 
 
 @pytest.fixture
-def started():
+def started() -> Any:
     workers = []
 
-    def start(act, *, on_open=None, settings=SETTINGS):
+    def start(act: Any, *, on_open: Any = None, settings: Any = SETTINGS) -> Any:
         log = []
         worker = SensorWorker(lambda: Scripted(act, log, on_open=on_open), settings, MonotonicClock())
         worker.start()
@@ -60,15 +64,15 @@ def started():
         worker.stop()
 
 
-def raiser(error):
-    def act():
+def raiser(error: Any) -> Any:
+    def act() -> None:
         time.sleep(0.002)
         raise error
 
     return act
 
 
-def test_the_newest_sample_wins_and_those_it_overtook_are_counted(started):
+def test_the_newest_sample_wins_and_those_it_overtook_are_counted(started: Callable[..., Any]) -> None:
     read = []
     worker, _ = started(lambda: (read.append(1), time.sleep(0.002)))
     assert eventually(lambda: len(read) > 6)
@@ -77,14 +81,14 @@ def test_the_newest_sample_wins_and_those_it_overtook_are_counted(started):
     assert worker.state == "running" and worker.serial == "S7"
 
 
-def test_all_samples_since_the_last_time_are_handed_out_in_order(started):
+def test_all_samples_since_the_last_time_are_handed_out_in_order(started: Callable[..., Any]) -> None:
     worker, _ = started(lambda: time.sleep(0.002))
     got = []
     assert eventually(lambda: got.extend(worker.take()) or len(got) >= 40)
     assert [frame.sequence for frame in got] == list(range(1, 1 + len(got))) and worker.stale_inputs == 0
 
 
-def test_what_nobody_reads_does_not_pile_up(started, monkeypatch):
+def test_what_nobody_reads_does_not_pile_up(started: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("runtime.sensor.worker.QUEUE_MAX", 10)
     worker, _ = started(lambda: time.sleep(0.001))
     assert eventually(lambda: worker.stale_inputs >= 20)
@@ -92,24 +96,26 @@ def test_what_nobody_reads_does_not_pile_up(started, monkeypatch):
     assert len(frames) == 10 and frames[0].sequence > 20
 
 
-def test_a_driver_that_may_pause_is_neither_stalled_nor_reopened(started, monkeypatch):
+def test_a_driver_that_may_pause_is_neither_stalled_nor_reopened(
+    started: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(Scripted, "capabilities", Capabilities(eye_points=True, may_pause=True))
     worker, log = started(raiser(SensorTimeout("nothing")))
     time.sleep(0.5)
     assert worker.state == "opening" and log == ["open"] and worker.reopened == 0
 
 
-def test_a_sample_is_handed_out_once(started):
+def test_a_sample_is_handed_out_once(started: Callable[..., Any]) -> None:
     gate = threading.Semaphore(1)
     worker, _ = started(lambda: gate.acquire(timeout=0.04) or (_ for _ in ()).throw(SensorTimeout("none")))
     assert eventually(lambda: worker.newest() is not None)
     assert worker.newest() is None
 
 
-def test_a_lost_device_is_closed_and_reopened_by_its_serial(started):
+def test_a_lost_device_is_closed_and_reopened_by_its_serial(started: Callable[..., Any]) -> None:
     lose = [False]
 
-    def act():
+    def act() -> None:
         time.sleep(0.002)
         if lose[0]:
             lose[0] = False
@@ -123,10 +129,10 @@ def test_a_lost_device_is_closed_and_reopened_by_its_serial(started):
     assert eventually(lambda: worker.newest() is not None)
 
 
-def test_attempts_to_reopen_back_off_and_go_on(started):
+def test_attempts_to_reopen_back_off_and_go_on(started: Callable[..., Any]) -> None:
     opened_s = []
 
-    def refuse():
+    def refuse() -> None:
         opened_s.append(time.monotonic())
         raise SensorLost("not there")
 
@@ -136,29 +142,31 @@ def test_attempts_to_reopen_back_off_and_go_on(started):
     assert worker.state == "lost" and worker.reason == "not there"
 
 
-def test_a_stream_that_stalls_without_an_error_is_reopened(started):
+def test_a_stream_that_stalls_without_an_error_is_reopened(started: Callable[..., Any]) -> None:
     worker, log = started(raiser(SensorTimeout("nothing")))
     assert eventually(lambda: log.count("open") >= 1 and worker.state == "stalled")
     assert eventually(lambda: log.count("open S7") >= 2)
 
 
-def test_an_unexpected_error_of_an_sdk_is_a_lost_sensor(started, caplog):
+def test_an_unexpected_error_of_an_sdk_is_a_lost_sensor(
+    started: Callable[..., Any], caplog: pytest.LogCaptureFixture
+) -> None:
     worker, log = started(raiser(ZeroDivisionError("inside the SDK")))
     assert eventually(lambda: log.count("close") >= 2)
     assert "ZeroDivisionError" in worker.reason
 
 
-def test_a_fatal_error_is_not_tried_again(started):
+def test_a_fatal_error_is_not_tried_again(started: Callable[..., Any]) -> None:
     worker, log = started(lambda: None, on_open=raiser(FatalError("no such driver")))
     assert eventually(lambda: worker.state == "failed")
     time.sleep(0.1)
     assert log == ["open", "close"] and str(worker.error) == "no such driver"
 
 
-def test_the_end_of_a_recording_is_told_and_its_last_sample_is_not_lost(started):
+def test_the_end_of_a_recording_is_told_and_its_last_sample_is_not_lost(started: Callable[..., Any]) -> None:
     calls = []
 
-    def act():
+    def act() -> None:
         calls.append(1)
         if len(calls) > 1:
             raise EndOfRecording("over")
@@ -169,11 +177,13 @@ def test_the_end_of_a_recording_is_told_and_its_last_sample_is_not_lost(started)
 
 
 @pytest.mark.parametrize("where", ["open", "read"])
-def test_an_sdk_that_hangs_is_left_behind_and_never_blocks_the_loop(started, where, monkeypatch):
+def test_an_sdk_that_hangs_is_left_behind_and_never_blocks_the_loop(
+    started: Callable[..., Any], where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("runtime.sensor.worker.HANG_MARGIN_S", 0.1)
     hung, release = [], threading.Event()
 
-    def hang_once():
+    def hang_once() -> None:
         time.sleep(0.002)
         if not hung:
             hung.append(threading.current_thread())
@@ -199,7 +209,7 @@ def test_an_sdk_that_hangs_is_left_behind_and_never_blocks_the_loop(started, whe
     assert log.count("close") == closed + 1 and worker.state == "running"
 
 
-def test_stopping_takes_no_longer_than_its_time_out_even_when_an_sdk_hangs(started):
+def test_stopping_takes_no_longer_than_its_time_out_even_when_an_sdk_hangs(started: Callable[..., Any]) -> None:
     release = threading.Event()
     worker, _ = started(lambda: release.wait(20))
     time.sleep(0.05)
@@ -209,7 +219,9 @@ def test_stopping_takes_no_longer_than_its_time_out_even_when_an_sdk_hangs(start
     release.set()
 
 
-def test_a_device_that_always_hangs_does_not_fill_memory_with_threads(started, monkeypatch):
+def test_a_device_that_always_hangs_does_not_fill_memory_with_threads(
+    started: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("runtime.sensor.worker.HANG_MARGIN_S", 0.0)
     monkeypatch.setattr("runtime.sensor.worker.ABANDONED_MAX", 3)
     release = threading.Event()

@@ -9,6 +9,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from runtime.clock import NS_PER_S
+from runtime.errors import InputError
+from runtime.eyes.demo_geometry import demo_sensor_from_stack
+from runtime.eyes.motions import MOTIONS, observe, path_of, true_eyes
+from runtime.records import EyePoints, SensorFrame
+from runtime.sensor.recording import RecordingLimits, recording_to
+from runtime.sensor.recording_format import RecordingHeader
+from runtime.support.foreign import real, whole
+
 SECONDS, RATE_HZ, NOISE_MM = 12.0, 30.0, 3.0
 SECONDS_MAX, NOISE_MAX_MM = 3600.0, 100.0
 RATE_LEAST_HZ, RATE_MOST_HZ = 15.0, 240.0
@@ -27,17 +38,6 @@ def write_motion(
 
     Raises InputError for a motion that is not known, a number out of range, or a file that can't be written.
     """
-    import numpy as np
-
-    from runtime.clock import NS_PER_S
-    from runtime.errors import InputError
-    from runtime.eyes.demo_geometry import demo_sensor_from_stack
-    from runtime.eyes.motions import MOTIONS, observe, path_of, true_eyes
-    from runtime.records import EyePoints, SensorFrame
-    from runtime.sensor.recording import RecordingLimits, recording_to
-    from runtime.sensor.recording_format import RecordingHeader
-    from runtime.support.foreign import real, whole
-
     if motion not in MOTIONS:
         raise InputError("record", "--motion", f"unknown: {motion!r}; known: {', '.join(MOTIONS)}")
     rate_hz = real(rate_hz, least=RATE_LEAST_HZ, most=RATE_MOST_HZ, source="record", field="--rate-hz")
