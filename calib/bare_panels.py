@@ -6,7 +6,9 @@ from calib.keys import WindowKeys
 from runtime.clock import NS_PER_MS, MonotonicClock
 from runtime.config import PanelSettings, Settings
 from runtime.optics.stack import PanelStack
+from runtime.panels.registry import open_panels, panel_settings
 from runtime.records import U8, PanelFrame
+from runtime.support.gl import offscreen_context
 
 SHOW_AGAIN_NS = 50 * NS_PER_MS
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -25,9 +27,6 @@ class BarePanels:
 
     def __init__(self, settings: Settings, stack: PanelStack, *, grey_curve: bool = True) -> None:
         """Opens the panels. Raises InputError, MissingPart, PanelLost."""
-        from runtime.panels.registry import open_panels, panel_settings
-        from runtime.support.gl import offscreen_context
-
         panels = bare(panel_settings(settings.output, stack.count), grey_curve=grey_curve)
         output = settings.output.model_copy(update={"panels": panels})
         self._clock = MonotonicClock()

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import cv2
 import numpy as np
 
 from runtime.errors import InputError
@@ -32,8 +33,6 @@ TILE = SQUARE + 2 * CORNER
 
 def dictionary() -> Any:
     """The markers' code."""
-    import cv2
-
     return cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_100)
 
 
@@ -62,7 +61,8 @@ class Mark:
     def marker_px(self) -> F64:
         """(4, 2) corners of the marker itself, in the same order."""
         inset = QUIET * self.unit_px
-        return self.saddles_px + inset * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+        found: F64 = self.saddles_px + inset * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+        return found
 
 
 @lru_cache(maxsize=8)
@@ -88,8 +88,6 @@ def marks(stack: PanelStack) -> tuple[Mark, ...]:
 
 def board(stack: PanelStack, panel: int) -> U8:
     """(H, W) what a panel shows, 0 or 255."""
-    import cv2
-
     picture = np.zeros((stack.height_px, stack.width_px), np.uint8)
     for mark in marks(stack):
         if mark.panel != panel:

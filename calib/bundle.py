@@ -29,7 +29,6 @@ FOCAL_GUESSES = (0.6, 0.8, 1.1, 1.6, 2.4)  # of the longer side
 ROBUST_PX = 0.3  # residuals beyond this count by their size, not their square
 OUTLIER_SIGMAS = 4.0
 LEAST_SIGMA_PX = 0.01
-MAD_TO_SIGMA = 1.4826
 # What is known of any camera before its first photograph, standard deviations: square pixels, a lens over the
 # sensor's middle, distortion of a few per cent. They decide nothing that twelve photographs tell.
 SQUARE_SIGMA, CENTRE_SIGMA, DISTORTION_SIGMAS = 0.003, 0.03, (0.3, 0.5, 0.005, 0.005, 0.5)
@@ -146,7 +145,8 @@ class _Problem:
         return np.concatenate([(found - self.image_px).ravel(), self._prior(x)])
 
     def _prior(self, x: F64) -> F64:
-        return np.concatenate([[x[0] - x[1]], x[2:4] - self.middle, x[4:9]]) * self.prior_scale
+        found: F64 = np.concatenate([[x[0] - x[1]], x[2:4] - self.middle, x[4:9]]) * self.prior_scale
+        return found
 
     def slopes(self, x: F64) -> F64:
         """(2K + priors, unknowns) derivatives of `residuals`."""
@@ -213,18 +213,20 @@ def _left_jacobian(rotation_vector: F64) -> F64:
     angle = float(np.linalg.norm(rotation_vector))
     k = _cross(rotation_vector[None])[0]
     if angle < 1e-6:
-        return np.eye(3) + k / 2
-    return np.eye(3) + (1 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * k @ k
+        return np.asarray(np.eye(3) + k / 2)
+    return np.asarray(np.eye(3) + (1 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * k @ k)
 
 
 def _solved(problem: _Problem, x: F64, used: NDArray[np.bool_], *, robust: bool) -> F64:
     weights = np.concatenate([np.repeat(used, 2).astype(np.float64), np.ones(len(problem.prior_scale))])
 
     def residuals(values: F64) -> F64:
-        return problem.residuals(values) * weights
+        found: F64 = problem.residuals(values) * weights
+        return found
 
     def slopes(values: F64) -> F64:
-        return problem.slopes(values) * weights[:, None]
+        found: F64 = problem.slopes(values) * weights[:, None]
+        return found
 
     fit = least_squares(
         residuals,

@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import typer
 
 from calib.capture import EyeWindow, midpoint, true_pair
+from calib.chart_files import ChartDisplay, Drawer
 from calib.keys import Key, TerminalKeys, first_of
 from calib.pairs import CapturedPair, PairsFile
 from calib.viewpoints import IPD_M, Viewpoint, grid
@@ -20,9 +22,12 @@ from calib.walk import Walk, accept, captured
 from runtime.clock import NS_PER_MS, NS_PER_S, MonotonicClock, SimulatedClock
 from runtime.config import Settings
 from runtime.errors import EndOfRecording, InputError
+from runtime.eyes.detect import EyeFinder
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, EyePoints, SensorFrame
 from runtime.sensor.base import SensorDriver, SteppedDriver
+from runtime.sensor.registry import open_sensor
+from runtime.sensor.worker import SensorWorker
 from runtime.support import foreign
 
 POLL_NS = 20 * NS_PER_MS
@@ -35,8 +40,6 @@ def capture_recording(
     out: Path, settings: Settings, *, source: str, marks: Path | None, window_s: float, max_spread_m: float
 ) -> dict[str, Any]:
     """Pairs from a recording: at marked instants, or from its own true eyes. Raises InputError."""
-    from runtime.sensor.registry import open_sensor
-
     chosen = settings.sensor.model_copy(update={"driver": "replay", "source": source, "loop": False, "start_s": 0.0})
     driver = open_sensor(chosen, SimulatedClock(), limits=settings.limits)
     if not isinstance(driver, SteppedDriver):
@@ -80,7 +83,6 @@ def eye_finder(driver: SensorDriver, settings: Settings) -> Find:
     """Eyes of a frame in frame `sensor`: the sensor's own, or found in its images."""
     if driver.capabilities.eye_points:
         return lambda frame: frame.eyes
-    from runtime.eyes.detect import EyeFinder
 
     finder = EyeFinder(settings.detector)
     return lambda frame: frame.eyes if frame.eyes is not None else finder.find(frame)
@@ -174,9 +176,6 @@ def capture_live(
     hold_s: float,
 ) -> dict[str, Any]:
     """Walk through the viewpoints with a person before the display. Raises InputError, FatalError."""
-    from runtime.sensor.registry import open_sensor
-    from runtime.sensor.worker import SensorWorker
-
     clock = MonotonicClock()
     file = PairsFile(out)
     open_sensor(settings.sensor, clock)  # refuses unknown names before anything starts
@@ -229,14 +228,10 @@ def _finder_of(worker: Any, settings: Settings) -> Find:
 
 
 def _chart_display(settings: Settings, stack: PanelStack) -> Any:
-    from calib.chart_files import ChartDisplay, Drawer
-
     ipd_m = settings.calibration.ipd_m or IPD_M
     drawer = Drawer(stack, kind="solved", ipd_m=ipd_m, model=CHART_MODEL, settings=settings.model)
     return ChartDisplay(settings, drawer)
 
 
 def _say(text: str) -> None:
-    import typer
-
     typer.echo(text, err=True)

@@ -10,19 +10,26 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import track
 
 from calib.charts import Kind, alone, chart_fov_deg, eye_chart, line_picture
 from calib.keys import Key, TerminalKeys, WindowKeys, first_of
 from calib.viewpoints import Viewpoint
 from runtime.clock import NS_PER_MS, MonotonicClock
 from runtime.config import ModelSettings, Settings
+from runtime.model.predictor import load_predictor
+from runtime.model.still import solve_still
 from runtime.model.visible import visible_boxes
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import relative_scale_shift
+from runtime.panels.registry import open_panels
 from runtime.records import F64, U8, PanelFrame
 from runtime.support.artifacts import OutputFolder, write_json, write_png
+from runtime.support.gl import offscreen_context
 
 if TYPE_CHECKING:
     from runtime.model.predictor import Predictor
@@ -64,9 +71,6 @@ class Drawer:
 
     def _solved(self, viewpoint: Viewpoint) -> U8:
         """(N, H, W, 4) layers through which both eyes see the line picture at the viewpoint."""
-        from runtime.model.predictor import load_predictor
-        from runtime.model.still import solve_still
-
         if self._predictor is None:
             self._predictor = load_predictor(self.model, self.stack, self._settings)
         picture = line_picture(width_px=self.stack.width_px, height_px=self.stack.height_px)
@@ -138,8 +142,6 @@ def make_charts(out: Path, viewpoints: Sequence[Viewpoint], drawer: Drawer, *, c
     check: also measure how well both eyes see the lines through each solved chart.
     """
     stack, ipd_m = drawer.stack, drawer.ipd_m
-    from rich.console import Console
-    from rich.progress import track
 
     entries: list[dict[str, Any]] = []
     sheet: list[U8] = []
@@ -211,9 +213,6 @@ class ChartDisplay:
 
     def __init__(self, settings: Settings, drawer: Drawer) -> None:
         """Opens the panels. Raises InputError, MissingPart, PanelLost."""
-        from runtime.panels.registry import open_panels
-        from runtime.support.gl import offscreen_context
-
         self._drawer = drawer
         self._sink = open_panels(settings.output, drawer.stack, MonotonicClock(), offscreen_context())
         self._number = 0
@@ -258,8 +257,6 @@ class ChartDisplay:
 
 def show_charts(settings: Settings, viewpoints: Sequence[Viewpoint], drawer: Drawer) -> None:
     """Show the charts one after the other until the last one is accepted, or q. Raises as `ChartDisplay`."""
-    import typer
-
     keys = TerminalKeys()
     if settings.output.kind == "offscreen":
         typer.echo("warning: output.kind is offscreen: nobody sees these charts", err=True)

@@ -7,6 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import tomlkit
+from tomlkit.exceptions import ParseError
+
 from calib.store import save
 from runtime.config import load_settings
 from runtime.errors import InputError
@@ -20,10 +23,7 @@ if TYPE_CHECKING:
 
 def read_document(config: Path) -> TOMLDocument:
     """A configuration to be changed; an empty one where the file is not there yet. Raises InputError."""
-    import tomlkit
-    from tomlkit.exceptions import ParseError
-
-    if not config.exists():
+    if not foreign.is_there(config):
         return tomlkit.document()
     load_settings(config)
     try:
@@ -34,8 +34,6 @@ def read_document(config: Path) -> TOMLDocument:
 
 def put(document: TOMLDocument, section: str, values: Mapping[str, Any]) -> None:
     """Set keys of a table, which is made where there is none."""
-    import tomlkit
-
     table: Any = document.setdefault(section, tomlkit.table())
     for key, value in values.items():
         table[key] = value
@@ -43,27 +41,23 @@ def put(document: TOMLDocument, section: str, values: Mapping[str, Any]) -> None
 
 def put_homographies(document: TOMLDocument, matrices: F64) -> None:
     """Set every panel's homography (N, 3, 3), making the tables where there are none."""
-    import tomlkit
-
-    output: Any = document.setdefault("output", tomlkit.table())
-    if "panels" not in output:
-        output["panels"] = tomlkit.aot()
-        for _ in matrices:
-            output["panels"].append(tomlkit.table())
-    for table, matrix in zip(output["panels"], matrices, strict=True):
+    for table, matrix in zip(_panels_tables(document, len(matrices)), matrices, strict=True):
         table["homography"] = matrix.tolist()
 
 
 def put_lut(document: TOMLDocument, panel: int, lut: str, *, panels: int) -> None:
     """Set one panel's measured grey curve, making the panels' tables where there are none."""
-    import tomlkit
+    _panels_tables(document, panels)[panel]["lut"] = lut
 
+
+def _panels_tables(document: TOMLDocument, count: int) -> Any:
+    """`[[output.panels]]`, made where there are none."""
     output: Any = document.setdefault("output", tomlkit.table())
     if "panels" not in output:
         output["panels"] = tomlkit.aot()
-        for _ in range(panels):
+        for _ in range(count):
             output["panels"].append(tomlkit.table())
-    output["panels"][panel]["lut"] = lut
+    return output["panels"]
 
 
 def put_monitors(document: TOMLDocument, tables: Sequence[Mapping[str, Any]]) -> None:
@@ -71,8 +65,6 @@ def put_monitors(document: TOMLDocument, tables: Sequence[Mapping[str, Any]]) ->
 
     A panel whose monitor and mounting are as they were keeps what else is known of it (registration, grey curve).
     """
-    import tomlkit
-
     output: Any = document.setdefault("output", tomlkit.table())
     past = [dict(table.unwrap()) for table in output.get("panels", ())]
     found = tomlkit.aot()
@@ -94,8 +86,6 @@ _DEFAULTS: dict[str, Any] = {"rotation_deg": 0, "mirror": "none"}
 
 def save_document(config: Path, document: TOMLDocument) -> Path | None:
     """Write it if it is valid, and only then; answers where the one it replaces is kept. Raises InputError."""
-    import tomlkit
-
     text = tomlkit.dumps(document)
     with tempfile.TemporaryDirectory() as folder:
         trial = Path(folder) / config.name

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
+from rich.progress import track
 
 from calib.misregistration import corrected, displayed_quality, shifted
-from calib.page import Picture, page
 from calib.panel_figures import cost_figure
 from calib.panel_run import asked_settings, fit_registration
 from calib.pictures import file_pictures, layers_for, scene_pictures
@@ -17,7 +19,8 @@ from calib.vernier import simulate, write_settings
 from runtime.config import Settings
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
-from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_text
+from runtime.report.page import Figure, Page, in_columns, section_of
+from runtime.support.artifacts import write_json
 
 SHIFTS_PX = (0.0, 0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
 JUDGED_EYES_M = ((0.6, -0.03, 0.0), (0.6, 0.03, 0.0))
@@ -35,9 +38,6 @@ def measure_cost(
     model: str,
 ) -> tuple[dict[str, Any], str]:
     """Displace each panel in turn, to the side. Raises InputError, MissingPart."""
-    from rich.console import Console
-    from rich.progress import track
-
     eyes, fov_deg = np.array(eyes_m), settings.content.fov_deg
     wanted = scene_pictures(settings, stack, eyes) if pictures is None else file_pictures(pictures)
     layers = layers_for(wanted, stack, eyes, settings=settings, model=model, fov_deg=fov_deg)
@@ -50,19 +50,11 @@ def measure_cost(
     summary = {"shifts_px": list(SHIFTS_PX), "psnr_db": found, "model": model, "eyes_m": eyes}
     rows = [["displaced", *[f"{shift:g} px" for shift in SHIFTS_PX]]]
     rows += [[name, *[f"{value:.2f}" for value in values]] for name, values in found.items()]
-    picture = Picture("cost.png", cost_figure(SHIFTS_PX, found), "Displayed PSNR against a panel's displacement")
-    with OutputFolder(out) as folder:
-        write_json(folder.staging / "cost.json", summary)
-        write_bytes(folder.staging / picture.name, picture.png)
-        html = page(
-            title="What registration error costs",
-            lead=f"Layers by {model}; one panel displaced to the side, the others right; displayed PSNR, dB.",
-            notes=[],
-            tables=[("dB", rows)],
-            pictures=[picture],
-        )
-        write_text(folder.staging / "index.html", html)
-    return summary, "\n".join("  ".join(cell.rjust(9) for cell in row) for row in rows)
+    figure = Figure("cost", cost_figure(SHIFTS_PX, found), "Displayed PSNR against a panel's displacement")
+    lead = f"Layers by {model}; one panel displaced to the side, the others right; displayed PSNR, dB."
+    page = Page("What registration error costs", lead, [replace(section_of("dB", rows), figures=[figure])])
+    page.write(out, record="cost.json", data=summary)
+    return summary, in_columns(rows)
 
 
 def misaligned(stack: PanelStack, *, reference: int, random: np.random.Generator) -> list[F64]:

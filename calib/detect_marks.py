@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -193,8 +192,3 @@ def _edge_px(picture: U8, quad: F64) -> float:
         steepest = float(np.abs(np.gradient(profile)).max()) / step_px
         widths.append(float(np.ptp(profile)) / max(steepest, 1e-9))
     return float(np.median(widths))
-
-
-def usable(photographs: Sequence[SeenMarks]) -> list[SeenMarks]:
-    """Those without a fault."""
-    return [photograph for photograph in photographs if not photograph.fault]

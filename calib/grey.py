@@ -24,6 +24,7 @@ from scipy.special import comb
 
 from runtime.errors import InputError
 from runtime.optics.malus import intensity_from_phase, phase_from_intensity
+from runtime.panels.lut import COLUMNS
 from runtime.records import F64
 from runtime.support import foreign
 
@@ -66,14 +67,16 @@ class GreyCurve:
         phases = self.phase(greys)
         rising = np.concatenate([[True], np.diff(np.maximum.accumulate(phases)) > 1e-12])
         inverse = PchipInterpolator(phases[rising], greys[rising])
-        return np.clip(inverse(np.clip(phase, 0.0, phases[-1])), 0.0, 1.0)
+        found: F64 = np.clip(inverse(np.clip(phase, 0.0, phases[-1])), 0.0, 1.0)
+        return found
 
 
 def _bernstein(x: F64, coefficients: F64) -> F64:
     degree = len(coefficients) - 1
     order = np.arange(degree + 1)
     basis = comb(degree, order) * x[..., None] ** order * (1 - x[..., None]) ** (degree - order)
-    return basis @ coefficients
+    found: F64 = basis @ coefficients
+    return found
 
 
 def _coefficients(free: F64) -> F64:
@@ -143,8 +146,6 @@ def _fit(grey: F64, values: F64, degree: int, *, of_intensity: bool) -> tuple[Gr
 
 def lut_text(curves: tuple[GreyCurve, GreyCurve, GreyCurve]) -> str:
     """The panel's LUT as the panels read it: 256 rows of phase and grey per channel, all 0 to 1."""
-    from runtime.panels.lut import COLUMNS
-
     phase = np.linspace(0.0, 1.0, LUT_ROWS)
     greys = [np.maximum.accumulate(curve.grey(phase)) for curve in curves]
     text = io.StringIO()

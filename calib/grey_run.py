@@ -8,14 +8,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import typer
 
+from calib.bare_panels import BarePanels
+from calib.charts import alone
 from calib.grey import CHANNELS, GreyCurve, Series, fit_series, lut_text, read_series
+from calib.grey_chart import Unusable, grey_chart, histograms, measure
+from calib.keys import Key, TerminalKeys, first_of
 from calib.panel_figures import grey_figure
+from calib.photo_run import photograph_files, read_photograph
+from runtime.clock import MonotonicClock
 from runtime.config import Settings
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
+from runtime.panels.registry import open_panels, panel_settings
 from runtime.records import F64, U8, PanelFrame
 from runtime.support.artifacts import OutputFolder, write_bytes, write_text
+from runtime.support.gl import offscreen_context
 
 
 def fit_lut(
@@ -58,16 +67,12 @@ def write_lut(out: Path, measured: Series, curves: tuple[GreyCurve, GreyCurve, G
 
 def photographed_series(photos: Path, stack: PanelStack, *, panel: int) -> Series:
     """Relative luminances from photographs of a panel's grey chart. Raises InputError, naming the photograph."""
-    from calib.photo_run import photograph_files, read_photograph
-
     pictures = ((str(path), read_photograph(path)) for path in photograph_files(photos))
     return pictures_series(pictures, stack, panel=panel, source=str(photos))
 
 
 def pictures_series(pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, panel: int, source: str) -> Series:
     """The same from named grey photographs (h, w). Raises InputError."""
-    from calib.grey_chart import Unusable, histograms, measure
-
     found = []
     for name, picture in pictures:
         try:
@@ -82,13 +87,6 @@ def pictures_series(pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, pa
 
 def show_grey_chart(settings: Settings, stack: PanelStack, *, panel: int) -> None:
     """A panel's grey chart on the bare panel, the others clear, until Enter or q. Raises InputError, PanelLost."""
-    import typer
-
-    from calib.bare_panels import BarePanels
-    from calib.charts import alone
-    from calib.grey_chart import grey_chart
-    from calib.keys import Key, TerminalKeys, first_of
-
     keys = TerminalKeys()
     panels = BarePanels(settings, stack, grey_curve=False)
     poll = first_of(keys.poll, panels.keys.poll)
@@ -106,8 +104,6 @@ def show_grey_chart(settings: Settings, stack: PanelStack, *, panel: int) -> Non
 
 def typed_series(settings: Settings, stack: PanelStack, *, levels: int, panel: int) -> Series:
     """Luminances that a person reads off a photometer; each grey is shown on the panel where one is given."""
-    import typer
-
     show, close = _screen(settings, stack, panel) if panel >= 0 else (lambda grey: None, lambda: None)
     try:
         return ask_series(
@@ -132,10 +128,6 @@ def ask_series(greys: Sequence[float], *, show: Callable[[float], None], ask: Ca
 
 
 def _screen(settings: Settings, stack: PanelStack, panel: int) -> tuple[Callable[[float], None], Callable[[], None]]:
-    from runtime.clock import MonotonicClock
-    from runtime.panels.registry import open_panels, panel_settings
-    from runtime.support.gl import offscreen_context
-
     # The bare panel is measured: no curve, whatever is configured.
     bare = tuple(
         item.model_copy(update={"lut": "", "gamma": 1.0}) for item in panel_settings(settings.output, stack.count)

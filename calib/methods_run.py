@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+from rich.progress import track
+
 from calib.experiment import DEFAULT, SIGMAS_M, Case, run_case, time_solvers
 from calib.figures import methods_figure, timing_figure
-from calib.page import Picture, page
-from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_text
+from runtime.report.page import Figure, Page, in_columns, section_of
 
 COUNTS = (3, 10, 27, 100, 1000, 10_000, 100_000, 1_000_000)
 SENSOR_SCALES_OFF = (0.95, 1.03, 1.1)
@@ -17,9 +19,6 @@ SENSOR_SCALES_OFF = (0.95, 1.03, 1.1)
 
 def compare_methods(out: Path, *, seeds: int, pairs_max: int) -> tuple[dict[str, Any], str]:
     """Write `methods.json`, PNGs and `index.html`; answers the summary and a table for people."""
-    from rich.console import Console
-    from rich.progress import track
-
     setups: dict[str, tuple[str, dict[str, Any]]] = {
         "clean": ("Noise alone; both frames truly in metres", {}),
         **{
@@ -39,30 +38,26 @@ def compare_methods(out: Path, *, seeds: int, pairs_max: int) -> tuple[dict[str,
         "timings": [asdict(timing) for timing in timings],
         "default_over_best": {name: [_over_best(case) for case in found] for name, found in cases.items()},
     }
-    pictures = [
-        Picture(f"methods-{name}.png", methods_figure(found, title=setups[name][0]), setups[name][0])
-        for name, found in cases.items()
-    ]
-    pictures.append(Picture("time.png", timing_figure(timings), "Error against run time"))
-    tables = [(setups[name][0], _rows(found)) for name, found in cases.items()]
-    timing_rows = [["solver", "pairs", "ms (median)", "error at the eye, mm"]] + [
+    tables = {setups[name][0]: _rows(found) for name, found in cases.items()}
+    tables["Run time"] = [["solver", "pairs", "ms (median)", "error at the eye, mm"]] + [
         [t.method, f"{t.pairs:,}", f"{t.ms_p50:.3f}", f"{t.error_m * 1e3:.3f}"] for t in timings
     ]
-    with OutputFolder(out) as folder:
-        for picture in pictures:
-            write_bytes(folder.staging / picture.name, picture.png)
-        write_json(folder.staging / "methods.json", summary)
-        html = page(
-            title="Methods of calibration",
-            lead=f"27 viewpoints, {seeds} noise samples for each sigma, each with a camera turned at random; error of "
-            "the calibrated position over the viewing volume (0.3 to 0.9 m, 25 degrees to each side), mm: mean "
-            "(95th percentile).",
-            notes=[],
-            tables=[*tables, ("Run time", timing_rows)],
-            pictures=pictures,
-        )
-        write_text(folder.staging / "index.html", html)
-    return summary, "\n\n".join(f"{title}\n{_plain(rows)}" for title, rows in [*tables, ("Run time", timing_rows)])
+    figures = [
+        Figure(f"methods-{name}", methods_figure(found, title=setups[name][0]), setups[name][0])
+        for name, found in cases.items()
+    ]
+    figures.append(Figure("time", timing_figure(timings), "Error against run time"))
+    sections = [
+        replace(section_of(title, rows), figures=[figure])
+        for (title, rows), figure in zip(tables.items(), figures, strict=True)
+    ]
+    lead = (
+        f"27 viewpoints, {seeds} noise samples for each sigma, each with a camera turned at random; error of the "
+        "calibrated position over the viewing volume (0.3 to 0.9 m, 25 degrees to each side), mm: mean (95th "
+        "percentile)."
+    )
+    Page("Methods of calibration", lead, sections).write(out, record="methods.json", data=summary)
+    return summary, "\n\n".join(f"{title}\n{in_columns(rows)}" for title, rows in tables.items())
 
 
 def _over_best(case: Case) -> float:
@@ -78,8 +73,3 @@ def _rows(cases: list[Case]) -> list[list[str]]:
         + [f"{case.mean_m[name] * 1e3:.3g} ({case.p95_m[name] * 1e3:.3g})" for name in names]
         for case in cases
     ]
-
-
-def _plain(rows: list[list[str]]) -> str:
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -47,8 +48,6 @@ def seen_through(
 
 def corrected(layers: U8, true_from_ideal: Sequence[F64]) -> U8:
     """The layers as the presentation shader shows them on registered panels: bicubic, black beyond the edges."""
-    import cv2
-
     half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
     whole = np.linalg.inv(half)
     height, width = layers.shape[1:3]

@@ -147,7 +147,7 @@ class PairsFile:
         """Resume an existing file or begin one. Raises InputError where it exists and is not ours."""
         self.path = path
         self._rows: list[dict[str, str]] = []
-        if path.exists():
+        if foreign.is_there(path):
             read_pairs(path)
             with io.StringIO(foreign.read_text(path), newline="") as file:
                 for row in csv.DictReader(file, skipinitialspace=True):

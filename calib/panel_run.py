@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomlkit
+import typer
 
 from calib.config_file import put_homographies, read_document, save_document
 from calib.keys import Key, TerminalKeys, WindowKeys, first_of
-from calib.page import Picture, page
 from calib.panel_figures import registration_figure
 from calib.registration import Setting, StackRegistration, parts, register
 from calib.vernier import STEPS_PX, Nudging, chart, nominal, read_settings, resumed, write_settings
@@ -19,8 +20,12 @@ from runtime.clock import NS_PER_MS, MonotonicClock
 from runtime.config import Settings
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
+from runtime.panels.registry import open_panels, panel_settings
 from runtime.records import F64, U8, PanelFrame
-from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_png, write_text
+from runtime.report.page import Figure, Page, in_columns, section_of
+from runtime.support import foreign
+from runtime.support.artifacts import OutputFolder, write_png
+from runtime.support.gl import offscreen_context
 
 POLL_NS = 30 * NS_PER_MS
 SHOW_AGAIN_POLLS = 5
@@ -51,13 +56,8 @@ def nudge_verniers(
     out: Path, settings: Settings, stack: PanelStack, *, eye_m: Sequence[float], reference: int
 ) -> dict[str, Any]:
     """Let a person set the verniers on the panels. Raises InputError, MissingPart, PanelLost."""
-    import typer
-
-    from runtime.panels.registry import open_panels, panel_settings
-    from runtime.support.gl import offscreen_context
-
     asked = asked_settings(stack, eye_m=eye_m, reference=reference)
-    nudging = resumed(asked, read_settings(out, stack) if out.exists() else [])
+    nudging = resumed(asked, read_settings(out, stack) if foreign.is_there(out) else [])
     # Verniers measure the bare panels: a registration that is already configured would be measured away.
     bare = tuple(
         panel.model_copy(update={"homography": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))})
@@ -140,32 +140,29 @@ def fit_registration(
     except ValueError as problem:
         raise InputError(vernier, "", str(problem)) from None
     if config is not None:
-        _check_tables(settings, stack, config)
+        check_tables(settings, stack, config)
     summary = registration_summary(registration, stack) | {"source": str(vernier)}
-    picture = Picture(
-        "registration.png",
+    rows = registration_rows(registration, stack)
+    figure = Figure(
+        "registration",
         registration_figure(registration, stack),
         "Displacement of each panel from its ideal place, enlarged; numbers: pixels at the corners",
     )
-    with OutputFolder(out) as folder:
-        write_json(folder.staging / "registration.json", summary)
-        write_text(folder.staging / "panels.toml", panels_text(registration))
-        write_bytes(folder.staging / picture.name, picture.png)
-        html = page(
-            title="Registration of the panels",
-            lead=f"{len(found)} vernier settings, panel {reference} as the reference; one setting is exact to "
-            f"{registration.sigma_px:.3f} px.",
-            notes=summary["warnings"],
-            tables=[("Panels", registration_rows(registration, stack))],
-            pictures=[picture],
-        )
-        write_text(folder.staging / "index.html", html)
+    page = Page(
+        "Registration of the panels",
+        f"{len(found)} vernier settings, panel {reference} as the reference; one setting is exact to "
+        f"{registration.sigma_px:.3f} px.",
+        [replace(section_of("Panels", rows), figures=[figure])],
+        notes=summary["warnings"],
+    )
+    page.write(out, record="registration.json", data=summary, texts={"panels.toml": panels_text(registration)})
     if config is not None:
         summary["kept_version"] = str(write_homographies(config, registration))
-    return summary, _plain(registration_rows(registration, stack))
+    return summary, in_columns(rows)
 
 
-def _check_tables(settings: Settings, stack: PanelStack, config: Path) -> None:
+def check_tables(settings: Settings, stack: PanelStack, config: Path) -> None:
+    """Raises InputError where a configuration has another number of panels' tables than panels."""
     if len(settings.output.panels) not in (0, stack.count):
         raise InputError(config, "output.panels", f"has {len(settings.output.panels)} tables for {stack.count} panels")
 
@@ -219,11 +216,6 @@ def registration_rows(registration: StackRegistration, stack: PanelStack) -> lis
     return rows
 
 
-def _plain(rows: list[list[str]]) -> str:
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
-
-
 def panels_text(registration: StackRegistration) -> str:
     """`[[output.panels]]` tables with the homographies, to paste into a configuration."""
     return panels_document(np.stack([panel.true_from_ideal for panel in registration.panels]))
@@ -231,8 +223,6 @@ def panels_text(registration: StackRegistration) -> str:
 
 def panels_document(matrices: F64, *, stack: Mapping[str, Any] | None = None) -> str:
     """The same from (N, 3, 3) homographies, and what is to be put into `[stack]`."""
-    import tomlkit
-
     document = tomlkit.document()
     if stack is not None:
         document["stack"] = dict(stack)

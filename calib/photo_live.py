@@ -14,6 +14,7 @@ from calib.detect_marks import SeenMarks, find_marks
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import U8
+from runtime.support.artifacts import write_png
 
 STILL_SHARE = 0.002  # of the picture's width: marks that move less between two pictures are held still
 NEW_SHARE = 0.02  # marks that moved more than this since every photograph: another place
@@ -129,8 +130,6 @@ def take_live(
                 break
             grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
             if taker.see(np.asarray(grey)) and keep is not None:
-                from runtime.support.artifacts import write_png
-
                 write_png(keep / f"photograph-{len(taker.taken):02d}.png", np.asarray(grey))
     finally:
         video.release()

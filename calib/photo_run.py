@@ -3,29 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import track
 
+from calib.bare_panels import BarePanels
 from calib.board import board, board_layers
 from calib.bundle import Undetermined
 from calib.config_file import put, put_homographies, read_document, save_document
 from calib.detect_marks import SeenMarks, find_marks
 from calib.keys import Key, TerminalKeys, first_of
-from calib.page import Picture, page
-from calib.panel_run import panels_document
+from calib.panel_run import check_tables, panels_document
 from calib.photo_figures import photo_figure
-from calib.photo_registration import PhotoRegistration, register_photographs
+from calib.photo_judge import displayed_db
+from calib.photo_live import open_video, take_live
+from calib.photo_registration import PhotoRegistration, corner_pixels, homographies, register_photographs
 from calib.registration import through
 from calib.viewpoints import viewing_place_m
 from runtime.config import Settings
 from runtime.errors import InputError
 from runtime.optics.stack import UNEVEN_MOST, PanelStack
 from runtime.records import U8
+from runtime.report.page import Figure, Page, in_columns, section_of
 from runtime.support import foreign
-from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_png, write_text
+from runtime.support.artifacts import OutputFolder, write_png
 
 PHOTOGRAPH_BYTES_MAX = 512 << 20
 
@@ -55,7 +62,7 @@ def read_photograph(path: Path) -> U8:
 
 def photograph_files(folder: Path) -> list[Path]:
     """The photographs of a folder, by name. Raises InputError."""
-    if not folder.is_dir():
+    if not foreign.is_there(folder, folder=True):
         raise InputError(folder, "", "is not a folder of photographs")
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
     if not found:
@@ -67,9 +74,6 @@ def photograph_files(folder: Path) -> list[Path]:
 
 def look_at(files: Sequence[Path], stack: PanelStack) -> list[SeenMarks]:
     """The marks of every photograph, with progress. Raises InputError."""
-    from rich.console import Console
-    from rich.progress import track
-
     return [
         find_marks(read_photograph(path), stack, name=path.name)
         for path in track(files, "photographs", console=Console(stderr=True), transient=True)
@@ -115,33 +119,24 @@ def register_seen(
         raise InputError(source, "photographs", str(problem)) from None
     summary = registration_summary(found, stack) | {"source": source}
     if model:
-        from calib.photo_judge import displayed_db
-
         summary["psnr_db"] = displayed_db(found, settings, stack, model=model)
-    picture = Picture("registration.png", photo_figure(found, stack), "Where the panels and the camera stood")
-    with OutputFolder(out) as folder:
-        write_json(folder.staging / "registration.json", summary)
-        write_text(folder.staging / "panels.toml", panels_document(found.homographies, stack=stack_table(found)))
-        write_bytes(folder.staging / picture.name, picture.png)
-        html = page(
-            title="Registration of the panels by photographs",
-            lead=f"{summary['used']} of {len(seen)} photographs, {summary['points']} points; a point is exact to "
-            f"{found.bundle.sigma_px:.3f} px of the photograph.",
-            notes=list(summary["notes"]),
-            tables=[("Panels", panel_rows(found)), ("Photographs", photograph_rows(found))],
-            pictures=[picture],
-        )
-        write_text(folder.staging / "index.html", html)
+    figure = Figure("registration", photo_figure(found, stack), "Where the panels and the camera stood")
+    page = Page(
+        "Registration of the panels by photographs",
+        f"{summary['used']} of {len(seen)} photographs, {summary['points']} points; a point is exact to "
+        f"{found.bundle.sigma_px:.3f} px of the photograph.",
+        [
+            replace(section_of("Panels", panel_rows(found)), figures=[figure]),
+            section_of("Photographs", photograph_rows(found)),
+        ],
+        notes=list(summary["notes"]),
+    )
+    document = panels_document(found.homographies, stack=stack_table(found))
+    page.write(out, record="registration.json", data=summary, texts={"panels.toml": document})
     if config is not None:
         kept = write_registration(config, found)
         summary["kept_version"] = str(kept) if kept else None
     return summary, summary_text(found, summary)
-
-
-def check_tables(settings: Settings, stack: PanelStack, config: Path) -> None:
-    """Raises InputError where a configuration has another number of panels' tables than panels."""
-    if len(settings.output.panels) not in (0, stack.count):
-        raise InputError(config, "output.panels", f"has {len(settings.output.panels)} tables for {stack.count} panels")
 
 
 def wants_even(settings: Settings, stack: PanelStack) -> bool | None:
@@ -228,8 +223,6 @@ def uneven_cost_px(found: PhotoRegistration, *, aside_m: float = 0.1) -> float:
 
 def tilt_cost_px(found: PhotoRegistration, *, aside_m: float) -> float:
     """By how much a corner is off, at most, for an eye that is so far beside the viewing place."""
-    from calib.photo_registration import corner_pixels, homographies
-
     corners, worst = corner_pixels(found.stack), 0.0
     for side in (-aside_m, aside_m):
         beside = homographies(found.bundle.panels, found.stack, found.eye_m + np.array([0.0, side, 0.0]))
@@ -263,11 +256,6 @@ def photograph_rows(found: PhotoRegistration) -> list[list[str]]:
     ]
 
 
-def _plain(rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
-
-
 def summary_text(found: PhotoRegistration, summary: dict[str, Any]) -> str:
     """What the command prints."""
     gaps = ", ".join(
@@ -275,7 +263,7 @@ def summary_text(found: PhotoRegistration, summary: dict[str, Any]) -> str:
         for gap, sigma in zip(summary["gap_m"], summary["gap_sigma_m"], strict=True)
     )
     lines = [
-        _plain(panel_rows(found)),
+        in_columns(panel_rows(found)),
         f"gaps {gaps} mm; {summary['points']} points of {summary['used']} photographs, {summary['outliers']} left out",
         f"what is uncertain is worth {summary['eye_error_mm']:.2f} mm at the eye",
     ]
@@ -310,10 +298,6 @@ def write_registration(config: Path, found: PhotoRegistration) -> Path | None:
 
 def show_board(settings: Settings, stack: PanelStack) -> None:
     """The boards on the bare panels until a person says that it is enough. Raises InputError, PanelLost."""
-    import typer
-
-    from calib.bare_panels import BarePanels
-
     keys = TerminalKeys()
     panels = BarePanels(settings, stack)
     poll = first_of(keys.poll, panels.keys.poll)
@@ -341,11 +325,6 @@ def register_live(
     config: Path | None,
 ) -> tuple[dict[str, Any], str]:
     """Show the boards, take photographs from a video device, register. q or Enter: enough. Raises InputError."""
-    import typer
-
-    from calib.bare_panels import BarePanels
-    from calib.photo_live import open_video, take_live
-
     open_video(device).release()  # refused before anything is shown
     keys = TerminalKeys()
     panels = BarePanels(settings, stack)

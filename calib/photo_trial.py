@@ -8,10 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
+from rich.progress import track
 
 from calib.board import board
 from calib.bundle import Undetermined
 from calib.detect_marks import find_marks
+from calib.photo_judge import displayed_db
 from calib.photo_registration import PhotoRegistration, corner_pixels, homographies, register_photographs
 from calib.photo_run import wants_even
 from calib.placed import PlacedPanel, in_frame_of, misplaced
@@ -82,9 +85,6 @@ def run_trial(
     keep: bool,
 ) -> tuple[dict[str, Any], str]:
     """Simulate, photograph, register, compare. Raises InputError, MissingPart."""
-    from rich.console import Console
-    from rich.progress import track
-
     eye_m = viewing_place_m(settings.calibration)
     even = wants_even(settings, stack)
     rows: list[dict[str, Any]] = []
@@ -116,8 +116,6 @@ def run_trial(
                 "sigma_px": found.bundle.sigma_px,
             }
             if model:
-                from calib.photo_judge import displayed_db
-
                 reference = stack.count // 2
                 true = in_frame_of(truth, reference=reference, reference_x_m=stack.x_m[reference])
                 row["psnr_db"] = displayed_db(found, settings, stack, model=model, truth=true)

@@ -218,4 +218,5 @@ def error_over_panel_px(found: F64, truth: F64, *, width_px: int, height_px: int
     """(N,) distance between two homographies at an even grid of a panel's points, pixels."""
     u, v = np.meshgrid(np.linspace(0, width_px, 17), np.linspace(0, height_px, 10))
     points = np.column_stack([u.ravel(), v.ravel()])
-    return np.linalg.norm(through(found, points) - through(truth, points), axis=1)
+    apart_px: F64 = np.linalg.norm(through(found, points) - through(truth, points), axis=1)
+    return apart_px

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from calib.checks import RESIDUAL_LIMIT_M
 from calib.figures import eye_error_figure, geometry_figure, residual_figure
-from calib.page import Picture, page
 from calib.pairs import Pairs, read_pairs
 from calib.viewpoints import spherical_m, viewing_volume_m
 from runtime.config import CalibrationSettings, read_table
@@ -19,7 +18,7 @@ from runtime.errors import InputError
 from runtime.eyes.calibration import Calibration, load_calibration, similarity_defect
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
-from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_text
+from runtime.report.page import Figure, Page, Section, section_of
 
 LISTED_POINTS = 200
 
@@ -64,44 +63,39 @@ def write_report(
         if not len(pairs):
             raise InputError(pairs_path, "pairs", "there are none")
         points = Points(pairs, np.ones(len(pairs), bool), calibration.points(pairs.sensor_m) - pairs.stack_m)
-    pictures = list(_pictures(calibration, points, stack, viewing))
+    pictures = _pictures(calibration, points, stack, viewing)
     summary = _summary(calibration, points, viewing_volume_m(viewing))
-    tables = [("Numbers", _numbers(calibration, summary)), ("stack_from_sensor", _matrix(calibration))]
+    sections = [
+        section_of("Numbers", _numbers(calibration, summary)),
+        section_of("stack_from_sensor", _matrix(calibration)),
+        Section("Pictures", figures=pictures),
+    ]
     if points is not None:
         heading = "Points" if len(points.pairs) <= LISTED_POINTS else f"The {LISTED_POINTS} worst points"
-        tables.append((heading, _point_rows(points)))
-    with OutputFolder(out) as folder:
-        for picture in pictures:
-            write_bytes(folder.staging / picture.name, picture.png)
-        write_json(folder.staging / "report.json", summary)
-        html = page(
-            title=f"Calibration {file.name}",
-            lead="Where the depth camera stands before the stack of panels, and how well that is known.",
-            notes=_notes(calibration, points, file),
-            tables=tables,
-            pictures=pictures,
-        )
-        write_text(folder.staging / "index.html", html)
-    return summary | {"out": str(out), "pictures": [picture.name for picture in pictures]}
+        sections.append(section_of(heading, _point_rows(points)))
+    lead = "Where the depth camera stands before the stack of panels, and how well that is known."
+    page = Page(f"Calibration {file.name}", lead, sections, notes=_notes(calibration, points, file))
+    page.write(out, record="report.json", data=summary)
+    return summary | {"out": str(out), "pictures": [f"{picture.name}.png" for picture in pictures]}
 
 
 def _pictures(
     calibration: Calibration, points: Points | None, stack: PanelStack, viewing: CalibrationSettings
-) -> list[Picture]:
+) -> list[Figure]:
     matrix = calibration.stack_from_sensor
     gaze = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
     found = []
     if points is not None:
         found.append(
-            Picture(
-                "residuals.png",
+            Figure(
+                "residuals",
                 residual_figure(points.residual_m, points.used, limit_m=RESIDUAL_LIMIT_M),
                 "X, Y and Z error of every calibration point (the EyeReal supplement's figure S5)",
             )
         )
     found.append(
-        Picture(
-            "geometry.png",
+        Figure(
+            "geometry",
             geometry_figure(
                 matrix[:3, 3],
                 gaze,
@@ -120,8 +114,8 @@ def _pictures(
     )
     if straight is not None and aside is not None:
         found.append(
-            Picture(
-                "eye-error.png",
+            Figure(
+                "eye-error",
                 eye_error_figure(distances_m, straight, aside),
                 "Expected error at the eye from the parameters' covariance",
             )

@@ -35,7 +35,8 @@ class RobustFit:
 def _residuals(candidate: Similarity, sensor_m: F64, stack_m: F64) -> F64:
     """(..., K) squared distances in `stack`, m², divided by the scale: no candidate wins by shrinking its points."""
     squared = ((candidate.points(sensor_m) - stack_m) ** 2).sum(-1)
-    return squared / np.maximum(candidate.scale[..., None], 1e-300) ** 2
+    found: F64 = squared / np.maximum(candidate.scale[..., None], 1e-300) ** 2
+    return found
 
 
 def _concentrated(

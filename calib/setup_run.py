@@ -5,12 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import typer
+
 from calib.keys import Key, TerminalKeys, first_of
-from calib.page import page
 from calib.setup_steps import STEPS, Setup, Step, Stopped
 from calib.setup_world import RealWorld, SimulatedWorld, World
 from runtime.config import Settings, load_settings
 from runtime.errors import InputError, PhasestackError
+from runtime.report.page import Page, section_of
 from runtime.support import foreign
 from runtime.support.artifacts import write_json, write_text
 
@@ -24,7 +26,7 @@ def progress_path(config: Path) -> Path:
 
 def read_progress(path: Path) -> dict[str, Any]:
     """The figures of the steps that are done, by name. Raises InputError."""
-    if not path.exists():
+    if not foreign.is_there(path):
         return {}
     try:
         found = foreign.read_json(path, most_bytes=PROGRESS_BYTES_MAX)
@@ -49,12 +51,11 @@ def run_setup(
     to_stderr: bool = False,
 ) -> tuple[dict[str, Any], str]:
     """Walk through every step; answers the summary and its text. Raises InputError."""
-    import typer
 
     def say(text: str) -> None:
         typer.echo(text, err=to_stderr)
 
-    settings = load_settings(config if config.exists() else None)
+    settings = load_settings(config if foreign.is_there(config) else None)
     done = {} if again else read_progress(progress_path(config))
     world: World
     if simulate:
@@ -127,19 +128,15 @@ def summarise(setup: Setup, *, finished: bool) -> tuple[dict[str, Any], str]:
     rows = figure_rows(setup, settings)
     lines = [f"{row[0]}: {row[1]}" for row in rows[1:]]
     if finished:
-        html = page(
-            title="Setting up",
-            lead=f"{setup.config}: what each step came to.",
-            notes=[note for figures in setup.done.values() for note in figures.get("notes", [])],
-            tables=[("Figures", rows)],
-            pictures=[],
-        )
-        write_text(setup.out / "index.html", html)
+        notes = [note for figures in setup.done.values() for note in figures.get("notes", [])]
+        lead = f"{setup.config}: what each step came to."
+        page = Page("Setting up", lead, [section_of("Figures", rows)], notes=notes)
+        write_text(setup.out / "index.html", page.html())
         write_json(setup.out / "setup.json", summary)
         lines.append(f"{setup.out / 'index.html'} has the figures; {setup.config} is valid")
         lines += _next(setup, settings)
     if missing:
-        lines.append(f"not done: {', '.join(missing)} (`phasestack setup --config {setup.config}` goes on there)")
+        lines.append(f"not done: {', '.join(missing)} (the same command goes on there)")
     return summary, "\n".join(lines)
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import tomlkit
+
 from calib.config_file import read_document
 from runtime.config import NAMES_OR_PATHS, PATHS, load_settings
 from runtime.errors import InputError
@@ -21,8 +23,6 @@ def gather(config: Path, out: Path) -> list[str]:
 
     Other files that it names stay where they are, named in full. Raises InputError where one cannot be read.
     """
-    import tomlkit
-
     if not config.exists():
         raise InputError(config, "", "there is nothing to install yet: the steps before this one")
     settings = load_settings(config)

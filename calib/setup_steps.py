@@ -8,12 +8,22 @@ from pathlib import Path
 from typing import Any
 
 from calib.config_file import put, put_lut, put_monitors, read_document, save_document
+from calib.grey import fit_series
+from calib.grey_run import pictures_series, write_lut
 from calib.interview import Interview
 from calib.keys import Key
-from calib.setup_world import Poll, Say, SimulatedWorld, World
-from calib.viewpoints import IPD_M
+from calib.pairs import PairsFile
+from calib.photo_run import register_seen, wants_even
+from calib.setup_service import gather
+from calib.setup_world import Poll, Say, World
+from calib.setup_worth import calibration_worth, grey_worth
+from calib.solve_run import solve_file
+from calib.viewpoints import IPD_M, grid
+from calib.walk import Walk
 from runtime.config import Settings, load_settings
 from runtime.errors import InputError
+from runtime.sensor.registry import driver_names
+from runtime.support import foreign
 
 Figures = dict[str, Any]
 LEAST_PAIRS = 9
@@ -34,7 +44,7 @@ class Setup:
     @property
     def settings(self) -> Settings:
         """The configuration as it is now."""
-        return load_settings(self.config if self.config.exists() else None)
+        return load_settings(self.config if foreign.is_there(self.config) else None)
 
     def key(self) -> Key:
         """Wait for a key."""
@@ -164,8 +174,6 @@ def geometry(setup: Setup) -> Figures:
 
 def registration(setup: Setup) -> Figures:
     """Where the panels truly are, from photographs of the boards."""
-    from calib.photo_run import register_seen, wants_even
-
     settings = setup.settings
     stack = settings.stack.stack()
     seen, source = setup.world.photographs(settings, poll=setup.poll, say=setup.say)
@@ -193,10 +201,6 @@ def _made(config: Path) -> Path:
 
 def grey(setup: Setup) -> Figures:
     """What each panel makes of a grey, from photographs of its chart; a panel at a time, each kept at once."""
-    from calib.grey import fit_series
-    from calib.grey_run import pictures_series, write_lut
-    from calib.setup_worth import grey_worth
-
     stack = setup.settings.stack.stack()
     known = [bool(panel.lut) for panel in setup.settings.output.panels] or [False] * stack.count
     residual: dict[int, float] = {}
@@ -238,8 +242,6 @@ def grey(setup: Setup) -> Figures:
 
 def sensor(setup: Setup) -> Figures:
     """Which depth sensor sees the viewer; tried at once."""
-    from runtime.sensor.registry import driver_names
-
     names = [name for name in driver_names() if name not in ("replay", "fixed")]
     settings = setup.settings
     if setup.world.simulated:
@@ -271,11 +273,6 @@ def sensor(setup: Setup) -> Figures:
 
 def calibration(setup: Setup) -> Figures:
     """Where the sensor stands: a person goes from viewpoint to viewpoint."""
-    from calib.pairs import PairsFile
-    from calib.solve_run import solve_file
-    from calib.viewpoints import grid
-    from calib.walk import Walk
-
     settings = setup.settings
     setup.say(f"sensor: {setup.world.open_sensor(settings)}")
     pairs_path, target = setup.out / "pairs.csv", setup.out / "calibration.toml"
@@ -313,7 +310,6 @@ def calibration(setup: Setup) -> Figures:
     document = read_document(_made(setup.config))
     put(document, "calibration", {"file": str(target.resolve())})
     save_document(setup.config, document)
-    from calib.setup_worth import calibration_worth
 
     return {
         "eye_error_mm": summary["eye_error_mm"],
@@ -326,8 +322,6 @@ def calibration(setup: Setup) -> Figures:
 
 def service(setup: Setup) -> Figures:
     """A folder with all that the service reads, and the commands that install it: they ask for another's rights."""
-    from calib.setup_service import gather
-
     files = gather(setup.config, setup.out / "service")
     folder = (setup.out / "service").resolve()
     commands = [
@@ -349,8 +343,3 @@ STEPS = (
          "(q: enough)", calibration),
     Step("service", "At every start", "what the service reads, gathered in a folder, and how it is installed", service),
 )  # fmt: skip
-
-
-def is_simulated(world: World) -> bool:
-    """Whether nothing of it is there."""
-    return isinstance(world, SimulatedWorld)

@@ -10,19 +10,33 @@ from typing import Any
 
 import numpy as np
 
+from calib.bare_panels import BarePanels
 from calib.board import board_layers
+from calib.capture_run import eye_finder
+from calib.chart_files import ChartDisplay, Drawer
+from calib.charts import alone
 from calib.detect_marks import SeenMarks, find_marks
-from calib.keys import Key, first_of
+from calib.grey_chart import grey_chart
+from calib.keys import Key, WindowKeys, first_of
 from calib.message import message_layers
+from calib.photo_live import one_picture, open_video, take_live
+from calib.photo_run import look_at, photograph_files, read_photograph
+from calib.photo_trial import simulated_photographs
 from calib.placed import PlacedPanel, in_frame_of, misplaced
+from calib.simulator import Exposure, Scene, camera_from_stack, phone, photograph, smaller
 from calib.viewpoints import IPD_M, Viewpoint
 from runtime.clock import NS_PER_MS, NS_PER_S, MonotonicClock
+from runtime.commands.identify import alone as card_alone
+from runtime.commands.identify import every_monitor
 from runtime.config import Settings
 from runtime.errors import InputError, PanelLost
+from runtime.eyes.demo_geometry import demo_sensor_from_stack
 from runtime.optics.malus import phase_from_intensity
 from runtime.optics.stack import PanelStack
 from runtime.panels.monitors import Monitor
-from runtime.records import F64, U8, EyePoints
+from runtime.records import F64, U8, EyePoints, PanelFrame
+from runtime.sensor.registry import open_sensor
+from runtime.sensor.worker import SensorWorker
 
 Poll = Callable[[], Key | None]
 Say = Callable[[str], None]
@@ -109,8 +123,6 @@ class RealWorld(World):
         self._number = 0
 
     def monitors(self) -> tuple[Monitor, ...]:
-        from runtime.commands.identify import every_monitor
-
         self._let_go()
         try:
             panels, cards, monitors = every_monitor()
@@ -121,13 +133,10 @@ class RealWorld(World):
         return monitors
 
     def show_card(self, number: int) -> None:
-        from runtime.commands.identify import alone
-        from runtime.records import PanelFrame
-
         assert self._cards is not None
         panels, cards = self._cards
         self._number += 1
-        panels.present(PanelFrame(self._number, alone(cards, number), self._number))
+        panels.present(PanelFrame(self._number, card_alone(cards, number), self._number))
 
     def show_words(self, settings: Settings, lines: Sequence[str]) -> None:
         try:
@@ -138,9 +147,6 @@ class RealWorld(World):
             self._let_go()  # the terminal has the same words
 
     def photographs(self, settings: Settings, *, poll: Poll, say: Say) -> tuple[list[SeenMarks], str]:
-        from calib.photo_live import take_live
-        from calib.photo_run import look_at, photograph_files
-
         stack = settings.stack.stack()
         panels = self._bare(settings)
         if panels is None:
@@ -162,12 +168,6 @@ class RealWorld(World):
         return look_at(photograph_files(folder), stack), str(folder)
 
     def grey_photographs(self, settings: Settings, panel: int, *, poll: Poll, say: Say) -> list[tuple[str, U8]]:
-        from calib.bare_panels import BarePanels
-        from calib.charts import alone
-        from calib.grey_chart import grey_chart
-        from calib.photo_live import one_picture, open_video
-        from calib.photo_run import photograph_files, read_photograph
-
         self._let_go()
         stack = settings.stack.stack()
         video = None if self._device is None else open_video(self._device)
@@ -199,10 +199,6 @@ class RealWorld(World):
                 video.release()
 
     def open_sensor(self, settings: Settings) -> str:
-        from calib.capture_run import eye_finder
-        from runtime.sensor.registry import open_sensor
-        from runtime.sensor.worker import SensorWorker
-
         self._stop_sensor()
         open_sensor(settings.sensor, self._clock)  # refuses unknown names before anything starts
         worker = SensorWorker(lambda: open_sensor(settings.sensor, self._clock), settings.sensor, self._clock)
@@ -232,8 +228,6 @@ class RealWorld(World):
         return None if frame is None else Sample(frame.capture_ns, self._find(frame), self._worker.serial)
 
     def chart(self, settings: Settings) -> Any:
-        from calib.chart_files import ChartDisplay, Drawer
-
         self._let_go()
         ipd_m = settings.calibration.ipd_m or IPD_M
         drawer = Drawer(settings.stack.stack(), kind="solved", ipd_m=ipd_m, model="best", settings=settings.model)
@@ -254,8 +248,6 @@ class RealWorld(World):
         self._stop_sensor()
 
     def _bare(self, settings: Settings) -> Any:
-        from calib.bare_panels import BarePanels
-
         if settings.output.kind == "offscreen" or not settings.output.panels:
             return None
         if self._panels is None or self._bound != settings.output:
@@ -265,8 +257,6 @@ class RealWorld(World):
         return self._panels
 
     def _watch(self, sink: Any) -> None:
-        from calib.keys import WindowKeys
-
         self._window_keys = WindowKeys(sink)
 
     def _let_go(self) -> None:
@@ -355,8 +345,6 @@ class SimulatedWorld(World):
         """Nobody would see them."""
 
     def photographs(self, settings: Settings, *, poll: Poll, say: Say) -> tuple[list[SeenMarks], str]:
-        from calib.photo_trial import simulated_photographs
-
         say(f"taking {self.built.photographs} simulated photographs by hand, with a phone ...")
         pictures = simulated_photographs(
             settings.stack.stack(), self.truth, count=self.built.photographs, megapixels=self.built.megapixels,
@@ -370,9 +358,6 @@ class SimulatedWorld(World):
         return phase_from_intensity(np.asarray(grey, dtype=np.float64) ** self.grey_gammas[panel], branch=1)
 
     def grey_photographs(self, settings: Settings, panel: int, *, poll: Poll, say: Say) -> list[tuple[str, U8]]:
-        from calib.grey_chart import grey_chart
-        from calib.simulator import Exposure, Scene, camera_from_stack, phone, photograph, smaller
-
         say(f"taking {GREY_PHOTOGRAPHS} simulated photographs of panel {panel}'s grey chart ...")
         stack = settings.stack.stack()
         layers = np.zeros((stack.count, stack.height_px, stack.width_px), np.uint8)
@@ -393,8 +378,6 @@ class SimulatedWorld(World):
         return "a simulated sensor, where the built-in recording's stands"
 
     def sample(self, standing_at: Viewpoint) -> Sample | None:
-        from runtime.eyes.demo_geometry import demo_sensor_from_stack
-
         if self._here[0] != standing_at.name:
             place = standing_at.midpoint_m + self._random.normal(scale=self.built.standing_m, size=3)
             self._here = (standing_at.name, place - standing_at.midpoint_m)

@@ -232,7 +232,8 @@ def _crossing_through_glass(scene: Scene, index: int, panel: PlacedPanel, pose: 
 
 def _grid(position: F32, depth: float) -> F32:
     """Light that a panel's pixels let through along one axis: least between two pixels."""
-    return np.float32(1 - depth / 2) - np.float32(depth / 2) * np.cos(np.float32(2 * np.pi) * position)
+    found: F32 = np.float32(1 - depth / 2) - np.float32(depth / 2) * np.cos(np.float32(2 * np.pi) * position)
+    return found
 
 
 def _softened(light: F32, exposure: Exposure) -> F32:
@@ -266,14 +267,6 @@ def _developed(light: F32, lens: Lens, exposure: Exposure, random: np.random.Gen
         coded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, exposure.jpeg_quality])[1]
         picture = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE))
     return picture
-
-
-def photographs(
-    scene: Scene, lens: Lens, poses: Sequence[F64], exposure: Exposure, *, random: np.random.Generator
-) -> list[U8]:
-    """A photograph from every pose."""
-    rays = camera_rays(lens)
-    return [photograph(scene, lens, pose, exposure, random=random, rays=rays) for pose in poses]
 
 
 def smaller(lens: Lens, factor: float) -> Lens:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import tomlkit
 
 from calib.pairs import Pairs
 from calib.solution import Solution
@@ -39,8 +40,6 @@ def calibration_text(
     solution: Solution, pairs: Pairs, *, origin: Origin, warnings: tuple[str, ...], volume_m: F64
 ) -> str:
     """The TOML of a solution; `runtime.eyes.calibration` reads it, `[data]` is the report's."""
-    import tomlkit
-
     document = tomlkit.document()
     document.add(tomlkit.comment("Made by `phasestack calibrate solve`. Lengths in metres, angles in radians."))
     document["stack_from_sensor"] = _rows(solution.similarity.matrix)
@@ -79,8 +78,6 @@ def calibration_text(
 
 
 def _rows(matrix: F64) -> Array:
-    import tomlkit
-
     rows = tomlkit.array()
     for row in matrix.tolist():
         rows.append(row)
@@ -101,7 +98,7 @@ def history(path: Path) -> list[Path]:
 def save(path: Path, text: str) -> Path | None:
     """Write a calibration atomically; the file it replaces becomes the newest past version, which is returned."""
     kept = None
-    if path.exists():
+    if foreign.is_there(path):
         past = history(path)
         number = int(past[-1].stem.rpartition(".")[2]) + 1 if past else 1
         kept = path.with_name(f"{path.stem}.{number}{path.suffix}")
@@ -123,7 +120,7 @@ def roll_back(path: Path) -> Path:
         raise InputError(path, "--rollback", "there is no past version")
     newest = past[-1]
     load_calibration(newest)
-    if path.exists():
+    if foreign.is_there(path):
         write_bytes(
             path.with_name(f"{path.stem}.undone{path.suffix}"), foreign.read_bytes(path, most_bytes=KEPT_BYTES_MAX)
         )

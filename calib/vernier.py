@@ -68,7 +68,8 @@ def draw(layers: U8, *, index: int, at_px: Sequence[float], first_half: bool) ->
 def _cover(start: int, stop: int, span: Sequence[float]) -> F64:
     """How much of each pixel from start to stop lies in a span."""
     edges = np.arange(start, stop)
-    return np.clip(np.minimum(edges + 1, span[1]) - np.maximum(edges, span[0]), 0.0, 1.0)
+    found: F64 = np.clip(np.minimum(edges + 1, span[1]) - np.maximum(edges, span[0]), 0.0, 1.0)
+    return found
 
 
 def chart(stack: PanelStack, settings: Sequence[Setting]) -> U8:

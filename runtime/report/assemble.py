@@ -9,6 +9,7 @@ from typing import Any
 
 from runtime.config import StackGeometry
 from runtime.report import focal, horizon, latency, moving, sweeps
+from runtime.report.backends_section import backends_section
 from runtime.report.focal_page import focal_section
 from runtime.report.frontier import MethodResult, check_models, measure
 from runtime.report.frontier_page import frontier_section
@@ -127,6 +128,9 @@ def whole_report(
     found_moving, strip = kept.part("moving", lambda: apart(moving.moving_runs, scale=scale, **motions))
     sections.insert(2 if cases else 1, moving_section(found_moving, strip))
     record["moving"] = [asdict(one) for one in found_moving]
+    progress("OpenCV and OpenGL")
+    section, record["backends"] = kept.part("backends", lambda: backends_section(MODELS, stack))
+    sections.append(section)
     if with_focal:
         full = StackGeometry().stack()
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from time import monotonic, perf_counter_ns
 from typing import Any
 
+import cv2
 import numpy as np
 
 from runtime.clock import NS_PER_MS
@@ -38,8 +39,6 @@ SCATTERS = 3.0  # of the medians' own scatter before a difference counts
 
 def yardstick_ms() -> float:
     """A fixed piece of work of the same kinds (warp, table, product of matrices): median of nine."""
-    import cv2
-
     picture = np.random.default_rng(0).integers(0, 256, (1080, 1920, 4), dtype=np.uint8)
     left = np.random.default_rng(1).random((1080, 240), dtype=np.float32)
     right = np.random.default_rng(2).random((240, 1920), dtype=np.float32)

@@ -14,6 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from runtime.config import ModelSettings
+from runtime.content import shapes
+from runtime.content.scenes import Scene, Thing
+from runtime.model.predictor import load_predictor
 from runtime.optics.malus import intensity_from_phase
 from runtime.optics.quality import psnr_db
 from runtime.optics.retina import Mask, average, pupil_points, sample_bilinear
@@ -124,8 +127,6 @@ def focal_stack(
     painter: Painter, stack: PanelStack, *, model: str, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> FocalStack:
     """Solve the layers for two pinhole eyes, then focus the right one at every plane."""
-    from runtime.model.predictor import load_predictor
-
     eyes = eyes_at(distance_m=DISTANCE_M)
     predictor = load_predictor(model, stack, ModelSettings())
     rasters = predictor.rasters(eyes)
@@ -181,9 +182,6 @@ def focal_stack(
 
 def cards_painter(stack: PanelStack) -> Painter:
     """Three finely textured cards: behind the panels' middle, in it, and before it."""
-    from runtime.content import shapes
-    from runtime.content.scenes import Scene, Thing
-
     card = shapes.card(0.034, 0.036, repeat=(3.4, 3.6))
     things = tuple(
         Thing(card, "checker", (x, y, 0.0), colour, lit=False)

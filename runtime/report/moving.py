@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 
 from runtime.config import Settings, validated
+from runtime.daemon.build import RunOptions, build_run, scaled_stack
 from runtime.errors import FatalError
+from runtime.evaluation.motion_recording import write_motion
 from runtime.eyes.motions import MOTIONS
 from runtime.optics.carried import CarriedView, carried_quality
 from runtime.optics.retina import as_codes
@@ -103,8 +105,6 @@ def simulated_run(settings: Settings, *, scale: float, keep_light: int, measure:
 
     keep_light: refreshes from one to the next. Raises FatalError.
     """
-    from runtime.daemon.build import RunOptions, build_run
-
     lights = _Lights(measure)
     with ExitStack() as cleanup:
         options = RunOptions(max_speed=True, scale=scale, keep_light=keep_light)
@@ -126,8 +126,6 @@ def settings_for(recording: Path, *, solver_ms: float, aligned: bool, scene: str
 
 def record_motion(path: Path, motion: str, *, seconds: float, seed: int) -> None:
     """A head that moves as the tracker's benchmark has it, with its true eyes."""
-    from runtime.commands.motion_recording import write_motion
-
     write_motion(path, motion, seconds=seconds, seed=seed)
 
 
@@ -162,8 +160,6 @@ def moving_runs(
 
 
 def _stack(scale: float) -> PanelStack:
-    from runtime.daemon.build import scaled_stack
-
     return scaled_stack(Settings(), scale)
 
 

@@ -11,7 +11,8 @@ from __future__ import annotations
 import json
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from math import log2, prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,11 +22,13 @@ from numpy.typing import NDArray
 
 from runtime.errors import InputError
 from runtime.model.chain import chain_frame
-from runtime.model.contract import Contract, Step
+from runtime.model.contract import Contract
 from runtime.model.predictor import Predictor
+from runtime.model.pyramid_level import CENTRE, I16, OUTER
+from runtime.model.schedule import Picture, Problem, carry_out
 from runtime.model.visible import visible_boxes
 from runtime.optics.stack import PanelStack
-from runtime.records import F64
+from runtime.records import F64, U8
 from runtime.report.pairs import StillPair
 
 if TYPE_CHECKING:
@@ -35,7 +38,8 @@ if TYPE_CHECKING:
 
 RGB, RGBA, EYES = 3, 4, 2
 LINEAR, CUBIC = 4, 16  # products per sample
-OUTER = (0, 2)  # panels that the chain models correct
+FINER = 4 * 8 + LINEAR  # of a picture made twice as fine, by two passes of a cubic kernel
+NOTHING: I16 = np.empty((0, 0), np.int16)
 Shape = tuple[int, ...]
 
 COUNTED_ONCE = (
@@ -110,7 +114,7 @@ def predictor_multiply_adds(predictor: Predictor, pair: StillPair, *, path: Path
         return predictor_multiply_adds(predictor.small, pair, path=path) + enlarged
     windows = predictor.windows(pair.eyes_m)
     drawn = sum((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in windows)
-    total: int = EYES * RGBA * drawn * (CUBIC if predictor.interpolation == "cubic" else LINEAR)
+    total: int = EYES * RGBA * drawn * (LINEAR if predictor.interpolation == "linear" else FINER)
     if isinstance(predictor, SartPredictor):
         return total + sart_multiply_adds(predictor.stack, iterations=predictor.iterations)
     if path is None:
@@ -156,38 +160,64 @@ def _network_runs(predictor: UnrolledPredictor | NetworkPredictor, pair: StillPa
 
 
 def correction_multiply_adds(contract: Contract, stack: PanelStack, eyes_m: F64) -> int:
-    """What a chain model does outside its network, over what both eyes look through."""
-    boxes = visible_boxes(eyes_m, stack)
+    """What a chain model does outside its network, over what both eyes look through: its schedule, counted."""
+    counted = _CountedSurround(contract, stack, eyes_m)
+    carry_out(contract.steps, counted, lambda pictures: dict.fromkeys(OUTER, NOTHING))
+    return counted.total
 
-    def values(panel: int, reduction: int) -> int:
-        box = boxes[panel]
+
+class _CountedSurround:
+    """Carries out nothing, and counts what each call of the schedule would cost."""
+
+    def __init__(self, contract: Contract, stack: PanelStack, eyes_m: F64) -> None:
+        self._boxes = visible_boxes(eyes_m, stack)
+        self._reduction: int = contract.reduction
+        self._level: int = contract.steps[0].reduction
+        frame = chain_frame(eyes_m, stack, cell_px=contract.cell_px, reduction=contract.reduction)
+        self._in_frame = RGB * frame.rows * frame.width_px
+        self._even = True  # no panel was changed yet
+        sharpened = 6 if contract.emphasis else 0  # a separable filter of three
+        self.total = EYES * self._values(CENTRE, 1) * (sharpened + 1)  # and a table
+
+    def begin(self, pictures: Sequence[Picture], problem: Problem) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    def network_pictures(self) -> tuple[I16, I16]:
+        self._residual()
+        # Every value goes into one mean.
+        coarser = EYES * self._values(CENTRE, 1 if self._reduction == 1 else self._level)
+        self.total += coarser + self._in_frame * (EYES * LINEAR + 2)
+        return NOTHING, NOTHING
+
+    def set_panel(self, reduction: int, panel: int, codes: I16, *, shown: bool) -> None:
+        self.total += (CUBIC + 2) * self._values(panel, reduction)
+
+    def project(self, reduction: int, panels: Sequence[int]) -> None:
+        self.total += len(panels) * EYES * LINEAR * self._values(CENTRE, reduction)
+
+    def correct(self, reduction: int, panel: int, *, size: float, shown: bool) -> None:
+        self._residual()
+        self.total += (EYES * LINEAR + 4) * self._values(panel, reduction)
+
+    def upsample(self, coarser_reduction: int, reduction: int, *, shown: bool) -> None:
+        self._level = reduction
+        self.total += sum(CUBIC * self._values(n, reduction) for n in OUTER)
+
+    def finish(self) -> U8:
+        self.total += 7 * self._values(CENTRE, 1)  # the centre: two targets less four, and a limit
+        return np.empty((0, 0, 0, 4), np.uint8)
+
+    def close(self) -> None:
+        pass
+
+    def _residual(self) -> None:
+        """What each eye lacks when the centre is closed: two differences each, mean, limit, two differences."""
+        self.total += 0 if self._even else 8 * self._values(CENTRE, self._level)
+        self._even = False
+
+    def _values(self, panel: int, reduction: int) -> int:
+        box = self._boxes[panel]
         return RGB * (box.width_px // reduction) * (box.height_px // reduction)
-
-    frame = chain_frame(eyes_m, stack, cell_px=contract.cell_px, reduction=contract.reduction)
-    in_frame = RGB * frame.rows * frame.width_px
-    whole, sharpened = values(1, 1), 6 if contract.emphasis else 0  # a separable filter of three
-    total = EYES * whole * (sharpened + 1)  # and a table
-    level = contract.steps[0].reduction
-    for index, step in enumerate(contract.steps):
-        if step.reduction != level:
-            level = step.reduction
-            total += sum(CUBIC * values(n, level) + EYES * LINEAR * values(1, level) for n in OUTER)
-        if index:  # what each eye lacks when the centre is closed: two differences each, mean, limit, two differences
-            total += 8 * values(1, level)
-        total += _step(step, values, in_frame=in_frame, reduction=contract.reduction)
-    if level != 1:
-        total += sum(CUBIC * values(n, 1) + EYES * LINEAR * values(1, 1) for n in OUTER)
-    return total + 7 * whole  # the centre: two targets less four, and a limit
-
-
-def _step(step: Step, values: Callable[[int, int], int], *, in_frame: int, reduction: int) -> int:
-    """One correction outside the network, and the residual after it."""
-    seen = EYES * LINEAR * values(1, step.reduction)  # one outer panel through the centre's pixels
-    if step.kind == "chain":
-        wave = sum((CUBIC + 2) * values(n, step.reduction) for n in OUTER)
-        coarser = EYES * values(1, 1 if reduction == 1 else step.reduction)  # every value goes into one mean
-        return coarser + in_frame * (EYES * LINEAR + 2) + wave + seen * len(OUTER)
-    return (EYES * LINEAR + 4) * values(2 if step.kind == "front" else 0, step.reduction) + seen
 
 
 def sart_multiply_adds(stack: PanelStack, *, iterations: int) -> int:

@@ -1,4 +1,4 @@
-"""One self-contained HTML page out of sections: text, pictures and tables."""
+"""One self-contained HTML page out of sections (text, pictures and tables), and the folder that it is written to."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +74,10 @@ class Page:
     title: str
     lead: str  # one sentence that says what the page found
     sections: Sequence[Section]
-    machine: Mapping[str, str]
-    command: str  # that makes this page again
-    tiles: Sequence[Tile] = field(default_factory=tuple)
+    machine: Mapping[str, str] = field(default_factory=dict)
+    command: str = ""  # that makes this page again; empty: nothing is said of it
+    tiles: Sequence[Tile] = ()
+    notes: Sequence[str] = ()  # what to beware of
 
     def html(self) -> str:
         """The page. Every text is escaped; no request leaves it."""
@@ -86,3 +90,25 @@ class Page:
     def figures(self) -> list[Figure]:
         """Every picture of the page, in its order."""
         return [figure for section in self.sections for figure in section.figures]
+
+    def write(self, out: Path, *, record: str, data: Any, texts: Mapping[str, str] | None = None) -> None:
+        """index.html, its pictures as PNGs, `data` as JSON under the name `record`, and further texts by name:
+        all of them in the folder `out`, or none. Raises InputError."""
+        with OutputFolder(out) as folder:
+            write_json(folder.staging / record, data)
+            write_text(folder.staging / "index.html", self.html())
+            for name, text in (texts or {}).items():
+                write_text(folder.staging / name, text)
+            for figure in self.figures():
+                write_bytes(folder.staging / f"{figure.name}.png", figure.png)
+
+
+def in_columns(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of equally many texts as lines for a terminal, flush right."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+
+
+def section_of(title: str, rows: Sequence[Sequence[str]]) -> Section:
+    """A section of one table, whose first row is its headings."""
+    return Section(title, tables=[Table(rows[0], rows[1:])])

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from runtime.report.page import Figure, Section, Table
+from runtime.report.survey_page import HEADINGS, cells
+from runtime.report.survey_run import survey
 from runtime.report.worker import apart
 
 CAPTIONS = {
@@ -17,8 +19,6 @@ CAPTIONS = {
 
 def surveyed(*, quick: bool) -> tuple[Section, dict[str, Any]]:
     """Measure it in a process of its own. The section, and what report.json has of it. Raises FatalError."""
-    from runtime.report.survey_run import survey
-
     with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
         out = Path(folder) / "plan"
         record = apart(survey, None, out=out, model=None, scale=1.0, quick=quick, quiet=True)
@@ -28,8 +28,6 @@ def surveyed(*, quick: bool) -> tuple[Section, dict[str, Any]]:
 
 def plan_section(record: dict[str, Any], pictures: dict[str, bytes]) -> Section:
     """The survey's record and its two plots as a section."""
-    from runtime.report.survey_page import HEADINGS, cells
-
     rows = [
         [*cells(row), "; ".join(str(item["what"]) for item in row["left_out"])]
         for row in (*record["scenes"], *record["other_sparse"])

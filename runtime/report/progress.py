@@ -6,6 +6,9 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
 from runtime.support.progress import NowAndThen
 
 
@@ -16,8 +19,6 @@ def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
         told = NowAndThen(sys.stderr)
         yield lambda done, of: told(f"{title}: {done} of {of}")
         return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     console = Console(stderr=True)
@@ -33,7 +34,6 @@ def status_line(title: str) -> Iterator[Callable[[str], None]]:
         told = NowAndThen(sys.stderr)
         yield lambda text: told(f"{title}: {text}")
         return
-    from rich.console import Console
 
     console = Console(stderr=True)
     with console.status(title) as status:

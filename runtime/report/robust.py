@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from runtime.errors import ModelFailure
@@ -103,8 +104,6 @@ def outcomes(
 
     Raises InputError for an unknown model or a folder that can't be written, before or at the first pair.
     """
-    import cv2
-
     cv2.setNumThreads(threads)
     found = []
     for done, number in enumerate(numbers):

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
+
 from runtime.config import load_settings
+from runtime.plan.planning import HALF_IPD_M, MIDDLE_M, overridden, teller
+from runtime.plan.survey import QUICK_REGIONS, REGIONS, survey_regions, survey_scenes
+from runtime.report.survey_page import write_survey
+from runtime.support.artifacts import OutputFolder
+from runtime.support.gl import offscreen_context
 
 SURVEY_REPEATS = 15
 
@@ -19,17 +28,6 @@ def survey(
 
     Raises PhasestackError; leaves nothing new then.
     """
-    from datetime import UTC, datetime
-
-    import cv2
-    import numpy as np
-
-    from runtime.plan.planning import HALF_IPD_M, MIDDLE_M, overridden, teller
-    from runtime.plan.survey import QUICK_REGIONS, REGIONS, survey_regions, survey_scenes
-    from runtime.report.survey_page import write_survey
-    from runtime.support.artifacts import OutputFolder
-    from runtime.support.gl import offscreen_context
-
     settings = overridden(load_settings(config), scene=None, model=model, budget_ms=None)
     cv2.setNumThreads(settings.model.threads or -1)
     stack = settings.stack.stack()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from calib.viewpoints import grid
 from runtime.eyes.demo_geometry import demo_stack_from_sensor
@@ -23,7 +24,9 @@ def known_m() -> np.ndarray:
 def measured(known_m: np.ndarray) -> Callable[..., np.ndarray]:
     """What the demo's camera tells of points, with noise and with a metre of its own."""
 
-    def sensor(points: np.ndarray | None = None, *, sigma_m: float = 0.0, scale: float = 1.0, seed: int = 0):
+    def sensor(
+        points: np.ndarray | None = None, *, sigma_m: float = 0.0, scale: float = 1.0, seed: int = 0
+    ) -> NDArray[np.float64]:
         sensor_from_stack = np.linalg.inv(demo_stack_from_sensor())
         chosen = known_m if points is None else points
         exact = chosen @ sensor_from_stack[:3, :3].T + sensor_from_stack[:3, 3]

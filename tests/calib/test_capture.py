@@ -91,7 +91,7 @@ def test_a_moving_head_with_known_truth_gives_an_exact_pair() -> None:
     np.testing.assert_allclose(pair.measured.midpoint_m, eyes_at(pair.true_m).eyes_m.mean(0), atol=1e-12)
 
 
-def walk(path: Path, said: list[str], **options) -> Walk:
+def walk(path: Path, said: list[str], **options: bool) -> Walk:
     request = {"again": False, "window_s": 0.5, "max_spread_m": 0.01} | options
     return Walk(PairsFile(path), grid()[:3], say=said.append, **request)
 
@@ -181,7 +181,7 @@ def test_after_three_pairs_a_person_is_told_where_to_go(tmp_path: Path) -> None:
     assert said[-1].startswith("here")
 
 
-def guided(tmp_path: Path, said: list[str], **options) -> Walk:
+def guided(tmp_path: Path, said: list[str], **options: float) -> Walk:
     """A walk whose first three pairs tell where the camera stands; the fourth viewpoint is shown."""
     chosen = [grid()[number] for number in (0, 2, 6, 13, 20)]
     person = Walk(PairsFile(tmp_path / "p.csv"), chosen, again=False, window_s=0.5, max_spread_m=0.01,
@@ -213,7 +213,7 @@ def test_who_holds_still_at_the_viewpoint_is_taken_without_a_key(tmp_path: Path)
 
 
 @pytest.mark.parametrize("away", [{"drift_m": 0.05}, {"noise_m": 0.02}])
-def test_who_moves_or_scatters_is_not_taken(tmp_path: Path, away) -> None:
+def test_who_moves_or_scatters_is_not_taken(tmp_path: Path, away: dict[str, float]) -> None:
     person = guided(tmp_path, [])
     stand_long(person, grid()[13].midpoint_m, start_s=10, **away)
     assert len(read_pairs(tmp_path / "p.csv")) == 3

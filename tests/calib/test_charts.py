@@ -14,7 +14,7 @@ from calib.chart_files import Chart, captioned, steps
 from calib.charts import alone, chart_fov_deg, eye_chart, line_picture
 from calib.commands import app
 from calib.keys import Key
-from calib.viewpoints import grid
+from calib.viewpoints import Viewpoint, grid
 from runtime.errors import InputError
 from runtime.optics.quality import psnr_db
 from runtime.optics.retina import panel_positions, seen_by
@@ -33,7 +33,7 @@ def test_the_picture_has_ten_pixel_lines_at_the_thirds() -> None:
     assert set(np.unique(picture)) == {0, 255}
 
 
-def seen_error_db(stack: PanelStack, viewpoint, *, side: int, index: int, moved_m: float) -> float:
+def seen_error_db(stack: PanelStack, viewpoint: Viewpoint, *, side: int, index: int, moved_m: float) -> float:
     layers = alone(eye_chart(viewpoint, stack, side=side, index=index, ipd_m=0.06), stack, index=index)
     eye = viewpoint.eyes_m(0.06)[side] + [0.0, moved_m, 0.0]
     seen = seen_by(eye, layers, stack, fov_deg=chart_fov_deg(viewpoint, stack))
@@ -43,14 +43,16 @@ def seen_error_db(stack: PanelStack, viewpoint, *, side: int, index: int, moved_
 
 @pytest.mark.parametrize("index", range(3))
 @pytest.mark.parametrize("side", range(2))
-def test_the_seeds_chart_shows_the_picture_from_its_viewpoint_alone(small_stack, index, side) -> None:
+def test_the_seeds_chart_shows_the_picture_from_its_viewpoint_alone(
+    small_stack: PanelStack, index: int, side: int
+) -> None:
     viewpoint = grid()[4]
     here = seen_error_db(small_stack, viewpoint, side=side, index=index, moved_m=0.0)
     assert here > 25
     assert here > 8 + seen_error_db(small_stack, viewpoint, side=side, index=index, moved_m=0.03)
 
 
-def test_the_lines_are_in_the_middle_of_their_pixels(small_stack) -> None:
+def test_the_lines_are_in_the_middle_of_their_pixels(small_stack: PanelStack) -> None:
     """Half a pixel of misplacement would be seen: the centre of the ink against the thirds, in the eye's image."""
     viewpoint = grid()[0]
     layers = alone(eye_chart(viewpoint, small_stack, side=1, index=2, ipd_m=0.06), small_stack, index=2)
@@ -129,7 +131,7 @@ def test_a_solved_chart_shows_both_eyes_the_picture_from_its_viewpoint_alone(tmp
         ["--out", "x", "--panels", "no-such-file.toml"],
     ],
 )
-def test_wrong_requests_are_refused(tmp_path: Path, monkeypatch, options) -> None:
+def test_wrong_requests_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]) -> None:
     monkeypatch.chdir(tmp_path)
     assert isinstance(run.invoke(app, ["charts", *options]).exception, InputError)
     assert list(tmp_path.iterdir()) == []
@@ -141,7 +143,7 @@ class Panels:
     def __init__(self) -> None:
         self.shown: list[str] = []
 
-    def charts(self, viewpoint) -> list[Chart]:
+    def charts(self, viewpoint: Viewpoint) -> list[Chart]:
         layers = np.zeros((1, 1, 1, 4), np.uint8)
         return [Chart(viewpoint, label, layers) for label in ("a", "b")]
 
@@ -159,7 +161,7 @@ class Panels:
         ([Key.UP, Key.QUIT], ["0a", "0a"]),
     ],
 )
-def test_keys_walk_through_the_charts(keys, shown) -> None:
+def test_keys_walk_through_the_charts(keys: list[Key], shown: list[str]) -> None:
     panels, pressed = Panels(), iter(keys)
     viewpoints = grid()[:2]
     seen = [

@@ -15,34 +15,36 @@ def clean() -> dict[float, Case]:
     return {sigma: run_case(sigma_m=sigma, seeds=SEEDS) for sigma in SIGMAS_M}
 
 
-def test_the_default_is_within_two_percent_of_the_best_at_every_sigma(clean) -> None:
+def test_the_default_is_within_two_percent_of_the_best_at_every_sigma(clean: dict[float, Case]) -> None:
     for case in clean.values():
         best = min(case.mean_m[method] for method in METHODS)
         assert case.mean_m[DEFAULT] <= 1.02 * best + 1e-12
 
 
-def test_the_residual_of_least_squares_is_never_above_the_seeds(clean) -> None:
+def test_the_residual_of_least_squares_is_never_above_the_seeds(clean: dict[float, Case]) -> None:
     for case in clean.values():
         assert case.rms_residual_m["least-squares"] <= case.rms_residual_m["seed"] * (1 + 1e-12) + 1e-15
 
 
-def test_without_noise_every_method_is_exact(clean) -> None:
+def test_without_noise_every_method_is_exact(clean: dict[float, Case]) -> None:
     assert max(clean[0.0].p95_m.values()) < 1e-12
 
 
-def test_the_error_grows_with_the_noise(clean) -> None:
+def test_the_error_grows_with_the_noise(clean: dict[float, Case]) -> None:
     for method in METHODS:
         means = [clean[sigma].mean_m[method] for sigma in SIGMAS_M]
         assert means == sorted(means)
 
 
-def test_least_squares_is_the_worst_where_the_sensor_is_noisy(clean) -> None:
+def test_least_squares_is_the_worst_where_the_sensor_is_noisy(clean: dict[float, Case]) -> None:
     case = clean[0.030]
     assert case.mean_m["least-squares"] > case.mean_m["seed"] > case.mean_m["inverse"]
 
 
 @pytest.mark.parametrize("sigma_m", [0.003, 0.030])
-def test_robust_with_a_fifth_of_gross_errors_is_within_half_again_of_the_default_without(clean, sigma_m) -> None:
+def test_robust_with_a_fifth_of_gross_errors_is_within_half_again_of_the_default_without(
+    clean: dict[float, Case], sigma_m: float
+) -> None:
     dirty = run_case(sigma_m=sigma_m, outliers=True, seeds=SEEDS)
     assert dirty.mean_m["robust"] <= 1.5 * clean[sigma_m].mean_m[DEFAULT]
     assert dirty.mean_m["inverse"] > 2 * dirty.mean_m["robust"]
@@ -50,7 +52,9 @@ def test_robust_with_a_fifth_of_gross_errors_is_within_half_again_of_the_default
 
 @pytest.mark.parametrize("true_scale", [1.0, 0.95, 1.1])
 @pytest.mark.parametrize("sigma_m", [0.001, 0.003])
-def test_the_default_is_within_one_percent_of_the_best_whatever_the_sensors_metre(true_scale, sigma_m) -> None:
+def test_the_default_is_within_one_percent_of_the_best_whatever_the_sensors_metre(
+    true_scale: float, sigma_m: float
+) -> None:
     case = run_case(sigma_m=sigma_m, sensor_scale=true_scale, seeds=200)
     assert case.mean_m[DEFAULT] <= 1.01 * min(case.mean_m[method] for method in METHODS)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -70,7 +72,7 @@ def test_a_separation_that_agrees_changes_nothing_where_the_pairs_are_exact() ->
     assert found.similarity.scale == pytest.approx(1.0, abs=1e-9)
 
 
-def test_the_file_of_pairs_keeps_what_the_sensor_told_of_the_eyes(tmp_path) -> None:
+def test_the_file_of_pairs_keeps_what_the_sensor_told_of_the_eyes(tmp_path: Path) -> None:
     from calib.capture import EyeWindow
 
     window = EyeWindow(0.5)

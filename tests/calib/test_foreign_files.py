@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -37,7 +38,7 @@ READERS = {
 }
 
 
-def answer_of(reader, path: Path) -> str:
+def answer_of(reader: Any, path: Path) -> str:
     """The refusal; a test that fails where there is none within ten seconds."""
     with ThreadPoolExecutor(1) as pool:
         waiting = pool.submit(reader, path)

@@ -34,7 +34,7 @@ CURVES = {
 
 @pytest.mark.parametrize("name", CURVES)
 @pytest.mark.parametrize("levels", [9, 17])
-def test_a_short_series_gives_the_curve(name, levels) -> None:
+def test_a_short_series_gives_the_curve(name: str, levels: int) -> None:
     grey = np.linspace(0, 1, levels)
     found = fit_grey_curve(grey, luminance(CURVES[name](grey)))
     fine = np.linspace(0, 1, 301)
@@ -43,7 +43,7 @@ def test_a_short_series_gives_the_curve(name, levels) -> None:
 
 
 @pytest.mark.parametrize("name", CURVES)
-def test_a_photometers_noise_does_little(name) -> None:
+def test_a_photometers_noise_does_little(name: str) -> None:
     """Half a percent of noise: what matters is the error of the light, which the ends of the curve hardly move."""
     random, grey = np.random.default_rng(0), np.linspace(0, 1, 17)
     wanted = np.linspace(0, 1, 201)
@@ -57,7 +57,7 @@ def test_a_photometers_noise_does_little(name) -> None:
 
 @settings(deadline=None, max_examples=10)
 @given(st.floats(0.5, 3.0), st.floats(0, 5), st.floats(50, 500), st.integers(5, 20))
-def test_the_inverse_undoes_the_curve_and_ascends(gamma, dark, white, levels) -> None:
+def test_the_inverse_undoes_the_curve_and_ascends(gamma: float, dark: float, white: float, levels: int) -> None:
     grey = np.linspace(0, 1, levels)
     found = fit_grey_curve(grey, luminance(grey**gamma, dark=dark, white=white))
     wanted = np.linspace(0, 1, 101)
@@ -70,7 +70,7 @@ def test_the_inverse_undoes_the_curve_and_ascends(gamma, dark, white, levels) ->
 
 @given(st.lists(st.floats(0, 100), min_size=6, max_size=6))
 @settings(deadline=None, max_examples=4)
-def test_whatever_was_measured_the_curve_ascends(values) -> None:
+def test_whatever_was_measured_the_curve_ascends(values: list[float]) -> None:
     told = np.array([0.0, *values, 100.0])
     found = fit_grey_curve(np.linspace(0, 1, 8), told)
     assert (np.diff(found.phase(np.linspace(0, 1, 200))) >= -1e-12).all()
@@ -85,7 +85,7 @@ def test_whatever_was_measured_the_curve_ascends(values) -> None:
         ([0, 0.3, 0.6, 1], [1, 1, 1, 1], "not brighter"),
     ],
 )
-def test_a_series_that_tells_nothing_is_refused(grey, told, why) -> None:
+def test_a_series_that_tells_nothing_is_refused(grey: list[float], told: list[int], why: str) -> None:
     with pytest.raises(ValueError, match=why):
         fit_grey_curve(np.array(grey, dtype=float), np.array(told, dtype=float))
 

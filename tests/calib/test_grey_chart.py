@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,7 +29,7 @@ def phase_of(grey: np.ndarray) -> np.ndarray:
     return (1 - np.cos(np.pi * grey**1.4)) / 2
 
 
-def photographs(curve, *, count: int = 2, **changes) -> list[np.ndarray]:
+def photographs(curve: Callable[..., Any], *, count: int = 2, **changes: float) -> list[np.ndarray]:
     random = np.random.default_rng(1)
     layers = np.zeros((3, STACK.height_px, STACK.width_px), np.uint8)
     layers[PANEL] = np.rint(255 * curve(grey_chart(STACK, PANEL) / 255)).astype(np.uint8)
@@ -60,7 +62,9 @@ def test_mixed_patches_hold_their_share_of_white_pixels() -> None:
         assert area.mean() / 255 == pytest.approx(patch.share if patch.grey < 0 else patch.grey / 255)
 
 
-def test_two_photographs_tell_a_panels_curve_without_knowing_the_cameras(tmp_path: Path, pictures) -> None:
+def test_two_photographs_tell_a_panels_curve_without_knowing_the_cameras(
+    tmp_path: Path, pictures: list[np.ndarray]
+) -> None:
     folder = tmp_path / "photos"
     folder.mkdir()
     for number, picture in enumerate(pictures):
@@ -82,13 +86,13 @@ def test_a_curve_that_falls_is_told_and_not_swallowed() -> None:
 
 
 @pytest.mark.parametrize(("gain", "why"), [(2.0, "overexposed"), (0.02, "marks|too dark")])
-def test_a_wrong_exposure_is_told(gain, why) -> None:
+def test_a_wrong_exposure_is_told(gain: float, why: str) -> None:
     (picture,) = photographs(phase_of, count=1, gain=gain)
     with pytest.raises(Unusable, match=why):
         histograms(picture, STACK, PANEL)
 
 
-def test_another_panels_chart_is_told(pictures) -> None:
+def test_another_panels_chart_is_told(pictures: list[np.ndarray]) -> None:
     with pytest.raises(Unusable, match="marks of panel 0"):
         histograms(pictures[0], STACK, 0)
 
@@ -103,7 +107,9 @@ def test_another_panels_chart_is_told(pictures) -> None:
         ["grey-chart", "--panel", "1"],
     ],
 )
-def test_wrong_requests_are_refused_and_leave_nothing(tmp_path, monkeypatch, options) -> None:
+def test_wrong_requests_are_refused_and_leave_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert isinstance(run.invoke(app, ["panels", *options]).exception, InputError)
     assert list(tmp_path.iterdir()) == []

@@ -10,6 +10,7 @@ from calib.registration import ideal_partner, register, through, true_from_ideal
 from calib.vernier import nominal, simulate
 from runtime.config import PanelSettings
 from runtime.optics.retina import seen_by
+from runtime.optics.stack import PanelStack
 
 EYES = np.array([[0.6, -0.03, 0.0], [0.6, 0.03, 0.0]])
 VIEW = {"fov_deg": 40.0, "width_px": 480, "height_px": 270}
@@ -26,7 +27,7 @@ def smooth_layers(seed: int = 0) -> np.ndarray:
     return layers
 
 
-def test_panels_in_their_places_look_as_the_retina_says(small_stack) -> None:
+def test_panels_in_their_places_look_as_the_retina_says(small_stack: PanelStack) -> None:
     layers = smooth_layers()
     straight = seen_through(EYES[0], layers, small_stack, [np.eye(3)] * 3, **VIEW)
     plain = seen_by(EYES[0], layers, small_stack, **VIEW)
@@ -34,7 +35,7 @@ def test_panels_in_their_places_look_as_the_retina_says(small_stack) -> None:
     np.testing.assert_array_equal(straight.mask, plain.mask)
 
 
-def test_a_displaced_panel_looks_as_its_shifted_picture(small_stack) -> None:
+def test_a_displaced_panel_looks_as_its_shifted_picture(small_stack: PanelStack) -> None:
     """Pixel (u, v) of a panel displaced by (3, -2) lies where (u - 3, v + 2) belongs."""
     layers = smooth_layers()
     displaced = seen_through(EYES[0], layers, small_stack, shifted(small_stack, index=2, shift_px=(3, -2)), **VIEW)
@@ -46,7 +47,7 @@ def test_a_displaced_panel_looks_as_its_shifted_picture(small_stack) -> None:
     np.testing.assert_allclose(displaced.image[inner], plain.image[inner], atol=2e-3)
 
 
-def test_half_a_pixel_costs_and_more_costs_more(small_stack) -> None:
+def test_half_a_pixel_costs_and_more_costs_more(small_stack: PanelStack) -> None:
     layers = smooth_layers()
     wanted = [(seen_by(eye, layers, small_stack, **VIEW).image * 255).astype(np.uint8) for eye in EYES]
     cost = [
@@ -59,7 +60,7 @@ def test_half_a_pixel_costs_and_more_costs_more(small_stack) -> None:
     assert cost[2] > cost[3] + 3
 
 
-def test_the_correction_gives_the_picture_back(small_stack) -> None:
+def test_the_correction_gives_the_picture_back(small_stack: PanelStack) -> None:
     layers = smooth_layers()
     wanted = [(seen_by(eye, layers, small_stack, **VIEW).image * 255).astype(np.uint8) for eye in EYES]
     truth = [
@@ -90,7 +91,7 @@ def test_the_correction_is_what_the_presentation_shader_does() -> None:
     assert np.abs(shown[inner].astype(int) - ours[inner].astype(int)).max() <= 3
 
 
-def test_a_viewpoint_off_the_mark_does_no_harm_to_eyes_that_are_calibrated_afterwards(small_stack) -> None:
+def test_a_viewpoint_off_the_mark_does_no_harm_to_eyes_that_are_calibrated_afterwards(small_stack: PanelStack) -> None:
     """Verniers set from 2 mm beside the mark shear the stack: whoever stands beside in proportion sees it straight."""
     off_m, mark, eye = np.array([0.0, 0.002, -0.001]), np.array([0.5, 0.0, 0.0]), np.array([0.6, 0.03, 0.02])
     asked = nominal(tuple(mark), small_stack, reference=1)
@@ -111,7 +112,7 @@ def test_a_viewpoint_off_the_mark_does_no_harm_to_eyes_that_are_calibrated_after
 
 
 @pytest.mark.parametrize("index", range(3))
-def test_only_the_panel_that_was_asked_for_is_displaced(small_stack, index) -> None:
+def test_only_the_panel_that_was_asked_for_is_displaced(small_stack: PanelStack, index: int) -> None:
     matrices = shifted(small_stack, index=index, shift_px=(1.5, 0.5))
     for number, matrix in enumerate(matrices):
         assert np.array_equal(matrix, np.eye(3)) == (number != index)

@@ -46,14 +46,16 @@ def truth() -> list[np.ndarray]:
 
 
 @pytest.fixture
-def vernier(tmp_path: Path, truth) -> Path:
+def vernier(tmp_path: Path, truth: list[np.ndarray]) -> Path:
     asked = nominal((0.5, 0.0, 0.0), STACK, reference=1)
     taken = simulate(asked, STACK, truth, noise_px=0.05, viewpoint_error_m=np.zeros(3), random=np.random.default_rng(0))
     write_settings(tmp_path / "vernier.csv", taken)
     return tmp_path / "vernier.csv"
 
 
-def test_the_homographies_go_into_the_configuration_and_all_else_stays(tmp_path, vernier, truth) -> None:
+def test_the_homographies_go_into_the_configuration_and_all_else_stays(
+    tmp_path: Path, vernier: Path, truth: list[np.ndarray]
+) -> None:
     config = tmp_path / "config.toml"
     config.write_text(CONFIG)
     told = panels("fit", "--vernier", str(vernier), "--out", str(tmp_path / "r"), "--config", str(config), "--write")
@@ -69,14 +71,14 @@ def test_the_homographies_go_into_the_configuration_and_all_else_stays(tmp_path,
     assert Path(told["kept_version"]).read_text() == CONFIG
 
 
-def test_a_configuration_without_panels_gets_them(tmp_path, vernier) -> None:
+def test_a_configuration_without_panels_gets_them(tmp_path: Path, vernier: Path) -> None:
     config = tmp_path / "config.toml"
     config.write_text("")
     panels("fit", "--vernier", str(vernier), "--out", str(tmp_path / "r"), "--config", str(config), "--write")
     assert len(load_settings(config).output.panels) == 3
 
 
-def test_a_configuration_of_another_number_of_panels_is_left_alone(tmp_path, vernier) -> None:
+def test_a_configuration_of_another_number_of_panels_is_left_alone(tmp_path: Path, vernier: Path) -> None:
     config = tmp_path / "config.toml"
     config.write_text('[[output.panels]]\nconnector = "HDMI-1"\n')
     with pytest.raises(InputError, match=r"output\.panels"):
@@ -85,7 +87,7 @@ def test_a_configuration_of_another_number_of_panels_is_left_alone(tmp_path, ver
     assert not (tmp_path / "r").exists()
 
 
-def test_the_registration_is_written_with_its_uncertainty(tmp_path, vernier) -> None:
+def test_the_registration_is_written_with_its_uncertainty(tmp_path: Path, vernier: Path) -> None:
     told = panels("fit", "--vernier", str(vernier), "--out", str(tmp_path / "r"))
     written = json.loads((tmp_path / "r" / "registration.json").read_text())
     assert written["reference"] == told["reference"] == 1
@@ -96,7 +98,7 @@ def test_the_registration_is_written_with_its_uncertainty(tmp_path, vernier) -> 
     assert len(load_settings(tmp_path / "r" / "panels.toml").output.panels) == 3
 
 
-def test_a_setting_that_was_missed_is_named(tmp_path, vernier) -> None:
+def test_a_setting_that_was_missed_is_named(tmp_path: Path, vernier: Path) -> None:
     taken = read_settings(vernier, STACK)
     lines = vernier.read_text().splitlines()
     lines[8] = ",".join([*lines[8].split(",")[:-1], str(taken[7].panel_px[1] + 5)])
@@ -105,13 +107,13 @@ def test_a_setting_that_was_missed_is_named(tmp_path, vernier) -> None:
     assert any(warning.startswith("setting 8 ") for warning in told["warnings"])
 
 
-def test_too_few_settings_are_refused_with_the_file(tmp_path, vernier) -> None:
+def test_too_few_settings_are_refused_with_the_file(tmp_path: Path, vernier: Path) -> None:
     vernier.write_text("\n".join(vernier.read_text().splitlines()[:4]) + "\n")
     with pytest.raises(InputError, match=r"vernier\.csv: panel"):
         panels("fit", "--vernier", str(vernier), "--out", str(tmp_path / "r"))
 
 
-def test_vernier_charts_are_drawn_for_every_pair(tmp_path) -> None:
+def test_vernier_charts_are_drawn_for_every_pair(tmp_path: Path) -> None:
     told = panels("charts", "--out", str(tmp_path / "v"), "--eye", "0.5", "0", "0.02")
     assert told["files"] == [f"vernier-1-{p}-layer-{n}.png" for p, n in ((0, 1), (0, 0), (2, 1), (2, 2))]
     for name in told["files"]:
@@ -121,7 +123,7 @@ def test_vernier_charts_are_drawn_for_every_pair(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_simulated_stack_is_recovered_to_a_tenth_of_a_pixel(tmp_path, seed) -> None:
+def test_a_simulated_stack_is_recovered_to_a_tenth_of_a_pixel(tmp_path: Path, seed: int) -> None:
     told = panels("simulate", "--out", str(tmp_path / "s"), "--model", "", "--seed", str(seed))
     assert max(told["error_rms_px"]) < 0.1
     assert min(told["misaligned_rms_px"][::2]) > 0.5
@@ -142,7 +144,9 @@ def test_a_simulated_stack_is_recovered_to_a_tenth_of_a_pixel(tmp_path, seed) ->
         ["simulate", "--out", "r", "--noise-px", "-1"],
     ],
 )
-def test_wrong_requests_are_refused_and_leave_nothing(tmp_path, monkeypatch, options) -> None:
+def test_wrong_requests_are_refused_and_leave_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError):
         panels(*options)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +17,7 @@ from calib.commands import app
 from calib.detect_marks import find_marks
 from calib.photo_live import Taker
 from calib.photo_trial import simulated_photographs
-from calib.placed import in_frame_of, misplaced, true_from_ideal_seen
+from calib.placed import PlacedPanel, in_frame_of, misplaced, true_from_ideal_seen
 from calib.registration import error_over_panel_px
 from calib.viewpoints import viewing_place_m
 from runtime.config import Settings, StackGeometry, load_settings
@@ -37,17 +39,17 @@ def panels(*options: str) -> dict:
 
 
 @pytest.fixture(scope="module")
-def truth():
+def truth() -> tuple[PlacedPanel, PlacedPanel, PlacedPanel]:
     return misplaced(STACK, shift_m=0.002, turn_deg=1.0, gap_m=0.002, random=np.random.default_rng(2))
 
 
 @pytest.fixture(scope="module")
-def pictures(truth) -> list[np.ndarray]:
+def pictures(truth: tuple[PlacedPanel, PlacedPanel, PlacedPanel]) -> list[np.ndarray]:
     return simulated_photographs(STACK, truth, count=7, megapixels=6.0, random=np.random.default_rng(3))
 
 
 @pytest.fixture
-def photos(tmp_path: Path, pictures) -> Path:
+def photos(tmp_path: Path, pictures: list[np.ndarray]) -> Path:
     folder = tmp_path / "photos"
     folder.mkdir()
     for number, picture in enumerate(pictures):
@@ -77,7 +79,7 @@ def half_covered(picture: np.ndarray) -> np.ndarray:
         PanelStack(0.3, 0.2, (-0.04, 0.0, 0.02, 0.05), 1280, 800),
     ],
 )
-def test_a_camera_square_to_a_bare_panel_reads_every_mark_where_it_was_drawn(stack) -> None:
+def test_a_camera_square_to_a_bare_panel_reads_every_mark_where_it_was_drawn(stack: PanelStack) -> None:
     for index in range(stack.count):
         picture = cv2.copyMakeBorder(board(stack, index), 40, 40, 40, 40, cv2.BORDER_CONSTANT)
         seen = find_marks(cv2.GaussianBlur(picture, (0, 0), 0.8), stack, name="")
@@ -99,7 +101,9 @@ def test_panels_too_small_or_too_many_for_boards_are_refused() -> None:
         marks(PanelStack(0.3, 0.2, tuple(0.01 * n for n in range(6)), 1920, 1080))
 
 
-def test_photographs_register_the_panels_in_the_configuration(tmp_path, photos, truth) -> None:
+def test_photographs_register_the_panels_in_the_configuration(
+    tmp_path: Path, photos: Path, truth: tuple[PlacedPanel, PlacedPanel, PlacedPanel]
+) -> None:
     config = tmp_path / "c.toml"
     config.write_text(CONFIG)
     told = panels(
@@ -124,15 +128,15 @@ def test_photographs_register_the_panels_in_the_configuration(tmp_path, photos, 
 
 
 @pytest.mark.slow
-def test_a_model_for_even_gaps_gets_even_gaps_and_is_told_what_that_costs(tmp_path, photos) -> None:
-    told = panels("photo", "--photos", str(photos), "--out", str(tmp_path / "r"), "--model", "")
+def test_who_asks_for_even_gaps_gets_them_and_is_told_what_that_costs(tmp_path: Path, photos: Path) -> None:
+    told = panels("photo", "--photos", str(photos), "--out", str(tmp_path / "r"), "--model", "", "--spacing", "even")
     assert load_settings(tmp_path / "r" / "panels.toml").stack.stack().is_evenly_spaced
     assert not np.allclose(told["true_x_m"], told["x_m"], atol=1e-4)
     assert any("even ones of" in note for note in told["notes"])
 
 
 @pytest.mark.slow
-def test_what_the_registration_gains_is_told_in_decibels(tmp_path, photos) -> None:
+def test_what_the_registration_gains_is_told_in_decibels(tmp_path: Path, photos: Path) -> None:
     told = panels("photo", "--photos", str(photos), "--out", str(tmp_path / "r"), "--model", "fast")["psnr_db"]
     assert told["registered"] > told["as configured"] + 5
     assert told["registered"] > told["perfect stack"] - 5
@@ -147,7 +151,9 @@ def test_what_the_registration_gains_is_told_in_decibels(tmp_path, photos) -> No
         (lambda picture: np.full_like(picture, 30), "shows no mark"),
     ],
 )
-def test_photographs_that_cannot_be_used_are_named_and_nothing_is_written(tmp_path, photos, pictures, spoil, why):
+def test_photographs_that_cannot_be_used_are_named_and_nothing_is_written(
+    tmp_path: Path, photos: Path, pictures: list[np.ndarray], spoil: Callable[..., Any], why: str
+) -> None:
     config = tmp_path / "c.toml"
     config.write_text(CONFIG)
     for number in (1, 3, 5):
@@ -164,14 +170,18 @@ def test_photographs_that_cannot_be_used_are_named_and_nothing_is_written(tmp_pa
     assert not (tmp_path / "r").exists()
 
 
-def test_a_bad_photograph_among_good_ones_is_left_out_and_named(tmp_path, photos, pictures) -> None:
+def test_a_bad_photograph_among_good_ones_is_left_out_and_named(
+    tmp_path: Path, photos: Path, pictures: list[np.ndarray]
+) -> None:
     replaced(photos, 2, blurred(pictures[1]))
     told = panels("photo", "--photos", str(photos), "--out", str(tmp_path / "r"), "--model", "")
     assert told["used"] == 6
     assert any(note.startswith("2.png") and note.endswith("left out") for note in told["notes"])
 
 
-def test_a_video_device_takes_photographs_by_itself_when_it_is_held_still(tmp_path, pictures) -> None:
+def test_a_video_device_takes_photographs_by_itself_when_it_is_held_still(
+    tmp_path: Path, pictures: list[np.ndarray]
+) -> None:
     said: list[str] = []
     taker = Taker(STACK, wanted=3, say=said.append)
     for picture in pictures[:3]:
@@ -183,7 +193,7 @@ def test_a_video_device_takes_photographs_by_itself_when_it_is_held_still(tmp_pa
 
 
 @pytest.mark.slow
-def test_a_video_registers_the_panels(tmp_path, pictures) -> None:
+def test_a_video_registers_the_panels(tmp_path: Path, pictures: list[np.ndarray]) -> None:
     number = 0
     for picture in pictures:
         for _ in range(5):
@@ -209,26 +219,28 @@ def test_a_video_registers_the_panels(tmp_path, pictures) -> None:
         ["board"],
     ],
 )
-def test_wrong_requests_are_refused_and_leave_nothing(tmp_path, monkeypatch, options) -> None:
+def test_wrong_requests_are_refused_and_leave_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError):
         panels(*options)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_that_is_no_picture_is_named(tmp_path, photos) -> None:
+def test_a_file_that_is_no_picture_is_named(tmp_path: Path, photos: Path) -> None:
     (photos / "8.jpg").write_bytes(b"not a picture")
     with pytest.raises(InputError, match=r"8\.jpg: is not a photograph"):
         panels("photo", "--photos", str(photos), "--out", str(tmp_path / "r"))
 
 
-def test_a_trial_tells_its_errors_against_the_truth(tmp_path) -> None:
+def test_a_trial_tells_its_errors_against_the_truth(tmp_path: Path) -> None:
     told = panels("photo-trial", "--out", str(tmp_path / "t"), "--stacks", "1", "--count", "6", "--megapixels", "5")
     assert told["registered"] == 1
     assert told["rms_px"] < 0.1
     assert json.loads((tmp_path / "t" / "trial.json").read_text())["worst_gap_mm"] < 0.2
 
 
-def test_boards_are_written_one_for_each_panel(tmp_path) -> None:
+def test_boards_are_written_one_for_each_panel(tmp_path: Path) -> None:
     told = panels("board", "--out", str(tmp_path / "b"))
     assert np.array_equal(read_image(tmp_path / "b" / told["files"][2])[..., 0], board(STACK, 2))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ def hands(seed: int, stack: PanelStack = STACK) -> tuple[tuple[PlacedPanel, ...]
     return misplaced(stack, shift_m=0.002, turn_deg=1.0, gap_m=0.002, random=random), random
 
 
-def register(seen, *, stack: PanelStack = STACK, even: bool = False):
+def register(seen: Any, *, stack: PanelStack = STACK, even: bool = False) -> Any:
     return register_photographs(seen, stack, eye_m=EYE, even=even)
 
 

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from calib.cost_run import misaligned
 from calib.registration import (
+    Setting,
     error_over_panel_px,
     ideal_partner,
     parts,
@@ -25,7 +27,15 @@ EYE = (0.5, 0.02, -0.01)
 SIZE = {"width_px": 1920, "height_px": 1080}
 
 
-def settings_of(truth, *, noise_px=0.0, off_m=(0, 0, 0), seed=0, stack=STACK, reference=1):
+def settings_of(
+    truth: list[NDArray[np.float64]],
+    *,
+    noise_px: float = 0.0,
+    off_m: tuple[int, int, int] = (0, 0, 0),
+    seed: int = 0,
+    stack: PanelStack = STACK,
+    reference: int = 1,
+) -> list[Setting]:
     asked = nominal(EYE, stack, reference=reference)
     random = np.random.default_rng(seed)
     return simulate(asked, stack, truth, noise_px=noise_px, viewpoint_error_m=np.array(off_m), random=random)
@@ -34,7 +44,7 @@ def settings_of(truth, *, noise_px=0.0, off_m=(0, 0, 0), seed=0, stack=STACK, re
 @given(
     st.tuples(st.floats(0.2, 2), st.floats(-0.3, 0.3), st.floats(-0.2, 0.2)), st.floats(50, 1800), st.floats(50, 1000)
 )
-def test_partners_lie_on_one_ray(eye, u, v) -> None:
+def test_partners_lie_on_one_ray(eye: tuple[float, float, float], u: float, v: float) -> None:
     """Against the projection into the eye's image: two pixels on one ray have one image."""
     partner = ideal_partner(np.array([[u, v]]), eye, STACK, reference=0, panel=2)
     projection = image_from_stack(eye, width_px=1920, height_px=1080, fov_deg=40)
@@ -44,7 +54,7 @@ def test_partners_lie_on_one_ray(eye, u, v) -> None:
 
 
 @given(st.lists(st.floats(-20, 20), min_size=8, max_size=8))
-def test_a_homography_moves_the_corners_as_it_was_told(corners) -> None:
+def test_a_homography_moves_the_corners_as_it_was_told(corners: list[float]) -> None:
     displacement = np.array(corners).reshape(4, 2)
     ideal = np.array([[0, 0], [1920, 0], [1920, 1080], [0, 1080]], dtype=float)
     matrix = true_from_ideal(displacement, **SIZE)
@@ -53,7 +63,7 @@ def test_a_homography_moves_the_corners_as_it_was_told(corners) -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("reference", range(3))
-def test_exact_settings_give_the_misalignment_back(seed, reference) -> None:
+def test_exact_settings_give_the_misalignment_back(seed: int, reference: int) -> None:
     truth = misaligned(STACK, reference=reference, random=np.random.default_rng(seed))
     found = register(settings_of(truth, reference=reference), STACK, reference=reference)
     for panel, matrix in zip(found.panels, truth, strict=True):
@@ -144,7 +154,9 @@ def test_settings_on_a_line_are_refused() -> None:
         ([[1.01, 0, -9.6], [0, 1.01, -5.4], [0, 0, 1]], (0, 0), 0.0, (1.01, 1.01)),
     ],
 )
-def test_a_homography_in_words(matrix, shift, rotation, scale) -> None:
+def test_a_homography_in_words(
+    matrix: list[list[float]], shift: tuple[int, int], rotation: float, scale: tuple[float, float]
+) -> None:
     told = parts(np.array(matrix, dtype=float), **SIZE)
     np.testing.assert_allclose(told.shift_px, shift, atol=1e-9)
     np.testing.assert_allclose(told.scale, scale, atol=1e-12)

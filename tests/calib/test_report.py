@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,9 @@ def report(*options: str) -> dict:
 
 
 @pytest.fixture
-def calibration(tmp_path, measured, known_m, write_pairs) -> Path:
+def calibration(
+    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
+) -> Path:
     sensor = measured(sigma_m=0.003)
     sensor[5] += 0.3
     path = tmp_path / "c.toml"
@@ -38,21 +41,23 @@ def calibration(tmp_path, measured, known_m, write_pairs) -> Path:
     return path
 
 
-def test_the_page_holds_numbers_and_pictures_and_needs_nothing_else(tmp_path, calibration) -> None:
+def test_the_page_holds_numbers_and_pictures_and_needs_nothing_else(tmp_path: Path, calibration: Path) -> None:
     out = tmp_path / "deep" / "report"
     told = report(str(calibration), "--out", str(out))
     assert told["points"] == 27
     assert told["rejected"] == 1
     page = (out / "index.html").read_text()
     assert page.count("data:image/png;base64,") == 3
-    assert not re.search(r"(src|href)=\"(?!data:)", page)
+    assert not re.search(r"(src|href)=\"(?!data:|#)", page)
     for text in ("residual, RMS", "robust", "condition", "expected error at the eye", "line 7", "rejected"):
         assert text in page
     for name in ("residuals.png", "geometry.png", "eye-error.png"):
         assert read_image(out / name).std() > 5
 
 
-def test_its_numbers_are_those_of_the_solution(tmp_path, calibration, measured, known_m) -> None:
+def test_its_numbers_are_those_of_the_solution(
+    tmp_path: Path, calibration: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray
+) -> None:
     told = report(str(calibration), "--out", str(tmp_path / "r"))
     assert 2 < told["rms_mm"] < 8
     assert told["axis_rms_mm"] == pytest.approx(told["axis_rms_mm"])
@@ -60,7 +65,7 @@ def test_its_numbers_are_those_of_the_solution(tmp_path, calibration, measured, 
     assert told["eye_error_mm"] < told["eye_error_p95_mm"] < 10
 
 
-def test_the_published_prototype_is_reported_without_its_points(tmp_path) -> None:
+def test_the_published_prototype_is_reported_without_its_points(tmp_path: Path) -> None:
     path = tmp_path / "published.toml"
     path.write_text(PUBLISHED)
     told = report(str(path), "--out", str(tmp_path / "r"))
@@ -72,7 +77,9 @@ def test_the_published_prototype_is_reported_without_its_points(tmp_path) -> Non
     assert "--pairs" in page
 
 
-def test_the_points_can_be_given(tmp_path, measured, known_m, write_pairs) -> None:
+def test_the_points_can_be_given(
+    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
+) -> None:
     path = tmp_path / "plain.toml"
     from runtime.eyes.demo_geometry import demo_stack_from_sensor
 
@@ -82,7 +89,7 @@ def test_the_points_can_be_given(tmp_path, measured, known_m, write_pairs) -> No
     assert told["rms_mm"] == pytest.approx(0.002e3 * np.sqrt(3), rel=0.2)
 
 
-def test_what_a_file_says_is_not_taken_for_markup(tmp_path) -> None:
+def test_what_a_file_says_is_not_taken_for_markup(tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
     path.write_text(PUBLISHED + 'method = "<script>alert(1)</script>"\n')
     report(str(path), "--out", str(tmp_path / "r"))
@@ -99,7 +106,7 @@ def test_what_a_file_says_is_not_taken_for_markup(tmp_path) -> None:
         "sensor_m = [[1, 2, nan]]\nstack_m = [[1, 2, 3]]",
     ],
 )
-def test_spoiled_points_are_refused_and_nothing_is_written(tmp_path, data) -> None:
+def test_spoiled_points_are_refused_and_nothing_is_written(tmp_path: Path, data: str) -> None:
     path = tmp_path / "c.toml"
     path.write_text(PUBLISHED + "[data]\n" + data + "\n")
     with pytest.raises(InputError, match="data"):
@@ -107,7 +114,7 @@ def test_spoiled_points_are_refused_and_nothing_is_written(tmp_path, data) -> No
     assert not (tmp_path / "r").exists()
 
 
-def test_the_methods_table_is_written_with_its_plots(tmp_path) -> None:
+def test_the_methods_table_is_written_with_its_plots(tmp_path: Path) -> None:
     result = run.invoke(app, ["methods", "--out", str(tmp_path / "m"), "--seeds", "2", "--pairs-max", "100", "--json"])
     assert result.exit_code == 0, result.output
     told = json.loads((tmp_path / "m" / "methods.json").read_text())

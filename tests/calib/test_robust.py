@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -20,13 +22,17 @@ def spoiled(sensor: np.ndarray, wrong: list[int], *, by_m: float = 0.3) -> np.nd
 
 @pytest.mark.parametrize("sigma_m", [0.0, 0.001, 0.01])
 @pytest.mark.parametrize("wrong", [[], [0], [3, 9, 12, 20, 26], [0, 1, 2, 3, 4, 5, 6, 7]])
-def test_exactly_the_wrong_pairs_are_left_out(measured, known_m, sigma_m, wrong) -> None:
+def test_exactly_the_wrong_pairs_are_left_out(
+    measured: Callable[..., np.ndarray], known_m: np.ndarray, sigma_m: float, wrong: list[int]
+) -> None:
     found = fit_robust(spoiled(measured(sigma_m=sigma_m), wrong), known_m)
     assert np.flatnonzero(~found.inlier).tolist() == wrong
 
 
 @pytest.mark.parametrize("sigma_m", [0.001, 0.01])
-def test_the_result_is_that_of_the_good_pairs_alone(measured, known_m, sigma_m) -> None:
+def test_the_result_is_that_of_the_good_pairs_alone(
+    measured: Callable[..., np.ndarray], known_m: np.ndarray, sigma_m: float
+) -> None:
     wrong = [2, 7, 11, 19, 24]
     good = np.setdiff1d(np.arange(27), wrong)
     sensor = spoiled(measured(sigma_m=sigma_m), wrong)
@@ -34,30 +40,30 @@ def test_the_result_is_that_of_the_good_pairs_alone(measured, known_m, sigma_m) 
     np.testing.assert_array_equal(fit_robust(sensor, known_m).similarity.matrix, alone.matrix)
 
 
-def test_without_outliers_it_is_the_plain_fit(measured, known_m) -> None:
+def test_without_outliers_it_is_the_plain_fit(measured: Callable[..., np.ndarray], known_m: np.ndarray) -> None:
     sensor = measured(sigma_m=0.003)
     plain = fit(sensor, known_m, rule="inverse")
     np.testing.assert_array_equal(fit_robust(sensor, known_m).similarity.matrix, plain.matrix)
 
 
-def test_it_tells_the_noise_of_the_good_pairs(measured, known_m) -> None:
+def test_it_tells_the_noise_of_the_good_pairs(measured: Callable[..., np.ndarray], known_m: np.ndarray) -> None:
     told = [fit_robust(spoiled(measured(sigma_m=0.004, seed=s), [1, 8]), known_m).noise_m for s in range(20)]
     assert np.mean(told) == pytest.approx(0.004, rel=0.08)
 
 
-def test_few_pairs_have_nothing_to_vote_with(measured, known_m) -> None:
+def test_few_pairs_have_nothing_to_vote_with(measured: Callable[..., np.ndarray], known_m: np.ndarray) -> None:
     few = [0, 2, 13, 24]
     sensor = spoiled(measured()[few], [0], by_m=0.05)
     assert fit_robust(sensor, known_m[few]).inlier.all()
 
 
-def test_it_is_the_same_from_run_to_run(measured, known_m) -> None:
+def test_it_is_the_same_from_run_to_run(measured: Callable[..., np.ndarray], known_m: np.ndarray) -> None:
     sensor = spoiled(measured(sigma_m=0.01), [4, 5, 6])
     first, second = fit_robust(sensor, known_m), fit_robust(sensor, known_m)
     np.testing.assert_array_equal(first.similarity.matrix, second.similarity.matrix)
 
 
-def test_many_pairs_are_scored_by_a_sample_and_rejected_one_by_one(measured) -> None:
+def test_many_pairs_are_scored_by_a_sample_and_rejected_one_by_one(measured: Callable[..., np.ndarray]) -> None:
     volume = viewing_volume_m()
     points = np.random.default_rng(0).uniform(volume.min(0), volume.max(0), size=(5000, 3))
     wrong = list(range(0, 5000, 5))
@@ -66,6 +72,6 @@ def test_many_pairs_are_scored_by_a_sample_and_rejected_one_by_one(measured) -> 
     assert found.inlier.sum() >= 0.998 * 4000
 
 
-def test_degenerate_pairs_are_refused(known_m) -> None:
+def test_degenerate_pairs_are_refused(known_m: np.ndarray) -> None:
     with pytest.raises(Degenerate):
         fit_robust(np.ones((27, 3)), known_m)

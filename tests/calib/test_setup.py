@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -76,7 +77,7 @@ def setup_command(folder: Path, keys: str, *options: str) -> subprocess.Complete
 
 
 @pytest.fixture(scope="module")
-def set_up(tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess[str], SimulatedWorld]:
+def set_up(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str], SimulatedWorld]:
     folder = tmp_path_factory.mktemp("setup")
     done = setup_command(folder, every_key(5), "--simulate", "--seed", "5")
     return folder, done, SimulatedWorld(STACK, seed=5)
@@ -84,7 +85,9 @@ def set_up(tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess[str], Si
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_keys_alone_lead_from_nothing_to_a_configuration_that_is_valid(set_up) -> None:
+def test_keys_alone_lead_from_nothing_to_a_configuration_that_is_valid(
+    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedWorld],
+) -> None:
     folder, done, _ = set_up
     assert done.returncode == 0, done.stdout + done.stderr
     assert "step calibration: done" in done.stdout
@@ -99,7 +102,9 @@ def test_keys_alone_lead_from_nothing_to_a_configuration_that_is_valid(set_up) -
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_every_panel_is_bound_to_its_monitor_as_it_is_mounted(set_up) -> None:
+def test_every_panel_is_bound_to_its_monitor_as_it_is_mounted(
+    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedWorld],
+) -> None:
     folder, _, world = set_up
     for index, panel in enumerate(load_settings(folder / "new.toml").output.panels):
         monitor = world.order.index(index)
@@ -109,7 +114,9 @@ def test_every_panel_is_bound_to_its_monitor_as_it_is_mounted(set_up) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_the_sensor_is_found_where_it_stands(set_up) -> None:
+def test_the_sensor_is_found_where_it_stands(
+    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedWorld],
+) -> None:
     folder, _, _ = set_up
     settings = load_settings(folder / "new.toml")
     found = load_calibration(Path(settings.calibration.file)).stack_from_sensor
@@ -121,11 +128,11 @@ def test_the_sensor_is_found_where_it_stands(set_up) -> None:
 class TrueStackView(CarriedView):
     """What an eye sees along the carried rays through panels that truly stand elsewhere."""
 
-    def __init__(self, nominal_m, stack, panels, **view) -> None:
+    def __init__(self, nominal_m: Any, stack: Any, panels: Any, **view: Any) -> None:
         super().__init__(nominal_m, stack, **view)
         self._panels = panels
 
-    def _positions(self, true_m, rows):
+    def _positions(self, true_m: Any, rows: Any) -> Any:
         for index, (u, v) in enumerate(super()._positions(true_m, rows)):
             matrix = true_from_ideal_seen(self._panels[index], true_m, self._stack, index)
             places = through(matrix, np.column_stack([u.ravel(), v.ravel()]))
@@ -142,7 +149,7 @@ def sent_through(layers: np.ndarray, settings: Settings, world: SimulatedWorld, 
 
 
 def carried_db(
-    light: Path, settings: Settings, panels, *, registered: bool, world: SimulatedWorld | None = None,
+    light: Path, settings: Settings, panels: Any, *, registered: bool, world: SimulatedWorld | None = None,
     curves: bool = True,
 ) -> float:  # fmt: skip
     """Displayed dB (docs/contracts.md) of what a run left of a refresh's light, on panels that stand where they do.
@@ -170,7 +177,9 @@ def carried_db(
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_a_run_of_it_shows_the_eyes_within_a_decibel_of_a_perfect_stack(set_up, tmp_path) -> None:
+def test_a_run_of_it_shows_the_eyes_within_a_decibel_of_a_perfect_stack(
+    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedWorld], tmp_path: Path
+) -> None:
     """The run's own light, sent through the registration to the panels where they truly are."""
     folder, _, world = set_up
     command = [sys.executable, "-m", "runtime.cli", "run", "--config", str(folder / "new.toml"), "--replay", "demo",
@@ -192,7 +201,9 @@ def test_a_run_of_it_shows_the_eyes_within_a_decibel_of_a_perfect_stack(set_up, 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_what_the_service_reads_is_gathered_and_stands_by_itself(set_up, tmp_path) -> None:
+def test_what_the_service_reads_is_gathered_and_stands_by_itself(
+    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedWorld], tmp_path: Path
+) -> None:
     folder, _, _ = set_up
     there = shutil.copytree(folder / "out" / "service", tmp_path / "etc")
     settings = load_settings(there / "phasestack.toml")
@@ -215,7 +226,7 @@ class Scripted:
         )
 
 
-def test_a_step_that_is_done_is_where_it_goes_on_after(tmp_path) -> None:
+def test_a_step_that_is_done_is_where_it_goes_on_after(tmp_path: Path) -> None:
     first = Scripted(tmp_path, [Key.NEXT, Key.ACCEPT, Key.ACCEPT, Key.QUIT])
     assert not walk_through(first.setup)
     done = read_progress(progress_path(tmp_path / "c.toml"))
@@ -228,7 +239,7 @@ def test_a_step_that_is_done_is_where_it_goes_on_after(tmp_path) -> None:
     assert "(done before)" in second.said[1]
 
 
-def test_a_step_that_is_stopped_writes_nothing_and_is_offered_again(tmp_path) -> None:
+def test_a_step_that_is_stopped_writes_nothing_and_is_offered_again(tmp_path: Path) -> None:
     scripted = Scripted(tmp_path, [Key.ACCEPT, Key.ACCEPT, Key.QUIT, Key.QUIT])
     assert not walk_through(scripted.setup)
     assert not (tmp_path / "c.toml").exists()
@@ -236,7 +247,7 @@ def test_a_step_that_is_stopped_writes_nothing_and_is_offered_again(tmp_path) ->
     assert len([text for text in scripted.said if text.startswith("\nStep 1")]) == 2
 
 
-def test_sizes_are_set_with_arrows_and_measured_distances_stay(tmp_path) -> None:
+def test_sizes_are_set_with_arrows_and_measured_distances_stay(tmp_path: Path) -> None:
     config = tmp_path / "c.toml"
     config.write_text("[stack]\nx_m = [-0.0601, 0.0, 0.0593]  # measured\n")
     keys = [Key.COARSER, Key.RIGHT, Key.DOWN, Key.FINER, Key.LEFT, Key.ACCEPT]
@@ -248,7 +259,7 @@ def test_sizes_are_set_with_arrows_and_measured_distances_stay(tmp_path) -> None
     assert load_settings(config).stack.x_m == pytest.approx((-0.0587, 0.0, 0.0587))
 
 
-def test_who_knows_the_distance_of_their_eyes_says_so_and_may_take_it_back(tmp_path) -> None:
+def test_who_knows_the_distance_of_their_eyes_says_so_and_may_take_it_back(tmp_path: Path) -> None:
     down = [Key.DOWN] * 5
     geometry(Scripted(tmp_path, [*down, Key.RIGHT, Key.RIGHT, Key.ACCEPT]).setup)
     assert load_settings(tmp_path / "c.toml").calibration.ipd_m == pytest.approx(IPD_M + 0.0005)
@@ -258,7 +269,7 @@ def test_who_knows_the_distance_of_their_eyes_says_so_and_may_take_it_back(tmp_p
     assert load_settings(tmp_path / "c.toml").calibration.ipd_m == 0.0
 
 
-def test_panels_already_known_keep_their_registration_when_they_are_identified_again(tmp_path) -> None:
+def test_panels_already_known_keep_their_registration_when_they_are_identified_again(tmp_path: Path) -> None:
     world = SimulatedWorld(STACK, seed=1)
     meanings = {"\n": Key.ACCEPT, "n": Key.NEXT, UP: Key.UP, DOWN: Key.DOWN}
     keys, rest = [], answers_of(world)
@@ -273,7 +284,7 @@ def test_panels_already_known_keep_their_registration_when_they_are_identified_a
     assert [panel.gamma for panel in load_settings(config).output.panels] == [2.0, 2.0, 2.0]
 
 
-def test_progress_that_is_not_ours_is_refused(tmp_path) -> None:
+def test_progress_that_is_not_ours_is_refused(tmp_path: Path) -> None:
     (tmp_path / "c.setup.json").write_text("[]")
     with pytest.raises(InputError, match=r"c\.setup\.json: done"):
         read_progress(progress_path(tmp_path / "c.toml"))
@@ -286,14 +297,14 @@ def test_words_stand_on_one_panel_and_the_others_are_clear() -> None:
     assert 0.002 < (layers[1, ..., 0] > 128).mean() < 0.2
 
 
-def test_nothing_is_asked_of_a_terminal_that_is_closed(tmp_path) -> None:
+def test_nothing_is_asked_of_a_terminal_that_is_closed(tmp_path: Path) -> None:
     done = setup_command(tmp_path, "", "--simulate")
     assert done.returncode == 0
     assert "not done: identify" in done.stdout
     assert list(tmp_path.iterdir()) == []
 
 
-def test_photographs_and_a_device_are_one_or_the_other(tmp_path) -> None:
+def test_photographs_and_a_device_are_one_or_the_other(tmp_path: Path) -> None:
     done = setup_command(tmp_path, "", "--photos", "a", "--device", "0")
     assert done.returncode == 2
     assert done.stderr.startswith("phasestack: setup: --photos")

@@ -35,7 +35,7 @@ def screen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[xserver.XServer
     server.stop()
 
 
-def test_keys_lead_through_cards_words_and_boards_on_the_panels(screen, tmp_path: Path) -> None:
+def test_keys_lead_through_cards_words_and_boards_on_the_panels(screen: xserver.XServer, tmp_path: Path) -> None:
     config, photos = tmp_path / "c.toml", tmp_path / "photos"
     config.write_text(CONFIG + '[model]\nname = "fast"\n')
     random = np.random.default_rng(0)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
@@ -29,7 +30,9 @@ shifts = st.tuples(*[st.floats(-10, 10)] * 3).map(np.array)
 
 @settings(deadline=None)
 @given(st.integers(0, 1000), st.integers(3, 40), rotations, scales, shifts, st.sampled_from(RULES))
-def test_exact_pairs_give_the_similarity_back(seed, count, rotation, scale, shift, rule) -> None:
+def test_exact_pairs_give_the_similarity_back(
+    seed: int, count: int, rotation: Rotation, scale: float, shift: NDArray[np.float64], rule: str
+) -> None:
     points = cloud(seed, count)
     found = fit(camera(points, rotation=rotation, scale=scale, shift=shift), points, rule=rule)
     assert found.scale == pytest.approx(scale, rel=1e-9)
@@ -38,7 +41,7 @@ def test_exact_pairs_give_the_similarity_back(seed, count, rotation, scale, shif
 
 
 @given(st.integers(0, 1000), st.floats(0.001, 0.05))
-def test_the_least_squares_residual_is_never_above_the_seeds(seed, sigma_m) -> None:
+def test_the_least_squares_residual_is_never_above_the_seeds(seed: int, sigma_m: float) -> None:
     points = cloud(seed)
     sensor = points + np.random.default_rng(seed + 1).normal(scale=sigma_m, size=points.shape)
     residual = {rule: ((fit(sensor, points, rule=rule).points(sensor) - points) ** 2).sum() for rule in RULES}
@@ -47,7 +50,7 @@ def test_the_least_squares_residual_is_never_above_the_seeds(seed, sigma_m) -> N
 
 
 @given(st.integers(0, 1000), st.floats(0.001, 0.05))
-def test_the_seeds_scale_lies_between_the_two_optima(seed, sigma_m) -> None:
+def test_the_seeds_scale_lies_between_the_two_optima(seed: int, sigma_m: float) -> None:
     points = cloud(seed)
     sensor = points + np.random.default_rng(seed + 1).normal(scale=sigma_m, size=points.shape)
     low, middle, high = (float(fit(sensor, points, rule=rule).scale) for rule in ("least-squares", "seed", "inverse"))
@@ -93,7 +96,7 @@ def test_a_known_scale_is_kept() -> None:
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_scipys_rotation_is_the_same(rule) -> None:
+def test_scipys_rotation_is_the_same(rule: str) -> None:
     points = cloud(7)
     sensor = Rotation.from_rotvec([1, 2, 3]).apply(points) + np.random.default_rng(0).normal(scale=0.01, size=(27, 3))
     reference, _ = Rotation.align_vectors(points - points.mean(0), sensor - sensor.mean(0))
@@ -107,7 +110,7 @@ def test_mirrored_points_never_give_a_mirrored_rotation() -> None:
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_weights_count_like_repetitions(rule) -> None:
+def test_weights_count_like_repetitions(rule: str) -> None:
     points, random = cloud(6, 10), np.random.default_rng(0)
     sensor = points + random.normal(scale=0.01, size=points.shape)
     weights = random.integers(0, 4, 10).astype(float)
@@ -127,7 +130,7 @@ def test_weights_count_like_repetitions(rule) -> None:
         (np.full((4, 3), np.nan), "finite"),
     ],
 )
-def test_points_that_determine_nothing_are_refused(points, why) -> None:
+def test_points_that_determine_nothing_are_refused(points: NDArray[np.float64], why: str) -> None:
     with pytest.raises(Degenerate, match=why):
         fit(points, points, rule="inverse")
     with pytest.raises(Degenerate, match=why):

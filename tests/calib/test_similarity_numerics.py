@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.similarity import Degenerate, extents, fit, fit_batch, rotation_rounding_rad
+from calib.similarity import Degenerate, Similarity, extents, fit, fit_batch, rotation_rounding_rad
 
 mp.mp.dps = 50
 DIGITS = float(np.finfo(np.float64).eps)
@@ -29,7 +29,7 @@ def reference(sensor: np.ndarray, stack: np.ndarray) -> tuple[mp.mpf, mp.matrix,
     return scale, rotation, mp.matrix(mean_w) - scale * (rotation * mp.matrix(mean_c))
 
 
-def forward_errors(found, truth) -> tuple[float, float, float]:
+def forward_errors(found: Similarity, truth: tuple[mp.mpf, mp.matrix, mp.matrix]) -> tuple[float, float, float]:
     """Largest entry of the rotation's error, relative error of the scale, largest of the shift's."""
     scale, rotation, shift = truth
     turned = max(abs(mp.mpf(float(found.rotation[i, j])) - rotation[i, j]) for i in range(3) for j in range(3))
@@ -37,7 +37,7 @@ def forward_errors(found, truth) -> tuple[float, float, float]:
     return float(turned), float(abs(mp.mpf(float(found.scale)) / scale - 1)), float(moved)
 
 
-def backward_error_m(found, truth, sensor: np.ndarray) -> float:
+def backward_error_m(found: Similarity, truth: tuple[mp.mpf, mp.matrix, mp.matrix], sensor: np.ndarray) -> float:
     """By how much the calibrated points differ from the reference's: what a user sees."""
     scale, rotation, shift = truth
     exact = [scale * (rotation * mp.matrix(point.tolist())) + shift for point in sensor]
@@ -84,7 +84,7 @@ def bound_rad(*clouds: np.ndarray) -> float:
     ],
     ids=str,
 )
-def test_the_error_stays_below_the_bound_that_decides_refusal(case) -> None:
+def test_the_error_stays_below_the_bound_that_decides_refusal(case: dict[str, float]) -> None:
     sensor, stack = scene(**case)
     found, truth = fit(sensor, stack, rule="inverse"), reference(sensor, stack)
     rotation, scale, shift = forward_errors(found, truth)
@@ -97,7 +97,7 @@ def test_the_error_stays_below_the_bound_that_decides_refusal(case) -> None:
 
 
 @pytest.mark.parametrize("case", [{"aspect": 10.0**-power} for power in (9, 10, 11, 12)] + [{"offset_m": 1e9}], ids=str)
-def test_where_rounding_alone_would_turn_the_result_it_refuses(case) -> None:
+def test_where_rounding_alone_would_turn_the_result_it_refuses(case: dict[str, float]) -> None:
     with pytest.raises(Degenerate, match="double precision"):
         fit(*scene(**case), rule="inverse")
 
@@ -112,7 +112,7 @@ def test_the_polish_saves_digits_that_the_covariance_alone_loses() -> None:
 
 
 @pytest.mark.parametrize("axis", np.vstack([np.eye(3), [[0.6, 0.8, 0.0], [-0.5, 0.5, 0.7]]]).tolist())
-def test_half_turns_are_no_special_case(axis) -> None:
+def test_half_turns_are_no_special_case(axis: list[float]) -> None:
     stack = scene()[1]
     turn = Rotation.from_rotvec(np.pi * np.array(axis) / np.linalg.norm(axis))
     found = fit(turn.inv().apply(stack), stack, rule="inverse")
@@ -127,7 +127,7 @@ def test_a_mirrored_cloud_gets_the_same_best_rotation_as_with_50_digits() -> Non
 
 
 @pytest.mark.parametrize("unit", [1e-150, 1e-30, 1e30, 1e150])
-def test_units_beyond_reason_neither_overflow_nor_underflow(unit) -> None:
+def test_units_beyond_reason_neither_overflow_nor_underflow(unit: float) -> None:
     sensor, stack = scene()
     found = fit(sensor * unit, stack, rule="inverse")
     assert found.scale * unit == pytest.approx(float(fit(sensor, stack, rule="inverse").scale), rel=1e-12)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib.placed import PlacedPanel, ideal_panel, in_frame_of, misplaced, stack_from_pixels, true_from_ideal_seen
@@ -27,14 +28,23 @@ def uniform(*values: float) -> np.ndarray:
     return layers
 
 
-def taken(layers, panels=None, *, lens=LENS, pose=STRAIGHT, exposure=PLAIN, glass=None, seed=0):
+def taken(
+    layers: NDArray[np.uint8],
+    panels: tuple[PlacedPanel, PlacedPanel, PlacedPanel] | None = None,
+    *,
+    lens: Lens = LENS,
+    pose: NDArray[np.float64] = STRAIGHT,
+    exposure: Exposure = PLAIN,
+    glass: Glass | None = None,
+    seed: int = 0,
+) -> NDArray[np.uint8]:
     panels = panels or tuple(ideal_panel(STACK, index) for index in range(3))
     scene = Scene(STACK, panels, layers, glass or Glass())
     return photograph(scene, lens, pose, exposure, random=np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("values", [(0, 0, 0), (1, 0, 0), (0.5, 0.5, 0), (1, 1, 0), (0.4, 0.2, 0.1), (1, 1, 1)])
-def test_the_light_is_the_squared_sine_of_the_summed_phases(values) -> None:
+def test_the_light_is_the_squared_sine_of_the_summed_phases(values: tuple[float, float, float]) -> None:
     picture = taken(uniform(*values))
     phases = np.rint(255 * np.array(values)) / 255
     assert picture[440, 610] == pytest.approx(255 * np.sin(np.pi / 2 * phases.sum()) ** 2, abs=1.0)
@@ -42,7 +52,7 @@ def test_the_light_is_the_squared_sine_of_the_summed_phases(values) -> None:
 
 @pytest.mark.parametrize("pose", [STRAIGHT, ASIDE])
 @pytest.mark.parametrize("index", range(3))
-def test_a_spot_on_a_panel_is_seen_where_opencv_projects_it(index, pose) -> None:
+def test_a_spot_on_a_panel_is_seen_where_opencv_projects_it(index: int, pose: NDArray[np.float64]) -> None:
     random = np.random.default_rng(5)
     panels = misplaced(STACK, shift_m=0.002, turn_deg=1.0, gap_m=0.002, random=random)
     layers = uniform(0, 0, 0)
@@ -58,7 +68,7 @@ def test_a_spot_on_a_panel_is_seen_where_opencv_projects_it(index, pose) -> None
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 20.0, 35.0])
-def test_glass_shifts_what_lies_behind_it_as_snell_says(angle_deg) -> None:
+def test_glass_shifts_what_lies_behind_it_as_snell_says(angle_deg: float) -> None:
     angle = np.radians(angle_deg)
     pose = camera_from_stack(0.7 * np.array([np.cos(angle), np.sin(angle), 0.0]), towards_m=np.zeros(3))
     layers = uniform(0, 0, 0)

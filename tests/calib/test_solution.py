@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import product
+
 import numpy as np
 import pytest
 
+from calib.eye_separation import SeparationScale
 from calib.scale_prior import posterior_scale
-from calib.solution import METHODS, design_covariance, solve, solve_default
+from calib.solution import METHODS, SCALE_SIGMA, design_covariance, solve, solve_default
 from calib.viewpoints import viewing_volume_m
 from runtime.eyes.demo_geometry import demo_stack_from_sensor
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_method_recovers_exact_pairs(measured, known_m, method) -> None:
+def test_every_method_recovers_exact_pairs(
+    measured: Callable[..., np.ndarray], known_m: np.ndarray, method: str
+) -> None:
     found = solve(measured(), known_m, method=method)
     np.testing.assert_allclose(found.similarity.matrix, demo_stack_from_sensor(), atol=1e-12)
     assert found.max_m < 1e-12
@@ -20,7 +26,9 @@ def test_every_method_recovers_exact_pairs(measured, known_m, method) -> None:
 
 
 @pytest.mark.parametrize("method", ["inverse", "fixed-scale"])
-def test_the_predicted_error_at_the_eye_is_the_real_one(measured, known_m, method) -> None:
+def test_the_predicted_error_at_the_eye_is_the_real_one(
+    measured: Callable[..., np.ndarray], known_m: np.ndarray, method: str
+) -> None:
     """200 noise samples: the RMS over samples against the covariance's promise, at every point of the volume."""
     volume = viewing_volume_m()
     seen = measured(volume)
@@ -34,12 +42,14 @@ def test_the_predicted_error_at_the_eye_is_the_real_one(measured, known_m, metho
     assert 0.8 < ratio.min() <= ratio.max() < 1.2
 
 
-def test_the_noise_is_what_was_put_in(measured, known_m) -> None:
+def test_the_noise_is_what_was_put_in(measured: Callable[..., np.ndarray], known_m: np.ndarray) -> None:
     told = [solve(measured(sigma_m=0.005, seed=s), known_m, method="inverse").noise_m for s in range(50)]
     assert np.mean(told) == pytest.approx(0.005, rel=0.03)
 
 
-def test_leaving_one_out_is_what_solving_without_it_gives(measured, known_m) -> None:
+def test_leaving_one_out_is_what_solving_without_it_gives(
+    measured: Callable[..., np.ndarray], known_m: np.ndarray
+) -> None:
     sensor = measured(sigma_m=0.003)
     quick = solve(sensor, known_m, method="inverse").leave_one_out_m
     for index in range(27):
@@ -49,19 +59,19 @@ def test_leaving_one_out_is_what_solving_without_it_gives(measured, known_m) -> 
         assert np.linalg.norm(quick[index] - slow) < 0.05 * np.linalg.norm(slow) + 2e-5
 
 
-def test_three_pairs_leave_no_pair_to_leave_out(measured, known_m) -> None:
+def test_three_pairs_leave_no_pair_to_leave_out(measured: Callable[..., np.ndarray], known_m: np.ndarray) -> None:
     three = [0, 8, 22]
     found = solve(measured(sigma_m=0.001)[three], known_m[three], method="inverse")
     assert found.leave_one_out_rms_m > found.rms_m or np.isinf(found.leave_one_out_rms_m)
 
 
-def test_a_fixed_scale_has_no_uncertainty_of_scale(measured, known_m) -> None:
+def test_a_fixed_scale_has_no_uncertainty_of_scale(measured: Callable[..., np.ndarray], known_m: np.ndarray) -> None:
     found = solve(measured(sigma_m=0.003), known_m, method="fixed-scale")
     assert found.scale_sigma == 0.0
     assert solve(measured(sigma_m=0.003), known_m, method="inverse").scale_sigma > 0.0
 
 
-def test_a_thin_design_has_a_large_condition(known_m) -> None:
+def test_a_thin_design_has_a_large_condition(known_m: np.ndarray) -> None:
     thin = (known_m - known_m.mean(0)) * [1.0, 0.01, 0.01] + known_m.mean(0)
     _, _, wide_condition = design_covariance(known_m, fixed_scale=False)
     _, _, thin_condition = design_covariance(thin, fixed_scale=False)
@@ -75,7 +85,9 @@ def test_a_line_leaves_the_turn_about_it_free() -> None:
     assert np.isinf(covariance).any()
 
 
-def test_by_default_the_scale_is_one_where_the_data_agree(measured, known_m) -> None:
+def test_by_default_the_scale_is_one_where_the_data_agree(
+    measured: Callable[..., np.ndarray], known_m: np.ndarray
+) -> None:
     found = [solve_default(measured(sigma_m=0.003, seed=seed), known_m) for seed in range(20)]
     assert {item.method for item in found} == {"fixed-scale"}
     assert np.median([abs(item.similarity.scale - 1) for item in found]) < 0.001
@@ -83,7 +95,9 @@ def test_by_default_the_scale_is_one_where_the_data_agree(measured, known_m) -> 
 
 
 @pytest.mark.parametrize("scale", [0.5, 0.95, 1.1, 8.125])
-def test_by_default_another_scale_is_found_where_the_data_tell_it(measured, known_m, scale) -> None:
+def test_by_default_another_scale_is_found_where_the_data_tell_it(
+    measured: Callable[..., np.ndarray], known_m: np.ndarray, scale: float
+) -> None:
     found = solve_default(measured(sigma_m=0.0, scale=scale), known_m)
     assert found.similarity.scale == pytest.approx(scale)
     noisy = solve_default(measured(sigma_m=0.001 / scale, scale=scale), known_m)
@@ -91,7 +105,9 @@ def test_by_default_another_scale_is_found_where_the_data_tell_it(measured, know
     assert noisy.scale_sigma > 0
 
 
-def test_a_sensor_whose_metre_is_configured_to_be_exact_keeps_it(measured, known_m) -> None:
+def test_a_sensor_whose_metre_is_configured_to_be_exact_keeps_it(
+    measured: Callable[..., np.ndarray], known_m: np.ndarray
+) -> None:
     found = solve_default(measured(sigma_m=0.001, scale=1.02), known_m, scale_sigma=0.0)
     assert found.similarity.scale == 1.0
     assert found.scale_sigma == 0.0
@@ -108,7 +124,33 @@ def test_what_is_believed_of_the_scale_moves_from_one_to_the_fitted_without_a_ju
     assert believed.exact[-1] < 0.01
 
 
-def test_by_default_wrong_pairs_are_left_out(measured, known_m) -> None:
+def test_few_pairs_are_believed_as_far_as_their_own_noise_is_known(
+    measured: Callable[..., np.ndarray], known_m: np.ndarray
+) -> None:
+    """Five pairs are fifteen numbers, seven of which the fit takes."""
+    chosen = [0, 4, 8, 13, 22]
+    sensor, stack = measured(sigma_m=0.003, scale=1.02)[chosen], known_m[chosen]
+    fitted = solve(sensor, stack, method="inverse")
+    believed = posterior_scale(
+        np.log(fitted.similarity.scale), sigma=fitted.scale_sigma, freedom=15 - 7, prior_sigma=SCALE_SIGMA
+    )
+    found = solve_default(sensor, stack).similarity.scale
+    assert found == pytest.approx(np.exp(believed.log_scale), rel=1e-12)
+
+
+def test_what_the_eyes_own_separation_says_is_told(measured: Callable[..., np.ndarray], known_m: np.ndarray) -> None:
+    found = solve_default(measured(sigma_m=0.003), known_m, separation=SeparationScale(np.log(1.02), 0.003))
+    assert "by the eyes' separation 1.02 ± 0.003, " in found.reason
+
+
+def test_pairs_without_any_noise_leave_no_uncertainty() -> None:
+    corners = np.array(list(product((-1.0, 1.0), repeat=3)))
+    found = solve_default(corners, corners)
+    assert found.noise_m == 0.0
+    assert found.unit_covariance[6, 6] == 0.0
+
+
+def test_by_default_wrong_pairs_are_left_out(measured: Callable[..., np.ndarray], known_m: np.ndarray) -> None:
     sensor = measured(sigma_m=0.003)
     sensor[4] += 0.3
     found = solve_default(sensor, known_m)
@@ -116,7 +158,9 @@ def test_by_default_wrong_pairs_are_left_out(measured, known_m) -> None:
     assert np.flatnonzero(~found.used).tolist() == [4]
 
 
-def test_three_noisy_pairs_are_hardly_evidence_against_a_scale_of_one(measured, known_m) -> None:
+def test_three_noisy_pairs_are_hardly_evidence_against_a_scale_of_one(
+    measured: Callable[..., np.ndarray], known_m: np.ndarray
+) -> None:
     """Two degrees of freedom: the noise itself is hardly known, and small by chance in every tenth sample."""
     three = [0, 8, 22]
     scales = [

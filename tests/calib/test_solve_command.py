@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,9 @@ def refusal(pairs: Path, tmp_path: Path, *options: str) -> str:
     return message
 
 
-def test_the_runtime_loads_what_solve_writes(tmp_path, measured, known_m, write_pairs) -> None:
+def test_the_runtime_loads_what_solve_writes(
+    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
+) -> None:
     out = tmp_path / "deep" / "calibration.toml"
     told = solve(write_pairs(measured(sigma_m=0.003), known_m), out)
     loaded = load_calibration(out)
@@ -50,14 +53,22 @@ def test_the_runtime_loads_what_solve_writes(tmp_path, measured, known_m, write_
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_method_can_be_asked_for(tmp_path, measured, known_m, write_pairs, method) -> None:
+def test_every_method_can_be_asked_for(
+    tmp_path: Path,
+    measured: Callable[..., np.ndarray],
+    known_m: np.ndarray,
+    write_pairs: Callable[..., Path],
+    method: str,
+) -> None:
     told = solve(write_pairs(measured(sigma_m=0.002), known_m), tmp_path / "c.toml", "--method", method)
     assert told["method"] == method
     assert {row["method"] for row in told["methods"]} == set(METHODS)
     assert load_calibration(tmp_path / "c.toml").method == method
 
 
-def test_the_error_figures_are_told(tmp_path, measured, known_m, write_pairs) -> None:
+def test_the_error_figures_are_told(
+    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
+) -> None:
     told = solve(write_pairs(measured(sigma_m=0.003), known_m), tmp_path / "c.toml")
     assert 0 < told["rms_mm"] < told["max_mm"] < 20
     assert told["leave_one_out_mm"] > told["rms_mm"]
@@ -65,7 +76,9 @@ def test_the_error_figures_are_told(tmp_path, measured, known_m, write_pairs) ->
     assert 1 < told["condition"] < 3
 
 
-def test_the_sensors_serial_travels_from_the_pairs_to_the_runtimes_check(tmp_path, measured, known_m, write_pairs):
+def test_the_sensors_serial_travels_from_the_pairs_to_the_runtimes_check(
+    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
+) -> None:
     path = write_pairs(measured(), known_m)
     lines = path.read_text().splitlines()
     path.write_text("\n".join([lines[0] + ",sensor_serial", *[line + ",A1" for line in lines[1:]]]))
@@ -73,7 +86,9 @@ def test_the_sensors_serial_travels_from_the_pairs_to_the_runtimes_check(tmp_pat
     assert "A1" in load_calibration(tmp_path / "c.toml").serial_warning("B2")
 
 
-def test_outliers_are_named(tmp_path, measured, known_m, write_pairs) -> None:
+def test_outliers_are_named(
+    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
+) -> None:
     sensor = measured(sigma_m=0.003)
     sensor[[4, 20]] += [0.2, -0.3, 0.1]
     told = solve(write_pairs(sensor, known_m), tmp_path / "c.toml")
@@ -82,7 +97,9 @@ def test_outliers_are_named(tmp_path, measured, known_m, write_pairs) -> None:
     assert any("line 6, line 22: rejected" in warning for warning in told["warnings"])
 
 
-def test_one_pair_beyond_the_seeds_five_centimetres_is_named(tmp_path, measured, known_m, write_pairs) -> None:
+def test_one_pair_beyond_the_seeds_five_centimetres_is_named(
+    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
+) -> None:
     sensor = measured(sigma_m=0.001)
     sensor[3] += [0.0, 0.09, 0.0]
     told = solve(write_pairs(sensor, known_m), tmp_path / "c.toml", "--method", "inverse")
@@ -90,12 +107,24 @@ def test_one_pair_beyond_the_seeds_five_centimetres_is_named(tmp_path, measured,
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_fewer_than_three_pairs_are_refused(tmp_path, measured, known_m, write_pairs, count) -> None:
+def test_fewer_than_three_pairs_are_refused(
+    tmp_path: Path,
+    measured: Callable[..., np.ndarray],
+    known_m: np.ndarray,
+    write_pairs: Callable[..., Path],
+    count: int,
+) -> None:
     assert "at least 3" in refusal(write_pairs(measured()[:count], known_m[:count]), tmp_path)
 
 
 @pytest.mark.parametrize("count", [3, 4, 5, 6])
-def test_three_pairs_and_more_are_enough(tmp_path, measured, known_m, write_pairs, count) -> None:
+def test_three_pairs_and_more_are_enough(
+    tmp_path: Path,
+    measured: Callable[..., np.ndarray],
+    known_m: np.ndarray,
+    write_pairs: Callable[..., Path],
+    count: int,
+) -> None:
     some = [0, 8, 22, 13, 4, 18][:count]
     solve(write_pairs(measured()[some], known_m[some]), tmp_path / "c.toml")
     np.testing.assert_allclose(
@@ -103,22 +132,28 @@ def test_three_pairs_and_more_are_enough(tmp_path, measured, known_m, write_pair
     )
 
 
-def test_coincident_points_are_refused(tmp_path, known_m, write_pairs) -> None:
+def test_coincident_points_are_refused(tmp_path: Path, known_m: np.ndarray, write_pairs: Callable[..., Path]) -> None:
     assert "coincide" in refusal(write_pairs(np.ones((27, 3)), known_m), tmp_path)
 
 
-def test_viewpoints_all_but_in_one_place_are_refused(tmp_path, measured, known_m, write_pairs) -> None:
+def test_viewpoints_all_but_in_one_place_are_refused(
+    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
+) -> None:
     close = known_m.mean(0) + 1e-3 * (known_m - known_m.mean(0))
     assert "do not determine" in refusal(write_pairs(measured(close), close), tmp_path)
 
 
-def test_collinear_points_are_refused(tmp_path, measured, write_pairs) -> None:
+def test_collinear_points_are_refused(
+    tmp_path: Path, measured: Callable[..., np.ndarray], write_pairs: Callable[..., Path]
+) -> None:
     line = np.outer(np.linspace(0.3, 0.9, 9), [1.0, 0.1, 0.2])
     assert "on one line" in refusal(write_pairs(measured(line), line), tmp_path)
 
 
 @pytest.mark.parametrize("aspect", [1e-2, 1e-3, 1e-5])
-def test_nearly_collinear_points_are_refused_with_what_they_would_cost(tmp_path, measured, write_pairs, aspect) -> None:
+def test_nearly_collinear_points_are_refused_with_what_they_would_cost(
+    tmp_path: Path, measured: Callable[..., np.ndarray], write_pairs: Callable[..., Path], aspect: float
+) -> None:
     random = np.random.default_rng(0)
     line = np.outer(np.linspace(0.4, 0.6, 9), [1.0, 0.0, 0.0]) + 0.1 * aspect * random.normal(size=(9, 3))
     message = refusal(write_pairs(measured(line), line), tmp_path)
@@ -126,7 +161,9 @@ def test_nearly_collinear_points_are_refused_with_what_they_would_cost(tmp_path,
     assert "condition" in message
 
 
-def test_coplanar_points_are_fine_and_said_to_be(tmp_path, measured, known_m, write_pairs) -> None:
+def test_coplanar_points_are_fine_and_said_to_be(
+    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
+) -> None:
     flat = known_m * [1.0, 1.0, 0.0]
     told = solve(write_pairs(measured(flat), flat), tmp_path / "c.toml")
     assert any("one plane" in warning for warning in told["warnings"])
@@ -135,7 +172,14 @@ def test_coplanar_points_are_fine_and_said_to_be(tmp_path, measured, known_m, wr
 
 @pytest.mark.parametrize("sigma_m", [0.0, 0.01])
 @pytest.mark.parametrize("axis", range(3))
-def test_mirrored_data_are_refused(tmp_path, measured, known_m, write_pairs, axis, sigma_m) -> None:
+def test_mirrored_data_are_refused(
+    tmp_path: Path,
+    measured: Callable[..., np.ndarray],
+    known_m: np.ndarray,
+    write_pairs: Callable[..., Path],
+    axis: int,
+    sigma_m: float,
+) -> None:
     mirror = np.ones(3)
     mirror[axis] = -1.0
     assert "mirror" in refusal(write_pairs(measured(sigma_m=sigma_m) * mirror, known_m), tmp_path)
@@ -143,7 +187,12 @@ def test_mirrored_data_are_refused(tmp_path, measured, known_m, write_pairs, axi
 
 @pytest.mark.parametrize(("scale", "option"), [(1000.0, "--stack-unit"), (0.001, "--sensor-unit")])
 def test_millimetres_on_one_side_are_refused_and_can_be_declared(
-    tmp_path, measured, known_m, write_pairs, scale, option
+    tmp_path: Path,
+    measured: Callable[..., np.ndarray],
+    known_m: np.ndarray,
+    write_pairs: Callable[..., Path],
+    scale: float,
+    option: str,
 ) -> None:
     mixed = (measured(scale=scale), known_m) if scale < 1 else (measured(), known_m * 1000)
     path = write_pairs(*mixed)
@@ -156,20 +205,26 @@ def test_millimetres_on_one_side_are_refused_and_can_be_declared(
     )
 
 
-def test_repeated_rows_are_left_out_and_named(tmp_path, measured, known_m, write_pairs) -> None:
+def test_repeated_rows_are_left_out_and_named(
+    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
+) -> None:
     twice = [*range(27), 3]
     told = solve(write_pairs(measured(sigma_m=0.001)[twice], known_m[twice]), tmp_path / "c.toml")
     assert told["pairs"] == 27
     assert any("line 29: repeats" in warning for warning in told["warnings"])
 
 
-def test_nan_rows_are_refused_with_their_line(tmp_path, measured, known_m, write_pairs) -> None:
+def test_nan_rows_are_refused_with_their_line(
+    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
+) -> None:
     sensor = measured()
     sensor[7, 1] = np.nan
     assert "line 9, sensor_y: is not finite" in refusal(write_pairs(sensor, known_m), tmp_path)
 
 
-def test_pairs_that_do_not_fit_are_refused_with_a_hint(tmp_path, measured, known_m, write_pairs) -> None:
+def test_pairs_that_do_not_fit_are_refused_with_a_hint(
+    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
+) -> None:
     sensor = measured()
     sensor[::5] += [0.2, 0.1, -0.2]
     message = refusal(write_pairs(sensor, known_m), tmp_path, "--method", "seed")
@@ -177,16 +232,22 @@ def test_pairs_that_do_not_fit_are_refused_with_a_hint(tmp_path, measured, known
     assert "robust" in message
 
 
-def test_pairs_that_do_not_belong_together_are_refused(tmp_path, known_m, write_pairs) -> None:
+def test_pairs_that_do_not_belong_together_are_refused(
+    tmp_path: Path, known_m: np.ndarray, write_pairs: Callable[..., Path]
+) -> None:
     shuffled = np.random.default_rng(3).permutation(known_m)
     refusal(write_pairs(shuffled, known_m), tmp_path)
 
 
-def test_an_unknown_method_is_refused(tmp_path, measured, known_m, write_pairs) -> None:
+def test_an_unknown_method_is_refused(
+    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
+) -> None:
     assert "--method" in refusal(write_pairs(measured(), known_m), tmp_path, "--method", "magic")
 
 
-def test_past_versions_are_kept_and_come_back(tmp_path, measured, known_m, write_pairs) -> None:
+def test_past_versions_are_kept_and_come_back(
+    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
+) -> None:
     out = tmp_path / "c.toml"
     texts = []
     for seed in range(3):
@@ -202,7 +263,9 @@ def test_past_versions_are_kept_and_come_back(tmp_path, measured, known_m, write
     assert out.read_text() == texts[0]
 
 
-def test_a_broken_past_version_is_not_put_back(tmp_path, measured, known_m, write_pairs) -> None:
+def test_a_broken_past_version_is_not_put_back(
+    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
+) -> None:
     out = tmp_path / "c.toml"
     for seed in range(2):
         solve(write_pairs(measured(sigma_m=0.002, seed=seed), known_m), out)

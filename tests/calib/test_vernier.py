@@ -9,6 +9,7 @@ import pytest
 
 from calib.keys import Key
 from calib.panel_run import nudge
+from calib.registration import Setting
 from calib.vernier import ARM_PX, STEPS_PX, Nudging, chart, draw, nominal, read_settings, resumed, write_settings
 from runtime.errors import InputError
 from runtime.optics.retina import seen_by
@@ -98,7 +99,7 @@ def test_a_person_sets_all_verniers_and_each_is_kept_at_once(tmp_path: Path) -> 
     kept: list[int] = []
     shown: list[np.ndarray] = []
 
-    def keep(settings) -> None:
+    def keep(settings: list[Setting]) -> None:
         kept.append(len(settings))
         write_settings(tmp_path / "v.csv", settings)
 

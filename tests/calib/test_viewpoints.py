@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from calib.solution import solve_default
-from calib.viewpoints import grid, viewing_place_m, viewing_volume_m
+from calib.viewpoints import Viewpoint, grid, viewing_place_m, viewing_volume_m
 from runtime.config import CalibrationSettings
 
 
@@ -17,7 +19,7 @@ def test_the_grid_has_27_viewpoints_with_names_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("viewpoint", grid(), ids=lambda v: v.name)
-def test_a_viewpoint_lies_where_its_polar_angles_say(viewpoint) -> None:
+def test_a_viewpoint_lies_where_its_polar_angles_say(viewpoint: Viewpoint) -> None:
     x, y, z = viewpoint.midpoint_m
     assert np.hypot(np.hypot(x, y), z) == pytest.approx(viewpoint.radius_cm / 100)
     assert np.degrees(np.arccos(z * 100 / viewpoint.radius_cm)) == pytest.approx(viewpoint.phi_deg)
@@ -31,7 +33,7 @@ def test_small_theta_is_the_viewers_right_and_small_phi_is_up() -> None:
 
 
 @pytest.mark.parametrize("viewpoint", grid()[::5], ids=lambda v: v.name)
-def test_the_eyes_are_level_apart_by_the_ipd_and_equally_far(viewpoint) -> None:
+def test_the_eyes_are_level_apart_by_the_ipd_and_equally_far(viewpoint: Viewpoint) -> None:
     left, right = viewpoint.eyes_m(0.064)
     assert np.linalg.norm(left - right) == pytest.approx(0.064)
     np.testing.assert_allclose((left + right) / 2, viewpoint.midpoint_m, atol=1e-15)
@@ -50,7 +52,9 @@ def test_the_grid_and_the_volume_follow_the_configured_viewing_range() -> None:
     assert viewing_place_m(far)[0] == pytest.approx(1.5)
 
 
-def test_for_people_who_stand_a_metre_and_a_half_away_two_millimetres_are_predicted_and_kept(measured) -> None:
+def test_for_people_who_stand_a_metre_and_a_half_away_two_millimetres_are_predicted_and_kept(
+    measured: Callable[..., np.ndarray],
+) -> None:
     standing = CalibrationSettings(viewing_m=(1.2, 1.8))
     known = np.array([viewpoint.midpoint_m for viewpoint in grid(standing)])
     exact = measured(known)

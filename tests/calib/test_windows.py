@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,7 +44,7 @@ def screen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[xserver.XServer
 
 
 @pytest.fixture
-def phasestack(screen, tmp_path):
+def phasestack(screen: xserver.XServer, tmp_path: Path) -> Any:
     """The command in a process of its own, its panels on the virtual monitors."""
     (tmp_path / "config.toml").write_text(CONFIG)
     running = []
@@ -86,7 +87,7 @@ def shows(screen: xserver.XServer, monitor: int, expected: np.ndarray) -> bool:
     return eventually(lambda: np.array_equal(screen.panel(monitor)[..., 0], expected), within_s=30)
 
 
-def test_charts_are_shown_one_after_the_other(screen, phasestack) -> None:
+def test_charts_are_shown_one_after_the_other(screen: xserver.XServer, phasestack: Any) -> None:
     viewpoint = grid()[4]
     running = phasestack("charts", "--show", "--kind", "seed", "--viewpoint", viewpoint.name)
     charts = [
@@ -105,7 +106,9 @@ def test_charts_are_shown_one_after_the_other(screen, phasestack) -> None:
     assert running.wait(timeout=60) == 0
 
 
-def test_a_vernier_is_nudged_with_the_keyboard_and_kept(screen, phasestack, tmp_path: Path) -> None:
+def test_a_vernier_is_nudged_with_the_keyboard_and_kept(
+    screen: xserver.XServer, phasestack: Any, tmp_path: Path
+) -> None:
     out = tmp_path / "vernier.csv"
     running = phasestack("panels", "vernier", "--eye", "0.5", "0", "0", "--out", str(out))
     assert eventually(lambda: screen.panel(0).any() and screen.panel(1).any(), within_s=30)

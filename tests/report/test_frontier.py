@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -95,7 +96,7 @@ def test_the_comparison_has_our_sizes_and_the_references() -> None:
     assert len(set(names)) == len(names)
 
 
-def test_a_model_that_is_not_there_is_refused_before_anything_is_measured(tmp_path) -> None:
+def test_a_model_that_is_not_there_is_refused_before_anything_is_measured(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is not a file"):
         check_models([str(tmp_path / "none.onnx")])
     (tmp_path / "bad.onnx").write_bytes(b"no onnx")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,12 +20,12 @@ SCALE = 0.15
 
 
 @pytest.fixture(scope="module")
-def runs():
+def runs() -> Any:
     """One motion with a slow solver."""
     return moving_runs(motions=("lean",), solver_ms=(150.0,), seconds=2.5, scale=SCALE)
 
 
-def test_an_aligned_picture_holds_where_a_held_one_falls_apart(runs) -> None:
+def test_an_aligned_picture_holds_where_a_held_one_falls_apart(runs: Any) -> None:
     held, aligned = runs[0]
     assert (held.aligned, aligned.aligned) == (False, True)
     assert held.lights == aligned.lights > 5
@@ -34,7 +35,7 @@ def test_an_aligned_picture_holds_where_a_held_one_falls_apart(runs) -> None:
     assert aligned.behind_mm > 2 * aligned.tracker_mm[0] > 0
 
 
-def test_the_film_strip_shows_the_same_instants_both_ways(runs) -> None:
+def test_the_film_strip_shows_the_same_instants_both_ways(runs: Any) -> None:
     strip = runs[1]
     assert strip.held.shape == strip.aligned.shape == strip.wanted.shape
     assert len(strip.seconds) == len(strip.held) == len(strip.held_db) > 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -63,7 +64,7 @@ def test_the_published_network_counts_as_its_own_layers_do(tmp_path: Path) -> No
     (tmp_path / "e.onnx").write_bytes(data)
     convolved = 0
 
-    def note(layer, _, answer) -> None:
+    def note(layer: Any, _: Any, answer: Any) -> None:
         nonlocal convolved
         convolved += answer.numel() * layer.weight[0].numel()
 

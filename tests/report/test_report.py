@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
@@ -20,7 +21,7 @@ from tests.report.test_pairs import case_folder
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
 
 
-def command(*arguments: str):
+def command(*arguments: str) -> Any:
     app = typer.Typer()
     app.command()(report)
     return CliRunner().invoke(app, list(arguments))

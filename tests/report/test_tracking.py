@@ -1,15 +1,18 @@
 """The tracker against what offline tuning finds, on motions it cannot know beforehand."""
 
+from __future__ import annotations
+
 import time
 import timeit
 from collections import defaultdict
+from typing import Any
 
 import numpy as np
 import pytest
 
 from runtime.eyes.motions import MOTIONS, observe, true_eyes
 from runtime.eyes.tracker import Tracker
-from runtime.report.tracking import (
+from tests.report.tracker_benchmark import (
     BEST,
     EURO,
     NONE,
@@ -21,16 +24,16 @@ from runtime.report.tracking import (
 
 
 @pytest.fixture(scope="module")
-def rows():
+def rows() -> Any:
     return benchmark(seconds=20.0, rates_hz=(30,), horizons_ms=(0, 60, 120))
 
 
 @pytest.fixture(scope="module")
-def trades():
+def trades() -> Any:
     return jitter_and_lag(seconds=8.0)
 
 
-def by_method(rows, horizon_ms):
+def by_method(rows: Any, horizon_ms: Any) -> Any:
     table = defaultdict(dict)
     for row in rows:
         if row.horizon_ms == horizon_ms:
@@ -40,37 +43,37 @@ def by_method(rows, horizon_ms):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
-def test_at_both_rates_and_with_other_noise_it_stays_close_to_the_best(seed):
+def test_at_both_rates_and_with_other_noise_it_stays_close_to_the_best(seed: int) -> None:
     for case, methods in by_method(benchmark(seconds=24.0, horizons_ms=(60,), seed=seed), 60).items():
         assert methods[SHIPPED].p95_mm <= 1.1 * methods[BEST].p95_mm, case
 
 
-def test_at_60_ms_it_is_close_to_the_best_filter_tuned_for_each_motion(rows):
+def test_at_60_ms_it_is_close_to_the_best_filter_tuned_for_each_motion(rows: Any) -> None:
     for case, methods in by_method(rows, 60).items():
         assert methods[SHIPPED].p95_mm <= 1.1 * methods[BEST].p95_mm, case
 
 
-def test_it_beats_one_euro_and_no_prediction_with_and_without_a_filter_in_every_motion(rows):
+def test_it_beats_one_euro_and_no_prediction_with_and_without_a_filter_in_every_motion(rows: Any) -> None:
     for methods in by_method(rows, 60).values():
         assert methods[SHIPPED].p95_mm < methods[NONE].p95_mm
         assert methods[SHIPPED].p95_mm < methods[EURO].p95_mm
         assert methods[SHIPPED].p95_mm < methods[UNPREDICTED].p95_mm
 
 
-def test_errors_grow_with_the_horizon_and_begin_near_the_noise(rows):
+def test_errors_grow_with_the_horizon_and_begin_near_the_noise(rows: Any) -> None:
     for motion in ("lean", "nod", "walk", "stop-and-go"):
         line = [r.p50_mm for r in rows if (r.motion, r.rate_hz, r.method) == (motion, 30, SHIPPED)]
         assert line[0] < 5.0 and line[-1] > line[0]
 
 
-def test_its_jitter_lies_under_the_curve_of_single_filters_at_its_lag(trades):
+def test_its_jitter_lies_under_the_curve_of_single_filters_at_its_lag(trades: Any) -> None:
     shipped = next(t for t in trades if t.method == SHIPPED)
     kalman = sorted((t.lag_ms, t.jitter_mm) for t in trades if t.method == "Kalman" and t.jitter_mm > 1.0)
     lags, jitters = zip(*kalman)
     assert shipped.jitter_mm < np.interp(shipped.lag_ms, lags, jitters)
 
 
-def test_an_update_costs_less_than_three_thousand_calls_of_a_small_function():
+def test_an_update_costs_less_than_three_thousand_calls_of_a_small_function() -> None:
     """In one process and in turns: some 50 us where a call takes 30 ns, and twice that is still allowed."""
     observed, tracker = observe("walk", seconds=6.0, rate_hz=60), Tracker()
     ratios = []
@@ -86,7 +89,7 @@ def test_an_update_costs_less_than_three_thousand_calls_of_a_small_function():
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_motions_are_smooth_and_the_eyes_keep_their_distance(motion):
+def test_motions_are_smooth_and_the_eyes_keep_their_distance(motion: Any) -> None:
     times = np.arange(0, 20, 1e-3)
     eyes = true_eyes(motion, times)
     np.testing.assert_allclose(np.linalg.norm(eyes[:, 1] - eyes[:, 0], axis=1), 0.063, atol=1e-9)
@@ -95,7 +98,7 @@ def test_motions_are_smooth_and_the_eyes_keep_their_distance(motion):
     assert (eyes[:, :, 0] > 0.2).all()
 
 
-def test_an_observation_is_reproducible_and_has_its_faults():
+def test_an_observation_is_reproducible_and_has_its_faults() -> None:
     one, two = (observe("walk", seconds=20, rate_hz=30) for _ in range(2))
     assert all(
         (a.points is None) == (b.points is None) and (a.points is None or (a.points.eyes_m == b.points.eyes_m).all())
