@@ -18,7 +18,7 @@ demo: $(VENV)/.runtime
 	$(BIN)/phasestack demo $(DEMO_ARGS)
 
 test: $(VENV)/.test lint types
-	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist loadfile $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist loadfile --max-worker-restart 0 $(PYTEST_ARGS)
 
 test-slow: $(VENV)/.test
 	$(BIN)/python -m pytest -m slow --timeout 3600 $(PYTEST_ARGS)

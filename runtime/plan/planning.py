@@ -9,8 +9,23 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
+import numpy as np
+from rich.console import Console
+
 from runtime.config import Settings, load_settings, validated
+from runtime.content.registry import open_content
 from runtime.errors import FatalError, InputError
+from runtime.model.predictor import load_predictor
+from runtime.optics.retina import seen_by
+from runtime.plan.ladder import rungs
+from runtime.plan.levels import BudgetKeeper, QualityLevel, useful
+from runtime.plan.measure import measure, trial
+from runtime.plan.planner import focused_part
+from runtime.plan.predictors import planned_predictor
+from runtime.plan.reduced import ladder_predictor
+from runtime.plan.savings import Saving, make_plan
+from runtime.support.gl import offscreen_context
 from runtime.support.progress import NowAndThen
 
 if TYPE_CHECKING:
@@ -36,17 +51,6 @@ def plan_for(
     quiet: bool,
 ) -> dict[str, Any]:
     """Measure and plan one scene; everything that `phasestack plan` prints. Raises PhasestackError."""
-    import cv2
-    import numpy as np
-
-    from runtime.content.registry import open_content
-    from runtime.model.predictor import load_predictor
-    from runtime.plan.measure import measure
-    from runtime.plan.planner import focused_part
-    from runtime.plan.predictors import planned_predictor
-    from runtime.plan.savings import make_plan
-    from runtime.support.gl import offscreen_context
-
     settings = overridden(load_settings(config), scene=scene, model=model, budget_ms=budget_ms)
     cv2.setNumThreads(settings.model.threads or -1)
     stack = settings.stack.stack()
@@ -122,12 +126,6 @@ def _budget(
 
     Raises FatalError where no level can be had.
     """
-    from runtime.plan.ladder import rungs
-    from runtime.plan.levels import BudgetKeeper, QualityLevel, useful
-    from runtime.plan.measure import trial
-    from runtime.plan.reduced import ladder_predictor
-    from runtime.plan.savings import Saving
-
     trials: dict[str, Trial] = {}
     levels = []
     for name, scale in rungs(settings, stack):
@@ -152,10 +150,6 @@ def _budget(
 
 def _check_viewer(eyes_m: F64, stack: PanelStack, *, fov_deg: float, source: str) -> None:
     """Raise InputError, naming the option, for eyes (2, 3) from which nothing of the display can be seen."""
-    import numpy as np
-
-    from runtime.optics.retina import seen_by
-
     if not np.isfinite(eyes_m).all():
         raise InputError(source, "", "must be three finite numbers, metres")
     if np.abs(eyes_m).max() > FARTHEST_M:
@@ -195,7 +189,6 @@ def teller(cleanup: ExitStack, quiet: bool) -> Callable[[str], None]:
     if not sys.stderr.isatty():
         told = NowAndThen(sys.stderr)
         return lambda text: told(f"measuring: {text}")
-    from rich.console import Console
 
     status = cleanup.enter_context(Console(stderr=True).status("loading"))
     return lambda text: status.update(f"measuring: {text}")

@@ -25,7 +25,7 @@ SMALL: dict[str, Any] = {
         "open_timeout_s": 0.3,
     },
     "tracker": {"hold_s": 0.1, "blend_s": 0.02},
-    "model": {"name": "fast", "threads": 1},
+    "model": {"name": "fast", "threads": 1, "backend": "opencv"},  # auto would be what the machine is like today
     "loop": {"rate_hz": 200.0, "solver_late_s": 5.0, "solver_abandon_s": 60.0},  # a busy machine is no fault
 }  # fmt: skip
 

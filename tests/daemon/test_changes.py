@@ -5,6 +5,7 @@ Whatever changes, no refresh is lost: the presenter goes on with the solution th
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,6 +25,7 @@ from runtime.daemon.server import StatusServer
 from runtime.daemon.signals import Signals
 from runtime.daemon.supervise import Daemon
 from runtime.support import progress
+from tests.content.gltf_files import bending_bar
 from tests.daemon.rig import SMALL, TRACKING, Rig
 
 STEADY = {"sensor": {"timeout_s": 5.0, "open_timeout_s": 20.0}, "tracker": {"hold_s": 20.0}}  # on a busy machine too
@@ -124,9 +126,17 @@ def test_the_present_scene_goes_on_while_another_is_loaded(served: Served, gate:
     assert served.rig.content.info.name == "sparse"
 
 
-def a_mesh(folder: Path, broken: str) -> Path:
+def broken_content(folder: Path, broken: str) -> Path:
     path = folder / f"{broken}.obj"
     match broken:
+        case "a million bones":
+            path = bending_bar(folder / "bar.gltf")
+            table = json.loads(path.read_text())
+            table["skins"][0]["joints"] = [1] * 1_000_000
+            path.write_text(json.dumps(table))
+        case "a list":
+            path = folder / "list.toml"
+            path.write_text('[[show]]\nscene = "demo"\nseconds = 5\n\n[[show]]\nscene = "gone.glb"\nseconds = 5\n')
         case "NaN":
             path.write_text("v 0 0 0\nv nan 0 1\nv 0 1 0\nf 1 2 3\n")
         case "no faces":
@@ -139,12 +149,19 @@ def a_mesh(folder: Path, broken: str) -> Path:
 
 @pytest.mark.parametrize(
     ("broken", "field"),
-    [("NaN", "vertices: 1 of 3"), ("no faces", "faces"), ("no texture", "gone.png"), ("missing", "neither a file")],
+    [
+        ("NaN", "vertices: 1 of 3"),
+        ("no faces", "faces"),
+        ("no texture", "gone.png"),
+        ("missing", "neither a file"),
+        ("a million bones", "skins[0].joints: 1,000,000 is over the limit"),
+        ("a list", "show[1]: content: scene: "),
+    ],
 )
 def test_content_that_can_t_be_loaded_is_refused_and_the_last_good_stays(
     served: Served, tmp_path: Path, caplog: pytest.LogCaptureFixture, broken: str, field: str
 ) -> None:
-    path = a_mesh(tmp_path, broken)
+    path = broken_content(tmp_path, broken)
     content = served.rig.content
     answer = served.asked("scene", str(path))
     assert not answer["ok"]

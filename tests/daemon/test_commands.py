@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import threading
+from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
@@ -26,25 +28,25 @@ ACCOUNT = {
 
 
 @pytest.fixture
-def clock():
+def clock() -> Any:
     return SimulatedClock()
 
 
 @pytest.fixture
-def server(tmp_path, clock):
+def server(tmp_path: Path, clock: Any) -> Any:
     made = StatusServer(tmp_path / "status.sock", group="root", clock=clock)
     made.publish(lambda: ACCOUNT)
     yield made
     made.close()
 
 
-def ask_status(*arguments):
+def ask_status(*arguments: Any) -> Any:
     app = typer.Typer()
     app.command()(status)
     return CliRunner().invoke(app, list(arguments))
 
 
-def test_people_see_state_reason_rate_eyes_and_faults(server):
+def test_people_see_state_reason_rate_eyes_and_faults(server: StatusServer) -> None:
     result = ask_status("--socket", str(server.path))
     assert result.exit_code == 0
     for words in ("degraded: sensor", "unplugged", "31.2 frames/s", "2 dropped", "(0.900, -0.030, 0.000)", "held",
@@ -53,26 +55,26 @@ def test_people_see_state_reason_rate_eyes_and_faults(server):
         assert words in result.stdout
 
 
-def test_machines_get_one_object(server):
+def test_machines_get_one_object(server: StatusServer) -> None:
     result = ask_status("--json", "--socket", str(server.path))
     assert json.loads(result.stdout)["state"] == "degraded: sensor"
 
 
-def test_a_loop_that_stands_still_is_a_failure(server, clock):
+def test_a_loop_that_stands_still_is_a_failure(server: StatusServer, clock: SimulatedClock) -> None:
     clock.advance_ns(6 * NS_PER_S)
     result = ask_status("--socket", str(server.path))
     assert result.exit_code == 1
     assert "has not completed a turn for 6 s" in result.stderr
 
 
-def test_without_a_daemon_status_fails_with_one_line(tmp_path):
+def test_without_a_daemon_status_fails_with_one_line(tmp_path: Path) -> None:
     result = ask_status("--socket", str(tmp_path / "none.sock"))
     assert result.exit_code == 1
     assert result.stderr.count("\n") == 1
     assert "no daemon" in result.stderr
 
 
-def test_the_configuration_says_where_the_socket_is(server, tmp_path):
+def test_the_configuration_says_where_the_socket_is(server: StatusServer, tmp_path: Path) -> None:
     config = tmp_path / "phasestack.toml"
     config.write_text(f'[service]\nsocket = "{server.path}"\n')
     assert ask_status("--config", str(config)).exit_code == 0
@@ -89,10 +91,10 @@ def test_the_configuration_says_where_the_socket_is(server, tmp_path):
         (["reload"], "reload", None),
     ],
 )
-def test_every_command_arrives(server, arguments, name, value):
+def test_every_command_arrives(server: StatusServer, arguments: list[str], name: str, value: Any) -> None:
     taken = []
 
-    def loop():
+    def loop() -> None:
         taken.append(server.commands.get(timeout=60))
         taken[0].done()
 
@@ -104,7 +106,7 @@ def test_every_command_arrives(server, arguments, name, value):
     assert (taken[0].name, taken[0].value) == (name, value)
 
 
-def test_a_refusal_is_bad_input(server):
+def test_a_refusal_is_bad_input(server: StatusServer) -> None:
     result = CliRunner().invoke(ctl.app, ["budget", "99999999", "--socket", str(server.path)])
     assert isinstance(result.exception, InputError)
     assert "budget must lie in" in str(result.exception)

@@ -8,6 +8,10 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from signal import Signals
+from typing import Any
 
 import pytest
 
@@ -41,7 +45,7 @@ class Daemon:
     """One process of `phasestack run`."""
 
     def __init__(
-        self, folder, *extra: str, config: str = CONFIG, watchdog_s: float = 0.0, headless: bool = True
+        self, folder: Path, *extra: str, config: str = CONFIG, watchdog_s: float = 0.0, headless: bool = True
     ) -> None:
         self.socket = folder / "status.sock"
         self.config = folder / "phasestack.toml"
@@ -86,10 +90,10 @@ class Daemon:
 
 
 @pytest.fixture
-def started(tmp_path):
+def started(tmp_path: Path) -> Iterator[Callable[..., Any]]:
     made = []
 
-    def start(*extra, **keywords) -> Daemon:
+    def start(*extra: str, **keywords: float | str) -> Daemon:
         folder = tmp_path / str(len(made))
         folder.mkdir()
         made.append(Daemon(folder, *extra, **keywords))
@@ -100,7 +104,7 @@ def started(tmp_path):
         daemon.close()
 
 
-def test_ready_comes_after_the_first_presented_frame_and_stopping_before_the_end(started):
+def test_ready_comes_after_the_first_presented_frame_and_stopping_before_the_end(started: Callable[..., Any]) -> None:
     daemon = started(watchdog_s=2.0)
     assert daemon.hears("READY=1")
     assert daemon.status()["presented"] >= 1
@@ -117,7 +121,9 @@ def test_ready_comes_after_the_first_presented_frame_and_stopping_before_the_end
     ("number", "after_s"),
     [(signal.SIGTERM, 0.05), (signal.SIGTERM, 0.5), (signal.SIGTERM, 1.0), (signal.SIGTERM, 1.6), (signal.SIGINT, 1.0)],
 )
-def test_a_signal_at_any_stage_of_the_start_ends_it_without_a_traceback(started, number, after_s):
+def test_a_signal_at_any_stage_of_the_start_ends_it_without_a_traceback(
+    started: Callable[..., Any], number: Signals, after_s: float
+) -> None:
     daemon = started()
     time.sleep(after_s)
     daemon.process.send_signal(number)
@@ -128,7 +134,9 @@ def test_a_signal_at_any_stage_of_the_start_ends_it_without_a_traceback(started,
 
 
 @pytest.mark.parametrize("after_s", [0.7, 1.2])
-def test_a_hangup_during_the_start_is_a_reload_that_comes_when_it_can(started, after_s):
+def test_a_hangup_during_the_start_is_a_reload_that_comes_when_it_can(
+    started: Callable[..., Any], after_s: float
+) -> None:
     daemon = started()
     time.sleep(after_s)
     daemon.process.send_signal(signal.SIGHUP)
@@ -139,7 +147,7 @@ def test_a_hangup_during_the_start_is_a_reload_that_comes_when_it_can(started, a
     assert "Traceback" not in errors
 
 
-def test_a_bad_configuration_on_reload_is_refused_and_the_old_one_stays(started):
+def test_a_bad_configuration_on_reload_is_refused_and_the_old_one_stays(started: Callable[..., Any]) -> None:
     daemon = started()
     assert daemon.hears("READY=1")
     daemon.config.write_text("[loop]\nrate_hz = -1\n")
@@ -155,7 +163,7 @@ def test_a_bad_configuration_on_reload_is_refused_and_the_old_one_stays(started)
     assert any("refused" in line and "rate_hz" in line for line in errors.splitlines())
 
 
-def test_commands_change_what_it_does(started):
+def test_commands_change_what_it_does(started: Callable[..., Any]) -> None:
     daemon = started()
     assert daemon.hears("READY=1")
     assert ask([daemon.socket], {"command": "flat"}) == {"ok": True}
@@ -171,7 +179,9 @@ def test_commands_change_what_it_does(started):
     assert daemon.status()["frames"] > frames  # paused is a still picture, not a still loop
 
 
-def test_the_status_socket_in_use_is_refused_in_one_line_and_the_other_goes_on(started, tmp_path):
+def test_the_status_socket_in_use_is_refused_in_one_line_and_the_other_goes_on(
+    started: Callable[..., Any], tmp_path: Path
+) -> None:
     first = started()
     assert first.hears("READY=1")
     second = started(config=CONFIG.replace("{folder}", str(tmp_path / "0")))
@@ -182,7 +192,7 @@ def test_the_status_socket_in_use_is_refused_in_one_line_and_the_other_goes_on(s
     assert first.status()["ok"]
 
 
-def test_every_log_line_is_one_object(started):
+def test_every_log_line_is_one_object(started: Callable[..., Any]) -> None:
     daemon = started("--frames", "20")
     code, errors = daemon.ends()
     assert code == 0
@@ -194,7 +204,9 @@ PANEL = '[[output.panels]]\nconnector = "HDMI-%d"\n'
 NO_SCREEN = CONFIG + '[output]\nkind = "windows"\n' + "".join(PANEL % n for n in range(3))
 
 
-def test_a_panel_that_is_missing_at_the_start_is_waited_for_and_more_time_asked_for(started, monkeypatch):
+def test_a_panel_that_is_missing_at_the_start_is_waited_for_and_more_time_asked_for(
+    started: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     daemon = started(config=NO_SCREEN, headless=False)
     assert daemon.hears("EXTEND_TIMEOUT_USEC=")
@@ -206,7 +218,7 @@ def test_a_panel_that_is_missing_at_the_start_is_waited_for_and_more_time_asked_
     assert code == 0
 
 
-def test_by_hand_a_missing_panel_is_refused_in_one_line(tmp_path, monkeypatch):
+def test_by_hand_a_missing_panel_is_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     config = tmp_path / "phasestack.toml"
     config.write_text(NO_SCREEN.format(folder=tmp_path))
@@ -218,7 +230,7 @@ def test_by_hand_a_missing_panel_is_refused_in_one_line(tmp_path, monkeypatch):
     assert "Traceback" not in result.stderr
 
 
-def test_killed_outright_it_leaves_a_socket_that_the_next_one_takes_over(started):
+def test_killed_outright_it_leaves_a_socket_that_the_next_one_takes_over(started: Callable[..., Any]) -> None:
     first = started()
     assert first.hears("READY=1")
     first.process.kill()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from runtime.daemon.client import ask
 from runtime.panels.xlib import SERVER_DIED
 from tests.daemon.test_daemon import Daemon
 from tests.panels import xserver
-from tests.panels.xserver import HEIGHT_PX, WIDTH_PX
+from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, XServer
 from tests.waiting import eventually
 
 pytestmark = pytest.mark.windows
@@ -43,7 +45,7 @@ connector = "DUMMY2"
 
 
 @pytest.fixture
-def x(tmp_path, monkeypatch):
+def x(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     servers = [xserver.start_or_skip(tmp_path)]
     monkeypatch.setenv("DISPLAY", servers[0].name)
     yield servers
@@ -51,7 +53,7 @@ def x(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def daemon(x, tmp_path):
+def daemon(x: Any, tmp_path: Path) -> Any:
     started = Daemon(tmp_path, config=CONFIG, headless=False, watchdog_s=2.0)
     assert started.hears("READY=1")
     yield started
@@ -66,7 +68,7 @@ def shows_something_on(x: list[xserver.XServer]) -> bool:
     return all(int(np.ptp(x[-1].panel(index))) > 0 for index in range(3))
 
 
-def test_it_shows_a_scene_takes_another_and_stops_in_order(daemon, x):
+def test_it_shows_a_scene_takes_another_and_stops_in_order(daemon: Any, x: XServer) -> None:
     assert eventually(lambda: shows_something_on(x))
     status = daemon.status()
     assert (status["panels"], status["scene"]) == ("windows", "demo")
@@ -82,7 +84,7 @@ def test_it_shows_a_scene_takes_another_and_stops_in_order(daemon, x):
     assert code == 0, errors
 
 
-def test_a_monitor_goes_and_returns_and_the_watchdog_stays_fed(daemon, x):
+def test_a_monitor_goes_and_returns_and_the_watchdog_stays_fed(daemon: Any, x: XServer) -> None:
     assert eventually(lambda: shows_something_on(x))
     x[0].unplug(1)
     assert eventually(lambda: state(daemon) == "degraded: panel")
@@ -96,7 +98,9 @@ def test_a_monitor_goes_and_returns_and_the_watchdog_stays_fed(daemon, x):
     assert eventually(lambda: shows_something_on(x))
 
 
-def test_the_x_server_dies_and_the_daemon_that_is_started_again_waits_for_it(daemon, x, tmp_path):
+def test_the_x_server_dies_and_the_daemon_that_is_started_again_waits_for_it(
+    daemon: Any, x: XServer, tmp_path: Path
+) -> None:
     x[0].stop()
     code, errors = daemon.ends()
     assert code == SERVER_DIED

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
@@ -14,7 +16,7 @@ from runtime.commands.doctor import doctor
 from runtime.daemon.server import StatusServer
 
 
-def examined(tmp_path, text=""):
+def examined(tmp_path: Any, text: str = "") -> Any:
     config = tmp_path / "phasestack.toml"
     config.write_text(f'{text}\n[service]\nsocket = "{tmp_path}/status.sock"\n')
     app = typer.Typer()
@@ -25,12 +27,12 @@ def examined(tmp_path, text=""):
 
 
 @pytest.fixture(autouse=True)
-def nowhere(monkeypatch):
+def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
 
 
-def test_the_defaults_are_well(tmp_path):
+def test_the_defaults_are_well(tmp_path: Path) -> None:
     code, checks = examined(tmp_path)
     assert code == 0
     assert {name for name, check in checks.items() if check["state"] == "ok"} >= {
@@ -39,7 +41,7 @@ def test_the_defaults_are_well(tmp_path):
     assert checks["service"]["state"] == "skip"
 
 
-def test_monitors_without_an_x_server_fail_with_a_remedy(tmp_path):
+def test_monitors_without_an_x_server_fail_with_a_remedy(tmp_path: Path) -> None:
     code, checks = examined(tmp_path, '[output]\nkind = "windows"')
     assert code == 1
     assert checks["monitors"]["state"] == "fail"
@@ -56,7 +58,7 @@ def test_monitors_without_an_x_server_fail_with_a_remedy(tmp_path):
         ('[model]\nprovider = "tensorrt"', "model", "tensorrt"),
     ],
 )
-def test_what_is_wrong_is_named_and_the_rest_is_still_checked(tmp_path, text, name, words):
+def test_what_is_wrong_is_named_and_the_rest_is_still_checked(tmp_path: Path, text: str, name: str, words: str) -> None:
     code, checks = examined(tmp_path, text)
     assert code == 1
     assert checks[name]["state"] == "fail"
@@ -64,7 +66,7 @@ def test_what_is_wrong_is_named_and_the_rest_is_still_checked(tmp_path, text, na
     assert set(checks) >= {"opengl", "sensor", "calibration", "model", "service"}
 
 
-def test_a_real_sensor_with_the_demos_calibration_is_a_failure(tmp_path):
+def test_a_real_sensor_with_the_demos_calibration_is_a_failure(tmp_path: Path) -> None:
     _, checks = examined(tmp_path, '[sensor]\ndriver = "usb-eyes"\nsource = ""')
     assert checks["calibration"]["state"] == "fail"
     assert "calibrate" in checks["calibration"]["remedy"]
@@ -79,7 +81,7 @@ def test_a_real_sensor_with_the_demos_calibration_is_a_failure(tmp_path):
         ({"state": "tracking"}, 60, "fail"),
     ],
 )
-def test_a_running_daemon_is_asked_how_it_is(tmp_path, account, seconds, state):
+def test_a_running_daemon_is_asked_how_it_is(tmp_path: Path, account: Any, seconds: int, state: str) -> None:
     clock = SimulatedClock()
     server = StatusServer(tmp_path / "status.sock", group="root", clock=clock)
     server.publish(lambda: account)
@@ -93,8 +95,8 @@ def test_a_running_daemon_is_asked_how_it_is(tmp_path, account, seconds, state):
     assert code == 1
 
 
-def test_a_check_that_breaks_is_a_failed_row(monkeypatch, tmp_path):
-    def broken(_settings):
+def test_a_check_that_breaks_is_a_failed_row(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def broken(_settings: Any) -> None:
         raise RuntimeError("boom")
 
     monkeypatch.setitem(doctor_checks.CHECKS, "opengl", broken)
@@ -104,7 +106,7 @@ def test_a_check_that_breaks_is_a_failed_row(monkeypatch, tmp_path):
     assert checks["model"]["state"] == "ok"
 
 
-def test_people_get_a_table(tmp_path):
+def test_people_get_a_table(tmp_path: Path) -> None:
     app = typer.Typer()
     app.command()(doctor)
     result = CliRunner().invoke(app, [], env={"COLUMNS": "160"})

@@ -7,6 +7,8 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
+from subprocess import CompletedProcess
 from typing import Any
 
 import numpy as np
@@ -63,7 +65,7 @@ def alignments(rig: Rig, count: int) -> int:
 @pytest.mark.parametrize(
     "fault", [SensorLost("unplugged"), RuntimeError("SDK confused"), OSError(19, "no such device")]
 )
-def test_a_sensor_that_raises_degrades_and_comes_back(rig, fault):
+def test_a_sensor_that_raises_degrades_and_comes_back(rig: Rig, fault: Exception) -> None:
     rig.plan.fault = fault
     rig.refresh_until("degraded: sensor")
     assert str(fault.args[-1]) in rig.presenter.machine.reason
@@ -73,7 +75,7 @@ def test_a_sensor_that_raises_degrades_and_comes_back(rig, fault):
     assert rig.plan.opened >= 2
 
 
-def test_a_sensor_that_hangs_is_left_behind_and_opened_anew(rig):
+def test_a_sensor_that_hangs_is_left_behind_and_opened_anew(rig: Rig) -> None:
     rig.plan.hang.set()
     rig.refresh_until("degraded: sensor")
     assert longest_gap_s(rig.refreshes(5)) < 20 * rig.settings.sensor.timeout_s  # no refresh waits for it
@@ -82,7 +84,7 @@ def test_a_sensor_that_hangs_is_left_behind_and_opened_anew(rig):
     assert rig.plan.opened >= 2
 
 
-def test_a_sensor_that_can_not_be_opened_is_waited_for(rig):
+def test_a_sensor_that_can_not_be_opened_is_waited_for(rig: Rig) -> None:
     rig.plan.fault = rig.plan.refuse = SensorLost("unplugged")
     rig.refresh_until("degraded: sensor")
     assert presented_all(rig.refreshes(3))
@@ -90,7 +92,7 @@ def test_a_sensor_that_can_not_be_opened_is_waited_for(rig):
     rig.refresh_until(TRACKING)
 
 
-def test_a_sensor_that_never_will_be_ends_the_run_with_one_line(rig):
+def test_a_sensor_that_never_will_be_ends_the_run_with_one_line(rig: Rig) -> None:
     rig.plan.fault = SensorLost("unplugged")
     rig.plan.refuse = InputError("sensor", "driver", "is not allowed here")
     with pytest.raises(InputError, match="not allowed here"):
@@ -104,7 +106,7 @@ def held_as_it_was(rig: Rig) -> tuple[int, np.ndarray]:
 
 
 @pytest.mark.parametrize("fault", [ModelFailure("out of memory"), RuntimeError("unexpected"), MemoryError()])
-def test_a_model_that_raises_keeps_the_last_solution_aligned_to_the_eyes(rig, fault):
+def test_a_model_that_raises_keeps_the_last_solution_aligned_to_the_eyes(rig: Rig, fault: Exception) -> None:
     def fail(images: Any, eyes_m: Any, **how: Any) -> Any:
         raise fault
 
@@ -124,7 +126,7 @@ def test_a_model_that_raises_keeps_the_last_solution_aligned_to_the_eyes(rig, fa
     rig.refresh_until_solved()
 
 
-def test_a_model_that_answers_nan_is_a_model_that_failed(rig, monkeypatch):
+def test_a_model_that_answers_nan_is_a_model_that_failed(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(
             ModelSession, "run", lambda *_: dict.fromkeys(("rear", "front", "check"), np.full(1, np.nan, np.float32))
@@ -138,7 +140,9 @@ def test_a_model_that_answers_nan_is_a_model_that_failed(rig, monkeypatch):
 
 
 @pytest.mark.parametrize("fault", [ContentFailure("no such frame"), ZeroDivisionError()])
-def test_content_that_raises_keeps_the_last_picture(rig, fault, monkeypatch):
+def test_content_that_raises_keeps_the_last_picture(
+    rig: Rig, fault: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail(*arguments: Any, **keywords: Any) -> Any:
         raise fault
 
@@ -185,7 +189,7 @@ def asleep(rig: Rig, solver: Any) -> list[RefreshAccount]:
     return accounts
 
 
-def test_a_model_that_takes_very_long_costs_no_refresh_and_the_picture_follows_the_eyes(steady):
+def test_a_model_that_takes_very_long_costs_no_refresh_and_the_picture_follows_the_eyes(steady: Rig) -> None:
     slow = Slow(steady)
     asleep(steady, steady.presenter.solver)
     slow.gate.set()
@@ -195,7 +199,7 @@ def test_a_model_that_takes_very_long_costs_no_refresh_and_the_picture_follows_t
     assert steady.presenter.solver.restarts == 0
 
 
-def test_a_model_that_never_returns_is_left_behind_and_the_solver_is_made_anew(steady):
+def test_a_model_that_never_returns_is_left_behind_and_the_solver_is_made_anew(steady: Rig) -> None:
     slow, solver = Slow(steady), steady.presenter.solver
     try:
         asleep(steady, solver)
@@ -212,7 +216,7 @@ def test_a_model_that_never_returns_is_left_behind_and_the_solver_is_made_anew(s
         slow.gate.set()
 
 
-def test_after_a_suspended_machine_it_does_not_look_too_far_ahead_for_ever(rig):
+def test_after_a_suspended_machine_it_does_not_look_too_far_ahead_for_ever(rig: Rig) -> None:
     slow = Slow(rig)
     time.sleep(20 * rig.settings.tracker.hold_s)
     slow.gate.set()
@@ -226,7 +230,7 @@ def test_after_a_suspended_machine_it_does_not_look_too_far_ahead_for_ever(rig):
 
 
 @pytest.mark.parametrize("why", ["DUMMY1 was disconnected", "a panel's window was closed", "the X server died"])
-def test_a_lost_panel_drops_refreshes_and_comes_back_with_the_newest(rig, why):
+def test_a_lost_panel_drops_refreshes_and_comes_back_with_the_newest(rig: Rig, why: str) -> None:
     panels = rig.break_panels()
     panels.lost = why
     account = rig.refresh_until("degraded: panel")
@@ -241,7 +245,7 @@ def test_a_lost_panel_drops_refreshes_and_comes_back_with_the_newest(rig, why):
     assert panels.shown[-1].number > lost[-1].frame
 
 
-def test_several_faults_are_all_named(rig):
+def test_several_faults_are_all_named(rig: Rig) -> None:
     panels = rig.break_panels()
     panels.lost = "gone"
     rig.plan.fault = SensorLost("unplugged")
@@ -254,7 +258,7 @@ def test_several_faults_are_all_named(rig):
 
 
 @pytest.mark.parametrize("jump_s", [-3600, -5, 5, 3600])
-def test_a_sensor_clock_that_jumps_leaves_no_nonsense_on_the_panels(rig, jump_s):
+def test_a_sensor_clock_that_jumps_leaves_no_nonsense_on_the_panels(rig: Rig, jump_s: int) -> None:
     rig.plan.clock_jump_ns = jump_s * NS_PER_S
     for account in rig.refreshes(30):
         assert account.presented
@@ -264,7 +268,7 @@ def test_a_sensor_clock_that_jumps_leaves_no_nonsense_on_the_panels(rig, jump_s)
 
 
 @pytest.mark.parametrize("place_m", [(-0.5, 0.0, 0.0), (0.05, 0.0, 0.0), (np.nan, 0.0, 0.0), (1e9, 0.0, 0.0)])
-def test_eyes_at_impossible_places_never_stop_it(rig, place_m):
+def test_eyes_at_impossible_places_never_stop_it(rig: Rig, place_m: tuple[float, float, float]) -> None:
     well = rig.plan.eyes_m
     rig.plan.eyes_m = np.array(place_m) + np.array([[0.0, -0.031, 0.0], [0.0, 0.031, 0.0]])
     assert presented_all(rig.refreshes(30))
@@ -295,7 +299,7 @@ WATCHDOG_S = 0.4
 
 
 @pytest.fixture
-def heard(tmp_path, monkeypatch) -> Iterator[Supervisor]:
+def heard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Supervisor]:
     made = Supervisor(str(tmp_path / "notify"))
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
     yield made
@@ -303,7 +307,7 @@ def heard(tmp_path, monkeypatch) -> Iterator[Supervisor]:
 
 
 @pytest.fixture
-def fed(heard) -> Iterator[Rig]:
+def fed(heard: Supervisor) -> Iterator[Rig]:
     notifier = Notifier(MonotonicClock(), {"WATCHDOG_USEC": str(int(WATCHDOG_S * 1e6))})
     with Rig(supervisor=Watched(notifier), loop={"solver_late_s": 0.3}) as rig:
         rig.refresh_until_solved()
@@ -313,7 +317,7 @@ def fed(heard) -> Iterator[Rig]:
     notifier.close()
 
 
-def test_a_solver_that_hangs_does_not_starve_the_watchdog(fed, heard):
+def test_a_solver_that_hangs_does_not_starve_the_watchdog(fed: Rig, heard: Supervisor) -> None:
     """The presenter's clock alone feeds it: there is a picture, it follows the eyes, and the solver is made anew."""
     gate = threading.Event()
     predictor = fed.break_predictor()
@@ -325,7 +329,7 @@ def test_a_solver_that_hangs_does_not_starve_the_watchdog(fed, heard):
     assert heard.heard().count("WATCHDOG=1") >= 1
 
 
-def test_a_refresh_that_takes_for_ever_starves_the_watchdog(fed, heard):
+def test_a_refresh_that_takes_for_ever_starves_the_watchdog(fed: Rig, heard: Supervisor) -> None:
     panels, spoken = fed.break_panels(keep=False), []
     present = panels.present
 
@@ -356,7 +360,8 @@ from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))  # beyond it a write fails, as on a full disk
+_, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, most))  # beyond it a write fails, as on a full disk
 eyes = EyePoints(np.array([[0.7, -0.03, 0.0], [0.7, 0.03, 0.0]]), np.ones(2))
 written = 0
 try:
@@ -368,31 +373,36 @@ except InputError as error:
     print(error)
 finally:
     print(written)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))  # where coverage is measured, its own file is larger
 """
 
 
 @pytest.fixture(scope="module")
-def disk_filled(tmp_path_factory):
+def disk_filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CompletedProcess[Any]]:
     path = tmp_path_factory.mktemp("disk") / "recording.mcap"
     return path, subprocess.run(
         [sys.executable, "-c", FILL_THE_DISK, str(path)], capture_output=True, text=True, timeout=60, check=False
     )
 
 
-def test_a_disk_that_fills_up_while_recording_loses_nothing_that_was_written(disk_filled):
+def test_a_disk_that_fills_up_while_recording_loses_nothing_that_was_written(
+    disk_filled: tuple[Path, CompletedProcess[Any]],
+) -> None:
     path, result = disk_filled
     written = int(result.stdout.splitlines()[-1])
     read = sum(1 for _ in Recording(path).samples())
     assert read > 0.5 * written
 
 
-def test_a_disk_that_fills_up_while_recording_is_told_in_one_line(disk_filled):
+def test_a_disk_that_fills_up_while_recording_is_told_in_one_line(
+    disk_filled: tuple[Path, CompletedProcess[Any]],
+) -> None:
     path, result = disk_filled
     assert "Traceback" not in result.stderr
     assert str(path) in result.stdout.splitlines()[0]
 
 
-def test_transitions_are_logged_once_each(rig, caplog):
+def test_transitions_are_logged_once_each(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO", logger="phasestack")
     rig.plan.fault = SensorLost("unplugged")
     rig.refresh_until("degraded: sensor")

@@ -6,6 +6,9 @@ import os
 import signal
 import subprocess
 import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,7 +22,7 @@ QUIET = CONFIG.replace('log_format = "json"', 'log_format = "json"\nlog_level = 
 class Daemon:
     """`phasestack run` with standard output and error of a test's choice."""
 
-    def __init__(self, folder, *, stdout, stderr, preexec_fn=None) -> None:
+    def __init__(self, folder: Any, *, stdout: Any, stderr: Any, preexec_fn: Any = None) -> None:
         self.socket, config = folder / "status.sock", folder / "phasestack.toml"
         config.write_text(QUIET.format(folder=folder))
         self.process = subprocess.Popen(
@@ -53,10 +56,10 @@ class Daemon:
 
 
 @pytest.fixture
-def started(tmp_path):
+def started(tmp_path: Path) -> Any:
     made = []
 
-    def start(**streams) -> Daemon:
+    def start(**streams: Any) -> Daemon:
         made.append(Daemon(tmp_path, **streams))
         return made[-1]
 
@@ -67,7 +70,7 @@ def started(tmp_path):
             daemon.process.wait()
 
 
-def test_a_log_reader_that_never_reads_stops_neither_the_display_nor_its_end(started):
+def test_a_log_reader_that_never_reads_stops_neither_the_display_nor_its_end(started: Callable[..., Any]) -> None:
     out, descriptor = os.pipe()
     os.set_blocking(descriptor, False)
     try:
@@ -89,7 +92,9 @@ def test_a_log_reader_that_never_reads_stops_neither_the_display_nor_its_end(sta
         os.close(out)
 
 
-def test_a_log_reader_that_dies_is_survived_and_the_lost_lines_are_told_in_the_status(started):
+def test_a_log_reader_that_dies_is_survived_and_the_lost_lines_are_told_in_the_status(
+    started: Callable[..., Any],
+) -> None:
     out, descriptor = os.pipe()
     daemon = started(stdout=subprocess.DEVNULL, stderr=descriptor)
     os.close(descriptor)
@@ -99,14 +104,14 @@ def test_a_log_reader_that_dies_is_survived_and_the_lost_lines_are_told_in_the_s
     daemon.ends()
 
 
-def test_full_devices_for_output_and_log_are_survived(started):
+def test_full_devices_for_output_and_log_are_survived(started: Callable[..., Any]) -> None:
     with open("/dev/full", "wb") as full:  # noqa: PTH123
         daemon = started(stdout=full, stderr=full)
         assert daemon.goes_on()
         daemon.ends()
 
 
-def test_closed_standard_descriptors_are_survived(started):
+def test_closed_standard_descriptors_are_survived(started: Callable[..., Any]) -> None:
     def close() -> None:
         os.close(1)
         os.close(2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import pytest
 
@@ -20,35 +21,35 @@ def told(lateness: Lateness, *, period_ns: int, seconds: float, start_ns: int, p
     return [lateness.update(presented=presented, now_ns=start_ns + (k + 1) * period_ns) for k in range(count)]
 
 
-def test_in_time_nothing_is_said():
+def test_in_time_nothing_is_said() -> None:
     assert not any(told(Lateness(PERIOD), period_ns=PERIOD, seconds=10, start_ns=0))
 
 
-def test_a_second_on_end_of_too_few_refreshes_is_told_with_both_figures():
+def test_a_second_on_end_of_too_few_refreshes_is_told_with_both_figures() -> None:
     said = told(Lateness(PERIOD), period_ns=-(-NS_PER_S // 38), seconds=5, start_ns=0)
     assert not any(said[:38])  # not before a second has passed
     assert said[-1] == "late: 38 of 60 refreshes a second"
 
 
-def test_a_short_hitch_is_not_told():
+def test_a_short_hitch_is_not_told() -> None:
     lateness = Lateness(PERIOD)
     told(lateness, period_ns=PERIOD, seconds=3, start_ns=0)
     assert not any(told(lateness, period_ns=PERIOD, seconds=3, start_ns=3 * NS_PER_S + 150 * NS_PER_MS))
 
 
-def test_a_display_that_hardly_moves_is_told_too():
+def test_a_display_that_hardly_moves_is_told_too() -> None:
     assert told(Lateness(PERIOD), period_ns=2 * NS_PER_S, seconds=20, start_ns=0)[-1] == (
         "late: 1 of 60 refreshes a second"
     )
 
 
-def test_once_it_is_in_time_again_it_is_told_no_more():
+def test_once_it_is_in_time_again_it_is_told_no_more() -> None:
     lateness = Lateness(PERIOD)
     assert told(lateness, period_ns=NS_PER_S // 38, seconds=5, start_ns=0)[-1]
     assert told(lateness, period_ns=PERIOD, seconds=3, start_ns=5 * NS_PER_S)[-1] == ""
 
 
-def test_the_figure_changes_once_a_second_at_most():
+def test_the_figure_changes_once_a_second_at_most() -> None:
     lateness = Lateness(PERIOD)
     said, now_ns = [], 0
     for number in range(400):
@@ -67,18 +68,18 @@ def test_the_figure_changes_once_a_second_at_most():
         ({"eyes": "exact", "flat_wanted": True}, State.FLAT),
     ],
 )
-def test_every_state_that_shows_something_says_it(changes, state):
+def test_every_state_that_shows_something_says_it(changes: Any, state: Any) -> None:
     conditions = Conditions(**{"missing": {}, "presented": True, "late": "late: 38 of 60 refreshes a second"} | changes)
     assert judge(conditions)[0] is state
     assert judge(conditions)[1].endswith("late: 38 of 60 refreshes a second")
 
 
-def test_panels_that_take_longer_than_a_period_are_told_by_the_presenter():
+def test_panels_that_take_longer_than_a_period_are_told_by_the_presenter() -> None:
     stage = Stage()
     stage.solver.hand_over(solved=solution(1))
     present = stage.panels.present
 
-    def slow(frame, *, unchanged=False):
+    def slow(frame: Any, *, unchanged: bool = False) -> Any:
         stage.clock.advance_ns(round(1.6 * PERIOD_NS))
         return present(frame, unchanged=unchanged)
 

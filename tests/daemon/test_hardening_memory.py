@@ -31,7 +31,7 @@ print(full, before, size().rss)
 
 
 @pytest.mark.skipif(not give_back(), reason="a C library without malloc_trim")
-def test_what_lies_between_pieces_in_use_goes_back():
+def test_what_lies_between_pieces_in_use_goes_back() -> None:
     done = subprocess.run([sys.executable, "-c", FRAGMENTED], cwd=ROOT, capture_output=True, text=True, check=True)
     full, before, after = (int(word) for word in done.stdout.split())
     freed = 4000 * 65000 * 49 // 50
@@ -40,7 +40,9 @@ def test_what_lies_between_pieces_in_use_goes_back():
 
 
 @pytest.mark.parametrize(("scene", "taken"), [("sparse", True), ("no-such-scene", False)])
-def test_after_a_change_and_after_a_refused_one_memory_is_given_back(monkeypatch, scene, taken):
+def test_after_a_change_and_after_a_refused_one_memory_is_given_back(
+    monkeypatch: pytest.MonkeyPatch, scene: str, taken: bool
+) -> None:
     times = []
     monkeypatch.setattr(reconfigure, "give_back_later", lambda: times.append(1))
     with Rig() as rig:
@@ -55,7 +57,7 @@ def test_after_a_change_and_after_a_refused_one_memory_is_given_back(monkeypatch
 
 
 @pytest.mark.slow
-def test_hundreds_of_switches_end_on_a_plateau(tmp_path):
+def test_hundreds_of_switches_end_on_a_plateau(tmp_path: Path) -> None:
     """Of a mesh with a texture, as the daemon loads it: the second half adds nothing."""
     done = subprocess.run(
         [sys.executable, "-c", SWITCHES, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, check=True

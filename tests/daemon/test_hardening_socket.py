@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -37,18 +38,18 @@ STATUS = {"command": "status"}
 
 
 @pytest.fixture
-def path(tmp_path):
+def path(tmp_path: Path) -> Path:
     return tmp_path / "run" / "status.sock"
 
 
 @pytest.fixture
-def server(path):
+def server(path: Path) -> Iterator[StatusServer]:
     made = StatusServer(path, group=OWN_GROUP, clock=SimulatedClock())
     yield made
     made.close()
 
 
-def connected(path) -> socket.socket:
+def connected(path: Path) -> socket.socket:
     client = socket.socket(socket.AF_UNIX)
     client.settimeout(20)
     client.connect(str(path))
@@ -58,7 +59,9 @@ def connected(path) -> socket.socket:
 # What was refused is never done
 
 
-def test_a_command_that_was_refused_as_too_late_is_never_done(server, path, monkeypatch):
+def test_a_command_that_was_refused_as_too_late_is_never_done(
+    server: StatusServer, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(server_module, "LOOP_ANSWERS_WITHIN_S", 0.05)
     answer = ask([path], {"command": "pause"})
     assert not answer["ok"]
@@ -66,10 +69,12 @@ def test_a_command_that_was_refused_as_too_late_is_never_done(server, path, monk
     assert not server.commands.get(timeout=60).take()
 
 
-def test_a_command_that_was_taken_in_time_is_waited_for_and_not_given_up(server, path, monkeypatch):
+def test_a_command_that_was_taken_in_time_is_waited_for_and_not_given_up(
+    server: StatusServer, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(server_module, "LOOP_ANSWERS_WITHIN_S", 0.05)
 
-    def loop():
+    def loop() -> None:
         command = server.commands.get(timeout=60)
         assert command.take()
         time.sleep(0.3)
@@ -81,7 +86,7 @@ def test_a_command_that_was_taken_in_time_is_waited_for_and_not_given_up(server,
     thread.join()
 
 
-def test_either_it_is_done_or_it_is_given_up():
+def test_either_it_is_done_or_it_is_given_up() -> None:
     for _ in range(200):
         command = Command("pause")
         with ThreadPoolExecutor(2) as pool:
@@ -89,7 +94,9 @@ def test_either_it_is_done_or_it_is_given_up():
         assert taken.result() != given_up.result()
 
 
-def test_the_daemon_leaves_a_command_that_was_given_up(server, path, monkeypatch):
+def test_the_daemon_leaves_a_command_that_was_given_up(
+    server: StatusServer, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from runtime.clock import MonotonicClock
     from runtime.config import Overrides
     from runtime.daemon.notify import Notifier
@@ -113,7 +120,7 @@ def test_the_daemon_leaves_a_command_that_was_given_up(server, path, monkeypatch
     assert timely.wait(1.0) == ""
 
 
-def test_while_it_starts_the_status_says_what_it_waits_for(server, path):
+def test_while_it_starts_the_status_says_what_it_waits_for(server: StatusServer, path: Path) -> None:
     from runtime.clock import MonotonicClock
     from runtime.config import Overrides
     from runtime.daemon.notify import Notifier
@@ -127,7 +134,7 @@ def test_while_it_starts_the_status_says_what_it_waits_for(server, path):
     assert (answer["state"], answer["reason"]) == ("starting", "loading content and model")
 
 
-def test_when_the_daemon_stops_who_waits_is_told_and_nothing_is_done_later(server, path):
+def test_when_the_daemon_stops_who_waits_is_told_and_nothing_is_done_later(server: StatusServer, path: Path) -> None:
     with ThreadPoolExecutor(1) as pool:
         asked = pool.submit(ask, [path], {"command": "pause"})
         command = server.commands.get(timeout=60)
@@ -139,14 +146,14 @@ def test_when_the_daemon_stops_who_waits_is_told_and_nothing_is_done_later(serve
 # Crowds
 
 
-def test_twenty_at_once_are_all_answered(server, path):
+def test_twenty_at_once_are_all_answered(server: StatusServer, path: Path) -> None:
     server.publish(lambda: {"state": "tracking"})
     with ThreadPoolExecutor(20) as pool:
         answers = list(pool.map(lambda _: ask([path], STATUS), range(200)))
     assert all(answer["ok"] for answer in answers)
 
 
-def test_twenty_status_commands_at_once_are_all_answered(server, path):
+def test_twenty_status_commands_at_once_are_all_answered(server: StatusServer, path: Path) -> None:
     """As processes, as an operator's scripts are."""
     server.publish(lambda: {"state": "tracking"})
     command = [sys.executable, "-m", "runtime.cli", "status", "--json", "--socket", str(path)]
@@ -159,7 +166,7 @@ def test_twenty_status_commands_at_once_are_all_answered(server, path):
     assert all(code == 0 and json.loads(output)["state"] == "tracking" for (output, _), code in results)
 
 
-def test_clients_that_connect_before_any_is_looked_at_find_room(path):
+def test_clients_that_connect_before_any_is_looked_at_find_room(path: Path) -> None:
     """The backlog: connections wait, they are not refused."""
     made = StatusServer(path, group=OWN_GROUP, clock=SimulatedClock())
     made.publish(lambda: time.sleep(0.5) or {"state": "tracking"})
@@ -180,12 +187,12 @@ def test_clients_that_connect_before_any_is_looked_at_find_room(path):
         made.close()
 
 
-def test_tricklers_lock_out_nobody(server, path):
+def test_tricklers_lock_out_nobody(server: StatusServer, path: Path) -> None:
     """More of them than there are places, each sending a byte now and then, and coming again when it is sent away."""
     stop = threading.Event()
     sent = [0]
 
-    def trickle():
+    def trickle() -> None:
         while not stop.is_set():
             try:
                 with connected(path) as client:
@@ -216,14 +223,14 @@ def test_tricklers_lock_out_nobody(server, path):
 
 
 @pytest.fixture
-def hasty(path, monkeypatch):
+def hasty(path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[StatusServer]:
     monkeypatch.setattr(server_module, "REQUEST_S", 0.3)
     made = StatusServer(path, group=OWN_GROUP, clock=SimulatedClock())
     yield made
     made.close()
 
 
-def test_a_request_has_so_long_altogether_however_it_trickles(hasty, path):
+def test_a_request_has_so_long_altogether_however_it_trickles(hasty: StatusServer, path: Path) -> None:
     with connected(path) as client:
         begin_s = time.monotonic()
         with pytest.raises(OSError):
@@ -233,7 +240,7 @@ def test_a_request_has_so_long_altogether_however_it_trickles(hasty, path):
         assert b"in time" in client.recv(1000)
 
 
-def test_a_client_that_does_not_read_its_answers_is_let_go(hasty, path):
+def test_a_client_that_does_not_read_its_answers_is_let_go(hasty: StatusServer, path: Path) -> None:
     hasty.publish(lambda: {"long": "x" * 60000})
     with connected(path) as client:
         client.settimeout(0.05)
@@ -244,7 +251,7 @@ def test_a_client_that_does_not_read_its_answers_is_let_go(hasty, path):
     assert ask([path], STATUS)["ok"]
 
 
-def test_a_request_without_line_break_is_answered_at_the_end_of_what_is_sent(server, path):
+def test_a_request_without_line_break_is_answered_at_the_end_of_what_is_sent(server: StatusServer, path: Path) -> None:
     with connected(path) as client:
         client.sendall(json.dumps(STATUS).encode())
         client.shutdown(socket.SHUT_WR)
@@ -252,14 +259,14 @@ def test_a_request_without_line_break_is_answered_at_the_end_of_what_is_sent(ser
         assert client.recv(10) == b""
 
 
-def test_many_requests_in_one_piece_are_answered_in_order(server, path):
+def test_many_requests_in_one_piece_are_answered_in_order(server: StatusServer, path: Path) -> None:
     with connected(path) as client:
         client.sendall(b'{"command": "status"}\n{"command": "nonsense"}\n{"command": "status"}\n')
         stream = client.makefile("rb")
         assert [json.loads(stream.readline())["ok"] for _ in range(3)] == [True, False, True]
 
 
-def test_without_descriptors_it_waits_and_then_serves_again(server, path):
+def test_without_descriptors_it_waits_and_then_serves_again(server: StatusServer, path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     clients = [socket.socket(socket.AF_UNIX) for _ in range(4)]
     free = os.dup(0)
@@ -285,7 +292,7 @@ def test_without_descriptors_it_waits_and_then_serves_again(server, path):
 
 
 @pytest.mark.parametrize("line", [b"[" * 60000 + b"\n", b'{"a":' * 10000 + b"\n", b"\0\n", b"9" * 60000 + b"\n"])
-def test_hostile_lines_are_refused_in_one_line(server, path, line):
+def test_hostile_lines_are_refused_in_one_line(server: StatusServer, path: Path, line: bytes) -> None:
     with connected(path) as client:
         client.sendall(line)
         answer = json.loads(client.makefile("rb").readline())
@@ -293,7 +300,7 @@ def test_hostile_lines_are_refused_in_one_line(server, path, line):
     assert ask([path], STATUS)["ok"]
 
 
-def test_a_snapshot_that_fails_is_told_and_the_server_goes_on(server, path):
+def test_a_snapshot_that_fails_is_told_and_the_server_goes_on(server: StatusServer, path: Path) -> None:
     server.publish(lambda: 1 / 0)
     assert not ask([path], STATUS)["ok"]
     server.publish(dict)
@@ -303,16 +310,16 @@ def test_a_snapshot_that_fails_is_told_and_the_server_goes_on(server, path):
 # The lock and the socket's place
 
 
-def lock_of(path) -> Path:
+def lock_of(path: Path) -> Path:
     return path.with_name(path.name + ".lock")
 
 
-def test_the_lock_is_its_owners_alone_and_not_inherited(server, path):
+def test_the_lock_is_its_owners_alone_and_not_inherited(server: StatusServer, path: Path) -> None:
     assert stat.S_IMODE(lock_of(path).stat().st_mode) == 0o600
     assert fcntl.fcntl(server._lock, fcntl.F_GETFD) & fcntl.FD_CLOEXEC
 
 
-def test_a_lock_of_an_older_version_that_all_could_read_is_made_its_owners(path):
+def test_a_lock_of_an_older_version_that_all_could_read_is_made_its_owners(path: Path) -> None:
     path.parent.mkdir()
     lock_of(path).write_text("1\n")
     lock_of(path).chmod(0o644)
@@ -321,7 +328,9 @@ def test_a_lock_of_an_older_version_that_all_could_read_is_made_its_owners(path)
 
 
 @pytest.mark.parametrize("link", ["symlink_to", "hardlink_to"])
-def test_a_link_in_the_locks_place_is_refused_and_its_target_stays_as_it_was(path, tmp_path, link):
+def test_a_link_in_the_locks_place_is_refused_and_its_target_stays_as_it_was(
+    path: Path, tmp_path: Path, link: str
+) -> None:
     path.parent.mkdir()
     precious = tmp_path / "precious"
     precious.write_text("precious")
@@ -333,14 +342,14 @@ def test_a_link_in_the_locks_place_is_refused_and_its_target_stays_as_it_was(pat
 
 
 @pytest.mark.parametrize("kind", ["fifo", "folder"])
-def test_what_is_no_file_in_the_locks_place_is_refused_without_waiting(path, kind):
+def test_what_is_no_file_in_the_locks_place_is_refused_without_waiting(path: Path, kind: str) -> None:
     path.parent.mkdir()
     os.mkfifo(lock_of(path)) if kind == "fifo" else lock_of(path).mkdir()
     with pytest.raises(InputError, match=r"status\.sock\.lock"):
         StatusServer(path, group=OWN_GROUP, clock=SimulatedClock())
 
 
-def test_where_the_lock_was_deleted_a_second_daemon_does_not_steal_the_socket(server, path):
+def test_where_the_lock_was_deleted_a_second_daemon_does_not_steal_the_socket(server: StatusServer, path: Path) -> None:
     lock_of(path).unlink()
     with pytest.raises(SocketInUse):
         StatusServer(path, group=OWN_GROUP, clock=SimulatedClock())
@@ -348,7 +357,7 @@ def test_where_the_lock_was_deleted_a_second_daemon_does_not_steal_the_socket(se
     assert ask([path], STATUS)["state"] == "the first"
 
 
-def test_where_both_were_deleted_the_first_does_not_take_the_seconds_socket_with_it(path):
+def test_where_both_were_deleted_the_first_does_not_take_the_seconds_socket_with_it(path: Path) -> None:
     first = StatusServer(path, group=OWN_GROUP, clock=SimulatedClock())
     lock_of(path).unlink()
     path.unlink()
@@ -360,7 +369,7 @@ def test_where_both_were_deleted_the_first_does_not_take_the_seconds_socket_with
     assert not path.exists()
 
 
-def test_a_link_in_the_sockets_place_is_not_followed(path, tmp_path):
+def test_a_link_in_the_sockets_place_is_not_followed(path: Path, tmp_path: Path) -> None:
     path.parent.mkdir()
     precious = tmp_path / "precious"
     precious.write_text("precious")
@@ -374,12 +383,12 @@ def test_a_link_in_the_sockets_place_is_not_followed(path, tmp_path):
 # The client
 
 
-def test_the_clients_default_socket_is_the_configurations():
+def test_the_clients_default_socket_is_the_configurations() -> None:
     assert DEFAULT_SOCKET == ServiceSettings().socket == configured_socket(None)
 
 
 @pytest.mark.parametrize("socket_line", ['socket = "/run/x/status.sock"', 'socket = "here.sock"', ""])
-def test_the_clients_reading_of_a_configuration_is_the_daemons(tmp_path, socket_line):
+def test_the_clients_reading_of_a_configuration_is_the_daemons(tmp_path: Path, socket_line: str) -> None:
     config = tmp_path / "phasestack.toml"
     config.write_text(f"[service]\n{socket_line}\n")
     assert Path(configured_socket(config)) == Path(load_settings(config).service.socket)
@@ -389,7 +398,7 @@ def test_the_clients_reading_of_a_configuration_is_the_daemons(tmp_path, socket_
     "text",
     ["[service\n", "[service]\nsocket = 3\n", '[service]\nsocket = ""\n', "\udcff", '[service]\nsocket="a\\u0000"'],
 )
-def test_a_bad_configuration_is_told_by_the_client(tmp_path, text):
+def test_a_bad_configuration_is_told_by_the_client(tmp_path: Path, text: str) -> None:
     config = tmp_path / "phasestack.toml"
     config.write_bytes(text.encode(errors="surrogateescape"))
     with pytest.raises(InputError, match=r"phasestack\.toml"):
@@ -397,7 +406,7 @@ def test_a_bad_configuration_is_told_by_the_client(tmp_path, text):
 
 
 @pytest.mark.parametrize("arguments", [["status"], ["ctl", "pause"], ["ctl", "scene", "demo"]])
-def test_a_client_loads_nothing_heavy(tmp_path, arguments):
+def test_a_client_loads_nothing_heavy(tmp_path: Path, arguments: list[str]) -> None:
     config = tmp_path / "phasestack.toml"
     config.write_text(f'[service]\nsocket = "{tmp_path}/none.sock"\n')
     code = (
@@ -416,7 +425,9 @@ def test_a_client_loads_nothing_heavy(tmp_path, arguments):
 
 
 @pytest.mark.parametrize("name", ["pictures", "a.glb", "sub/a.glb", "./a.glb"])
-def test_a_file_or_folder_is_sent_with_its_whole_path(server, tmp_path, monkeypatch, name):
+def test_a_file_or_folder_is_sent_with_its_whole_path(
+    server: StatusServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sub").mkdir()
     (tmp_path / "pictures").mkdir()
@@ -426,16 +437,18 @@ def test_a_file_or_folder_is_sent_with_its_whole_path(server, tmp_path, monkeypa
 
 
 @pytest.mark.parametrize("name", ["demo", "lego_bulldozer", "nowhere.glb"])
-def test_a_known_name_and_what_is_not_there_are_sent_as_they_are(server, tmp_path, monkeypatch, name):
+def test_a_known_name_and_what_is_not_there_are_sent_as_they_are(
+    server: StatusServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "demo").mkdir()  # the built-in scene is meant all the same
     assert sent_scene(server, name) == name
 
 
-def sent_scene(server, name: str):
+def sent_scene(server: StatusServer, name: str) -> str:
     taken = []
 
-    def loop():
+    def loop() -> None:
         taken.append(server.commands.get(timeout=60))
         taken[0].done()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from runtime.support.artifacts import to_json
 from tests.daemon.rig import Rig
 
 
-def told_by(rig) -> tuple[dict, str]:
+def told_by(rig: Rig) -> tuple[dict, str]:
     """The snapshot as it comes through the socket, and as a person reads it."""
     account = rig.presenter.last.account
     answer = json.loads(to_json({"ok": True, "pid": 1, "uptime_s": 1.0, **snapshot(rig.run, rig.presenter, account)}))
@@ -24,12 +25,12 @@ def told_by(rig) -> tuple[dict, str]:
 
 
 @pytest.fixture
-def rig():
+def rig() -> Iterator[Rig]:
     with Rig() as made:
         yield made
 
 
-def test_a_run_that_tracks_says_rates_of_now_eyes_and_how_sure_and_the_sensors_rate(rig):
+def test_a_run_that_tracks_says_rates_of_now_eyes_and_how_sure_and_the_sensors_rate(rig: Rig) -> None:
     rig.refresh_until("tracking")
     rig.refreshes(60)
     answer, text = told_by(rig)
@@ -43,7 +44,7 @@ def test_a_run_that_tracks_says_rates_of_now_eyes_and_how_sure_and_the_sensors_r
 
 
 @pytest.mark.parametrize(("name", "words"), [("paused", "frozen until"), ("flat_asked", "asked for, until")])
-def test_what_an_operator_asked_for_is_told(rig, name, words):
+def test_what_an_operator_asked_for_is_told(rig: Rig, name: str, words: str) -> None:
     rig.refresh_until("tracking")
     setattr(rig.presenter, name, True)
     rig.refreshes(3)
@@ -52,7 +53,7 @@ def test_what_an_operator_asked_for_is_told(rig, name, words):
     assert words in text
 
 
-def test_eyes_that_are_refused_are_counted_by_reason(rig):
+def test_eyes_that_are_refused_are_counted_by_reason(rig: Rig) -> None:
     rig.refresh_until("tracking")
     rig.plan.eyes_m = np.array([[-0.7, -0.031, 0.0], [-0.7, 0.031, 0.0]])  # behind the display
     rig.refreshes(100)
@@ -63,7 +64,7 @@ def test_eyes_that_are_refused_are_counted_by_reason(rig):
         assert re.search(rf"^rejected .*{count} {re.escape(why)}", text, re.MULTILINE)
 
 
-def test_a_sensor_that_is_gone_has_no_rate(rig):
+def test_a_sensor_that_is_gone_has_no_rate(rig: Rig) -> None:
     rig.refresh_until("tracking")
     rig.plan.fault = SensorLost("unplugged")
     rig.refresh_until("degraded: sensor")
@@ -73,7 +74,7 @@ def test_a_sensor_that_is_gone_has_no_rate(rig):
     assert "unplugged" in text
 
 
-def test_a_stand_in_is_called_one():
+def test_a_stand_in_is_called_one() -> None:
     with Rig(content={"scene": "lego_bulldozer"}) as rig:
         rig.refreshes(3)
         answer, text = told_by(rig)
@@ -81,7 +82,7 @@ def test_a_stand_in_is_called_one():
     assert re.search(r"^content +lego_bulldozer \(stand-in", text, re.MULTILINE)
 
 
-def test_what_was_not_measured_is_no_figure_anywhere(rig):
+def test_what_was_not_measured_is_no_figure_anywhere(rig: Rig) -> None:
     """Every value that can be None is, as before the first refresh and without a viewer."""
     rig.refreshes(2)
     answer, _ = told_by(rig)
@@ -94,13 +95,13 @@ def test_what_was_not_measured_is_no_figure_anywhere(rig):
     assert digits == []
 
 
-def test_nothing_that_came_through_the_socket_breaks_a_line():
+def test_nothing_that_came_through_the_socket_breaks_a_line() -> None:
     lines = list(describe({"state": "tracking\nup 3 h", "scene": "\x1b[2Ja\u202eb", "refused": "x" * 10000}))
     assert all(line.isprintable() for line in lines)
     assert all(len(line) <= 2000 for line in lines)
 
 
-def test_the_manual_names_what_the_status_tells():
+def test_the_manual_names_what_the_status_tells() -> None:
     text = (Path(__file__).parents[2] / "docs" / "operation.md").read_text()
     for name in ("turn_age_s", "log_lines_lost", "loading", "refused"):
         assert f"`{name}`" in text

@@ -8,14 +8,17 @@ import resource
 import subprocess
 import sys
 import urllib.request
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from runtime.clock import MonotonicClock
-from runtime.config import Overrides, SensorSettings
+from runtime.config import Overrides, SensorSettings, Settings
 from runtime.daemon import supervise
+from runtime.daemon.build import RunOptions
 from runtime.daemon.metrics import CLIENTS_MAX, LOOPBACK, Metrics
 from runtime.errors import InputError, SensorLost, TransientError
 from runtime.sensor.base import Capabilities
@@ -39,17 +42,17 @@ def read_by_a_reader(number: int) -> InputError:
 
 
 @pytest.mark.parametrize("number", sorted(PASSING))
-def test_what_the_machine_lacks_passes_however_it_was_told(number):
+def test_what_the_machine_lacks_passes_however_it_was_told(number: int) -> None:
     assert may_pass(OSError(number, "x"))
     assert may_pass(read_by_a_reader(number))
 
 
 @pytest.mark.parametrize("number", [errno.ENOENT, errno.EACCES, errno.EISDIR, errno.EADDRINUSE, errno.ELOOP])
-def test_what_is_wrong_for_good_does_not(number):
+def test_what_is_wrong_for_good_does_not(number: int) -> None:
     assert not may_pass(read_by_a_reader(number))
 
 
-def test_memory_and_threads_pass_and_so_do_libraries_words_for_them():
+def test_memory_and_threads_pass_and_so_do_libraries_words_for_them() -> None:
     for error in (
         MemoryError(),
         RuntimeError("can't start new thread"),
@@ -59,45 +62,47 @@ def test_memory_and_threads_pass_and_so_do_libraries_words_for_them():
         assert may_pass(error)
 
 
-def test_a_users_words_prove_nothing():
+def test_a_users_words_prove_nothing() -> None:
     assert not may_pass(InputError("too many open files.toml", "std::bad_alloc", "no space left on device"))
 
 
 @pytest.mark.parametrize("error", [MemoryError(), OSError(errno.EMFILE, "x"), read_by_a_reader(errno.EIO)])
-def test_a_run_that_the_machine_ended_may_be_started_again(monkeypatch, error):
+def test_a_run_that_the_machine_ended_may_be_started_again(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
     monkeypatch.setattr(supervise, "drive", raising(error))
     with pytest.raises(TransientError, match="start again"):
         lived()
 
 
 @pytest.mark.parametrize("error", [read_by_a_reader(errno.ENOENT), InputError("a.toml", "x", "bad"), ValueError("x")])
-def test_a_run_that_its_input_or_a_mistake_of_ours_ended_tells_just_that(monkeypatch, error):
+def test_a_run_that_its_input_or_a_mistake_of_ours_ended_tells_just_that(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
     monkeypatch.setattr(supervise, "drive", raising(error))
     with pytest.raises(type(error)) as caught:
         lived()
     assert not isinstance(caught.value, TransientError)
 
 
-def raising(error: Exception):
-    def drive(*_, **__):
+def raising(error: Exception) -> Callable[..., Any]:
+    def drive(*_: Settings | RunOptions | None, **__: Any) -> None:
         raise error
 
     return drive
 
 
-def lived():
+def lived() -> None:
     overrides = Overrides(replay="demo", headless=True)
     supervise.run_daemon(None, overrides, frames=1, max_speed=True, out=None, scale=0.1, quiet=True)
 
 
-def test_a_configuration_on_a_failing_disk_may_be_started_again(monkeypatch):
+def test_a_configuration_on_a_failing_disk_may_be_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervise, "load_settings", raising(read_by_a_reader(errno.EIO)))
     with pytest.raises(TransientError):
         lived()
 
 
 @pytest.mark.parametrize("limit", [8, 10, 12, 14, 18, 24])
-def test_without_descriptors_the_exit_code_is_never_that_of_bad_configuration(tmp_path, limit):
+def test_without_descriptors_the_exit_code_is_never_that_of_bad_configuration(tmp_path: Path, limit: int) -> None:
     code = (
         "import resource, sys; from runtime.cli import main\n"
         "import runtime.commands.app, runtime.daemon.supervise, runtime.daemon.build\n"
@@ -126,7 +131,7 @@ class Refusing:
         if self._errors:
             raise self._errors.pop(0)
 
-    def read_arrived(self, timeout_s: float):
+    def read_arrived(self, timeout_s: float) -> None:
         raise SensorLost("open it was")
 
     def close(self) -> None:
@@ -134,7 +139,7 @@ class Refusing:
 
 
 @pytest.mark.parametrize(("number", "opened"), [(errno.EMFILE, True), (errno.ENOMEM, True), (errno.ENOENT, False)])
-def test_a_sensor_that_can_not_be_reopened_for_want_of_descriptors_is_tried_again(number, opened):
+def test_a_sensor_that_can_not_be_reopened_for_want_of_descriptors_is_tried_again(number: int, opened: bool) -> None:
     errors: list[Exception] = [read_by_a_reader(number), read_by_a_reader(number)]
     settings = SensorSettings(reopen_backoff_s=0.01, reopen_backoff_max_s=0.02)
     worker = SensorWorker(lambda: Refusing(errors), settings, MonotonicClock())
@@ -153,13 +158,13 @@ def test_a_sensor_that_can_not_be_reopened_for_want_of_descriptors_is_tried_agai
 
 
 @pytest.fixture
-def metrics():
+def metrics() -> Iterator[Metrics]:
     made = Metrics()
     yield made
     made.close()
 
 
-def test_a_thousand_connections_take_a_bounded_number_of_descriptors_and_scrapes_are_answered(metrics):
+def test_a_thousand_connections_take_a_bounded_number_of_descriptors_and_scrapes_are_answered(metrics: Metrics) -> None:
     port = free_port()
     metrics.serve(port)
     code = (
@@ -187,7 +192,9 @@ def test_a_thousand_connections_take_a_bounded_number_of_descriptors_and_scrapes
         crowd.communicate()
 
 
-def test_a_port_that_is_taken_costs_the_figures_and_not_the_display(metrics, caplog):
+def test_a_port_that_is_taken_costs_the_figures_and_not_the_display(
+    metrics: Metrics, caplog: pytest.LogCaptureFixture
+) -> None:
     port = free_port()
     metrics.serve(port)
     with ExitStack() as cleanup:
@@ -195,7 +202,7 @@ def test_a_port_that_is_taken_costs_the_figures_and_not_the_display(metrics, cap
         assert supervise._metrics(0, cleanup) is None
 
 
-def test_what_was_not_measured_has_no_figure(metrics):
+def test_what_was_not_measured_has_no_figure(metrics: Metrics) -> None:
     port = free_port()
     metrics.serve(port)
     told = scraped(port)
@@ -214,7 +221,7 @@ def test_what_was_not_measured_has_no_figure(metrics):
         (b"GET /" + b"x" * 20000, b"503"),
     ],
 )
-def test_whatever_is_asked_gets_one_short_answer(metrics, request_bytes, status):
+def test_whatever_is_asked_gets_one_short_answer(metrics: Metrics, request_bytes: bytes, status: bytes) -> None:
     import socket
 
     port = free_port()
@@ -231,7 +238,7 @@ def test_whatever_is_asked_gets_one_short_answer(metrics, request_bytes, status)
     assert (b"phasestack_" in answer.partition(b"\r\n\r\n")[2]) == request_bytes.startswith(b"GET /metrics")
 
 
-def test_it_is_what_prometheus_expects(metrics):
+def test_it_is_what_prometheus_expects(metrics: Metrics) -> None:
     from prometheus_client.parser import text_string_to_metric_families
 
     port = free_port()

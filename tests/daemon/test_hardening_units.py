@@ -28,14 +28,14 @@ def keys(unit: str) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("unit", DAEMONS)
-def test_what_the_daemon_may_take_of_the_machine_is_bounded(unit):
+def test_what_the_daemon_may_take_of_the_machine_is_bounded(unit: str) -> None:
     found = keys(unit)
     assert 0 < int(found["MemoryMax"][0].removesuffix("%")) < 100
     assert 64 <= int(found["TasksMax"][0]) <= 4096
     assert int(found["CPUWeight"][0]) > 100  # the default: the picture goes first
 
 
-def test_the_presenters_thread_may_take_the_niceness_that_it_wants():
+def test_the_presenters_thread_may_take_the_niceness_that_it_wants() -> None:
     from runtime.support.priority import PRESENTER_NICENESS
 
     assert int(keys("phasestack.service")["LimitNICE"][0]) <= PRESENTER_NICENESS
@@ -43,7 +43,7 @@ def test_the_presenters_thread_may_take_the_niceness_that_it_wants():
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze here")
 @pytest.mark.parametrize("unit", DAEMONS)
-def test_systemd_knows_every_key_and_value(unit, tmp_path):
+def test_systemd_knows_every_key_and_value(unit: str, tmp_path: Path) -> None:
     text = re.sub(r"^(Exec\w+=)\S+", rf"\g<1>{shutil.which('true')}", (UNITS / unit).read_text(), flags=re.MULTILINE)
     (tmp_path / "phasestack-x.service").write_text("[Service]\nExecStart=/bin/true\n")
     copy = tmp_path / "phasestack.service"
@@ -55,7 +55,7 @@ def test_systemd_knows_every_key_and_value(unit, tmp_path):
     assert (done.returncode, done.stderr.strip()) == (0, "")
 
 
-def test_units_image_and_launcher_switch_the_networks_telemetry_off(tmp_path):
+def test_units_image_and_launcher_switch_the_networks_telemetry_off(tmp_path: Path) -> None:
     for unit in DAEMONS:
         assert "ORT_DISABLE_TELEMETRY=1" in keys(unit)["Environment"]
     assert re.search(r"^ENV [^#]*ORT_DISABLE_TELEMETRY=1", (ROOT / "Dockerfile").read_text(), re.MULTILINE | re.DOTALL)
@@ -63,7 +63,7 @@ def test_units_image_and_launcher_switch_the_networks_telemetry_off(tmp_path):
     assert "ORT_DISABLE_TELEMETRY=1" in (tmp_path / "usr/bin/phasestack").read_text()
 
 
-def test_the_installed_onnxruntime_knows_that_switch():
+def test_the_installed_onnxruntime_knows_that_switch() -> None:
     """A name that it does not look for would switch nothing off."""
     import importlib.util
 
@@ -85,7 +85,7 @@ def installed(root: Path, *arguments: str, mask: int = 0o022, **environment: str
 
 @pytest.mark.parametrize("script", ["install.sh", "uninstall.sh"])
 @pytest.mark.parametrize("flag", ["--help", "-h"])
-def test_help_is_help_and_touches_nothing(tmp_path, script, flag):
+def test_help_is_help_and_touches_nothing(tmp_path: Path, script: str, flag: str) -> None:
     (tmp_path / "opt/phasestack").mkdir(parents=True)
     before = sorted(tmp_path.rglob("*"))
     done = subprocess.run(
@@ -101,7 +101,7 @@ def test_help_is_help_and_touches_nothing(tmp_path, script, flag):
 
 
 @pytest.mark.parametrize("script", ["install.sh", "uninstall.sh"])
-def test_an_argument_that_nobody_knows_is_refused_and_nothing_is_touched(tmp_path, script):
+def test_an_argument_that_nobody_knows_is_refused_and_nothing_is_touched(tmp_path: Path, script: str) -> None:
     done = subprocess.run(
         ["sh", str(UNITS / script), "--hlep"],
         env={**os.environ, "DESTDIR": str(tmp_path), "APP": "no"},
@@ -119,7 +119,7 @@ def others_may_read(path: Path) -> bool:
     return bool(mode & stat.S_IROTH) and (not path.is_dir() or bool(mode & stat.S_IXOTH))
 
 
-def test_under_a_narrow_mask_the_services_user_can_read_what_is_installed(tmp_path):
+def test_under_a_narrow_mask_the_services_user_can_read_what_is_installed(tmp_path: Path) -> None:
     root = tmp_path / "tree"
     root.mkdir(mode=0o755)
     done = installed(root, mask=0o077)
@@ -128,7 +128,7 @@ def test_under_a_narrow_mask_the_services_user_can_read_what_is_installed(tmp_pa
 
 
 @pytest.mark.slow
-def test_the_library_too_also_where_an_earlier_one_was_roots_alone(tmp_path):
+def test_the_library_too_also_where_an_earlier_one_was_roots_alone(tmp_path: Path) -> None:
     """The whole program, from the lock with its hashes: minutes."""
     root = tmp_path / "tree"
     (root / "opt/phasestack").mkdir(parents=True)
@@ -157,7 +157,7 @@ def packages(lock: str) -> dict[str, tuple[str, list[str]]]:
 @pytest.mark.parametrize(
     ("lock", "least"), [("runtime.lock", 40), ("page.lock", 6), ("test.lock", 40), ("mutation.lock", 15)]
 )
-def test_every_pin_has_the_hashes_of_its_files(lock, least):
+def test_every_pin_has_the_hashes_of_its_files(lock: str, least: int) -> None:
     found = packages(lock)
     assert len(found) > least
     for name, (version, options) in found.items():
@@ -166,14 +166,14 @@ def test_every_pin_has_the_hashes_of_its_files(lock, least):
         assert len(set(options)) == len(options)
 
 
-def test_all_locks_mean_the_same_files():
+def test_all_locks_mean_the_same_files() -> None:
     runtime, test = packages("runtime.lock") | packages("page.lock"), packages("test.lock")
     assert {name: test.get(name) for name in runtime} == runtime
     mutation = packages("mutation.lock")
     assert {name: test[name] for name in mutation if name in test} == {n: mutation[n] for n in mutation if n in test}
 
 
-def test_torch_alone_is_left_out_and_the_lock_says_why():
+def test_torch_alone_is_left_out_and_the_lock_says_why() -> None:
     assert "torch" not in packages("test.lock")
     text = (LOCKS / "torch.lock").read_text()
     assert text.startswith("#") and "hash" in text
@@ -182,7 +182,7 @@ def test_torch_alone_is_left_out_and_the_lock_says_why():
     assert pin in extras["export"]
 
 
-def test_everything_that_is_declared_is_locked():
+def test_everything_that_is_declared_is_locked() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     test = packages("test.lock") | {"torch": ("2.13.0", [])}
     for requirement in (
@@ -194,7 +194,7 @@ def test_everything_that_is_declared_is_locked():
             assert name in test, requirement
 
 
-def test_a_file_that_is_not_the_one_that_was_meant_is_refused(tmp_path):
+def test_a_file_that_is_not_the_one_that_was_meant_is_refused(tmp_path: Path) -> None:
     """The lock in use: a wheel of a right name and version whose bytes are others."""
     import sys
     import zipfile

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import urllib.request
+from typing import Any
 
 import pytest
 
@@ -12,7 +13,7 @@ from runtime.errors import InputError
 from runtime.records import RefreshAccount, State
 
 
-def account(**changes):
+def account(**changes: Any) -> Any:
     values = {
         "frame": 1, "capture_ns": 1_000_000_000, "predicted_for_ns": 0, "present_ns": 1_062_000_000, "eyes_m": None,
         "eyes_label": "predicted", "eye_sigma_mm": 2.5, "state": State.TRACKING, "solution": 7, "solved_for_m": None,
@@ -29,7 +30,7 @@ def free_port() -> int:
 
 
 @pytest.fixture
-def metrics():
+def metrics() -> Any:
     made = Metrics()
     yield made
     made.close()
@@ -41,7 +42,7 @@ def scraped(port: int) -> dict[str, float]:
     return {name: float(value) for name, value in (line.rsplit(" ", 1) for line in lines if not line.startswith("#"))}
 
 
-def test_refreshes_solutions_stages_faults_and_state_are_told(metrics):
+def test_refreshes_solutions_stages_faults_and_state_are_told(metrics: Metrics) -> None:
     port = free_port()
     metrics.serve(port)
     metrics.refresh(account())
@@ -66,7 +67,7 @@ def test_refreshes_solutions_stages_faults_and_state_are_told(metrics):
     assert told["phasestack_missed_blanks_total"] == 2
 
 
-def test_nothing_is_told_that_was_not_measured(metrics):
+def test_nothing_is_told_that_was_not_measured(metrics: Metrics) -> None:
     """No gauge stands at 0.0 for a quality that nobody looked at, and no rate is a mean since the start."""
     port = free_port()
     metrics.serve(port)
@@ -77,7 +78,7 @@ def test_nothing_is_told_that_was_not_measured(metrics):
     assert not [name for name in told if "psnr" in name or "fps" in name or "per_second" in name]
 
 
-def test_a_refresh_that_reached_no_panel_parts_two_intervals(metrics):
+def test_a_refresh_that_reached_no_panel_parts_two_intervals(metrics: Metrics) -> None:
     port = free_port()
     metrics.serve(port)
     for number, presented in enumerate([True, False, True, True]):
@@ -85,12 +86,12 @@ def test_a_refresh_that_reached_no_panel_parts_two_intervals(metrics):
     assert scraped(port)["phasestack_interval_milliseconds_count"] == 1
 
 
-def test_it_listens_on_loopback_only(metrics):
+def test_it_listens_on_loopback_only(metrics: Metrics) -> None:
     metrics.serve(free_port())
     assert metrics.address[0] == LOOPBACK
 
 
-def test_a_port_that_is_taken_is_named(metrics):
+def test_a_port_that_is_taken_is_named(metrics: Metrics) -> None:
     with socket.socket() as other:
         other.bind((LOOPBACK, 0))
         other.listen()
@@ -98,7 +99,7 @@ def test_a_port_that_is_taken_is_named(metrics):
             metrics.serve(other.getsockname()[1])
 
 
-def test_after_closing_nobody_listens(metrics):
+def test_after_closing_nobody_listens(metrics: Metrics) -> None:
     port = free_port()
     metrics.serve(port)
     metrics.close()

@@ -117,7 +117,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
 SCENE, MODEL = {"content": {"scene": "sparse"}}, {"model": {"name": "balanced"}}
 
 
-def test_a_scene_is_taken_over_and_the_one_before_is_closed(bench):
+def test_a_scene_is_taken_over_and_the_one_before_is_closed(bench: Bench) -> None:
     before = bench.state
     change = bench.change(settings(**SCENE))
     assert not change.finished
@@ -130,7 +130,7 @@ def test_a_scene_is_taken_over_and_the_one_before_is_closed(bench):
     bench.solve()
 
 
-def test_a_model_is_taken_over_and_the_one_before_is_closed(bench):
+def test_a_model_is_taken_over_and_the_one_before_is_closed(bench: Bench) -> None:
     before = bench.state
     change = bench.change(settings(**MODEL))
     bench.advance(change)
@@ -140,7 +140,7 @@ def test_a_model_is_taken_over_and_the_one_before_is_closed(bench):
     bench.solve()
 
 
-def test_settings_alone_load_nothing_and_are_taken_over_at_the_next_step(bench):
+def test_settings_alone_load_nothing_and_are_taken_over_at_the_next_step(bench: Bench) -> None:
     before = bench.state
     change = bench.change(settings(tracker={"hold_s": 2.0}))
     assert change.advance(bench.parts) is True
@@ -149,7 +149,7 @@ def test_settings_alone_load_nothing_and_are_taken_over_at_the_next_step(bench):
     assert (bench.models, bench.contents) == ([], [])
 
 
-def test_all_of_a_change_is_one_new_state(bench, tmp_path):
+def test_all_of_a_change_is_one_new_state(bench: Bench, tmp_path: Path) -> None:
     before = bench.state
     change = bench.change(settings(**SCENE, **MODEL, tracker={"hold_s": 2.0}))
     bench.advance(change)
@@ -158,7 +158,7 @@ def test_all_of_a_change_is_one_new_state(bench, tmp_path):
     assert bench.state.settings.tracker.hold_s == 2.0
 
 
-def test_nothing_changes_until_all_of_it_is_ready(bench):
+def test_nothing_changes_until_all_of_it_is_ready(bench: Bench) -> None:
     bench.gate.clear()
     before = bench.state
     change = bench.change(settings(**SCENE, **MODEL))
@@ -176,7 +176,7 @@ def test_nothing_changes_until_all_of_it_is_ready(bench):
 BAD = {"content": {"scene": "no-such-scene"}}
 
 
-def test_where_a_part_can_t_be_had_everything_stays_and_what_was_loaded_is_closed(bench):
+def test_where_a_part_can_t_be_had_everything_stays_and_what_was_loaded_is_closed(bench: Bench) -> None:
     before = bench.state
     change = bench.change(settings(**BAD, **MODEL))
     bench.advance(change)
@@ -188,7 +188,7 @@ def test_where_a_part_can_t_be_had_everything_stays_and_what_was_loaded_is_close
     bench.solve()
 
 
-def test_a_model_that_can_t_be_had_leaves_the_scene_as_it_was_and_closes_the_new_one(bench):
+def test_a_model_that_can_t_be_had_leaves_the_scene_as_it_was_and_closes_the_new_one(bench: Bench) -> None:
     before = bench.state
     change = bench.change(settings(**SCENE, model={"name": "nothing.onnx"}))
     bench.advance(change)
@@ -198,7 +198,7 @@ def test_a_model_that_can_t_be_had_leaves_the_scene_as_it_was_and_closes_the_new
     bench.solve()
 
 
-def test_a_bad_calibration_is_refused_before_anything_is_loaded(bench, tmp_path):
+def test_a_bad_calibration_is_refused_before_anything_is_loaded(bench: Bench, tmp_path: Path) -> None:
     path = Path(tmp_path / "bad.toml")
     path.write_text("stack_from_sensor = 3\n")
     with pytest.raises(InputError, match="stack_from_sensor"):
@@ -206,7 +206,7 @@ def test_a_bad_calibration_is_refused_before_anything_is_loaded(bench, tmp_path)
     assert (bench.models, bench.contents) == ([], [])
 
 
-def test_another_calibration_is_part_of_the_new_state(bench, tmp_path):
+def test_another_calibration_is_part_of_the_new_state(bench: Bench, tmp_path: Path) -> None:
     path = tmp_path / "calibration.toml"
     path.write_text("stack_from_sensor = [[1.0,0.0,0.0,0.5],[0.0,1.0,0.0,0.0],[0.0,0.0,1.0,0.0],[0.0,0.0,0.0,1.0]]\n")
     bench.advance(bench.change(settings(calibration={"file": str(path)})))
@@ -214,7 +214,7 @@ def test_another_calibration_is_part_of_the_new_state(bench, tmp_path):
 
 
 @pytest.mark.parametrize("when", ["at once", "when the scene is there", "when all is there"])
-def test_what_is_no_longer_wanted_is_closed_and_changes_nothing(bench, when):
+def test_what_is_no_longer_wanted_is_closed_and_changes_nothing(bench: Bench, when: str) -> None:
     before = bench.state
     bench.gate.clear()
     change = bench.change(settings(**SCENE, **MODEL))
@@ -234,13 +234,13 @@ def test_what_is_no_longer_wanted_is_closed_and_changes_nothing(bench, when):
     bench.solve()
 
 
-def test_the_same_scene_is_read_again_where_that_is_asked_for(bench):
+def test_the_same_scene_is_read_again_where_that_is_asked_for(bench: Bench) -> None:
     bench.advance(bench.change(settings(), reload_content=True))
     assert bench.state.content is bench.contents[0]
     assert bench.first_content.closed == 1
 
 
-def test_what_is_decided_anew_for_every_solution_loads_no_model(bench):
+def test_what_is_decided_anew_for_every_solution_loads_no_model(bench: Bench) -> None:
     before = bench.state
     change = bench.change(settings(model={"eye_sigma_mm": 2.0}))
     assert change.advance(bench.parts) is True
@@ -248,7 +248,7 @@ def test_what_is_decided_anew_for_every_solution_loads_no_model(bench):
     assert bench.models == []
 
 
-def test_after_a_change_the_next_step_solves_with_it(bench):
+def test_after_a_change_the_next_step_solves_with_it(bench: Bench) -> None:
     first = bench.solve()
     bench.advance(bench.change(settings(**SCENE)))
     second = bench.solve()

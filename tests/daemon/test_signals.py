@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import os
 import signal
+from typing import Any
 
 import pytest
 
 from runtime.daemon.signals import Signals
 
 
-def send(number):
+def send(number: Any) -> None:
     os.kill(os.getpid(), number)
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGINT"])
-def test_being_asked_to_stop_is_remembered_by_name(name):
+def test_being_asked_to_stop_is_remembered_by_name(name: str) -> None:
     with Signals() as signals:
         assert signals.stop == ""
         send(getattr(signal, name))
         assert signals.stop == name
 
 
-def test_a_burst_of_hangups_is_one_reload():
+def test_a_burst_of_hangups_is_one_reload() -> None:
     with Signals() as signals:
         send(signal.SIGHUP)
         send(signal.SIGHUP)
@@ -31,7 +32,7 @@ def test_a_burst_of_hangups_is_one_reload():
         assert not signals.stop
 
 
-def test_a_second_interrupt_interrupts():
+def test_a_second_interrupt_interrupts() -> None:
     with Signals() as signals:
         send(signal.SIGINT)
         with pytest.raises(KeyboardInterrupt):
@@ -39,7 +40,7 @@ def test_a_second_interrupt_interrupts():
         assert signals.stop == "SIGINT"
 
 
-def test_the_handlers_before_are_back_afterwards():
+def test_the_handlers_before_are_back_afterwards() -> None:
     before = signal.getsignal(signal.SIGTERM)
     with Signals():
         assert signal.getsignal(signal.SIGTERM) != before

@@ -5,7 +5,7 @@ from __future__ import annotations
 from tests.soak import soak
 
 
-def test_nothing_piles_up_and_no_refresh_is_lost_while_parts_are_lost_and_changed():
+def test_nothing_piles_up_and_no_refresh_is_lost_while_parts_are_lost_and_changed() -> None:
     result = soak(1200, warm=400, fault_every=100, change_every=60, least_changes=4)
     assert result.frames >= 1200
     assert result.faults["panel"] >= 4

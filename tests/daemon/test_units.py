@@ -39,7 +39,7 @@ def with_programs_that_exist(unit: str, folder: Path) -> Path:
 
 @with_systemd
 @pytest.mark.parametrize("unit", SYSTEM)
-def test_systemd_finds_nothing_wrong_with_the_system_units(unit, tmp_path):
+def test_systemd_finds_nothing_wrong_with_the_system_units(unit: str, tmp_path: Path) -> None:
     for each in SYSTEM:
         with_programs_that_exist(each, tmp_path)
     result = run("systemd-analyze", "verify", "--man=no", str(tmp_path / unit))
@@ -48,7 +48,7 @@ def test_systemd_finds_nothing_wrong_with_the_system_units(unit, tmp_path):
 
 
 @with_systemd
-def test_systemd_finds_nothing_wrong_with_the_user_unit(tmp_path):
+def test_systemd_finds_nothing_wrong_with_the_user_unit(tmp_path: Path) -> None:
     copy = with_programs_that_exist("phasestack-user.service", tmp_path)
     result = run("systemd-analyze", "--user", "verify", "--man=no", str(copy), XDG_RUNTIME_DIR=str(tmp_path))
     assert (result.returncode, result.stderr.strip()) == (0, "")
@@ -56,7 +56,7 @@ def test_systemd_finds_nothing_wrong_with_the_user_unit(tmp_path):
 
 @with_systemd
 @pytest.mark.parametrize("unit", SYSTEM)
-def test_exposure_stays_below_what_the_manual_states(unit):
+def test_exposure_stays_below_what_the_manual_states(unit: str) -> None:
     threshold = EXPOSURE_MAX[unit]
     result = run(
         "systemd-analyze", "security", "--offline=yes", f"--threshold={round(threshold * 10)}", str(UNITS / unit)
@@ -78,7 +78,7 @@ def keys(unit: str) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("unit", ["phasestack.service", "phasestack-user.service"])
-def test_the_daemon_is_watched_and_restarted_with_limits(unit):
+def test_the_daemon_is_watched_and_restarted_with_limits(unit: str) -> None:
     unit_keys = keys(unit)
     assert unit_keys["Type"] == ["notify"]
     assert unit_keys["Restart"] == ["on-failure"]
@@ -89,14 +89,14 @@ def test_the_daemon_is_watched_and_restarted_with_limits(unit):
     )
 
 
-def test_the_socket_of_the_defaults_lies_in_the_units_runtime_folder():
+def test_the_socket_of_the_defaults_lies_in_the_units_runtime_folder() -> None:
     settings = ServiceSettings()
     unit_keys = keys("phasestack.service")
     assert Path(settings.socket).parent == Path("/run") / unit_keys["RuntimeDirectory"][0]
     assert settings.group == unit_keys["Group"][0]
 
 
-def test_the_daemon_finds_the_kiosks_x_server():
+def test_the_daemon_finds_the_kiosks_x_server() -> None:
     daemon, server = keys("phasestack.service"), keys("phasestack-x.service")
     environment = dict(entry.split("=", 1) for entry in daemon["Environment"])
     assert f" {environment['DISPLAY']} " in server["ExecStart"][0]
@@ -104,7 +104,7 @@ def test_the_daemon_finds_the_kiosks_x_server():
     assert environment["XAUTHORITY"] in server["ExecStartPre"][0]
 
 
-def test_the_udev_rules_are_those_of_the_known_devices():
+def test_the_udev_rules_are_those_of_the_known_devices() -> None:
     spec = importlib.util.spec_from_file_location("make_udev_rules", UNITS / "make_udev_rules.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -114,7 +114,7 @@ def test_the_udev_rules_are_those_of_the_known_devices():
         assert f'ATTR{{idVendor}}=="{device.vendor_id:04x}", ATTR{{idProduct}}=="{device.product_id:04x}"' in text
 
 
-def test_the_installed_configuration_is_valid():
+def test_the_installed_configuration_is_valid() -> None:
     load_settings(UNITS / "phasestack.toml")
     commented = (UNITS / "phasestack.toml").read_text()
     for line in commented.splitlines():
@@ -125,7 +125,7 @@ def test_the_installed_configuration_is_valid():
 
 
 @with_systemd
-def test_sysusers_and_tmpfiles_make_the_user_and_its_folders(tmp_path):
+def test_sysusers_and_tmpfiles_make_the_user_and_its_folders(tmp_path: Path) -> None:
     if os.getuid() != 0:
         pytest.skip("only root can give folders away")
     install(tmp_path)
@@ -146,7 +146,7 @@ def files(root: Path) -> set[str]:
     return {str(path.relative_to(root)) for path in root.rglob("*") if path.is_file()}
 
 
-def test_the_installer_writes_below_destdir_and_the_uninstaller_takes_it_away(tmp_path):
+def test_the_installer_writes_below_destdir_and_the_uninstaller_takes_it_away(tmp_path: Path) -> None:
     result = install(tmp_path)
     assert result.returncode == 0, result.stderr
     installed = files(tmp_path)
@@ -169,7 +169,7 @@ def test_the_installer_writes_below_destdir_and_the_uninstaller_takes_it_away(tm
     assert files(tmp_path) == set()
 
 
-def test_installing_again_keeps_the_operators_configuration(tmp_path):
+def test_installing_again_keeps_the_operators_configuration(tmp_path: Path) -> None:
     install(tmp_path)
     mine = tmp_path / "etc/phasestack/phasestack.toml"
     mine.write_text("# mine\n")
@@ -177,7 +177,7 @@ def test_installing_again_keeps_the_operators_configuration(tmp_path):
     assert mine.read_text() == "# mine\n"
 
 
-def test_every_program_that_a_unit_starts_is_installed(tmp_path):
+def test_every_program_that_a_unit_starts_is_installed(tmp_path: Path) -> None:
     install(tmp_path)
     for unit in SYSTEM:
         for key, values in keys(unit).items():
@@ -186,7 +186,7 @@ def test_every_program_that_a_unit_starts_is_installed(tmp_path):
                 assert program == "/usr/bin/Xorg" or (tmp_path / program.lstrip("/")).exists()
 
 
-def test_the_installer_refuses_an_old_or_missing_python(tmp_path):
+def test_the_installer_refuses_an_old_or_missing_python(tmp_path: Path) -> None:
     result = install(tmp_path, PYTHON="no-such-python")
     assert result.returncode == 2
     assert "no-such-python" in result.stderr
@@ -194,13 +194,13 @@ def test_the_installer_refuses_an_old_or_missing_python(tmp_path):
 
 @pytest.mark.skipif(shutil.which("shellcheck") is None, reason="no shellcheck here")
 @pytest.mark.parametrize("script", ["install.sh", "uninstall.sh", "x-authority"])
-def test_the_shell_scripts_are_clean(script):
+def test_the_shell_scripts_are_clean(script: str) -> None:
     result = run("shellcheck", str(UNITS / script))
     assert result.returncode == 0, result.stdout
 
 
 @pytest.mark.skipif(shutil.which("xauth") is None or shutil.which("mcookie") is None, reason="no xauth or mcookie here")
-def test_the_authority_file_is_fresh_each_time_and_the_groups_alone(tmp_path):
+def test_the_authority_file_is_fresh_each_time_and_the_groups_alone(tmp_path: Path) -> None:
     file = tmp_path / "authority"
     cookies = []
     for _ in range(2):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import pytest
 
@@ -10,7 +11,7 @@ from model_export.export import ExportRequest, eyereal_model
 from runtime.errors import InputError
 
 
-def test_a_checkpoint_that_becomes_a_fifo_is_refused(tmp_path, monkeypatch):
+def test_a_checkpoint_that_becomes_a_fifo_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is read twice: the weights, and what they are told by."""
     path = tmp_path / "a.pth"
     os.mkfifo(path)
