@@ -87,8 +87,8 @@ def test_every_stage_has_its_impostors_and_they_fail_most_of_its_cases(record: t
     assert {name.partition(":")[0] for name in found} == STAGES
     for name in (
         "solve: an operator of zeros", "solve: grey layers", "solve: one eye alone", "solve: mean of targets",
-        "network: mean of targets", "network: grey layers", "tracker: repeats its first sample",
-        "calibration: no shift", "retina: grey, and 30 dB",
+        "network: mean of targets", "network: grey layers", "network: eyes always straight ahead",
+        "tracker: repeats its first sample", "calibration: no shift", "retina: grey, and 30 dB",
     ):  # fmt: skip
         assert found[name]["forward_error"] <= 0.5, found[name]["note"]
 

@@ -20,6 +20,7 @@ from runtime.optics.views import image_from_stack
 from runtime.records import F32, F64, U8
 from runtime.report.baselines import EyeOperator, as_codes, conjugate_gradients, eye_operator, mean_of_targets
 from runtime.report.eyesight import as_intensity
+from runtime.report.pairs import eyes_at
 from runtime.report.stability import calibration, networks, phases, poses, retina, rpu, solve, tracking, uncertainty
 from runtime.report.stability.calibration import Fit
 from runtime.report.stability.limits import key_of
@@ -142,6 +143,11 @@ def mean_network(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStac
     return as_codes(mean_of_targets(eyes_m, wanted, stack, fov_deg=networks.FOV_DEG))
 
 
+def one_place_network(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack) -> U8:
+    """(N, h, w, 3) what eyes straight ahead should be shown, wherever the eyes are."""
+    return networks.predicted(model, images, eyes_at(distance_m=0.6), stack)
+
+
 def even_answer(model: str, need: F64, doubt: uncertainty.Doubt) -> F64:
     """Both outer panels half way, whatever is wanted."""
     cell = 2 * uncertainty.loaded(model).session.contract.cell_px
@@ -230,7 +236,11 @@ def controls(fits: Mapping[str, Fit]) -> Iterator[Control]:
         yield Control(
             solve.STAGE, name, partial(_recorded, partial(solve.trials, solve.Solvers(methods=solved_by(method))))
         )
-    for name, predict in (("grey layers", grey_network), ("mean of targets", mean_network)):
+    for name, predict in (
+        ("grey layers", grey_network),
+        ("mean of targets", mean_network),
+        ("eyes always straight ahead", one_place_network),
+    ):
         yield Control(networks.STAGE, name, partial(networks.picture_trials, predict))
     yield Control(uncertainty.STAGE, "even panels", partial(uncertainty.trials, even_answer, even_panels))
     sure = partial(uncertainty.trials, sure_answer, sure_panels)

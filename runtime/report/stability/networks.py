@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -26,7 +27,7 @@ STAGE = "network"
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
 FOV_DEG = 40.0
 MODELS = ("fast", "balanced", "best")
-
+PLACES = ((0.7, 15.0), (0.9, -25.0), (0.45, 10.0), (1.5, -35.0))  # metres and degrees; pictures are seen from in turn
 
 RAYS = 150  # of each eye, traced
 FLOOR = 0.0005  # an eighth of a code: what another processor's rounding may move
@@ -213,10 +214,10 @@ def solver(model: str) -> Method:
 
 def picture_trials(predict: Predict = predicted, *, full: bool = False) -> Iterator[Trial]:
     """Every case of what a model makes of two pictures; `full`: on every pose for each model, and on 4K panels."""
-    eyes = eyes_at(distance_m=0.6)
     for model in MODELS:
-        for kind in KINDS:
-            run = partial(stressed, predict, model, pictures(kind), eyes)
+        for kind, (distance_m, angle_deg) in zip(KINDS, itertools.cycle(PLACES), strict=False):
+            seen_from = eyes_at(distance_m=distance_m, angle_deg=angle_deg)
+            run = partial(stressed, predict, model, pictures(kind), seen_from)
             yield Trial(STAGE, f"{model}: {kind}", run, measure="intensity", recorded=True, floor=FLOOR)
         run = partial(scored, predict, model)
         yield Trial(STAGE, f"{model}: what is seen of its layers", run, measure="intensity")
