@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from runtime.optics.pupil import POINT_MM
+from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8, Layers, pixels_of
 
@@ -76,7 +76,9 @@ class Predictor(ABC):
         return tuple((slice(0, raster.height_px), slice(0, raster.width_px)) for raster in self.rasters(eyes_m))
 
     @abstractmethod
-    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> Prediction:
+    def predict(
+        self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = PUPIL_SIGMA_MM
+    ) -> Prediction:
         """Layers for `images[eye][raster]`, (h, w, 4) RGBA, left eye first, drawn on `rasters(eyes_m)`.
 
         eye_sigma_mm: standard deviation, an axis, of where light enters the eyes, common to both, to the right and

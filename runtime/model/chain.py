@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from math import atanh, ceil, sqrt
+from math import atanh, ceil, inf, sqrt
 from typing import Any
 
 import numpy as np
@@ -111,48 +111,88 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
     rows high and sheared along the line of the eyes. It covers what both see of all panels, and a margin.
     Raises ValueError where the eyes have no horizontal separation.
     """
-    between, half = eyes_m.mean(axis=0), (eyes_m[1] - eyes_m[0]) / 2
-    plane_m = _equal_parallax_m(stack, between[0])
-    ahead_m, nearer_m = between[0] - plane_m, half[0]
-    middle = between - half * (nearer_m / ahead_m)
-    low, high = _common_extent(middle, stack, plane_m=plane_m, axis=1)
-    bottom, top = _panel_extent(middle, stack, plane_m=plane_m)
-    # The line of the eyes meets the plane at F = towards / nearer, anywhere up to infinity.
-    towards = nearer_m * between[1:] - ahead_m * half[1:]
-    from_f = nearer_m * np.array([low + high, bottom + top]) / 2 - towards
-    by_column = (stack.x_m[-1] - plane_m) / (middle[0] - stack.x_m[-1]) / (cell_px * ahead_m)
-    if abs(from_f[0] * by_column) < 1e-12:
+    between_m, half_m = eyes_m.mean(axis=0), (eyes_m[1] - eyes_m[0]) / 2
+    plane_m = _equal_parallax_m(stack, between_m[0])
+    ahead_m = between_m[0] - plane_m
+    middle_m = between_m - half_m * (half_m[0] / ahead_m)
+    window = _Window(
+        *_common_extent(middle_m, stack, plane_m=plane_m, axis=1), *_panel_extent(middle_m, stack, plane_m=plane_m)
+    )
+    line = _line_of_eyes(between_m, half_m, plane_m=plane_m, window=window)
+    per_column = (stack.x_m[-1] - plane_m) / (middle_m[0] - stack.x_m[-1]) / (cell_px * ahead_m)
+    column_m = abs(line.from_f_m2[0] * per_column)  # in the window's middle
+    if column_m < 1e-12:
         raise ValueError("the line of the eyes is vertical or has no length")
-    half_m = (high - low) / 2
-    ratio = half_m * nearer_m / from_f[0]
-    if abs(ratio) > NEAREST_F:
-        ratio, nearer_m, towards = 0.0, 0.0, -from_f
-    elif abs(ratio) < FARTHEST_F:  # level eyes keep level rows, which are sampled better
-        ratio, nearer_m, towards = 0.0, 0.0, -ahead_m * half[1:]
-        from_f = -towards
-    half_columns = half_m / abs(from_f[0] * by_column) * (atanh(ratio) / ratio if ratio else 1.0)
-    cells = ceil(half_columns / cell_px) + 1
-    cells = min(CELLS_MAX, CELLS_STEP * ceil(cells / CELLS_STEP))
-    width = cells * 2 * cell_px
-    bend, (bend_y_m, bend_z_m) = nearer_m * by_column, towards * by_column
-    columns = ColumnLaw(float(bend), width / 2)
-    middle_y = (low + high) / 2 - half_m * ratio / (1 + sqrt(1 - ratio * ratio))
-    pitch_v_m = (top - bottom) / (stack.height_px / reduction)
+    half_columns = window.half_width_m / column_m * (atanh(line.nearness) / line.nearness if line.nearness else 1.0)
+    cells = CELLS_STEP * ceil((ceil(half_columns / cell_px) + 1) / CELLS_STEP)
+    cells = min(CELLS_MAX, cells)
+    middle_column = cells * cell_px
+    bend, (bend_y_m, bend_z_m) = line.nearer_m * per_column, line.towards_f_m2 * per_column
+    columns = ColumnLaw(float(bend), float(middle_column))
     # In the raster's middle, what is to be seen at either end of its rows.
-    ends = columns.homography_from_column(np.array([0.0, width])) - width / 2
-    reached = [z * (1 - bend * end) + bend_z_m * end for z in (bottom, top) for end in ends]
-    rise_m = max(reached) - min(reached) - (top - bottom)
-    step = ROWS_STEP if rise_m / pitch_v_m > 0.01 else BLOCK_ROWS
-    rows = step * ceil((stack.height_px / reduction + rise_m / pitch_v_m) / step)
-    middle_z = (min(reached) + max(reached)) / 2
+    ends = columns.homography_from_column(np.array([0.0, 2.0 * middle_column])) - middle_column
+    reached_m = [z * (1 - bend * end) + bend_z_m * end for z in (window.bottom_m, window.top_m) for end in ends]
+    row_m = window.height_m / (stack.height_px / reduction)
+    rise_rows = (max(reached_m) - min(reached_m) - window.height_m) / row_m
+    step = ROWS_STEP if rise_rows > 0.01 else BLOCK_ROWS
+    rows = step * ceil((stack.height_px / reduction + rise_rows) / step)
+    middle_y_m = window.middle_m[0] - window.half_width_m * line.nearness / (1 + sqrt(1 - line.nearness**2))
+    middle_z_m = (min(reached_m) + max(reached_m)) / 2
     plane_from_raster = np.array(
         [
-            [-bend_y_m, 0.0, middle_y + bend_y_m * width / 2],
-            [-bend_z_m, -pitch_v_m, middle_z + pitch_v_m * rows / 2 + bend_z_m * width / 2],
-            [-bend, 0.0, 1.0 + bend * width / 2],
+            [-bend_y_m, 0.0, middle_y_m + bend_y_m * middle_column],
+            [-bend_z_m, -row_m, middle_z_m + row_m * rows / 2 + bend_z_m * middle_column],
+            [-bend, 0.0, 1.0 + bend * middle_column],
         ]
     )
-    return ChainFrame(plane_m, plane_from_raster, columns, cells, cell_px, rows, middle)
+    return ChainFrame(plane_m, plane_from_raster, columns, cells, cell_px, rows, middle_m)
+
+
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """What a raster covers of its plane, metres; frame `stack`."""
+
+    low_m: float  # along y
+    high_m: float
+    bottom_m: float  # along z
+    top_m: float
+
+    @property
+    def half_width_m(self) -> float:
+        return (self.high_m - self.low_m) / 2
+
+    @property
+    def height_m(self) -> float:
+        return self.top_m - self.bottom_m
+
+    @property
+    def middle_m(self) -> F64:
+        """(2,) y, z."""
+        return np.array([self.low_m + self.high_m, self.bottom_m + self.top_m]) / 2
+
+
+@dataclass(frozen=True, slots=True)
+class _LineOfEyes:
+    """Where the line through the eyes meets the plane: F = towards_f_m2 / nearer_m, anywhere up to infinity."""
+
+    nearer_m: float  # half of what the right eye is farther from the plane than the left; 0 where F counts as infinite
+    towards_f_m2: F64  # (2,) y, z
+    from_f_m2: F64  # (2,) from F to the window's middle, by nearer_m
+    nearness: float  # the window's half width by its middle's distance from F; 0 where F counts as infinite
+
+
+def _line_of_eyes(between_m: F64, half_m: F64, *, plane_m: float, window: _Window) -> _LineOfEyes:
+    """For eyes at between_m -+ half_m (3,). F counts as infinite where it is within the window or close, or far off."""
+    nearer_m, ahead_m = float(half_m[0]), between_m[0] - plane_m
+    towards = nearer_m * between_m[1:] - ahead_m * half_m[1:]
+    from_f = nearer_m * window.middle_m - towards
+    nearness = window.half_width_m * nearer_m / from_f[0] if from_f[0] else inf
+    if abs(nearness) > NEAREST_F:
+        return _LineOfEyes(0.0, -from_f, from_f, 0.0)
+    if abs(nearness) < FARTHEST_F:  # level eyes keep level rows, which are sampled better
+        level = -ahead_m * half_m[1:]
+        return _LineOfEyes(0.0, level, -level, 0.0)
+    return _LineOfEyes(nearer_m, towards, from_f, float(nearness))
 
 
 def _equal_parallax_m(stack: PanelStack, eye_x_m: float) -> float:

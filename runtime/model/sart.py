@@ -18,7 +18,7 @@ from runtime.model.base import Prediction, Predictor
 from runtime.model.resample import target_from_source
 from runtime.model.timing import Stopwatch
 from runtime.optics.malus import phase_from_intensity
-from runtime.optics.pupil import POINT_MM
+from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen, layer_pixels_from_seen
 from runtime.records import F32, F64, U8
@@ -41,7 +41,9 @@ class SartPredictor(Predictor):
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         return (self.stack.panel(self.stack.count // 2),)
 
-    def predict(self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> Prediction:
+    def predict(
+        self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = PUPIL_SIGMA_MM
+    ) -> Prediction:
         watch = Stopwatch()
         stack = self.stack
         table = phase_from_intensity(np.arange(256, dtype=np.float32) / np.float32(255)).astype(np.float32)

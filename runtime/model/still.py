@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from runtime.model.base import Prediction, Predictor
-from runtime.optics.pupil import POINT_MM
+from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack
 from runtime.records import F64, U8
@@ -23,7 +23,7 @@ def solve_still(
     eyes_m: F64,
     fov_deg: float,
     predictor: Predictor,
-    eye_sigma_mm: float = POINT_MM,
+    eye_sigma_mm: float = PUPIL_SIGMA_MM,
 ) -> Prediction:
     """Layers for two pictures (h, w, 3 or 4) that a left and a right eye (2, 3), frame `stack`, should see.
 

@@ -24,7 +24,7 @@ from runtime.model.schedule import Answer, Backend, Picture, Problem, Surround, 
 from runtime.model.session import ModelSession
 from runtime.model.timing import Stopwatch
 from runtime.model.visible import visible_boxes
-from runtime.optics.pupil import POINT_MM
+from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8
@@ -90,7 +90,7 @@ class UnrolledPredictor(Predictor):
         return (visible_boxes(eyes_m, self.stack)[CENTRE].slices,)
 
     def predict(
-        self, images: Sequence[Sequence[Picture]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM
+        self, images: Sequence[Sequence[Picture]], eyes_m: F64, *, eye_sigma_mm: float = PUPIL_SIGMA_MM
     ) -> Prediction:
         across_m = np.abs(eyes_m[1] - eyes_m[0])
         if across_m[2] > across_m[1]:

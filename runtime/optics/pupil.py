@@ -6,7 +6,7 @@ import math
 from typing import Literal
 
 PUPIL_DIAMETERS = 4.0  # a disc's standard deviation along an axis is a quarter of its diameter
-POINT_MM = 1.0  # where nobody tells: the pupil alone, 4 mm wide
+PUPIL_SIGMA_MM = 1.0  # where nobody tells: the pupil alone, 4 mm wide
 
 
 def combined_sigma_mm(*, pupil_mm: float, tracker_sigma_m: float) -> float:

@@ -23,7 +23,7 @@ from runtime.model.pyramid_level import NEUTRAL
 from runtime.model.schedule import Backend, Picture
 from runtime.model.transfer import SUBCODE, phase_codes, pre_emphasised
 from runtime.model.unrolled import UnrolledPredictor
-from runtime.optics.pupil import POINT_MM
+from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import raster_from_stack
@@ -134,7 +134,7 @@ class FocusedPredictor(Predictor):
         )
 
     def predict(
-        self, images: Sequence[Sequence[Picture]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM
+        self, images: Sequence[Sequence[Picture]], eyes_m: F64, *, eye_sigma_mm: float = PUPIL_SIGMA_MM
     ) -> Prediction:
         begin_ns = perf_counter_ns()
         left, right = images[0][0], images[1][0]

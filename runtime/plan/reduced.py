@@ -13,7 +13,7 @@ import numpy as np
 from runtime.config import Settings
 from runtime.model.predictor import Prediction, Predictor
 from runtime.model.schedule import Backend
-from runtime.optics.pupil import POINT_MM
+from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.plan.predictors import planned_predictor
 from runtime.records import F64
@@ -51,7 +51,9 @@ class ReducedPredictor(Predictor):
     def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
         return self.small.windows(eyes_m)
 
-    def predict(self, images: Sequence[Sequence[Any]], eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> Prediction:
+    def predict(
+        self, images: Sequence[Sequence[Any]], eyes_m: F64, *, eye_sigma_mm: float = PUPIL_SIGMA_MM
+    ) -> Prediction:
         solved = self.small.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
         begin_ns = perf_counter_ns()
         size = (self.stack.width_px, self.stack.height_px)

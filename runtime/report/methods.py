@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from runtime.model.backends import Wanted
-from runtime.optics.pupil import POINT_MM
+from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.records import U8
 from runtime.report.pairs import StillPair
 
@@ -30,7 +30,7 @@ class Method:
     kind: Kind
     source: str  # `cg`, `filter`, `mean`, `sart`, or what `load_predictor` takes
     iterations: int = 0
-    eye_sigma_mm: float = POINT_MM  # that networks solve for
+    eye_sigma_mm: float = PUPIL_SIGMA_MM  # that networks solve for
     scale: float = 1.0  # a network works at this share of the panels' columns and rows; its layers are enlarged
     backend: Wanted = "opencv"  # what surrounds a network
     trained: bool = True  # where not, time and memory are the network's, its picture is nobody's

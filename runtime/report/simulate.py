@@ -14,7 +14,7 @@ from runtime.config import ModelSettings
 from runtime.errors import ModelFailure
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.optics.carried import expected_psnrs_db
-from runtime.optics.pupil import POINT_MM
+from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import drawn_for
 from runtime.records import F64, U8
@@ -39,7 +39,7 @@ class Simulation:
         self.painter.__exit__()
         self.predictor.close()
 
-    def layers(self, eyes_m: F64, *, eye_sigma_mm: float = POINT_MM) -> U8 | None:
+    def layers(self, eyes_m: F64, *, eye_sigma_mm: float = PUPIL_SIGMA_MM) -> U8 | None:
         """Layers for two eyes, drawn straight into the model's rasters as the daemon does; None: it refuses them."""
         images = drawn_for(self.predictor, self.painter.content, eyes_m, time_ns=0)
         try:
