@@ -240,11 +240,3 @@ def _kind(mode: int) -> str:
 
 def _size(count: int) -> str:
     return f"{count / MIB:.1f} MiB" if count >= MIB else f"{count} bytes"
-
-
-def bounded(file: IO[bytes], *, most_bytes: int, source: str | Path, field: str = "") -> bytes:
-    """What is left in a stream, refused where it is more than `most_bytes`: for what is unpacked."""
-    data = file.read(most_bytes + 1)
-    if len(data) > most_bytes:
-        raise InputError(source, field, f"unpacks to more than {_size(most_bytes)}")
-    return data

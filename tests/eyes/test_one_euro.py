@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from runtime.eyes.one_euro import OneEuro, smoothing
+from tests.eyes.one_euro import OneEuro, smoothing
 
 
 def filtered(path: NDArray[np.float64], *, rate_hz: float = 60.0, **options: float) -> NDArray[np.float64]:

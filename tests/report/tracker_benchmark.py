@@ -12,9 +12,9 @@ import numpy as np
 from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.config import TrackerSettings
 from runtime.eyes.motions import Observation, observe, true_eyes
-from runtime.eyes.one_euro import OneEuro
 from runtime.eyes.tracker import Tracker
 from runtime.records import F64, EyePoints
+from tests.eyes.one_euro import OneEuro
 
 HORIZONS_MS = (0, 15, 30, 45, 60, 75, 90, 105, 120)
 SETTLED_S = 1.5  # the start of a run, in which no filter knows the velocity yet, is left out
