@@ -18,6 +18,7 @@ import pytest
 from runtime.daemon.client import ask
 from runtime.errors import TransientError
 from tests.daemon.test_notify import Supervisor
+from tests.waiting import eventually
 
 CONFIG = """
 [stack]
@@ -28,6 +29,7 @@ loop = true
 [model]
 name = "fast"
 threads = 1
+backend = "opencv"
 [loop]
 rate_hz = 60.0
 solver_late_s = 60.0  # a busy machine is no fault
@@ -156,7 +158,7 @@ def test_a_bad_configuration_on_reload_is_refused_and_the_old_one_stays(started:
     answer = ask([daemon.socket], {"command": "reload"})
     assert not answer["ok"]
     assert "rate_hz" in answer["error"]
-    assert daemon.status()["state"] in ("tracking", "holding", "flat")
+    assert eventually(lambda: daemon.status()["state"] == "tracking")  # a busy machine may have starved its sensor
     daemon.process.send_signal(signal.SIGTERM)
     code, errors = daemon.ends()
     assert code == 0

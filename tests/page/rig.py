@@ -26,6 +26,7 @@ loop = true
 [model]
 name = "fast"
 threads = 1
+backend = "opencv"
 [loop]
 rate_hz = 60.0
 solver_late_s = 10.0

@@ -48,6 +48,7 @@ Section "Screen"
   EndSubSection
 EndSection
 """
+NUMBERS_EACH = 30  # of displays, to a process
 NEEDED = ("Xorg", "xrandr", "xwd")
 
 
@@ -66,18 +67,24 @@ def start_or_skip(folder: Path) -> XServer:
     return XServer(folder)
 
 
+def _unused_number() -> int:
+    """A number that no other worker's server can take either: one that stopped may be started again with its own."""
+    first = NUMBERS_EACH * (1 + os.getpid() % 1000)
+    return next(n for n in range(first, first + NUMBERS_EACH) if not Path(f"/tmp/.X11-unix/X{n}").exists())
+
+
 class XServer:
     """Monitors DUMMY0, DUMMY1, DUMMY2 from left to right, 320x180 each."""
 
     def __init__(self, folder: Path, display: int | None = None) -> None:
         config = folder / "xorg.conf"
         config.write_text(CONFIG)
-        where = [] if display is None else [f":{display}"]
+        self.number = _unused_number() if display is None else display
         reader, writer = os.pipe()
         self._output = (folder / "xorg.out").open("wb")
         self._process = subprocess.Popen(
-            ["Xorg", *where, "-displayfd", str(writer), "-config", str(config), "-logfile", str(folder / "xorg.log"),
-             "-noreset", "-nolisten", "tcp"],
+            ["Xorg", f":{self.number}", "-displayfd", str(writer), "-config", str(config),
+             "-logfile", str(folder / "xorg.log"), "-noreset", "-nolisten", "tcp"],
             pass_fds=(writer,), stdout=self._output, stderr=self._output,
         )  # fmt: skip
         os.close(writer)
@@ -90,7 +97,6 @@ class XServer:
         if not answer:
             self.stop()
             raise RuntimeError((folder / "xorg.out").read_text()[-500:])
-        self.number = int(answer)
         self.name = f":{self.number}"
         self.xrandr("--newmode", MODE, *TIMINGS)
         for name, timings in OTHER_MODES.items():
@@ -189,4 +195,5 @@ class XServer:
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGKILL)
         self._process.wait(timeout=60)
+        Path(f"/tmp/.X11-unix/X{self.number}").unlink(missing_ok=True)
         self._output.close()  # harmless when stopped twice
