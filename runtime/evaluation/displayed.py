@@ -62,13 +62,17 @@ def expected_db(
     eyes_m: F64,
     fov_deg: float,
     sigmas_mm: Sequence[float] = (1.0, 2.0),
+    step: int = 1,
 ) -> dict[str, float | None]:
     """Expected PSNR (docs/contracts.md, Error) of layers, by the eyes' uncertainty in millimetres: "1", "2".
 
-    None where such an error would take an eye to where it sees nothing.
+    step: only every so-manieth ray of every so-manieth row. None where such an error would take an eye to where it
+    sees nothing.
     """
     try:
-        values = expected_psnrs_db(layers, eye_views.wanted, stack, eyes_m=eyes_m, fov_deg=fov_deg, sigmas_mm=sigmas_mm)
+        values = expected_psnrs_db(
+            layers, eye_views.wanted, stack, eyes_m=eyes_m, fov_deg=fov_deg, sigmas_mm=sigmas_mm, step=step
+        )
     except ValueError:
         return {f"{sigma_mm:g}": None for sigma_mm in sigmas_mm}
     return {f"{sigma_mm:g}": value for sigma_mm, value in values.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -17,6 +18,7 @@ from runtime.records import F32, U8
 from runtime.report.pairs import OffView, StillPair
 
 SIGMAS_MM = (1.0, 2.0)  # a pupil alone, a pupil and a good tracker
+ENOUGH_RAYS = 200_000  # of an eye, for an expected error
 OFF_STEP = 3  # away from the eyes, every third ray of every third row is enough for a mean squared error
 
 
@@ -37,9 +39,22 @@ def as_intensity(image: Picture) -> F32:
 def judged(pair: StillPair, layers: U8) -> Seen:
     """Displayed quality: exact at the eyes, expected (docs/contracts.md, Error), and at places away from them."""
     eye_views = displayed(layers, pair.wanted, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg)
-    expected = expected_db(eye_views, layers, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, sigmas_mm=SIGMAS_MM)
+    expected = expected_db(
+        eye_views,
+        layers,
+        pair.stack,
+        eyes_m=pair.eyes_m,
+        fov_deg=pair.fov_deg,
+        sigmas_mm=SIGMAS_MM,
+        step=_enough(pair.images[0]),
+    )
     known = {sigma: value for sigma, value in expected.items() if value is not None}
     return Seen(eye_views.quality, known, off_eye_db(pair.off, layers, pair.stack, fov_deg=pair.fov_deg))
+
+
+def _enough(picture: Picture) -> int:
+    """Of every so-manieth ray a mean squared error is known to some hundredths of a decibel."""
+    return max(1, math.isqrt(picture.shape[0] * picture.shape[1] // ENOUGH_RAYS))
 
 
 def off_eye_db(views: Iterable[OffView], layers: U8, stack: PanelStack, *, fov_deg: float) -> dict[str, float]:
