@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from runtime.daemon.client import ask
-from runtime.support.waiting import wait_for
 from tests.daemon.test_daemon import CONFIG, PHASESTACK
+from tests.waiting import eventually
 
 QUIET = CONFIG.replace('log_format = "json"', 'log_format = "json"\nlog_level = "debug"')
 
@@ -39,10 +39,10 @@ class Daemon:
 
     def goes_on(self) -> bool:
         """It comes up, and shows more than it has shown."""
-        assert wait_for(self.socket.exists, timeout_s=60)
-        assert wait_for(lambda: self.answers() and self.presented() > 5, timeout_s=60)
+        assert eventually(self.socket.exists, within_s=60)
+        assert eventually(lambda: self.answers() and self.presented() > 5, within_s=60)
         before = self.presented()
-        return wait_for(lambda: self.presented() > before + 10, timeout_s=30)
+        return eventually(lambda: self.presented() > before + 10, within_s=30)
 
     def answers(self) -> bool:
         try:

@@ -30,7 +30,7 @@ from runtime.daemon.commands import Command
 from runtime.daemon.location import DEFAULT_SOCKET, configured_socket
 from runtime.daemon.server import SocketInUse, StatusServer
 from runtime.errors import InputError
-from runtime.support.waiting import wait_for
+from tests.waiting import eventually
 
 ROOT = Path(__file__).parents[2]
 OWN_GROUP = grp.getgrgid(os.getgid()).gr_name
@@ -207,7 +207,7 @@ def test_tricklers_lock_out_nobody(server: StatusServer, path: Path) -> None:
     for thread in threads:
         thread.start()
     try:
-        assert wait_for(lambda: sent[0] > 3 * len(threads), timeout_s=20)
+        assert eventually(lambda: sent[0] > 3 * len(threads), within_s=20)
         assert all(ask([path], STATUS)["ok"] for _ in range(20))
         with ThreadPoolExecutor(1) as pool:
             asked = pool.submit(ask, [path], {"command": "reload"})
@@ -247,7 +247,7 @@ def test_a_client_that_does_not_read_its_answers_is_let_go(hasty: StatusServer, 
         with pytest.raises(OSError):  # at last the server reads no more
             while True:
                 client.sendall(b'{"command": "status"}\n' * 100)
-        assert wait_for(lambda: hasty._server.connections == 0, timeout_s=20)
+        assert eventually(lambda: hasty._server.connections == 0, within_s=20)
     assert ask([path], STATUS)["ok"]
 
 

@@ -24,8 +24,8 @@ from runtime.errors import InputError, SensorLost, TransientError
 from runtime.sensor.base import Capabilities
 from runtime.sensor.worker import SensorState, SensorWorker
 from runtime.support.transient import PASSING, may_pass
-from runtime.support.waiting import wait_for
 from tests.daemon.test_metrics import free_port, scraped
+from tests.waiting import eventually
 
 ROOT = Path(__file__).parents[2]
 
@@ -146,9 +146,9 @@ def test_a_sensor_that_can_not_be_reopened_for_want_of_descriptors_is_tried_agai
     worker.start()
     try:
         if opened:
-            assert wait_for(lambda: worker.reason == "open it was", timeout_s=20)
+            assert eventually(lambda: worker.reason == "open it was", within_s=20)
         else:
-            assert wait_for(lambda: worker.state is SensorState.FAILED, timeout_s=20)
+            assert eventually(lambda: worker.state is SensorState.FAILED, within_s=20)
             assert isinstance(worker.error, InputError)
     finally:
         worker.stop()
