@@ -15,9 +15,9 @@
 #     phasestack run --config /etc/phasestack/phasestack.toml
 # NVIDIA: --gpus all -e NVIDIA_DRIVER_CAPABILITIES=all in place of --device /dev/dri.
 
-# To pin to the byte: --build-arg BASE=python@sha256:... (where this was written no image registry could be asked for
-# the digest; `docker buildx imagetools inspect python:3.11.9-slim-bookworm` tells it).
-ARG BASE=python:3.11.9-slim-bookworm
+# The digest of the index of all architectures, as others pin it too (where this was written no image registry could be
+# asked). A newer one: docker buildx imagetools inspect python:3.11-slim-bookworm
+ARG BASE=python:3.11.14-slim-bookworm@sha256:65a93d69fa75478d554f4ad27c85c1e69fa184956261b4301ebaf6dbb0a3543d
 
 FROM ${BASE} AS build
 WORKDIR /src
