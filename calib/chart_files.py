@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import track
 
 from calib.charts import Kind, alone, chart_fov_deg, eye_chart, line_picture
 from calib.keys import Key, TerminalKeys, WindowKeys, first_of
@@ -28,6 +26,7 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import relative_scale_shift
 from runtime.panels.registry import open_panels
 from runtime.records import F64, U8, PanelFrame
+from runtime.report.progress import tracked
 from runtime.support.artifacts import OutputFolder, write_json, write_png
 from runtime.support.gl import offscreen_context
 
@@ -147,7 +146,7 @@ def make_charts(out: Path, viewpoints: Sequence[Viewpoint], drawer: Drawer, *, c
     sheet: list[U8] = []
     references: dict[str, U8] = {}
     with OutputFolder(out) as folder:
-        for viewpoint in track(viewpoints, "charts", console=Console(stderr=True), transient=True):
+        for viewpoint in tracked("charts", viewpoints):
             files = []
             entry: dict[str, Any] = {
                 "viewpoint": viewpoint.name,

@@ -6,12 +6,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.progress import track
-
 from calib.experiment import DEFAULT, SIGMAS_M, Case, run_case, time_solvers
 from calib.figures import methods_figure, timing_figure
 from runtime.report.page import Figure, Page, in_columns, section_of
+from runtime.report.progress import tracked
 
 COUNTS = (3, 10, 27, 100, 1000, 10_000, 100_000, 1_000_000)
 SENSOR_SCALES_OFF = (0.95, 1.03, 1.1)
@@ -29,7 +27,7 @@ def compare_methods(out: Path, *, seeds: int, pairs_max: int) -> tuple[dict[str,
     }
     work = [(name, sigma) for name in setups for sigma in SIGMAS_M]
     cases: dict[str, list[Case]] = {name: [] for name in setups}
-    for name, sigma in track(work, "noise samples", console=Console(stderr=True), transient=True):
+    for name, sigma in tracked("noise samples", work):
         cases[name].append(run_case(sigma_m=sigma, seeds=seeds, **setups[name][1]))
     timings = time_solvers([count for count in COUNTS if count <= pairs_max])
     summary = {

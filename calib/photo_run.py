@@ -10,8 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import track
 
 from calib.bare_panels import BarePanels
 from calib.board import board, board_layers
@@ -31,6 +29,7 @@ from runtime.errors import InputError
 from runtime.optics.stack import UNEVEN_MOST, PanelStack
 from runtime.records import U8
 from runtime.report.page import Figure, Page, in_columns, section_of
+from runtime.report.progress import tracked
 from runtime.support import foreign
 from runtime.support.artifacts import OutputFolder, write_png
 
@@ -74,10 +73,7 @@ def photograph_files(folder: Path) -> list[Path]:
 
 def look_at(files: Sequence[Path], stack: PanelStack) -> list[SeenMarks]:
     """The marks of every photograph, with progress. Raises InputError."""
-    return [
-        find_marks(read_photograph(path), stack, name=path.name)
-        for path in track(files, "photographs", console=Console(stderr=True), transient=True)
-    ]
+    return [find_marks(read_photograph(path), stack, name=path.name) for path in tracked("photographs", files)]
 
 
 def register_folder(

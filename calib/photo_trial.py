@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
 from calib.board import board
 from calib.bundle import Undetermined
@@ -24,6 +22,7 @@ from calib.viewpoints import viewing_place_m
 from runtime.config import Settings
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
+from runtime.report.progress import tracked
 from runtime.support.artifacts import OutputFolder, write_json, write_png
 
 PHONE_MEGAPIXELS = 12.0
@@ -89,7 +88,7 @@ def run_trial(
     even = wants_even(settings, stack)
     rows: list[dict[str, Any]] = []
     with OutputFolder(out) as folder:
-        for number in track(range(seed, seed + stacks), "stacks", console=Console(stderr=True), transient=True):
+        for number in tracked("stacks", range(seed, seed + stacks)):
             random = np.random.default_rng(number)
             truth = misplaced(stack, shift_m=off_m, turn_deg=turn_deg, gap_m=off_m, random=random)
             pictures = simulated_photographs(stack, truth, count=count, megapixels=megapixels, random=random)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from runtime.support.progress import NowAndThen
+
+T = TypeVar("T")
 
 
 @contextmanager
@@ -25,6 +28,14 @@ def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(title, total=None)
         yield lambda done, of: progress.update(task, completed=done, total=of)
+
+
+def tracked(title: str, items: Sequence[T]) -> Iterator[T]:
+    """The items, one after the other, with a bar of how many are done."""
+    with progress_bar(title) as tell:
+        for number, item in enumerate(items, start=1):
+            yield item
+            tell(number, len(items))
 
 
 @contextmanager
