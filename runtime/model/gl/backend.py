@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import Any
 
+from runtime.model.assembly import ArrayAssembly
 from runtime.model.contract import Contract
 from runtime.model.gl.programs import Passes
 from runtime.model.gl.surround import GlSurround, check_size
@@ -31,6 +32,9 @@ class GlBackend:
 
     def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> GlSurround:
         return GlSurround(self.passes, contract, stack, at_once=self.at_once, pool=self._pool)
+
+    def assembly(self, stack: PanelStack) -> ArrayAssembly:
+        return ArrayAssembly(stack)
 
     def close(self) -> None:
         with suppress(Exception):  # of a context that is lost there is nothing to release
