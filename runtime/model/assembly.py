@@ -1,4 +1,4 @@
-"""Layers of whole panels from what was solved of them: a window among the rest, or fewer pixels enlarged.
+"""Layers of whole panels from what was solved: a window among the rest, fewer pixels enlarged, rows for columns.
 
 The plan says which window and what is beside it; a backend carries it out where its layers lie.
 """
@@ -17,6 +17,7 @@ from runtime.model.transfer import SUBCODE, phase_codes, pre_emphasised
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import U8, Layers, pixels_of
+from runtime.support.gl import DrawnPicture
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +57,13 @@ class Assembly(Protocol):
         """(N, h, w, 4): layers of fewer pixels, bilinear, with their outermost pixels repeated; an array is the
         assembly's own until the next frame."""
 
+    def turned_picture(self, picture: U8 | DrawnPicture, side: int) -> U8 | DrawnPicture:
+        """(w, h, 4): an eye's picture of the whole centre panel with rows for columns, until the next of its side."""
+
+    def turned(self, layers: Layers) -> Layers:
+        """(N, h, w, 4): layers (N, w, h, 4) of turned panels with rows for columns; an array is the assembly's own
+        until the next frame."""
+
     def close(self) -> None:
         """Release textures. May be called twice."""
 
@@ -66,7 +74,7 @@ class ArrayAssembly:
     def __init__(self, stack: PanelStack) -> None:
         self._stack = stack
         self._layers: U8 | None = None  # assembled
-        self._large: U8 | None = None  # enlarged
+        self._large: U8 | None = None  # enlarged, or turned
         self._solved: PixelRect | None = None  # where the outer panels are not even
         self._colour: tuple[int, ...] | None = None  # that fills the centre panel beside the window
 
@@ -85,14 +93,28 @@ class ArrayAssembly:
         return layers
 
     def enlarged(self, layers: Layers) -> U8:
-        if self._large is None:
-            self._large = self._empty(0)
-        for layer, out in zip(pixels_of(layers), self._large, strict=True):
+        found = self._own()
+        for layer, out in zip(pixels_of(layers), found, strict=True):
             cv2.resize(layer, out.shape[1::-1], dst=out, interpolation=cv2.INTER_LINEAR)
-        return self._large
+        return found
+
+    def turned_picture(self, picture: U8 | DrawnPicture, side: int) -> U8:
+        pixels = picture.pixels() if isinstance(picture, DrawnPicture) else picture
+        return np.asarray(cv2.transpose(pixels), np.uint8)
+
+    def turned(self, layers: Layers) -> U8:
+        found = self._own()
+        for layer, out in zip(pixels_of(layers), found, strict=True):
+            cv2.transpose(layer, dst=out)
+        return found
 
     def close(self) -> None:
         """It holds nothing."""
+
+    def _own(self) -> U8:
+        if self._large is None:
+            self._large = self._empty(0)
+        return self._large
 
     def _empty(self, code: int) -> U8:
         return np.full((self._stack.count, self._stack.height_px, self._stack.width_px, 4), code, np.uint8)

@@ -147,6 +147,9 @@ def test_arrays_are_put_together_on_the_processor(gl: GlBackend, pool: LayerPool
     window = Placed(noise(64, 64, count=3), box, box)
     assert isinstance(textures.assembled(Uniform((1, 2, 3)), window), np.ndarray)
     assert isinstance(textures.enlarged(noise(120, 68, count=3)), np.ndarray)
+    turned, picture = noise(135, 240, count=3), noise(240, 135)
+    assert (textures.turned(turned) == turned.transpose(0, 2, 1, 3)).all()
+    assert (textures.turned_picture(picture, 0) == picture.transpose(1, 0, 2)).all()
     assert gl.assembly(STACK).assembled(Uniform((1, 2, 3)), None).shape == (3, 135, 240, 4)
     assert isinstance(GlBackend(gl.context, STACK).assembly(STACK), ArrayAssembly)  # nobody shows its textures
 
@@ -194,6 +197,24 @@ def test_coarser_levels_stay_in_textures(scene: str, scale: float, gl: GlBackend
         gl.passes.account = None
         assert isinstance(found, LayerTextures)
         assert found.shape == (3, 135, 240, 4)
+        assert within_one(wanted, found.pixels()) >= WITHIN_ONE
+        assert crossed(account) == NETWORK
+    content.close()
+
+
+@pytest.mark.usefixtures("exactly")
+@pytest.mark.parametrize("scene", ["demo", "sparse"])
+def test_solutions_for_eyes_above_each_other_stay_in_textures(scene: str, gl: GlBackend) -> None:
+    content = ProceduralSource(scene, stack=STACK, context=gl.context)
+    opencv, opengl = both(gl)
+    for head in (0.0, 0.05, -0.05):
+        eyes_m = np.array([[0.6, head, -0.031], [0.6, head, 0.031]])[:: -1 if head < 0 else 1]
+        wanted = drawn(opencv, content, eyes_m)
+        gl.passes.account = account = Account()
+        found = drawn(opengl, content, eyes_m)
+        gl.passes.account = None
+        assert (opengl.active_fraction < 0.6) == (scene == "sparse")
+        assert isinstance(found, LayerTextures)
         assert within_one(wanted, found.pixels()) >= WITHIN_ONE
         assert crossed(account) == NETWORK
     content.close()

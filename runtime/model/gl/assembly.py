@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from runtime.model.pyramid_level import NEUTRAL
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import U8, Layers
+from runtime.support.gl import DrawnPicture
 from runtime.support.gl_sharing import LayerPool, LayerTextures, wait_until_drawn
 
 NAMES = ("rear", "centre", "front")
@@ -26,6 +28,7 @@ class GlAssembly:
         """pool: where layers are left, and where those come from that are put together."""
         self._passes, self._pool, self._stack = passes, pool, stack
         self._arrays = ArrayAssembly(stack)
+        self._turned: dict[int, DrawnPicture] = {}  # an eye
         self._textures: dict[str, Any] = {}  # made when they are first needed, on the thread that draws
 
     def assembled(self, rest: Rest, window: Placed | None) -> Layers:
@@ -64,11 +67,37 @@ class GlAssembly:
             wait_until_drawn()
         return left
 
+    def turned_picture(self, picture: U8 | DrawnPicture, side: int) -> U8 | DrawnPicture:
+        if not isinstance(picture, DrawnPicture):
+            return self._arrays.turned_picture(picture, side)
+        width, height = self._stack.height_px, self._stack.width_px
+        with self._passes.drawing():
+            if side not in self._turned:
+                texture = self._textures[f"turned {side}"] = self._passes.context.texture((width, height), 4)
+                target = self._passes.target((Image(texture, width, height),))
+                self._turned[side] = DrawnPicture(texture, target, np.empty((height, width, 4), np.uint8))
+            turned = self._turned[side]
+            self._turn(picture.texture, turned.texture)
+        return replace(turned, grey=picture.grey)
+
+    def turned(self, layers: Layers) -> Layers:
+        if not isinstance(layers, LayerTextures):
+            return self._arrays.turned(layers)
+        with self._passes.drawing():
+            left = self._left()
+            for texture, turned in zip(layers.textures, left.textures, strict=True):
+                self._turn(texture, turned)
+            wait_until_drawn()
+        return left
+
     def close(self) -> None:
         with suppress(Exception):  # of a context that is lost there is nothing to release
             for texture in self._textures.values():
                 self._passes.forget(texture)
-        self._textures = {}
+        self._textures, self._turned = {}, {}
+
+    def _turn(self, texture: Any, turned: Any) -> None:
+        self._passes.draw("turn", (Image(turned, *turned.size),), {"image": Image(texture, *texture.size)}, {})
 
     def _left(self) -> LayerTextures:
         return left_in(self._pool, self._passes, self._stack)
