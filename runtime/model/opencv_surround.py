@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from runtime.model.assembly import ArrayAssembly
 from runtime.model.channels import RGBA_FROM, without_alpha
 from runtime.model.contract import Contract
 from runtime.model.pyramid_level import CENTRE, I16, NEUTRAL, OUTER, PyramidLevel
@@ -31,6 +32,9 @@ class OpenCvBackend:
 
     def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> OpenCvSurround:
         return OpenCvSurround(contract, stack, threads=threads)
+
+    def assembly(self, stack: PanelStack) -> ArrayAssembly:
+        return ArrayAssembly(stack)
 
     def close(self) -> None:
         """It holds nothing."""

@@ -13,6 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
+from runtime.model.assembly import Assembly
 from runtime.model.chain import ChainFrame, ColumnLaw
 from runtime.model.contract import Contract, Step
 from runtime.model.fade import Fade
@@ -132,6 +133,9 @@ class Backend(Protocol):
 
     def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> Surround:
         """One for a model and a stack. Raises InputError where the stack does not fit."""
+
+    def assembly(self, stack: PanelStack) -> Assembly:
+        """One for a model that solves a part of a stack, or at fewer pixels; made on any thread."""
 
     def close(self) -> None:
         """Release what its surrounds shared, once they are closed. May be called twice."""

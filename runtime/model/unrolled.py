@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from runtime.errors import ModelFailure
+from runtime.model.assembly import Assembly
 from runtime.model.base import Prediction, Predictor
 from runtime.model.chain import chain_frame, chain_modes
 from runtime.model.channels import is_grey
@@ -27,7 +27,7 @@ from runtime.model.visible import visible_boxes
 from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
-from runtime.records import F64, U8
+from runtime.records import F64
 from runtime.support.gl import DrawnPicture
 
 HALF_IPD_M = 0.031
@@ -59,7 +59,7 @@ class UnrolledPredictor(Predictor):
         self._twin: UnrolledPredictor | None = None  # for eyes above each other
         self.fade: Fade | None = None  # how this stack ends, where it is a part of larger panels
         self._made: Surround | None = None
-        self._turned_layers: U8 | None = None
+        self._turner: Assembly | None = None  # for the twin's pictures and layers
 
     @property
     def backend(self) -> str:  # type: ignore[override]
@@ -73,7 +73,7 @@ class UnrolledPredictor(Predictor):
 
     def surround_with(self, backend: Backend) -> None:
         self.close()
-        self.surroundings, self._made, self._twin = backend, None, None
+        self.surroundings, self._made, self._twin, self._turner = backend, None, None, None
 
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         return (self.stack.panel(CENTRE),)
@@ -119,6 +119,8 @@ class UnrolledPredictor(Predictor):
             self._made.close()
         if self._twin is not None:
             self._twin.close()
+        if self._turner is not None:
+            self._turner.close()
 
     def _surround(self) -> Surround:
         """Made when it is first needed, on the thread that uses it. Raises InputError where the stack is too large."""
@@ -129,24 +131,20 @@ class UnrolledPredictor(Predictor):
     def _turned(self, images: Sequence[Sequence[Picture]], eyes_m: F64, *, eye_sigma_mm: float) -> Prediction:
         """Eyes above each other: the same problem with rows for columns, solved by a twin for panels turned so."""
         stack = self.stack
-        if self._twin is None:
+        if self._twin is None or self._turner is None:
             self._twin = UnrolledPredictor(
                 self.session, stack.turned(), threads=self._threads, surroundings=self.surroundings
             )
-            self._turned_layers = np.empty((stack.count, stack.height_px, stack.width_px, 4), np.uint8)
-        twin, layers = self._twin, self._turned_layers
-        assert layers is not None
+            self._turner = self.surroundings.assembly(stack)
+        twin, turner = self._twin, self._turner
         twin.one_channel, twin.fade = self.one_channel, self.fade and self.fade.turned()
         # A picture's rows become its columns: what was down (-z) is to the right (+y), what was right is down.
         turned_m = np.stack([eyes_m[:, 0], -eyes_m[:, 2], -eyes_m[:, 1]], axis=1)
         order = (0, 1) if turned_m[1, 1] > turned_m[0, 1] else (1, 0)
-        arrays = [image[0].pixels() if isinstance(image[0], DrawnPicture) else image[0] for image in images]
-        pictures = [[np.asarray(cv2.transpose(arrays[side]), np.uint8)] for side in order]
+        pictures = [[turner.turned_picture(images[side][0], side)] for side in order]
         solved = twin.predict(pictures, turned_m[list(order)], eye_sigma_mm=eye_sigma_mm)
-        for layer, part in zip(layers, solved.layers, strict=True):
-            cv2.transpose(part, dst=layer)
         self.channels = twin.channels
-        return Prediction(layers, solved.stage_ms)
+        return Prediction(turner.turned(solved.made), solved.stage_ms)
 
     def _network(self, seen: tuple[I16, I16], problem: Problem, watch: Stopwatch) -> Answer:
         """The network's answer: both outer panels on the chain frame's raster, from one parallax before its first

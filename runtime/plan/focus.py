@@ -12,16 +12,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from time import perf_counter_ns
 
-import cv2
 import numpy as np
 
 from runtime.content.base import ContentSource, View
 from runtime.content.camera import union
+from runtime.model.assembly import Placed, Rest, Shared, Uniform
 from runtime.model.fade import Fade
 from runtime.model.predictor import Prediction, Predictor
-from runtime.model.pyramid_level import NEUTRAL
 from runtime.model.schedule import Backend, Picture
-from runtime.model.transfer import SUBCODE, phase_codes, pre_emphasised
 from runtime.model.unrolled import UnrolledPredictor
 from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.rect import PixelRect
@@ -57,12 +55,9 @@ class FocusedPredictor(Predictor):
         self.name, self.provider, self.parameters = whole.name, whole.provider, whole.parameters
         self.stack = whole.stack
         self._parts: dict[tuple[int, int], UnrolledPredictor] = {}
-        self._layers = np.full((self.stack.count, self.stack.height_px, self.stack.width_px, 4), 255, np.uint8)
-        self._layers[..., :3] = NEUTRAL
-        self._solved: PixelRect | None = None  # where the outer panels are not even
+        self._assembly = whole.surroundings.assembly(whole.stack)
         self._aimed: Window | None = None
-        self._wanted_background: tuple[int, ...] = (255, 255, 255)
-        self._background: tuple[int, ...] | None = None  # that fills the centre panel beside the aimed window
+        self._background = Uniform((255, 255, 255))  # beside the aimed window
         self.window: Window | None = None  # of the last frame
         self.active_fraction = 1.0  # of the panel's pixels that went through the model
 
@@ -79,6 +74,8 @@ class FocusedPredictor(Predictor):
     def surround_with(self, backend: Backend) -> None:
         for part in (self.whole, *self._parts.values()):
             part.surround_with(backend)
+        self._assembly.close()
+        self._assembly = backend.assembly(self.stack)
 
     def aim(self, content: ContentSource, eyes_m: F64, *, time_ns: int) -> None:
         """Ask the content where it lies, so that only that is drawn and solved."""
@@ -100,7 +97,7 @@ class FocusedPredictor(Predictor):
         steep = max(steepness(np.array([code], np.uint8)) for code in colour)
         wanted = window_of(box, eyes_m, self.stack, steep=steep)
         self._aimed = self._kept(wanted)
-        self._wanted_background = colour
+        self._background = Uniform(colour)
 
     @property
     def one_channel(self) -> bool:
@@ -139,42 +136,39 @@ class FocusedPredictor(Predictor):
         begin_ns = perf_counter_ns()
         left, right = images[0][0], images[1][0]
         aimed, self._aimed = self._aimed, None
+        rest: Rest
         if aimed is not None:
-            window, cut = aimed, [[left], [right]]
+            window, cut, rest = aimed, [[left], [right]], self._background
         elif isinstance(left, DrawnPicture) or isinstance(right, DrawnPicture):  # nobody looked where they differ
-            self.window, self.active_fraction = None, 1.0
-            prediction = self.whole.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
-            self.channels = self.whole.channels
-            return prediction
+            return self._whole(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
         else:
             # A coarse look tells for next to nothing what is too large; only the rest is worth a close one.
             for look in (coarse_box, differing_box):
                 box = look(left, right)
                 found = self._around(box, left, eyes_m)
                 if box.width_px and found is None:
-                    self.window, self.active_fraction = None, 1.0
-                    prediction = self.whole.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
-                    self.channels = self.whole.channels
-                    return prediction
+                    return self._whole(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
+            rest = Shared(left, self.whole.pre_emphasis)
             kept = self._kept(found)
             if kept is None:
-                return self._filled(left, begin_ns)
+                return self._filled(rest, _ms_since(begin_ns))
             window = kept
             area = window.box
             cut = [[np.ascontiguousarray(image[area.v0 : area.v1, area.u0 : area.u1])] for image in (left, right)]
-        found_ms = (perf_counter_ns() - begin_ns) / 1e6
-        # Solved before anything is painted: where the model fails, the last good layers stay as they were.
+        found_ms = _ms_since(begin_ns)
+        # Solved before anything is put together: where the model fails, the last good layers stay as they were.
         part = self._part(window.stack)
         part.fade = self._fade(window, eyes_m)
         solved = part.predict(cut, eyes_m - window.shift_m, eye_sigma_mm=eye_sigma_mm)
         self.channels = part.channels
-        begin_ns = perf_counter_ns()
-        if aimed is not None:
-            self._even_out(but=window.box)
-            self._paint_background(self._wanted_background)
-        elif not isinstance(left, DrawnPicture):
-            self._fill_with(left, but=window.box, solved=whole_rays(window, eyes_m, self.stack))
-        return self._place(window, solved, eyes_m, found_ms + (perf_counter_ns() - begin_ns) / 1e6)
+        return self._placed(window, solved, rest, eyes_m, found_ms)
+
+    def _whole(self, images: Sequence[Sequence[Picture]], eyes_m: F64, *, eye_sigma_mm: float) -> Prediction:
+        """Layers of which nothing can be left out."""
+        self.window, self.active_fraction = None, 1.0
+        prediction = self.whole.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
+        self.channels = self.whole.channels
+        return prediction
 
     def _around(self, box: PixelRect, picture: U8, eyes_m: F64) -> Window | None:
         """The window around a box in which the eyes' pictures differ; None where nothing does, or too much."""
@@ -196,40 +190,28 @@ class FocusedPredictor(Predictor):
         for part in (self.whole, *self._parts.values()):
             part.close()
         self._parts = {}
+        self._assembly.close()
 
-    def _filled(self, picture: U8, begin_ns: int) -> Prediction:
+    def _filled(self, rest: Rest, found_ms: float) -> Prediction:
         """Layers of which the centre panel alone carries the picture, for both eyes."""
-        self._fill_with(picture, but=None, solved=None)
+        begin_ns = perf_counter_ns()
+        layers = self._assembly.assembled(rest, None)
         self.window, self.active_fraction, self.channels = None, 0.0, 3
-        filled_ms = (perf_counter_ns() - begin_ns) / 1e6
-        return Prediction(self._layers, {"prepare": filled_ms, "inference": 0.0, "finish": 0.0})
+        return Prediction(layers, {"prepare": found_ms, "inference": 0.0, "finish": _ms_since(begin_ns)})
 
-    def _fill_with(self, picture: U8, *, but: PixelRect | None, solved: PixelRect | None) -> None:
-        """The picture on the centre panel, as both eyes see it where they agree."""
-        self._even_out(but=but)
-        self._background = None
-        centre, codes = self._layers[self.stack.count // 2], _centre_codes(self.stack.count)
-        for part in _around(solved, width_px=self.stack.width_px, height_px=self.stack.height_px):
-            grown = PixelRect(max(0, part.u0 - 1), max(0, part.v0 - 1), part.u1 + 1, part.v1 + 1)
-            sharp = pre_emphasised(picture[grown.slices], self.whole.pre_emphasis)
-            rows = slice(part.v0 - grown.v0, part.v1 - grown.v0)
-            columns = slice(part.u0 - grown.u0, part.u1 - grown.u0)
-            centre[part.slices] = cv2.LUT(np.ascontiguousarray(sharp[rows, columns]), codes)
-
-    def _place(self, window: Window, solved: Prediction, eyes_m: F64, filled_ms: float) -> Prediction:
+    def _placed(self, window: Window, solved: Prediction, rest: Rest, eyes_m: F64, found_ms: float) -> Prediction:
         """The window's layers among the rest."""
+        begin_ns = perf_counter_ns()
+        # Near the window's edge the centre panel can't know what rays meet that leave the window.
+        kept = whole_rays(window, eyes_m, self.stack)
+        layers = self._assembly.assembled(rest, Placed(solved.made, window.box, kept))
+        self.window = window
         area = window.box
-        centre = self.stack.count // 2
-        for index, (layer, part) in enumerate(zip(self._layers, solved.layers, strict=True)):
-            # Near the window's edge the centre panel can't know what rays meet that leave the window.
-            kept = whole_rays(window, eyes_m, self.stack) if index == centre else area
-            rows, columns = slice(kept.v0 - area.v0, kept.v1 - area.v0), slice(kept.u0 - area.u0, kept.u1 - area.u0)
-            layer[kept.v0 : kept.v1, kept.u0 : kept.u1] = part[rows, columns]
-        self._solved, self.window = area, window
         self.active_fraction = area.width_px * area.height_px / (self.stack.width_px * self.stack.height_px)
         stage_ms = dict(solved.stage_ms)
-        stage_ms["prepare"] = stage_ms.get("prepare", 0.0) + filled_ms
-        return Prediction(self._layers, stage_ms)
+        stage_ms["prepare"] = stage_ms.get("prepare", 0.0) + found_ms
+        stage_ms["finish"] = stage_ms.get("finish", 0.0) + _ms_since(begin_ns)
+        return Prediction(layers, stage_ms)
 
     def _fade(self, window: Window, eyes_m: F64) -> Fade:
         """How a window ends: gently, but where the panels themselves do."""
@@ -246,25 +228,6 @@ class FocusedPredictor(Predictor):
     def _middle(self) -> PlaneRaster:
         return self.stack.panel(self.stack.count // 2)
 
-    def _even_out(self, *, but: PixelRect | None) -> None:
-        """Bring the outer panels back to the middle of their range where the last frame drove them."""
-        if self._solved is None or self._solved == but:
-            return
-        area = self._solved
-        for layer in self._layers:
-            _fill(layer, area, (NEUTRAL, NEUTRAL, NEUTRAL))
-        self._solved, self._background = None, None
-
-    def _paint_background(self, colour: tuple[int, ...]) -> None:
-        """The centre panel as if both eyes saw nothing but the background; once, as long as nothing changes."""
-        codes = _centre_codes(self.stack.count)[list(colour)].tolist()
-        layer = self._layers[self.stack.count // 2]
-        if self._background != colour:
-            _fill(layer, PixelRect(0, 0, self.stack.width_px, self.stack.height_px), codes)
-            self._background = colour
-        elif self._solved is not None:
-            _fill(layer, self._solved, codes)
-
     def _part(self, stack: PanelStack) -> UnrolledPredictor:
         size = (stack.width_px, stack.height_px)
         if size not in self._parts:
@@ -274,26 +237,5 @@ class FocusedPredictor(Predictor):
         return self._parts[size]
 
 
-def _around(hole: PixelRect | None, *, width_px: int, height_px: int) -> list[PixelRect]:
-    """A panel's pixels but for a hole."""
-    if hole is None:
-        return [PixelRect(0, 0, width_px, height_px)]
-    parts = (
-        PixelRect(0, 0, width_px, hole.v0),
-        PixelRect(0, hole.v1, width_px, height_px),
-        PixelRect(0, hole.v0, hole.u0, hole.v1),
-        PixelRect(hole.u1, hole.v0, width_px, hole.v1),
-    )
-    return [part for part in parts if part.width_px and part.height_px]
-
-
-def _fill(layer: U8, area: PixelRect, codes: Sequence[int]) -> None:
-    """One colour in a part of an RGBA layer; whole pixels at a time, which is many times as fast as bytes."""
-    pixel = np.array([*codes, 255], np.uint8).view(np.uint32)
-    layer.view(np.uint32)[area.v0 : area.v1, area.u0 : area.u1, 0] = pixel
-
-
-def _centre_codes(panels: int) -> U8:
-    """(256,) the centre panel's code for each code of the picture, the others standing at NEUTRAL."""
-    phases = phase_codes(2).reshape(256, -1)[:, 0].astype(np.int32)
-    return np.clip((phases - (panels - 1) * NEUTRAL * SUBCODE + SUBCODE // 2) // SUBCODE, 0, 255).astype(np.uint8)
+def _ms_since(begin_ns: int) -> float:
+    return (perf_counter_ns() - begin_ns) / 1e6

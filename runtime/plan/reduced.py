@@ -7,10 +7,8 @@ from dataclasses import replace
 from time import perf_counter_ns
 from typing import Any
 
-import cv2
-import numpy as np
-
 from runtime.config import Settings
+from runtime.model.assembly import ArrayAssembly, Assembly
 from runtime.model.predictor import Prediction, Predictor
 from runtime.model.schedule import Backend
 from runtime.optics.pupil import PUPIL_SIGMA_MM
@@ -26,7 +24,7 @@ class ReducedPredictor(Predictor):
         """small: the model for the same panels at fewer pixels; stack: the panels as they are."""
         self.small, self.stack = small, stack
         self.name, self.provider, self.parameters = small.name, small.provider, small.parameters
-        self._layers = np.empty((stack.count, stack.height_px, stack.width_px, 4), np.uint8)
+        self._assembly: Assembly = ArrayAssembly(stack)
 
     @property
     def backend(self) -> str:  # type: ignore[override]
@@ -40,6 +38,8 @@ class ReducedPredictor(Predictor):
 
     def surround_with(self, backend: Backend) -> None:
         self.small.surround_with(backend)
+        self._assembly.close()
+        self._assembly = backend.assembly(self.stack)
 
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         return self.small.rasters(eyes_m)
@@ -56,15 +56,14 @@ class ReducedPredictor(Predictor):
     ) -> Prediction:
         solved = self.small.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
         begin_ns = perf_counter_ns()
-        size = (self.stack.width_px, self.stack.height_px)
-        for layer, out in zip(solved.layers, self._layers, strict=True):
-            cv2.resize(layer, size, dst=out, interpolation=cv2.INTER_LINEAR)
+        layers = self._assembly.enlarged(solved.made)
         stage_ms = dict(solved.stage_ms)
         stage_ms["finish"] = stage_ms.get("finish", 0.0) + (perf_counter_ns() - begin_ns) / 1e6
-        return Prediction(self._layers, stage_ms)
+        return Prediction(layers, stage_ms)
 
     def close(self) -> None:
         self.small.close()
+        self._assembly.close()
 
 
 def ladder_predictor(name: str, scale: float, stack: PanelStack, settings: Settings) -> Predictor:

@@ -9,14 +9,18 @@ import numpy as np
 import pytest
 
 from runtime.model.gl.surround import GlSurround
+from runtime.model.pyramid_level import NEUTRAL
 from runtime.optics.alignment import shown_layers
-from runtime.support.gl_sharing import LayerTextures
+from runtime.plan.reduced import ReducedPredictor, ladder_predictor
+from runtime.records import Solution
+from runtime.support.gl_sharing import LayerTextures, lies_in
 from tests.daemon.rig import Rig
 from tests.panels import xserver
 from tests.support.gl_calls import Counted
 from tests.waiting import eventually
 
 MODEL = {"backend": "gl"}
+HELD = {"hold_s": 60.0}  # a machine too busy to see the viewer draws no flat picture
 PANELS = [{"connector": f"DUMMY{index}"} for index in range(3)]
 
 
@@ -49,35 +53,126 @@ def on_windows() -> dict[str, Any]:
     }
 
 
-def test_nothing_is_read_back_in_the_loop_but_the_network_s_raster(
-    outputs: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    counted = Counted(monkeypatch)
-    rasters: list[tuple[int, int]] = []
-    network_pictures = GlSurround.network_pictures
+class Crossing:
+    """What crosses in the driver's functions, and what may: the network's raster down, its answer up."""
 
-    def noted(self: GlSurround) -> Any:
-        seen = network_pictures(self)
-        rasters.extend((image.shape[1], image.shape[0]) for image in seen)
-        return seen
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.counted = Counted(monkeypatch)
+        self.rasters: list[tuple[int, int]] = []
+        self.answers: list[tuple[int, int]] = []
+        network_pictures, set_panel = GlSurround.network_pictures, GlSurround.set_panel
 
-    monkeypatch.setattr(GlSurround, "network_pictures", noted)
-    with Rig(model=MODEL, **outputs) as rig:
+        def noted_pictures(surround: GlSurround) -> Any:
+            seen = network_pictures(surround)
+            self.rasters.extend((image.shape[1], image.shape[0]) for image in seen)
+            return seen
+
+        def noted_panel(surround: GlSurround, reduction: int, panel: int, codes: Any, *, shown: bool) -> None:
+            self.answers.append((codes.shape[1], codes.shape[0]))
+            set_panel(surround, reduction, panel, codes, shown=shown)
+
+        monkeypatch.setattr(GlSurround, "network_pictures", noted_pictures)
+        monkeypatch.setattr(GlSurround, "set_panel", noted_panel)
+
+    def begin(self) -> None:
+        """From here on."""
+        # The wrapped functions are those in use.
+        assert any(name == "glReadPixels" for name, _, _ in self.counted.calls)
+        assert any(name == "glTexSubImage2D" for name, _, _ in self.counted.uploads)
+        for calls in (self.counted.calls, self.counted.uploads, self.rasters, self.answers):
+            calls.clear()
+
+    def assert_only_the_network_s(self, *, solutions: int) -> None:
+        seen, up = list(self.counted.calls), list(self.counted.uploads)
+        assert len(self.rasters) >= 2 * solutions
+        assert [(name, size) for name, size, _ in seen] == [("glReadPixels", size) for size in self.rasters]
+        assert [(name, size) for name, size, _ in up] == [("glTexSubImage2D", size) for size in self.answers]
+
+
+@pytest.fixture
+def crossing(monkeypatch: pytest.MonkeyPatch) -> Crossing:
+    return Crossing(monkeypatch)
+
+
+def test_nothing_is_read_back_in_the_loop_but_the_network_s_raster(outputs: dict[str, Any], crossing: Crossing) -> None:
+    with Rig(model=MODEL, tracker=HELD, **outputs) as rig:
         rig.refresh_until_solved()
         rig.settle()
-        assert any(name == "glReadPixels" for name, _, _ in counted.calls)  # the wrapped functions are those in use
-        counted.calls.clear()
-        rasters.clear()
+        crossing.begin()
         rig.refresh_until_solved(times=4)
         rig.settle()
-        seen = list(counted.calls)
-        assert len(rasters) >= 2 * 4
-        assert [(name, size) for name, size, _ in seen] == [("glReadPixels", size) for size in rasters]
-        solution = rig.presenter.last.solution  # type: ignore[union-attr]
-        assert solution is not None
-        assert isinstance(solution.made, LayerTextures)
+        crossing.assert_only_the_network_s(solutions=4)
+        solution = left_in_textures(rig)
+        before = len(crossing.counted.calls)
         assert solution.layers.std() > 5  # whoever asks gets the pixels
-        assert len(counted.calls) > len(seen)
+        assert len(crossing.counted.calls) > before
+
+
+def test_of_a_window_of_the_plan_nothing_else_crosses(outputs: dict[str, Any], crossing: Crossing) -> None:
+    with Rig(model=MODEL, tracker=HELD, content={"scene": "sparse"}, **outputs) as rig:
+        rig.refresh_until_solved()
+        rig.settle()
+        crossing.begin()
+        rig.refresh_until_solved(times=4)
+        rig.settle()
+        assert 0 < rig.predictor.active_fraction < 0.5
+        crossing.assert_only_the_network_s(solutions=4)
+        layers = left_in_textures(rig).layers
+        assert np.unique(layers[0, :8]).tolist() == [NEUTRAL, 255]  # beside the window outer panels are even
+        assert layers[0].std() > 1
+
+
+@pytest.mark.parametrize("scene", ["demo", "sparse"])
+def test_of_a_budget_s_coarser_level_nothing_else_crosses(
+    scene: str, outputs: dict[str, Any], crossing: Crossing
+) -> None:
+    with Rig(model=MODEL, tracker=HELD, content={"scene": scene}, **outputs) as rig:
+        rig.refresh_until_solved()
+
+        def coarser(parts: Any) -> bool:
+            """As the budget switches to it."""
+            parts.use(ladder_predictor("fast", 0.75, rig.settings.stack.stack(), rig.settings)).close()
+            return True
+
+        rig.presenter.solver.do(coarser)
+        rig.settle()
+        rig.refresh_until_solved(times=2)
+        rig.settle()
+        crossing.begin()
+        rig.refresh_until_solved(times=4)
+        rig.settle()
+        assert isinstance(rig.predictor, ReducedPredictor)
+        assert (rig.predictor.small.active_fraction < 0.5) == (scene == "sparse")
+        crossing.assert_only_the_network_s(solutions=4)
+        assert left_in_textures(rig).layers.std() > 1
+
+
+def test_of_a_head_on_its_side_nothing_else_crosses(outputs: dict[str, Any], crossing: Crossing) -> None:
+    with Rig(model=MODEL, tracker=HELD, **outputs) as rig:
+        rig.plan.eyes_m = np.array([[0.7, 0.0, -0.031], [0.7, 0.0, 0.031]])
+        rig.refresh_until(lambda: rig.presenter.last is not None and on_its_side(rig.presenter.last.solution))
+        rig.refresh_until_solved()
+        rig.settle()
+        crossing.begin()
+        rig.refresh_until_solved(times=4)
+        rig.settle()
+        assert on_its_side(left_in_textures(rig))
+        crossing.assert_only_the_network_s(solutions=4)
+
+
+def on_its_side(solution: Solution | None) -> bool:
+    if solution is None or solution.solved_for_m is None:
+        return False
+    across_m = np.abs(solution.solved_for_m[1] - solution.solved_for_m[0])
+    return bool(across_m[2] > across_m[1])
+
+
+def left_in_textures(rig: Rig) -> Solution:
+    """What is shown, which a solver left for the panels to sample."""
+    solution: Solution = rig.presenter.last.solution  # type: ignore[union-attr]
+    assert isinstance(solution.made, LayerTextures)
+    assert lies_in(solution.made, rig.presenter.panels.group)
+    return solution
 
 
 def test_panels_show_the_solution_from_its_textures(server: xserver.XServer, monkeypatch: pytest.MonkeyPatch) -> None:

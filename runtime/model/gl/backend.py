@@ -5,7 +5,9 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import Any
 
+from runtime.model.assembly import ArrayAssembly, Assembly
 from runtime.model.contract import Contract
+from runtime.model.gl.assembly import GlAssembly
 from runtime.model.gl.programs import Passes
 from runtime.model.gl.surround import GlSurround, check_size
 from runtime.optics.stack import PanelStack
@@ -31,6 +33,9 @@ class GlBackend:
 
     def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> GlSurround:
         return GlSurround(self.passes, contract, stack, at_once=self.at_once, pool=self._pool)
+
+    def assembly(self, stack: PanelStack) -> Assembly:
+        return ArrayAssembly(stack) if self._pool is None else GlAssembly(self.passes, self._pool, stack)
 
     def close(self) -> None:
         with suppress(Exception):  # of a context that is lost there is nothing to release

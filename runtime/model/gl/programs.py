@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
 
 import moderngl
+
+from runtime.errors import ContextLost, PhasestackError
 
 INCLUDE = re.compile(r'^#include "([a-z_]+\.glsl)"$', re.MULTILINE)
 SHADERS = "runtime.model.gl"
@@ -76,6 +79,20 @@ class Passes:
         self._vertex = source("whole.vert.glsl")
         self._programs: dict[str, tuple[Any, Any, dict[str, Any]]] = {}
         self._targets: dict[tuple[int, ...], Any] = {}
+
+    @contextmanager
+    def drawing(self) -> Iterator[None]:
+        """Draw within this, whatever the context was used for before. Raises ContextLost where that fails."""
+        try:
+            self.context.enable_only(moderngl.NOTHING)
+            yield
+            fault = self.context.error
+        except PhasestackError:
+            raise
+        except Exception as error:  # a lost context answers with whatever moderngl has at hand
+            raise ContextLost(f"OpenGL: {error}") from error
+        if fault != "GL_NO_ERROR":
+            raise ContextLost(f"OpenGL: {fault}")
 
     def draw(
         self,

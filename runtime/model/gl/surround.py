@@ -17,10 +17,11 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.errors import ContextLost, InputError, ModelFailure, PhasestackError
+from runtime.errors import InputError, ModelFailure
 from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
 from runtime.model.contract import Contract
 from runtime.model.fade import CORRECTED_SHARE
+from runtime.model.gl.assembly import left_in
 from runtime.model.gl.programs import Image, Passes
 from runtime.model.pyramid_level import CENTRE, FRONT, I16, NEUTRAL, OUTER, REAR, START, pixels_in_line, spreads
 from runtime.model.schedule import Picture, Problem, reductions
@@ -65,8 +66,7 @@ class GlSurround:
 
     @contextmanager
     def begin(self, pictures: Sequence[Picture], problem: Problem) -> Iterator[None]:
-        try:
-            self._passes.context.enable_only(moderngl.NOTHING)
+        with self._passes.drawing():
             self._problem = problem
             self._grey = problem.channels == 1
             needed = reductions(self._contract) | {self._contract.reduction}
@@ -83,13 +83,6 @@ class GlSurround:
             self._outer: dict[tuple[int, int], str] = {}  # which of two images a panel is in
             self._want(self._taken(pictures))
             yield
-            fault = self._passes.context.error
-        except PhasestackError:
-            raise
-        except Exception as error:  # a lost context answers with whatever moderngl has at hand
-            raise ContextLost(f"OpenGL: {error}") from error
-        if fault != "GL_NO_ERROR":
-            raise ContextLost(f"OpenGL: {fault}")
 
     def network_pictures(self) -> tuple[I16, I16]:
         problem, frame, reduction = self._problem, self._problem.frame, self._contract.reduction
@@ -168,10 +161,7 @@ class GlSurround:
     def finish(self) -> Layers:
         width, height = self._stack.width_px, self._stack.height_px
         if self._pool is not None:
-            left = self._pool.taken(3, width_px=width, height_px=height)
-            for textures in self._pool.surplus():
-                for texture in textures:
-                    self._passes.forget(texture)
+            left = left_in(self._pool, self._passes, self._stack)
             self._draw_layers(tuple(Image(texture, width, height) for texture in left.textures))
             wait_until_drawn()
             return left

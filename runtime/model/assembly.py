@@ -1,0 +1,183 @@
+"""Layers of whole panels from what was solved: a window among the rest, fewer pixels enlarged, rows for columns.
+
+The plan says which window and what is beside it; a backend carries it out where its layers lie.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from runtime.model.pyramid_level import NEUTRAL
+from runtime.model.transfer import SUBCODE, phase_codes, pre_emphasised
+from runtime.optics.rect import PixelRect
+from runtime.optics.stack import PanelStack
+from runtime.records import U8, Layers, pixels_of
+from runtime.support.gl import DrawnPicture
+
+
+@dataclass(frozen=True, slots=True)
+class Uniform:
+    """Both eyes see one colour."""
+
+    colour: tuple[int, ...]  # red, green, blue in 8-bit codes
+
+
+@dataclass(frozen=True, slots=True)
+class Shared:
+    """Both eyes see one picture."""
+
+    picture: U8  # (h, w, 4) RGBA of the whole centre panel
+    emphasis: float  # how strongly it is sharpened (`transfer.pre_emphasised`)
+
+
+Rest = Uniform | Shared  # beside a window: the outer panels are even, the centre panel carries it
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """What was solved of a window, and where it belongs: pixels of the whole panels."""
+
+    layers: Layers  # (N, h, w, 4) of the box
+    box: PixelRect  # of every panel
+    kept: PixelRect  # of the centre panel, within the box: beside it that panel belongs to the rest
+
+
+class Assembly(Protocol):
+    """Puts layers of whole panels together. State lives from frame to frame; one thread uses it."""
+
+    def assembled(self, rest: Rest, window: Placed | None) -> Layers:
+        """(N, h, w, 4): a window, if any, among the rest; an array is the assembly's own until the next frame."""
+
+    def enlarged(self, layers: Layers) -> Layers:
+        """(N, h, w, 4): layers of fewer pixels, bilinear, with their outermost pixels repeated; an array is the
+        assembly's own until the next frame."""
+
+    def turned_picture(self, picture: U8 | DrawnPicture, side: int) -> U8 | DrawnPicture:
+        """(w, h, 4): an eye's picture of the whole centre panel with rows for columns, until the next of its side."""
+
+    def turned(self, layers: Layers) -> Layers:
+        """(N, h, w, 4): layers (N, w, h, 4) of turned panels with rows for columns; an array is the assembly's own
+        until the next frame."""
+
+    def close(self) -> None:
+        """Release textures. May be called twice."""
+
+
+class ArrayAssembly:
+    """An `Assembly` on the processor, which writes only what changes from frame to frame."""
+
+    def __init__(self, stack: PanelStack) -> None:
+        self._stack = stack
+        self._layers: U8 | None = None  # assembled
+        self._large: U8 | None = None  # enlarged, or turned
+        self._solved: PixelRect | None = None  # where the outer panels are not even
+        self._colour: tuple[int, ...] | None = None  # that fills the centre panel beside the window
+
+    def assembled(self, rest: Rest, window: Placed | None) -> U8:
+        if self._layers is None:
+            self._layers = self._empty(255)
+            self._layers[..., :3] = NEUTRAL
+        layers = self._layers
+        self._even_out(layers, but=None if window is None else window.box)
+        if isinstance(rest, Uniform):
+            self._paint(layers, rest.colour)
+        else:
+            self._fill_with(layers, rest, but=None if window is None else window.kept)
+        if window is not None:
+            self._place(layers, window)
+        return layers
+
+    def enlarged(self, layers: Layers) -> U8:
+        found = self._own()
+        for layer, out in zip(pixels_of(layers), found, strict=True):
+            cv2.resize(layer, out.shape[1::-1], dst=out, interpolation=cv2.INTER_LINEAR)
+        return found
+
+    def turned_picture(self, picture: U8 | DrawnPicture, side: int) -> U8:
+        pixels = picture.pixels() if isinstance(picture, DrawnPicture) else picture
+        return np.asarray(cv2.transpose(pixels), np.uint8)
+
+    def turned(self, layers: Layers) -> U8:
+        found = self._own()
+        for layer, out in zip(pixels_of(layers), found, strict=True):
+            cv2.transpose(layer, dst=out)
+        return found
+
+    def close(self) -> None:
+        """It holds nothing."""
+
+    def _own(self) -> U8:
+        if self._large is None:
+            self._large = self._empty(0)
+        return self._large
+
+    def _empty(self, code: int) -> U8:
+        return np.full((self._stack.count, self._stack.height_px, self._stack.width_px, 4), code, np.uint8)
+
+    def _even_out(self, layers: U8, *, but: PixelRect | None) -> None:
+        """Bring the outer panels back to the middle of their range where the last frame drove them."""
+        if self._solved is None or self._solved == but:
+            return
+        for layer in layers:
+            _fill(layer, self._solved, (NEUTRAL, NEUTRAL, NEUTRAL))
+        self._solved, self._colour = None, None
+
+    def _paint(self, layers: U8, colour: tuple[int, ...]) -> None:
+        """The centre panel as if both eyes saw nothing but a colour; once, as long as nothing changes."""
+        codes = centre_codes(self._stack.count)[list(colour)].tolist()
+        layer = layers[self._stack.count // 2]
+        if self._colour != colour:
+            _fill(layer, PixelRect(0, 0, self._stack.width_px, self._stack.height_px), codes)
+            self._colour = colour
+        elif self._solved is not None:
+            _fill(layer, self._solved, codes)
+
+    def _fill_with(self, layers: U8, rest: Shared, *, but: PixelRect | None) -> None:
+        """The picture on the centre panel, as both eyes see it where they agree."""
+        self._colour = None
+        centre, codes = layers[self._stack.count // 2], centre_codes(self._stack.count)
+        for part in _around(but, width_px=self._stack.width_px, height_px=self._stack.height_px):
+            grown = PixelRect(max(0, part.u0 - 1), max(0, part.v0 - 1), part.u1 + 1, part.v1 + 1)
+            sharp = pre_emphasised(rest.picture[grown.slices], rest.emphasis)
+            rows = slice(part.v0 - grown.v0, part.v1 - grown.v0)
+            columns = slice(part.u0 - grown.u0, part.u1 - grown.u0)
+            centre[part.slices] = cv2.LUT(np.ascontiguousarray(sharp[rows, columns]), codes)
+
+    def _place(self, layers: U8, window: Placed) -> None:
+        """The window's layers among the rest."""
+        area = window.box
+        for index, (layer, part) in enumerate(zip(layers, pixels_of(window.layers), strict=True)):
+            kept = window.kept if index == self._stack.count // 2 else area
+            rows, columns = slice(kept.v0 - area.v0, kept.v1 - area.v0), slice(kept.u0 - area.u0, kept.u1 - area.u0)
+            layer[kept.v0 : kept.v1, kept.u0 : kept.u1] = part[rows, columns]
+        self._solved = area
+
+
+def centre_codes(panels: int) -> U8:
+    """(256,) the centre panel's code for each code of the picture, the others standing at NEUTRAL."""
+    phases = phase_codes(2).reshape(256, -1)[:, 0].astype(np.int32)
+    return np.clip((phases - (panels - 1) * NEUTRAL * SUBCODE + SUBCODE // 2) // SUBCODE, 0, 255).astype(np.uint8)
+
+
+def _around(hole: PixelRect | None, *, width_px: int, height_px: int) -> list[PixelRect]:
+    """A panel's pixels but for a hole."""
+    if hole is None:
+        return [PixelRect(0, 0, width_px, height_px)]
+    parts = (
+        PixelRect(0, 0, width_px, hole.v0),
+        PixelRect(0, hole.v1, width_px, height_px),
+        PixelRect(0, hole.v0, hole.u0, hole.v1),
+        PixelRect(hole.u1, hole.v0, width_px, hole.v1),
+    )
+    return [part for part in parts if part.width_px and part.height_px]
+
+
+def _fill(layer: U8, area: PixelRect, codes: Sequence[int]) -> None:
+    """One colour in a part of an RGBA layer; whole pixels at a time, which is many times as fast as bytes."""
+    pixel = np.array([*codes, 255], np.uint8).view(np.uint32)
+    layer.view(np.uint32)[area.v0 : area.v1, area.u0 : area.u1, 0] = pixel
