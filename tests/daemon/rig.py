@@ -138,10 +138,19 @@ class Rig:
             ran = self.refresh_until(lambda: self.accounts[-1].inference == "ran")
         return ran
 
-    def settle(self) -> None:
-        """Refreshes until the solver has completed what it was at, and a refresh has shown it."""
+    def settle(self, work: Callable[[], object] = lambda: None) -> None:
+        """Refreshes until the solver has completed what it was at, and a refresh has shown it.
+
+        work: done on the solver's thread between two solutions.
+        """
         done = threading.Event()
-        self.presenter.solver.do(lambda parts: bool(done.set()) or True)
+
+        def between(parts: Any) -> bool:
+            work()
+            done.set()
+            return True
+
+        self.presenter.solver.do(between)
         self.refresh_until(done.is_set)
         self.presenter.refresh()
 

@@ -74,19 +74,20 @@ class Crossing:
         monkeypatch.setattr(GlSurround, "network_pictures", noted_pictures)
         monkeypatch.setattr(GlSurround, "set_panel", noted_panel)
 
-    def begin(self) -> None:
-        """From here on."""
+    def assert_only_the_network_s(self, rig: Rig, *, solutions: int) -> None:
+        """Of so many solutions from here on; counted from between two solutions to between two others."""
         # The wrapped functions are those in use.
         assert any(name == "glReadPixels" for name, _, _ in self.counted.calls)
         assert any(name == "glTexSubImage2D" for name, _, _ in self.counted.uploads)
-        for calls in (self.counted.calls, self.counted.uploads, self.rasters, self.answers):
-            calls.clear()
-
-    def assert_only_the_network_s(self, *, solutions: int) -> None:
-        seen, up = list(self.counted.calls), list(self.counted.uploads)
-        assert len(self.rasters) >= 2 * solutions
-        assert [(name, size) for name, size, _ in seen] == [("glReadPixels", size) for size in self.rasters]
-        assert [(name, size) for name, size, _ in up] == [("glTexSubImage2D", size) for size in self.answers]
+        lists: tuple[list[Any], ...] = (self.counted.calls, self.counted.uploads, self.rasters, self.answers)
+        rig.settle(lambda: [one.clear() for one in lists])
+        rig.refresh_until_solved(times=solutions)
+        found: list[list[Any]] = []
+        rig.settle(lambda: found.extend(list(one) for one in lists))
+        reads, uploads, rasters, answers = found
+        assert len(rasters) >= 2 * solutions
+        assert [(name, size) for name, size, _ in reads] == [("glReadPixels", size) for size in rasters]
+        assert [(name, size) for name, size, _ in uploads] == [("glTexSubImage2D", size) for size in answers]
 
 
 @pytest.fixture
@@ -97,11 +98,7 @@ def crossing(monkeypatch: pytest.MonkeyPatch) -> Crossing:
 def test_nothing_is_read_back_in_the_loop_but_the_network_s_raster(outputs: dict[str, Any], crossing: Crossing) -> None:
     with Rig(model=MODEL, tracker=HELD, **outputs) as rig:
         rig.refresh_until_solved()
-        rig.settle()
-        crossing.begin()
-        rig.refresh_until_solved(times=4)
-        rig.settle()
-        crossing.assert_only_the_network_s(solutions=4)
+        crossing.assert_only_the_network_s(rig, solutions=4)
         solution = left_in_textures(rig)
         before = len(crossing.counted.calls)
         assert solution.layers.std() > 5  # whoever asks gets the pixels
@@ -111,12 +108,8 @@ def test_nothing_is_read_back_in_the_loop_but_the_network_s_raster(outputs: dict
 def test_of_a_window_of_the_plan_nothing_else_crosses(outputs: dict[str, Any], crossing: Crossing) -> None:
     with Rig(model=MODEL, tracker=HELD, content={"scene": "sparse"}, **outputs) as rig:
         rig.refresh_until_solved()
-        rig.settle()
-        crossing.begin()
-        rig.refresh_until_solved(times=4)
-        rig.settle()
+        crossing.assert_only_the_network_s(rig, solutions=4)
         assert 0 < rig.predictor.active_fraction < 0.5
-        crossing.assert_only_the_network_s(solutions=4)
         layers = left_in_textures(rig).layers
         assert np.unique(layers[0, :8]).tolist() == [NEUTRAL, 255]  # beside the window outer panels are even
         assert layers[0].std() > 1
@@ -137,13 +130,9 @@ def test_of_a_budget_s_coarser_level_nothing_else_crosses(
         rig.presenter.solver.do(coarser)
         rig.settle()
         rig.refresh_until_solved(times=2)
-        rig.settle()
-        crossing.begin()
-        rig.refresh_until_solved(times=4)
-        rig.settle()
+        crossing.assert_only_the_network_s(rig, solutions=4)
         assert isinstance(rig.predictor, ReducedPredictor)
         assert (rig.predictor.small.active_fraction < 0.5) == (scene == "sparse")
-        crossing.assert_only_the_network_s(solutions=4)
         assert left_in_textures(rig).layers.std() > 1
 
 
@@ -152,12 +141,8 @@ def test_of_a_head_on_its_side_nothing_else_crosses(outputs: dict[str, Any], cro
         rig.plan.eyes_m = np.array([[0.7, 0.0, -0.031], [0.7, 0.0, 0.031]])
         rig.refresh_until(lambda: rig.presenter.last is not None and on_its_side(rig.presenter.last.solution))
         rig.refresh_until_solved()
-        rig.settle()
-        crossing.begin()
-        rig.refresh_until_solved(times=4)
-        rig.settle()
+        crossing.assert_only_the_network_s(rig, solutions=4)
         assert on_its_side(left_in_textures(rig))
-        crossing.assert_only_the_network_s(solutions=4)
 
 
 def on_its_side(solution: Solution | None) -> bool:
