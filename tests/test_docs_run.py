@@ -86,6 +86,8 @@ NOT_RUN = {
     "phasestack report --pairs my-pairs --out report": REPORT,
     "phasestack report --quick --focal --out report": REPORT,
     "phasestack stability --full --record runtime/report/stability/limits.json": "changes a file that ships",
+    "phasestack train --recipe balanced --iterations 200 --threads 1 --out out/balanced": "is run with one iteration: "
+    "`phasestack train --recipe balanced --out out/balanced`",
     "phasestack stability --out stability --full": "takes many minutes: tests/report/test_stability.py runs it",
 }
 
@@ -177,7 +179,7 @@ def cases() -> list[object]:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("line", cases())
 def test_a_command_of_the_pages_does_what_it_says(
     line: str, workshop: Workshop, request: pytest.FixtureRequest

@@ -112,7 +112,7 @@ class Workshop:
         )  # fmt: skip
 
     def typed(
-        self, line: str, folder: Path, *, keys: str = "", display: str = "", within_s: float = 800.0
+        self, line: str, folder: Path, *, keys: str = "", display: str = "", within_s: float = 1700.0
     ) -> subprocess.CompletedProcess[str]:
         """The same, with the keys that the person presses, until it is done."""
         with self.started(line, folder, display=display) as running:
