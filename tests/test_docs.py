@@ -14,10 +14,8 @@ import pytest
 
 import runtime.config
 from runtime.sensor.known_devices import KNOWN_DEVICES
+from tests.shown import DOCS, PAGES, ROOT, shown_commands
 
-ROOT = Path(__file__).resolve().parents[1]
-DOCS = ROOT / "docs"
-PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")])
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 
 
@@ -159,16 +157,6 @@ def test_the_gallery_shows_what_its_list_names_with_the_commands_that_made_it() 
     assert sum(sizes.values()) <= 2_500_000
 
 
-def shown_commands() -> list[tuple[str, str]]:
-    """Every call of phasestack in the pages' examples, comments and continued lines resolved: page and words."""
-    lines = re.compile(r"^    (?:sudo .*)?(phasestack .+)$", re.MULTILINE)
-    return [
-        (str(page.relative_to(ROOT)), re.split(r"\s+(?:#|&&)\s|\s{4,}", line)[0])
-        for page in PAGES
-        for line in lines.findall(page.read_text(encoding="utf-8").replace("\\\n", " "))
-    ]
-
-
 def test_every_command_that_a_page_shows_exists_with_its_options() -> None:
     pages = script("make_pages")
     known = {tuple(path[1:]): command for path, command in pages.walk(pages.typer.main.get_command(pages.app), [""])}
@@ -176,7 +164,7 @@ def test_every_command_that_a_page_shows_exists_with_its_options() -> None:
     assert len(shown) > 60
     for page, line in shown:
         for part in line.split(", "):  # `phasestack record, doctor, status`
-            words = part.removeprefix("phasestack ").split()
+            words = re.sub(r"^(?:phasestack|torchrun .* -m runtime\.cli) ", "", part).split()
             name = max((path for path in known if tuple(words[: len(path)]) == path), key=len)
             options = {option for parameter in known[name].params for option in parameter.opts} | {"--help"}
             assert name, f"{page}: {line}"
