@@ -81,6 +81,7 @@ NOT_RUN = {
     "phasestack bench --backend gl --out gl.json": BENCH,
     "phasestack bench --out bench.json": BENCH,
     "phasestack bench --out new.json": BENCH,
+    "phasestack plan --survey --out plan": "is run as `phasestack plan --survey --out out/plan`",
     "phasestack report --focal": REPORT,
     "phasestack report --out report": REPORT,
     "phasestack report --pairs my-pairs --out report": REPORT,
