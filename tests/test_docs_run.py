@@ -81,14 +81,16 @@ NOT_RUN = {
     "phasestack bench --backend gl --out gl.json": BENCH,
     "phasestack bench --out bench.json": BENCH,
     "phasestack bench --out new.json": BENCH,
+    "phasestack plan --survey --out plan": "is run as `phasestack plan --survey --out out/plan`",
     "phasestack report --focal": REPORT,
     "phasestack report --out report": REPORT,
     "phasestack report --pairs my-pairs --out report": REPORT,
     "phasestack report --quick --focal --out report": REPORT,
     "phasestack stability --full --record runtime/report/stability/limits.json": "changes a file that ships",
+    "phasestack stability --out stability": "the fast tests run it: tests/report/test_stability.py",
+    "phasestack stability --out stability --full": "takes many minutes: tests/report/test_stability.py runs it",
     "phasestack train --recipe balanced --iterations 200 --threads 1 --out out/balanced": "is run with one iteration: "
     "`phasestack train --recipe balanced --out out/balanced`",
-    "phasestack stability --out stability --full": "takes many minutes: tests/report/test_stability.py runs it",
 }
 
 RUN = [line for line in runnable_commands() if line not in NOT_RUN]
