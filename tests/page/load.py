@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import statistics
 import subprocess
 import sys
 import threading
@@ -131,7 +130,7 @@ def _children_s() -> float:
 
 def _together(spans: list[dict[str, float]]) -> dict[str, float]:
     total = {name: sum(span[name] for span in spans) for name in ("seconds", "refreshes", "missed")}
-    cores = statistics.median(span["cores"] for span in spans)  # one that the machine disturbed says nothing
+    cores = sum(span["cores"] * span["seconds"] for span in spans) / total["seconds"]
     return {**total, "cores": round(cores, 4), "missed_per_minute": round(60 * total["missed"] / total["seconds"], 2)}
 
 

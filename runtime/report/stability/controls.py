@@ -236,12 +236,10 @@ def controls(fits: Mapping[str, Fit]) -> Iterator[Control]:
         yield Control(
             solve.STAGE, name, partial(_recorded, partial(solve.trials, solve.Solvers(methods=solved_by(method))))
         )
-    for name, predict in (
-        ("grey layers", grey_network),
-        ("mean of targets", mean_network),
-        ("eyes always straight ahead", one_place_network),
-    ):
+    for name, predict in (("grey layers", grey_network), ("mean of targets", mean_network)):
         yield Control(networks.STAGE, name, partial(networks.picture_trials, predict))
+    unmoving = partial(networks.picture_trials, one_place_network)
+    yield Control(networks.STAGE, "eyes always straight ahead", partial(_elsewhere, unmoving))
     yield Control(uncertainty.STAGE, "even panels", partial(uncertainty.trials, even_answer, even_panels))
     sure = partial(uncertainty.trials, sure_answer, sure_panels)
     yield Control(uncertainty.STAGE, "never in doubt", partial(_doubtful, sure))
@@ -269,6 +267,11 @@ def _doubtful(make: Callable[[], Iterable[Trial]]) -> Iterator[Trial]:
     off = tuple(f"off by {value} mm" for value in (1, 2, 4, 10, 50))
     felt = (*columns, *off, "to 50 columns", "NaN doubt", "infinite doubt")
     return (trial for trial in make() if trial.name.endswith(felt))
+
+
+def _elsewhere(make: Callable[[], Iterable[Trial]]) -> Iterator[Trial]:
+    """The cases in which eyes are not straight ahead."""
+    return (trial for trial in make() if networks.FROM in trial.name)
 
 
 def _noisy(make: Callable[[], Iterable[Trial]]) -> Iterator[Trial]:

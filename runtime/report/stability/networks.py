@@ -27,7 +27,8 @@ STAGE = "network"
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
 FOV_DEG = 40.0
 MODELS = ("fast", "balanced", "best")
-PLACES = ((0.7, 15.0), (0.9, -25.0), (0.45, 10.0), (1.5, -35.0))  # metres and degrees; pictures are seen from in turn
+PLACES = ((0.7, 15.0), (0.9, -25.0), (0.45, 10.0), (1.5, -35.0))  # metres, degrees: besides from straight ahead
+FROM = ", from "  # a case's name and its place
 
 RAYS = 150  # of each eye, traced
 FLOOR = 0.0005  # an eighth of a code: what another processor's rounding may move
@@ -216,9 +217,12 @@ def picture_trials(predict: Predict = predicted, *, full: bool = False) -> Itera
     """Every case of what a model makes of two pictures; `full`: on every pose for each model, and on 4K panels."""
     for model in MODELS:
         for kind, (distance_m, angle_deg) in zip(KINDS, itertools.cycle(PLACES), strict=False):
-            seen_from = eyes_at(distance_m=distance_m, angle_deg=angle_deg)
-            run = partial(stressed, predict, model, pictures(kind), seen_from)
-            yield Trial(STAGE, f"{model}: {kind}", run, measure="intensity", recorded=True, floor=FLOOR)
+            for place, eyes in (
+                ("", eyes_at(distance_m=0.6)),
+                (f"{FROM}{distance_m:g} m, {angle_deg:g} degrees", eyes_at(distance_m=distance_m, angle_deg=angle_deg)),
+            ):
+                run = partial(stressed, predict, model, pictures(kind), eyes)
+                yield Trial(STAGE, f"{model}: {kind}{place}", run, measure="intensity", recorded=True, floor=FLOOR)
         run = partial(scored, predict, model)
         yield Trial(STAGE, f"{model}: what is seen of its layers", run, measure="intensity")
         yield Trial(
