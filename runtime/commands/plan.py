@@ -93,7 +93,10 @@ def _print(result: dict[str, Any]) -> None:
     from rich.table import Table
 
     console = Console()
-    console.print(f"scene {result['scene']}, model {result['model']}, {result['width_px']} x {result['height_px']}")
+    console.print(
+        f"scene {result['scene']}, model {result['model']} ({result['backend']}), "
+        f"{result['width_px']} x {result['height_px']}"
+    )
     table = Table("left out", "why", "saves ms", "costs dB")
     drifted = result["psnr_db_drifted"]
     for item in result["plan"]:

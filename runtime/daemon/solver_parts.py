@@ -82,9 +82,13 @@ class RunningSolver:
         if before is not self.backend:
             before.backend.close()
 
-    def use(self, predictor: Predictor) -> Predictor:
-        """Another model from the next solution on. Answers the one before it, which is the caller's to close."""
+    def surround_level(self, predictor: Predictor) -> None:
+        """Have this run's backend surround a model that a budget may choose."""
         predictor.surround_with(self.backend.backend)
+
+    def use(self, predictor: Predictor) -> Predictor:
+        """Another model, surrounded already, from the next solution on. Answers the one before it, which is the
+        caller's to close."""
         return self.run.replace(predictor=predictor).predictor
 
     def tell_level(self, label: str, saving: Saving) -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import queue
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import asdict, replace
 from functools import partial
 from typing import Any, Protocol, TypeVar
@@ -17,6 +18,8 @@ from runtime.errors import PhasestackError
 from runtime.model.predictor import Predictor
 from runtime.optics.stack import PanelStack
 from runtime.plan.ladder import (
+    Ask,
+    LevelHost,
     NoLongerAsked,
     Rung,
     Scenery,
@@ -36,6 +39,7 @@ T = TypeVar("T")
 
 FRAMES_KEPT = 30
 FEWEST_FRAMES = 5
+CLOSING_S = 0.5  # for what is being measured to let go of its level
 VIEWER_M = ((0.6, -0.031, 0.0), (0.6, 0.031, 0.0))  # before anybody was seen
 
 
@@ -50,8 +54,12 @@ class Solving(Protocol):
     def content(self) -> ContentSource:
         """What is drawn at present."""
 
+    def surround_level(self, predictor: Predictor) -> None:
+        """Have the run's backend surround a model that may be used."""
+
     def use(self, predictor: Predictor) -> Predictor:
-        """Another model from the next solution on. Answers the one before it, which is the caller's to close."""
+        """Another model, surrounded already, from the next solution on. Answers the one before it, which is the
+        caller's to close."""
 
     def tell_level(self, label: str, saving: Saving) -> None:
         """What the plan says of the level that is shown; empty: no budget."""
@@ -60,9 +68,10 @@ class Solving(Protocol):
 class BudgetControl:
     """Holds `model.budget_ms` for one solver; without a budget it does nothing. The solver's thread uses it.
 
-    Levels are measured on the content and eyes of the moment: before the first solution where the settings have a
-    budget, else on a thread of its own, which asks the solver's for one drawing a step. A level is switched to only
-    when its predictor is warm; the neighbours of the present one are kept so.
+    Levels are measured with the run's backend, on the content and eyes of the moment: before the first solution where
+    the settings have a budget, else on a thread of its own, which asks the solver's for one drawing a step, or for one
+    solution where the backend needs the GL context. A level is switched to only when its predictor is warm; the
+    neighbours of the present one are kept so.
     """
 
     def __init__(self, solving: Solving, stack: PanelStack, *, simulated: bool = False) -> None:
@@ -74,6 +83,7 @@ class BudgetControl:
         self._levels: list[QualityLevel] = []
         self._keeper: BudgetKeeper | None = None
         self._calls = SolverCalls()
+        self._unwanted: queue.SimpleQueue[Predictor] = queue.SimpleQueue()  # to be closed on the solver's thread
         self._measuring: Job[list[QualityLevel]] | None = None
         self._doing = ""  # what is being measured
         self._kept: dict[Rung, Predictor] = {}
@@ -112,14 +122,16 @@ class BudgetControl:
                 raise NoLongerAsked("stopped")
             return call()
 
-        scenery = self._scenery()
+        scenery, host = self._scenery(), self._host(ask)
         try:
-            self._choose(measured_levels(self._settings, scenery, ask, simulated=self.simulated, tell=told))
+            self._choose(measured_levels(self._settings, scenery, host, simulated=self.simulated, tell=told))
             if self._wanted() != self._shown:
-                self._switch(self._wanted(), ready_level(self._wanted(), self._settings, scenery, ask))
+                self._switch(self._wanted(), ready_level(self._wanted(), self._settings, scenery, host))
         except PhasestackError as error:
             self._problem = str(error)
             log.error("budget: it can't be held: %s", error)
+        finally:
+            self._close_unwanted()
 
     def changed(self, *, content: bool = False, model: bool = False) -> None:
         """Other settings hold. content: another scene is shown; model: another one is configured and in use."""
@@ -135,6 +147,7 @@ class BudgetControl:
         if self.budget_ms <= 0:
             self._stop_asking()
             self._levels, self._keeper, self._problem = [], None, ""
+            self._forget_levels(but=(self._configured,))
             self._report()
         elif content or model or not self._levels:
             self._measure()
@@ -146,6 +159,7 @@ class BudgetControl:
 
         eyes_m: (2, 3) of the newest request, frame `stack`; took_ms: of the solution, where one was made.
         """
+        self._close_unwanted()
         if self.budget_ms <= 0 and self._shown == self._configured:
             return
         self._time_ns = time_ns
@@ -176,8 +190,13 @@ class BudgetControl:
 
     def close(self) -> None:
         """Let go of every level but the pipeline's own. May be called twice."""
+        jobs = [self._measuring, self._job and self._job[1]]
         self._stop_asking()
+        for job in jobs:
+            if job is not None:
+                job.wait(CLOSING_S)
         self._forget_levels()
+        self._close_unwanted()
 
     def _wanted(self) -> Rung:
         if self.budget_ms <= 0:
@@ -204,18 +223,16 @@ class BudgetControl:
         if wanted != self._shown and wanted in self._kept:
             self._switch(wanted, self._kept.pop(wanted))
         near = self._neighbours()
-        for rung in [rung for rung in self._kept if rung not in (wanted, *near)]:
-            self._kept.pop(rung).close()
+        self._forget_levels(but=(wanted, *near))
         have = {self._shown, *self._kept, *self._failed}
         missing = [rung for rung in (wanted, *near) if rung not in have]
         if missing and self._job is None and self._measuring is None:
             self._get_ready(missing[0])
 
     def _get_ready(self, rung: Rung) -> None:
-        settings, scenery, calls = self._settings, self._scenery(), self._calls
         name = f"model {QualityLevel(*rung, 0.0, 0.0).label}"
-        work = partial(ready_level, rung, settings, scenery, calls)
-        self._job = rung, Job(name, work, discard=lambda made: made.close())
+        work = partial(ready_level, rung, self._settings, self._scenery(), self._host(self._calls))
+        self._job = rung, Job(name, work, discard=self._unwanted.put)
 
     def _take_predictor(self) -> None:
         if self._job is None or not self._job[1].done:
@@ -248,13 +265,13 @@ class BudgetControl:
 
     def _measure(self) -> None:
         """Begin to measure, alongside the loop; the present level stays until that is done."""
-        settings, scenery, calls = self._settings, self._scenery(), self._calls
+        settings, scenery, host = self._settings, self._scenery(), self._host(self._calls)
         self._problem = ""
 
         def tell(text: str) -> None:
             self._doing = text
 
-        self._measuring = Job("budget", lambda: measured_levels(settings, scenery, calls, tell=tell))
+        self._measuring = Job("budget", lambda: measured_levels(settings, scenery, host, tell=tell))
 
     def _take_measurement(self) -> None:
         if self._measuring is None or not self._measuring.done:
@@ -302,6 +319,13 @@ class BudgetControl:
         fov_deg = self._settings.content.fov_deg
         return Scenery(self._solving.content, self._eyes_m, self._time_ns, self._stack, fov_deg)
 
+    def _host(self, ask: Ask) -> LevelHost:
+        return LevelHost(ask, self._solving.surround_level, self._unwanted.put)
+
+    def _close_unwanted(self) -> None:
+        while not self._unwanted.empty():
+            self._unwanted.get().close()
+
     def _stop_asking(self) -> None:
         """What is being measured or made ready is for a picture that is no more."""
         self._calls.close()
@@ -312,10 +336,9 @@ class BudgetControl:
             self._measuring.abandon()
         self._job, self._measuring, self._doing, self._failed = None, None, "", set()
 
-    def _forget_levels(self) -> None:
-        for predictor in self._kept.values():
-            predictor.close()
-        self._kept = {}
+    def _forget_levels(self, *, but: Collection[Rung] = ()) -> None:
+        for rung in [rung for rung in self._kept if rung not in but]:
+            self._kept.pop(rung).close()
 
 
 def _rung(level: QualityLevel) -> Rung:

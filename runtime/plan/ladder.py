@@ -47,6 +47,15 @@ class Ask(Protocol):
     def __call__(self, call: Callable[[], T]) -> T: ...
 
 
+@dataclass(frozen=True, slots=True)
+class LevelHost:
+    """What the solver's thread, which has the GL context, does for whoever measures levels or makes one ready."""
+
+    ask: Ask
+    surround: Callable[[Predictor], None]  # has the run's backend surround a model; only when asked
+    release: Callable[[Predictor], None]  # closes a level there, sooner or later; from any thread
+
+
 class SolverCalls:
     """`Ask` for other threads: the solver's thread, which has the GL context, serves one call between two steps."""
 
@@ -97,7 +106,26 @@ class Scenery:
     stack: PanelStack
     fov_deg: float
 
-    def pictures(self, predictor: Predictor) -> tuple[list[list[U8]], float]:
+    def solved(self, predictor: Predictor, host: LevelHost) -> tuple[U8, float]:
+        """A model's layers of the present picture, and how many milliseconds drawing and solving took.
+
+        Solved by whoever calls, while the loop goes on; a model whose backend needs the context, where that is.
+        """
+        if _needs_the_context(predictor):
+            return host.ask(lambda: self._solved_here(predictor))
+        images, drawing_ms = host.ask(lambda: self._pictures(predictor))
+        begin_ns = perf_counter_ns()
+        layers = predictor.predict(images, self.eyes_m).layers
+        return layers, drawing_ms + (perf_counter_ns() - begin_ns) / 1e6
+
+    def _solved_here(self, predictor: Predictor) -> tuple[U8, float]:
+        begin_ns = perf_counter_ns()
+        images = drawn_for(predictor, self.content, self.eyes_m, time_ns=self.time_ns)
+        solved = predictor.predict(images, self.eyes_m)
+        taken_ms = (perf_counter_ns() - begin_ns) / 1e6
+        return solved.layers, taken_ms  # the loop reads nothing back
+
+    def _pictures(self, predictor: Predictor) -> tuple[list[list[U8]], float]:
         """What a model wants to see (copies), and how many milliseconds drawing it took."""
         begin_ns = perf_counter_ns()
         images = drawn_for(predictor, self.content, self.eyes_m, time_ns=self.time_ns)
@@ -127,18 +155,22 @@ def rungs(settings: Settings, stack: PanelStack) -> tuple[Rung, ...]:
     return tuple((settings.model.name, scale) for scale in SCALES)
 
 
-def ready_level(rung: Rung, settings: Settings, scenery: Scenery, ask: Ask) -> Predictor:
-    """A level's predictor that has drawn and solved the present picture: its first frame costs no more than others.
+def ready_level(rung: Rung, settings: Settings, scenery: Scenery, host: LevelHost) -> Predictor:
+    """A level's predictor that has drawn and solved the present picture, surrounded by the run's backend: its first
+    frame costs no more than others.
 
     Raises PhasestackError.
     """
     predictor = ladder_predictor(*rung, scenery.stack, settings)
     try:
-        predictor.warm_up(scenery.eyes_m)
-        images, _ = ask(lambda: scenery.pictures(predictor))
-        predictor.predict(images, scenery.eyes_m)
+        host.ask(lambda: host.surround(predictor))
+        if _needs_the_context(predictor):
+            host.ask(lambda: predictor.warm_up(scenery.eyes_m))
+        else:
+            predictor.warm_up(scenery.eyes_m)
+        scenery.solved(predictor, host)
     except BaseException:
-        predictor.close()
+        host.release(predictor)
         raise
     return predictor
 
@@ -146,7 +178,7 @@ def ready_level(rung: Rung, settings: Settings, scenery: Scenery, ask: Ask) -> P
 def measured_levels(
     settings: Settings,
     scenery: Scenery,
-    ask: Ask,
+    host: LevelHost,
     *,
     simulated: bool = False,
     tell: Callable[[str], None] = lambda _: None,
@@ -155,13 +187,13 @@ def measured_levels(
 
     simulated: times are the simulated clock's instead of the machine's. Raises FatalError where none can be had.
     """
-    wanted = ask(scenery.wanted)
+    wanted = host.ask(scenery.wanted)
     levels: list[QualityLevel] = []
     for rung in rungs(settings, scenery.stack):
         level = QualityLevel(*rung, 0.0, 0.0)
         tell(level.label)
         try:
-            level = _measured(rung, settings, scenery, ask, wanted, simulated=simulated)
+            level = _measured(rung, settings, scenery, host, wanted, simulated=simulated)
         except FatalError as error:  # a network of fixed size has no smaller ones
             log.info("budget: %s is left out: %s", level.label, error)
             continue
@@ -173,23 +205,22 @@ def measured_levels(
 
 
 def _measured(
-    rung: Rung, settings: Settings, scenery: Scenery, ask: Ask, wanted: list[F32], *, simulated: bool
+    rung: Rung, settings: Settings, scenery: Scenery, host: LevelHost, wanted: list[F32], *, simulated: bool
 ) -> QualityLevel:
-    predictor = ready_level(rung, settings, scenery, ask)
+    predictor = ready_level(rung, settings, scenery, host)
     try:
-        times_ms = []
-        for _ in range(1 if simulated else REPEATS):
-            images, drawing_ms = ask(lambda: scenery.pictures(predictor))
-            begin_ns = perf_counter_ns()
-            layers = predictor.predict(images, scenery.eyes_m).layers
-            times_ms.append(drawing_ms + (perf_counter_ns() - begin_ns) / 1e6)
-        shown_db = scenery.psnr_db(layers, wanted)
+        tries = [scenery.solved(predictor, host) for _ in range(1 if simulated else REPEATS)]
+        shown_db = scenery.psnr_db(tries[-1][0], wanted)
     finally:
-        predictor.close()
-    cost_ms = min(times_ms)  # the least disturbed: the loop may be at work meanwhile
+        host.release(predictor)
+    cost_ms = min(taken_ms for _, taken_ms in tries)  # the least disturbed: the loop may be at work meanwhile
     if simulated:
         cost_ms = sum(simulated_stage_ms(rung, settings)[stage] for stage in ("render", *SOLVING))
     return QualityLevel(*rung, cost_ms, shown_db)
+
+
+def _needs_the_context(predictor: Predictor) -> bool:
+    return predictor.backend == "gl"
 
 
 def simulated_stage_ms(rung: Rung, settings: Settings) -> dict[str, float]:

@@ -16,6 +16,7 @@ from rich.console import Console
 from runtime.config import Settings, load_settings, validated
 from runtime.content.registry import open_content
 from runtime.errors import FatalError, InputError
+from runtime.model.backends import choose
 from runtime.model.predictor import load_predictor
 from runtime.optics.retina import seen_by
 from runtime.plan.ladder import rungs
@@ -30,6 +31,7 @@ from runtime.support.progress import NowAndThen
 
 if TYPE_CHECKING:
     from runtime.content.base import ContentSource
+    from runtime.model.schedule import Backend
     from runtime.optics.stack import PanelStack
     from runtime.plan.levels import QualityLevel
     from runtime.plan.measure import Trial
@@ -72,15 +74,22 @@ def plan_for(
         cleanup.callback(content.close)
         plain = load_predictor(settings.model.name, stack, settings.model)
         cleanup.callback(plain.close)
+        tell("backend")
+        backend = choose(settings.model.backend, plain, lambda: context).backend
+        cleanup.callback(backend.close)
         predictor = planned_predictor(settings, stack)
-        cleanup.callback(predictor.close)
+        for surrounded in (plain, predictor):
+            cleanup.callback(surrounded.close)  # before its backend
+            surrounded.surround_with(backend)
         tell("with and without the plan")
         numbers, without, with_plan = measure(
             content, plain, predictor, eyes_m, stack, fov_deg=settings.content.fov_deg, band_m=_band_m(settings)
         )
         levels: list[QualityLevel] = []
         if settings.model.budget_ms > 0:
-            levels, numbers, with_plan = _budget(settings, stack, content, eyes_m, numbers, with_plan, tell)
+            levels, numbers, with_plan = _budget(
+                settings, stack, content, eyes_m, numbers, with_plan, tell, backend=backend
+            )
         planned = make_plan(
             content.info,
             stack,
@@ -94,6 +103,7 @@ def plan_for(
         return {
             "scene": content.info.name,
             "model": plain.name,
+            "backend": plain.backend,
             "width_px": stack.width_px,
             "height_px": stack.height_px,
             "plan": [asdict(item) for item in planned.items],
@@ -121,6 +131,8 @@ def _budget(
     numbers: Any,
     present: Trial,
     tell: Callable[[str], None],
+    *,
+    backend: Backend,
 ) -> tuple[list[QualityLevel], Any, Trial]:
     """Measure what the running daemon would choose from (`ladder.rungs`), and choose by the budget.
 
@@ -135,8 +147,11 @@ def _budget(
             predictor = ladder_predictor(name, scale, stack, settings)
         except FatalError:  # a network of fixed size has no smaller ones
             continue
-        result = trial(content, predictor, eyes_m, stack, fov_deg=settings.content.fov_deg, repeats=3)
-        predictor.close()
+        try:
+            predictor.surround_with(backend)
+            result = trial(content, predictor, eyes_m, stack, fov_deg=settings.content.fov_deg, repeats=3)
+        finally:
+            predictor.close()
         trials[level.label] = result
         levels.append(replace(level, expected_ms=result.frame_ms, psnr_db=result.psnr_db))
     if not levels:

@@ -50,6 +50,10 @@ class Job(Generic[T]):
         if result is not None:
             self._discard(result)
 
+    def wait(self, timeout_s: float) -> None:
+        """Until its thread has ended, so long at most."""
+        self._thread.join(timeout_s)
+
     def take(self) -> T | None:
         """The result, which is the caller's from now on; None where there is none (yet)."""
         with self._lock:

@@ -124,7 +124,9 @@ def test_of_a_budget_s_coarser_level_nothing_else_crosses(
 
         def coarser(parts: Any) -> bool:
             """As the budget switches to it."""
-            parts.use(ladder_predictor("fast", 0.75, rig.settings.stack.stack(), rig.settings)).close()
+            level = ladder_predictor("fast", 0.75, rig.settings.stack.stack(), rig.settings)
+            parts.surround_level(level)
+            parts.use(level).close()
             return True
 
         rig.presenter.solver.do(coarser)

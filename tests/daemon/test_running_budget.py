@@ -19,6 +19,7 @@ from runtime.plan.ladder import rungs
 from runtime.plan.levels import QualityLevel, useful
 from runtime.plan.predictors import LADDER
 from runtime.records import RefreshAccount
+from tests.daemon.gl_soak import objects
 from tests.daemon.rig import Rig
 from tests.daemon.test_changes import Served, configuration
 from tests.test_cli import phasestack
@@ -162,6 +163,47 @@ def test_what_can_t_be_cut_is_offered_at_fewer_pixels() -> None:
     with Rig(stack={"width_px": 64, "height_px": 36, "x_m": (-0.06, 0.0, 0.02)}) as rig:
         names = rungs(rig.settings, rig.presenter.stack)
         assert names == (("fast", 1.0), ("fast", 0.75), ("fast", 0.5))
+
+
+def test_levels_are_measured_as_the_loop_solves_and_leave_nothing_in_the_gpu(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, ways = UnrolledPredictor.predict, set()
+
+    def predict(self: UnrolledPredictor, images: Any, eyes_m: Any, **how: Any) -> Any:
+        ways.add((self.backend, threading.current_thread().name.split("-")[0]))
+        return real(self, images, eyes_m, **how)
+
+    with Served(tmp_path, **{**MOVING, "model": {"name": "best", "backend": "gl"}}) as served:
+        rig, counts = served.rig, []
+        monkeypatch.setattr(UnrolledPredictor, "predict", predict)
+        for _ in range(3):
+            served.asked("budget", 5000.0)
+            rig.refresh_until(lambda: levels_of(served))
+            rig.refresh_until_solved()
+            served.asked("budget", 0.0)
+            rig.refresh_until(lambda: rig.predictor.name == "best" and served.budget.describe() is None)
+            rig.settle()
+            counts.append(objects(rig.presenter.panels.group))
+    assert ways == {("gl", "solver")}
+    assert counts[2] == counts[1]  # the first compiled programs
+
+
+def test_what_is_being_measured_at_the_end_is_closed_on_the_solver_s_thread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed: list[str] = []
+    real = UnrolledPredictor.close
+
+    def close(self: UnrolledPredictor) -> None:
+        closed.append(threading.current_thread().name.split("-")[0])
+        real(self)
+
+    with Served(tmp_path, **{**MOVING, "model": {"name": "best", "backend": "gl"}}) as served:
+        served.asked("budget", 5000.0)
+        served.rig.refresh_until(lambda: served.budget.describe()["measuring"])
+        monkeypatch.setattr(UnrolledPredictor, "close", close)
+    assert set(closed) <= {"solver", "MainThread"}
 
 
 def test_the_choice_is_the_same_every_time_on_a_simulated_clock(tmp_path: Path) -> None:
