@@ -29,6 +29,7 @@ FOCAL_GUESSES = (0.6, 0.8, 1.1, 1.6, 2.4)  # of the longer side
 ROBUST_PX = 0.3  # residuals beyond this count by their size, not their square
 OUTLIER_SIGMAS = 4.0
 LEAST_SIGMA_PX = 0.01
+NO_FIT_PX = 5.0  # median distance of points beyond which nothing like the configuration was photographed
 # What is known of any camera before its first photograph, standard deviations: square pixels, a lens over the
 # sensor's middle, distortion of a few per cent. They decide nothing that twelve photographs tell.
 SQUARE_SIGMA, CENTRE_SIGMA, DISTORTION_SIGMAS = 0.003, 0.03, (0.3, 0.5, 0.005, 0.005, 0.5)
@@ -177,11 +178,15 @@ class _Problem:
         prior *= self.prior_scale[:, None]
         return matrix
 
-    def start(self) -> F64:
-        """Ideal panels, the focal length for which they explain the photographs best, and poses for it."""
+    def start(self, *, reverse: bool = False) -> F64:
+        """Ideal panels, the focal length for which they explain the photographs best, and poses for it.
+
+        reverse: panels in the reverse of the configuration's order.
+        """
         ideal = np.zeros(self.size)
         for index in self.moving:
-            ideal[self.panel_part(index)] = [0, 0, 0, self.stack.x_m[index], 0, 0]
+            off_m = self.stack.x_m[index] - self.fixed_m[0]
+            ideal[self.panel_part(index)] = [0, 0, 0, self.fixed_m[0] + (-off_m if reverse else off_m), 0, 0]
         points = self.stack_m(ideal)
         long_side = max(self.seen[0].width_px, self.seen[0].height_px)
         best, least = ideal, np.inf
@@ -245,14 +250,30 @@ def _solved(problem: _Problem, x: F64, used: NDArray[np.bool_], *, robust: bool)
     return np.asarray(fit.x, dtype=np.float64)
 
 
-def _refuse_behind(problem: _Problem, x: F64) -> None:
-    """A stack that is mirrored front to rear, seen by cameras behind it, has the same pictures: only one is real."""
+def _refuse_reverse(problem: _Problem, x: F64) -> None:
+    """Raises Undetermined where the panels stand in the reverse of the configuration's order.
+
+    A stack that is mirrored front to rear, seen by cameras behind it, has the same pictures: only one is real. Or
+    nothing that the configuration allows fits, and the reverse does.
+    """
     points = problem.stack_m(x)
+    behind = False
     for number in range(len(problem.seen)):
         pose = x[problem.pose_part(number)]
         depth_m = (points[problem.photograph == number] @ cv2.Rodrigues(pose[:3])[0].T + pose[3:])[:, 2]
-        if np.median(depth_m) <= 0:
-            raise Undetermined("the panels stand in the reverse of the configuration's order: panel 0 is the rear one")
+        behind |= bool(np.median(depth_m) <= 0)
+    if not behind and _median_px(problem, x) > NO_FIT_PX:
+        everything = np.ones(len(problem.image_px), bool)
+        other = _solved(problem, problem.start(reverse=True), everything, robust=True)
+        behind = _median_px(problem, other) < NO_FIT_PX
+    if behind:
+        raise Undetermined("the panels stand in the reverse of the configuration's order: panel 0 is the rear one")
+
+
+def _median_px(problem: _Problem, x: F64) -> float:
+    """Of the distances between points and where they were seen."""
+    residual = problem.residuals(x)[: 2 * len(problem.image_px)].reshape(-1, 2)
+    return float(np.median(np.linalg.norm(residual, axis=1)))
 
 
 def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> Bundle:
@@ -271,7 +292,7 @@ def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> B
         if (good == used).all():
             break
         used = good
-    _refuse_behind(problem, x)
+    _refuse_reverse(problem, x)
     residual = problem.residuals(x)[: 2 * count].reshape(-1, 2)
     slopes = problem.slopes(x)
     kept = np.concatenate([np.repeat(used, 2), np.ones(len(problem.prior_scale), bool)])

@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.bundle import Bundle
 from calib.misregistration import corrected, seen_through
-from calib.photo_registration import PhotoRegistration
+from calib.photo_registration import PhotoRegistration, geometry_of, homographies
 from calib.pictures import layers_for, scene_pictures
 from calib.placed import PlacedPanel, true_from_ideal_seen
 from calib.viewpoints import IPD_M, eyes_at
@@ -50,11 +50,13 @@ def displayed_db(
     *,
     model: str,
     truth: tuple[PlacedPanel, ...] | None = None,
+    even: bool | None = None,
 ) -> dict[str, float]:
     """dB of a perfect stack, of this one as it was configured, and of this one registered.
 
-    truth: where the panels are (a simulation knows); else as found, off by one draw of what is uncertain.
-    Raises InputError, MissingPart.
+    truth: where the panels are (a simulation knows); else as found, off by one draw of what is uncertain. With it, also
+    the dB of a registration without any error (`even`: as in `register_photographs`): what is lost there is lost by
+    resampling and tilts. Raises InputError, MissingPart.
     """
     panels = one_draw(found.bundle) if truth is None else truth
     eyes_m = eyes_at(found.eye_m, settings.calibration.ipd_m or IPD_M)
@@ -64,12 +66,18 @@ def displayed_db(
     def solved(stack: PanelStack) -> U8:
         return layers_for(wanted, stack, eyes_m, settings=settings, model=model, fov_deg=fov_deg)
 
+    def registered(stack: PanelStack, matrices: F64) -> float:
+        shown = corrected(solved(stack), list(matrices))
+        return seen_db(shown, wanted, eyes_m, replace(stack, tilt=None), panels, fov_deg=fov_deg)
+
     parallel = replace(found.stack, tilt=None)
-    perfect = solved(parallel)
     ideal = tuple(PlacedPanel(np.eye(3), np.array([x, 0.0, 0.0])) for x in found.stack.x_m)
-    shown = corrected(solved(found.stack), list(found.homographies))
-    return {
-        "perfect stack": seen_db(perfect, wanted, eyes_m, parallel, ideal, fov_deg=fov_deg),
+    seen = {
+        "perfect stack": seen_db(solved(parallel), wanted, eyes_m, parallel, ideal, fov_deg=fov_deg),
         "as configured": seen_db(solved(believed), wanted, eyes_m, believed, panels, fov_deg=fov_deg),
-        "registered": seen_db(shown, wanted, eyes_m, parallel, panels, fov_deg=fov_deg),
+        "registered": registered(found.stack, found.homographies),
     }
+    if truth is not None:
+        stack = geometry_of(truth, believed, eye_m=found.eye_m, even=even, reference=found.bundle.reference)
+        seen["registered without error"] = registered(stack, homographies(truth, stack, found.eye_m))
+    return seen

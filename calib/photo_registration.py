@@ -109,6 +109,19 @@ def tilt_of(panels: Sequence[PlacedPanel], eye_m: F64) -> Tilt:
     return Tilt(depth, (x, y, z))
 
 
+def geometry_of(
+    panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64, even: bool | None, reference: int
+) -> PanelStack:
+    """The geometry to configure for panels that stand so: their distances, or even ones near them, and tilts.
+
+    even: as in `register_photographs`. Raises ValueError where the panels do not stand in order.
+    """
+    true = found_stack(panels, stack)
+    if even is None:
+        even = not true.is_evenly_spaced
+    return replace(evenly_spaced(true, reference=reference) if even else true, tilt=tilt_of(panels, eye_m))
+
+
 def register_photographs(
     seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m: F64, even: bool | None, reference: int | None = None
 ) -> PhotoRegistration:
@@ -134,14 +147,10 @@ def register_photographs(
             f"the photographs do not show one rigid stack: points are {bundle.sigma_px:.1f} px off on average"
         )
     try:
-        true = found_stack(bundle.panels, stack)
+        model = geometry_of(bundle.panels, stack, eye_m=eye_m, even=even, reference=reference)
     except ValueError as problem:
         raise Undetermined(str(problem)) from None
     _refuse_implausible(bundle, stack)
-    if even is None:
-        even = not true.is_evenly_spaced
-    model = evenly_spaced(true, reference=reference) if even else true
-    model = replace(model, tilt=tilt_of(bundle.panels, eye_m))
     corners = corner_pixels(stack)
 
     def moved(panels: Sequence[PlacedPanel]) -> F64:
@@ -160,7 +169,7 @@ def register_photographs(
     return PhotoRegistration(
         bundle=bundle,
         stack=model,
-        true_x_m=np.array(true.x_m),
+        true_x_m=np.array([panel.axis_x_m for panel in bundle.panels]),
         gap_sigma_m=bundle.sigma_of(gaps),
         homographies=homographies(bundle.panels, model, eye_m),
         corners_px=moved(bundle.panels),

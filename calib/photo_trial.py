@@ -117,7 +117,7 @@ def run_trial(
             if model:
                 reference = stack.count // 2
                 true = in_frame_of(truth, reference=reference, reference_x_m=stack.x_m[reference])
-                row["psnr_db"] = displayed_db(found, settings, stack, model=model, truth=true)
+                row["psnr_db"] = displayed_db(found, settings, stack, model=model, truth=true, even=even)
             rows.append(row)
         summary = _summary(rows) | {"stacks": rows, "photographs": count, "megapixels": megapixels}
         write_json(folder.staging / "trial.json", summary)
@@ -140,7 +140,8 @@ def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     judged = [row["psnr_db"] for row in done if "psnr_db" in row]
     if judged:
         found["psnr_db"] = {name: float(np.mean([db[name] for db in judged])) for name in judged[0]}
-        found["worst_loss_db"] = max(db["perfect stack"] - db["registered"] for db in judged)
+        for name, way in (("worst_loss_db", "registered"), ("worst_loss_without_error_db", "registered without error")):
+            found[name] = max(db["perfect stack"] - db[way] for db in judged)
     return found
 
 
