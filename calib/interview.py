@@ -49,16 +49,22 @@ class Interview:
 
     def ask(self) -> None:
         """Say what is asked."""
+        asked, keys = self.asked
+        monitor = self.monitors[self.shown]
+        first = f"{monitor} shows its card, the others are clear. " if self.question is Question.WHICH else ""
+        self._say(f"{first}{asked} ({keys})")
+
+    @property
+    def asked(self) -> tuple[str, str]:
+        """The question, and the keys that answer it."""
         number = len(self.tables)
         place = {0: "the rearmost, at the backlight", self.panels - 1: "the front one"}.get(number, "the next one")
-        monitor = self.monitors[self.shown]
         texts = {
-            Question.WHICH: f"{monitor} shows its card, the others are clear. Is it panel {number}, {place}? "
-            "(Enter: yes, n: another monitor, u: one back, q: stop)",
-            Question.ARROW: "Which way does its arrow point, seen from the front? (arrow keys)",
-            Question.MIRROR: "Does its writing read rightly? (Enter: yes, n: it is mirrored)",
+            Question.WHICH: (f"Is it panel {number}, {place}?", "Enter: yes, n: another monitor, u: one back, q: stop"),
+            Question.ARROW: ("Which way does its arrow point, seen from the front?", "arrow keys"),
+            Question.MIRROR: ("Does its writing read rightly?", "Enter: yes, n: it is mirrored"),
         }
-        self._say(texts[self.question])
+        return texts[self.question]
 
     def press(self, key: Key) -> None:
         """Take in an answer."""

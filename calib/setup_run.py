@@ -77,41 +77,45 @@ def run_setup(
 def walk_through(setup: Setup) -> bool:
     """Every step until the last, or q. True where the end was reached."""
     number = next((n for n, step in enumerate(STEPS) if step.name not in setup.done), 0)
+    problem = ""
     while number < len(STEPS):
         step = STEPS[number]
-        _announce(setup, step, number)
-        key = setup.key()
+        _announce(setup, step, number, problem=problem)
+        key, problem = setup.key(), ""
         if key is Key.QUIT:
             return False
         if key in (Key.PREVIOUS, Key.LEFT):
             number = max(0, number - 1)
-        elif key in (Key.NEXT, Key.RIGHT) or (key is Key.ACCEPT and _done(setup, step)):
+        elif key in (Key.NEXT, Key.RIGHT):
             number += 1
+        elif key is Key.ACCEPT:
+            problem = _problem_of(setup, step)
+            number += not problem
     return True
 
 
-def _announce(setup: Setup, step: Step, number: int) -> None:
+def _announce(setup: Setup, step: Step, number: int, *, problem: str) -> None:
+    """A step, in the terminal and on the panels; what was wrong with it, if it was tried, on the panels."""
     state = "done before" if step.name in setup.done else "not done yet"
     lines = [f"Step {number + 1} of {len(STEPS)}: {step.title}", step.what, f"({state})",
              "Enter: do it   n: skip   p: back   q: stop"]  # fmt: skip
     setup.say("\n" + "\n".join(lines))
-    setup.world.show_words(setup.settings, lines)
+    setup.world.show_words(setup.settings, [*lines, problem] if problem else lines)
 
 
-def _done(setup: Setup, step: Step) -> bool:
-    """Run a step; what is wrong is told, and the step is offered again."""
+def _problem_of(setup: Setup, step: Step) -> str:
+    """Run a step. What was wrong is told and answered; empty: it is done."""
     try:
         figures = step.run(setup)
-    except Stopped:
-        setup.say("stopped: what was not finished is not written into the configuration")
-        return False
-    except PhasestackError as problem:
-        setup.say(f"it did not work: {problem}")
-        return False
+    except (Stopped, PhasestackError) as error:
+        told = "stopped: what was not finished is not written into the configuration"
+        problem = told if isinstance(error, Stopped) else f"it did not work: {error}"
+        setup.say(problem)
+        return problem
     setup.done[step.name] = figures
     write_json(progress_path(setup.config), {"done": setup.done})
     setup.say(f"step {step.name}: done")
-    return True
+    return ""
 
 
 def summarise(setup: Setup, *, finished: bool) -> tuple[dict[str, Any], str]:

@@ -46,6 +46,13 @@ class Setup:
         """The configuration as it is now."""
         return load_settings(self.config if foreign.is_there(self.config) else None)
 
+    def ask(self, question: str, keys: str, *, before: str = "") -> None:
+        """In the terminal and on the panels: a question and the keys that answer it. before: what went wrong."""
+        if before:
+            self.say(before)
+        self.say(f"{question}  ({keys})")
+        self.world.show_words(self.settings, [line for line in (question, keys, before) if line])
+
     def key(self) -> Key:
         """Wait for a key."""
         while (key := self.poll()) is None:
@@ -79,7 +86,7 @@ def identify(setup: Setup) -> Figures:
     while not interview.finished:
         if shown != interview.shown or not setup.world.simulated:
             shown = interview.shown
-            setup.world.show_card(shown)
+            setup.world.show_card(shown, interview.asked)
         key = setup.poll()
         if key is None:
             setup.world.wait()
@@ -140,9 +147,9 @@ def geometry(setup: Setup) -> Figures:
     ]
     chosen, coarse = 0, 1  # which dial; how many of its steps at once
     while True:
-        setup.say(
-            f"{dials[chosen].name}: {dials[chosen].show(dials[chosen].value)}  (left, right: change; f, c: finer, "
-            "coarser; up, down: another number; Enter: all are right; q: stop)"
+        setup.ask(
+            f"{dials[chosen].name}: {dials[chosen].show(dials[chosen].value)}",
+            "left, right: change; f, c: finer, coarser; up, down: another number; Enter: all are right; q: stop",
         )
         key = setup.key()
         if key is Key.ACCEPT:
@@ -204,10 +211,13 @@ def grey(setup: Setup) -> Figures:
     stack = setup.settings.stack.stack()
     known = [bool(panel.lut) for panel in setup.settings.output.panels] or [False] * stack.count
     residual: dict[int, float] = {}
-    number = 0
+    number, problem = 0, ""
     while number < stack.count:
         state = "has a curve" if known[number] else "has no curve yet"
-        setup.say(f"panel {number} ({state}): Enter: measure it; n: leave it; u: the panel before; q: stop")
+        setup.ask(
+            f"panel {number} {state}", "Enter: measure it; n: leave it; u: the panel before; q: stop", before=problem
+        )
+        problem = ""
         key = setup.key()
         if key is Key.QUIT:
             raise Stopped
@@ -220,8 +230,8 @@ def grey(setup: Setup) -> Figures:
                 pictures = setup.world.grey_photographs(setup.settings, number, poll=setup.poll, say=setup.say)
                 measured = pictures_series(pictures, stack, panel=number, source="photographs")
                 curves = fit_series(measured, "photographs")
-            except InputError as problem:
-                setup.say(f"it did not work: {problem}")
+            except InputError as error:
+                problem = f"it did not work: {error}"
                 continue
             path = (setup.out / "grey" / f"panel-{number}.csv").resolve()
             write_lut(path, measured, curves)
@@ -246,9 +256,10 @@ def sensor(setup: Setup) -> Figures:
     settings = setup.settings
     if setup.world.simulated:
         names = ["replay"]
-    chosen = names.index(settings.sensor.driver) if settings.sensor.driver in names else 0
+    chosen, problem = names.index(settings.sensor.driver) if settings.sensor.driver in names else 0, ""
     while True:
-        setup.say(f"depth sensor: {names[chosen]}  (up, down: another; Enter: try it; q: stop)")
+        setup.ask(f"depth sensor: {names[chosen]}", "up, down: another; Enter: try it; q: stop", before=problem)
+        problem = ""
         key = setup.key()
         if key is Key.QUIT:
             raise Stopped
@@ -263,8 +274,8 @@ def sensor(setup: Setup) -> Figures:
         try:
             name = setup.world.open_sensor(tried)
             break
-        except InputError as problem:
-            setup.say(f"it does not work: {problem}")
+        except InputError as error:
+            problem = f"it does not work: {error}"
     document = read_document(setup.config)
     put(document, "sensor", update)
     save_document(setup.config, document)

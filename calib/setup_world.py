@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ from runtime.errors import InputError, PanelLost
 from runtime.eyes.demo_geometry import demo_sensor_from_stack
 from runtime.optics.malus import phase_from_intensity
 from runtime.optics.stack import PanelStack
+from runtime.panels.card import identity_card
 from runtime.panels.monitors import Monitor
 from runtime.records import F64, U8, EyePoints, PanelFrame
 from runtime.sensor.registry import open_sensor
@@ -42,6 +44,7 @@ Poll = Callable[[], Key | None]
 Say = Callable[[str], None]
 GREY_PHOTOGRAPHS = 2
 POLL_NS = 20 * NS_PER_MS
+CARD_CHARACTERS = 32  # of a line on a card
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +66,8 @@ class World(ABC):
         """The active monitors. Raises InputError."""
 
     @abstractmethod
-    def show_card(self, number: int) -> None:
-        """Monitor `number` shows its identity card as it is sent, the others are clear."""
+    def show_card(self, number: int, words: Sequence[str]) -> None:
+        """Monitor `number` shows its identity card with words as it is sent, the others are clear."""
 
     @abstractmethod
     def show_words(self, settings: Settings, lines: Sequence[str]) -> None:
@@ -114,7 +117,8 @@ class RealWorld(World):
     def __init__(self, *, photos: Path | None, device: str | None) -> None:
         self._photos, self._device = photos, device
         self._clock = MonotonicClock()
-        self._cards: tuple[Any, list[Any]] | None = None
+        self._cards: tuple[Any, list[U8], tuple[Monitor, ...]] | None = None
+        self._card: tuple[tuple[int, tuple[str, ...]], U8] | None = None  # the one that was shown last, and of what
         self._panels: Any = None
         self._bound: Any = None
         self._window_keys: Any = None
@@ -128,15 +132,21 @@ class RealWorld(World):
             panels, cards, monitors = every_monitor()
         except PanelLost as error:
             raise InputError("monitors", "", str(error)) from None
-        self._cards = (panels, cards)
+        self._cards = (panels, cards, monitors)
         self._watch(panels)
         return monitors
 
-    def show_card(self, number: int) -> None:
+    def show_card(self, number: int, words: Sequence[str]) -> None:
         assert self._cards is not None
-        panels, cards = self._cards
+        panels, cards, monitors = self._cards
+        wanted = (number, tuple(words))
+        if self._card is None or self._card[0] != wanted:
+            height, width = cards[number].shape[:2]
+            lines = [line for text in words for line in wrap(text, CARD_CHARACTERS)]
+            self._card = wanted, identity_card(width, height, title=monitors[number].connector, lines=lines)
+        shown = [self._card[1] if index == number else card for index, card in enumerate(cards)]
         self._number += 1
-        panels.present(PanelFrame(self._number, card_alone(cards, number), self._number))
+        panels.present(PanelFrame(self._number, card_alone(shown, number), self._number))
 
     def show_words(self, settings: Settings, lines: Sequence[str]) -> None:
         try:
@@ -333,7 +343,7 @@ class SimulatedWorld(World):
             for n in range(self._stack.count)
         )
 
-    def show_card(self, number: int) -> None:
+    def show_card(self, number: int, words: Sequence[str]) -> None:
         """Tells what a person would see of it, since nobody can look."""
         rotation_deg, mirror = self.mounted[number]
         self._said(

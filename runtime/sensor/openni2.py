@@ -17,6 +17,7 @@ from runtime.errors import EndOfRecording, InputError, SensorLost, SensorTimeout
 from runtime.records import U8, U16, Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, SensorDriver
 from runtime.sensor.device_clock import DeviceClock
+from runtime.sensor.lasting_thread import LastingThread, borrowed, give_back
 from runtime.sensor.openni2_library import load
 
 SERIAL_PROPERTY = 3
@@ -36,7 +37,10 @@ class _Picture(NamedTuple):
 
 
 class OpenNI2Driver(SensorDriver):
-    """Depth in millimetres and colour, registered by the camera where it can."""
+    """Depth in millimetres and colour, registered by the camera where it can.
+
+    The library is called on a thread that outlives whoever reads (`lasting_thread`).
+    """
 
     name = "openni2"
     capabilities = Capabilities(colour=True, depth=True)
@@ -44,6 +48,7 @@ class OpenNI2Driver(SensorDriver):
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
         """settings.source: `demo` or empty for the only camera, a serial number, a device URI, `Dummy`, or a .oni."""
         self._settings, self._clock = settings, clock
+        self._thread: LastingThread | None = None  # while it is open
         self._openni: Any = None
         self._device: Any = None
         self._streams: dict[str, Any] = {}
@@ -54,6 +59,14 @@ class OpenNI2Driver(SensorDriver):
 
     def open(self) -> None:
         self.close()
+        self._thread = thread = borrowed("openni2")
+        try:
+            thread(self._open)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self) -> None:
         source = self._settings.source
         if source.endswith(".oni") and not Path(source).is_file():
             raise InputError(source, "", "cannot be read")
@@ -62,10 +75,8 @@ class OpenNI2Driver(SensorDriver):
             self._device = self._find_device()
             self._start_streams()
         except SensorLost:
-            self.close()
             raise
         except Exception as error:  # the package raises its own, ctypes' and plain AssertionError
-            self.close()
             raise SensorLost(f"OpenNI2: {_text(error)}") from None
 
     def _find_device(self) -> Any:
@@ -130,8 +141,11 @@ class OpenNI2Driver(SensorDriver):
         return Intrinsics(width, height, fx, fy, width / 2, height / 2)
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
-        if self._device is None:
+        if self._thread is None:
             raise SensorLost("not open")
+        return self._thread(lambda: self._read_newest(timeout_s))
+
+    def _read_newest(self, timeout_s: float) -> SensorFrame:
         deadline_ns = self._clock.now_ns() + round(timeout_s * NS_PER_S)
         main = "depth" if "depth" in self._streams else "colour"
         before = self._newest.get(main)
@@ -198,6 +212,12 @@ class OpenNI2Driver(SensorDriver):
         raise SensorTimeout(f"no frame for {timeout_s:g} s")
 
     def close(self) -> None:
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread(self._close)
+            give_back(thread)
+
+    def _close(self) -> None:
         streams, self._streams = self._streams, {}
         device, self._device = self._device, None
         for stream in streams.values():

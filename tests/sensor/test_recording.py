@@ -237,7 +237,9 @@ from tests.sensor.test_recording import sample, write
 resource.setrlimit(resource.RLIMIT_FSIZE, (30000, 30000))
 write(pathlib.Path({str(path)!r}), [sample(k) for k in range(1000)])
 """
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    # A measurement of coverage would write a file of its own.
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE_")}
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
     assert answer.returncode != 0 and "InputError" in answer.stderr.splitlines()[-1] and str(path) in answer.stderr
     assert len(list(Recording(path).samples())) > 50
 

@@ -1,0 +1,37 @@
+"""Threads that outlive whoever calls on them."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from runtime.sensor.lasting_thread import LastingThread, borrowed, give_back
+
+
+def test_a_call_is_answered_from_another_thread_always_the_same_one() -> None:
+    thread = LastingThread("lasting")
+    first, second = thread(threading.current_thread), thread(threading.current_thread)
+    assert first is second is not threading.current_thread()
+    assert first.name == "lasting"
+
+
+def test_what_a_call_raises_belongs_to_who_asked_and_the_thread_goes_on() -> None:
+    thread = LastingThread("lasting")
+
+    def broken() -> None:
+        raise OSError("no")
+
+    with pytest.raises(OSError, match="no"):
+        thread(broken)
+    assert thread(lambda: 3) == 3
+
+
+def test_a_thread_that_was_given_back_is_used_again_and_one_that_hangs_is_not() -> None:
+    thread = borrowed("lasting")
+    give_back(thread)
+    assert borrowed("lasting") is thread
+    other = borrowed("lasting")
+    assert other is not thread
+    give_back(thread)
+    give_back(other)
