@@ -17,6 +17,7 @@ from runtime.support.interrupts import INTERRUPTED, imports_end_at_once
 
 TYPE_CHECKING = False  # typing's own would be one more import before the guard stands
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from typing import Any
 
 BAD_INPUT, OWN_ERROR, MAY_PASS, NOBODY_READS = 2, 70, 75, 141
@@ -37,8 +38,8 @@ def main() -> None:
         with listening(TerminalLine(sys.stderr)):
             code = _code_of(app, output)
     except BaseException as error:
-        code = _told(error, output)
-    code = _flushed(code, output)
+        code = _ended(_told, error, output)
+    code = _ended(_flushed, code, output)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt now would find the interpreter half taken down
     if _has_hung_solver():  # taking down what a library's own thread still runs in would end in an abort
@@ -47,6 +48,14 @@ def main() -> None:
         logs.flush()
         os._exit(code)
     sys.exit(code)
+
+
+def _ended(step: Callable[..., int], *arguments: object) -> int:
+    """The exit code of one of the last steps, which a second interrupt may fall into."""
+    try:
+        return step(*arguments)
+    except KeyboardInterrupt:
+        return INTERRUPTED
 
 
 def _has_hung_solver() -> bool:
@@ -83,6 +92,9 @@ def _told(error: BaseException, output: _Output) -> int:
     if isinstance(error, PhasestackError):
         _say(f"phasestack: {one_line(str(error), most=2000)}")
         return MAY_PASS if isinstance(error, TransientError) else BAD_INPUT
+    if isinstance(error, MemoryError):
+        _say("phasestack: out of memory (this may pass: start again)")
+        return MAY_PASS
     from runtime.support.crash import written
 
     _say(f"phasestack: {written(error)}")

@@ -48,7 +48,6 @@ def test_the_version_is_told() -> None:
     [
         "{}['key']",
         "1 / 0",
-        "raise MemoryError",
         "raise OSError(24, 'Too many open files')",
         "raise ValueError('two\\nlines\\0')",
         "raise ExceptionGroup('several', [ValueError('one'), OSError('two')])",
@@ -100,6 +99,22 @@ def test_an_interrupt_that_a_library_turned_into_something_else_is_still_one(tmp
         raise KeyboardInterrupt
     except KeyboardInterrupt as error:
         raise ImportError("numpy failed") from error"""
+    answer = broken(body, tmp_path)
+    assert (answer.returncode, answer.stderr) == (130, "")
+
+
+def test_without_memory_it_may_pass(tmp_path: Path) -> None:
+    answer = broken("raise MemoryError", tmp_path)
+    assert (answer.returncode, answer.stderr) == (75, "phasestack: out of memory (this may pass: start again)\n")
+
+
+def test_an_interrupt_while_an_interrupt_is_told_is_still_one_without_a_word(tmp_path: Path) -> None:
+    body = """
+    import runtime.cli
+    def told(*_):
+        raise KeyboardInterrupt
+    runtime.cli._told = runtime.cli._flushed = told
+    raise KeyboardInterrupt"""
     answer = broken(body, tmp_path)
     assert (answer.returncode, answer.stderr) == (130, "")
 

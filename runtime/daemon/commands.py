@@ -76,24 +76,36 @@ def parse(request: Any) -> Command:
     if name == "playlist":
         return Command(name, _shows(value))
     if name == "budget":
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ValueError("value: budget wants milliseconds")
-        if not (math.isfinite(value) and 0 <= value <= BUDGET_MAX_MS):
+        budget_ms = _number(value, "value: budget wants milliseconds")
+        if not 0 <= budget_ms <= BUDGET_MAX_MS:
             raise ValueError(f"value: budget must lie in 0 to {BUDGET_MAX_MS:.0f} ms")
-        return Command(name, float(value))
+        return Command(name, budget_ms)
     return Command(name, value if name in ("scene", "model") else None)
 
 
+def _number(value: Any, wanted: str) -> float:
+    """A finite number. Raises ValueError with `wanted`."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(wanted)
+    try:
+        number = float(value)
+    except OverflowError:  # JSON's whole numbers have no end
+        number = math.inf
+    if not math.isfinite(number):
+        raise ValueError(wanted)
+    return number
+
+
 def _shows(value: Any) -> list[dict[str, Any]]:
-    """What `playlist` is to show; times and names are checked where the list is read."""
+    """What `playlist` is to show; how long it may be, and names, are checked where the list is read."""
     if not isinstance(value, list) or not 0 < len(value) <= SHOWS_MAX:
         raise ValueError(f"value: playlist wants a list of 1 to {SHOWS_MAX} scenes with their seconds")
+    shows = []
     for number, show in enumerate(value):
         if not (isinstance(show, dict) and set(show) == {"scene", "seconds"} and isinstance(show["scene"], str)):
             raise ValueError(f"value[{number}]: playlist wants a scene and its seconds, and nothing else")
-        if isinstance(show["seconds"], bool) or not isinstance(show["seconds"], int | float):
-            raise ValueError(f"value[{number}].seconds: playlist wants a number")
-    return value
+        shows.append(show | {"seconds": _number(show["seconds"], f"value[{number}].seconds: playlist wants a number")})
+    return shows
 
 
 def _placing(value: Any) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from runtime.errors import InputError
+from runtime.support import foreign
 from runtime.support.live import LIVE, is_live
 from runtime.support.plausible import nearest
 
@@ -72,6 +73,13 @@ def _from_here(name: str, known: Callable[[], tuple[str, ...]]) -> str:
         return name
 
 
+def check_recording(settings: Settings, *, source: str | Path) -> None:
+    """Raise InputError where a recording is to be replayed that is not there."""
+    sensor = settings.sensor
+    if sensor.driver == "replay" and sensor.source != "demo":
+        _there("sensor.source", sensor.source, source)
+
+
 def check_names(settings: Settings, *, source: str | Path) -> None:
     """Raise InputError for the first name that nobody knows, or file that is not there, naming its field."""
     from runtime.eyes.calibration import load_calibration
@@ -80,8 +88,7 @@ def check_names(settings: Settings, *, source: str | Path) -> None:
     sensor, content, output = settings.sensor, settings.content, settings.output
     if sensor.driver not in driver_names():
         _unknown("sensor.driver", sensor.driver, driver_names(), source)
-    if sensor.driver == "replay" and sensor.source != "demo":
-        _there("sensor.source", sensor.source, source)
+    check_recording(settings, source=source)
     if sensor.openni2_folder:
         _there("sensor.openni2_folder", sensor.openni2_folder, source)
     if settings.detector.kind == "yunet":
@@ -111,7 +118,7 @@ def check_names(settings: Settings, *, source: str | Path) -> None:
 
 
 def _there(field: str, path: str, source: str | Path) -> None:
-    if not path or not Path(path).exists():
+    if not path or not foreign.is_there(Path(path)):
         raise InputError(source, field, f"{path!r} is not there")
 
 

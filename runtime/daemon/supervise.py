@@ -18,7 +18,7 @@ from runtime.content.placed import placed_source, placing_of
 from runtime.daemon.build import Run, RunOptions
 from runtime.daemon.commands import PLACING, Command
 from runtime.daemon.drive import drive, print_summary
-from runtime.daemon.names import library_scenes, model_names, scene_from_here, scene_names
+from runtime.daemon.names import check_recording, library_scenes, model_names, scene_from_here, scene_names
 from runtime.daemon.notify import Notifier, may_restart
 from runtime.daemon.reconfigure import Reconfiguration
 from runtime.daemon.server import StatusServer, open_status_server
@@ -80,7 +80,11 @@ class Daemon:
         while self._server is not None and not self._server.commands.empty():
             command = self._server.commands.get()
             if command.take():  # else it was refused meanwhile: never done later
-                self._carry_out(command, presenter)
+                try:
+                    self._carry_out(command, presenter)
+                except Exception as error:  # one request must not end what everybody looks at
+                    log.exception("%s: unexpected error", command.name)
+                    command.refuse(f"unexpected error ({type(error).__name__}): see the log")
         if self._change is not None and self._change.finished:
             change, self._change = self._change, None
             if not change.problem:
@@ -201,7 +205,7 @@ class Daemon:
         text = "# Shown from the page or by a program; made anew each time.\n"
         for show in shows:
             scene = json.dumps(scene_from_here(show["scene"]), ensure_ascii=False)  # a TOML string too
-            text += f"\n[[show]]\nscene = {scene}\nseconds = {float(show['seconds'])!r}\n"
+            text += f"\n[[show]]\nscene = {scene}\nseconds = {show['seconds']!r}\n"
         path = state_folder() / "playlist.toml"
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, text)
@@ -415,7 +419,7 @@ def _recorder(settings: Settings, *, simulated: bool, record: Path | None, image
     recorder = Recorder(plan)
     try:
         yield recorder
-    except Stopped:
+    except (Stopped, InputError):  # the latter before anything ran
         recorder.close()
         raise
     except Exception as error:
@@ -448,7 +452,7 @@ def run_daemon(
     except Exception as error:
         if isinstance(error, TransientError) or not may_pass(error):
             raise
-        raise MayPass(f"{error or type(error).__name__} (this may pass: start again)") from error
+        raise MayPass(f"{str(error) or type(error).__name__} (this may pass: start again)") from error
 
 
 def _lived(
@@ -463,6 +467,7 @@ def _lived(
     record_images: bool,
 ) -> dict[str, Any]:
     settings = overrides.applied(load_settings(config))
+    check_recording(settings, source=config or "run")  # before seconds go into content and models
     logs.configure(settings.service)
     clock = MonotonicClock()
     with ExitStack() as cleanup:

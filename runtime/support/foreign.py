@@ -94,7 +94,10 @@ def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", fi
     whence = source or str(path)
     with open_regular(path, most_bytes=most_bytes, source=source, field=field) as file:
         try:
-            data = file.read(most_bytes + 1)  # it may grow while it is read
+            size = min(os.fstat(file.fileno()).st_size, most_bytes)
+            data = file.read(size + 1)  # room for what there is, not for what there may be
+            if len(data) > size:  # it grows while it is read
+                data += file.read(most_bytes + 1 - len(data))
         except OSError as error:
             raise InputError(whence, field, f"cannot be read ({error.strerror})") from None
     if len(data) > most_bytes:

@@ -15,6 +15,7 @@ PASSING = frozenset(
 WORDS = (
     "too many open files",
     "cannot allocate memory",
+    "failed to map segment",  # of a library, where memory is limited
     "failed to allocate memory",
     "bad_alloc",
     "out of memory",

@@ -314,3 +314,17 @@ def test_a_head_at_rest_costs_no_solution_whatever_its_sensor_s_noise(served: Se
     assert item["costs_db"] is None  # what the eyes would have seen of a fresh solution is not known here
     served.rig.plan.eyes_m = served.rig.plan.eyes_m + np.array([0.0, 0.02, 0.0])
     served.rig.refresh_until_solved()
+
+
+def test_a_command_that_fails_in_a_way_that_nobody_expected_is_refused_and_the_run_goes_on(
+    served: Served, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(*_: Any) -> None:
+        raise OverflowError("int too large to convert to float")
+
+    monkeypatch.setattr(served.daemon, "_set_budget", broken)
+    answer = served.asked("budget", 20.0)
+    assert answer == {"ok": False, "error": "unexpected error (OverflowError): see the log"}
+    assert "budget: unexpected error" in caplog.text
+    assert all(account.presented for account in served.rig.refreshes(3))
+    assert served.asked("pause") == {"ok": True}

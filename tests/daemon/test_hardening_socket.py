@@ -291,6 +291,26 @@ def test_without_descriptors_it_waits_and_then_serves_again(server: StatusServer
         client.close()
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("budget", "HUGE", "value: budget wants milliseconds"),
+        ("playlist", '[{"scene": "demo", "seconds": HUGE}]', "value[0].seconds: playlist wants a number"),
+        ("playlist", '[{"scene": "demo", "seconds": 1e999}]', "value[0].seconds: playlist wants a number"),
+    ],
+)
+def test_numbers_that_nothing_can_hold_are_refused_by_field(
+    server: StatusServer, path: Path, name: str, value: str, told: str
+) -> None:
+    """Seen: a playlist of 310 digits ended the daemon."""
+    line = f'{{"command": "{name}", "value": {value}}}\n'.replace("HUGE", "1" + "0" * 400)
+    with connected(path) as client:
+        client.sendall(line.encode())
+        answer = json.loads(client.makefile("rb").readline())
+    assert not answer["ok"] and answer["error"].startswith(told)
+    assert server.commands.empty()
+
+
 @pytest.mark.parametrize("line", [b"[" * 60000 + b"\n", b'{"a":' * 10000 + b"\n", b"\0\n", b"9" * 60000 + b"\n"])
 def test_hostile_lines_are_refused_in_one_line(server: StatusServer, path: Path, line: bytes) -> None:
     with connected(path) as client:

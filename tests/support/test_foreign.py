@@ -6,6 +6,7 @@ import json
 import os
 import socket
 import time
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,16 @@ def test_a_file_is_read_up_to_its_limit_and_refused_beyond_with_both_figures(tmp
     (tmp_path / "a").write_bytes(b"x" * 1000)
     assert foreign.read_bytes(tmp_path / "a", most_bytes=1000) == b"x" * 1000
     assert "has 1000 bytes; at most 999 bytes" in refused(foreign.read_bytes, tmp_path / "a", most_bytes=999)
+
+
+def test_a_small_file_takes_little_memory_whatever_its_limit(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"x" * 1000)
+    tracemalloc.start()
+    try:
+        foreign.read_bytes(tmp_path / "a", most_bytes=1 << 30)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
 
 
 def test_whether_something_is_there_is_asked_of_names_that_can_be(tmp_path: Path) -> None:
