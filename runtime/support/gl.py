@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import resource
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -28,8 +29,14 @@ def offscreen_context() -> moderngl.Context:
     except Exception as error:  # moderngl and glcontext raise plain Exception
         raise MissingPart(
             f"no OpenGL without a screen ({str(error).strip() or 'EGL failed'}): "
-            f"install Debian's packages {DEBIAN_PACKAGES}"
+            f"install Debian's packages {DEBIAN_PACKAGES}{_limited()}"
         ) from None
+
+
+def _limited() -> str:
+    """What else may be wrong: drivers take hundreds of MiB of addresses, and do not say that there are none."""
+    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return "" if most == resource.RLIM_INFINITY else f"; or lift the limit of {most >> 20} MiB (ulimit -v)"
 
 
 @cache
