@@ -89,7 +89,7 @@ NOT_RUN = {
     "phasestack stability --full --record runtime/report/stability/limits.json": "changes a file that ships",
     "phasestack stability --out stability": "the fast tests run it: tests/report/test_stability.py",
     "phasestack stability --out stability --full": "takes many minutes: tests/report/test_stability.py runs it",
-    "phasestack train --recipe balanced --iterations 200 --threads 1 --out out/balanced": "is run with one iteration: "
+    "phasestack train --recipe balanced --iterations 400 --threads 1 --out out/balanced": "is run with one iteration: "
     "`phasestack train --recipe balanced --out out/balanced`",
 }
 
