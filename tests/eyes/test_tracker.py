@@ -20,6 +20,7 @@ MS = 1_000_000
 PERIOD = 33_333_333
 STILL = np.array([[0.6, -0.031, 0.03], [0.6, 0.031, 0.03]])
 SURE = np.ones(2)
+HOLD_MS = round(1000 * TrackerSettings().hold_s)
 
 
 def points(
@@ -73,19 +74,19 @@ def test_it_never_predicts_further_than_the_horizon() -> None:
 def test_a_lost_face_is_held_coming_to_rest_then_nobody() -> None:
     tracker, last = fed(count=60, motion=moving)
     tracker.update(None, capture_ns=last + PERIOD)
-    path = [tracker.at(last + PERIOD + ms * MS) for ms in range(0, 460, 10)]
+    path = [tracker.at(last + PERIOD + ms * MS) for ms in range(0, HOLD_MS - 40, 10)]
     assert {a.label for a in path} == {"held"}
     y = np.array([a.eyes_m[0, 1] for a in path])
     steps = np.diff(y)
     assert (steps >= -1e-12).all() and steps[0] > 3 * steps[7] and steps[-1] < 1e-6
-    assert tracker.at(last + 501 * MS).label == "none"
+    assert tracker.at(last + (HOLD_MS + 1) * MS).label == "none"
 
 
 def test_a_stalled_stream_is_held_even_without_word_of_a_loss() -> None:
     tracker, last = fed()
     assert tracker.at(last + 190 * MS).label == "predicted"
     assert tracker.at(last + 210 * MS).label == "held"
-    assert tracker.at(last + 510 * MS).label == "none"
+    assert tracker.at(last + (HOLD_MS + 10) * MS).label == "none"
 
 
 @given(ms=st.integers(-2000, 2000))
