@@ -29,6 +29,7 @@ from runtime.sensor.base import SensorDriver, SteppedDriver
 from runtime.sensor.registry import open_sensor
 from runtime.sensor.worker import SensorWorker
 from runtime.support import foreign
+from runtime.support.ranges import RECORD_MOST_S
 
 POLL_NS = 20 * NS_PER_MS
 SHOW_AGAIN_NS = 100 * NS_PER_MS
@@ -111,7 +112,7 @@ def read_marks(path: Path, viewpoints: Sequence[Viewpoint]) -> list[tuple[float,
                     seconds = float(row["seconds"] or "")
                 except ValueError:
                     seconds = math.nan
-                if not (math.isfinite(seconds) and seconds >= 0):
+                if not 0 <= seconds <= RECORD_MOST_S:
                     raise InputError(path, f"{label}, seconds", f"is not a time: {row['seconds']}")
                 name = (row["viewpoint"] or "").strip()
                 if name not in known:

@@ -11,6 +11,7 @@ from calib.robust import fit_robust
 from calib.similarity import Degenerate, Similarity, extents, fit
 from calib.solution import Solution
 from runtime.errors import InputError
+from runtime.eyes.calibration import check_similarity
 from runtime.records import F64
 
 RESIDUAL_LIMIT_M = 0.05  # the EyeReal supplement's (its figure S5)
@@ -67,6 +68,7 @@ _MIRRORED = (
 def check_solution(pairs: Pairs, solution: Solution, volume_m: F64) -> tuple[str, ...]:
     """Warnings about a solution; `volume_m` (..., 3): where viewers are. Raises InputError: not to be used."""
     warnings = []
+    check_similarity(solution.similarity.matrix, source=pairs.source)
     axis = "xyz"[int(np.argmax(solution.axis_rms_m))]
     if solution.axis_rms_m.max() > RESIDUAL_LIMIT_M:
         hint = "" if solution.method == "robust" else "; if some pairs are wrong, try --method robust"

@@ -10,6 +10,8 @@ import typer
 from calib.options import ConfigOption, JsonOption, PanelsOption, settings_and_stack, tell
 from calib.panel_commands import app as panels_app
 from runtime.errors import InputError
+from runtime.support.options import number
+from runtime.support.ranges import SCALE
 
 if TYPE_CHECKING:
     from runtime.config import Settings
@@ -32,7 +34,7 @@ def charts(
     show: Annotated[bool, typer.Option("--show", help="show them on the panels, one after the other")] = False,
     viewpoint: Annotated[list[str] | None, typer.Option(help="only this one, as R40-phi70-theta80; repeatable")] = None,
     check: Annotated[bool, typer.Option("--check", help="measure how well each solved chart fuses, dB")] = False,
-    ipd_mm: Annotated[float, typer.Option(help="the observer's eye separation, mm")] = 60.0,
+    ipd_mm: Annotated[float, number(5, 100, "mm", help="the observer's eye separation, mm")] = 60.0,
     model: Annotated[str, typer.Option(help="model that solves the charts, or sart")] = "best",
     panels: PanelsOption = None,
     config: ConfigOption = None,
@@ -50,8 +52,6 @@ def charts(
         raise InputError("calibrate charts", "--kind", f"must be solved or seed, not {kind}")
     if check and (kind == "seed" or out is None):
         raise InputError("calibrate charts", "--check", "measures solved charts that are written: give --out")
-    if not 5.0 <= ipd_mm <= 100.0:
-        raise InputError("calibrate charts", "--ipd-mm", "must lie between 5 and 100")
     settings, stack = settings_and_stack(config, panels)
     chosen = _viewpoints("calibrate charts", viewpoint, settings)
     drawer = Drawer(stack, kind=kind, ipd_m=ipd_mm / 1000, model=model, settings=settings.model)  # type: ignore[arg-type]
@@ -90,10 +90,13 @@ def capture(
     viewpoint: Annotated[list[str] | None, typer.Option(help="only this one; repeatable")] = None,
     again: Annotated[bool, typer.Option("--again", help="also viewpoints that the file holds already")] = False,
     show: Annotated[bool, typer.Option("--show", help="show each chart on the panels")] = False,
-    window_s: Annotated[float, typer.Option(help="median over the last so many seconds")] = 0.5,
-    max_spread_mm: Annotated[float, typer.Option(help="refuse a pair whose eyes moved or scattered by more")] = 10.0,
+    window_s: Annotated[float, number(0.01, 10, "s", help="median over the last so many seconds")] = 0.5,
+    max_spread_mm: Annotated[
+        float, number(0.01, 1000, "mm", help="refuse a pair whose eyes moved or scattered by more")
+    ] = 10.0,
     hold_s: Annotated[
-        float, typer.Option(help="eyes held still for so long near the viewpoint are taken without a key; 0: never")
+        float,
+        number(0, 10, "s", help="eyes held still for so long near the viewpoint are taken without a key; 0: never"),
     ] = 1.5,
     as_json: JsonOption = False,
 ) -> None:
@@ -107,12 +110,6 @@ def capture(
     """
     from calib.capture_run import capture_live, capture_recording
 
-    if not 0.0 < window_s <= 10.0:
-        raise InputError("calibrate capture", "--window-s", "must be above 0, at most 10")
-    if not 0.0 <= hold_s <= 10.0:
-        raise InputError("calibrate capture", "--hold-s", "must be 0 to 10")
-    if not max_spread_mm > 0.0:
-        raise InputError("calibrate capture", "--max-spread-mm", "must be above 0")
     if marks is not None and replay is None:
         raise InputError("calibrate capture", "--marks", "needs --replay")
     settings, stack = settings_and_stack(config)
@@ -132,9 +129,9 @@ def solve(
     method: Annotated[
         str, typer.Option(help="seed, least-squares, inverse, robust or fixed-scale; without: the best for the pairs")
     ] = "",
-    scale: Annotated[float, typer.Option(help="the known scale of fixed-scale")] = 1.0,
-    sensor_unit: Annotated[float, typer.Option(help="metres in one unit of the sensor's columns")] = 1.0,
-    stack_unit: Annotated[float, typer.Option(help="metres in one unit of the stack's columns")] = 1.0,
+    scale: Annotated[float, number(*SCALE, help="the known scale of fixed-scale")] = 1.0,
+    sensor_unit: Annotated[float, number(*SCALE, help="metres in one unit of the sensor's columns")] = 1.0,
+    stack_unit: Annotated[float, number(*SCALE, help="metres in one unit of the stack's columns")] = 1.0,
     serial: Annotated[str, typer.Option(help="the sensor's serial; without: as the pairs' file says")] = "",
     config: ConfigOption = None,
     rollback: Annotated[bool, typer.Option("--rollback", help="put the past version of --out back")] = False,
@@ -155,9 +152,6 @@ def solve(
     from calib.solve_run import solve_file
 
     units = {"sensor_unit_m": sensor_unit, "stack_unit_m": stack_unit, "known_scale": scale}
-    for name, value in zip(("--sensor-unit", "--stack-unit", "--scale"), units.values(), strict=True):
-        if not 0.0 < value < float("inf"):
-            raise InputError("calibrate solve", name, "must be a positive number")
     settings, _ = settings_and_stack(config)
     summary, text = solve_file(pairs, out, method=method, settings=settings, serial=serial, **units)
     for warning in summary["warnings"]:

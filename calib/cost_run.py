@@ -17,6 +17,7 @@ from calib.pictures import file_pictures, layers_for, scene_pictures
 from calib.registration import error_over_panel_px, register, true_from_ideal
 from calib.vernier import simulate, write_settings
 from runtime.config import Settings
+from runtime.errors import EyesNotServed, InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
 from runtime.report.page import Figure, Page, in_columns, section_of
@@ -40,7 +41,10 @@ def measure_cost(
     """Displace each panel in turn, to the side. Raises InputError, MissingPart."""
     eyes, fov_deg = np.array(eyes_m), settings.content.fov_deg
     wanted = scene_pictures(settings, stack, eyes) if pictures is None else file_pictures(pictures)
-    layers = layers_for(wanted, stack, eyes, settings=settings, model=model, fov_deg=fov_deg)
+    try:
+        layers = layers_for(wanted, stack, eyes, settings=settings, model=model, fov_deg=fov_deg)
+    except EyesNotServed as error:
+        raise InputError("calibrate panels cost", "--left-eye, --right-eye", str(error)) from None
     found: dict[str, list[float]] = {f"panel {index}": [] for index in reversed(range(stack.count))}
     work = [(index, shift) for index in range(stack.count) for shift in SHIFTS_PX]
     for index, shift in track(work, "displacements", console=Console(stderr=True), transient=True):

@@ -21,6 +21,7 @@ COLUMNS = ("sensor_x", "sensor_y", "sensor_z", "stack_x", "stack_y", "stack_z")
 SEPARATION = "separation_m"  # of the eyes, by the sensor's metre; may be missing
 NOTES = ("viewpoint", "spread_mm", "samples", "accepted_at", "sensor_serial", SEPARATION)
 MAXIMUM_PAIRS = 1_000_000
+FARTHEST = 1e9  # of a coordinate, in whatever unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +133,10 @@ def _number(path: Path, label: str, name: str, value: Any) -> float:
         raise InputError(path, f"{label}, {name}", f"is not a number: {str(value)[:40]}") from None
     if not math.isfinite(number):
         raise InputError(path, f"{label}, {name}", f"is not finite: {number}")
+    if abs(number) > FARTHEST:
+        raise InputError(
+            path, f"{label}, {name}", f"is {number:g}: no display is farther than {FARTHEST:g} of any unit"
+        )
     return number
 
 

@@ -9,6 +9,7 @@ import typer
 
 from calib.options import ConfigOption, JsonOption, PanelsOption, settings_and_stack, tell
 from runtime.errors import InputError
+from runtime.support.options import number, place
 
 if TYPE_CHECKING:
     from runtime.optics.stack import PanelStack
@@ -23,9 +24,7 @@ app = typer.Typer(
 )
 
 Point = tuple[float, float, float]
-EyeOption = Annotated[
-    Point, typer.Option(help="the marked viewpoint of one eye, X Y Z in metres before the stack", metavar="X Y Z")
-]
+EyeOption = Annotated[Point, place(help="the marked viewpoint of one eye, X Y Z in metres before the stack")]
 ReferenceOption = Annotated[int, typer.Option(help="the panel that the others are registered to; -1: the middle one")]
 EYE: Point = (0.5, 0.0, 0.0)
 LEFT_EYE: Point = (0.6, -0.03, 0.0)
@@ -179,10 +178,10 @@ def photo_trial(
     out: Annotated[Path, typer.Option(help="folder for trial.json and, with --photos, the photographs")],
     stacks: Annotated[int, typer.Option(help="random stacks", min=1, max=1000)] = 3,
     count: Annotated[int, typer.Option("--count", help="photographs of each, by hand", min=1, max=40)] = 12,
-    seed: Annotated[int, typer.Option(help="of the first stack")] = 0,
-    megapixels: Annotated[float, typer.Option(help="of the phone's camera", min=0.5, max=50)] = 12.0,
-    off_mm: Annotated[float, typer.Option(help="panels and gaps are off by up to this", min=0)] = 2.0,
-    turn_deg: Annotated[float, typer.Option(help="and turned about a random axis by up to this", min=0)] = 1.0,
+    seed: Annotated[int, typer.Option(min=0, help="of the first stack")] = 0,
+    megapixels: Annotated[float, number(0.5, 50, help="of the phone's camera")] = 12.0,
+    off_mm: Annotated[float, number(0, 20, "mm", help="panels and gaps are off by up to this")] = 2.0,
+    turn_deg: Annotated[float, number(0, 30, "degrees", help="and turned about a random axis by up to this")] = 1.0,
     model: Annotated[str, typer.Option(help="model whose layers are judged; empty: geometry only")] = "",
     keep: Annotated[bool, typer.Option("--photos", help="keep the photographs: what `photo --photos` reads")] = False,
     panels: PanelsOption = None,
@@ -270,8 +269,8 @@ def cost(
     model: Annotated[str, typer.Option(help="model whose layers are displaced")] = "best",
     left: Annotated[Path | None, typer.Option(help="the left eye's picture; without: the configured scene")] = None,
     right: Annotated[Path | None, typer.Option(help="the right eye's picture")] = None,
-    left_eye: Annotated[Point, typer.Option(help="the left eye, metres before the stack", metavar="X Y Z")] = LEFT_EYE,
-    right_eye: Annotated[Point, typer.Option(help="the right eye, metres", metavar="X Y Z")] = RIGHT_EYE,
+    left_eye: Annotated[Point, place(help="the left eye, metres before the stack")] = LEFT_EYE,
+    right_eye: Annotated[Point, place(help="the right eye, metres")] = RIGHT_EYE,
     panels: PanelsOption = None,
     config: ConfigOption = None,
     as_json: JsonOption = False,
@@ -295,11 +294,11 @@ def cost(
 def simulate(
     out: Annotated[Path, typer.Option(help="folder for simulation.json, vernier.csv and the registration's report")],
     eye: EyeOption = EYE,
-    seed: Annotated[int, typer.Option(help="of the misalignment and of the installer's hand")] = 0,
-    noise_px: Annotated[float, typer.Option(help="how exactly a half is set, standard deviation")] = 0.06,
-    viewpoint_error_mm: Annotated[float, typer.Option(help="how far off the mark the eye is, standard deviation")] = (
-        0.0
-    ),
+    seed: Annotated[int, typer.Option(min=0, help="of the misalignment and of the installer's hand")] = 0,
+    noise_px: Annotated[float, number(0, 100, help="how exactly a half is set, standard deviation")] = 0.06,
+    viewpoint_error_mm: Annotated[
+        float, number(0, 1000, "mm", help="how far off the mark the eye is, standard deviation")
+    ] = 0.0,
     model: Annotated[str, typer.Option(help="model whose layers are judged; empty: geometry only")] = "best",
     panels: PanelsOption = None,
     config: ConfigOption = None,
@@ -311,8 +310,6 @@ def simulate(
     """
     from calib.cost_run import simulate_registration
 
-    if noise_px < 0 or viewpoint_error_mm < 0:
-        raise InputError("calibrate panels simulate", "--noise-px", "and --viewpoint-error-mm must not be negative")
     settings, stack = settings_and_stack(config, panels)
     summary, text = simulate_registration(
         out,
@@ -328,7 +325,7 @@ def simulate(
 
 
 def _eye(eye: Point, stack: PanelStack, option: str = "--eye") -> Point:
-    if not all(abs(value) < 100 for value in eye) or eye[0] <= max(stack.x_m):
+    if eye[0] <= max(stack.x_m):
         raise InputError("calibrate panels", option, "must be in front of every panel, in metres")
     return eye
 

@@ -24,8 +24,15 @@ EVERYWHERE = {
     0: "done",
     2: "bad usage or bad input",
 }
+ANYWHERE = {  # but in the index alone: they say nothing about a command
+    70: "an error of ours: one line on stderr names the file that tells it whole",
+    130: "Ctrl-C",
+    141: "nobody reads what is printed",
+}
 COMMON = (
-    "Bad usage and bad input (2) are one line on stderr that names the file and the field.",
+    "Bad input (2) is one line on stderr that names the file or the option, and the field; bad usage (an option that",
+    "is not there, a word for a number) is told with the usage. A library that decodes pictures or films may write",
+    "lines of its own before.",
     "",
     "`--json` prints one JSON object on stdout. `--out` makes its parents and replaces files of the same names; after",
     "an error nothing new is left there.",
@@ -72,7 +79,7 @@ def _index(root: Any) -> str:
 
 
 def _all_codes(root: Any) -> list[tuple[str, str]]:
-    told: dict[int, list[str]] = {code: [text] for code, text in EVERYWHERE.items()}
+    told: dict[int, list[str]] = {code: [text] for code, text in (EVERYWHERE | ANYWHERE).items()}
     for path, command in walk(root, ["phasestack"]):
         for code, text in EXIT.findall(_help(command)):
             told.setdefault(int(code), []).append(f"`{' '.join(path[1:])}`: {text}")

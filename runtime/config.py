@@ -17,6 +17,7 @@ from runtime.optics.stack import PanelStack, Tilt
 from runtime.support import foreign
 from runtime.support.live import LIVE
 from runtime.support.plausible import check_text, nearest, socket_path, within
+from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, RECORD_MOST_S
 
 TABLE_BYTES_MAX = 4 << 20
 
@@ -37,6 +38,7 @@ S = TypeVar("S", bound=Section)
 MOST = 1e9  # of any number that has no narrower range
 PIXEL_ASPECT_TOLERANCE = 0.03
 LEAST_GAP_M = 1e-5
+PANELS_MOST = 8  # of a stack
 
 Positive = Annotated[float, Field(gt=0, le=MOST)]
 NonNegative = Annotated[float, Field(ge=0, le=MOST)]
@@ -44,7 +46,7 @@ Unit = Annotated[float, Field(ge=0, le=1)]
 SocketPath = Annotated[str, AfterValidator(socket_path)]
 Entry = Annotated[float, Field(ge=-MOST, le=MOST)]  # of a matrix
 Slope = Annotated[float, Field(ge=-0.2, le=0.2)]  # of a panel that should stand upright
-Place = Annotated[float, within(-50.0, 50.0, "m")]  # a coordinate of an eye
+Place = Annotated[float, within(-EYE_MOST_M, EYE_MOST_M, "m")]  # a coordinate of an eye
 Offset = Annotated[float, within(-10.0, 10.0, "m")]  # of a scene
 Turn = Annotated[float, within(-360.0, 360.0, "degrees")]
 
@@ -58,16 +60,16 @@ class StackGeometry(Section):
     height_m: Annotated[float, within(0.005, 20.0, "m")] = Field(
         0.2916, description="active height of every panel, metres"
     )
-    x_m: Annotated[tuple[Annotated[float, within(-10.0, 10.0, "m")], ...], Field(min_length=2, max_length=8)] = Field(
-        (-0.06, 0.0, 0.06), description="panel positions along +x, rear to front, metres"
-    )
+    x_m: Annotated[
+        tuple[Annotated[float, within(-10.0, 10.0, "m")], ...], Field(min_length=2, max_length=PANELS_MOST)
+    ] = Field((-0.06, 0.0, 0.06), description="panel positions along +x, rear to front, metres")
     width_px: Annotated[int, Field(ge=16, le=16384)] = Field(1920, description="columns of every panel")
     height_px: Annotated[int, Field(ge=16, le=16384)] = Field(1080, description="rows of every panel")
     pixel_aspect: Annotated[float, within(0.1, 10.0, "")] = Field(
         1.0, description="width of a pixel over its height; the configuration's sizes must agree with it to 3%"
     )
 
-    tilt: Annotated[tuple[tuple[Slope, Slope], ...], Field(max_length=8)] = Field(
+    tilt: Annotated[tuple[tuple[Slope, Slope], ...], Field(max_length=PANELS_MOST)] = Field(
         (),
         description="per panel, how much farther out it stands per metre to the viewer's right, and per metre up; "
         "written by `calibrate panels photo`; empty: the panels are parallel",
@@ -139,7 +141,9 @@ class SensorSettings(Section):
     fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
         0.0, description="driver `openni2`: horizontal field of view of a camera that does not tell; 0: unknown"
     )
-    record_max_s: Annotated[float, within(0.01, 604_800.0, "s")] = Field(600.0, description="`record` stops after this")
+    record_max_s: Annotated[float, within(0.01, RECORD_MOST_S, "s")] = Field(
+        600.0, description="`record` stops after this"
+    )
     record_max_mib: Positive = Field(2048.0, description="`record` stops before its file is larger")
     fixed_eyes_m: tuple[tuple[Place, Place, Place], tuple[Place, Place, Place]] | None = Field(
         None, description="driver `fixed`: left and right eye in the stack frame; no sensor is opened"
@@ -263,7 +267,9 @@ class ContentSettings(Section):
     reading: Literal["seed", "published-code", "published-training"] = Field(
         "seed", description="how a preset's d_thick is read, and where its panels stand"
     )
-    fov_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="horizontal field of view of eye images")
+    fov_deg: Annotated[float, within(*FOV_RANGE_DEG, "degrees")] = Field(
+        40.0, description="horizontal field of view of eye images"
+    )
     background: tuple[Unit, Unit, Unit] = Field((1.0, 1.0, 1.0), description="colour behind the scene, 0-1")
     file: str = Field("", description="a preset's data: its .ply or .glb, or its data-set folder; empty: a stand-in")
     layout: Layout = Field(
@@ -379,7 +385,9 @@ class OutputSettings(Section):
         "offscreen", description="EGL, one window a panel, or one window"
     )
     vsync: bool = Field(True, description="wait for the vertical blank")
-    panels: tuple[PanelSettings, ...] = Field((), max_length=8, description="one table a panel, rear to front")
+    panels: tuple[PanelSettings, ...] = Field(
+        (), max_length=PANELS_MOST, description="one table a panel, rear to front"
+    )
     allow_rescaling: bool = Field(
         False, description="let a monitor whose mode has other pixels than the stack rescale the phases"
     )
@@ -661,7 +669,8 @@ def load_stack(path: Path, *, width_px: int, height_px: int) -> PanelStack:
     table = {"width_px": width_px, "height_px": height_px} | read_table(path)
     for name in ("width_m", "height_m", "x_m"):
         if name not in table:
-            raise InputError(path, name, "is missing")
-    if not 2 <= len(table["x_m"] if isinstance(table["x_m"], list) else ()) <= 4:
-        raise InputError(path, "x_m", "must list 2 to 4 panels")
+            hint = ": a configuration has it under [stack], a panels file at the top" if "stack" in table else ""
+            raise InputError(path, name, f"is missing{hint}")
+    if not 2 <= len(table["x_m"] if isinstance(table["x_m"], list) else ()) <= PANELS_MOST:
+        raise InputError(path, "x_m", f"must list 2 to {PANELS_MOST} panels")
     return validated(StackGeometry, table, source=path).stack()

@@ -67,6 +67,10 @@ class ModelFailure(TransientError):
     """Inference failed or answered something that is not a picture: the last good layers stay."""
 
 
+class EyesNotServed(ModelFailure):
+    """Two eyes that this model has no picture for, wherever they come from: a viewer may move on, an option won't."""
+
+
 class ContextLost(TransientError):
     """The solver's GL context is gone: whatever is in it is made anew, from the settings."""
 

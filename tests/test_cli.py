@@ -74,8 +74,12 @@ def test_solve_leaves_layers_and_what_the_eyes_see(pair: Path) -> None:
         ({"left_eye": ("nan", 0, 0)}, "--left-eye"),
         ({"right_eye": (0.6, -0.03, 0.0)}, "--right-eye"),
         ({"left_eye": (0.061, 40.0, 0.0), "right_eye": (0.061, 40.06, 0.0)}, "--left-eye"),
+        ({"left_eye": (0.6, 1e30, 0)}, "--left-eye: 1e+30 m is beyond 50 m"),
+        ({"left_eye": (0.6, 0, 0), "right_eye": (0.66, 0, 0), "model": "fast"}, "--right-eye: the eyes are not beside"),
+        ({"left_eye": (50, 50, 50), "right_eye": (0.07, -50, -50), "model": "fast"}, "--right-eye: the eyes stand so"),
         ({"fov": 180}, "--fov"),
-        ({"model": "quick"}, "quick"),
+        ({"fov": 1e-320}, "--fov"),
+        ({"model": "quick"}, "solve: --model: 'quick'"),
         ({"model": "panels.onnx"}, "panels.onnx"),
     ],
 )
@@ -91,6 +95,31 @@ def test_what_cannot_be_solved_is_one_line_and_exit_2(pair: Path, changes: dict[
     assert not (pair / "out").exists()
 
 
+def test_eyes_in_line_with_the_displays_depth_are_served_by_sart(pair: Path) -> None:
+    eyes: dict[str, object] = {"left_eye": (0.6, 0, 0), "right_eye": (0.66, 0, 0)}
+    assert phasestack(*solve_arguments(pair, **eyes, model="sart")).returncode == 0
+
+
+def test_what_a_decoder_says_of_a_damaged_picture_stands_in_the_one_line(pair: Path) -> None:
+    data = bytearray((pair / "left.png").read_bytes())
+    data[len(data) // 2] ^= 0x5A
+    (pair / "damaged.png").write_bytes(data)
+    result = phasestack(*solve_arguments(pair, left=pair / "damaged.png"))
+    assert result.returncode == 2
+    (line,) = result.stderr.strip().splitlines()
+    assert "damaged.png: is not an image that can be decoded (libpng error: " in line
+
+
+def test_a_folder_in_the_place_of_a_layer_is_named_and_nothing_is_replaced(pair: Path) -> None:
+    (pair / "out" / "layer-1.png").mkdir(parents=True)
+    (pair / "out" / "layer-0.png").write_text("the old one")
+    result = phasestack(*solve_arguments(pair, model="fast"))
+    assert (result.returncode, len(result.stderr.strip().splitlines())) == (2, 1)
+    assert "layer-1.png: is a folder" in result.stderr
+    assert {path.name for path in (pair / "out").iterdir()} == {"layer-0.png", "layer-1.png"}
+    assert (pair / "out" / "layer-0.png").read_text() == "the old one"
+
+
 def test_pictures_of_different_sizes_are_refused(pair: Path) -> None:
     write_png(pair / "right.png", np.zeros((50, 60, 3), np.uint8))
     result = phasestack(*solve_arguments(pair))
@@ -104,6 +133,8 @@ def test_pictures_of_different_sizes_are_refused(pair: Path) -> None:
         ({**PANELS, "width_m": "wide"}, "width_m"),
         ({**PANELS, "depth_m": 1}, "depth_m"),
         ({"width_m": 0.5, "height_m": 0.3}, "x_m"),
+        ({**PANELS, "x_m": [0.01 * n for n in range(9)]}, "x_m: must list 2 to 8 panels"),
+        ({"stack": PANELS}, "width_m: is missing: a configuration has it under [stack]"),
     ],
 )
 def test_panels_that_make_no_stack_are_refused_by_field(pair: Path, table: dict[str, object], field: str) -> None:

@@ -207,3 +207,10 @@ def test_the_first_change_that_contributing_leads_to_is_there_to_be_made() -> No
     assert lines[place] == f"{name} = {before}" and lines[place - 1].startswith("# ")
     for run in re.findall(r"make golden GOLDEN_ARGS=(\S+)", text):
         assert (ROOT / "tests" / "golden" / "data" / f"{run}.jsonl").is_file()
+
+
+@pytest.mark.parametrize(("page", "codes"), [("README.md", ()), ("docs/contracts.md", (130, 141)),
+                                             ("docs/commands/README.md", (130, 141))])  # fmt: skip
+def test_every_exit_code_is_in_the_tables(page: str, codes: tuple[int, ...]) -> None:
+    told = re.findall(r"^\| (\d+) \|", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE)
+    assert told == [str(code) for code in (0, 1, 2, 70, 75, *codes)]

@@ -5,9 +5,15 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer.main
+
+from runtime.commands.app import app
+from runtime.errors import InputError
 
 HEADLESS = "run --headless --max-speed --frames 1 --scale 0.1 --out {out}"
 EYES = "--left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0 --fov 40"
@@ -86,3 +92,38 @@ def test_limits_of_the_configuration_hold(folder: Path, limits: str, command: st
     command = command.replace("--frames 1", "--frames 400 --config {folder}/limits.toml --model fast")
     answer = run(command, folder)
     assert answer.returncode == 2 and told in answer.stderr and "Traceback" not in answer.stderr
+
+
+def commands(command: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    yield words, command
+    for name, child in getattr(command, "commands", {}).items():
+        yield from commands(child, (*words, name))
+
+
+def parameters(kind: str) -> list[tuple[tuple[str, ...], Any]]:
+    """Every option and argument of a kind, with its command's words."""
+    found = commands(typer.main.get_command(app))
+    return [(words, one) for words, command in found for one in command.params
+            if kind in str(one.type_descriptor.annotation)]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "1e308"])
+@pytest.mark.parametrize(("words", "parameter"), parameters("float"), ids=lambda x: " ".join(getattr(x, "opts", x)))
+def test_every_number_has_a_range_and_what_is_outside_is_told_by_its_option(
+    words: tuple[str, ...], parameter: Any, text: str
+) -> None:
+    count = str(parameter.type_descriptor.annotation).count("float")
+    given = [name for name in parameter.opts if name.startswith("-")]
+    with pytest.raises(InputError, match=f"^{' '.join(words)}: {parameter.opts[0]}: "):
+        app([*words, *given, *[text] * count])
+
+
+@pytest.mark.parametrize(
+    ("words", "parameter"),
+    [(words, one) for words, one in parameters("int") if one.opts == ["--seed"]],
+    ids=lambda x: " ".join(getattr(x, "opts", x)),
+)
+def test_a_seed_is_not_negative(words: tuple[str, ...], parameter: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        app([*words, "--seed", "-1"])
+    assert ended.value.code == 2 and "--seed" in capsys.readouterr().err

@@ -7,6 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
+from runtime.support.options import number, number_argument
+from runtime.support.ranges import BUDGET_MOST_MS
+
 app = typer.Typer(
     no_args_is_help=True,
     help="Tell the running daemon what to do between two of its turns. Exits with 1 where no daemon answers.\n\n"
@@ -47,14 +50,17 @@ def next_one(config: Config = None, socket: Socket = None) -> None:
 
 @app.command()
 def place(
-    scale: Annotated[float | None, typer.Option(help="the scene's size, times its own")] = None,
+    scale: Annotated[float | None, number(0.001, 1000, help="the scene's size, times its own")] = None,
     offset: Annotated[
-        tuple[float, float, float] | None, typer.Option(help="where it is moved: out, right, up; metres")
+        tuple[float, float, float] | None, number(-10, 10, "m", help="where it is moved: out, right, up; metres")
     ] = None,
     rotate: Annotated[
-        tuple[float, float, float] | None, typer.Option(help="turns about the axes out, right and up; degrees")
+        tuple[float, float, float] | None,
+        number(-360, 360, "degrees", help="turns about the axes out, right and up; degrees"),
     ] = None,
-    turntable: Annotated[float | None, typer.Option(help="turns a minute about the vertical; 0: it stands")] = None,
+    turntable: Annotated[
+        float | None, number(-600, 600, help="turns a minute about the vertical; 0: it stands")
+    ] = None,
     reset: Annotated[bool, typer.Option("--reset", help="as the configuration has it")] = False,
     config: Config = None,
     socket: Socket = None,
@@ -128,7 +134,7 @@ def flat(config: Config = None, socket: Socket = None) -> None:
 
 @app.command()
 def budget(
-    milliseconds: Annotated[float, typer.Argument(help="time for one frame; 0: none")],
+    milliseconds: Annotated[float, number_argument(0, BUDGET_MOST_MS, "ms", help="time for one frame; 0: none")],
     config: Config = None,
     socket: Socket = None,
 ) -> None:

@@ -8,11 +8,13 @@ from typing import Annotated
 
 import typer
 
+from runtime.support.options import number
+
 
 def demo(
     out: Annotated[Path, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = Path("out/demo"),
     frames: Annotated[int | None, typer.Option(min=1, help="refreshes; default: the whole recording")] = None,
-    scale: Annotated[float, typer.Option(min=0.05, max=2.0, help="panel resolution, times 1920x1080")] = 1.0,
+    scale: Annotated[float, number(0.05, 2.0, help="panel resolution, times 1920x1080")] = 1.0,
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="the summary as one JSON object on stdout")] = False,
 ) -> None:

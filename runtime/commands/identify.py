@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from runtime.support.options import number
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -22,7 +24,7 @@ def identify(
     panel: Annotated[int, typer.Option(help="show this panel (or monitor) alone; -1: one after the other")] = -1,
     all_at_once: Annotated[bool, typer.Option("--all", help="all at once: for panels that lie side by side")] = False,
     ask: Annotated[bool, typer.Option("--ask", help="ask which is which, and write the answers into --config")] = False,
-    seconds: Annotated[float, typer.Option(help="how long; 0: until q", min=0)] = 0.0,
+    seconds: Annotated[float, number(0, 86_400, "s", help="how long; 0: until q")] = 0.0,
     out: Annotated[
         Path | None, typer.Option(help="write what each monitor would be sent as PNG; needs no screen")
     ] = None,

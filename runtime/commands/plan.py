@@ -8,16 +8,19 @@ from typing import Annotated, Any
 
 import typer
 
+from runtime.support.options import number, place, told_by_option
+from runtime.support.ranges import BUDGET_MOST_MS
+
 
 def plan(
     config: Annotated[Path | None, typer.Option(help="TOML file; see `phasestack config`")] = None,
     scene: Annotated[str | None, typer.Option(help="a preset's name, a built-in scene, a file or folder")] = None,
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
-    scale: Annotated[float, typer.Option(min=0.05, max=2.0, help="panel resolution, times the configured one")] = 1.0,
-    budget_ms: Annotated[float | None, typer.Option(min=0, help="time for a frame; picks model and size")] = None,
-    eyes: Annotated[
-        tuple[float, float, float] | None, typer.Option(help="x y z between the eyes, metres, frame `stack`")
+    scale: Annotated[float, number(0.05, 2.0, help="panel resolution, times the configured one")] = 1.0,
+    budget_ms: Annotated[
+        float | None, number(0, BUDGET_MOST_MS, "ms", help="time for a frame; picks model and size")
     ] = None,
+    eyes: Annotated[tuple[float, float, float] | None, place(help="between the eyes, metres, frame `stack`")] = None,
     survey: Annotated[
         bool, typer.Option("--survey", help="six kinds of scenes, the plan on and off, and cost against region size")
     ] = False,
@@ -38,7 +41,10 @@ def plan(
         return
     from runtime.plan.planning import plan_for
 
-    result = plan_for(config, scene=scene, model=model, scale=scale, budget_ms=budget_ms, middle_m=eyes, quiet=as_json)
+    with told_by_option("plan", scene=scene, model=model):
+        result = plan_for(
+            config, scene=scene, model=model, scale=scale, budget_ms=budget_ms, middle_m=eyes, quiet=as_json
+        )
     if as_json:
         typer.echo(json.dumps(result))
     else:

@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from runtime.support.options import number
+from runtime.support.ranges import RECORD_MOST_S
+
 if TYPE_CHECKING:
     from runtime.config import Settings
     from runtime.records import SensorFrame
@@ -25,15 +28,15 @@ def record(
     config: Annotated[Path | None, typer.Option(help="TOML file; see `phasestack config`")] = None,
     images: Annotated[bool, typer.Option("--images", help="colour and depth as well: shows faces")] = False,
     seconds: Annotated[
-        float | None, typer.Option(min=0.1, help="stop after this long; else Ctrl-C, with --motion 12 s")
+        float | None, number(0.1, RECORD_MOST_S, "s", help="stop after this long; else Ctrl-C, with --motion 12 s")
     ] = None,
     motion: Annotated[
         str | None, typer.Option(help="no sensor, but a head that moves: still, lean, nod, walk or stop-and-go")
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="with --motion: another seed, another path")] = None,
-    rate_hz: Annotated[float | None, typer.Option(min=15, max=240, help="with --motion: samples a second")] = None,
+    rate_hz: Annotated[float | None, number(15, 240, "Hz", help="with --motion: samples a second")] = None,
     noise_mm: Annotated[
-        float | None, typer.Option(min=0, max=100, help="with --motion: the sensor's noise, standard deviation an axis")
+        float | None, number(0, 100, "mm", help="with --motion: the sensor's noise, standard deviation an axis")
     ] = None,
     force: Annotated[
         bool,

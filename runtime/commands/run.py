@@ -9,6 +9,9 @@ from typing import Annotated
 
 import typer
 
+from runtime.support.options import number, told_by_option
+from runtime.support.ranges import BUDGET_MOST_MS
+
 
 def leave_at_once() -> None:
     """End the process though a solver's call never returned: waiting for its thread would never end."""
@@ -37,8 +40,10 @@ def run(
     out: Annotated[Path | None, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = None,
     scene: Annotated[str | None, typer.Option(help="a built-in scene, a preset's name, a file or folder")] = None,
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
-    scale: Annotated[float, typer.Option(min=0.05, max=2.0, help="panel resolution, times the configured one")] = 1.0,
-    budget_ms: Annotated[float | None, typer.Option(min=0, help="time for a frame; picks model and size")] = None,
+    scale: Annotated[float, number(0.05, 2.0, help="panel resolution, times the configured one")] = 1.0,
+    budget_ms: Annotated[
+        float | None, number(0, BUDGET_MOST_MS, "ms", help="time for a frame; picks model and size")
+    ] = None,
     backend: Annotated[
         str | None, typer.Option(help="what surrounds the network: auto (the faster one here), opencv or gl")
     ] = None,
@@ -81,18 +86,19 @@ def run(
     overrides = Overrides(
         replay=replay, headless=headless, scene=scene, model=model, budget_ms=budget_ms, backend=backend
     )
-    summary = run_daemon(
-        config,
-        overrides,
-        frames=frames,
-        max_speed=max_speed,
-        out=out,
-        scale=scale,
-        quiet=as_json,
-        keep_light=keep_light,
-        record=record,
-        record_images=record_images,
-    )
+    with told_by_option("run", scene=scene, model=model):
+        summary = run_daemon(
+            config,
+            overrides,
+            frames=frames,
+            max_speed=max_speed,
+            out=out,
+            scale=scale,
+            quiet=as_json,
+            keep_light=keep_light,
+            record=record,
+            record_images=record_images,
+        )
     left_behind = summary.pop("left_behind", 0)
     if as_json:
         typer.echo(json.dumps(summary))

@@ -18,7 +18,7 @@ def setup(
     photos: Annotated[Path | None, typer.Option(help="folder in which the photographs of the boards will lie")] = None,
     device: Annotated[str | None, typer.Option(help="a video device (number or path) instead of photographs")] = None,
     simulate: Annotated[bool, typer.Option("--simulate", help="a display that is not there, to try it out")] = False,
-    seed: Annotated[int, typer.Option(help="of the simulated display")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="of the simulated display")] = 0,
     again: Annotated[bool, typer.Option("--again", help="begin at the first step, whatever is done")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout, at the end")] = False,
 ) -> None:

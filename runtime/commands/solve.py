@@ -8,21 +8,24 @@ from typing import Annotated
 
 import typer
 
+from runtime.support.options import number, place, told_by_option
+from runtime.support.ranges import FOV_RANGE_DEG
+
 
 def solve(
     left: Annotated[Path, typer.Option(help="picture for the left eye")],
     right: Annotated[Path, typer.Option(help="picture for the right eye")],
-    left_eye: Annotated[
-        tuple[float, float, float], typer.Option(help="left eye, metres, stack frame", metavar="X Y Z")
-    ],
-    right_eye: Annotated[tuple[float, float, float], typer.Option(help="right eye, metres", metavar="X Y Z")],
+    left_eye: Annotated[tuple[float, float, float], place(help="left eye, metres, stack frame")],
+    right_eye: Annotated[tuple[float, float, float], place(help="right eye, metres")],
     panels: Annotated[Path, typer.Option(help="TOML or JSON: width_m, height_m, x_m")],
     out: Annotated[Path, typer.Option(help="folder for the layers")],
-    fov: Annotated[float, typer.Option(help="the pictures' horizontal field of view, degrees")] = 40.0,
+    fov: Annotated[
+        float, number(*FOV_RANGE_DEG, "degrees", help="the pictures' horizontal field of view, degrees")
+    ] = 40.0,
     model: Annotated[str, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = "balanced",
     repeat: Annotated[int, typer.Option(min=1, max=10000, help="timed runs, after the warm-up")] = 1,
     eye_sigma_mm: Annotated[
-        float, typer.Option(min=0, max=1000, help="how unsure the eyes are, mm an axis; 1: a pupil; 0: two points")
+        float, number(0, 1000, "mm", help="how unsure the eyes are, mm an axis; 1: a pupil; 0: two points")
     ] = 1.0,
     backend: Annotated[
         str | None,
@@ -39,23 +42,24 @@ def solve(
     """
     from runtime.commands.solving import SolveRequest, solve_pair
 
-    result = solve_pair(
-        SolveRequest(
-            left,
-            right,
-            left_eye,
-            right_eye,
-            fov,
-            panels,
-            out,
-            model,
-            repeat,
-            eye_sigma_mm,
-            config,
-            backend,
-            no_plan,
+    with told_by_option("solve", model=model):
+        result = solve_pair(
+            SolveRequest(
+                left,
+                right,
+                left_eye,
+                right_eye,
+                fov,
+                panels,
+                out,
+                model,
+                repeat,
+                eye_sigma_mm,
+                config,
+                backend,
+                no_plan,
+            )
         )
-    )
     if as_json:
         typer.echo(json.dumps(result))
     else:

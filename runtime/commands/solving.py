@@ -14,7 +14,7 @@ import numpy as np
 
 from runtime.config import ModelSettings, Overrides, changed, load_settings, load_stack
 from runtime.content.base import ContentInfo
-from runtime.errors import InputError
+from runtime.errors import EyesNotServed, InputError
 from runtime.evaluation.displayed import EyeViews, Picture, displayed, expected_db
 from runtime.evaluation.trials import timed, timed_in_turn
 from runtime.model.backends import choose
@@ -68,10 +68,6 @@ def solve_pair(request: SolveRequest) -> dict[str, Any]:
         raise InputError(request.right, "size", f"the two pictures differ: {sizes}")
     height, width = pictures[0].shape[:2]
     stack = load_stack(request.panels, width_px=width, height_px=height)
-    if not (math.isfinite(request.fov_deg) and 0 < request.fov_deg < 180):
-        raise InputError("solve", "--fov", "must lie between 0 and 180 degrees")
-    if not math.isfinite(request.eye_sigma_mm):
-        raise InputError("solve", "--eye-sigma-mm", "must be a finite number")
     eyes_m = checked_eyes(request.left_eye, request.right_eye, stack)
     model_settings = model_settings.model_copy(update={"name": request.model})
     settings = settings.model_copy(update={"model": model_settings})
@@ -174,9 +170,15 @@ def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stac
 
 
 def _solved(pictures: list[U8], eyes_m: F64, request: SolveRequest, predictor: Predictor) -> Prediction:
-    return solve_still(
-        *pictures, eyes_m=eyes_m, fov_deg=request.fov_deg, predictor=predictor, eye_sigma_mm=request.eye_sigma_mm
-    )
+    """Raises InputError for eyes that the model does not serve: here they will not move on."""
+    try:
+        return solve_still(
+            *pictures, eyes_m=eyes_m, fov_deg=request.fov_deg, predictor=predictor, eye_sigma_mm=request.eye_sigma_mm
+        )
+    except EyesNotServed as error:
+        raise InputError(
+            "solve", "--left-eye, --right-eye", f"{error}: {predictor.name} can't serve them (try --model sart)"
+        ) from None
 
 
 def _timed(

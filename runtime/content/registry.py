@@ -19,6 +19,7 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64
 from runtime.support import foreign, progress
 from runtime.support.live import is_live
+from runtime.support.plausible import nearest
 
 MESHES = (".glb", ".gltf", ".obj", ".stl")
 PLAYLISTS = (".toml", ".json")
@@ -70,9 +71,16 @@ def _prepared(settings: ContentSettings, stack: PanelStack, limits: LimitSetting
         return _live(name, settings, stack, limits)
     path = foreign.checked_path(name, source="content", field="scene")
     if not path.exists():
-        known = ", ".join((*SCENES, *preset_names(), "external"))
-        raise InputError("content", "scene", f"`{name}` is neither a file or folder nor one of {known}")
+        raise InputError("content", "scene", f"`{name}` {_no_scene(name)}")
     return _from_path(path, settings, stack, None, limits)
+
+
+def _no_scene(name: str) -> str:
+    """What a name is not, and what was meant; not all names, which one line does not hold."""
+    presets = preset_names()
+    meant = nearest(name, (*SCENES, *presets, "external"))
+    some = f"built in: {', '.join(SCENES)}; {len(presets)} presets, such as lego_bulldozer"
+    return f"is neither a file or folder nor a scene's name{meant} ({some})"
 
 
 def _from_path(

@@ -16,15 +16,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import ConfigDict, Field, field_validator
 
-from runtime.config import Section, read_table, validated
+from runtime.config import MOST, Section, read_table, validated
 from runtime.errors import InputError
 from runtime.records import F64, EyePoints
+from runtime.support.ranges import SCALE
 
 DEMO_FILE = Path(__file__).parent / "data" / "demo-calibration.toml"
 SIMILARITY_TOLERANCE = 1e-3  # relative; printed matrices of four digits pass, sheared ones do not
 PLAUSIBLE_SCALE = (0.8, 1.25)  # both frames are in metres
 
-Number = Annotated[float, Field(strict=True)]  # "1.0" and true are not numbers
+Number = Annotated[float, Field(strict=True, ge=-MOST, le=MOST)]  # "1.0" and true are not numbers
 Row4 = tuple[Number, Number, Number, Number]
 Vector3 = tuple[Number, Number, Number]
 Row7 = tuple[Number, Number, Number, Number, Number, Number, Number]
@@ -172,8 +173,13 @@ def similarity_defect(matrix: ArrayLike) -> float:
 
 
 def check_similarity(matrix: F64, *, source: str | Path) -> None:
-    """Raise InputError, naming the field, where a finite 4x4 matrix is no similarity with positive determinant."""
+    """Raise InputError, naming the field, where a finite 4x4 matrix is no similarity that a display can have.
+
+    Its determinant must be positive and its scale within `SCALE`, which takes any units that lengths are told in.
+    """
     name = "stack_from_sensor"
+    if not np.abs(matrix).max() <= MOST:
+        raise InputError(source, name, f"has an entry beyond {MOST:g}")
     if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
         raise InputError(source, name, "its last row must be 0, 0, 0, 1")
     defect = similarity_defect(matrix)
@@ -181,9 +187,13 @@ def check_similarity(matrix: F64, *, source: str | Path) -> None:
         raise InputError(
             source, name, f"must be rotation times one scale (off by {defect:.2g}, allowed {SIMILARITY_TOLERANCE})"
         )
-    sign = np.linalg.det(matrix[:3, :3] / np.abs(matrix[:3, :3]).max())
-    if sign <= 0.0:
+    largest = float(np.abs(matrix[:3, :3]).max())
+    volume = float(np.linalg.det(matrix[:3, :3] / largest))
+    if volume <= 0.0:
         raise InputError(source, name, "mirrors space (determinant not positive): check the axes' directions")
+    scale = largest * float(np.cbrt(volume))  # of the matrix itself the determinant may leave float64
+    if not SCALE[0] / 2 <= scale <= SCALE[1] * 2:  # a fit is off by a little
+        raise InputError(source, name, f"has scale {scale:.3g}: no unit is that; {SCALE[0]:g} to {SCALE[1]:g} are")
 
 
 def _warnings(matrix: F64, source: str) -> tuple[str, ...]:

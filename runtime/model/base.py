@@ -84,7 +84,8 @@ class Predictor(ABC):
         eye_sigma_mm: standard deviation, an axis, of where light enters the eyes, common to both, to the right and
         up; 0 asks for two points.
 
-        Raises ModelFailure where inference fails or does not answer with finite numbers.
+        Raises ModelFailure where inference fails or does not answer with finite numbers; of these EyesNotServed where
+        the model has no picture for two eyes like these.
         """
 
     def warm_up(self, eyes_m: F64) -> None:

@@ -27,6 +27,7 @@ CELLS_STEP = 8  # chains' lengths are rounded up to this, so that a moving viewe
 ROWS_STEP = 64
 CELLS_MAX = 1024
 BLOCK_ROWS = 8  # that the network transforms together: the raster has whole blocks
+ROWS_MAX = (1 << 15) - BLOCK_ROWS  # OpenCV samples no taller rasters
 NEAREST_F = 0.8  # the raster's half width by F's distance from its middle: nearer to F it is not laid
 FARTHEST_F = 0.01  # and beyond, s changes by less than a hundredth of itself: columns may as well be even
 
@@ -109,7 +110,7 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
 
     Columns are scaled so that the outer panels' parallax is `cell_px` columns; rows are `reduction` panel
     rows high and sheared along the line of the eyes. It covers what both see of all panels, and a margin.
-    Raises ValueError where the eyes have no horizontal separation.
+    Raises ValueError where the eyes have no horizontal separation, or the raster would be too tall.
     """
     between_m, half_m = eyes_m.mean(axis=0), (eyes_m[1] - eyes_m[0]) / 2
     plane_m = _equal_parallax_m(stack, between_m[0])
@@ -122,7 +123,7 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
     per_column = (stack.x_m[-1] - plane_m) / (middle_m[0] - stack.x_m[-1]) / (cell_px * ahead_m)
     column_m = abs(line.from_f_m2[0] * per_column)  # in the window's middle
     if column_m < 1e-12:
-        raise ValueError("the line of the eyes is vertical or has no length")
+        raise ValueError("the eyes are not beside each other: one is behind or above the other, or in its place")
     half_columns = window.half_width_m / column_m * (atanh(line.nearness) / line.nearness if line.nearness else 1.0)
     cells = CELLS_STEP * ceil((ceil(half_columns / cell_px) + 1) / CELLS_STEP)
     cells = min(CELLS_MAX, cells)
@@ -136,6 +137,8 @@ def chain_frame(eyes_m: F64, stack: PanelStack, *, cell_px: int, reduction: int)
     rise_rows = (max(reached_m) - min(reached_m) - window.height_m) / row_m
     step = ROWS_STEP if rise_rows > 0.01 else BLOCK_ROWS
     rows = step * ceil((stack.height_px / reduction + rise_rows) / step)
+    if rows > ROWS_MAX:
+        raise ValueError(f"the eyes stand so unlike a person's that their raster has {rows} rows")
     middle_y_m = window.middle_m[0] - window.half_width_m * line.nearness / (1 + sqrt(1 - line.nearness**2))
     middle_z_m = (min(reached_m) + max(reached_m)) / 2
     plane_from_raster = np.array(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.errors import ModelFailure
+from runtime.errors import EyesNotServed, ModelFailure
 from runtime.model.assembly import Assembly
 from runtime.model.base import Prediction, Predictor
 from runtime.model.chain import chain_frame, chain_modes
@@ -102,7 +102,7 @@ class UnrolledPredictor(Predictor):
         try:
             frame = chain_frame(along_m, self.stack, cell_px=contract.cell_px, reduction=contract.reduction)
         except ValueError as error:
-            raise ModelFailure(str(error)) from None
+            raise EyesNotServed(str(error)) from None
         boxes = visible_boxes(eyes_m, self.stack)
         pictures = [image[0] for image in images]
         grey = self.one_channel and all(_is_grey(picture, boxes[CENTRE]) for picture in pictures)

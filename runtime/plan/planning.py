@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
 MIDDLE_M = (0.6, 0.0, 0.05)
 HALF_IPD_M = 0.031
-FARTHEST_M = 100.0  # of a viewer
 
 
 def plan_for(
@@ -165,10 +164,6 @@ def _budget(
 
 def _check_viewer(eyes_m: F64, stack: PanelStack, *, fov_deg: float, source: str) -> None:
     """Raise InputError, naming the option, for eyes (2, 3) from which nothing of the display can be seen."""
-    if not np.isfinite(eyes_m).all():
-        raise InputError(source, "", "must be three finite numbers, metres")
-    if np.abs(eyes_m).max() > FARTHEST_M:
-        raise InputError(source, "", f"is farther than {FARTHEST_M:g} m: metres are meant")
     nearest_m = float(eyes_m[:, 0].min())
     if nearest_m <= max(stack.x_m):
         raise InputError(source, "", f"x = {nearest_m:g} m : not in front of the panels (x > {max(stack.x_m):g} m)")

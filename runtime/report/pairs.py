@@ -17,7 +17,9 @@ from runtime.evaluation.displayed import Picture
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, stack_from_eye
 from runtime.records import F64, U8
+from runtime.support import foreign
 from runtime.support.artifacts import in_8_bits, read_picture
+from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
 
 if TYPE_CHECKING:
     from runtime.content.scenes import Scene
@@ -86,12 +88,10 @@ def _case(path: Path, table: dict[str, Any]) -> StillPair:
         raise InputError(path, "eyes", "must be the left and the right eye")
     if not (eyes[:, 0] > max(stack.x_m)).all():
         raise InputError(path, "eyes", "must be before every panel")
-    fov_deg = table.get("fov")
-    if not (isinstance(fov_deg, int | float) and 0 < fov_deg < 180):
-        raise InputError(path, "fov", "must be the pictures' horizontal field of view in degrees")
+    fov_deg = foreign.real(table.get("fov"), least=FOV_RANGE_DEG[0], most=FOV_RANGE_DEG[1], source=path, field="fov")
     off = tuple(_off_view(item, path, left.shape) for item in _items(table.get("off", []), path, "off"))
     images = (in_8_bits(left), in_8_bits(right))
-    return StillPair(path.stem, stack, eyes, images, float(fov_deg), off, (left, right))
+    return StillPair(path.stem, stack, eyes, images, fov_deg, off, (left, right))
 
 
 def _items(value: Any, path: Path, field: str) -> list[Any]:
@@ -101,21 +101,22 @@ def _items(value: Any, path: Path, field: str) -> list[Any]:
 
 
 def _place(value: Any, path: Path, field: str) -> F64:
-    numbers = isinstance(value, list) and len(value) == 3 and all(isinstance(c, int | float) for c in value)
-    if not numbers or not all(math.isfinite(c) for c in value):
+    """(3,) metres: where an eye is."""
+    if not isinstance(value, list) or len(value) != 3:
         raise InputError(path, field, "must be three finite numbers, metres")
-    return np.array(value, dtype=np.float64)
+    return np.array([foreign.real(c, least=-EYE_MOST_M, most=EYE_MOST_M, source=path, field=field) for c in value])
 
 
 def _off_view(item: Any, path: Path, shape: tuple[int, ...]) -> OffView:
     if not (isinstance(item, dict) and {"mm", "eye", "image"} <= item.keys()):
         raise InputError(path, "off", "entries need mm, eye and image")
-    if not isinstance(item["mm"], int | float) or not isinstance(item["image"], str):
-        raise InputError(path, "off", "mm must be a number and image a file name")
+    mm = foreign.real(item["mm"], least=0.0, most=EYE_MOST_M * 1000, source=path, field="off.mm")
+    if not isinstance(item["image"], str):
+        raise InputError(path, "off.image", "must be a file name")
     image = read_picture(path.parent / item["image"])
     if image.shape != shape:
         raise InputError(path.parent / item["image"], "", "differs in size from the pair")
-    return OffView(float(item["mm"]), _place(item["eye"], path, "off.eye"), image)
+    return OffView(mm, _place(item["eye"], path, "off.eye"), image)
 
 
 def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0, ipd_m: float = 0.063) -> F64:

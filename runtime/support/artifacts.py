@@ -18,6 +18,7 @@ import numpy as np
 
 from runtime.errors import InputError
 from runtime.records import U8, U16
+from runtime.support.library_lines import held_back
 from runtime.support.picture_header import read_coded
 
 STAGING = ".phasestack-"
@@ -119,20 +120,22 @@ def read_picture(path: Path) -> U8 | U16:
     import cv2
 
     data = read_coded(path)
-    unreadable = InputError(path, "", "is not an image that can be decoded")
-    # libpng would write a line of its own to stderr about a file that is cut off.
     if data.startswith(PNG) and b"IEND" not in data:
-        raise unreadable
+        raise InputError(path, "", "is not an image that can be decoded (it is cut off)")
     coded = np.frombuffer(data, np.uint8)
-    image: Any = cv2.imdecode(coded, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    stored: Any = None
+    with held_back() as said:
+        image: Any = cv2.imdecode(coded, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+        if image is not None and _may_be_transparent(data):
+            stored = cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)
     if image is None or image.dtype not in (np.uint8, np.uint16):
-        raise unreadable
-    if _may_be_transparent(data):
-        stored: Any = cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)
-        if stored is not None and stored.ndim == 3 and stored.shape[2] == 4:
-            if not np.array_equal(stored[..., :3], image):
-                raise InputError(path, "orientation", "a transparent picture that its EXIF entry turns can't be read")
-            image = _on_white(image, stored[..., 3:])
+        why = f" ({said.first_line})" if said.first_line else ""
+        raise InputError(path, "", f"is not an image that can be decoded{why}")
+    said.release()
+    if stored is not None and stored.ndim == 3 and stored.shape[2] == 4:
+        if not np.array_equal(stored[..., :3], image):
+            raise InputError(path, "orientation", "a transparent picture that its EXIF entry turns can't be read")
+        image = _on_white(image, stored[..., 3:])
     return np.ascontiguousarray(image[..., ::-1])
 
 
@@ -180,11 +183,7 @@ class OutputFolder:
     ) -> None:
         try:
             if kind is None:
-                for path in sorted(self.staging.rglob("*")):
-                    if path.is_file():
-                        destination = self.target / path.relative_to(self.staging)
-                        destination.parent.mkdir(parents=True, exist_ok=True)
-                        path.replace(destination)
+                self._put_in_place()
         finally:
             self.discard()
             self._lock.close()
@@ -199,9 +198,33 @@ class OutputFolder:
         if isinstance(error, OSError) and str(error.filename or "").startswith(str(self.staging)):
             raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
 
+    def _put_in_place(self) -> None:
+        """Rename every staged file. Raises InputError, with nothing replaced, where something is in the way of one."""
+        files = sorted(path for path in self.staging.rglob("*") if path.is_file())
+        places = {path: self.target / path.relative_to(self.staging) for path in files}
+        for place in places.values():
+            _check_free(place, within=self.target)
+        for path, place in places.items():
+            try:
+                place.parent.mkdir(parents=True, exist_ok=True)
+                path.replace(place)
+            except OSError as error:
+                raise InputError(place, "", f"cannot be written ({error.strerror})") from None
+
     def discard(self) -> None:
         """Remove what was staged so far, before the end."""
         shutil.rmtree(self.staging, ignore_errors=True)
+
+
+def _check_free(place: Path, *, within: Path) -> None:
+    """Raise InputError where a folder is in a file's place, or a file in that of a folder it needs."""
+    for folder in place.parents:
+        if folder == within:
+            break
+        if folder.exists() and not folder.is_dir():
+            raise InputError(folder, "", "is no folder: it is in the way of an output")
+    if place.is_dir():
+        raise InputError(place, "", "is a folder: it is in the way of an output")
 
 
 @contextmanager

@@ -8,15 +8,11 @@ from pathlib import PurePosixPath
 
 from pydantic import AfterValidator
 
+from runtime.support.ranges import refusal
+
 TEXT_MAX_BYTES = 4095  # of a path on Linux
 PART_MAX_BYTES = 255  # of one part of a path
 SOCKET_MAX_BYTES = 107  # of a Unix socket's path
-# What a value may have been given in, by its own unit: factor and name.
-OTHER_UNITS = {
-    "m": ((1e-3, "millimetres"), (1e-2, "centimetres")),
-    "s": ((1e-3, "milliseconds"),),
-    "ms": ((1e-3, "microseconds"),),
-}
 
 
 def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterValidator:
@@ -28,16 +24,10 @@ def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterVa
     """
 
     def check(value: float) -> float:
-        if low <= value <= high or (zero and value == 0):
-            return value
-        named = f" {unit}" if unit else ""
-        bound, side = (high, "beyond") if value > high else (low, "below")
-        for factor, other in OTHER_UNITS.get(unit, ()):
-            if abs(value) > abs(bound) and low <= value * factor <= high:
-                raise ValueError(
-                    f"{value:g}{named} is {side} {bound:g}{named}: did you mean {other} ({value * factor:g})?"
-                )
-        raise ValueError(f"{value:g}{named} is {side} {bound:g}{named}; it may be {low:g} to {high:g}{named}")
+        problem = "" if zero and value == 0 else refusal(value, low, high, unit)
+        if problem:
+            raise ValueError(problem)
+        return value
 
     return AfterValidator(check)
 

@@ -296,7 +296,14 @@ def test_a_recording_without_marks_or_truth_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "a,b\n1,2\n", "seconds,viewpoint\nx,R40-phi70-theta80\n", "seconds,viewpoint\n1,R1\n"]
+    "text",
+    [
+        "",
+        "a,b\n1,2\n",
+        "seconds,viewpoint\nx,R40-phi70-theta80\n",
+        "seconds,viewpoint\n1e308,R40-phi70-theta80\n",
+        "seconds,viewpoint\n1,R1\n",
+    ],
 )
 def test_wrong_marks_are_refused(tmp_path: Path, text: str) -> None:
     path = recording(tmp_path / "r.mcap", [grid()[0].midpoint_m], true=False)

@@ -54,6 +54,7 @@ def test_a_spreadsheets_byte_order_mark_and_blanks_do_no_harm(tmp_path: Path) ->
         ("p.csv", HEADER + "\n1,2,3,4,5\n", "line 2, stack_z: is missing"),
         ("p.csv", HEADER + "\n1,2,3,4,5,6\n1,nan,3,4,5,6\n", "line 3, sensor_y: is not finite"),
         ("p.csv", HEADER + "\n1,2,3,4,5,1e999\n", "line 2, stack_z: is not finite"),
+        ("p.csv", HEADER + "\n1,2,3,4,5,1e200\n", r"line 2, stack_z: is 1e\+200"),
         ("p.csv", HEADER + "\n1,2,three,4,5,6\n", "line 2, sensor_z: is not a number: three"),
         ("p.json", "{", "malformed"),
         ("p.json", "3", "must be a list"),

@@ -106,6 +106,13 @@ def test_one_pair_beyond_the_seeds_five_centimetres_is_named(
     assert any("line 5: residual beyond 50 mm" in warning for warning in told["warnings"])
 
 
+def test_units_that_together_make_a_scale_that_no_calibration_has_are_refused(
+    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
+) -> None:
+    units = ("--sensor-unit", "1e6", "--stack-unit", "1e-6")
+    assert "stack_from_sensor: has scale 1e-12" in refusal(write_pairs(measured(), known_m), tmp_path, *units)
+
+
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_fewer_than_three_pairs_are_refused(
     tmp_path: Path,

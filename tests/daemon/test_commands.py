@@ -107,6 +107,5 @@ def test_every_command_arrives(server: StatusServer, arguments: list[str], name:
 
 
 def test_a_refusal_is_bad_input(server: StatusServer) -> None:
-    result = CliRunner().invoke(ctl.app, ["budget", "99999999", "--socket", str(server.path)])
-    assert isinstance(result.exception, InputError)
-    assert "budget must lie in" in str(result.exception)
+    with pytest.raises(InputError, match="budget must lie in"):
+        ctl.tell({"command": "budget", "value": 1e8}, None, server.path)

@@ -201,7 +201,7 @@ def test_what_is_being_measured_at_the_end_is_closed_on_the_solver_s_thread(
 
     with Served(tmp_path, **{**MOVING, "model": {"name": "best", "backend": "gl"}}) as served:
         served.asked("budget", 5000.0)
-        served.rig.refresh_until(lambda: served.budget.describe()["measuring"])
+        served.rig.refresh_until(lambda: (served.budget.describe() or {}).get("measuring"))
         monkeypatch.setattr(UnrolledPredictor, "close", close)
     assert set(closed) <= {"solver", "MainThread"}
 

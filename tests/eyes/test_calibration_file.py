@@ -193,3 +193,15 @@ def test_the_error_at_the_eye_grows_with_the_distance_from_the_pairs(tmp_path: P
     assert near == pytest.approx(np.sqrt(3) * 1e-3)
     assert far == pytest.approx(np.sqrt(6) * 1e-3), "two axes of rotation and the scale act at a metre's arm"
     assert load_calibration(None).position_error_m([[0.5, 0.0, 0.0]]) is None, "not known is not zero"
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("scale", [1e200, 1e-200, 1e8, 1e-8])
+def test_a_scale_that_no_unit_has_is_refused_by_name(tmp_path: Path, scale: float) -> None:
+    assert "stack_from_sensor" in refusal(tmp_path, toml(np.diag([scale, scale, scale, 1.0])))
+
+
+@pytest.mark.parametrize("scale", [1e6, 1e-6])
+def test_micrometres_in_metres_are_only_warned_of(tmp_path: Path, scale: float) -> None:
+    (tmp_path / "c.toml").write_text(toml(np.diag([scale, scale, scale, 1.0])))
+    assert "far from 1" in load_calibration(tmp_path / "c.toml").warnings[0]

@@ -145,7 +145,7 @@ def test_the_raster_covers_what_is_seen_of_all_panels() -> None:
 
 def test_eyes_above_each_other_have_no_row_to_solve_along() -> None:
     upright = np.array([[0.6, 0.0, -0.03], [0.6, 0.0, 0.03]])
-    with pytest.raises(ValueError, match="vertical"):
+    with pytest.raises(ValueError, match="not beside each other"):
         chain_frame(upright, STACK, cell_px=4, reduction=2)
 
 
@@ -207,3 +207,9 @@ def test_where_the_origin_lies_along_x_changes_nothing() -> None:
     assert (there.cells, there.rows) == (here.cells, here.rows)
     np.testing.assert_allclose(there.plane_from_raster, here.plane_from_raster, atol=1e-12)
     np.testing.assert_allclose(there.doubt(moved, eye_sigma_mm=2.0), here.doubt(STACK, eye_sigma_mm=2.0), rtol=1e-6)
+
+
+def test_a_raster_that_opencv_can_not_sample_is_refused() -> None:
+    pair = np.array([[50.0, 50.0, 50.0], [0.07, -50.0, -50.0]])
+    with pytest.raises(ValueError, match="rows"):
+        chain_frame(pair, STACK, cell_px=4, reduction=2)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from runtime.config import ModelSettings
-from runtime.errors import ModelFailure
+from runtime.errors import EyesNotServed, ModelFailure
 from runtime.model.predictor import load_predictor
 from runtime.model.pyramid_level import NEUTRAL
 from runtime.model.sart import SartPredictor
@@ -118,6 +118,14 @@ def test_a_head_that_lies_down_and_sits_up_again_leaves_nothing_behind() -> None
         pictures = [card_scene(eye) for eye in pair]
         layers = solve_still(*pictures, eyes_m=pair, fov_deg=FOV_DEG, predictor=predictor).layers
         assert (layers == solved("balanced", pair)).all()
+
+
+def test_eyes_behind_each_other_are_a_model_failure_that_a_viewer_may_leave_again() -> None:
+    predictor = load_predictor("fast", STACK)
+    grey = np.full((270, 480, 4), 128, np.uint8)
+    with pytest.raises(EyesNotServed, match="not beside each other") as caught:
+        predictor.predict([[grey], [grey]], np.array([[0.6, 0.0, 0.0], [0.66, 0.0, 0.0]]))
+    assert isinstance(caught.value, ModelFailure)
 
 
 def test_a_doubt_that_is_no_number_is_a_model_failure() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -71,11 +72,11 @@ def test_what_can_be_chosen_is_the_ladder_of_the_running_loop(model: str) -> Non
         ("0 0 0", "not in front of the panels"),
         ("-1 0 0", "not in front of the panels"),
         ("0.06 0 0", "not in front of the panels"),
-        ("nan 0 0", "finite"),
-        ("0.6 inf 0", "finite"),
+        ("nan 0 0", "is not a number"),
+        ("0.6 inf 0", "is beyond 50 m"),
         ("0.061 40 0", "nothing of the display can be seen"),
-        ("1e300 0 0", "metres are meant"),
-        ("600 0 0", "metres are meant"),
+        ("1e300 0 0", "is beyond 50 m"),
+        ("600 0 0", "did you mean millimetres (0.6)"),
     ],
 )
 def test_eyes_that_see_nothing_are_one_line(eyes: str, said: str) -> None:
@@ -175,3 +176,16 @@ def test_one_figure_stands_for_one_thing() -> None:
     (reuse,) = [item for item in result["plan"] if item["what"] == "render and inference"]
     assert still - drifted == pytest.approx(reuse["costs_db"], abs=0.02)
     assert result["psnr_db"] - result["psnr_db_drifted"] == pytest.approx(reuse["costs_db"], abs=0.002)
+
+
+@pytest.mark.parametrize(
+    ("option", "name", "told"),
+    [
+        ("--scene", "textur", "plan: --scene: `textur` is neither .* did you mean texture"),
+        ("--scene", "nosuch", "17 presets, such as lego_bulldozer"),
+        ("--model", "nosuch", "plan: --model: 'nosuch'"),
+    ],
+)
+def test_a_name_that_nothing_has_is_told_by_its_option_and_uncut(option: str, name: str, told: str) -> None:
+    error = runner.invoke(app, [option, name, "--scale", "0.05", "--json"]).exception
+    assert isinstance(error, InputError) and re.search(told, str(error)) and "..." not in str(error)

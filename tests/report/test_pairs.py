@@ -60,6 +60,8 @@ def test_other_json_files_are_passed_over_and_views_beside_the_eyes_are_optional
         ({"eyes": [[-0.7, 0.0, 0.1], [0.7, 0.1, 0.1]]}, "before every panel"),
         ({"fov": 0}, "case.json: fov"),
         ({"fov": None}, "case.json: fov"),
+        ({"fov": 1e-320}, "case.json: fov"),
+        ({"eyes": [[10**320, 0.0, 0.1], [0.7, 0.1, 0.1]]}, "case.json: eyes: is a number of some 321 digits"),
         ({"images": ["left.png"]}, "case.json: images"),
         ({"images": ["left.png", "none.png"]}, "none.png: cannot be read"),
         ({"images": ["left.png", "small.png"]}, "differ in size"),
@@ -68,6 +70,7 @@ def test_other_json_files_are_passed_over_and_views_beside_the_eyes_are_optional
         ({"panels": 3}, "case.json: panels"),
         ({"off": [{"mm": 2}]}, "case.json: off"),
         ({"off": [{"mm": 2, "eye": [1, 2], "image": "off.png"}]}, "case.json: off.eye"),
+        ({"off": [{"mm": 10**320, "eye": [1, 2, 3], "image": "off.png"}]}, "case.json: off.mm"),
         ({"off": [{"mm": 2, "eye": [1, 2, 3], "image": "small.png"}]}, "small.png: differs in size"),
     ],
 )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import signal
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +13,7 @@ import pytest
 
 from runtime.errors import InputError
 from runtime.support.artifacts import OutputFolder, write_bytes
+from runtime.support.library_lines import held_back
 
 
 @pytest.mark.parametrize("name", [".", "..", "folder", "/", "", "x" * 300, "/".join(["d" * 200] * 40)])
@@ -61,3 +64,35 @@ def test_a_file_replaces_another_whole(tmp_path: Path) -> None:
         write_bytes(tmp_path / "new" / "a", data)
         assert (tmp_path / "new" / "a").read_bytes() == data
     assert len(list((tmp_path / "new").iterdir())) == 1
+
+
+@pytest.mark.parametrize(("in_the_way", "told"), [("b/c/x", "b/c: is a folder"), ("b", "b: is no folder")])
+def test_what_is_in_the_way_of_one_file_keeps_all_others_from_being_replaced(
+    tmp_path: Path, in_the_way: str, told: str
+) -> None:
+    write_bytes(tmp_path / "a", b"old")
+    write_bytes(tmp_path / in_the_way, b"x")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(InputError, match=told), OutputFolder(tmp_path) as folder:
+        write_bytes(folder.staging / "a", b"new")
+        write_bytes(folder.staging / "b" / "c", b"new")
+    assert (tmp_path / "a").read_bytes() == b"old" and sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_librarys_lines_are_held_back_and_can_be_released(capfd: pytest.CaptureFixture[str]) -> None:
+    with held_back() as held:
+        os.write(2, b"\n a warning\nmore\n")
+    assert (held.first_line, capfd.readouterr().err) == ("a warning", "")
+    held.release()
+    assert capfd.readouterr().err == "\n a warning\nmore\n"
+
+
+def test_another_threads_lines_are_not_held_back(capfd: pytest.CaptureFixture[str]) -> None:
+    done = threading.Event()
+    other = threading.Thread(target=done.wait)
+    other.start()
+    with held_back() as held:
+        os.write(2, b"told at once\n")
+    done.set()
+    other.join()
+    assert (held.text, capfd.readouterr().err) == ("", "told at once\n")

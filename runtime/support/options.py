@@ -1,0 +1,67 @@
+"""Options and arguments that are numbers: each within a range, so that what no display has is told by its option."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+
+from runtime.errors import InputError
+from runtime.support.ranges import EYE_MOST_M, refusal
+
+OPTION_OF = {("content", "scene"): "scene", ("model", "name"): "model"}
+
+
+def number(low: float, high: float, unit: str = "", *, help: str) -> Any:
+    """An option whose number, or each of its numbers, lies from low to high, both finite.
+
+    Anything else, NaN too, raises InputError when the line is read, naming command and option.
+    """
+    return typer.Option(help=f"{help} ({low:g} to {high:g})", callback=_checked(low, high, unit))
+
+
+def number_argument(low: float, high: float, unit: str = "", *, help: str) -> Any:
+    """As `number`, for an argument."""
+    return typer.Argument(help=f"{help} ({low:g} to {high:g})", callback=_checked(low, high, unit))
+
+
+def place(*, help: str) -> Any:
+    """An option that is where an eye is: three coordinates, metres, no farther than the settings allow."""
+    return typer.Option(help=help, metavar="X Y Z", callback=_checked(-EYE_MOST_M, EYE_MOST_M, "m"))
+
+
+@contextmanager
+def told_by_option(command: str, **given: Any) -> Iterator[None]:
+    """An InputError about a setting that the command line gave names the option: `scene`, `model`; None: not given."""
+    try:
+        yield
+    except InputError as error:
+        option = OPTION_OF.get((error.source, error.field))
+        if option is None or given.get(option) is None:
+            raise
+        raise InputError(command, f"--{option}", error.problem) from None
+
+
+def _checked(low: float, high: float, unit: str) -> Callable[[typer.Context, typer.CallbackParam, Any], Any]:
+    def checked(context: typer.Context, parameter: typer.CallbackParam, value: Any) -> Any:
+        for each in () if value is None else value if isinstance(value, tuple | list) else (value,):
+            if problem := refusal(each, low, high, unit):
+                raise InputError(_command(context), _option(parameter), problem)
+        return value
+
+    return checked
+
+
+def _command(context: Any) -> str:
+    """The words of the command behind the program's own name, where there are more."""
+    words: list[str] = []
+    while context.parent is not None:
+        words.insert(0, context.info_name or "")
+        context = context.parent
+    return " ".join(words) or str(context.command.name)
+
+
+def _option(parameter: typer.CallbackParam) -> str:
+    return parameter.opts[0] if parameter.opts else str(parameter.name)
