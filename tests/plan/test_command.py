@@ -181,7 +181,7 @@ def test_one_figure_stands_for_one_thing() -> None:
 @pytest.mark.parametrize(
     ("option", "name", "told"),
     [
-        ("--scene", "textur", "plan: --scene: `textur` is neither .* did you mean texture"),
+        ("--scene", "textures", "plan: --scene: `textures` is neither .* did you mean texture"),
         ("--scene", "nosuch", "17 presets, such as lego_bulldozer"),
         ("--model", "nosuch", "plan: --model: 'nosuch'"),
     ],
