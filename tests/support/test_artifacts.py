@@ -79,7 +79,7 @@ def test_what_is_in_the_way_of_one_file_keeps_all_others_from_being_replaced(
     assert (tmp_path / "a").read_bytes() == b"old" and sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_librarys_lines_are_held_back_and_can_be_released(capfd: pytest.CaptureFixture[str]) -> None:
+def test_lines_of_a_library_are_held_back_and_can_be_released(capfd: pytest.CaptureFixture[str]) -> None:
     with held_back() as held:
         os.write(2, b"\n a warning\nmore\n")
     assert (held.first_line, capfd.readouterr().err) == ("a warning", "")
