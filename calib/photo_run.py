@@ -32,8 +32,10 @@ from runtime.report.page import Figure, Page, in_columns, section_of
 from runtime.report.progress import tracked
 from runtime.support import foreign
 from runtime.support.artifacts import OutputFolder, write_png
+from runtime.support.picture_header import is_cut_off, picture_size
 
 PHOTOGRAPH_BYTES_MAX = 512 << 20
+PHOTOGRAPH_PIXELS_MAX = 250_000_000  # phones have up to 200 million
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 MOST_PHOTOGRAPHS = 100
@@ -52,8 +54,15 @@ def write_board(out: Path, stack: PanelStack) -> dict[str, Any]:
 def read_photograph(path: Path) -> U8:
     """(h, w) grey, as the sensor saw it: a note to turn it is not heeded. Raises InputError."""
     data = foreign.read_bytes(path, most_bytes=PHOTOGRAPH_BYTES_MAX)
+    try:
+        width, height = picture_size(data)
+    except ValueError:
+        width = height = 0
+    if width * height > PHOTOGRAPH_PIXELS_MAX:
+        raise InputError(path, "", f"has {width} x {height} pixels; at most {PHOTOGRAPH_PIXELS_MAX:,}")
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    readable = width > 0 and not is_cut_off(data)
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if readable else None
     if picture is None:
         raise InputError(path, "", "is not a photograph that can be decoded (JPEG or PNG; export HEIC as JPEG)")
     return np.asarray(picture)

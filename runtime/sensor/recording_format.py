@@ -15,7 +15,7 @@ from runtime.clock import NS_PER_S
 from runtime.errors import InputError
 from runtime.records import F64, U8, U16, EyePoints, Intrinsics, SensorFrame
 from runtime.support.foreign import parsed_json, real, shown, whole
-from runtime.support.picture_header import picture_size
+from runtime.support.picture_header import is_cut_off, picture_size
 
 SCHEMA_VERSION = 1
 METADATA_NAME = "phasestack.recording"
@@ -214,7 +214,7 @@ def colour_from_message(data: bytes, *, most_pixels: int = 1 << 26) -> U8:
     width, height = picture_size(coded)
     if max(width, height) > IMAGE_SIDE_MAX_PX or width * height > most_pixels:
         raise ValueError(f"a colour image has {width} by {height} pixels; at most {most_pixels:,} (limits.pixels)")
-    image = cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_COLOR)
+    image = None if is_cut_off(coded) else cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise ValueError("a colour image cannot be decoded")
     return np.ascontiguousarray(image[..., ::-1])

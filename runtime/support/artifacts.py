@@ -19,10 +19,10 @@ import numpy as np
 from runtime.errors import InputError
 from runtime.records import U8, U16
 from runtime.support.library_lines import held_back
-from runtime.support.picture_header import read_coded
+from runtime.support.picture_header import PNG, is_cut_off, read_coded
 
 STAGING = ".phasestack-"
-PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+JPEG = b"\xff\xd8\xff"
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -120,7 +120,7 @@ def read_picture(path: Path) -> U8 | U16:
     import cv2
 
     data = read_coded(path)
-    if data.startswith(PNG) and b"IEND" not in data:
+    if is_cut_off(data):
         raise InputError(path, "", "is not an image that can be decoded (it is cut off)")
     coded = np.frombuffer(data, np.uint8)
     stored: Any = None

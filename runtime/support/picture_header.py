@@ -11,6 +11,8 @@ from runtime.config import LimitSettings
 from runtime.errors import InputError
 from runtime.support import foreign
 
+PNG = b"\x89PNG\r\n\x1a\n"
+CHUNK_BYTES = 12  # of a PNG's part without what it holds: length, kind, checksum
 SIDE_MAX_PX = 1 << 16
 ORIENTATION = 0x0112  # EXIF's tag
 TURNED = (5, 6, 7, 8)  # by a quarter: width and height are exchanged
@@ -33,6 +35,22 @@ def picture_size(coded: bytes, *, turned: bool = False) -> tuple[int, int]:
         finally:
             Image.MAX_IMAGE_PIXELS = most
     return (height, width) if is_turned else (width, height)
+
+
+def is_cut_off(coded: bytes) -> bool:
+    """Whether a PNG's parts promise more bytes than there are, or it has no end. False for other formats.
+
+    OpenCV takes memory for what is promised before it reads: up to 2 GiB for a file of any size.
+    """
+    if not coded.startswith(PNG):
+        return False
+    place = len(PNG)
+    while place + CHUNK_BYTES <= len(coded):
+        length, kind = int.from_bytes(coded[place : place + 4], "big"), coded[place + 4 : place + 8]
+        place += CHUNK_BYTES + length
+        if kind == b"IEND" and place <= len(coded):
+            return False
+    return True
 
 
 def _orientation(image: Any) -> int:

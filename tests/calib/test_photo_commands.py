@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from calib.board import PER_PANEL, board, board_layers, marks
 from calib.commands import app
 from calib.detect_marks import find_marks
 from calib.photo_live import Taker
+from calib.photo_run import read_photograph
 from calib.photo_trial import simulated_photographs
 from calib.placed import PlacedPanel, in_frame_of, misplaced, true_from_ideal_seen
 from calib.registration import error_over_panel_px
@@ -226,6 +228,14 @@ def test_wrong_requests_are_refused_and_leave_nothing(
     with pytest.raises(InputError):
         panels(*options)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_photograph_of_too_many_pixels_is_refused_by_its_header(tmp_path: Path) -> None:
+    small = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes()
+    header = b"IHDR" + (30_000).to_bytes(4, "big") * 2 + small[24:29]
+    (tmp_path / "a.png").write_bytes(small[:12] + header + zlib.crc32(header).to_bytes(4, "big") + small[33:])
+    with pytest.raises(InputError, match=r"30000 x 30000 pixels; at most 250,000,000"):
+        read_photograph(tmp_path / "a.png")
 
 
 def test_a_file_that_is_no_picture_is_named(tmp_path: Path, photos: Path) -> None:
