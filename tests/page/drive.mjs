@@ -161,6 +161,7 @@ say("a wish without a daemon is refused", await until(async () => (await page.ge
 await page.screenshot({ path: `${folder}/page-gone.png` });
 await parent("start");
 say("it goes on when it is back", (await until(() => page.isHidden("#gone"))) && (await shows("#numbers", "presented")));
+say("and without the old refusal", await until(async () => (await page.textContent("#told")) === ""));
 await statusIs((s) => s.eyes_m && s.presented > 100);
 await page.waitForTimeout(8000);
 

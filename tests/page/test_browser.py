@@ -28,7 +28,7 @@ CONTROLS = (
     "thumbnails", "a scene by its picture", "moved at once", "turntable", "a place where nothing is seen",
     "as configured", "another model", "the model back", "a playlist", "the next one", "a restart is not offered here",
     "from a playlist to a scene", "a wish without a daemon is refused",
-    "it goes on when it is back", "fits 1280", "fits 390",
+    "it goes on when it is back", "and without the old refusal", "fits 1280", "fits 390",
 )  # fmt: skip
 
 

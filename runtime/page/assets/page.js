@@ -384,6 +384,9 @@ function gone(why) {
 }
 
 function show(status) {
+  if (!running) { // what failed for want of a daemon has nothing to do with this one
+    for (const told of document.querySelectorAll('[data-kind="bad"]')) setText(told, "");
+  }
   running = true;
   const hangs = status.turn_age_s > 5;
   $("gone").hidden = !hangs;
