@@ -18,13 +18,13 @@ from runtime.records import U8, U16, Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, SensorDriver
 from runtime.sensor.device_clock import DeviceClock
 from runtime.sensor.lasting_thread import LastingThread, borrowed, give_back
-from runtime.sensor.openni2_library import load
+from runtime.sensor.openni2_library import load, needs
 
 SERIAL_PROPERTY = 3
 DEPTH_1_MM, DEPTH_100_UM, RGB888, GRAY8 = 100, 101, 200, 202
 PAIR_APART_US = 40_000  # depth and colour of one instant are no further apart: a period of a camera without sync
 PAIR_WAIT_S = 0.02
-DUMMY_STOPS_S = 0.5  # fifteen periods of its threads: on a busy machine three were too few (a crash in a test)
+THREADS_STOP_S = 0.5  # fifteen periods of a test device's threads: on a busy machine three were too few (crashes)
 DRAIN_MAX = 32  # frames that are passed over in one call: a queue can't keep us
 
 log = logging.getLogger(__name__)
@@ -222,9 +222,9 @@ class OpenNI2Driver(SensorDriver):
         device, self._device = self._device, None
         for stream in streams.values():
             _quietly(stream.stop)
-        if streams and self._settings.source == "Dummy":
-            # Its threads are told to stop but not waited for: without a pause they write to freed memory.
-            time.sleep(DUMMY_STOPS_S)
+        if streams and needs(self._settings.source) == "test":
+            # Their threads are told to stop but not waited for: without a pause they write to freed memory.
+            time.sleep(THREADS_STOP_S)
         for handle in (*streams.values(), device):
             if handle is not None:
                 _quietly(handle.close)

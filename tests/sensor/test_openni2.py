@@ -191,3 +191,33 @@ def test_a_process_whose_reading_threads_have_ended_ends_well() -> None:
         answer = subprocess.run([sys.executable, "-c", ENDED_THREADS], capture_output=True, timeout=60, text=True)
         assert answer.returncode == 0, answer.stderr
         assert answer.stdout.count("no OpenNI2 camera found") == 9
+
+
+PLAYED_TO_THE_END = """
+import sys
+from runtime.clock import MonotonicClock
+from runtime.config import SensorSettings
+from runtime.errors import EndOfRecording
+from runtime.sensor.openni2 import OpenNI2Driver
+for _ in range(25):
+    with OpenNI2Driver(SensorSettings(driver="openni2", source=sys.argv[1]), MonotonicClock()) as driver:
+        try:
+            while True:
+                driver.read_newest(0.05)
+        except EndOfRecording:
+            pass
+"""
+BUSY = "while True: pass"
+
+
+@pytest.mark.slow
+def test_recordings_that_are_closed_at_their_end_on_a_busy_machine_end_well(oni: Any) -> None:
+    """Seen in CI: the library's own thread of a file outlives its device."""
+    busy = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(3)]
+    try:
+        played = [subprocess.Popen([sys.executable, "-c", PLAYED_TO_THE_END, str(oni)]) for _ in range(2)]
+        assert [process.wait(timeout=120) for process in played] == [0, 0]
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
