@@ -115,6 +115,7 @@ class BudgetControl:
 
         def told(text: str) -> None:
             nonlocal go_on
+            self._close_unwanted()  # one level at a time is enough to have in memory
             go_on = go_on and tell(f"measuring {text}")
 
         def ask(call: Callable[[], T]) -> T:
