@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from runtime.support.foreign import shown
+from runtime.support.ranges import BUDGET_MOST_MS
 
 Name = Literal[
     "scene", "playlist", "next", "place", "model", "pause", "resume", "flat", "budget", "reload", "blackbox", "restart"
 ]  # fmt: skip
 NAMES: tuple[Name, ...] = get_args(Name)
-BUDGET_MAX_MS = 10_000.0
 SHOWS_MAX = 64
 PLACING = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # of `place`: settings of [content]
 
@@ -77,8 +77,8 @@ def parse(request: Any) -> Command:
         return Command(name, _shows(value))
     if name == "budget":
         budget_ms = _number(value, "value: budget wants milliseconds")
-        if not 0 <= budget_ms <= BUDGET_MAX_MS:
-            raise ValueError(f"value: budget must lie in 0 to {BUDGET_MAX_MS:.0f} ms")
+        if not 0 <= budget_ms <= BUDGET_MOST_MS:
+            raise ValueError(f"value: budget must lie in 0 to {BUDGET_MOST_MS:.0f} ms")
         return Command(name, budget_ms)
     return Command(name, value if name in ("scene", "model") else None)
 

@@ -1,6 +1,7 @@
 """Calls on threads that live as long as the process, for libraries that ask after every thread that called them.
 
-OpenNI2 does, on its way out: of a thread that has ended and whose stack the system took back, that is a crash.
+OpenNI2 does, on its way out: of a thread that has ended and whose stack the system took back, that is a crash. A
+`ThreadPoolExecutor`'s would not do: Python ends them before that, and waits for one that hangs in a call.
 """
 
 from __future__ import annotations
