@@ -230,7 +230,7 @@ def _pairs_cache(seed: int) -> Path:
     """A folder of its own for each seed, and for each state of the code that draws and solves the pairs."""
     from model_export import data, scene, stills, textures
     from runtime.model import sart, still
-    from runtime.report.cache import digest, user_cache
+    from runtime.support.cache import digest, user_cache
 
     modules = (data, scene, stills, textures, sart, still)
     return user_cache("pairs") / digest([Path(str(module.__file__)) for module in modules], seed, ROBUST_SIZE)

@@ -94,8 +94,8 @@ def _variants(width_px: int, height_px: int) -> list[Method]:
         return []
     import model_export
     from model_export import yardstick
-    from runtime.report.cache import digest, user_cache
     from runtime.report.methods import SHIPPED, Method
+    from runtime.support.cache import digest, user_cache
 
     code = Path(model_export.__file__).parent
     versions = [importlib.metadata.version(name) for name in ("torch", "onnx", "onnxruntime")]

@@ -52,21 +52,13 @@ class Fade:
             weights = weights * np.clip(inside / over_px, 0.0, 1.0)
         return np.asarray(weights, np.float32)[..., None]
 
-    def soften(self, residual: Sequence[I16], centre_from_raster: F64) -> None:
-        """Take back, towards the edges, what the eyes lack (per eye, in place): no correction must drive the panels
-        beyond them."""
+    def softening(self, centre_from_raster: F64, *, rows: int, columns: int) -> Softening:
+        """How corrections on a raster of the centre panel end: none must drive the panels beyond their edges."""
         m = centre_from_raster
-        height, width = residual[0].shape[:2]
-        u = m[0, 0] * (np.arange(width) + 0.5) + m[0, 2]
-        v = m[1, 1] * (np.arange(height) + 0.5) + m[1, 2]
+        u = m[0, 0] * (np.arange(columns) + 0.5) + m[0, 2]
+        v = m[1, 1] * (np.arange(rows) + 0.5) + m[1, 2]
         along, down = (over_px * CORRECTED_SHARE for over_px in self.over_px)
-        for image in residual:
-            for inside, over_px in self._across(u, along):
-                columns, weights = _ramp(inside, over_px)
-                _scale(image[:, columns], weights[None])
-            for inside, over_px in self._down(v, down):
-                rows, weights = _ramp(inside, over_px)
-                _scale(image[rows], weights[:, None])
+        return Softening(_softening(self._across(u, along), columns), _softening(self._down(v, down), rows))
 
     def _across(self, u: F64, over_px: float) -> list[tuple[F64, float]]:
         """How far inside the left and right edge columns are, and over how much the edge fades."""
@@ -79,12 +71,35 @@ class Fade:
         return [(inside, over_px) for fades, inside in sides if fades and over_px > 0]
 
 
-def _ramp(inside: F64, over_px: float) -> tuple[slice, I16]:
-    """The rows or columns that an edge weakens, and their weights in `QUARTERS`."""
-    weights = np.clip(np.rint(inside / over_px * QUARTERS), 0, QUARTERS)
-    (faded,) = np.nonzero(weights < QUARTERS)
+@dataclass(frozen=True, slots=True)
+class Softening:
+    """How corrections end towards the edges of a part: what their residual is multiplied with, in whole `QUARTERS`."""
+
+    columns: F32  # (columns,) 0 to 1
+    rows: F32  # (rows,)
+
+    def soften(self, residual: Sequence[I16]) -> None:
+        """Take back what the eyes lack there: (rows, columns[, 3]) per eye, in place."""
+        for image in residual:
+            columns, weights = _weakened(self.columns)
+            _scale(image[:, columns], weights[None])
+            rows, weights = _weakened(self.rows)
+            _scale(image[rows], weights[:, None])
+
+
+def _softening(edges: Sequence[tuple[F64, float]], count: int) -> F32:
+    """(count,): what the nearest of some edges leaves."""
+    weights = np.ones(count)
+    for inside, over_px in edges:
+        weights = np.minimum(weights, np.clip(np.rint(inside / over_px * QUARTERS), 0, QUARTERS) / QUARTERS)
+    return weights.astype(np.float32)
+
+
+def _weakened(weights: F32) -> tuple[slice, I16]:
+    """The rows or columns that are weakened, and their weights in `QUARTERS`."""
+    (faded,) = np.nonzero(weights < 1)
     part = slice(int(faded[0]), int(faded[-1]) + 1) if faded.size else slice(0, 0)
-    return part, weights[part].astype(np.int16)
+    return part, np.rint(weights[part] * QUARTERS).astype(np.int16)
 
 
 def _scale(image: I16, weights: I16) -> None:

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
 
 import cv2
 import numpy as np
 
 from runtime.model.assembly import ArrayAssembly
-from runtime.model.channels import RGBA_FROM, without_alpha
+from runtime.model.channels import without_alpha
 from runtime.model.contract import Contract
-from runtime.model.pyramid_level import CENTRE, I16, NEUTRAL, OUTER, PyramidLevel
+from runtime.model.loops import level_class
+from runtime.model.pyramid_level import CENTRE, EYES, I16, NEUTRAL, PyramidLevel
 from runtime.model.resample import resample
 from runtime.model.rows import RowPool
 from runtime.model.schedule import Picture, Problem, reductions
-from runtime.model.transfer import SUBCODE, phase_codes, pre_emphasised
+from runtime.model.transfer import phase_codes, pre_emphasised
 from runtime.model.workspace import Workspace
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
@@ -30,8 +30,12 @@ class OpenCvBackend:
     name = "opencv"
     context: object = None
 
+    def __init__(self, *, compiled: bool = True) -> None:
+        """compiled: whether corrections are done by compiled loops, where there are any."""
+        self.compiled = compiled
+
     def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> OpenCvSurround:
-        return OpenCvSurround(contract, stack, threads=threads)
+        return OpenCvSurround(contract, stack, threads=threads, level=level_class() if self.compiled else PyramidLevel)
 
     def assembly(self, stack: PanelStack) -> ArrayAssembly:
         return ArrayAssembly(stack)
@@ -43,8 +47,8 @@ class OpenCvBackend:
 class OpenCvSurround:
     """A `Surround`."""
 
-    def __init__(self, contract: Contract, stack: PanelStack, *, threads: int) -> None:
-        self._contract, self._stack = contract, stack
+    def __init__(self, contract: Contract, stack: PanelStack, *, threads: int, level: type[PyramidLevel]) -> None:
+        self._contract, self._stack, self._level = contract, stack, level
         self._rows = RowPool(threads, width_px=stack.width_px)
         self._workspaces: dict[int, Workspace] = {}
         self._drawn: tuple[PixelRect, ...] = ()  # where the layers hold more than even panels
@@ -55,7 +59,7 @@ class OpenCvSurround:
         self._problem = problem
         if problem.channels not in self._workspaces:
             self._workspaces[problem.channels] = Workspace(
-                self._stack, reductions(self._contract), rows=self._rows, channels=problem.channels
+                self._stack, reductions(self._contract), level=self._level, rows=self._rows, channels=problem.channels
             )
         self._workspace = self._workspaces[problem.channels]
         self._workspace.crop(problem.boxes, self._stack)
@@ -67,7 +71,7 @@ class OpenCvSurround:
 
         self._pictures = self._rows.map(prepared, arrays)
         for level in self._workspace.levels.values():
-            level.wanted = [np.asarray(phases, np.int16) for phases in self._phases(level.size)]
+            self._fill_phases(level.wanted)
             level.set_eye_sigma(
                 problem.eyes_m, eye_sigma_mm=problem.eye_sigma_mm, least_px=self._contract.least_spread_px
             )
@@ -75,9 +79,10 @@ class OpenCvSurround:
 
     def network_pictures(self) -> tuple[I16, I16]:
         problem, size = self._problem, self._problem.reduced_size
+        tail = (problem.channels,) if problem.channels > 1 else ()
         known = (level.wanted for level in self._workspace.levels.values() if level.size == size)
-        left, right = next(known, None) or self._phases(size)
-        half = (np.asarray(right, np.int16) - np.asarray(left, np.int16)) >> 1
+        left, right = next(known, None) or self._fill_phases([np.empty(size[::-1] + tail, np.int16) for _ in EYES])
+        half = (right - left) >> 1
         seen = self._workspace.chain_buffers(problem.frame)
         for side, lacks in enumerate((-half, half)):
             matrix = problem.reduced_from_frame(side)
@@ -94,37 +99,37 @@ class OpenCvSurround:
 
     def correct(self, reduction: int, panel: int, *, size: float, shown: bool) -> None:
         level, problem = self._workspace.levels[reduction], self._problem
-        level.update_residuals()
+        fading = None
         if problem.fade is not None:
-            problem.fade.soften(level.residual, problem.centre_from(level.rasters[CENTRE].plane_from_raster()))
-        level.correct(panel, problem.eyes_m, size=size, shown=shown)
+            width_px, height_px = level.size
+            matrix = problem.centre_from(level.rasters[CENTRE].plane_from_raster())
+            fading = problem.fade.softening(matrix, rows=height_px, columns=width_px)
+        level.step(panel, problem.eyes_m, size=size, shown=shown, fading=fading)
 
     def upsample(self, coarser_reduction: int, reduction: int, *, shown: bool) -> None:
         levels = self._workspace.levels
         levels[reduction].upsample(levels[coarser_reduction], shown=shown)
 
     def finish(self) -> U8:
-        workspace, boxes = self._workspace, self._problem.boxes
-        whole: PyramidLevel = workspace.levels[1]
-        whole.close_centre(workspace.shown[CENTRE])
+        boxes = self._problem.boxes
         if self._drawn != boxes:
             self._layers[..., :3] = NEUTRAL
             self._drawn = boxes
-        for n, box in enumerate(boxes):
-            if n in OUTER:
-                cv2.convertScaleAbs(whole.outer[n], dst=workspace.shown[n], alpha=1 / SUBCODE)
-            self._layers[n][box.slices] = cv2.cvtColor(workspace.shown[n], RGBA_FROM[self._problem.channels])
+        self._workspace.levels[1].show(self._layers, boxes)
         return self._layers
 
     def close(self) -> None:
         self._rows.close()
 
-    def _phases(self, size: tuple[int, int]) -> list[Any]:
-        """Phase sums of the pictures at a size, averaged as codes."""
-        pictures, table = self._pictures, phase_codes(self._contract.branch)
-        same = pictures[0].shape[1::-1] == size
+    def _fill_phases(self, wanted: Sequence[I16]) -> Sequence[I16]:
+        """Phase sums of the pictures at the size of these images, averaged as codes: into them."""
+        table = phase_codes(self._contract.branch)
 
-        def phases(picture: U8) -> Any:
-            return cv2.LUT(picture if same else cv2.resize(picture, size, interpolation=cv2.INTER_AREA), table)
+        def fill(item: tuple[U8, I16]) -> None:
+            picture, image = item
+            size = image.shape[1::-1]
+            same = picture.shape[1::-1] == size
+            cv2.LUT(picture if same else cv2.resize(picture, size, interpolation=cv2.INTER_AREA), table, dst=image)
 
-        return self._rows.map(phases, pictures)
+        self._rows.map(fill, list(zip(self._pictures, wanted, strict=True)))
+        return wanted

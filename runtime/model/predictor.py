@@ -9,6 +9,7 @@ from runtime.config import ModelSettings
 from runtime.errors import InputError
 from runtime.model.allocator import keep_freed_memory
 from runtime.model.base import Prediction, Predictor
+from runtime.model.loops import level_class
 from runtime.optics.stack import PanelStack
 
 __all__ = ["SHIPPED", "Prediction", "Predictor", "load_predictor", "model_path"]
@@ -64,6 +65,8 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
             raise InputError(path, "contract.panels", "needs evenly spaced panels; use the model sart")
         from runtime.model.unrolled import UnrolledPredictor
 
+        if settings.backend != "gl":
+            level_class()  # compiled or loaded before the first frame
         return UnrolledPredictor(session, stack, threads=settings.threads)
     from runtime.model.network import NetworkPredictor
 

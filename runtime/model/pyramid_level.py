@@ -8,12 +8,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from math import ceil
+from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
+from runtime.model.channels import RGBA_FROM
 from runtime.model.contract import LEAST_SPREAD_PX
 from runtime.model.resample import buffer, resample, target_from_source
 from runtime.model.rows import RowPool, Work
@@ -21,7 +23,7 @@ from runtime.model.transfer import FULL, SUBCODE
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen, layer_pixels_from_seen
-from runtime.records import F64, U8
+from runtime.records import F32, F64, U8
 
 I16 = NDArray[np.int16]
 REAR, CENTRE, FRONT = 0, 1, 2
@@ -30,6 +32,21 @@ EYES = (0, 1)
 START = FULL // 2  # of every outer panel: the middle of its range
 MOST_SPREAD = 8.0  # pixels
 NEUTRAL = (START + SUBCODE // 2) // SUBCODE  # the same in 8-bit codes, rounded as what is shown is
+
+
+class Fading(Protocol):
+    """How a residual ends towards the edges of a part of larger panels (`fade.Softening`)."""
+
+    @property
+    def columns(self) -> F32:
+        """(columns,) weights, 0 to 1."""
+
+    @property
+    def rows(self) -> F32:
+        """(rows,) the same."""
+
+    def soften(self, residual: Sequence[I16]) -> None:
+        """Weaken it, in place: (rows, columns[, 3]) for each eye."""
 
 
 class PyramidLevel:
@@ -42,15 +59,15 @@ class PyramidLevel:
         self.reduction = reduction
         self._stack = stack
         self._rows = rows
+        self._channels = channels
         self._tail = () if channels == 1 else (channels,)
         height, width = -(-stack.height_px // reduction), -(-stack.width_px // reduction)
         names = [*(("outer", n, 0) for n in OUTER), *(("seen", n, side) for n in OUTER for side in EYES)]
-        names += [(name, CENTRE, side) for name in ("residual", "back") for side in EYES]
+        names += [(name, CENTRE, side) for name in ("wanted", "residual", "back") for side in EYES]
         self._whole = {name: buffer(height, width, channels=channels) for name in names}
         self.rasters: tuple[PlaneRaster, ...] = ()
         self.spread: dict[int, tuple[float, float]] = {}  # per outer panel, right and down, pixels
         self._mean: dict[int, I16] = {}
-        self.wanted: list[I16] = []  # per eye, phase sums on the centre panel
 
     @property
     def size(self) -> tuple[int, int]:
@@ -62,6 +79,7 @@ class PyramidLevel:
         self.rasters = tuple(coarser(box.cut(stack.panel(n)), self.reduction) for n, box in enumerate(boxes))
         self.outer = {n: self._view("outer", n, 0, on=n) for n in OUTER}
         self.seen = {(n, side): self._view("seen", n, side, on=CENTRE) for n in OUTER for side in EYES}
+        self.wanted = tuple(self._view("wanted", CENTRE, side, on=CENTRE) for side in EYES)  # phase sums
         self.residual = tuple(self._view("residual", CENTRE, side, on=CENTRE) for side in EYES)
         self._back = {n: tuple(self._view("back", CENTRE, side, on=n) for side in EYES) for n in OUTER}
 
@@ -77,6 +95,13 @@ class PyramidLevel:
             self._mean[n] = panel
             for side, eye_m in enumerate(eyes_m):
                 self._between(panel, eye_m, of=n, on=CENTRE, out=self.seen[n, side])
+
+    def step(self, panel: int, eyes_m: F64, *, size: float, shown: bool, fading: Fading | None = None) -> None:
+        """Change one outer panel by what both eyes (2, 3) still lack; fading: how the residual ends towards edges."""
+        self.update_residuals()
+        if fading is not None:
+            fading.soften(self.residual)
+        self.correct(panel, eyes_m, size=size, shown=shown)
 
     def update_residuals(self) -> None:
         """Find what each eye still lacks when the centre panel is the best one for the outer panels."""
@@ -156,6 +181,16 @@ class PyramidLevel:
             out[rows] = best
 
         self._each(CENTRE, work)
+
+    def show(self, layers: U8, boxes: Sequence[PixelRect]) -> None:
+        """All panels in 8-bit codes, the centre closed, into layers (N, H, W, 4), each within its box."""
+        for n, box in enumerate(boxes):
+            codes = np.empty((box.height_px, box.width_px, *self._tail), np.uint8)
+            if n == CENTRE:
+                self.close_centre(codes)
+            else:
+                cv2.convertScaleAbs(self.outer[n], dst=codes, alpha=1 / SUBCODE)
+            layers[n][box.slices] = cv2.cvtColor(codes, RGBA_FROM[self._channels])
 
     def _blurred(self, image: I16, panel: int, *, twice: bool = False) -> I16:
         """What is left of an image in the mean over where the eyes may be, as an outer panel's pixels move."""

@@ -50,6 +50,18 @@ class RowPool:
         else:
             list(self._pool.map(share, range(self._threads), [self._threads] * self._threads))
 
+    @property
+    def threads(self) -> int:
+        """How many calls run at once, at most."""
+        return self._threads
+
+    def split(self, numbers: int, work: Callable[[int, int], None]) -> None:
+        """`work(index, of)` for each of as many shares as there are threads, of an image of so many numbers."""
+        if self._pool is None or numbers <= WORTH_A_THREAD:
+            work(0, 1)
+        else:
+            list(self._pool.map(work, range(self._threads), [self._threads] * self._threads))
+
     def map(self, work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
         """`work` of every item, at once where there are threads: for OpenCV's functions that use one thread only."""
         return [work(item) for item in items] if self._pool is None else list(self._pool.map(work, items))

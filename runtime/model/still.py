@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from runtime.model import loops
 from runtime.model.base import Prediction, Predictor
 from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.stack import PlaneRaster
@@ -78,7 +79,16 @@ def _warped(
     large = (rows.stop - rows.start) * (columns.stop - columns.start) > SMALL_PX
     kernel = interpolation == "cubic" and not large
     finer = interpolation != "linear" and not kernel
-    if finer and _source_px(image_from_raster, rows=rows, columns=columns) < FINE_ENOUGH:
+    source_px = _source_px(image_from_raster, rows=rows, columns=columns)
+    if interpolation != "linear" and not black_beside and loops.are_compiled() and source_px < FINE_ENOUGH:
+        from runtime.model.compiled.warp import is_level, warped  # noqa: PLC0415 - imports numba
+
+        matrix = _shifted(-0.5, -0.5) @ image_from_raster @ _shifted(columns.start + 0.5, rows.start + 0.5)
+        matrix /= matrix[2, 2]
+        if is_level(matrix, rows=rows, columns=columns, size=(rgba.shape[1], rgba.shape[0])):
+            warped(rgba, matrix, out=out, rows=rows, columns=columns, threads=cv2.getNumThreads())
+            return out
+    if finer and source_px < FINE_ENOUGH:
         rgba, finer_from_image = _finer(rgba, image_from_raster, rows=rows, columns=columns)
         image_from_raster = finer_from_image @ image_from_raster
     # OpenCV puts pixel centres at integers.

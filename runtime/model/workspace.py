@@ -4,26 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-import numpy as np
-
 from runtime.model.chain import ChainFrame
 from runtime.model.pyramid_level import I16, PyramidLevel
 from runtime.model.resample import buffer
 from runtime.model.rows import RowPool
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
-from runtime.records import U8
 
 
 class Workspace:
     """Buffers that live from frame to frame; those of the network follow the viewer."""
 
-    def __init__(self, stack: PanelStack, reductions: Collection[int], *, rows: RowPool, channels: int) -> None:
+    def __init__(
+        self,
+        stack: PanelStack,
+        reductions: Collection[int],
+        *,
+        level: type[PyramidLevel],
+        rows: RowPool,
+        channels: int,
+    ) -> None:
         self._channels = channels
-        self.levels = {r: PyramidLevel(stack, reduction=r, rows=rows, channels=channels) for r in reductions}
+        self.levels = {r: level(stack, reduction=r, rows=rows, channels=channels) for r in reductions}
         self._boxes: tuple[PixelRect, ...] = ()
         self._chain: tuple[tuple[int, int], tuple[I16, I16]] | None = None
-        self.shown: list[U8] = []  # the panels in 8-bit codes, cut to the boxes
 
     def crop(self, boxes: tuple[PixelRect, ...], stack: PanelStack) -> None:
         """Cut every raster and buffer to boxes of the panels."""
@@ -32,8 +36,6 @@ class Workspace:
         self._boxes = boxes
         for level in self.levels.values():
             level.crop(boxes, stack)
-        tail = () if self._channels == 1 else (self._channels,)
-        self.shown = [np.empty((box.height_px, box.width_px, *tail), np.uint8) for box in boxes]
 
     def chain_buffers(self, frame: ChainFrame) -> tuple[I16, I16]:
         """One image for each eye on the network's raster."""

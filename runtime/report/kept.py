@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import runtime
-from runtime.report.cache import digest, user_cache
 from runtime.report.machine import describe
 from runtime.support.artifacts import write_bytes
+from runtime.support.cache import digest, user_cache
 
 T = TypeVar("T")
 

@@ -96,6 +96,7 @@ def test_nothing_is_read_back_but_the_network_s_raster_and_the_layers(
 def test_pictures_in_textures_are_solved_as_pictures_in_arrays_are(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (runtime.model.opencv_surround, runtime.model.pyramid_level):
         monkeypatch.setattr(module, "resample", exact_resample)
+    monkeypatch.setattr(runtime.model.opencv_surround, "level_class", lambda: runtime.model.pyramid_level.PyramidLevel)
     layers = []
     for backend in ("gl", "opencv"):
         context = offscreen_context()

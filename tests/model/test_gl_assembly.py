@@ -67,6 +67,7 @@ def exactly(monkeypatch: pytest.MonkeyPatch) -> None:
     """OpenCV's steps sample by the definition."""
     for module in (runtime.model.opencv_surround, runtime.model.pyramid_level):
         monkeypatch.setattr(module, "resample", exact_resample)
+    monkeypatch.setattr(runtime.model.opencv_surround, "level_class", lambda: runtime.model.pyramid_level.PyramidLevel)
 
 
 def noise(width_px: int, height_px: int, *, count: int | None = None, seed: int = 0) -> U8:

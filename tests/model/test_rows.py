@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from runtime.model.chain import chain_frame
+from runtime.model.pyramid_level import PyramidLevel
 from runtime.model.rows import STRIP, RowPool
 from runtime.model.workspace import Workspace
 from runtime.optics.rect import PixelRect
@@ -62,14 +63,15 @@ def test_what_the_work_raises_is_raised() -> None:
 def test_a_workspace_keeps_its_buffers_while_the_eyes_see_the_same_and_the_network_the_same_raster() -> None:
     stack = PanelStack(0.48, 0.24, (-0.06, 0.0, 0.06), 96, 48)
     pool = RowPool(1, width_px=96)
-    workspace = Workspace(stack, {1, 2}, rows=pool, channels=3)
+    workspace = Workspace(stack, {1, 2}, level=PyramidLevel, rows=pool, channels=3)
     boxes = (PixelRect(0, 0, 96, 48), PixelRect(8, 8, 88, 40), PixelRect(16, 8, 96, 40))
     workspace.crop(boxes, stack)
-    shown = workspace.shown
-    assert [image.shape for image in shown] == [(48, 96, 3), (32, 80, 3), (32, 80, 3)]
+    whole = workspace.levels[1]
+    wanted, outer = whole.wanted, whole.outer
+    assert [image.shape for image in (outer[0], wanted[0], outer[2])] == [(48, 96, 3), (32, 80, 3), (32, 80, 3)]
     assert workspace.levels[2].size == (40, 16)
     workspace.crop(boxes, stack)
-    assert workspace.shown is shown
+    assert whole.wanted is wanted and whole.outer is outer
     workspace.crop((boxes[0],) * 3, stack)
     assert workspace.levels[2].size == (48, 24)
     near, far = (chain_frame(eyes(distance_m), stack, cell_px=4, reduction=2) for distance_m in (0.4, 1.5))

@@ -18,8 +18,8 @@ from runtime.commands.bench import app
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_raster, image_from_stack
 from runtime.report import robust
-from runtime.report.cache import digest, user_cache
 from runtime.report.pairs import StillPair
+from runtime.support.cache import digest, user_cache
 
 SIZE = {"width_px": 96, "height_px": 54}
 

@@ -1,0 +1,1 @@
+"""Compiled inner loops of what surrounds the network on the processor (numba)."""

@@ -1,0 +1,55 @@
+"""The inner loops of the OpenCV backend: compiled ones where their compiler is installed and works, else OpenCV's."""
+
+from __future__ import annotations
+
+import logging
+import os
+from functools import cache
+from importlib import metadata, resources
+from pathlib import Path
+
+from runtime.model.pyramid_level import PyramidLevel
+from runtime.support.cache import digest, user_cache
+
+log = logging.getLogger("phasestack.model")
+
+SOURCES = ("sampling.py", "passes.py", "warp.py")
+
+
+@cache
+def level_class() -> type[PyramidLevel]:
+    """What does corrections. The first call on a machine compiles, which takes some ten seconds and is kept."""
+    try:
+        import numba  # noqa: PLC0415 - half a second that only models need
+
+        folder = _kept()
+        numba.config.CACHE_DIR = str(folder or "")  # type: ignore[attr-defined]
+        if folder is not None and not any(folder.iterdir()):
+            log.info("inner loops are compiled, once: some ten seconds")
+        from runtime.model.compiled.level import CompiledLevel, warm_up  # noqa: PLC0415 - imports numba
+
+        warm_up()
+    except ImportError as error:
+        log.info("inner loops: OpenCV's, for want of compiled ones (%s)", error)
+        return PyramidLevel
+    except Exception as error:  # a compiler has no list of what it may fail with
+        log.warning("inner loops: OpenCV's, the compiled ones failed (%s: %s)", type(error).__name__, error)
+        return PyramidLevel
+    return CompiledLevel
+
+
+def are_compiled() -> bool:
+    """Whether the inner loops are compiled ones here."""
+    return level_class() is not PyramidLevel
+
+
+def _kept() -> Path | None:
+    """The folder for compiled code, named by what it follows from; None where none can be written."""
+    package = resources.files("runtime.model") / "compiled"
+    sources = [Path(str(package / name)) for name in SOURCES]
+    folder = user_cache("compiled") / digest(sources, metadata.version("numba"))
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return folder if os.access(folder, os.W_OK) else None

@@ -1,0 +1,313 @@
+"""Compiled corrections do what OpenCV's do where those sample by the definition: code for code, and no byte beside."""
+
+from __future__ import annotations
+
+import builtins
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import runtime.model.pyramid_level
+from runtime.config import ModelSettings
+from runtime.evaluation.displayed import displayed, expected_db
+from runtime.model import loops
+from runtime.model.compiled import passes, sampling, warp
+from runtime.model.compiled.level import CompiledLevel, warm_up
+from runtime.model.fade import Softening
+from runtime.model.opencv_surround import OpenCvBackend
+from runtime.model.predictor import SHIPPED, load_predictor
+from runtime.model.pyramid_level import CENTRE, EYES, FRONT, OUTER, REAR, PyramidLevel
+from runtime.model.rows import RowPool
+from runtime.model.still import solve_still
+from runtime.model.transfer import FULL, SUBCODE
+from runtime.optics.rect import PixelRect
+from runtime.optics.stack import PanelStack, Tilt
+from runtime.records import F64, U8
+from tests.model.exact import exact_resample
+from tests.model.scenes import FOV_DEG, card_scene, eyes
+
+STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 200, 112)
+CARDS = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
+WITHIN_ONE = 0.999  # of all codes
+LEAST_DB = -0.05  # of displayed quality, against OpenCV's loops
+BOXES = {
+    "whole": (PixelRect(0, 0, 200, 112),) * 3,
+    "parts": (PixelRect(8, 16, 168, 96), PixelRect(16, 16, 160, 96), PixelRect(24, 8, 152, 104)),
+}
+POSES = {
+    "straight": eyes(0.6),
+    "beside and above": eyes(0.7, 0.2, 0.1),
+    "near": eyes(0.2, -0.05),
+    "rolled": eyes(0.6, roll_deg=20),
+    "one behind the other": eyes(0.6) + np.array([[0.0], [0.2]]) * (1.0, 0.0, 0.0),
+    "one eye for both": np.array([[0.6, 0.0, 0.0], [0.6, 0.0, 0.0]]),
+    "far beside": eyes(0.5, 0.9),
+}
+
+
+@pytest.fixture(params=[1, 3], ids=["one thread", "three threads"])
+def rows(request: pytest.FixtureRequest) -> Iterator[RowPool]:
+    pool = RowPool(request.param, width_px=200)
+    yield pool
+    pool.close()
+
+
+def filled(kind: type[PyramidLevel], rows: RowPool, stack: PanelStack, *, boxes: str, channels: int) -> PyramidLevel:
+    """A level with outer panels and pictures of smooth noise, the same for every kind."""
+    level = kind(stack, reduction=1, rows=rows, channels=channels)
+    level.crop(BOXES[boxes], stack)
+    noise = np.random.default_rng(5)
+    for image in (*(level.outer[n] for n in OUTER), *level.wanted):
+        most = 2 * FULL if any(image is wanted for wanted in level.wanted) else FULL
+        coarse = noise.integers(0, most, (image.shape[0] // 4 + 2, image.shape[1] // 4 + 2, *image.shape[2:]))
+        fine = coarse.repeat(4, 0).repeat(4, 1)[: image.shape[0], : image.shape[1]]
+        image[...] = (fine + np.roll(fine, 2, 0) + np.roll(fine, 2, 1)) // 3
+    return level
+
+
+def solved(level: PyramidLevel, pair: F64, *, sigma_mm: float, fading: Softening | None = None) -> U8:
+    """Layers after three corrections, of which two are shown."""
+    boxes = BOXES["whole"] if level.size == (200, 112) else BOXES["parts"]
+    level.set_eye_sigma(pair, eye_sigma_mm=sigma_mm)
+    level.project(OUTER, pair)
+    for panel, shown in ((FRONT, False), (REAR, True), (FRONT, True)):
+        level.step(panel, pair, size=0.75, shown=shown, fading=fading)
+        level.project((panel,), pair)
+    layers = np.full((3, 112, 200, 4), 255, np.uint8)
+    level.show(layers, boxes)
+    return layers
+
+
+def within_one(first: U8, second: U8) -> float:
+    return float((np.abs(first.astype(np.int16) - second) <= 1).mean())
+
+
+@pytest.fixture
+def exactly(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runtime.model.pyramid_level, "resample", exact_resample)
+
+
+@pytest.mark.usefixtures("exactly")
+@pytest.mark.parametrize("boxes", BOXES)
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("pose", POSES)
+def test_codes_are_those_of_exact_sampling(pose: str, channels: int, boxes: str, rows: RowPool) -> None:
+    kinds = (PyramidLevel, CompiledLevel)
+    levels = [filled(kind, rows, STACK, boxes=boxes, channels=channels) for kind in kinds]
+    wanted, found = (solved(level, POSES[pose], sigma_mm=0.0) for level in levels)
+    assert within_one(wanted, found) >= WITHIN_ONE
+    assert (found[..., 3] == 255).all()
+    beside = np.ones((3, 112, 200), bool)
+    for n, box in enumerate(BOXES[boxes]):
+        beside[n][box.slices] = False
+    assert (found[beside] == 255).all()
+
+
+@pytest.mark.parametrize("sigma_mm", [0.0, 2.0, 6.0, 50.0])
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_eyes_see_no_less_however_unsure_they_are(name: str, sigma_mm: float) -> None:
+    """What is blurred before it is sampled here is blurred after it there: not the same codes, but the same quality."""
+    pair, found = eyes(0.6, 0.05, 0.03), []
+    pictures = tuple(card_scene(eye) for eye in pair)
+    for compiled in (False, True):
+        predictor = load_predictor(name, CARDS, ModelSettings(threads=1))
+        predictor.surround_with(OpenCvBackend(compiled=compiled))
+        made = solve_still(*pictures, eyes_m=pair, fov_deg=FOV_DEG, predictor=predictor, eye_sigma_mm=sigma_mm).layers
+        views = displayed(made, pictures, CARDS, eyes_m=pair, fov_deg=FOV_DEG, similarity=False)
+        how: Any = {"eyes_m": pair, "fov_deg": FOV_DEG, "sigmas_mm": (sigma_mm,)}
+        found.append(expected_db(views, made, CARDS, **how).popitem()[1] if sigma_mm else views.quality.psnr_db)
+        predictor.close()
+    assert found[1] - found[0] >= LEAST_DB
+
+
+@pytest.mark.usefixtures("exactly")
+def test_corrections_fade_out_alike(rows: RowPool) -> None:
+    columns, down = np.linspace(0, 1, 200, dtype=np.float32), np.ones(112, np.float32)
+    down[:20] = 0.25
+    fading = Softening(np.rint(columns * 4) / np.float32(4), down)
+    levels = [filled(kind, rows, STACK, boxes="whole", channels=3) for kind in (PyramidLevel, CompiledLevel)]
+    wanted, found = (solved(level, eyes(0.6), sigma_mm=0.0, fading=fading) for level in levels)
+    # OpenCV's way rounds to whole sixteenths at every edge.
+    assert (np.abs(wanted.astype(np.int16) - found) <= 2).mean() >= WITHIN_ONE
+    whole = solved(filled(CompiledLevel, rows, STACK, boxes="whole", channels=3), eyes(0.6), sigma_mm=0.0)
+    assert within_one(whole, found) < 0.9
+
+
+def test_tilted_panels_are_left_to_opencv(rows: RowPool) -> None:
+    tilt = Tilt(((0.001, 0.012, -0.006), (0.0, 0.0, 0.0), (-0.002, 0.004, 0.015)), (1.0, 0.1, -0.05))
+    stack = replace(STACK, tilt=tilt)
+    levels = [filled(kind, rows, stack, boxes="whole", channels=3) for kind in (PyramidLevel, CompiledLevel)]
+    assert (solved(levels[0], eyes(0.6), sigma_mm=0.0) == solved(levels[1], eyes(0.6), sigma_mm=0.0)).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    scale=st.tuples(st.floats(0.05, 4.0), st.floats(0.05, 4.0)),
+    shift=st.tuples(st.floats(-150, 150), st.floats(-80, 80)),
+    size=st.tuples(st.integers(1, 40), st.integers(1, 90)),
+    source=st.tuples(st.integers(1, 40), st.integers(1, 90)),
+    channels=st.sampled_from([1, 3]),
+)
+def test_samples_are_those_of_the_definition_wherever_the_rasters_are(
+    scale: tuple[float, float],
+    shift: tuple[float, float],
+    size: tuple[int, int],
+    source: tuple[int, int],
+    channels: int,
+) -> None:
+    """Through a correction of nothing but one eye's residual: the sampling of the residual alone is left."""
+    matrix = np.array([[scale[0], 0.0, shift[0]], [0.0, scale[1], shift[1]], [0.0, 0.0, 1.0]])
+    image = np.random.default_rng(1).integers(-4000, 4000, (*source, channels)).astype(np.int16)
+    held = np.zeros((source[0] + 3, source[1] * channels + sampling.SLACK + 4 * channels), np.int16)
+    held[: source[0], : source[1] * channels] = image.reshape(source[0], -1)
+    at = sampling.samplings([matrix], height=size[0], width=size[1], sizes=[source], channels=channels)
+    found = np.zeros((size[0], size[1] * channels))
+    row, tiles = sampling.work_row(4.0), sampling.work_tiles()
+    step = sampling.TILE // channels * channels
+    for v in range(size[0]):
+        for tile in range(at.tiles.shape[1] - 1):
+            count = min(step, size[1] * channels - tile * step)
+            line = tiles[2]
+            numbers = (count, at, channels, np.float32(7), row, line)
+            sampling.lack(tiles[1:2], 0, 0, held, 0, source[1] * channels, 0, v, tile, *numbers)
+            found[v, tile * step : tile * step + count] = -line[:count]
+    wanted = np.zeros((*size, channels))
+    exact_resample(image, image_from_result=matrix, out=wanted, outside=7)
+    assert np.abs(found.reshape(wanted.shape) - wanted).max() < 0.51 + 8000 * 2e-4
+
+
+def test_nothing_is_written_beside_the_images(rows: RowPool) -> None:
+    level = filled(CompiledLevel, rows, STACK, boxes="parts", channels=3)
+    assert isinstance(level, CompiledLevel)
+    images = {
+        "outer": level._whole["outer", FRONT, 0],
+        "spare": level._spare,
+        "moved": level._moved,
+        **{f"mean {n}": image for n, image in level._means.items()},
+        **{f"wanted {side}": level._whole["wanted", CENTRE, side] for side in EYES},
+    }
+    inside = {"outer": FRONT, "spare": FRONT, "moved": REAR, **{f"mean {n}": n for n in OUTER}}
+    for name, image in images.items():
+        panel = inside.get(name, CENTRE)
+        height, width = level.rasters[panel].height_px, level.rasters[panel].width_px
+        if name in {"spare", "moved"}:  # for whichever panel
+            height, width = 96, 160
+        image.base[height:] = -77
+        image.base[:, width:] = -77
+    for sigma_mm in (0.0, 30.0):
+        solved(level, eyes(0.6), sigma_mm=sigma_mm)
+    for name, image in images.items():
+        panel = inside.get(name, CENTRE)
+        height, width = level.rasters[panel].height_px, level.rasters[panel].width_px
+        if name in {"outer", "spare", "moved"}:
+            height, width = 96, 160
+        assert (image.base[height:] == -77).all(), name
+        assert (image.base[:, width:] == -77).all(), name
+
+
+def test_what_was_compiled_at_the_start_serves_every_case(rows: RowPool) -> None:
+    warm_up()
+    compiled = (passes.correct, passes.blur, passes.close_centre, passes.show, warp.warp)
+    for boxes in BOXES:
+        for channels in (1, 3):
+            level = filled(CompiledLevel, rows, STACK, boxes=boxes, channels=channels)
+            for sigma_mm in (0.0, 30.0):
+                fading = Softening(np.ones(level.size[0], np.float32), np.ones(level.size[1], np.float32))
+                solved(level, POSES["rolled"], sigma_mm=sigma_mm, fading=fading)
+    assert [len(function.signatures) for function in compiled] == [1] * len(compiled)
+
+
+@pytest.mark.parametrize(("right", "down"), [(0.0, 0.0), (0.1, -0.05), (-0.12, 0.0), (0.0, 0.1)])
+@pytest.mark.parametrize("scale", [0.4, 0.94, 1.2])
+def test_a_picture_is_sampled_by_the_cubic_definition(right: float, down: float, scale: float) -> None:
+    noise = np.random.default_rng(2).integers(0, 256, (30, 40, 4)).astype(np.uint8)
+    picture = noise.repeat(4, 0).repeat(4, 1)
+    matrix = np.array([[scale, right, 9.3], [down * scale, scale, 14.6], [2e-5, 3e-5, 1.0]])
+    rows, columns = slice(3, 83), slice(5, 125)
+    out = np.zeros((90, 130, 4), np.uint8)
+    warp.warped(picture, matrix, out=out, rows=rows, columns=columns, threads=2)
+    v, u = np.mgrid[0:80, 0:120].astype(float)
+    x, y, w = (row[0] * u + row[1] * v + row[2] for row in matrix)
+    x, y = x / w, y / w
+    i, j = np.floor(x).astype(int), np.floor(y).astype(int)
+    wanted = np.zeros((80, 120, 3))
+    for n, b in enumerate(_cubic(y - j)):
+        for k, a in enumerate(_cubic(x - i)):
+            taps = picture[np.clip(j + n - 1, 0, 119), np.clip(i + k - 1, 0, 159), :3]
+            wanted += (a * b)[..., None] * taps
+    error = np.abs(np.clip(wanted, 0, 255) - out[rows, columns, :3])
+    # A rising row leans the kernel by its slope.
+    assert error.max() <= 2 + 110 * abs(down) and error.mean() <= 0.25 + 4 * abs(down)
+    assert (out[rows, columns, 3] == 255).all()
+    assert (out[:3] == 0).all() and (out[83:] == 0).all() and (out[:, :5] == 0).all() and (out[:, 125:] == 0).all()
+
+
+def _cubic(t: Any, a: float = -0.75) -> list[Any]:
+    def near(d: Any) -> Any:
+        return ((a + 2) * d - (a + 3)) * d * d + 1
+
+    def far(d: Any) -> Any:
+        return ((a * d - 5 * a) * d + 8 * a) * d - 4 * a
+
+    return [far(1 + t), near(t), near(1 - t), far(2 - t)]
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        [[-1.0, 0.0, 100.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],  # mirrored
+        [[0.7, 0.7, 0.0], [-0.7, 0.7, 60.0], [0.0, 0.0, 1.0]],  # rolled
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.02, 0.0, 1.0]],  # partly behind the eye
+        [[1.0, 0.0, 500.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],  # beside it
+        [[80.0, 0.0, -3000.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],  # far beyond it
+    ],
+)
+def test_what_is_not_level_is_told(matrix: list[list[float]]) -> None:
+    assert not warp.is_level(np.array(matrix), rows=slice(0, 80), columns=slice(0, 120), size=(160, 120))
+
+
+def test_without_numba_opencv_does_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    imported = builtins.__import__
+
+    def missing(name: str, *rest: Any, **names: Any) -> Any:
+        if name == "numba":
+            raise ImportError("No module named 'numba'")
+        return imported(name, *rest, **names)
+
+    monkeypatch.setattr(builtins, "__import__", missing)
+    assert loops.level_class.__wrapped__() is PyramidLevel
+
+
+def test_a_compiler_that_fails_is_told_and_opencv_does_it(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken() -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("runtime.model.compiled.level.warm_up", broken)
+    assert loops.level_class.__wrapped__() is PyramidLevel
+    assert "No space left on device" in caplog.text
+
+
+def test_compiled_code_is_kept_by_what_it_follows_from(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = loops._kept()
+    assert folder is not None and folder.parent == tmp_path / "phasestack" / "compiled"
+    assert folder.stat().st_mode & 0o77 == 0
+    monkeypatch.setattr(loops, "SOURCES", loops.SOURCES[:1])
+    assert loops._kept() not in (None, folder)
+    monkeypatch.setenv("XDG_CACHE_HOME", "/proc")
+    assert loops._kept() is None
+
+
+def test_shown_codes_are_whole(rows: RowPool) -> None:
+    for sigma_mm in (0.0, 30.0):
+        level = filled(CompiledLevel, rows, STACK, boxes="whole", channels=3)
+        solved(level, eyes(0.6), sigma_mm=sigma_mm)
+        assert all((level.outer[n] % SUBCODE == 0).all() and level.outer[n].max() <= FULL for n in OUTER)
