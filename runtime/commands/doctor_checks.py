@@ -170,6 +170,7 @@ def monitors(settings: Settings) -> Iterator[Row]:
 def model(settings: Settings) -> Iterator[Row]:
     """The network loads, its contract fits the stack, and the provider is there."""
     from runtime.model.backends import choose
+    from runtime.model.loops import inner_loops
     from runtime.model.predictor import load_predictor
     from runtime.model.session import told_nodes
     from runtime.support.gl import offscreen_context
@@ -200,6 +201,10 @@ def model(settings: Settings) -> Iterator[Row]:
             "they cross to the processor and back: model.provider = \"cpu\" may be faster",
         )  # fmt: skip
     yield Row("backend", "ok", f"{choice.backend.name} around the network: {choice.why}")
+    if choice.backend.name == "opencv":
+        loops = inner_loops()
+        remedy = "" if loops.compiled else "corrections take two to three times as long: install numba"
+        yield Row("inner loops", "ok" if loops.compiled else "warn", loops.why, remedy)
 
 
 def calibration(settings: Settings) -> Iterator[Row]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from dataclasses import dataclass
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
@@ -16,9 +17,22 @@ log = logging.getLogger("phasestack.model")
 SOURCES = ("sampling.py", "passes.py", "warp.py")
 
 
+@dataclass(frozen=True, slots=True)
+class Loops:
+    """What does corrections, and why."""
+
+    level: type[PyramidLevel]
+    why: str  # one line
+
+    @property
+    def compiled(self) -> bool:
+        """Whether they are compiled ones."""
+        return self.level is not PyramidLevel
+
+
 @cache
-def level_class() -> type[PyramidLevel]:
-    """What does corrections. The first call on a machine compiles, which takes some ten seconds and is kept."""
+def inner_loops() -> Loops:
+    """Those of this machine. The first call on it compiles, which takes some ten seconds and is kept."""
     try:
         import numba  # noqa: PLC0415 - half a second that only models need
 
@@ -30,17 +44,11 @@ def level_class() -> type[PyramidLevel]:
 
         warm_up()
     except ImportError as error:
-        log.info("inner loops: OpenCV's, for want of compiled ones (%s)", error)
-        return PyramidLevel
+        return Loops(PyramidLevel, f"OpenCV's, for want of compiled ones ({error})")
     except Exception as error:  # a compiler has no list of what it may fail with
         log.warning("inner loops: OpenCV's, the compiled ones failed (%s: %s)", type(error).__name__, error)
-        return PyramidLevel
-    return CompiledLevel
-
-
-def are_compiled() -> bool:
-    """Whether the inner loops are compiled ones here."""
-    return level_class() is not PyramidLevel
+        return Loops(PyramidLevel, f"OpenCV's, the compiled ones failed ({type(error).__name__}: {error})")
+    return Loops(CompiledLevel, f"compiled, kept in {folder}" if folder else "compiled, at every start anew")
 
 
 def _kept() -> Path | None:

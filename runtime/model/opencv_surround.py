@@ -11,7 +11,7 @@ import numpy as np
 from runtime.model.assembly import ArrayAssembly
 from runtime.model.channels import without_alpha
 from runtime.model.contract import Contract
-from runtime.model.loops import level_class
+from runtime.model.loops import inner_loops
 from runtime.model.pyramid_level import CENTRE, EYES, I16, NEUTRAL, PyramidLevel
 from runtime.model.resample import resample
 from runtime.model.rows import RowPool
@@ -35,7 +35,9 @@ class OpenCvBackend:
         self.compiled = compiled
 
     def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> OpenCvSurround:
-        return OpenCvSurround(contract, stack, threads=threads, level=level_class() if self.compiled else PyramidLevel)
+        return OpenCvSurround(
+            contract, stack, threads=threads, level=inner_loops().level if self.compiled else PyramidLevel
+        )
 
     def assembly(self, stack: PanelStack) -> ArrayAssembly:
         return ArrayAssembly(stack)

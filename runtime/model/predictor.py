@@ -9,7 +9,7 @@ from runtime.config import ModelSettings
 from runtime.errors import InputError
 from runtime.model.allocator import keep_freed_memory
 from runtime.model.base import Prediction, Predictor
-from runtime.model.loops import level_class
+from runtime.model.loops import inner_loops
 from runtime.optics.stack import PanelStack
 
 __all__ = ["SHIPPED", "Prediction", "Predictor", "load_predictor", "model_path"]
@@ -66,7 +66,7 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
         from runtime.model.unrolled import UnrolledPredictor
 
         if settings.backend != "gl":
-            level_class()  # compiled or loaded before the first frame
+            inner_loops()  # compiled or loaded before the first frame
         return UnrolledPredictor(session, stack, threads=settings.threads)
     from runtime.model.network import NetworkPredictor
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from runtime.model import loops
 from runtime.model.base import Prediction, Predictor
+from runtime.model.loops import inner_loops
 from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack
@@ -80,7 +80,7 @@ def _warped(
     kernel = interpolation == "cubic" and not large
     finer = interpolation != "linear" and not kernel
     source_px = _source_px(image_from_raster, rows=rows, columns=columns)
-    if interpolation != "linear" and not black_beside and loops.are_compiled() and source_px < FINE_ENOUGH:
+    if interpolation != "linear" and not black_beside and inner_loops().compiled and source_px < FINE_ENOUGH:
         from runtime.model.compiled.warp import is_level, warped  # noqa: PLC0415 - imports numba
 
         matrix = _shifted(-0.5, -0.5) @ image_from_raster @ _shifted(columns.start + 0.5, rows.start + 0.5)

@@ -18,6 +18,7 @@ from runtime.daemon.solver_parts import RunningSolver, SolverMaker
 from runtime.eyes.calibration import load_calibration
 from runtime.frame.solver_thread import SolverThread
 from runtime.model.chain import chain_frame
+from runtime.model.loops import Loops
 from runtime.optics.stack import PanelStack
 from runtime.records import SolveRequest
 from runtime.support.gl import offscreen_context
@@ -96,7 +97,9 @@ def test_nothing_is_read_back_but_the_network_s_raster_and_the_layers(
 def test_pictures_in_textures_are_solved_as_pictures_in_arrays_are(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (runtime.model.opencv_surround, runtime.model.pyramid_level):
         monkeypatch.setattr(module, "resample", exact_resample)
-    monkeypatch.setattr(runtime.model.opencv_surround, "level_class", lambda: runtime.model.pyramid_level.PyramidLevel)
+    monkeypatch.setattr(
+        runtime.model.opencv_surround, "inner_loops", lambda: Loops(runtime.model.pyramid_level.PyramidLevel, "")
+    )
     layers = []
     for backend in ("gl", "opencv"):
         context = offscreen_context()

@@ -281,7 +281,8 @@ def test_without_numba_opencv_does_it(monkeypatch: pytest.MonkeyPatch) -> None:
         return imported(name, *rest, **names)
 
     monkeypatch.setattr(builtins, "__import__", missing)
-    assert loops.level_class.__wrapped__() is PyramidLevel
+    found = loops.inner_loops.__wrapped__()
+    assert found.level is PyramidLevel and not found.compiled and "numba" in found.why
 
 
 def test_a_compiler_that_fails_is_told_and_opencv_does_it(
@@ -291,8 +292,9 @@ def test_a_compiler_that_fails_is_told_and_opencv_does_it(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("runtime.model.compiled.level.warm_up", broken)
-    assert loops.level_class.__wrapped__() is PyramidLevel
-    assert "No space left on device" in caplog.text
+    found = loops.inner_loops.__wrapped__()
+    assert found.level is PyramidLevel and not found.compiled
+    assert "No space left on device" in caplog.text and "No space left on device" in found.why
 
 
 def test_compiled_code_is_kept_by_what_it_follows_from(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from runtime.model.backends import choose
 from runtime.model.fade import Fade
 from runtime.model.gl.backend import GlBackend
 from runtime.model.gl.programs import Account
+from runtime.model.loops import Loops
 from runtime.model.opencv_surround import OpenCvBackend
 from runtime.model.predictor import SHIPPED, Predictor, load_predictor
 from runtime.model.pyramid_level import PyramidLevel
@@ -70,7 +71,7 @@ def exactly(monkeypatch: pytest.MonkeyPatch) -> None:
     """OpenCV's steps sample by the definition: its own sampling is off by up to a twelfth of a pixel."""
     for module in (runtime.model.opencv_surround, runtime.model.pyramid_level):
         monkeypatch.setattr(module, "resample", exact_resample)
-    monkeypatch.setattr(runtime.model.opencv_surround, "level_class", lambda: PyramidLevel)
+    monkeypatch.setattr(runtime.model.opencv_surround, "inner_loops", lambda: Loops(PyramidLevel, ""))
 
 
 def both(name: str, stack: PanelStack, gl: GlBackend) -> tuple[UnrolledPredictor, UnrolledPredictor]:
@@ -227,7 +228,7 @@ def test_at_1920x1080(name: str, gl: GlBackend, monkeypatch: pytest.MonkeyPatch)
     assert abs(shown_db[1] - shown_db[0]) <= 0.05
     for module in (runtime.model.opencv_surround, runtime.model.pyramid_level):
         monkeypatch.setattr(module, "resample", exact_resample)
-    monkeypatch.setattr(runtime.model.opencv_surround, "level_class", lambda: PyramidLevel)
+    monkeypatch.setattr(runtime.model.opencv_surround, "inner_loops", lambda: Loops(PyramidLevel, ""))
     opencv.surround_with(OpenCvBackend(compiled=False))
     assert within_one(layers_of(opencv, pictures, pair), found) >= WITHIN_ONE
 

@@ -18,6 +18,7 @@ from runtime.model.assembly import ArrayAssembly, Placed, Rest, Shared, Uniform
 from runtime.model.gl.assembly import GlAssembly
 from runtime.model.gl.backend import GlBackend
 from runtime.model.gl.programs import Account
+from runtime.model.loops import Loops
 from runtime.model.predictor import Predictor
 from runtime.model.pyramid_level import NEUTRAL
 from runtime.optics.rect import PixelRect
@@ -67,7 +68,9 @@ def exactly(monkeypatch: pytest.MonkeyPatch) -> None:
     """OpenCV's steps sample by the definition."""
     for module in (runtime.model.opencv_surround, runtime.model.pyramid_level):
         monkeypatch.setattr(module, "resample", exact_resample)
-    monkeypatch.setattr(runtime.model.opencv_surround, "level_class", lambda: runtime.model.pyramid_level.PyramidLevel)
+    monkeypatch.setattr(
+        runtime.model.opencv_surround, "inner_loops", lambda: Loops(runtime.model.pyramid_level.PyramidLevel, "")
+    )
 
 
 def noise(width_px: int, height_px: int, *, count: int | None = None, seed: int = 0) -> U8:
