@@ -92,8 +92,8 @@ def table(solutions: Iterable[Solution]) -> list[str]:
         raster = one.crossing_bytes("network down", "answer up") / 1e6
         layers = one.crossing_bytes("layer down") / 1e6
         times = "".join(f" {one.least_ms(speed):.1f} ms |" for speed in SPEEDS_GB_S)
-        unsure = any(step.name == "noise" for step in one.drawn)
-        how = "in six, and two of the mean" if unsure else "in one pass" if one.at_once else "in two"
+        unsure = any(step.name == "correct_unsure" for step in one.drawn)
+        how = "in five, and two of the mean" if unsure else "in one pass" if one.at_once else "in two"
         lines.append(
             f"| {one.model} | {one.eye_sigma_mm:g} mm | {how} | {len(one.drawn)} | {one.moved_bytes / 1e6:.0f} | "
             f"{raster:.1f} | {layers:.1f} |{times}"

@@ -31,7 +31,7 @@ class Image:
 
     @property
     def texel_bytes(self) -> int:
-        width = {"f1": 1, "i2": 2}[self.texture.dtype]
+        width = {"f1": 1, "i2": 2, "u4": 4}[self.texture.dtype]
         components: int = self.texture.components
         return components * width
 
@@ -61,13 +61,14 @@ class Account:
     passes: list[Pass] = field(default_factory=list)
 
 
-def source(name: str) -> str:
-    """A shader with what it includes."""
+def source(name: str, *, packed: bool = False) -> str:
+    """A shader with what it includes. packed: for images of three numbers in one (`sample.glsl`)."""
 
     def read(file: str) -> str:
         return (resources.files(SHADERS) / "shaders" / file).read_text(encoding="ascii")
 
-    return INCLUDE.sub(lambda found: read(found[1]), read(name))
+    first, _, rest = INCLUDE.sub(lambda found: read(found[1]), read(name)).partition("\n")
+    return f"{first}\n#define PACKED\n{rest}" if packed else f"{first}\n{rest}"
 
 
 class Passes:
@@ -77,7 +78,7 @@ class Passes:
         self.context = context
         self.account: Account | None = None
         self._vertex = source("whole.vert.glsl")
-        self._programs: dict[str, tuple[Any, Any, dict[str, Any]]] = {}
+        self._programs: dict[tuple[str, bool], tuple[Any, Any, dict[str, Any]]] = {}
         self._targets: dict[tuple[int, ...], Any] = {}
 
     @contextmanager
@@ -100,10 +101,12 @@ class Passes:
         outputs: Sequence[Image],
         inputs: Mapping[str, Image],
         uniforms: Mapping[str, Any],
+        *,
+        packed: bool = False,
     ) -> None:
         """Draw the first output's size into all of them. Inputs and uniforms are named as in the shader; what it
-        has no use for is left out."""
-        program, array, held = self._program(name)
+        has no use for is left out. packed: images are."""
+        program, array, held = self._program(name, packed=packed)
         for unit, (key, image) in enumerate(inputs.items()):
             image.texture.use(unit)
             self._set(program, held, key, unit)
@@ -151,11 +154,12 @@ class Passes:
             program.release()
         self._targets, self._programs = {}, {}
 
-    def _program(self, name: str) -> tuple[Any, Any, dict[str, Any]]:
-        if name not in self._programs:
-            program = self.context.program(vertex_shader=self._vertex, fragment_shader=source(f"{name}.frag.glsl"))
-            self._programs[name] = program, self.context.vertex_array(program, []), {}
-        return self._programs[name]
+    def _program(self, name: str, *, packed: bool) -> tuple[Any, Any, dict[str, Any]]:
+        if (name, packed) not in self._programs:
+            fragment = source(f"{name}.frag.glsl", packed=packed)
+            program = self.context.program(vertex_shader=self._vertex, fragment_shader=fragment)
+            self._programs[name, packed] = program, self.context.vertex_array(program, []), {}
+        return self._programs[name, packed]
 
     @staticmethod
     def _set(program: Any, held: dict[str, Any], key: str, value: Any) -> None:

@@ -1,13 +1,14 @@
 """The steps around the network as passes of fragment shaders, and the images that live from frame to frame.
 
 Images are signed 16-bit sixteenths of a code, as OpenCV's are: one number a pixel where there is one channel, else
-four, of which one is unused (three can't be drawn into). Only the network's raster, its answer and, where they are
-asked for, the layers cross the bus.
+four, of which one is unused (three can't be drawn into). Where the eyes are unsure three are packed into 32 bits.
+What the eyes want is held as 8-bit codes. Only the network's raster, its answer and, where they are asked for, the
+layers cross the bus.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from math import ceil
 from typing import Any
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.errors import InputError, ModelFailure
-from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
+from runtime.model.chain import ColumnLaw
 from runtime.model.contract import Contract
 from runtime.model.fade import CORRECTED_SHARE
 from runtime.model.gl.assembly import left_in
@@ -34,6 +35,8 @@ from runtime.support.gl_sharing import LayerPool, wait_until_drawn
 EYES = ("left", "right")
 NAMES = {REAR: "rear", FRONT: "front"}
 KERNEL = 64  # entries of the blur's uniform
+SURE = (0.0, 0.0)  # a spread, pixels
+PACKED_SPREAD_PX = 0.5  # images are packed where blurs of so much, on every pixel, hide what that rounds
 
 Spread = dict[int, tuple[float, float]]
 
@@ -80,6 +83,9 @@ class GlSurround:
                 )
                 for reduction, rasters in self._rasters.items()
             }
+            self._packed = not self._grey and all(
+                n in self._spread[1] and min(self._spread[1][n]) >= PACKED_SPREAD_PX for n in OUTER
+            )
             self._outer: dict[tuple[int, int], str] = {}  # which of two images a panel is in
             self._want(self._taken(pictures))
             yield
@@ -88,7 +94,7 @@ class GlSurround:
         problem, frame, reduction = self._problem, self._problem.frame, self._contract.reduction
         seen = tuple(self._grown(f"network {side}", frame.width_px, frame.rows) for side in EYES)
         matrices = [problem.reduced_from_frame(side) for side in range(2)]
-        self._passes.draw(
+        self._draw(
             "network",
             seen,
             self._wanted(reduction),
@@ -107,56 +113,50 @@ class GlSurround:
         answer.texture.write(np.ascontiguousarray(codes), viewport=(0, 0, columns, rows), alignment=1)
         self._passes.crossed("answer up", answer, bytes_px=2 * self._problem.channels, to_gpu=True)
         matrix = self._problem.answer_from_raster(panel, self._rasters[reduction][panel])
-        self._resample(answer, reduction, panel, matrix, columns=self._problem.answer_columns, shown=shown)
+        place = {"size": answer.size, "image_from_panel": _mat3(matrix), **_columns(self._problem.answer_columns)}
+        self._draw("resample", (self._spare(reduction, panel),), {"image": answer}, {**place, "shown": shown})
+        self._swap(reduction, panel)
 
     def project(self, reduction: int, panels: Sequence[int]) -> None:
         for n in panels:
-            if n in self._spread[reduction]:
-                outer, half = self._panel(reduction, n), self._image(reduction, n, "half")
-                self._blur(reduction, n, {"first": outer, "second": outer}, (half,))
-                mean = self._image(reduction, n, "mean")
-                self._blur(reduction, n, {"first": half, "second": half}, (mean,), down=True)
+            if n in (spread := self._spread[reduction]):
+                half, mean = self._image(reduction, n, "half"), self._image(reduction, n, "mean")
+                self._blur({"image": self._panel(reduction, n)}, (half,), spread[n])
+                self._blur({"image": half}, (mean,), spread[n], down=True)
 
     def correct(self, reduction: int, panel: int, *, size: float, shown: bool) -> None:
-        rasters = self._rasters[reduction]
         places: dict[str, Any] = {
-            f"centre_from_{eye}": _mat3(pixels_in_line(self._stack, rasters, eye_m, of=CENTRE, on=panel))
+            f"centre_from_{eye}": _mat3(
+                pixels_in_line(self._stack, self._rasters[reduction], eye_m, of=CENTRE, on=panel)
+            )
             for eye, eye_m in zip(EYES, self._problem.eyes_m, strict=True)
         }
-        places["size"] = _size(rasters[CENTRE])
-        outer, result = self._panel(reduction, panel), self._spare(reduction, panel)
+        places["size"] = _size(self._rasters[reduction][CENTRE])
+        result, outer = (self._spare(reduction, panel),), {"panel": self._panel(reduction, panel)}
         how = {"eighths": round(size * 8), "shown": shown}
-        unsure = bool(self._spread[reduction])
-        if self._at_once and not unsure:
-            seen = {**self._through(reduction), **self._fade(reduction)}
-            looked = {**self._wanted(reduction), **self._means(reduction), "panel": outer}
-            self._passes.draw("correct_at_once", (result,), looked, {**seen, **places, **how})
-            self._swap(reduction, panel)
-            return
-        left, right = self._residuals(reduction, panel)
-        lacks = {"left": left, "right": right}
-        if not unsure:
-            self._passes.draw("correct", (result,), {**lacks, "panel": outer}, {**places, **how})
+        if spread := self._spread[reduction]:
+            outer["mean"] = self._mean(reduction, panel)
+            half = self._joined(reduction, panel, outer, places, spread.get(panel, SURE))
+            kernel = {**_kernel(spread.get(panel, SURE), down=True), "size": half.size}
+            self._draw("correct_unsure", result, {**outer, "half_blurred": half}, {**how, **kernel})
+        elif self._at_once:
+            images, seen = self._seen(reduction)
+            self._draw("correct_at_once", result, {**images, **outer}, {**seen, **places, **how})
         else:
-            back = self._image(reduction, panel, "back")
-            self._passes.draw("back", (back,), lacks, places)
-            across = (self._image(reduction, panel, "half"), self._image(reduction, panel, "half mean"))
-            mean = self._mean(reduction, panel)
-            self._blur(reduction, panel, {"first": back, "second": mean}, across)
-            self._passes.draw(
-                "correct_unsure",
-                (result,),
-                {"panel": outer, "half_blurred_lacks": across[0], "half_blurred_mean": across[1]},
-                {**how, **self._kernel(reduction, panel, down=True), "size": result.size},
-            )
+            images, seen = self._seen(reduction)
+            lacks = {eye: self._image(reduction, CENTRE, f"lacks {eye}") for eye in EYES}
+            self._draw("residual", tuple(lacks.values()), images, seen)
+            self._draw("correct", result, {**lacks, **outer}, {**places, **how})
         self._swap(reduction, panel)
 
     def upsample(self, coarser_reduction: int, reduction: int, *, shown: bool) -> None:
         for n in OUTER:
             coarse = self._panel(coarser_reduction, n)
             fine = self._rasters[reduction][n]
-            matrix = np.diag([coarse.width_px / fine.width_px, coarse.height_px / fine.height_px, 1.0])
-            self._resample(coarse, reduction, n, matrix, columns=EVEN_COLUMNS, shown=shown)
+            scale = (coarse.width_px / fine.width_px, coarse.height_px / fine.height_px)
+            how = {"size": coarse.size, "image_from_panel": scale, "shown": shown}
+            self._draw("finer", (self._spare(reduction, n),), {"image": coarse}, how)
+            self._swap(reduction, n)
 
     def finish(self) -> Layers:
         width, height = self._stack.width_px, self._stack.height_px
@@ -193,11 +193,11 @@ class GlSurround:
             f"{name}_origin": (boxes[n].u0, boxes[n].v0) for n, name in ((CENTRE, "centre"), *NAMES.items())
         }
         where["centre_size"] = _size(self._rasters[1][CENTRE])
-        self._passes.draw(
+        self._draw(
             "close",
             images,
             {**self._wanted(1), **outer},
-            {**self._through(1), **where, "neutral": NEUTRAL, "grey": self._grey},
+            {**self._through(1), **where, "neutral": NEUTRAL},
         )
 
     def _taken(self, pictures: Sequence[Picture]) -> list[Image]:
@@ -223,52 +223,55 @@ class GlSurround:
         for reduction, rasters in self._rasters.items():
             width, height = _size(rasters[CENTRE])
             wanted = self._wanted(reduction)
-            self._passes.draw(
+            self._draw(
                 "wanted",
-                tuple(wanted.values()),
-                {"left": pictures[0], "right": pictures[1], "table": self._table},
+                (wanted["wanted_left"], wanted["wanted_right"]),
+                {"left": pictures[0], "right": pictures[1]},
                 {
                     "origin": self._origin,
                     "box": (box.width_px, box.height_px),
                     "reduction": (box.width_px / width, box.height_px / height),
                     "emphasis": self._contract.emphasis,
-                    "grey": self._grey,
                 },
             )
 
-    def _residuals(self, reduction: int, panel: int) -> tuple[Image, Image]:
-        """What each eye lacks, and what moves of the panel that is not corrected where the eyes are unsure."""
-        left, right = (self._image(reduction, CENTRE, f"lacks {eye}") for eye in EYES)
-        unsure = bool(self._spread[reduction])
-        seen = tuple(self._image(reduction, CENTRE, f"seen {eye}") for eye in EYES) if unsure else ()
-        self._passes.draw(
-            "residual",
-            (left, right, *seen),
-            {**self._wanted(reduction), **self._means(reduction)},
-            {**self._through(reduction), **self._fade(reduction), "unsure": unsure, "of_front": panel == REAR},
+    def _joined(
+        self,
+        reduction: int,
+        panel: int,
+        outer: dict[str, Image],
+        places: dict[str, Any],
+        spread: tuple[float, float],
+    ) -> Image:
+        """What a correction for unsure eyes blurs, blurred across.
+
+        The mean B of what is lacked, less twice the noise p - B m of a panel p with mean m = B p, is
+        B(lacks + 2 (m - p)) + 2 (m - p): one blur for two, of numbers that are small.
+        """
+        lacks, moving, half = (
+            tuple(self._image(reduction, CENTRE, f"{name} {eye}") for eye in EYES)
+            for name in ("lacks", "moving", "half")
         )
-        if not seen:
-            return left, right
-        half = tuple(self._image(reduction, CENTRE, f"half {eye}") for eye in EYES)
-        self._blur(reduction, panel, {"first": seen[0], "second": seen[1]}, half, twice=True)
-        joined = tuple(self._image(reduction, CENTRE, f"joined {eye}") for eye in EYES)
-        self._passes.draw(
-            "noise",
-            joined,
-            {
-                "left": left,
-                "right": right,
-                "half_blurred_left": half[0],
-                "half_blurred_right": half[1],
-            },
-            {**self._kernel(reduction, panel, down=True, twice=True), "size": left.size},
-        )
-        return joined[0], joined[1]
+        images, seen = self._seen(reduction)
+        self._draw("residual_unsure", (*lacks, *moving), images, {**seen, "of_front": panel == REAR})
+        self._blur({"first": moving[0], "second": moving[1]}, half, spread, name="blur_both", twice=True)
+        joined, blurred = (self._image(reduction, panel, name) for name in ("joined", "half"))
+        lacked = dict(zip((*EYES, *(f"half_blurred_{eye}" for eye in EYES)), (*lacks, *half), strict=True))
+        self._draw("back", (joined,), {**lacked, **outer}, {**places, **_kernel(spread, twice=True, down=True)})
+        self._blur({"image": joined}, (blurred,), spread)
+        return blurred
+
+    def _seen(self, reduction: int) -> tuple[dict[str, Image], dict[str, Any]]:
+        """What the eyes want and see at the centre panel's pixels."""
+        return {**self._wanted(reduction), **self._means(reduction)}, {
+            **self._through(reduction),
+            **self._fade(reduction),
+        }
 
     def _through(self, reduction: int) -> dict[str, Any]:
         """How the eyes see the outer panels through the centre panel's pixels."""
         rasters = self._rasters[reduction]
-        found: dict[str, Any] = {"even": START}
+        found: dict[str, Any] = {}
         for n, name in NAMES.items():
             found[f"{name}_size"] = _size(rasters[n])
             for eye, eye_m in zip(EYES, self._problem.eyes_m, strict=True):
@@ -288,50 +291,29 @@ class GlSurround:
             "centre_from_here": _as_scale_shift(matrix),
         }
 
-    def _resample(
-        self, image: Image, reduction: int, panel: int, matrix: F64, *, columns: ColumnLaw, shown: bool
-    ) -> None:
-        """An outer panel drawn anew from another raster."""
-        self._passes.draw(
-            "resample",
-            (self._spare(reduction, panel),),
-            {"image": image},
-            {
-                "size": image.size,
-                "image_from_panel": _mat3(matrix),
-                "outside": START,
-                "shown": shown,
-                **_columns(columns),
-            },
-        )
-        self._swap(reduction, panel)
-
     def _blur(
         self,
-        reduction: int,
-        panel: int,
-        inputs: dict[str, Image],
+        images: dict[str, Image],
         outputs: tuple[Image, ...],
+        spread: tuple[float, float],
         *,
+        name: str = "blur",
         down: bool = False,
         twice: bool = False,
     ) -> None:
-        kernel = self._kernel(reduction, panel, down=down, twice=twice)
-        self._passes.draw("blur", outputs, inputs, {**kernel, "size": outputs[0].size})
+        kernel = _kernel(spread, down=down, twice=twice)
+        self._draw(name, outputs, images, {**kernel, "size": outputs[0].size})
 
-    def _kernel(self, reduction: int, panel: int, *, down: bool = False, twice: bool = False) -> dict[str, Any]:
-        """The mean over where the eyes may be, as an outer panel's pixels move, along one direction."""
-        spread = self._spread[reduction].get(panel)
-        weights = [1.0]
-        if spread is not None:
-            u, v = (s * np.sqrt(2.0) if twice else s for s in spread)
-            reach = ceil(3 * max(u, v))
-            weights = cv2.getGaussianKernel(2 * reach + 1, v if down else u)[reach:, 0].tolist()
-        padded = tuple(weights) + (0.0,) * (KERNEL - len(weights))
-        return {"kernel": padded, "reach": len(weights) - 1, "along": (0, 1) if down else (1, 0)}
+    def _draw(
+        self, name: str, outputs: tuple[Image, ...], inputs: dict[str, Image], uniforms: Mapping[str, Any]
+    ) -> None:
+        always = {"even": START, "grey": self._grey}
+        self._passes.draw(name, outputs, inputs, {**uniforms, **always}, packed=self._packed)
 
     def _wanted(self, reduction: int) -> dict[str, Image]:
-        return {f"wanted_{eye}": self._image(reduction, CENTRE, f"wanted {eye}") for eye in EYES}
+        """What the eyes want, with the table that makes phase sums of it."""
+        images = {f"wanted_{eye}": self._image(reduction, CENTRE, f"wanted {eye}", dtype="f1") for eye in EYES}
+        return {**images, "table": self._table}
 
     def _mean(self, reduction: int, panel: int) -> Image:
         """An outer panel as eyes that are unsure see it."""
@@ -352,29 +334,30 @@ class GlSurround:
     def _swap(self, reduction: int, panel: int) -> None:
         self._outer[reduction, panel] = _other(self._outer.get((reduction, panel), "outer"))
 
-    def _image(self, reduction: int, panel: int, name: str) -> Image:
+    def _image(self, reduction: int, panel: int, name: str, *, dtype: str | None = None) -> Image:
         """The box's part of an image as large as a whole panel: boxes follow the viewer, textures don't."""
         width, height = -(-self._stack.width_px // reduction), -(-self._stack.height_px // reduction)
-        texture = self._texture((name, reduction, panel), width, height, 1 if self._grey else 4)
+        dtype = dtype or ("u4" if self._packed else "i2")
+        components = 1 if self._grey or dtype == "u4" else 4
+        texture = self._texture((name, reduction, panel), width, height, components, dtype=dtype)
         return Image(texture, *_size(self._rasters[reduction][panel]))
 
     def _grown(self, name: str, width_px: int, height_px: int, *, components: int | None = None) -> Image:
         """An image of the network's raster, whose size follows the viewer; its texture only grows."""
         components = components or (1 if self._grey else 4)
-        key = (name, components)
-        held = self._textures.get(key)
+        held = self._textures.get(key := (name, components, "i2"))
         if held is None or held.width < width_px or held.height < height_px:
             width, height = (max(width_px, held.width), max(height_px, held.height)) if held else (width_px, height_px)
             check_raster(self._passes.context, width, height)
             if held is not None:
                 self._passes.forget(self._textures.pop(key))
-            held = self._texture(key, width, height, components)
+            held = self._texture(name, width, height, components)
         return Image(held, width_px, height_px)
 
     def _texture(
         self, key: Any, width: int, height: int, components: int, *, dtype: str = "i2", data: NDArray[Any] | None = None
     ) -> Any:
-        key = key if isinstance(key, tuple) and len(key) == 2 else (key, components)
+        key = (key, components, dtype)
         if key not in self._textures:
             made = self._passes.context.texture((width, height), components, data, dtype=dtype, alignment=1)
             made.filter = (moderngl.NEAREST, moderngl.NEAREST)
@@ -415,6 +398,16 @@ def check_raster(context: moderngl.Context, width_px: int, height_px: int) -> No
 
 def _other(name: str) -> str:
     return "outer" if name == "spare" else "spare"
+
+
+def _kernel(spread: tuple[float, float], *, down: bool = False, twice: bool = False) -> dict[str, Any]:
+    """The mean over where the eyes may be, as pixels move by it, along one direction."""
+    u, v = (s * np.sqrt(2.0) if twice else s for s in spread)
+    reach, weights = ceil(3 * max(u, v)), [1.0]
+    if reach:
+        weights = cv2.getGaussianKernel(2 * reach + 1, v if down else u)[reach:, 0].tolist()
+    padded = tuple(weights) + (0.0,) * (KERNEL - len(weights))
+    return {"kernel": padded, "reach": reach, "along": (0, 1) if down else (1, 0)}
 
 
 def _size(raster: PlaneRaster) -> tuple[int, int]:

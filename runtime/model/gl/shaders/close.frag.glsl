@@ -1,21 +1,16 @@
 #version 330 core
 // All three panels in 8-bit codes: the centre one the best for the outer ones, per pixel; even beside the boxes.
-uniform isampler2D wanted_left, wanted_right;
-uniform isampler2D rear, front;                      // as they are
-uniform isampler2D rear_mean, front_mean;            // as eyes that are unsure see them
+#include "sample.glsl"
+#include "wanted.glsl"
+uniform IMAGE rear, front;                           // as they are
+uniform IMAGE rear_mean, front_mean;                 // as eyes that are unsure see them
 uniform ivec2 rear_size, front_size, centre_size;
 uniform ivec2 rear_origin, front_origin, centre_origin;
 uniform mat3 rear_from_left, rear_from_right, front_from_left, front_from_right;
-uniform int even, neutral;
-uniform bool grey;
+uniform int neutral;
 layout(location = 0) out vec4 rear_codes;
 layout(location = 1) out vec4 centre_codes;
 layout(location = 2) out vec4 front_codes;
-#include "sample.glsl"
-
-ivec4 through(isampler2D image, ivec2 size, mat3 image_from_here, vec2 at) {
-    return crossed(image, size, image_from_here, at, even);
-}
 
 bool within(ivec2 place, ivec2 size) {
     return all(greaterThanEqual(place, ivec2(0))) && all(lessThan(place, size));
@@ -25,17 +20,17 @@ vec4 coloured(ivec4 codes) {
     return vec4((grey ? vec3(codes.r) : vec3(codes.rgb)) / 255.0, 1.0);
 }
 
-vec4 outer(isampler2D image, ivec2 place, ivec2 size) {
+vec4 outer(IMAGE image, ivec2 place, ivec2 size) {
     if (!within(place, size)) return coloured(ivec4(neutral));
-    return coloured(rounded(vec4(texelFetch(image, place, 0)) / 16.0));
+    return coloured(rounded(vec4(value(image, place) + even) / 16.0));
 }
 
 vec4 centre(ivec2 place) {
     if (!within(place, centre_size)) return coloured(ivec4(neutral));
     vec2 at = vec2(place) + 0.5;
-    ivec4 best = texelFetch(wanted_left, place, 0) + texelFetch(wanted_right, place, 0) + 16;
-    best -= through(rear_mean, rear_size, rear_from_left, at) + through(rear_mean, rear_size, rear_from_right, at);
-    best -= through(front_mean, front_size, front_from_left, at) + through(front_mean, front_size, front_from_right, at);
+    ivec4 best = phases(wanted_left, place) + phases(wanted_right, place) + 16 - 4 * even;
+    best -= crossed(rear_mean, rear_size, rear_from_left, at) + crossed(rear_mean, rear_size, rear_from_right, at);
+    best -= crossed(front_mean, front_size, front_from_left, at) + crossed(front_mean, front_size, front_from_right, at);
     return coloured(clamp(best >> 5, 0, 255));
 }
 

@@ -1,13 +1,14 @@
 #version 330 core
 // `residual` and `correct` in one: no image in between, but four looks an eye for each pixel of the panel.
-uniform isampler2D panel;
+#include "sample.glsl"
+#include "wanted.glsl"
+#include "lacks.glsl"
+#include "shown.glsl"
+uniform IMAGE panel;
 uniform ivec2 size;         // of the centre panel's raster
 uniform mat3 centre_from_left, centre_from_right;
 uniform int eighths;
-out ivec4 corrected;
-#include "sample.glsl"
-#include "lacks.glsl"
-#include "shown.glsl"
+out STORED corrected;
 
 ivec4 lacked(mat3 centre_from_here, bool by_left) {
     vec2 place = moved(centre_from_here, gl_FragCoord.xy);
@@ -27,5 +28,5 @@ ivec4 lacked(mat3 centre_from_here, bool by_left) {
 
 void main() {
     ivec4 lacks = lacked(centre_from_left, true) + lacked(centre_from_right, false);
-    corrected = kept(texelFetch(panel, ivec2(gl_FragCoord.xy), 0) + (lacks >> 3) * eighths);
+    corrected = kept(value(panel, ivec2(gl_FragCoord.xy)) + (lacks >> 3) * eighths);
 }

@@ -1,8 +1,7 @@
 // What each eye lacks at a pixel of the centre panel when that panel is the best one for the outer ones.
-uniform isampler2D wanted_left, wanted_right, rear, front;
+uniform IMAGE rear, front;
 uniform ivec2 rear_size, front_size;
 uniform mat3 rear_from_left, rear_from_right, front_from_left, front_from_right;  // from the centre's pixels
-uniform int even;
 // How a part of larger panels ends: nothing beyond `kept_box` (left, top, right, bottom) drives the panels.
 uniform vec4 kept_box;
 uniform vec4 over;              // pixels over which each side fades; 0: it does not
@@ -26,13 +25,13 @@ ivec4 faded(ivec4 value, ivec2 place) {
 Look look(ivec2 place) {
     Look found;
     vec2 at = vec2(place) + 0.5;
-    found.rear_left = crossed(rear, rear_size, rear_from_left, at, even);
-    found.rear_right = crossed(rear, rear_size, rear_from_right, at, even);
-    found.front_left = crossed(front, front_size, front_from_left, at, even);
-    found.front_right = crossed(front, front_size, front_from_right, at, even);
-    ivec4 left = texelFetch(wanted_left, place, 0) - found.rear_left - found.front_left;
-    ivec4 right = texelFetch(wanted_right, place, 0) - found.rear_right - found.front_right;
-    ivec4 best = clamp((left + right) >> 1, 0, 4080);
+    found.rear_left = crossed(rear, rear_size, rear_from_left, at);
+    found.rear_right = crossed(rear, rear_size, rear_from_right, at);
+    found.front_left = crossed(front, front_size, front_from_left, at);
+    found.front_right = crossed(front, front_size, front_from_right, at);
+    ivec4 left = phases(wanted_left, place) - 2 * even - found.rear_left - found.front_left;
+    ivec4 right = phases(wanted_right, place) - 2 * even - found.rear_right - found.front_right;
+    ivec4 best = clamp((left + right) >> 1, 0, 2 * even);
     found.left = faded(left - best, place);
     found.right = faded(right - best, place);
     return found;

@@ -1,15 +1,16 @@
 #version 330 core
 // What each eye lacks while the outer panels are even, half the difference of what both want, on the network's raster.
-uniform isampler2D wanted_left, wanted_right;
+#include "sample.glsl"
+#include "columns.glsl"
+#include "wanted.glsl"
 uniform ivec2 size;
 uniform mat3 left_from_raster, right_from_raster;
 layout(location = 0) out ivec4 lacks_left;
 layout(location = 1) out ivec4 lacks_right;
-#include "sample.glsl"
-#include "columns.glsl"
 
 vec4 half_difference(ivec2 place) {
-    return vec4((texel(wanted_right, place, size) - texel(wanted_left, place, size)) >> 1);
+    place = clamp(place, ivec2(0), size - 1);
+    return vec4((phases(wanted_right, place) - phases(wanted_left, place)) >> 1);
 }
 
 ivec4 sampled(mat3 matrix, float sign) {

@@ -1,6 +1,7 @@
-// Within a panel's range; what will be shown is rounded to what 8 bits can show.
+// Within a panel's range, about its middle; what will be shown is rounded to what 8 bits can show.
 uniform bool shown;
-ivec4 kept(ivec4 codes) {
-    if (shown) codes = (codes + 8) & -16;
-    return clamp(codes, 0, 4080);
+
+STORED kept(ivec4 codes) {
+    if (shown) codes = ((codes + even + 8) & -16) - even;
+    return stored(vec4(clamp(codes, -even, even)));
 }

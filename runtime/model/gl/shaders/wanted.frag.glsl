@@ -1,11 +1,9 @@
 #version 330 core
-// The phase sums that two pictures ask for: sharpened, averaged to a coarser raster, looked up.
+// What the eyes want, in 8-bit codes: two pictures sharpened, and averaged to a coarser raster.
 uniform sampler2D left, right;
-uniform isampler2D table;   // 256 phases
 uniform vec2 reduction;     // pixels of the box to one of the result
-uniform bool grey;
-layout(location = 0) out ivec4 wanted_left;
-layout(location = 1) out ivec4 wanted_right;
+layout(location = 0) out vec4 wanted_left;
+layout(location = 1) out vec4 wanted_right;
 #include "picture.glsl"
 
 vec3 averaged(sampler2D picture) {
@@ -24,15 +22,12 @@ vec3 averaged(sampler2D picture) {
     return reduction == floor(reduction) ? floor(mean + 0.5) : roundEven(mean);  // as OpenCV rounds
 }
 
-ivec4 phases(sampler2D picture) {
-    bool same = reduction == vec2(1.0);
-    ivec3 codes = ivec3(same ? sharp(picture, ivec2(gl_FragCoord.xy)) : averaged(picture));
-    int red = texelFetch(table, ivec2(codes.r, 0), 0).r;
-    if (grey) return ivec4(red);
-    return ivec4(red, texelFetch(table, ivec2(codes.g, 0), 0).r, texelFetch(table, ivec2(codes.b, 0), 0).r, 0);
+vec4 codes(sampler2D picture) {
+    vec3 found = reduction == vec2(1.0) ? sharp(picture, ivec2(gl_FragCoord.xy)) : averaged(picture);
+    return vec4(found / 255.0, 1.0);
 }
 
 void main() {
-    wanted_left = phases(left);
-    wanted_right = phases(right);
+    wanted_left = codes(left);
+    wanted_right = codes(right);
 }
