@@ -66,6 +66,7 @@ class PyramidLevel:
         names += [(name, CENTRE, side) for name in ("wanted", "residual", "back") for side in EYES]
         self._whole = {name: buffer(height, width, channels=channels) for name in names}
         self.rasters: tuple[PlaneRaster, ...] = ()
+        self.slope_floor = 1.0  # of a ray's weight
         self.spread: dict[int, tuple[float, float]] = {}  # per outer panel, right and down, pixels
         self._mean: dict[int, I16] = {}
 

@@ -101,9 +101,9 @@ FAULTS = {
     ),
     "panels-swapped-by-the-solver": Fault(
         "panels swapped",
-        "runtime.model.opencv_surround",
-        "self._layers[n][box.slices] =",
-        "self._layers[2 - n][box.slices] =",
+        "runtime.model.compiled.level",
+        "self._copy(self.outer[n], layers[n], boxes[n])",
+        "self._copy(self.outer[n], layers[2 - n], boxes[n])",
     ),
     "panels-swapped-by-the-shader": Fault(
         "panels swapped",

@@ -36,6 +36,7 @@ from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F32, F64, U8
 
+LEAST_PX = 8  # of a raster, either way: smaller ones end before a panel does, and OpenCV repeats their edges
 SCALE_MOST = 4.0  # between two panels; eyes that see more of one than so are served by OpenCV
 LEAST_TAP = 1e-3  # of a blur's middle one: what weighs less is left out
 TAPS_MOST = int(MOST_SPREAD * sqrt(2) * sqrt(2 * log(1 / LEAST_TAP))) + 2  # pixels to either side
@@ -56,7 +57,7 @@ class CompiledLevel(PyramidLevel):
             _Work(
                 work_row(SCALE_MOST),
                 work_tiles(),
-                np.zeros((2, residual_rows, numbers), np.int16),
+                np.zeros((4, residual_rows, numbers), np.int16),
                 np.zeros((2, numbers), np.float32),
             )
             for _ in range(rows.threads)
@@ -107,16 +108,15 @@ class CompiledLevel(PyramidLevel):
         if seen is None:
             super().show(layers, boxes)
             return
-        channels, start, _, subcode = self._constants()
+        constants, floor = self._constants(), np.float32(self.slope_floor)
         panels = [_numbers(self._in_the_mean(n)) for n in OUTER]
-        widths = [self.rasters[n].width_px * channels for n in OUTER]
+        widths = [self.rasters[n].width_px * self._channels for n in OUTER]
         wanted = [_numbers(image) for image in self.wanted]
 
         def close(first: int, last: int, work: _Work) -> None:
             place = _pixels(layers[CENTRE]), boxes[CENTRE].v0, boxes[CENTRE].u0
-            close_centre(
-                *panels, *widths, *wanted, seen, *place, first, last, channels, start, subcode, work.row, work.tiles
-            )
+            rows = first, last, *constants, floor, work.row, work.tiles
+            close_centre(*panels, *widths, *wanted, seen, *place, *rows)
 
         self._on_rows(boxes[CENTRE].height_px, close)
         for n in OUTER:
@@ -150,7 +150,7 @@ class CompiledLevel(PyramidLevel):
             *(_numbers(image) for image in self.wanted),
             self._seen_at,
             self._back_at[panel],
-            *(np.float32(value) for value in (size, *limits)),
+            *(np.float32(value) for value in (size, self.slope_floor, *limits)),
             shown,
             np.repeat(columns, channels),
             down,
@@ -189,7 +189,7 @@ class CompiledLevel(PyramidLevel):
         """Where these eyes (2, 3) see the outer panels; None where the compiled passes don't serve them."""
         if self._eyes_m is None or not np.array_equal(self._eyes_m, eyes_m):
             self._eyes_m, self._seen_at = eyes_m.copy(), None
-            if self._stack.tilt is None:
+            if self._stack.tilt is None and min(self.size) >= LEAST_PX:
                 self._lay(eyes_m)
         return self._seen_at
 
@@ -243,7 +243,7 @@ class _Work:
 
     row: F32  # `work_row`
     tiles: F32  # `work_tiles`
-    residual: I16  # (2, rows, numbers)
+    residual: I16  # (4, rows, numbers)
     rows: F32  # (2, numbers)
 
 

@@ -8,6 +8,32 @@ from numba import njit
 from runtime.model.compiled.sampling import OPTIONS, PASS, TILE, U, lack
 
 STRIP_ROWS = 16  # of a panel, that are corrected together
+WHOLE = 4096  # of a weight, in 16 bits
+
+
+@njit(**OPTIONS)
+def _weigh(wanted, row, begin, count, floor, full, weights):  # pragma: no cover
+    """The slope of sin² at wanted phase sums, 1 at its steepest, as a parabola; floor at least."""
+    slope = np.float32(4) * (np.float32(1) - floor)
+    for k in range(count):
+        turns = np.float32(wanted[row, U(k) + begin]) * (np.float32(1) / full)
+        share = turns - np.floor(turns)
+        weights[U(k)] = floor + slope * share * (np.float32(1) - share)
+
+
+@njit(**OPTIONS)
+def _best(left, right, weights, weighed, most, count, best):  # pragma: no cover
+    """The centre panel that leaves both eyes least."""
+    none, half = np.float32(0), np.float32(0.5)
+    if weighed:
+        for k in range(count):
+            lacks = left[U(k)] * weights[0, U(k)] + right[U(k)] * weights[1, U(k)]
+            best[U(k)] = lacks / (weights[0, U(k)] + weights[1, U(k)])
+        for k in range(count):
+            best[U(k)] = min(max(best[U(k)], none), most)
+    else:
+        for k in range(count):
+            best[U(k)] = min(max((left[U(k)] + right[U(k)]) * half, none), most)
 
 
 @njit(**PASS)
@@ -25,6 +51,7 @@ def correct(
     seen,
     back,
     size,
+    floor,
     low,
     high,
     shown,
@@ -44,18 +71,22 @@ def correct(
 
     this, other: the panel to be corrected and the other one, (rows, numbers) int16, of which so many numbers a row
     count, as the eyes see them in the mean; other_moved: what is left of the other for an eye that is off by as much
-    again (used where `unsure`). out: `this` and `size` times what both eyes lack, between low and high. wanted: (rows,
+    again (used where `unsure`). out: `this` and `size` times what both eyes lack, between low and high; a
+    ray weighs as much as the slope of sin² there, and `floor` at least. wanted: (rows,
     numbers) int16. seen: `Samplings` of the rear panel on the centre one for the left and the right eye, and of the
     front one; this_first: the first of this panel's. back: of the centre panel on this, for each eye. fade_columns
-    (numbers,), fade_rows (rows,): what the residual is multiplied with. residual: (2, rows, numbers) int16, row:
+    (numbers,), fade_rows (rows,): what the residual is multiplied with. residual: (4, rows, numbers) int16, row:
     `work_row`, scratch: `work_tiles`, to work in.
     """
     height, width = back.rows.shape[1], back.starts.shape[1] * channels
     centre_height, centre_width = seen.rows.shape[1], seen.starts.shape[1] * channels
     size_of_tile = TILE // channels * channels
     part, even, left, right, moved = scratch[0:1], scratch[1:2], scratch[2], scratch[3], scratch[4:6]
-    none, most, half = np.float32(0), np.float32(full), np.float32(0.5)
-    codes = np.float32(1) / step
+    none, one, most, half = np.float32(0), np.float32(1), np.float32(full), np.float32(0.5)
+    codes, weight_whole, weights = one / step, np.float32(WHOLE), scratch[6:8]
+    for k in range(TILE):
+        weights[0, U(k)] = one
+        weights[1, U(k)] = one
     for v0 in range(share * STRIP_ROWS, height, shares * STRIP_ROWS):
         v1 = min(v0 + STRIP_ROWS, height)
         r0, r1 = centre_height, 0
@@ -92,26 +123,70 @@ def correct(
                             moved[side],
                         )
                 begin, down, line = U(at), fade_rows[U(r)], U(r - r0)
-                for k in range(count):
-                    part[0, U(k)] = min(max((left[U(k)] + right[U(k)]) * half, none), most)
+                if floor < one:
+                    _weigh(left_wanted, U(r), begin, count, floor, most, weights[0])
+                    _weigh(right_wanted, U(r), begin, count, floor, most, weights[1])
+                _best(left, right, weights, floor < one, most, count, part[0])
                 lefts, rights = (moved[0], moved[1]) if unsure else (left, right)
                 for k in range(count):
-                    weight = fade_columns[U(k) + begin] * down
+                    weight = fade_columns[U(k) + begin] * down * weights[0, U(k)]
                     residual[0, line, U(k) + begin] = np.int16(np.int32((lefts[U(k)] - part[0, U(k)]) * weight))
                 for k in range(count):
-                    weight = fade_columns[U(k) + begin] * down
+                    weight = fade_columns[U(k) + begin] * down * weights[1, U(k)]
                     residual[1, line, U(k) + begin] = np.int16(np.int32((rights[U(k)] - part[0, U(k)]) * weight))
+                if floor < one:
+                    for k in range(count):
+                        residual[2, line, U(k) + begin] = np.int16(np.int32(weights[0, U(k)] * weight_whole))
+                    for k in range(count):
+                        residual[3, line, U(k) + begin] = np.int16(np.int32(weights[1, U(k)] * weight_whole))
         for v in range(v0, v1):
             for tile in range(back.tiles.shape[1] - 1):
                 count = min(size_of_tile, width - tile * size_of_tile)
                 begin, down = U(tile * size_of_tile), U(v)
                 lack(even, 0, 0, residual[0], r0, centre_width, 0, v, tile, count, back, channels, none, row, part[0])
                 lack(part, 0, 0, residual[1], r0, centre_width, 1, v, tile, count, back, channels, none, row, left)
+                if floor < one:
+                    lack(
+                        even,
+                        0,
+                        0,
+                        residual[2],
+                        r0,
+                        centre_width,
+                        0,
+                        v,
+                        tile,
+                        count,
+                        back,
+                        channels,
+                        weight_whole,
+                        row,
+                        part[0],
+                    )
+                    lack(
+                        part,
+                        0,
+                        0,
+                        residual[3],
+                        r0,
+                        centre_width,
+                        1,
+                        v,
+                        tile,
+                        count,
+                        back,
+                        channels,
+                        weight_whole,
+                        row,
+                        right,
+                    )
+                    for k in range(count):
+                        left[U(k)] *= np.float32(-2) * weight_whole / right[U(k)]
                 if shown:
                     for k in range(count):
                         code = min(max(np.float32(this[down, U(k) + begin]) - left[U(k)] * size, low), high)
-                        whole = np.int32(code * codes + half)
-                        out[down, U(k) + begin] = np.int16(np.int32(np.float32(whole) * step))
+                        shown_code = np.int32(code * codes + half)
+                        out[down, U(k) + begin] = np.int16(np.int32(np.float32(shown_code) * step))
                 else:
                     for k in range(count):
                         code = min(max(np.float32(this[down, U(k) + begin]) - left[U(k)] * size, low), high)
@@ -196,7 +271,9 @@ def close_centre(
     last,
     channels,
     start,
+    full,
     step,
+    floor,
     row,
     scratch,
 ):  # pragma: no cover
@@ -207,7 +284,7 @@ def close_centre(
     width = seen.starts.shape[1] * channels
     size_of_tile = TILE // channels * channels
     part, left, right = scratch[0:1], scratch[2], scratch[3]
-    share, half, none, most = np.float32(0.5) / step, np.float32(0.5), np.float32(0), np.float32(255)
+    share, half, weights = np.float32(1) / step, np.float32(0.5), scratch[6:8]
     for v in range(first, last):
         for tile in range(seen.tiles.shape[1] - 1):
             at = tile * size_of_tile
@@ -216,8 +293,12 @@ def close_centre(
                 wanted, lacks = (left_wanted, left) if side == 0 else (right_wanted, right)
                 lack(wanted, v, at, rear, 0, rear_width, side, v, tile, count, seen, channels, start, row, part[0])
                 lack(part, 0, 0, front, 0, front_width, side + 2, v, tile, count, seen, channels, start, row, lacks)
+            if floor < np.float32(1):
+                _weigh(left_wanted, U(v), U(at), count, floor, full, weights[0])
+                _weigh(right_wanted, U(v), U(at), count, floor, full, weights[1])
+            _best(left, right, weights, floor < np.float32(1), full, count, part[0])
             for k in range(count):
-                left[U(k)] = min(max((left[U(k)] + right[U(k)]) * share + half, none), most)
+                left[U(k)] = part[0, U(k)] * share + half
             row_out, begin = U(v + v0), U(u0 + at // channels)
             if channels == 3:
                 for u in range(count // 3):

@@ -211,5 +211,5 @@ def work_row(scale: float) -> F32:
 
 
 def work_tiles() -> F32:
-    """(6, numbers): tiles to work in, the second all zeros."""
-    return np.zeros((6, TILE + SLACK), np.float32)
+    """(8, numbers): tiles to work in, the second all zeros."""
+    return np.zeros((8, TILE + SLACK), np.float32)
