@@ -6,12 +6,14 @@ import math
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 INPUTS = ("left", "right", "waves", "shifted_waves", "spectrum", "modes_in", "doubt")
 OUTPUTS = ("rear", "front", "check")
 BLOCK_ROWS = 8  # rows that are transformed together; the raster has whole blocks
 FULL = 255 * 16  # one panel's range in the units of inputs and outputs: sixteenths of an 8-bit code
 BOX = 0.5  # every outer panel starts in the middle of its range, and can go so far from there
+IN_SCALE = 64  # codes in the waves' unit on the way in: in codes they would be too large for half precision
 
 
 class SpectralSolver(nn.Module):
@@ -31,11 +33,21 @@ class SpectralSolver(nn.Module):
         self.cell_px, self.iterations = cell_px, iterations
         columns, w = _fourier(2 * cell_px)
         rows, v = _cosines(BLOCK_ROWS)
-        # Row by row of the block, then column by column of the cell.
-        self.patterns: Tensor
+        self.columns: Tensor
+        self.rows: Tensor
+        self.rows_in: Tensor
+        self.rows_out: Tensor
         self.w: Tensor
         self.v: Tensor
-        self.register_buffer("patterns", torch.kron(rows, columns), persistent=False)
+        self.register_buffer("columns", columns, persistent=False)
+        self.register_buffer("rows", rows, persistent=False)
+        # Difference and sum along with the block's rows: of the eyes on the way in, of g and h on the way out.
+        into = torch.cat([torch.cat([-rows, rows], dim=1), torch.cat([rows, rows], dim=1)]) / IN_SCALE
+        back = rows.transpose(0, 1) * FULL
+        out = torch.stack([torch.cat([-back, back], dim=1), torch.cat([back, back], dim=1)])
+        self.register_buffer("rows_in", into, persistent=False)
+        self.register_buffer("rows_out", out, persistent=False)
+        # Patterns row by row of the block, then column by column of the cell.
         self.register_buffer("w", w.repeat(BLOCK_ROWS), persistent=False)
         self.register_buffer("v", v.repeat_interleave(2 * cell_px), persistent=False)
         self.log_floor = nn.Parameter(torch.log(torch.tensor([0.01, 0.2])))  # λ of g and of h
@@ -77,9 +89,9 @@ class SpectralSolver(nn.Module):
         doubt: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """`panels` in 16-bit codes, and one number that is finite where all that was worked out is."""
-        rear, front = self.panels(left, right, waves, shifted_waves, spectrum, modes_in, doubt)
-        check = (rear.mean() + front.mean()).reshape(1)
-        codes = (torch.clamp(torch.round(x * FULL), 0, FULL).to(torch.int16) for x in (rear, front))
+        rear, front, check = self._solved(left, right, waves, shifted_waves, spectrum, modes_in, doubt, added=0.5)
+        # Nothing is below zero once it is clamped, and a cast cuts off what follows the point: the half makes it round.
+        codes = (_by_rows(torch.clamp(x, 0, FULL + 0.5), like=left).to(torch.int16) for x in (rear, front))
         return (*codes, check)  # type: ignore[return-value]
 
     def panels(
@@ -98,53 +110,124 @@ class SpectralSolver(nn.Module):
         (cells + 1, cells + 1) V, shifted_waves Ũ, spectrum (cells + 1,) s and modes_in (cells + 1, cells) U^T
         (`runtime.model.chain.chain_modes`); doubt (3,): c columns, r rows, e columns.
         """
+        rear, front, _ = self._solved(left, right, waves, shifted_waves, spectrum, modes_in, doubt, added=0.0)
+        return _by_rows(rear, like=left) / FULL, _by_rows(front, like=left) / FULL
+
+    def _solved(
+        self,
+        left: Tensor,
+        right: Tensor,
+        waves: Tensor,
+        shifted_waves: Tensor,
+        spectrum: Tensor,
+        modes_in: Tensor,
+        doubt: Tensor,
+        *,
+        added: float,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Rear and front panel (1, block's rows, all else), codes with a number added to them, and the check.
+
+        A row of a cell stays in one piece from end to end, those of all blocks beside each other: moving it is cheap,
+        and the products with the rows' and the chain's matrices are few and large.
+        """
         channels = left.shape[2] // (2 * self.cell_px)
-        sides = [self._packed(side.to(torch.float32) * (1.0 / FULL), channels) for side in (left, right)]
         numerator, denominator, gain_h = self.gains(spectrum, doubt)
-        # The eyes' difference, and its counterpart by the centre's parallax, as waves of chain and block.
-        difference = torch.matmul(modes_in, self._to_patterns(sides[1] - sides[0]))
-        counterpart = torch.matmul(modes_in, self._to_patterns(sides[1] + sides[0]))
-        wanted = numerator[..., None] * difference
-        h = self._to_pixels(torch.matmul(shifted_waves, gain_h[..., None] * counterpart))
+        numerator, gain_h = numerator * (IN_SCALE / FULL), gain_h * (IN_SCALE / FULL)
+        sides = torch.cat([_by_block_rows(left), _by_block_rows(right)]).to(torch.float32)
+        bias = torch.full((BLOCK_ROWS,), BOX * FULL + added, device=left.device)
         if self.iterations == 0:
-            g = self._to_pixels(torch.matmul(waves, wanted / denominator[..., None]))
-        else:
-            g = self._boxed(wanted, denominator, waves)
-        return self._unpacked(BOX + h - g, channels), self._unpacked(BOX + h + g, channels)
+            both = self._waved(sides, self.rows_in, modes_in)
+            both = self._in_columns(both, torch.cat([numerator / denominator, gain_h]), channels)
+            both = both.reshape(2, BLOCK_ROWS, both.shape[1], -1)
+            both = torch.matmul(torch.stack([waves, shifted_waves])[:, None], both).reshape(1, 2 * BLOCK_ROWS, -1)
+            # As a convolution, a product with a matrix adds and clamps while its numbers are at hand.
+            rear, front = (functional.conv1d(both, rows[..., None], bias) for rows in self.rows_out)
+            return rear, front, _size(both)
+        difference, counterpart = (self._waved(sides, rows, modes_in) for rows in self.rows_in.chunk(2))
+        h = self._in_columns(counterpart, gain_h, channels)
+        h = torch.matmul(shifted_waves, h.reshape(BLOCK_ROWS, h.shape[1], -1)).reshape(1, BLOCK_ROWS, -1)
+        g, size = self._boxed(difference, numerator, denominator, waves, channels)
+        check = _size(h) + size
+        h = functional.conv1d(h, self.rows_out[1, :, BLOCK_ROWS:, None], bias)
+        return h - g, h + g, check
 
-    def _boxed(self, wanted: Tensor, denominator: Tensor, waves: Tensor) -> Tensor:
-        """Alternating directions: the quadratic in the modes, the panels' range in the pixels."""
-        back = waves.transpose(0, 1)
-        # It starts from nothing: the first turn is the regularised solution.
-        z = u = torch.zeros(())
+    def _waved(self, sides: Tensor, rows: Tensor, modes_in: Tensor) -> Tensor:
+        """Waves (rows' waves, modes, blocks, 2K·C) of both eyes' (2 of the block's rows, cells, blocks, 2K·C)."""
+        count, cells = rows.shape[0], sides.shape[1]
+        x = torch.matmul(rows, sides.reshape(2 * BLOCK_ROWS, -1)).reshape(count, cells, -1)
+        return torch.matmul(modes_in, x).reshape(count, -1, *sides.shape[2:])
+
+    def _boxed(
+        self, difference: Tensor, numerator: Tensor, denominator: Tensor, waves: Tensor, channels: int
+    ) -> tuple[Tensor, Tensor]:
+        """Alternating directions: the quadratic in the modes, the panels' range in the pixels. g in codes, its check.
+
+        With z = clamp(v), a turn solves the quadratic near 2z - v for x, and makes v + relaxation·(x - z) the next v.
+        All but the clamp is linear and done in the modes; of the pixels z alone goes back there.
+        """
+        count, modes, _, row = difference.shape
+        same = _same(channels, like=self.columns)
+        to_waves = (self.columns.transpose(0, 1)[:, None, :, None] * same).reshape(row, row)
+        difference = torch.matmul(difference, to_waves)
+        v = z = difference  # used from the second turn on: the first starts from nothing, at the regularised solution
         for k in range(self.iterations):
-            penalty, relaxation = torch.exp(self.log_penalty[k]), self.relaxation[k]
-            target = wanted
+            penalty, relaxation, last = torch.exp(self.log_penalty[k]), self.relaxation[k], k == self.iterations - 1
+            gain = relaxation / (denominator + penalty)
+            turned = difference * _along_rows(gain * numerator, channels)
             if k:
-                target = wanted + penalty * torch.matmul(back, self._to_patterns(z - u))
-            x = self._to_pixels(torch.matmul(waves, target / (denominator + penalty)[..., None]))
-            moved = relaxation * x + ((1 - relaxation) * z + u if k else 0.0)
-            z = torch.clamp(moved, -BOX, BOX)
-            u = moved - z
-        return z + 0.0 * u  # no number that is not finite is lost in the clamp
+                turned = turned + v * _along_rows(1 - penalty * gain, channels)
+                turned = turned + z * _along_rows(2 * penalty * gain - relaxation, channels)
+            v = turned
+            along = torch.matmul(v, to_waves.transpose(0, 1)).reshape(count, modes, -1)
+            along = torch.matmul(waves, along)
+            unit = FULL if last else 1
+            x = torch.matmul(self.rows.transpose(0, 1) * unit, along.reshape(count, -1))
+            x = torch.clamp(x, -BOX * unit, BOX * unit)
+            if not last:
+                z = torch.matmul(self.rows, x).reshape(count, modes, -1)
+                z = torch.matmul(torch.matmul(waves.transpose(0, 1), z).reshape(difference.shape), to_waves)
+        return x, _size(along)  # what isn't finite stays in v from turn to turn, whatever the clamp makes of it
 
-    def _packed(self, image: Tensor, channels: int) -> Tensor:
-        """(rows, cells, 2K·C) to (block's pixels, cells, blocks·C)."""
-        cells, columns = image.shape[1], 2 * self.cell_px
-        x = image.reshape(-1, BLOCK_ROWS, cells, columns, channels).permute(1, 3, 2, 0, 4)
-        return x.reshape(BLOCK_ROWS * columns, cells, -1)
+    def _in_columns(self, x: Tensor, gains: Tensor, channels: int) -> Tensor:
+        """x (n rows' waves, modes, blocks, 2K·C), each of the columns' waves in it times its gain (n·2K, modes).
 
-    def _unpacked(self, x: Tensor, channels: int) -> Tensor:
-        """The other way round."""
-        cells, columns = x.shape[1], 2 * self.cell_px
-        image = x.reshape(BLOCK_ROWS, columns, cells, -1, channels).permute(3, 0, 2, 1, 4)
-        return image.reshape(-1, cells, columns * channels)
+        By one matrix for every wave of the rows and mode: to the columns' waves, times the gains, and back.
+        """
+        count, modes, _, row = x.shape
+        # For each of the columns' waves, what leaves of a cell's row only its part along it.
+        parts = self.columns[:, :, None, None, None] * self.columns[:, None, None, :, None]
+        parts = (parts * _same(channels, like=parts)).reshape(2 * self.cell_px, -1)
+        matrices = torch.matmul(gains.reshape(count, -1, modes).transpose(1, 2), parts)
+        return torch.matmul(x, matrices.reshape(count, modes, row, row))
 
-    def _to_patterns(self, x: Tensor) -> Tensor:
-        return torch.matmul(self.patterns, x.reshape(x.shape[0], -1)).reshape(x.shape)
 
-    def _to_pixels(self, x: Tensor) -> Tensor:
-        return torch.matmul(self.patterns.transpose(0, 1), x.reshape(x.shape[0], -1)).reshape(x.shape)
+def _same(channels: int, *, like: Tensor) -> Tensor:
+    """(C, 1, C): 1 where both are one channel, else 0."""
+    one = torch.arange(channels, device=like.device)
+    return (one[:, None, None] == one).to(torch.float32)
+
+
+def _along_rows(gains: Tensor, channels: int) -> Tensor:
+    """(block's rows' waves · 2K, modes) to (block's rows' waves, modes, 1, 2K·C): one for every channel."""
+    gains = gains.reshape(BLOCK_ROWS, -1, gains.shape[1]).transpose(1, 2)[..., None]
+    return gains.expand(-1, -1, -1, channels).reshape(BLOCK_ROWS, gains.shape[1], 1, -1)
+
+
+def _by_block_rows(image: Tensor) -> Tensor:
+    """(rows, cells, 2K·C) to (block's rows, cells, blocks, 2K·C)."""
+    return image.reshape(-1, BLOCK_ROWS, *image.shape[1:]).permute(1, 2, 0, 3)
+
+
+def _by_rows(x: Tensor, *, like: Tensor) -> Tensor:
+    """The other way round, from (block's rows, all else), for one cell more than an input has."""
+    cells, row = like.shape[1] + 1, like.shape[2]
+    return x.reshape(BLOCK_ROWS, cells, -1, row).permute(2, 0, 1, 3).reshape(-1, cells, row)
+
+
+def _size(x: Tensor) -> Tensor:
+    """(1,): finite where all of x is, and small enough to be so after matrices of moderate numbers."""
+    size: Tensor = torch.linalg.vector_norm(x)  # squares grow too large long before what is worked out of them does
+    return size.reshape(1)
 
 
 def _fourier(size: int) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,126 @@
+"""The shipped network: what it works out, beside the same steps written plainly, and the check that goes with it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+from model_export.network import BOX, FULL, SpectralSolver  # noqa: E402
+from runtime.model.chain import chain_modes  # noqa: E402
+from runtime.model.onnx_runtime import onnxruntime  # noqa: E402
+from runtime.model.predictor import SHIPPED, model_path  # noqa: E402
+from runtime.records import F64  # noqa: E402
+
+MODES = ("waves", "shifted_waves", "spectrum", "modes_in")
+K = 4  # columns
+BLOCK = 8  # rows
+
+
+def feeds_of(*, cells: int = 9, blocks: int = 3, channels: int = 3, most: int = 1500) -> dict[str, np.ndarray]:
+    random = np.random.default_rng(cells + channels)
+    sides = random.integers(-most, most + 1, (2, blocks * BLOCK, cells, 2 * K * channels)).astype(np.int16)
+    modes = dict(zip(MODES, chain_modes(cells), strict=True))
+    return {"left": sides[0], "right": sides[1], **modes, "doubt": np.array([0.2, 0.3, 0.4], np.float32)}
+
+
+def solver(iterations: int) -> SpectralSolver:
+    """With other steps at every turn, so that none can stand for another."""
+    net = SpectralSolver(K, iterations)
+    with torch.no_grad():
+        net.log_penalty += 0.3 * torch.arange(iterations)
+        net.relaxation -= 0.1 * torch.arange(iterations)
+    return net.eval()
+
+
+def answers(net: SpectralSolver, feeds: dict[str, np.ndarray]) -> tuple[np.ndarray, ...]:
+    with torch.no_grad():
+        return tuple(x.numpy() for x in net(*map(torch.from_numpy, feeds.values())))
+
+
+def plainly(net: SpectralSolver, feeds: dict[str, np.ndarray]) -> tuple[F64, F64]:
+    """Rear and front panel (rows, cells + 1, 2K·C), not clamped: one transform after another, in double precision."""
+    left, right, v, shifted, _, modes_in, _ = (np.asarray(x, np.float64) for x in feeds.values())
+    spectrum, unsure = torch.from_numpy(feeds["spectrum"]), torch.from_numpy(feeds["doubt"])
+    with torch.no_grad():
+        gains = (x.double().reshape(BLOCK, 2 * K, -1).numpy() for x in net.gains(spectrum, unsure))
+        penalties, relaxations = net.log_penalty.exp().double().numpy(), net.relaxation.double().numpy()
+    numerator, denominator, gain_h = (x.transpose(0, 2, 1)[:, :, :, None, None] for x in gains)  # rows, modes, columns
+    at = np.arange(2 * K)
+    turns = [np.exp(2j * np.pi * k * at / (2 * K)) * np.sqrt((2 - (k in (0, K))) / (2 * K)) for k in range(K + 1)]
+    columns = np.stack(
+        [turns[0].real, *(p for k in range(1, K) for p in (turns[k].real, turns[k].imag)), turns[K].real]
+    )
+    rows = np.cos(np.pi * at[:BLOCK, None] * (np.arange(BLOCK) + 0.5) / BLOCK) * np.sqrt(2 / BLOCK)
+    rows[0] /= np.sqrt(2)
+
+    def split(image: np.ndarray) -> F64:
+        return image.reshape(-1, BLOCK, image.shape[1], 2 * K, image.shape[2] // (2 * K)).astype(np.float64)
+
+    def into(image: F64, chain: F64) -> F64:
+        return np.einsum("pr,kc,qu,brcus->pkqbs", rows, chain, columns, image, optimize=True)
+
+    def out(waves: F64, chain: F64) -> F64:
+        return np.einsum("pr,ck,qu,pkqbs->brcus", rows, chain, columns, waves, optimize=True)
+
+    wanted = numerator * into(split(right - left) / FULL, modes_in)
+    h = out(gain_h * into(split(right + left) / FULL, modes_in), shifted)
+    g = out(wanted / denominator, v)
+    z = u = np.zeros_like(g)
+    for penalty, relaxation in zip(penalties, relaxations, strict=True):
+        x = out((wanted + penalty * into(z - u, v.T)) / (denominator + penalty), v)
+        moved = relaxation * x + (1 - relaxation) * z + u
+        g = z = np.clip(moved, -BOX, BOX)
+        u = moved - z
+    rear, front = (image.reshape(left.shape[0], -1, left.shape[2]) for image in (BOX + h - g, BOX + h + g))
+    return rear, front
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("iterations", [0, 1, 4])
+def test_it_works_out_what_the_same_steps_do_one_by_one(iterations: int, channels: int) -> None:
+    net, feeds = solver(iterations), feeds_of(channels=channels)
+    wanted = plainly(net, feeds)
+    with torch.no_grad():
+        panels = net.panels(*map(torch.from_numpy, feeds.values()))
+    for found, want in zip(panels, wanted, strict=True):
+        assert np.abs(found.numpy() - want).max() < 1e-5
+    assert not iterations or max(np.abs(want - 0.5).max() for want in wanted) > BOX  # the range is felt
+    rear, front, check = answers(net, feeds)
+    assert np.isfinite(check).all() and check.shape == (1,)
+    for found, want in zip((rear, front), wanted, strict=True):
+        assert found.dtype == np.int16
+        assert np.abs(found - np.clip(want, 0, 1) * FULL).max() < 0.5 + 0.02  # rounded, not cut off
+
+
+@pytest.mark.parametrize("iterations", [0, 3])
+def test_the_least_and_the_largest_codes_are_reached_and_not_passed(iterations: int) -> None:
+    for panel in answers(solver(iterations), feeds_of(most=32767))[:2]:
+        assert (panel.min(), panel.max()) == (0, FULL)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_number_that_is_not_finite_is_told_wherever_it_comes_in(name: str, bad: float) -> None:
+    """One of thousands, in any of the inputs that can have one."""
+    ort = onnxruntime()
+    session = ort.InferenceSession(str(model_path(name)), providers=["CPUExecutionProvider"])
+    good = feeds_of()
+    assert np.isfinite(session.run(["check"], good)[0]).all()
+    random = np.random.default_rng(3)
+    for field in ("waves", "shifted_waves", "modes_in", "doubt"):
+        for at in random.integers(0, good[field].size, 6):
+            spoilt: dict[str, Any] = {key: value.copy() for key, value in good.items()}
+            spoilt[field].flat[at] = bad
+            assert not np.isfinite(session.run(["check"], spoilt)[0]).any(), (field, at)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("turn", [0, 1, 2])
+def test_a_turn_that_is_not_finite_is_not_lost_in_the_clamp(turn: int, bad: float) -> None:
+    net = solver(3)
+    with torch.no_grad():
+        net.relaxation[turn] = bad
+    assert not np.isfinite(answers(net, feeds_of())[2]).any()
