@@ -14,6 +14,7 @@ import typer.main
 
 from runtime.commands.app import app
 from runtime.errors import InputError
+from runtime.model.loops import inner_loops
 
 HEADLESS = "run --headless --max-speed --frames 1 --scale 0.1 --out {out}"
 EYES = "--left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0 --fov 40"
@@ -29,6 +30,7 @@ def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
+    inner_loops()  # compiled before: that is told, once on a machine
     for name in ("fifo.png", "fifo.toml", "fifo.json", "fifo.mcap", "fifo.onnx", "fifo.csv", "fifo.pth"):
         os.mkfifo(tmp_path / name)
     rows = "0.1,0.1,0.6,0.6,0.1,0.2\n0.2,0.1,0.6,0.6,0.2,0.2\n0.1,0.3,0.7,0.7,0.1,0.4\n"

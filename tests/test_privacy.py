@@ -20,6 +20,7 @@ CALLS = (
 LINE = re.compile(r"^\d+\s+(\w+)\((.*)\)\s+= (-?\d+)")
 QUOTED = re.compile(r'"((?:[^"\\]|\\.)*)"')
 WRITES = re.compile(r"O_WRONLY|O_RDWR|O_CREAT|O_TRUNC|O_APPEND")
+KEPT = Path(".cache/phasestack/compiled")  # in the home: inner loops, compiled once (docs/dependencies.md)
 NAME_SERVICE = "/var/run/nscd/socket"  # the C library asks it for users and groups
 
 
@@ -40,6 +41,11 @@ def run_traced(folder: Path, *arguments: str) -> tuple[list[str], list[str]]:
     done = subprocess.run(traced, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     written, sockets = [], []
+    kept = {str(home / part) for part in (KEPT, *KEPT.parents)} - {str(home)}
+
+    def is_kept(name: str) -> bool:
+        return name in kept or name.startswith(f"{home / KEPT}/")
+
     for line in trace.read_text(errors="replace").splitlines():
         match = LINE.match(line)
         if match is None or int(match[3]) < 0:
@@ -51,9 +57,9 @@ def run_traced(folder: Path, *arguments: str) -> tuple[list[str], list[str]]:
                 sockets.append(line)
         elif call not in ("open", "openat") or WRITES.search(given):
             name = next(iter(reversed(QUOTED.findall(given))), "")
-            if not name.startswith((f"{folder}/out", "/dev/", "/proc/")):
+            if not (name.startswith((f"{folder}/out", "/dev/", "/proc/")) or is_kept(name)):
                 written.append(line)
-    left = [str(path) for place in (home, scratch) for path in place.rglob("*")]
+    left = [str(path) for place in (home, scratch) for path in place.rglob("*") if not is_kept(str(path))]
     return written + left, sockets
 
 
