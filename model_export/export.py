@@ -107,6 +107,7 @@ def spectral_file(
         emphasis=recipe.emphasis,
         interpolation=recipe.interpolation,
         least_spread_px=recipe.least_spread_px,
+        slope_floor=recipe.slope_floor,
         steps=recipe.steps,
     )
     return with_contract(data, contract)

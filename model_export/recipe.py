@@ -11,7 +11,7 @@ from pydantic import Field
 
 from runtime.config import Section, validated
 from runtime.errors import InputError
-from runtime.model.contract import LEAST_SPREAD_PX, LeastSpread, Steps, TrainedFor
+from runtime.model.contract import LEAST_SPREAD_PX, LeastSpread, SlopeFloor, Steps, TrainedFor
 from runtime.model.predictor import SHIPPED
 from runtime.support import foreign
 
@@ -52,6 +52,7 @@ class Recipe(Section):
         "makes twice as fine; cubic: its kernel on small rasters, and as finer on large ones",
     )
     least_spread_px: LeastSpread = LEAST_SPREAD_PX
+    slope_floor: SlopeFloor = 1.0
     steps: Annotated[Steps, Field(min_length=1)]
     training: Training = Training()
     weights: dict[str, Any] | None = Field(None, description="state_dict as nested lists; none: the analytic start")

@@ -48,6 +48,10 @@ LeastSpread = Annotated[
         "one standard deviation",
     ),
 ]
+SlopeFloor = Annotated[
+    float,
+    Field(gt=0, le=1, description="corrections weigh a ray by the slope of sin² there, and by so much at least"),
+]
 
 
 class TrainedFor(Section):
@@ -107,6 +111,7 @@ class Contract(Section):
         "makes twice as fine; cubic: its kernel on small rasters, and as finer on large ones",
     )
     least_spread_px: LeastSpread = LEAST_SPREAD_PX
+    slope_floor: SlopeFloor = 1.0
     steps: Steps = ()
 
     @model_validator(mode="after")

@@ -74,6 +74,7 @@ class OpenCvSurround:
         self._pictures = self._rows.map(prepared, arrays)
         for level in self._workspace.levels.values():
             self._fill_phases(level.wanted)
+            level.slope_floor = self._contract.slope_floor
             level.set_eye_sigma(
                 problem.eyes_m, eye_sigma_mm=problem.eye_sigma_mm, least_px=self._contract.least_spread_px
             )

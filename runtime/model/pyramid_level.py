@@ -31,6 +31,8 @@ OUTER = (REAR, FRONT)
 EYES = (0, 1)
 START = FULL // 2  # of every outer panel: the middle of its range
 MOST_SPREAD = 8.0  # pixels
+MOST = 32767  # what 16 bits hold
+WHOLE_WEIGHT = 1 << 14  # of weights that are held in 16 bits
 NEUTRAL = (START + SUBCODE // 2) // SUBCODE  # the same in 8-bit codes, rounded as what is shown is
 
 
@@ -68,6 +70,7 @@ class PyramidLevel:
         self.rasters: tuple[PlaneRaster, ...] = ()
         self.slope_floor = 1.0  # of a ray's weight
         self.spread: dict[int, tuple[float, float]] = {}  # per outer panel, right and down, pixels
+        self.slope_floor = 1.0  # the least weight of a ray; 1: all weigh alike (`_slope`)
         self._mean: dict[int, I16] = {}
 
     @property
@@ -113,6 +116,12 @@ class PyramidLevel:
                 np.subtract(wanted[side][rows], seen[REAR, side][rows], out=residual[side][rows])
                 np.subtract(residual[side][rows], seen[FRONT, side][rows], out=residual[side][rows])
             left, right = residual[0][rows], residual[1][rows]
+            if self.slope_floor < 1:
+                slopes = [self._slope(image[rows]) for image in wanted]
+                middle = _weighed_best((left, right), slopes)
+                for image, slope in zip((left, right), slopes, strict=True):
+                    image[...] = np.rint(slope * (image - middle))
+                return
             np.add(left, right, out=best)
             np.right_shift(best, 1, out=best)
             np.clip(best, 0, FULL, out=best)
@@ -125,13 +134,19 @@ class PyramidLevel:
         """Change one outer panel by what both eyes lack along the rays through each of its pixels."""
         back, outer = self._back[panel], self.outer[panel]
         other = REAR if panel == FRONT else FRONT
+        slopes = [self._slope(image) for image in self.wanted] if self.slope_floor < 1 else None
         for side, eye_m in enumerate(eyes_m):
             residual = self.residual[side]
             if self.spread:
                 # With m of a wave left, the noise is |front - m²·rear|²(1 - m²): its gradient joins the mean's.
                 seen = self.seen[other, side]
-                residual = residual + seen - self._blurred(seen, panel, twice=True)
+                moving = seen - self._blurred(seen, panel, twice=True)
+                if slopes is not None:
+                    moving = np.rint(slopes[side] * moving).astype(np.int16)
+                residual = residual + moving
             self._between(residual, eye_m, of=CENTRE, on=panel, out=back[side])
+        if slopes is not None:
+            self._divide_by_weights(panel, eyes_m, slopes)
         if self.spread:
             noise = outer - self._blurred(self._mean[panel], panel)
             back[0][...] = self._blurred(back[0] + back[1], panel) - 2 * noise
@@ -146,6 +161,27 @@ class PyramidLevel:
             _clamp_and_quantise(change, outer[rows], shown=shown)
 
         self._each(panel, work)
+
+    def _divide_by_weights(self, panel: int, eyes_m: F64, slopes: Sequence[F32]) -> None:
+        """Of what comes back to an outer panel, by the mean weight of the two rays through each of its pixels."""
+        back, total = self._back[panel], np.float32(0)
+        for eye_m, slope in zip(eyes_m, slopes, strict=True):
+            held = np.rint(slope * WHOLE_WEIGHT).astype(np.int16)
+            there = buffer(*back[0].shape[:2], channels=self._channels)
+            self._between(held, eye_m, of=CENTRE, on=panel, out=there, outside=WHOLE_WEIGHT)
+            total = total + there.astype(np.float32)
+        lacked = (back[0].astype(np.float32) + back[1]) * (2 * WHOLE_WEIGHT) / total
+        back[0][...] = np.clip(np.rint(lacked), -MOST, MOST)
+        back[1][...] = 0
+
+    def _slope(self, wanted: I16) -> F32:
+        """The weight of rays by the phase sums that are wanted of them: `slope_floor` to 1.
+
+        An eye sees sin² of the phase: before white and black that is level, so that errors there are not seen.
+        """
+        part = wanted.astype(np.float32) / FULL
+        part -= np.floor(part)
+        return np.asarray(self.slope_floor + (1 - self.slope_floor) * 4 * part * (1 - part), np.float32)
 
     def set_panel(
         self, panel: int, codes: I16, codes_from_raster: F64, *, columns: ColumnLaw = EVEN_COLUMNS, shown: bool
@@ -173,6 +209,11 @@ class PyramidLevel:
         seen, wanted = self.seen, self.wanted
 
         def work(rows: slice, best: I16) -> None:
+            if self.slope_floor < 1:
+                lacks = [wanted[side][rows] - seen[REAR, side][rows] - seen[FRONT, side][rows] for side in EYES]
+                middle = _weighed_best(lacks, [self._slope(image[rows]) for image in wanted])
+                out[rows] = np.floor(middle / SUBCODE + 0.5)
+                return
             np.add(wanted[0][rows], wanted[1][rows], out=best)
             for part in seen.values():
                 np.subtract(best, part[rows], out=best)
@@ -212,10 +253,12 @@ class PyramidLevel:
         assert isinstance(parent, np.ndarray)
         return parent[: self.rasters[on].height_px, : self.rasters[on].width_px]
 
-    def _between(self, image: I16, eye_m: F64, *, of: int, on: int, out: I16) -> I16:
-        """Panel `of`'s pixels on panel `on`'s raster, as an eye sees them in line."""
+    def _between(self, image: I16, eye_m: F64, *, of: int, on: int, out: I16, outside: int | None = None) -> I16:
+        """Panel `of`'s pixels on panel `on`'s raster, as an eye sees them in line. outside: what is beside them."""
+        if outside is None:
+            outside = 0 if of == CENTRE else START
         matrix = pixels_in_line(self._stack, self.rasters, eye_m, of=of, on=on)
-        return resample(image, image_from_result=matrix, out=out, outside=0 if of == CENTRE else START)
+        return resample(image, image_from_result=matrix, out=out, outside=outside)
 
 
 def pixels_in_line(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: F64, *, of: int, on: int) -> F64:
@@ -262,6 +305,12 @@ def coarser(raster: PlaneRaster, reduction: int) -> PlaneRaster:
         width_px=width,
         height_px=height,
     )
+
+
+def _weighed_best(lacks: Sequence[I16], slopes: Sequence[F32]) -> F32:
+    """The best centre panel for what both eyes lack there by so much weight each, in sixteenths of a code."""
+    left, right = (slope * lack for slope, lack in zip(slopes, lacks, strict=True))
+    return np.asarray(np.clip((left + right) / (slopes[0] + slopes[1]), 0, FULL), np.float32)
 
 
 def _clamp_and_quantise(codes: I16, out: I16, *, shown: bool) -> None:

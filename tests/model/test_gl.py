@@ -82,6 +82,14 @@ def both(name: str, stack: PanelStack, gl: GlBackend) -> tuple[UnrolledPredictor
     return opencv, UnrolledPredictor(opencv.session, stack, surroundings=gl)
 
 
+def sloped(predictors: tuple[UnrolledPredictor, UnrolledPredictor], floor: float) -> tuple[UnrolledPredictor, ...]:
+    """Both, with rays that weigh by the slope of sin² and by so much at least; they share a session."""
+    session = predictors[0].session
+    session.contract = session.contract.model_copy(update={"slope_floor": floor})
+    predictors[0].surround_with(OpenCvBackend())  # made anew: with this contract
+    return predictors
+
+
 def cards(pair: F64, stack: PanelStack, *, grey: bool = False) -> tuple[U8, U8]:
     left, right = (card_scene(eye, width_px=stack.width_px, height_px=stack.height_px) for eye in pair)
     return (left[..., :1].repeat(3, 2), right[..., :1].repeat(3, 2)) if grey else (left, right)
@@ -109,6 +117,44 @@ def test_codes_are_those_of_exact_sampling(name: str, pose: str, sigma_mm: float
     wanted, found = (layers_of(p, pictures, pair, sigma_mm=sigma_mm) for p in (opencv, opengl))
     assert within_one(wanted, found) >= WITHIN_ONE
     assert (found[..., 3] == 255).all()
+
+
+@pytest.mark.usefixtures("exactly")
+@pytest.mark.parametrize("at_once", [False, True])
+@pytest.mark.parametrize("sigma_mm", [0.0, 3.0, UNSURE_MM])
+@pytest.mark.parametrize("pose", POSES)
+@pytest.mark.parametrize("name", ["balanced", "best"])
+def test_codes_where_rays_weigh_by_the_slope(
+    name: str, pose: str, sigma_mm: float, at_once: bool, gl: GlBackend, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gl, "at_once", at_once)
+    pictures, pair = cards(POSES[pose], STACK), POSES[pose]
+    predictors = both(name, STACK, gl)
+    alike = layers_of(predictors[0], pictures, pair, sigma_mm=sigma_mm)
+    wanted, found = (layers_of(p, pictures, pair, sigma_mm=sigma_mm) for p in sloped(predictors, 0.25))
+    assert within_one(wanted, found) >= WITHIN_ONE
+    assert within_one(wanted, alike) < 0.995  # the weights are felt
+
+
+@pytest.mark.usefixtures("exactly")
+@pytest.mark.parametrize("sigma_mm", [0.0, UNSURE_MM])
+def test_a_grey_part_of_larger_panels_where_rays_weigh_by_the_slope(sigma_mm: float, gl: GlBackend) -> None:
+    pair, layers = eyes(0.6), []
+    for predictor in sloped(both("balanced", STACK, gl), 0.25):
+        predictor.one_channel = True
+        predictor.fade = Fade(PixelRect(30, 15, 200, 120), over_px=(40.0, 10.0), bottom=False)
+        layers.append(layers_of(predictor, cards(pair, STACK, grey=True), pair, sigma_mm=sigma_mm))
+    assert within_one(*layers) >= WITHIN_ONE
+
+
+@pytest.mark.usefixtures("exactly")
+@pytest.mark.parametrize("sigma_mm", [0.0, UNSURE_MM])
+def test_codes_on_tilted_panels_where_rays_weigh_by_the_slope(sigma_mm: float, gl: GlBackend) -> None:
+    stack, pair = replace(STACK, tilt=TILT), eyes(0.6)
+    pictures = cards(pair, stack)
+    predictors = sloped(both("balanced", stack, gl), 0.25)
+    wanted, found = (layers_of(p, pictures, pair, sigma_mm=sigma_mm) for p in predictors)
+    assert within_one(wanted, found) >= WITHIN_ONE
 
 
 @pytest.mark.usefixtures("exactly")
@@ -150,11 +196,14 @@ def test_grey_pictures_in_one_channel(sigma_mm: float, gl: GlBackend) -> None:
     assert within_one(*layers) >= WITHIN_ONE
 
 
-def test_corrections_in_one_pass_are_those_in_two(gl: GlBackend, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("slope_floor", [1.0, 0.25])
+def test_corrections_in_one_pass_are_those_in_two(
+    slope_floor: float, gl: GlBackend, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pair, found, passes = eyes(0.6), [], []
     for at_once in (False, True):
         monkeypatch.setattr(gl, "at_once", at_once)
-        _, predictor = both("balanced", STACK, gl)
+        _, predictor = sloped(both("balanced", STACK, gl), slope_floor)
         predictor.fade = Fade(PixelRect(30, 15, 200, 120), over_px=(40.0, 10.0))
         gl.passes.account = account = Account()
         found.append(layers_of(predictor, cards(pair, STACK), pair, sigma_mm=0.0))

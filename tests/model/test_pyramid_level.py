@@ -110,6 +110,71 @@ def test_residuals_are_what_is_left_after_the_best_centre_panel(rows: RowPool) -
             assert np.abs(level.residual[side][INNER] - (lacks[side] - best)).max() <= 1, (left, right)
 
 
+def slope(wanted: float, floor: float) -> float:
+    """Of sin² at a phase sum, 1 where it is steepest: the weight of a ray."""
+    part = wanted / FULL % 1
+    return floor + (1 - floor) * 4 * part * (1 - part)
+
+
+@pytest.mark.parametrize("floor", [0.05, 0.25, 1.0])
+def test_what_an_eye_lacks_weighs_by_the_slope_there(rows: RowPool, floor: float) -> None:
+    level = level_of(rows)
+    level.slope_floor = floor
+    out = np.empty((48, 96, 3), np.uint8)
+    for wanted in ((FULL, 5400), (5400, 2 * FULL), (5000, 6100), (FULL + 300, 2 * FULL - 900), (0, FULL), (0, 0)):
+        want(level, *wanted)
+        level.update_residuals()
+        level.close_centre(out)
+        lacks, weights = np.array(wanted) - 2 * START, np.array([slope(one, floor) for one in wanted])
+        best = np.clip((weights * lacks).sum() / weights.sum(), 0, FULL)
+        for side in (0, 1):
+            expected = weights[side] * (lacks[side] - best)
+            assert np.abs(level.residual[side][INNER] - expected).max() <= 1, wanted
+        assert np.abs(out[INNER] - best / SUBCODE).max() <= 0.51, wanted
+
+
+@pytest.mark.parametrize("panel", OUTER)
+def test_a_correction_is_divided_by_the_mean_weight_of_rays_and_that_is_one_beside_the_centre(
+    rows: RowPool, panel: int
+) -> None:
+    level, wanted, floor, lack = level_of(rows), (FULL + 200, 6100), 0.25, (400, 240)
+    level.slope_floor = floor
+    want(level, *wanted)
+    for side in (0, 1):
+        level.residual[side][...] = lack[side]
+    level.correct(panel, PAIR, size=0.5, shown=False)
+    total, weight = np.zeros(96), np.zeros(96)
+    y_m = (np.arange(96) + 0.5) * 0.005 - 0.24
+    near_edge = np.zeros(96, bool)
+    for side, eye_m in enumerate(PAIR):
+        t = -eye_m[0] / (STACK.x_m[panel] - eye_m[0])
+        u = (eye_m[1] + t * (y_m - eye_m[1]) + 0.24) / 0.005
+        within = (u >= 0) & (u <= 96)
+        total += np.where(within, lack[side], 0)
+        weight += np.where(within, slope(wanted[side], floor), 1)
+        near_edge |= np.minimum(np.abs(u), np.abs(u - 96)) < 0.1
+    expected = 0.5 * 2 * total / weight
+    assert np.abs(level.outer[panel][24, :, 0] - START - expected)[~near_edge].max() <= 5
+    if panel == FRONT:
+        assert ((0 < total) & (total < sum(lack))).any(), "where one eye's ray alone crosses the centre"
+
+
+@pytest.mark.parametrize("sigma_mm", [0.0, 60.0])
+def test_rays_that_weigh_alike_are_corrected_for_as_if_none_were_weighed(rows: RowPool, sigma_mm: float) -> None:
+    found = []
+    for floor in (1.0, 0.25):
+        level = level_of(rows)
+        level.slope_floor = floor
+        want(level, FULL + 500, 2 * FULL - 500)  # as far from white as from black
+        level.outer[REAR][:, 48:] += 800
+        level.set_eye_sigma(PAIR, eye_sigma_mm=sigma_mm)
+        level.project(OUTER, PAIR)
+        level.step(FRONT, PAIR, size=0.5, shown=False)
+        found.append(level.outer[FRONT][INNER].astype(int))
+    assert np.ptp(found[0]) > 100
+    assert np.abs(found[0] - found[1]).max() <= 8
+
+
 @pytest.mark.parametrize("panel", OUTER)
 def test_a_correction_adds_what_both_eyes_lack_times_its_size(rows: RowPool, panel: int) -> None:
     for size in (0.5, 1.0):

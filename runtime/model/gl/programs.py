@@ -61,14 +61,15 @@ class Account:
     passes: list[Pass] = field(default_factory=list)
 
 
-def source(name: str, *, packed: bool = False) -> str:
-    """A shader with what it includes. packed: for images of three numbers in one (`sample.glsl`)."""
+def source(name: str, *, defines: Sequence[str] = ()) -> str:
+    """A shader with what it includes. defines: PACKED, images of three numbers in one (`sample.glsl`); SLOPED, rays
+    weigh by the slope of sin² (`slope.glsl`)."""
 
     def read(file: str) -> str:
         return (resources.files(SHADERS) / "shaders" / file).read_text(encoding="ascii")
 
     first, _, rest = INCLUDE.sub(lambda found: read(found[1]), read(name)).partition("\n")
-    return f"{first}\n#define PACKED\n{rest}" if packed else f"{first}\n{rest}"
+    return "\n".join((first, *(f"#define {one}" for one in defines), rest))
 
 
 class Passes:
@@ -78,7 +79,7 @@ class Passes:
         self.context = context
         self.account: Account | None = None
         self._vertex = source("whole.vert.glsl")
-        self._programs: dict[tuple[str, bool], tuple[Any, Any, dict[str, Any]]] = {}
+        self._programs: dict[tuple[str, tuple[str, ...]], tuple[Any, Any, dict[str, Any]]] = {}
         self._targets: dict[tuple[int, ...], Any] = {}
 
     @contextmanager
@@ -102,11 +103,11 @@ class Passes:
         inputs: Mapping[str, Image],
         uniforms: Mapping[str, Any],
         *,
-        packed: bool = False,
+        defines: tuple[str, ...] = (),
     ) -> None:
         """Draw the first output's size into all of them. Inputs and uniforms are named as in the shader; what it
-        has no use for is left out. packed: images are."""
-        program, array, held = self._program(name, packed=packed)
+        has no use for is left out. defines: of the shader (`source`)."""
+        program, array, held = self._program(name, defines)
         for unit, (key, image) in enumerate(inputs.items()):
             image.texture.use(unit)
             self._set(program, held, key, unit)
@@ -154,12 +155,12 @@ class Passes:
             program.release()
         self._targets, self._programs = {}, {}
 
-    def _program(self, name: str, *, packed: bool) -> tuple[Any, Any, dict[str, Any]]:
-        if (name, packed) not in self._programs:
-            fragment = source(f"{name}.frag.glsl", packed=packed)
+    def _program(self, name: str, defines: tuple[str, ...]) -> tuple[Any, Any, dict[str, Any]]:
+        if (name, defines) not in self._programs:
+            fragment = source(f"{name}.frag.glsl", defines=defines)
             program = self.context.program(vertex_shader=self._vertex, fragment_shader=fragment)
-            self._programs[name, packed] = program, self.context.vertex_array(program, []), {}
-        return self._programs[name, packed]
+            self._programs[name, defines] = program, self.context.vertex_array(program, []), {}
+        return self._programs[name, defines]
 
     @staticmethod
     def _set(program: Any, held: dict[str, Any], key: str, value: Any) -> None:

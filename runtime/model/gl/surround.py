@@ -86,6 +86,8 @@ class GlSurround:
             self._packed = not self._grey and all(
                 n in self._spread[1] and min(self._spread[1][n]) >= PACKED_SPREAD_PX for n in OUTER
             )
+            sloped = self._contract.slope_floor < 1
+            self._defines = tuple(name for name, on in (("PACKED", self._packed), ("SLOPED", sloped)) if on)
             self._outer: dict[tuple[int, int], str] = {}  # which of two images a panel is in
             self._want(self._taken(pictures))
             yield
@@ -146,7 +148,7 @@ class GlSurround:
             images, seen = self._seen(reduction)
             lacks = {eye: self._image(reduction, CENTRE, f"lacks {eye}") for eye in EYES}
             self._draw("residual", tuple(lacks.values()), images, seen)
-            self._draw("correct", result, {**lacks, **outer}, {**places, **how})
+            self._draw("correct", result, {**lacks, **outer, **self._weighing(reduction)}, {**places, **how})
         self._swap(reduction, panel)
 
     def upsample(self, coarser_reduction: int, reduction: int, *, shown: bool) -> None:
@@ -257,6 +259,7 @@ class GlSurround:
         self._blur({"first": moving[0], "second": moving[1]}, half, spread, name="blur_both", twice=True)
         joined, blurred = (self._image(reduction, panel, name) for name in ("joined", "half"))
         lacked = dict(zip((*EYES, *(f"half_blurred_{eye}" for eye in EYES)), (*lacks, *half), strict=True))
+        lacked |= self._weighing(reduction)
         self._draw("back", (joined,), {**lacked, **outer}, {**places, **_kernel(spread, twice=True, down=True)})
         self._blur({"image": joined}, (blurred,), spread)
         return blurred
@@ -307,13 +310,17 @@ class GlSurround:
     def _draw(
         self, name: str, outputs: tuple[Image, ...], inputs: dict[str, Image], uniforms: Mapping[str, Any]
     ) -> None:
-        always = {"even": START, "grey": self._grey}
-        self._passes.draw(name, outputs, inputs, {**uniforms, **always}, packed=self._packed)
+        always = {"even": START, "grey": self._grey, "slope_floor": self._contract.slope_floor}
+        self._passes.draw(name, outputs, inputs, {**uniforms, **always}, defines=self._defines)
 
     def _wanted(self, reduction: int) -> dict[str, Image]:
         """What the eyes want, with the table that makes phase sums of it."""
         images = {f"wanted_{eye}": self._image(reduction, CENTRE, f"wanted {eye}", dtype="f1") for eye in EYES}
         return {**images, "table": self._table}
+
+    def _weighing(self, reduction: int) -> dict[str, Image]:
+        """What rays are weighed by, where they are."""
+        return self._wanted(reduction) if self._contract.slope_floor < 1 else {}
 
     def _mean(self, reduction: int, panel: int) -> Image:
         """An outer panel as eyes that are unsure see it."""

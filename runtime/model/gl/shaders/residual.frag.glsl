@@ -2,6 +2,7 @@
 // What each eye lacks at each pixel of the centre panel.
 #include "sample.glsl"
 #include "wanted.glsl"
+#include "slope.glsl"
 #include "lacks.glsl"
 layout(location = 0) out STORED left;
 layout(location = 1) out STORED right;

@@ -3,6 +3,7 @@
 // answered too: what is left of that in the mean over where they may be is taken off later (`back`).
 #include "sample.glsl"
 #include "wanted.glsl"
+#include "slope.glsl"
 #include "lacks.glsl"
 uniform bool of_front;      // which panel moves
 layout(location = 0) out STORED left;
