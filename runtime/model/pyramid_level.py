@@ -68,7 +68,6 @@ class PyramidLevel:
         names += [(name, CENTRE, side) for name in ("wanted", "residual", "back") for side in EYES]
         self._whole = {name: buffer(height, width, channels=channels) for name in names}
         self.rasters: tuple[PlaneRaster, ...] = ()
-        self.slope_floor = 1.0  # of a ray's weight
         self.spread: dict[int, tuple[float, float]] = {}  # per outer panel, right and down, pixels
         self.slope_floor = 1.0  # the least weight of a ray; 1: all weigh alike (`_slope`)
         self._mean: dict[int, I16] = {}

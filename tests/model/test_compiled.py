@@ -127,6 +127,19 @@ def test_the_eyes_see_no_less_however_unsure_they_are(name: str, sigma_mm: float
 
 
 @pytest.mark.usefixtures("exactly")
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("pose", ["straight", "near", "far beside"])
+def test_rays_are_weighed_alike(pose: str, channels: int, rows: RowPool) -> None:
+    levels = [filled(kind, rows, STACK, boxes="parts", channels=channels) for kind in (PyramidLevel, CompiledLevel)]
+    for level in levels:
+        level.slope_floor = 0.25
+    wanted, found = (solved(level, POSES[pose], sigma_mm=0.0) for level in levels)
+    assert within_one(wanted, found) >= WITHIN_ONE
+    even = solved(filled(CompiledLevel, rows, STACK, boxes="parts", channels=channels), POSES[pose], sigma_mm=0.0)
+    assert within_one(even, found) < 0.99
+
+
+@pytest.mark.usefixtures("exactly")
 def test_corrections_fade_out_alike(rows: RowPool) -> None:
     columns, down = np.linspace(0, 1, 200, dtype=np.float32), np.ones(112, np.float32)
     down[:20] = 0.25
