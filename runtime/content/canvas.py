@@ -97,4 +97,5 @@ class Canvas:
         return self._targets[size]
 
     def _framebuffer(self, size: tuple[int, int], colour: Any, *, samples: int = 0) -> Any:
-        return self._context.framebuffer([colour], self._context.depth_renderbuffer(size, samples=samples))
+        # Depth in a texture: Mesa keeps a renderbuffer's for good where another context of the group releases it.
+        return self._context.framebuffer([colour], self._context.depth_texture(size, samples=samples))

@@ -25,7 +25,7 @@ from runtime.plan.predictors import planned_predictor
 from runtime.plan.savings import Saving
 from runtime.records import SolveRequest
 from runtime.support.gl import offscreen_context
-from runtime.support.gl_sharing import ShareGroup, leave_context
+from runtime.support.gl_sharing import ShareGroup, SharingContext, leave_context
 
 log = logging.getLogger("phasestack.solver")
 
@@ -121,13 +121,13 @@ class RunningSolver:
             except Exception as error:  # of a context that is lost there is nothing to release
                 log.warning("solver: closing it: %s", error)
 
-    def _stand_in(self) -> Any:
+    def _stand_in(self) -> SharingContext | None:
         """A context of the group, current: textures outlive the solver's own, which may be lost, and are released in
         this one. None: they go with their context."""
         if not self._owns_context or self._group is None or self._group.lost:
             return None
         try:
-            return self._group.context()
+            return self._group.stand_in()
         except Exception as error:
             log.warning("solver: its textures stay: %s", error)
             return None

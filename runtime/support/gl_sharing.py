@@ -69,6 +69,16 @@ def _gl(name: str, answer: Any, *given: Any) -> Any:
     return ctypes.CFUNCTYPE(answer, *given)(address)
 
 
+@cache
+def _address(name: str) -> int:
+    """Of an OpenGL function, the same in every context; 0: there is none.
+
+    Kept: moderngl never lets go of the numbers that it is given, 20 KiB a context.
+    """
+    found: int | None = _egl().eglGetProcAddress(name.encode())
+    return found or 0
+
+
 class SharingContext:
     """What moderngl needs to know of a context of a group: where its functions are, and how it becomes current."""
 
@@ -91,8 +101,7 @@ class SharingContext:
 
     def load_opengl_function(self, name: str) -> int:
         """Address of an OpenGL function; 0: there is none."""
-        address: int | None = _egl().eglGetProcAddress(name.encode())
-        return address or 0
+        return _address(name)
 
     load = load_opengl_function
 
@@ -138,12 +147,18 @@ class ShareGroup:
 
     def context(self) -> moderngl.Context:
         """Another context of the group, current on this thread. Raises MissingPart."""
-        sharing = self._sharing()
-        sharing.__enter__()
+        sharing = self.stand_in()
         given: dict[str, Any] = {"context": sharing}
         made = moderngl.create_context(require=MINIMUM_VERSION, **given)
         made.extra = sharing
         return made
+
+    def stand_in(self) -> SharingContext:
+        """Another context, current on this thread, to release in what another one of the group made. moderngl knows
+        nothing of it: it would keep 16 KiB for good. Raises MissingPart."""
+        sharing = self._sharing()
+        sharing.__enter__()
+        return sharing
 
     def read_into(self, texture: Any, out: U8) -> None:
         """Read a texture (moderngl's, RGBA in 8 bits) back into (h, w, 4), on any thread. Raises ContextLost."""
