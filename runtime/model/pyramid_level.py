@@ -153,9 +153,12 @@ class PyramidLevel:
         eighths = np.int16(round(size * 8))
 
         def work(rows: slice, change: I16) -> None:
-            np.add(back[0][rows], back[1][rows], out=change)
-            np.right_shift(change, 3, out=change)
-            np.multiply(change, eighths, out=change)
+            if slopes is not None:
+                change[...] = np.clip(np.rint(back[0][rows] * np.float32(eighths / 8)), -FULL, FULL)
+            else:
+                np.add(back[0][rows], back[1][rows], out=change)
+                np.right_shift(change, 3, out=change)
+                np.multiply(change, eighths, out=change)
             np.add(change, outer[rows], out=change)
             _clamp_and_quantise(change, outer[rows], shown=shown)
 
@@ -163,12 +166,13 @@ class PyramidLevel:
 
     def _divide_by_weights(self, panel: int, eyes_m: F64, slopes: Sequence[F32]) -> None:
         """Of what comes back to an outer panel, by the mean weight of the two rays through each of its pixels."""
-        back, total = self._back[panel], np.float32(0)
+        back = self._back[panel]
+        total: F32 = np.zeros(back[0].shape, np.float32)
         for eye_m, slope in zip(eyes_m, slopes, strict=True):
             held = np.rint(slope * WHOLE_WEIGHT).astype(np.int16)
             there = buffer(*back[0].shape[:2], channels=self._channels)
             self._between(held, eye_m, of=CENTRE, on=panel, out=there, outside=WHOLE_WEIGHT)
-            total = total + there.astype(np.float32)
+            total += there
         lacked = (back[0].astype(np.float32) + back[1]) * (2 * WHOLE_WEIGHT) / total
         back[0][...] = np.clip(np.rint(lacked), -MOST, MOST)
         back[1][...] = 0

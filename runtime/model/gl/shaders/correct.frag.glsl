@@ -35,5 +35,5 @@ void main() {
 #else
     ivec4 lacks = crossed(left, size, centre_from_left, at) + crossed(right, size, centre_from_right, at);
 #endif
-    corrected = kept(value(panel, ivec2(at)) + (lacks >> 3) * eighths);
+    corrected = kept(value(panel, ivec2(at)) + times(lacks, eighths));
 }

@@ -50,5 +50,5 @@ void main() {
 #else
     ivec4 lacks = lacked(centre_from_left, true) + lacked(centre_from_right, false);
 #endif
-    corrected = kept(value(panel, ivec2(gl_FragCoord.xy)) + (lacks >> 3) * eighths);
+    corrected = kept(value(panel, ivec2(gl_FragCoord.xy)) + times(lacks, eighths));
 }

@@ -2,6 +2,7 @@
 // `correct` for eyes that are unsure: in the mean over where they may be, less what moves of the panel itself.
 #include "sample.glsl"
 #include "blur.glsl"
+#include "slope.glsl"
 #include "shown.glsl"
 uniform IMAGE panel, mean;
 uniform IMAGE half_blurred; // `back`, blurred across
@@ -12,5 +13,5 @@ void main() {
     ivec2 place = ivec2(gl_FragCoord.xy);
     ivec4 outer = value(panel, place);
     ivec4 change = rounded(blurred(half_blurred)) + 2 * (value(mean, place) - outer);
-    corrected = kept(outer + (change >> 3) * eighths);
+    corrected = kept(outer + times(change, eighths));
 }

@@ -30,4 +30,13 @@ void join(inout Weighed sum, ivec2 corner, vec2 weight, vec4 lacks, vec4 slope) 
 vec4 answered(Weighed left, Weighed right) {
     return 2.0 * (left.lacks + right.lacks) / (left.slope + right.slope);
 }
+
+ivec4 times(ivec4 lacks, int eighths) {
+    return rounded(vec4(lacks) * float(eighths) / 8.0);
+}
+#else
+// Rounded down as 16 bits need it that must hold the product.
+ivec4 times(ivec4 lacks, int eighths) {
+    return (lacks >> 3) * eighths;
+}
 #endif
