@@ -31,9 +31,10 @@ def test_one_pass_a_correction_moves_less_and_unsure_eyes_cost_more(solutions: l
     assert len(two.drawn) - len(at_once.drawn) == corrections
 
 
-def test_unsure_eyes_cost_less_than_four_milliseconds_of_a_small_gpu_s_memory(solutions: list[Solution]) -> None:
-    """800 MB at 1920x1080, 200 GB/s."""
-    assert solutions[2].moved_bytes / (240 * 136) < 800e6 / (1920 * 1080)
+def test_unsure_eyes_cost_less_than_four_milliseconds_of_a_small_gpu_s_memory() -> None:
+    """200 GB/s. On the panels themselves: on smaller ones the network's raster reaches farther beyond them."""
+    (unsure,) = counted(["balanced"], width_px=1920, height_px=1080, cases=((3.0, False),))
+    assert unsure.moved_bytes < 800e6
 
 
 def test_every_byte_of_an_image_counts_once_a_pass(solutions: list[Solution]) -> None:
