@@ -25,8 +25,17 @@ DISTANCE_M, EYE_SIGMA_MM = 0.6, 3.0  # a tracker's eyes
 RUNS = 5  # timed, after one that compiles and allocates; the backends take turns, so that both meet the same machine
 STAGES = {
     "reduce and transform": ("wanted", "network"),
-    "drive the outer panels": ("resample",),
-    "correct them": ("residual", "noise", "back", "correct", "correct_unsure", "correct_at_once", "blur"),
+    "drive the outer panels": ("resample", "finer"),
+    "correct them": (
+        "residual",
+        "residual_unsure",
+        "back",
+        "correct",
+        "correct_unsure",
+        "correct_at_once",
+        "blur",
+        "blur_both",
+    ),
     "close the centre": ("close",),
 }
 
