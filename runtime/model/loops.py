@@ -39,7 +39,7 @@ def inner_loops() -> Loops:
         folder = _kept()
         numba.config.CACHE_DIR = str(folder or "")  # type: ignore[attr-defined]
         if folder is not None and not any(folder.iterdir()):
-            log.info("inner loops are compiled, once: some ten seconds")
+            log.debug("inner loops are compiled, once: some ten seconds")
         from runtime.model.compiled.level import CompiledLevel, warm_up  # noqa: PLC0415 - imports numba
 
         warm_up()

@@ -59,7 +59,7 @@ def align(stack: PanelStack, *, solved_for_m: F64, eyes_m: F64) -> Alignment:
     share, limited = 1.0, ""
     for most, least, why in _limits(stack, solved_for_m, eyes_m, old=old, new=new):
         # Every limit says: share · most <= least.
-        reach = 0.0 if least < 0.0 else least / most if most > 0.0 else 1.0
+        reach = 0.0 if least < 0.0 else 1.0 if most <= least else least / most
         if reach < share:
             share, limited = reach, why
     if share == 0.0:
