@@ -68,7 +68,7 @@ class CompiledLevel(PyramidLevel):
 
     def crop(self, boxes: Sequence[PixelRect], stack: PanelStack) -> None:
         super().crop(boxes, stack)
-        self._eyes_m = None
+        self._eyes_m = self._seen_at = None
 
     def project(self, panels: Sequence[int], eyes_m: F64) -> None:
         if self._sampling(eyes_m) is None:

@@ -146,40 +146,12 @@ def correct(
                 lack(even, 0, 0, residual[0], r0, centre_width, 0, v, tile, count, back, channels, none, row, part[0])
                 lack(part, 0, 0, residual[1], r0, centre_width, 1, v, tile, count, back, channels, none, row, left)
                 if floor < one:
-                    lack(
-                        even,
-                        0,
-                        0,
-                        residual[2],
-                        r0,
-                        centre_width,
-                        0,
-                        v,
-                        tile,
-                        count,
-                        back,
-                        channels,
-                        weight_whole,
-                        row,
-                        part[0],
-                    )
-                    lack(
-                        part,
-                        0,
-                        0,
-                        residual[3],
-                        r0,
-                        centre_width,
-                        1,
-                        v,
-                        tile,
-                        count,
-                        back,
-                        channels,
-                        weight_whole,
-                        row,
-                        right,
-                    )
+                    for side in range(2):
+                        before, sums, seen_weights = (
+                            (even, part[0], residual[2]) if side == 0 else (part, right, residual[3])
+                        )
+                        tile_of = (centre_width, side, v, tile, count, back, channels, weight_whole, row, sums)
+                        lack(before, 0, 0, seen_weights, r0, *tile_of)
                     for k in range(count):
                         left[U(k)] *= np.float32(-2) * weight_whole / right[U(k)]
                 if shown:
@@ -201,7 +173,8 @@ def blur(
 
     weights: (taps,) float32 from the middle outwards, an odd number of them, for rows and for columns; beside the
     image's (height, width in numbers) its edge is repeated. out: (rows, numbers) int16, between 0 and high where that
-    is not 0, in whole steps where it is shown. acc: `work_rows`, to work in.
+    is not 0, in whole steps where it is shown. acc: (2, numbers) float32, with room for the taps beside a row, to work
+    in.
     """
     pad = (weights_across.shape[0] - 1) * channels
     half, none = np.float32(0.5), np.float32(0)
@@ -228,7 +201,7 @@ def blur(
         middle = weights_across[0]
         for tap in range(1, weights_across.shape[0], 2):
             w1, w2 = weights_across[tap], weights_across[tap + 1]
-            a, b, c, d = U(pad - tap * channels), U(pad + tap * channels), U(0), U(0)
+            a, b = U(pad - tap * channels), U(pad + tap * channels)
             c, d = U(pad - (tap + 1) * channels), U(pad + (tap + 1) * channels)
             if tap == 1:
                 for k in range(width):
