@@ -109,6 +109,7 @@ def spectral_file(
         least_spread_px=recipe.least_spread_px,
         slope_floor=recipe.slope_floor,
         steps=recipe.steps,
+        refining=recipe.refining,
     )
     return with_contract(data, contract)
 

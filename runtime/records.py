@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
+I16 = NDArray[np.int16]
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
 

@@ -60,16 +60,3 @@ def covered_box(
     u0, v0 = (int(value) for value in np.clip(low, 0, [width_px, height_px]))
     u1, v1 = (int(value) for value in np.clip(high, 0, [width_px, height_px]))
     return PixelRect(u0, v0, max(u1, u0), max(v1, v0))
-
-
-def union(boxes: list[PixelRect]) -> PixelRect:
-    """The smallest box around those that aren't empty; empty where all are."""
-    filled = [box for box in boxes if box.width_px and box.height_px]
-    if not filled:
-        return PixelRect(0, 0, 0, 0)
-    return PixelRect(
-        min(box.u0 for box in filled),
-        min(box.v0 for box in filled),
-        max(box.u1 for box in filled),
-        max(box.v1 for box in filled),
-    )

@@ -17,7 +17,7 @@ from runtime.content.base import View
 from runtime.content.canvas import Canvas
 from runtime.content.fringe import Edges, edges_of, ramps, silhouette
 from runtime.content.shapes import Shape
-from runtime.optics.rect import PixelRect
+from runtime.optics.rect import PixelRect, union
 from runtime.records import F32, F64, U8
 from runtime.support.gl import DrawnPicture
 
@@ -193,7 +193,7 @@ class TrianglePainter:
             placed = points @ matrix[:3, :3].T + matrix[:3, 3]
             if camera.depth_bounds(view.pixels_from_stack, placed) is not None:
                 boxes.append(camera.covered_box(view.pixels_from_stack, placed, align_px=1, **size))
-        return camera.union(boxes)
+        return union(boxes)
 
     def deform(self, index: int, shape: Shape) -> None:
         """Another shape for a part: the same triangles, their vertices elsewhere."""
@@ -211,7 +211,7 @@ class TrianglePainter:
         corners = self.corners_m(stack_from_parts).reshape(-1, 8, 3)
         bounds = camera.depth_bounds(view.pixels_from_stack, corners.reshape(-1, 3))
         boxes = [camera.covered_box(view.pixels_from_stack, part, **size) for part in corners]
-        area = camera.union(boxes) if bounds else PixelRect(0, 0, 0, 0)
+        area = union(boxes) if bounds else PixelRect(0, 0, 0, 0)
         # Nearest first: what they hide need not be shaded.
         order = np.argsort(-corners[..., 0].mean(1), kind="stable")
         placed = [(self._parts[index], stack_from_parts[index]) for index in order]

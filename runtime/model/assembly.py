@@ -18,6 +18,7 @@ from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import U8, Layers, pixels_of
 from runtime.support.gl import DrawnPicture
+from runtime.support.threads import PIECE_ROWS, at_once
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,20 +142,29 @@ class ArrayAssembly:
         """The picture on the centre panel, as both eyes see it where they agree."""
         self._colour = None
         centre, codes = layers[self._stack.count // 2], centre_codes(self._stack.count)
-        for part in _around(but, width_px=self._stack.width_px, height_px=self._stack.height_px):
+
+        def fill(part: PixelRect) -> None:
             grown = PixelRect(max(0, part.u0 - 1), max(0, part.v0 - 1), part.u1 + 1, part.v1 + 1)
             sharp = pre_emphasised(rest.picture[grown.slices], rest.emphasis)
             rows = slice(part.v0 - grown.v0, part.v1 - grown.v0)
             columns = slice(part.u0 - grown.u0, part.u1 - grown.u0)
             centre[part.slices] = cv2.LUT(np.ascontiguousarray(sharp[rows, columns]), codes)
 
+        hole = but or PixelRect(0, 0, 0, 0)
+        parts = hole.beside(width_px=self._stack.width_px, height_px=self._stack.height_px)
+        at_once(fill, [piece for part in parts for piece in part.in_rows(PIECE_ROWS)])
+
     def _place(self, layers: U8, window: Placed) -> None:
         """The window's layers among the rest."""
         area = window.box
-        for index, (layer, part) in enumerate(zip(layers, pixels_of(window.layers), strict=True)):
+
+        def place(item: tuple[int, U8, U8]) -> None:
+            index, layer, part = item
             kept = window.kept if index == self._stack.count // 2 else area
             rows, columns = slice(kept.v0 - area.v0, kept.v1 - area.v0), slice(kept.u0 - area.u0, kept.u1 - area.u0)
             layer[kept.v0 : kept.v1, kept.u0 : kept.u1] = part[rows, columns]
+
+        at_once(place, list(zip(range(len(layers)), layers, pixels_of(window.layers), strict=True)))
         self._solved = area
 
 
@@ -162,19 +172,6 @@ def centre_codes(panels: int) -> U8:
     """(256,) the centre panel's code for each code of the picture, the others standing at NEUTRAL."""
     phases = phase_codes(2).reshape(256, -1)[:, 0].astype(np.int32)
     return np.clip((phases - (panels - 1) * NEUTRAL * SUBCODE + SUBCODE // 2) // SUBCODE, 0, 255).astype(np.uint8)
-
-
-def _around(hole: PixelRect | None, *, width_px: int, height_px: int) -> list[PixelRect]:
-    """A panel's pixels but for a hole."""
-    if hole is None:
-        return [PixelRect(0, 0, width_px, height_px)]
-    parts = (
-        PixelRect(0, 0, width_px, hole.v0),
-        PixelRect(0, hole.v1, width_px, height_px),
-        PixelRect(0, hole.v0, hole.u0, hole.v1),
-        PixelRect(hole.u1, hole.v0, width_px, hole.v1),
-    )
-    return [part for part in parts if part.width_px and part.height_px]
 
 
 def _fill(layer: U8, area: PixelRect, codes: Sequence[int]) -> None:

@@ -88,6 +88,18 @@ class Predictor(ABC):
         the model has no picture for two eyes like these.
         """
 
+    @property
+    def refines(self) -> bool:
+        """Whether `refine` may follow the last call of `predict`."""
+        return False
+
+    def refine(
+        self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = PUPIL_SIGMA_MM
+    ) -> Prediction:
+        """Layers for images that differ a little from those of the last call, for the same eyes: its panels, changed by
+        the last steps alone. Raises ModelFailure."""
+        raise NotImplementedError(f"{self.name} has no steps to do again")
+
     def warm_up(self, eyes_m: F64) -> None:
         """Run once on grey pictures, so that the first frame does not pay for allocation."""
         rasters = self.rasters(eyes_m)

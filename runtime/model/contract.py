@@ -52,6 +52,21 @@ SlopeFloor = Annotated[
     float,
     Field(gt=0, le=1, description="corrections weigh a ray by the slope of sin² there, and by so much at least"),
 ]
+Refining = Annotated[
+    int,
+    Field(
+        ge=0,
+        le=16,
+        description="last steps that are done once more for a still picture, by what its own rays lack (0: none)",
+    ),
+]
+
+
+def check_refining(refining: int, steps: tuple[Step, ...]) -> None:
+    """Raises ValueError where the last steps can't be done once more."""
+    again = steps[len(steps) - refining :] if refining else ()
+    if refining > len(steps) or any(step.kind == "chain" or step.reduction != 1 for step in again):
+        raise ValueError("refining: more than the last corrections on every pixel")
 
 
 class TrainedFor(Section):
@@ -113,11 +128,13 @@ class Contract(Section):
     least_spread_px: LeastSpread = LEAST_SPREAD_PX
     slope_floor: SlopeFloor = 1.0
     steps: Steps = ()
+    refining: Refining = 0
 
     @model_validator(mode="after")
     def _has_steps(self) -> Contract:
         if self.input_frame == "chain" and not self.steps:
             raise ValueError("steps: a chain model needs one at least")
+        check_refining(self.refining, self.steps)
         return self
 
 

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
-from runtime.model.pyramid_level import I16
 from runtime.optics.rect import PixelRect
-from runtime.records import F32, F64
+from runtime.records import F32, F64, I16
 
 QUARTERS = 4  # the finest steps in which 16 bits hold any phase that an eye can lack
 CORRECTED_SHARE = 1 / 6  # of the fade, in which corrections fade too: they mend the error of the wave's own

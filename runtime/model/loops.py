@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
 
 from runtime.model.pyramid_level import PyramidLevel
+from runtime.model.wanted import fill_wanted
 from runtime.support.cache import digest, user_cache
 
 log = logging.getLogger("phasestack.model")
 
-SOURCES = ("sampling.py", "passes.py", "warp.py")
+SOURCES = ("sampling.py", "passes.py", "enlarge.py", "pixels.py", "warp.py", "sight.py", "wanted.py")
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +25,7 @@ class Loops:
 
     level: type[PyramidLevel]
     why: str  # one line
+    fill_wanted: Callable[..., None] = fill_wanted
 
     @property
     def compiled(self) -> bool:
@@ -40,7 +43,8 @@ def inner_loops() -> Loops:
         numba.config.CACHE_DIR = str(folder or "")  # type: ignore[attr-defined]
         if folder is not None and not any(folder.iterdir()):
             log.debug("inner loops are compiled, once: some ten seconds")
-        from runtime.model.compiled.level import CompiledLevel, warm_up  # noqa: PLC0415 - imports numba
+        from runtime.model.compiled import wanted  # noqa: PLC0415 - imports numba
+        from runtime.model.compiled.level import CompiledLevel, warm_up  # noqa: PLC0415
 
         warm_up()
     except ImportError as error:
@@ -48,7 +52,8 @@ def inner_loops() -> Loops:
     except Exception as error:  # a compiler has no list of what it may fail with
         log.warning("inner loops: OpenCV's, the compiled ones failed (%s: %s)", type(error).__name__, error)
         return Loops(PyramidLevel, f"OpenCV's, the compiled ones failed ({type(error).__name__}: {error})")
-    return Loops(CompiledLevel, f"compiled, kept in {folder}" if folder else "compiled, at every start anew")
+    why = f"compiled, kept in {folder}" if folder else "compiled, at every start anew"
+    return Loops(CompiledLevel, why, wanted.fill_wanted)
 
 
 def _kept() -> Path | None:

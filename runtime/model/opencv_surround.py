@@ -5,22 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 
-import cv2
 import numpy as np
 
 from runtime.model.assembly import ArrayAssembly
-from runtime.model.channels import without_alpha
 from runtime.model.contract import Contract
-from runtime.model.loops import inner_loops
-from runtime.model.pyramid_level import CENTRE, EYES, I16, NEUTRAL, PyramidLevel
+from runtime.model.loops import Loops, inner_loops
+from runtime.model.pyramid_level import CENTRE, EYES, NEUTRAL, PyramidLevel
 from runtime.model.resample import resample
 from runtime.model.rows import RowPool
 from runtime.model.schedule import Picture, Problem, reductions
-from runtime.model.transfer import phase_codes, pre_emphasised
+from runtime.model.wanted import Pictures, fill_wanted
 from runtime.model.workspace import Workspace
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
-from runtime.records import U8
+from runtime.records import I16, U8
 from runtime.support.gl import DrawnPicture
 
 
@@ -35,9 +33,8 @@ class OpenCvBackend:
         self.compiled = compiled
 
     def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> OpenCvSurround:
-        return OpenCvSurround(
-            contract, stack, threads=threads, level=inner_loops().level if self.compiled else PyramidLevel
-        )
+        loops = inner_loops() if self.compiled else Loops(PyramidLevel, "OpenCV's, as asked for")
+        return OpenCvSurround(contract, stack, threads=threads, loops=loops)
 
     def assembly(self, stack: PanelStack) -> ArrayAssembly:
         return ArrayAssembly(stack)
@@ -49,31 +46,32 @@ class OpenCvBackend:
 class OpenCvSurround:
     """A `Surround`."""
 
-    def __init__(self, contract: Contract, stack: PanelStack, *, threads: int, level: type[PyramidLevel]) -> None:
-        self._contract, self._stack, self._level = contract, stack, level
+    def __init__(self, contract: Contract, stack: PanelStack, *, threads: int, loops: Loops) -> None:
+        self._contract, self._stack, self._loops = contract, stack, loops
         self._rows = RowPool(threads, width_px=stack.width_px)
         self._workspaces: dict[int, Workspace] = {}
         self._drawn: tuple[PixelRect, ...] = ()  # where the layers hold more than even panels
         self._layers: U8 = np.full((3, stack.height_px, stack.width_px, 4), 255, np.uint8)
-        self._pictures: list[U8] = []
 
-    def begin(self, pictures: Sequence[Picture], problem: Problem) -> AbstractContextManager[None]:
+    def begin(
+        self, pictures: Sequence[Picture], problem: Problem, *, again: bool = False
+    ) -> AbstractContextManager[None]:
         self._problem = problem
         if problem.channels not in self._workspaces:
+            needed, kind = reductions(self._contract), self._loops.level
             self._workspaces[problem.channels] = Workspace(
-                self._stack, reductions(self._contract), level=self._level, rows=self._rows, channels=problem.channels
+                self._stack, needed, level=kind, rows=self._rows, channels=problem.channels
             )
         self._workspace = self._workspaces[problem.channels]
         self._workspace.crop(problem.boxes, self._stack)
         box = problem.boxes[CENTRE]
         arrays = [picture.pixels() if isinstance(picture, DrawnPicture) else picture for picture in pictures]
 
-        def prepared(picture: U8) -> U8:
-            return pre_emphasised(without_alpha(picture[box.slices], problem.channels), self._contract.emphasis)
-
-        self._pictures = self._rows.map(prepared, arrays)
-        for level in self._workspace.levels.values():
-            self._fill_phases(level.wanted)
+        contract, levels = self._contract, self._workspace.levels
+        self._pictures = Pictures(arrays, box, problem.channels, contract.emphasis, contract.branch)
+        used = [levels[reduction] for reduction in ([1] if again else sorted(levels))]
+        self._loops.fill_wanted(self._pictures, [level.wanted for level in used], rows=self._rows)
+        for level in used:
             level.slope_floor = self._contract.slope_floor
             level.set_eye_sigma(
                 problem.eyes_m, eye_sigma_mm=problem.eye_sigma_mm, least_px=self._contract.least_spread_px
@@ -84,7 +82,11 @@ class OpenCvSurround:
         problem, size = self._problem, self._problem.reduced_size
         tail = (problem.channels,) if problem.channels > 1 else ()
         known = (level.wanted for level in self._workspace.levels.values() if level.size == size)
-        left, right = next(known, None) or self._fill_phases([np.empty(size[::-1] + tail, np.int16) for _ in EYES])
+        pair = next(known, None)
+        if pair is None:
+            pair = tuple(np.empty(size[::-1] + tail, np.int16) for _ in EYES)
+            fill_wanted(self._pictures, [pair], rows=self._rows)
+        left, right = pair
         half = (right - left) >> 1
         seen = self._workspace.chain_buffers(problem.frame)
         for side, lacks in enumerate((-half, half)):
@@ -123,16 +125,3 @@ class OpenCvSurround:
 
     def close(self) -> None:
         self._rows.close()
-
-    def _fill_phases(self, wanted: Sequence[I16]) -> Sequence[I16]:
-        """Phase sums of the pictures at the size of these images, averaged as codes: into them."""
-        table = phase_codes(self._contract.branch)
-
-        def fill(item: tuple[U8, I16]) -> None:
-            picture, image = item
-            size = image.shape[1::-1]
-            same = picture.shape[1::-1] == size
-            cv2.LUT(picture if same else cv2.resize(picture, size, interpolation=cv2.INTER_AREA), table, dst=image)
-
-        self._rows.map(fill, list(zip(self._pictures, wanted, strict=True)))
-        return wanted

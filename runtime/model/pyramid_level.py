@@ -12,7 +12,6 @@ from typing import Protocol
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
 from runtime.model.channels import RGBA_FROM
@@ -23,9 +22,8 @@ from runtime.model.transfer import FULL, SUBCODE
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen, layer_pixels_from_seen
-from runtime.records import F32, F64, U8
+from runtime.records import F32, F64, I16, U8
 
-I16 = NDArray[np.int16]
 REAR, CENTRE, FRONT = 0, 1, 2
 OUTER = (REAR, FRONT)
 EYES = (0, 1)

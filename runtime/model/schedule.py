@@ -17,12 +17,13 @@ from runtime.model.assembly import Assembly
 from runtime.model.chain import ChainFrame, ColumnLaw
 from runtime.model.contract import Contract, Step
 from runtime.model.fade import Fade
-from runtime.model.pyramid_level import CENTRE, FRONT, I16, OUTER, REAR, coarser
+from runtime.model.pyramid_level import CENTRE, FRONT, OUTER, REAR, coarser
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen
-from runtime.records import F64, U8, Layers
+from runtime.records import F64, I16, U8, Layers
 from runtime.support.gl import DrawnPicture
+from runtime.support.threads import at_once
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,18 +72,25 @@ class Problem:
         law = self.frame.columns
         return ColumnLaw(law.bend, law.middle + self.frame.cell_px)
 
-    def faded(self, panel: I16, *, start: int) -> I16:
-        """(rows, columns[, 3]) the network's answer that ends, at `start`, within a part of the panels."""
+    def faded(self, panels: Answer, *, start: int) -> Answer:
+        """The network's answer that ends, at `start`, within a part of the panels."""
         if self.fade is None:
-            return panel
-        frame = self.frame
+            return panels
+        frame, first = self.frame, next(iter(panels.values()))
         plane_from_wave = frame.plane_from_frame(frame.middle_m, x_m=self.stack.x_m[CENTRE])
         plane_from_wave = plane_from_wave @ np.array([[1.0, 0.0, -frame.cell_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-        rows, columns = panel.shape[:2]
+        rows, columns = first.shape[:2]
         weights = self.fade.wave_weights(
             self.centre_from(plane_from_wave), rows=rows, columns=columns, law=self.answer_columns
         )
-        return np.asarray((panel - start) * (weights if panel.ndim == 3 else weights[..., 0]) + start, np.int16)
+        channels = first.size // (rows * columns)
+        weights = np.repeat(weights[..., 0], channels, axis=1)  # else numpy's innermost loop has three turns
+        rest = start * (1 - weights) + np.float32(0.5)  # rounded
+
+        def fade(panel: I16) -> I16:
+            return np.asarray(panel.reshape(rows, -1) * weights + rest, np.int16).reshape(panel.shape)
+
+        return dict(zip(panels, at_once(fade, list(panels.values())), strict=True))
 
     def centre_from(self, plane_from_raster: F64) -> F64:
         """3x3: the centre panel's pixels from a raster's on its plane."""
@@ -97,9 +105,13 @@ Network = Callable[[tuple[I16, I16]], Answer]
 class Surround(Protocol):
     """What surrounds the network. State lives from frame to frame; one thread uses it."""
 
-    def begin(self, pictures: Sequence[Picture], problem: Problem) -> AbstractContextManager[None]:
+    def begin(
+        self, pictures: Sequence[Picture], problem: Problem, *, again: bool = False
+    ) -> AbstractContextManager[None]:
         """Take two pictures (h, w, 4) of the centre panel's pixels: cut to its box, the phase sums that the eyes want,
-        on every raster that the steps need. The steps are done within what it answers."""
+        on every raster that the steps need. The steps are done within what it answers.
+
+        again: on the panels of the last problem, which was the same but for its pictures; every pixel alone."""
 
     def network_pictures(self) -> tuple[I16, I16]:
         """What each eye lacks while the outer panels are even, on the network's raster: (rows, columns[, 3])."""
@@ -166,6 +178,17 @@ def carry_out(steps: Sequence[Step], surround: Surround, network: Network) -> La
     if reduction != 1:
         surround.upsample(reduction, 1, shown=True)
         surround.project(1, OUTER)
+    return surround.finish()
+
+
+def carry_on(steps: Sequence[Step], surround: Surround) -> Layers:
+    """The layers of the problem that was begun again: its last steps, corrections on every pixel."""
+    last = {n: _last_change(steps, n) for n in OUTER}
+    surround.project(1, OUTER)
+    for index, step in enumerate(steps):
+        panel = FRONT if step.kind == "front" else REAR
+        surround.correct(1, panel, size=step.size, shown=index == last[panel])
+        surround.project(1, (panel,))
     return surround.finish()
 
 

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from itertools import chain
+
 import cv2
 import numpy as np
 
+from runtime.model.back_projection import add_what_is_lacked, gain_for
 from runtime.model.base import Prediction, Predictor
 from runtime.model.loops import inner_loops
 from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack
 from runtime.records import F64, U8
+from runtime.support.threads import at_once
 
 FINE_ENOUGH = 1.5  # pixels of a picture for one of the raster: finer ones are sampled as they are
 SMALL_PX = 960 * 540 // 2  # of a raster: below, OpenCV's cubic kernel takes a few milliseconds
+LEAST_RAYS, MOST_RAYS = 0.5, 2.0  # pixels of a picture for one of the raster, between which its rays are looked along
 KERNEL_PX = 4  # of a picture, that interpolation reads around what is shown
 
 
@@ -29,14 +34,16 @@ def solve_still(
     """Layers for two pictures (h, w, 3 or 4) that a left and a right eye (2, 3), frame `stack`, should see.
 
     The pictures' horizontal field of view is `fov_deg`; each eye looks at the stack's origin. Warps each picture
-    to the rasters that the predictor wants (EyeReal supplement, (47)). Its prepare time includes the warps.
+    to the rasters that the predictor wants (EyeReal supplement, (47)). Where the predictor `refines`, what the
+    pictures' own rays lack is added once (`back_projection`). Its prepare time includes both.
     """
     start = cv2.getTickCount()
     rasters, windows = predictor.rasters(eyes_m), predictor.windows(eyes_m)
+    pictures = at_once(_with_alpha, (left, right))
     images: list[list[U8]] = []
-    for picture, eye_m in zip((left, right), eyes_m, strict=True):
-        height, width = picture.shape[:2]
-        rgba = np.asarray(picture if picture.shape[2] == 4 else cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA), np.uint8)
+    picture_from_raster: list[F64] = []  # of the first raster
+    for rgba, eye_m in zip(pictures, eyes_m, strict=True):
+        height, width = rgba.shape[:2]
         projection = image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg)
         images.append(
             [
@@ -52,11 +59,39 @@ def solve_still(
                 for raster, (rows, columns) in zip(rasters, windows, strict=True)
             ]
         )
+        picture_from_raster.append(image_from_raster(projection, rasters[0]))
     warps_ms = (cv2.getTickCount() - start) / cv2.getTickFrequency() * 1e3
     prediction = predictor.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
-    stage_ms = dict(prediction.stage_ms)
-    stage_ms["prepare"] = stage_ms.get("prepare", 0.0) + warps_ms
-    return Prediction(prediction.layers, stage_ms)
+    rows, columns = windows[0]
+    rays_px = [_source_px(matrix, rows=rows, columns=columns) for matrix in picture_from_raster]
+    if not predictor.refines or min(rays_px) <= LEAST_RAYS or max(rays_px) >= MOST_RAYS:
+        return Prediction(prediction.layers, _added(prediction.stage_ms, {"prepare": warps_ms}))
+    start = cv2.getTickCount()
+    gain = gain_for(predictor.stack, eyes_m, eye_sigma_mm=eye_sigma_mm)
+    for rgba, (image,), eye_m in zip(pictures, images, eyes_m, strict=True):
+        add_what_is_lacked(
+            image,
+            rasters[0],
+            prediction.layers,
+            rgba,
+            predictor.stack,
+            eye_m=eye_m,
+            fov_deg=fov_deg,
+            gain=gain,
+            rows=rows,
+            columns=columns,
+        )
+    looks_ms = (cv2.getTickCount() - start) / cv2.getTickFrequency() * 1e3
+    refined = predictor.refine(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
+    return Prediction(refined.layers, _added(prediction.stage_ms, refined.stage_ms, {"prepare": warps_ms + looks_ms}))
+
+
+def _with_alpha(picture: U8) -> U8:
+    return np.asarray(picture if picture.shape[2] == 4 else cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA), np.uint8)
+
+
+def _added(*stages: dict[str, float]) -> dict[str, float]:
+    return {name: sum(part.get(name, 0.0) for part in stages) for name in dict.fromkeys(chain(*stages))}
 
 
 def _warped(
@@ -80,19 +115,24 @@ def _warped(
     kernel = interpolation == "cubic" and not large
     finer = interpolation != "linear" and not kernel
     source_px = _source_px(image_from_raster, rows=rows, columns=columns)
-    if interpolation != "linear" and not black_beside and inner_loops().compiled and source_px < FINE_ENOUGH:
-        from runtime.model.compiled.warp import is_level, warped  # noqa: PLC0415 - imports numba
+    # OpenCV puts pixel centres at integers.
+    matrix = _shifted(-0.5, -0.5) @ image_from_raster @ _shifted(columns.start + 0.5, rows.start + 0.5)
+    linear = interpolation == "linear"
+    wide = rgba.shape[1] > 1  # compiled loops read two pixels of a row at once
+    if wide and not black_beside and (linear or source_px < FINE_ENOUGH) and inner_loops().compiled:
+        from runtime.model.compiled.warp import is_before_the_eye, is_level, warped  # noqa: PLC0415 - imports numba
 
-        matrix = _shifted(-0.5, -0.5) @ image_from_raster @ _shifted(columns.start + 0.5, rows.start + 0.5)
-        matrix /= matrix[2, 2]
-        if is_level(matrix, rows=rows, columns=columns, size=(rgba.shape[1], rgba.shape[0])):
-            warped(rgba, matrix, out=out, rows=rows, columns=columns, threads=cv2.getNumThreads())
+        size, place = (rgba.shape[1], rgba.shape[0]), matrix / matrix[2, 2]
+        if (
+            is_before_the_eye(place, rows=rows, columns=columns)
+            if linear
+            else is_level(place, rows=rows, columns=columns, size=size)
+        ):
+            warped(rgba, place, out=out, rows=rows, columns=columns, linear=linear)
             return out
     if finer and source_px < FINE_ENOUGH:
         rgba, finer_from_image = _finer(rgba, image_from_raster, rows=rows, columns=columns)
-        image_from_raster = finer_from_image @ image_from_raster
-    # OpenCV puts pixel centres at integers.
-    matrix = _shifted(-0.5, -0.5) @ image_from_raster @ _shifted(columns.start + 0.5, rows.start + 0.5)
+        matrix = _shifted(-0.5, -0.5) @ finer_from_image @ _shifted(0.5, 0.5) @ matrix
     cv2.warpPerspective(
         rgba,
         matrix,

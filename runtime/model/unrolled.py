@@ -19,15 +19,15 @@ from runtime.model.chain import chain_frame, chain_modes
 from runtime.model.channels import is_grey
 from runtime.model.fade import Fade
 from runtime.model.opencv_surround import OpenCvBackend
-from runtime.model.pyramid_level import CENTRE, FRONT, I16, REAR, START
-from runtime.model.schedule import Answer, Backend, Picture, Problem, Surround, carry_out
+from runtime.model.pyramid_level import CENTRE, FRONT, REAR, START
+from runtime.model.schedule import Answer, Backend, Picture, Problem, Surround, carry_on, carry_out
 from runtime.model.session import ModelSession
 from runtime.model.timing import Stopwatch
 from runtime.model.visible import visible_boxes
 from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
-from runtime.records import F64
+from runtime.records import F64, I16
 from runtime.support.gl import DrawnPicture
 
 HALF_IPD_M = 0.031
@@ -92,9 +92,24 @@ class UnrolledPredictor(Predictor):
     def predict(
         self, images: Sequence[Sequence[Picture]], eyes_m: F64, *, eye_sigma_mm: float = PUPIL_SIGMA_MM
     ) -> Prediction:
+        return self._solved(images, eyes_m, eye_sigma_mm=eye_sigma_mm, again=False)
+
+    @property
+    def refines(self) -> bool:
+        return self.session.contract.refining > 0
+
+    def refine(
+        self, images: Sequence[Sequence[Picture]], eyes_m: F64, *, eye_sigma_mm: float = PUPIL_SIGMA_MM
+    ) -> Prediction:
+        return self._solved(images, eyes_m, eye_sigma_mm=eye_sigma_mm, again=True)
+
+    def _solved(
+        self, images: Sequence[Sequence[Picture]], eyes_m: F64, *, eye_sigma_mm: float, again: bool
+    ) -> Prediction:
+        """again: by the last steps alone, on the panels of the last call."""
         across_m = np.abs(eyes_m[1] - eyes_m[0])
         if across_m[2] > across_m[1]:
-            return self._turned(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
+            return self._turned(images, eyes_m, eye_sigma_mm=eye_sigma_mm, again=again)
         watch = Stopwatch()
         contract = self.session.contract
         # One eye that stands for both asks for no difference: the chain may run along any line.
@@ -109,8 +124,11 @@ class UnrolledPredictor(Predictor):
         self.channels = 1 if grey else 3
         problem = Problem(contract, self.stack, boxes, eyes_m, frame, eye_sigma_mm, self.channels, self.fade)
         surround = self._surround()
-        with surround.begin(pictures, problem):
-            layers = carry_out(contract.steps, surround, lambda seen: self._network(seen, problem, watch))
+        with surround.begin(pictures, problem, again=again):
+            if again:
+                layers = carry_on(contract.steps[-contract.refining :], surround)
+            else:
+                layers = carry_out(contract.steps, surround, lambda seen: self._network(seen, problem, watch))
         watch.lap("finish")
         return Prediction(layers, watch.stage_ms)
 
@@ -128,7 +146,9 @@ class UnrolledPredictor(Predictor):
             self._made = self.surroundings.surround(self.session.contract, self.stack, threads=self._threads)
         return self._made
 
-    def _turned(self, images: Sequence[Sequence[Picture]], eyes_m: F64, *, eye_sigma_mm: float) -> Prediction:
+    def _turned(
+        self, images: Sequence[Sequence[Picture]], eyes_m: F64, *, eye_sigma_mm: float, again: bool
+    ) -> Prediction:
         """Eyes above each other: the same problem with rows for columns, solved by a twin for panels turned so."""
         stack = self.stack
         if self._twin is None or self._turner is None:
@@ -142,7 +162,8 @@ class UnrolledPredictor(Predictor):
         turned_m = np.stack([eyes_m[:, 0], -eyes_m[:, 2], -eyes_m[:, 1]], axis=1)
         order = (0, 1) if turned_m[1, 1] > turned_m[0, 1] else (1, 0)
         pictures = [[turner.turned_picture(images[side][0], side)] for side in order]
-        solved = twin.predict(pictures, turned_m[list(order)], eye_sigma_mm=eye_sigma_mm)
+        solve = twin.refine if again else twin.predict
+        solved = solve(pictures, turned_m[list(order)], eye_sigma_mm=eye_sigma_mm)
         self.channels = twin.channels
         return Prediction(turner.turned(solved.made), solved.stage_ms)
 
@@ -169,7 +190,7 @@ class UnrolledPredictor(Predictor):
         watch.lap("inference")
         tail = seen[0].shape[2:]
         panels = {n: answer[name].reshape(frame.rows, -1, *tail) for n, name in ((REAR, "rear"), (FRONT, "front"))}
-        return {n: problem.faded(panel, start=START) for n, panel in panels.items()}
+        return problem.faded(panels, start=START)
 
 
 def _is_grey(picture: Picture, box: PixelRect) -> bool:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from runtime.model.chain import ChainFrame
-from runtime.model.pyramid_level import I16, PyramidLevel
+from runtime.model.pyramid_level import PyramidLevel
 from runtime.model.resample import buffer
 from runtime.model.rows import RowPool
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
+from runtime.records import I16
 
 
 class Workspace:

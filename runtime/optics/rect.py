@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from runtime.optics.stack import PlaneRaster
@@ -29,6 +30,22 @@ class PixelRect:
         """Rows and columns, to index an image."""
         return slice(self.v0, self.v1), slice(self.u0, self.u1)
 
+    def beside(self, *, width_px: int, height_px: int) -> list[PixelRect]:
+        """All pixels of a raster but for these: up to four boxes."""
+        if not self.width_px or not self.height_px:
+            return [PixelRect(0, 0, width_px, height_px)]
+        boxes = (
+            PixelRect(0, 0, width_px, self.v0),
+            PixelRect(0, self.v1, width_px, height_px),
+            PixelRect(0, self.v0, self.u0, self.v1),
+            PixelRect(self.u1, self.v0, width_px, self.v1),
+        )
+        return [box for box in boxes if box.width_px and box.height_px]
+
+    def in_rows(self, rows: int) -> list[PixelRect]:
+        """In boxes of so many rows at most."""
+        return [PixelRect(self.u0, v, self.u1, min(v + rows, self.v1)) for v in range(self.v0, self.v1, rows)]
+
     def cut(self, raster: PlaneRaster) -> PlaneRaster:
         """The part of a raster."""
         return replace(
@@ -38,3 +55,16 @@ class PixelRect:
             width_px=self.width_px,
             height_px=self.height_px,
         )
+
+
+def union(boxes: Sequence[PixelRect]) -> PixelRect:
+    """The smallest box around those that aren't empty; empty where all are."""
+    filled = [box for box in boxes if box.width_px and box.height_px]
+    if not filled:
+        return PixelRect(0, 0, 0, 0)
+    return PixelRect(
+        min(box.u0 for box in filled),
+        min(box.v0 for box in filled),
+        max(box.u1 for box in filled),
+        max(box.v1 for box in filled),
+    )

@@ -170,6 +170,12 @@ def seen_by(
     )
 
 
+def layer_from_image(stack: PanelStack, index: int, eye_m: F64, from_stack: F64) -> F64:
+    """3x3 the pixels of a panel's layer from those of an eye's image with projection `from_stack` (3x4) (M_RPU)."""
+    matrix, moved = panel_from_image(from_stack, stack.panel(index)), _moved(stack, index, eye_m)
+    return matrix if moved is None else np.asarray(moved @ matrix, np.float64)
+
+
 def _moved(stack: PanelStack, index: int, eye_m: F64) -> F64 | None:
     """(3, 3) a layer's pixels from the ideal panel's, as an eye sees them; None where they are the same."""
     if stack.tilt is None:

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from runtime.optics.rect import PixelRect
+from runtime.optics.rect import PixelRect, union
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
+from runtime.support.threads import PIECE_ROWS, at_once
 
 TOLERANCE_CODES = 2  # eyes that differ by no more agree: a tenth of what 8 bits cost at 40 dB
+NOTHING_KNOWN = PixelRect(0, 0, 0, 0)
 COARSE_STEP = 16  # of the look that decides whether a closer one is worth its time
 WHOLE_ABOVE = 0.6  # of the panel: a larger window is not worth cutting out
 MOST_SLACK = 1.3  # of a kept window's area over the one that would do
@@ -35,15 +37,28 @@ class Window:
     steps: float  # parallaxes over which what is driven beside the difference fades out
 
 
-def differing_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> PixelRect:
-    """The smallest box of pixels in which two (h, w, 4) RGBA pictures differ; empty where they agree everywhere."""
-    return _box(left, right, tolerance)
+def differing_box(
+    left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES, known: PixelRect = NOTHING_KNOWN
+) -> PixelRect:
+    """The smallest box of pixels in which two (h, w, 4) RGBA pictures differ; empty where they agree everywhere.
+
+    known: a box within it, as `coarse_box` finds one: only what is beside that is looked at.
+    """
+    height, width = left.shape[:2]
+
+    def look(part: PixelRect) -> PixelRect:
+        found = _box(left[part.slices], right[part.slices], tolerance)
+        return PixelRect(found.u0 + part.u0, found.v0 + part.v0, found.u1 + part.u0, found.v1 + part.v0)
+
+    parts = known.beside(width_px=width, height_px=height)
+    return union([known, *at_once(look, [piece for part in parts for piece in part.in_rows(PIECE_ROWS)])])
 
 
 def coarse_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> PixelRect:
     """A box within `differing_box`, from a look at a few pixels, for a hundredth of the time: what is too much of the
     panel to be cut out is told by it."""
-    box = _box(left[::COARSE_STEP, ::COARSE_STEP], right[::COARSE_STEP, ::COARSE_STEP], tolerance)
+    few = [np.ascontiguousarray(picture[::COARSE_STEP, ::COARSE_STEP]) for picture in (left, right)]
+    box = _box(few[0], few[1], tolerance)
     if not box.width_px:
         return box
     return PixelRect(
@@ -55,7 +70,7 @@ def coarse_box(left: U8, right: U8, *, tolerance: int = TOLERANCE_CODES) -> Pixe
 
 
 def _box(left: U8, right: U8, tolerance: int) -> PixelRect:
-    difference = cv2.absdiff(np.ascontiguousarray(left), np.ascontiguousarray(right))
+    difference = cv2.absdiff(left, right)
     agree = cv2.inRange(difference, (0, 0, 0, 0), (tolerance, tolerance, tolerance, 255))
     u, v, width, height = cv2.boundingRect(cv2.bitwise_not(agree))
     return PixelRect(u, v, u + width, v + height)

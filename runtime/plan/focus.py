@@ -15,14 +15,13 @@ from time import perf_counter_ns
 import numpy as np
 
 from runtime.content.base import ContentSource, View
-from runtime.content.camera import union
 from runtime.model.assembly import Placed, Rest, Shared, Uniform
 from runtime.model.fade import Fade
 from runtime.model.predictor import Prediction, Predictor
 from runtime.model.schedule import Backend, Picture
 from runtime.model.unrolled import UnrolledPredictor
 from runtime.optics.pupil import PUPIL_SIGMA_MM
-from runtime.optics.rect import PixelRect
+from runtime.optics.rect import PixelRect, union
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import raster_from_stack
 from runtime.plan.active import (
@@ -143,18 +142,18 @@ class FocusedPredictor(Predictor):
             return self._whole(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
         else:
             # A coarse look tells for next to nothing what is too large; only the rest is worth a close one.
-            for look in (coarse_box, differing_box):
-                box = look(left, right)
+            box = coarse_box(left, right)
+            found = self._around(box, left, eyes_m)
+            if not box.width_px or found is not None:
+                box = differing_box(left, right, known=box)
                 found = self._around(box, left, eyes_m)
-                if box.width_px and found is None:
-                    return self._whole(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
+            if box.width_px and found is None:
+                return self._whole(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
             rest = Shared(left, self.whole.pre_emphasis)
             kept = self._kept(found)
             if kept is None:
                 return self._filled(rest, _ms_since(begin_ns))
-            window = kept
-            area = window.box
-            cut = [[np.ascontiguousarray(image[area.v0 : area.v1, area.u0 : area.u1])] for image in (left, right)]
+            window, cut = kept, _cut(images, kept)
         found_ms = _ms_since(begin_ns)
         # Solved before anything is put together: where the model fails, the last good layers stay as they were.
         part = self._part(window.stack)
@@ -162,6 +161,25 @@ class FocusedPredictor(Predictor):
         solved = part.predict(cut, eyes_m - window.shift_m, eye_sigma_mm=eye_sigma_mm)
         self.channels = part.channels
         return self._placed(window, solved, rest, eyes_m, found_ms)
+
+    @property
+    def refines(self) -> bool:
+        return self.whole.refines and self.active_fraction > 0
+
+    def refine(
+        self, images: Sequence[Sequence[Picture]], eyes_m: F64, *, eye_sigma_mm: float = PUPIL_SIGMA_MM
+    ) -> Prediction:
+        """Of whole pictures, not of those of an aimed window."""
+        window, left = self.window, images[0][0]
+        if window is None:
+            return self.whole.refine(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
+        assert not isinstance(left, DrawnPicture)
+        begin_ns = perf_counter_ns()
+        cut, rest = _cut(images, window), Shared(left, self.whole.pre_emphasis)
+        cut_ms = _ms_since(begin_ns)
+        part = self._part(window.stack)
+        solved = part.refine(cut, eyes_m - window.shift_m, eye_sigma_mm=eye_sigma_mm)
+        return self._placed(window, solved, rest, eyes_m, cut_ms)
 
     def _whole(self, images: Sequence[Sequence[Picture]], eyes_m: F64, *, eye_sigma_mm: float) -> Prediction:
         """Layers of which nothing can be left out."""
@@ -235,6 +253,12 @@ class FocusedPredictor(Predictor):
                 self._parts.pop(next(iter(self._parts))).close()
             self._parts[size] = self._make(stack)
         return self._parts[size]
+
+
+def _cut(images: Sequence[Sequence[Picture]], window: Window) -> list[list[Picture]]:
+    """Both eyes' pictures within a window."""
+    arrays = [image for (image,) in images if not isinstance(image, DrawnPicture)]
+    return [[np.ascontiguousarray(array[window.box.slices])] for array in arrays]
 
 
 def _ms_since(begin_ns: int) -> float:

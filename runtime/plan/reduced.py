@@ -54,7 +54,18 @@ class ReducedPredictor(Predictor):
     def predict(
         self, images: Sequence[Sequence[Any]], eyes_m: F64, *, eye_sigma_mm: float = PUPIL_SIGMA_MM
     ) -> Prediction:
-        solved = self.small.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
+        return self._enlarged(self.small.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm))
+
+    @property
+    def refines(self) -> bool:
+        return self.small.refines
+
+    def refine(
+        self, images: Sequence[Sequence[Any]], eyes_m: F64, *, eye_sigma_mm: float = PUPIL_SIGMA_MM
+    ) -> Prediction:
+        return self._enlarged(self.small.refine(images, eyes_m, eye_sigma_mm=eye_sigma_mm))
+
+    def _enlarged(self, solved: Prediction) -> Prediction:
         begin_ns = perf_counter_ns()
         layers = self._assembly.enlarged(solved.made)
         stage_ms = dict(solved.stage_ms)

@@ -24,11 +24,11 @@ from runtime.errors import InputError
 from runtime.model.chain import chain_frame
 from runtime.model.contract import Contract
 from runtime.model.predictor import Predictor
-from runtime.model.pyramid_level import CENTRE, I16, OUTER
-from runtime.model.schedule import Picture, Problem, carry_out
+from runtime.model.pyramid_level import CENTRE, OUTER
+from runtime.model.schedule import Picture, Problem, carry_on, carry_out
 from runtime.model.visible import visible_boxes
 from runtime.optics.stack import PanelStack
-from runtime.records import F64, U8
+from runtime.records import F64, I16, U8
 from runtime.report.pairs import StillPair
 
 if TYPE_CHECKING:
@@ -163,6 +163,11 @@ def correction_multiply_adds(contract: Contract, stack: PanelStack, eyes_m: F64)
     """What a chain model does outside its network, over what both eyes look through: its schedule, counted."""
     counted = _CountedSurround(contract, stack, eyes_m)
     carry_out(contract.steps, counted, lambda pictures: dict.fromkeys(OUTER, NOTHING))
+    if contract.refining:
+        # Along each of a picture's rays three layers, sin² and what lacks; brought back to the panel's pixels.
+        counted.total += EYES * RGB * _pixels(stack) * (stack.count * LINEAR + 2 + LINEAR + 1)
+        counted.prepare()
+        carry_on(contract.steps[-contract.refining :], counted)
     return counted.total
 
 
@@ -176,10 +181,17 @@ class _CountedSurround:
         frame = chain_frame(eyes_m, stack, cell_px=contract.cell_px, reduction=contract.reduction)
         self._in_frame = RGB * frame.rows * frame.width_px
         self._even = True  # no panel was changed yet
-        sharpened = 6 if contract.emphasis else 0  # a separable filter of three
-        self.total = EYES * self._values(CENTRE, 1) * (sharpened + 1)  # and a table
+        self._sharpened = 6 if contract.emphasis else 0  # a separable filter of three
+        self.total = 0
+        self.prepare()
 
-    def begin(self, pictures: Sequence[Picture], problem: Problem) -> AbstractContextManager[None]:
+    def prepare(self) -> None:
+        """Both eyes' pictures, sharpened and looked up."""
+        self.total += EYES * self._values(CENTRE, 1) * (self._sharpened + 1)
+
+    def begin(
+        self, pictures: Sequence[Picture], problem: Problem, *, again: bool = False
+    ) -> AbstractContextManager[None]:
         return nullcontext()
 
     def network_pictures(self) -> tuple[I16, I16]:

@@ -121,9 +121,11 @@ def next_shown(host: SolverThread, sink: Any, number: int, *, after: int) -> int
         try:
             if solution is None:
                 sink.present(PanelFrame(number, None, 0, (), flat.made, flat.number, 1.0))
-            elif solution.number > after and isinstance(solution.made, LayerTextures):
+            elif solution.number > after or not isinstance(solution.made, LayerTextures):
                 sink.present(PanelFrame(number, solution.made, solution.number))
-                return solution.number
+                # Made while the panels had no context, it was read back; they have another as soon as they show it.
+                if isinstance(solution.made, LayerTextures):
+                    return solution.number
         except PanelLost:
             sleep(0.01)
         sleep(0.001)

@@ -164,3 +164,11 @@ def test_thousands_of_solutions_with_contexts_lost_under_way_do_not_grow() -> No
     first, last = found.looks[0], found.looks[-1]
     assert sum(last.objects.values()) <= sum(first.objects.values()) + 6  # two solutions more may be held just then
     assert last.resident_mib - first.resident_mib < 64  # the process's, after the first hundred
+
+
+def test_a_lost_context_leaves_no_object_behind() -> None:
+    """Depth once lay in renderbuffers, which Mesa keeps where another context of the group releases them."""
+    found = soaked(60, upset_every=5, look_every=5, tell=lambda _: None)
+    assert found.events == {"solver's context lost": 11}
+    assert {look.objects["renderbuffers"] for look in found.looks} == {0}
+    assert sum(found.looks[-1].objects.values()) <= sum(found.looks[0].objects.values()) + 6

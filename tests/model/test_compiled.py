@@ -244,7 +244,7 @@ def test_a_picture_is_sampled_by_the_cubic_definition(right: float, down: float,
     matrix = np.array([[scale, right, 9.3], [down * scale, scale, 14.6], [2e-5, 3e-5, 1.0]])
     rows, columns = slice(3, 83), slice(5, 125)
     out = np.zeros((90, 130, 4), np.uint8)
-    warp.warped(picture, matrix, out=out, rows=rows, columns=columns, threads=2)
+    warp.warped(picture, matrix, out=out, rows=rows, columns=columns)
     v, u = np.mgrid[0:80, 0:120].astype(float)
     x, y, w = (row[0] * u + row[1] * v + row[2] for row in matrix)
     x, y = x / w, y / w

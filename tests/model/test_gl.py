@@ -36,6 +36,7 @@ from tests.model.scenes import FOV_DEG, card_scene, eyes
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 240, 135)
 TILT = Tilt(((0.001, 0.012, -0.006), (0.0, 0.0, 0.0), (-0.002, 0.004, 0.015)), (1.0, 0.1, -0.05))
 WITHIN_ONE = 0.999  # of all codes
+REFINED_WITHIN_ONE = 0.997  # where corrections go on from panels in 8 bits, of which a sixteenth decides a whole code
 UNSURE_MM = 24.0  # pixels are eight times those of 1920x1080: as many of them as 3 mm are there
 LEAST_DB = -0.05  # of displayed quality, against OpenCV
 HALF_TURN = np.radians(30)
@@ -96,10 +97,20 @@ def cards(pair: F64, stack: PanelStack, *, grey: bool = False) -> tuple[U8, U8]:
 
 
 def layers_of(
-    predictor: Predictor, pictures: tuple[U8, U8], pair: F64, *, sigma_mm: float = 1.0, fov_deg: float = FOV_DEG
+    predictor: Predictor,
+    pictures: tuple[U8, U8],
+    pair: F64,
+    *,
+    sigma_mm: float = 1.0,
+    fov_deg: float = FOV_DEG,
+    refined: bool = False,
 ) -> U8:
+    """refined: by what the rays lack of the layers in 8 bits, which differ where a sixteenth of a code decides."""
     how: Any = {"eyes_m": pair, "fov_deg": fov_deg, "eye_sigma_mm": sigma_mm}
-    layers: U8 = solve_still(*pictures, predictor=predictor, **how).layers.copy()
+    with pytest.MonkeyPatch.context() as patch:
+        if not refined:
+            patch.setattr(UnrolledPredictor, "refines", False)
+        layers: U8 = solve_still(*pictures, predictor=predictor, **how).layers.copy()
     return layers
 
 
@@ -117,6 +128,30 @@ def test_codes_are_those_of_exact_sampling(name: str, pose: str, sigma_mm: float
     wanted, found = (layers_of(p, pictures, pair, sigma_mm=sigma_mm) for p in (opencv, opengl))
     assert within_one(wanted, found) >= WITHIN_ONE
     assert (found[..., 3] == 255).all()
+
+
+@pytest.mark.usefixtures("exactly")
+@pytest.mark.parametrize("sigma_mm", [0.0, 3.0, UNSURE_MM])
+@pytest.mark.parametrize("pose", ["straight", "beside and above", "above each other"])
+def test_codes_of_pictures_that_changed_a_little_are_those_of_exact_sampling(
+    pose: str, sigma_mm: float, gl: GlBackend, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both backends go on from their own panels, for the same pictures."""
+    opencv, opengl = both("best", STACK, gl)
+    given: list[list[list[U8]]] = []
+    for name in ("predict", "refine"):
+        solve = getattr(opencv, name)
+
+        def noted(images: list[list[U8]], *rest: Any, solve: Any = solve, **how: Any) -> Any:
+            given.append([[image.copy() for image in pair] for pair in images])
+            return solve(images, *rest, **how)
+
+        monkeypatch.setattr(opencv, name, noted)
+    pair = POSES[pose]
+    wanted = layers_of(opencv, cards(pair, STACK), pair, sigma_mm=sigma_mm, refined=True)
+    before = opengl.predict(given[0], pair, eye_sigma_mm=sigma_mm).layers.copy()
+    found = opengl.refine(given[1], pair, eye_sigma_mm=sigma_mm).layers
+    assert within_one(wanted, found) >= REFINED_WITHIN_ONE > within_one(before, found)
 
 
 @pytest.mark.usefixtures("exactly")
@@ -290,7 +325,7 @@ def test_at_1920x1080(name: str, gl: GlBackend, monkeypatch: pytest.MonkeyPatch)
     found = layers_of(opengl, pictures, pair)
     shown_db = [
         displayed(layers, pictures, stack, eyes_m=pair, fov_deg=FOV_DEG, similarity=False).quality.psnr_db
-        for layers in (layers_of(opencv, pictures, pair), found)
+        for layers in (layers_of(predictor, pictures, pair, refined=True) for predictor in (opencv, opengl))
     ]
     assert abs(shown_db[1] - shown_db[0]) <= 0.05
     for module in (runtime.model.opencv_surround, runtime.model.pyramid_level):

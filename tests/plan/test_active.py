@@ -58,12 +58,13 @@ def test_a_coarse_look_never_finds_more_than_a_close_one() -> None:
         u, v = random.integers(0, 400), random.integers(0, 200)
         right[v : v + random.integers(1, 70), u : u + random.integers(1, 80), 0] = 50
         coarse, close = coarse_box(left, right), differing_box(left, right)
-        if coarse.width_px:
+        if coarse.width_px and coarse.height_px:
             assert close.u0 <= coarse.u0
             assert close.v0 <= coarse.v0
             assert coarse.u1 <= close.u1
             assert coarse.v1 <= close.v1
             assert close.width_px - coarse.width_px <= 32
+            assert differing_box(left, right, known=coarse) == close
 
 
 def test_a_window_s_panels_are_the_same_panels() -> None:

@@ -13,14 +13,15 @@ from math import ceil, log, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.model.compiled.enlarge import enlarge
 from runtime.model.compiled.passes import STRIP_ROWS, blur, close_centre, correct, show
-from runtime.model.compiled.sampling import SLACK, Samplings, samplings, work_row, work_tiles
+from runtime.model.compiled.sampling import SLACK, Samplings, numbers_of, samplings, work_row, work_tiles
+from runtime.model.compiled.sight import add_at_raster, lack_at_rays
 from runtime.model.compiled.warp import warped
 from runtime.model.pyramid_level import (
     CENTRE,
     EYES,
     FRONT,
-    I16,
     MOST_SPREAD,
     OUTER,
     REAR,
@@ -34,7 +35,7 @@ from runtime.model.rows import RowPool
 from runtime.model.transfer import FULL, SUBCODE
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
-from runtime.records import F32, F64, U8
+from runtime.records import F32, F64, I16, U8
 
 LEAST_PX = 8  # of a raster, either way: smaller ones end before a panel does, and OpenCV repeats their edges
 SCALE_MOST = 4.0  # between two panels; eyes that see more of one than so are served by OpenCV
@@ -103,15 +104,42 @@ class CompiledLevel(PyramidLevel):
             self._spare, self._whole[key] = self._whole[key], self._spare
             self.outer[panel] = self._view(*key, on=panel)
 
+    def upsample(self, coarser: PyramidLevel, *, shown: bool) -> None:
+        panels = [(coarser.outer[n], self.outer[n]) for n in OUTER]
+        if any(fine.shape[:2] != (2 * image.shape[0], 2 * image.shape[1]) for image, fine in panels):
+            super().upsample(coarser, shown=shown)
+            return
+        channels, _, full, subcode = self._constants()
+
+        def work(first: int, last: int, _: _Work) -> None:
+            for image, fine in panels:
+                height, width = fine.shape[0], image.shape[1]
+                rows = height * first // self.size[1], height * last // self.size[1]
+                numbers = [np.empty((width + margin) * channels, np.float32) for margin in (4, 0, 0)]
+                enlarge(
+                    numbers_of(image),
+                    image.shape[0],
+                    width,
+                    channels,
+                    numbers_of(fine),
+                    *rows,
+                    shown,
+                    full,
+                    subcode,
+                    *numbers,
+                )
+
+        self._on_rows(self.size[1], work)
+
     def show(self, layers: U8, boxes: Sequence[PixelRect]) -> None:
         seen = self._seen_at
         if seen is None:
             super().show(layers, boxes)
             return
         constants, floor = self._constants(), np.float32(self.slope_floor)
-        panels = [_numbers(self._in_the_mean(n)) for n in OUTER]
+        panels = [numbers_of(self._in_the_mean(n)) for n in OUTER]
         widths = [self.rasters[n].width_px * self._channels for n in OUTER]
-        wanted = [_numbers(image) for image in self.wanted]
+        wanted = [numbers_of(image) for image in self.wanted]
 
         def close(first: int, last: int, work: _Work) -> None:
             place = _pixels(layers[CENTRE]), boxes[CENTRE].v0, boxes[CENTRE].u0
@@ -123,7 +151,7 @@ class CompiledLevel(PyramidLevel):
             self._copy(self.outer[n], layers[n], boxes[n])
 
     def _copy(self, panel: I16, layer: U8, box: PixelRect) -> None:
-        numbers, pixels, bits = _numbers(panel), _pixels(layer), SUBCODE.bit_length() - 1
+        numbers, pixels, bits = numbers_of(panel), _pixels(layer), SUBCODE.bit_length() - 1
 
         def copy(first: int, last: int, _: _Work) -> None:
             show(numbers, pixels, box.v0, box.u0, box.width_px, first, last, self._channels, bits)
@@ -142,12 +170,12 @@ class CompiledLevel(PyramidLevel):
         columns: F32 = np.ones(centre.width_px, np.float32) if fading is None else fading.columns
         down: F32 = np.ones(centre.height_px, np.float32) if fading is None else fading.rows
         arguments = (
-            *(_numbers(image) for image in (self._in_the_mean(panel), self._in_the_mean(other), self._moved)),
+            *(numbers_of(image) for image in (self._in_the_mean(panel), self._in_the_mean(other), self._moved)),
             *(self.rasters[n].width_px * channels for n in (panel, other)),
             2 * OUTER.index(panel),
             unsure,
-            _numbers(self._spare),
-            *(_numbers(image) for image in self.wanted),
+            numbers_of(self._spare),
+            *(numbers_of(image) for image in self.wanted),
             self._seen_at,
             self._back_at[panel],
             *(np.float32(value) for value in (size, self.slope_floor, *limits)),
@@ -176,7 +204,7 @@ class CompiledLevel(PyramidLevel):
         """What is left of an image in the mean over eyes that are unsure, into `out`, or `gain` of the way there."""
         channels, _, _, subcode = self._constants()
         across, down = (_taps(sigma) for sigma in spread)
-        numbers, target = _numbers(image), _numbers(out)
+        numbers, target = numbers_of(image), numbers_of(out)
         size = raster.height_px, raster.width_px * channels
 
         def work(first: int, last: int, work: _Work) -> None:
@@ -225,15 +253,21 @@ def warm_up() -> None:
     """Compile every pass, or load what was compiled before."""
     stack, eyes_m = PanelStack(0.5, 0.25, (-0.06, 0.0, 0.06), 64, 32), np.array([[0.6, -0.03, 0.0], [0.6, 0.03, 0.0]])
     boxes, rows = (PixelRect(0, 0, 64, 32),) * 3, RowPool(1, width_px=64)
-    level = CompiledLevel(stack, reduction=1, rows=rows)
+    coarse, level = (CompiledLevel(stack, reduction=reduction, rows=rows) for reduction in (2, 1))
+    coarse.crop(boxes, stack)
     level.crop(boxes, stack)
+    level.upsample(coarse, shown=True)
     for sigma_mm in (0.0, 100.0):
         level.set_eye_sigma(eyes_m, eye_sigma_mm=sigma_mm)
         level.project(OUTER, eyes_m)
         level.step(FRONT, eyes_m, size=1.0, shown=True)
     layers = np.zeros((3, 32, 64, 4), np.uint8)
     level.show(layers, boxes)
-    warped(layers[0], np.eye(3), out=layers[1], rows=slice(0, 32), columns=slice(0, 64), threads=1)
+    whole, same = (slice(0, 32), slice(0, 64)), np.eye(3)
+    for linear in (False, True):
+        warped(layers[0], same, out=layers[1], rows=whole[0], columns=whole[1], linear=linear)
+    lack = lack_at_rays(layers, layers[0], np.stack([same] * 3), least=0.0, most=1.0)
+    add_at_raster(layers[1], lack, same, gain=1.0, rows=whole[0], columns=whole[1])
     rows.close()
 
 
@@ -253,13 +287,6 @@ def _taps(sigma_px: float) -> F32:
     offsets = np.arange(count + 1 + count % 2)
     weights = np.exp(-0.5 * (offsets / max(sigma_px, 1e-3)) ** 2)
     return np.asarray(weights / (2 * weights.sum() - weights[0]), np.float32)
-
-
-def _numbers(image: I16) -> I16:
-    """(rows, numbers): the buffer that an image begins, with what is behind it."""
-    parent = image.base
-    assert isinstance(parent, np.ndarray)
-    return parent.reshape(parent.shape[0], -1)
 
 
 def _pixels(layer: U8) -> NDArray[np.uint32]:

@@ -16,7 +16,7 @@ from llvmlite import ir
 from numba import config, njit, types
 from numba.extending import intrinsic
 
-from runtime.records import F32
+from runtime.records import F32, I16
 
 PIECE = 32  # numbers that are blended at once
 TILE = 960  # numbers of a row that are done together: they stay in the nearest cache
@@ -32,6 +32,7 @@ OPTIONS: Any = {
 }
 PASS: Any = {**OPTIONS, "forceinline": False}  # of functions that are called from outside
 EDGE_PX = 1e-3  # a place on an image's very edge is within
+CHANNELS = 4  # of a picture's pixel, RGBA
 U = np.uint64
 
 _VECTOR = ir.VectorType(ir.FloatType(), PIECE)
@@ -213,3 +214,10 @@ def work_row(scale: float) -> F32:
 def work_tiles() -> F32:
     """(8, numbers): tiles to work in, the second all zeros."""
     return np.zeros((8, TILE + SLACK), np.float32)
+
+
+def numbers_of(image: I16) -> I16:
+    """(rows, numbers): the buffer that an image begins, with what is behind it."""
+    parent = image.base
+    assert isinstance(parent, np.ndarray)
+    return parent.reshape(parent.shape[0], -1)

@@ -2,23 +2,23 @@
 
 A row of the raster is a straight line in the picture. What that line crosses of each of the picture's columns is
 sampled first, and what was found then at the raster's pixels (Catmull and Smith, SIGGRAPH 1980): eight numbers of the
-picture for one of the raster instead of sixteen, and all of them contiguous.
+picture for one of the raster instead of sixteen. A pixel's four numbers are weighed at once.
 """
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from itertools import product
 
-import cv2
 import numpy as np
 from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 
-from runtime.model.compiled.sampling import OPTIONS, PASS, U
+from runtime.model.compiled.pixels import LEAST_WEIGHT, locate, sample_pixels
+from runtime.model.compiled.sampling import CHANNELS, OPTIONS, PASS, U
 from runtime.records import F64, U8
+from runtime.support.threads import on_rows
 
-PIECE = 16  # pixels that are sampled at once
 CUBIC = np.float32(-0.75)  # of the kernel, as OpenCV's
 TAPS = 4
 RISE_MOST = (
@@ -26,32 +26,72 @@ RISE_MOST = (
 )
 MARGIN_PX = 2048  # of a picture that a row may reach beside it
 
-_VECTOR = ir.VectorType(ir.FloatType(), PIECE)
+_PIXEL = ir.VectorType(ir.FloatType(), CHANNELS)
 
 
 @intrinsic
-def _weigh_piece(typing, line, source, weights, start, stride, out):
-    """out[start + k] = sum over t of weights[t·stride + start + k]·line[source + k + t], for `PIECE` pixels at once."""
-    signature = types.void(line, types.uint64, weights, types.uint64, types.uint64, out)
+def _weigh_bytes(typing, image, first, second, third, fourth, weights, start, stride, out, to):
+    """out[to:to + 4] = the sum over t of weights[t·stride + start] times the four numbers of an image (numbers,) uint8
+    from its t-th place on."""
+    signature = types.void(image, *(types.uint64,) * TAPS, weights, types.uint64, types.uint64, out, types.uint64)
 
     def generate(context, builder, signature, arguments):
-        line, source, weights, start, stride, out = arguments
-
-        def place(array, at, index):
-            data = context.make_array(signature.args[at])(context, builder, array).data
-            return builder.bitcast(builder.gep(data, [index]), ir.PointerType(_VECTOR))
-
+        weights, start, stride, out, to = arguments[1 + TAPS :]
         total = None
-        for tap in range(TAPS):
-            number = ir.Constant(ir.IntType(64), tap)
-            read = builder.load(place(line, 0, builder.add(source, number)), align=4)
-            weight = builder.load(place(weights, 2, builder.add(start, builder.mul(stride, number))), align=4)
-            product = builder.fmul(read, weight, flags=["contract"])
-            total = product if total is None else builder.fadd(total, product, flags=["contract"])
-        builder.store(total, place(out, 5, start), align=4)
+        for tap, place in enumerate(arguments[1 : 1 + TAPS]):
+            kind = ir.VectorType(ir.IntType(8), CHANNELS)
+            read = builder.load(_place(context, builder, signature.args[0], arguments[0], place, kind), align=1)
+            weight = _weight(context, builder, signature.args[1 + TAPS], weights, start, stride, tap)
+            total = _add_product(builder, total, builder.uitofp(read, _PIXEL), weight)
+        builder.store(total, _place(context, builder, signature.args[-2], out, to, _PIXEL), align=4)
         return context.get_dummy_value()
 
     return signature, generate
+
+
+@intrinsic
+def _weigh_pixels(typing, pixels, source, weights, start, stride, out, to):
+    """out[to:to + 4] = the sum over t of weights[t·stride + start] times the four numbers of the t-th pixel from number
+    `source` on, rounded, as uint8, the fourth 255."""
+    signature = types.void(pixels, types.uint64, weights, types.uint64, types.uint64, out, types.uint64)
+
+    def generate(context, builder, signature, arguments):
+        pixels, source, weights, start, stride, out, to = arguments
+        total = ir.Constant(_PIXEL, [0.5] * CHANNELS)
+        for tap in range(TAPS):
+            at = builder.add(source, ir.Constant(ir.IntType(64), CHANNELS * tap))
+            read = builder.load(_place(context, builder, signature.args[0], pixels, at, _PIXEL), align=4)
+            weight = _weight(context, builder, signature.args[2], weights, start, stride, tap)
+            total = _add_product(builder, total, read, weight)
+        none, most = ir.Constant(_PIXEL, [0.0] * CHANNELS), ir.Constant(_PIXEL, [255.0] * CHANNELS)
+        total = builder.select(builder.fcmp_ordered("<", total, none), none, total)
+        total = builder.select(builder.fcmp_ordered(">", total, most), most, total)
+        bytes_ = ir.VectorType(ir.IntType(8), CHANNELS)
+        codes = builder.trunc(builder.fptosi(total, ir.VectorType(ir.IntType(32), CHANNELS)), bytes_)
+        codes = builder.or_(codes, ir.Constant(bytes_, [0, 0, 0, 255]))
+        builder.store(codes, _place(context, builder, signature.args[-2], out, to, bytes_), align=1)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+def _place(context, builder, kind, array, index, vector):
+    data = context.make_array(kind)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), ir.PointerType(vector))
+
+
+def _weight(context, builder, kind, weights, start, stride, tap):
+    """The same for all numbers of a pixel."""
+    index = builder.add(start, builder.mul(stride, ir.Constant(ir.IntType(64), tap)))
+    value = builder.load(builder.gep(context.make_array(kind)(context, builder, weights).data, [index]))
+    one = builder.insert_element(ir.Constant(_PIXEL, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
+    same = ir.Constant(ir.VectorType(ir.IntType(32), CHANNELS), [0] * CHANNELS)
+    return builder.shuffle_vector(one, ir.Constant(_PIXEL, ir.Undefined), same)
+
+
+def _add_product(builder, total, a, b):
+    product = builder.fmul(a, b, flags=["contract"])
+    return product if total is None else builder.fadd(total, product, flags=["contract"])
 
 
 @njit(**OPTIONS)
@@ -84,17 +124,17 @@ def _divide(offset, slope, bend, one, count, shares, weights, places):  # pragma
 
 @njit(**PASS)
 def warp(
-    red, green, blue, matrix, out, v0, u0, width, first, last, line, columns, shares, weights, places
+    picture, height, picture_width, matrix, out, first, last, v0, u0, width, columns, shares, weights, places
 ):  # pragma: no cover
-    """Rows first to last of a raster, `width` pixels each, into out (rows, pixels) uint32, RGBA, from
-    row v0 and pixel u0 on.
+    """Rows first to last of a raster, `width` pixels each, into out (rows, numbers) uint8, RGBA, from row v0 and
+    pixel u0 on.
 
-    red, green, blue: the picture, (rows, columns) uint8, whose edge goes on beside it. matrix (3, 3): its pixels from
-    the raster's, pixel centres at integers; rows must stay nearly level. line, columns (3, numbers), shares (numbers,),
-    weights (4, numbers), places (numbers,): to work in.
+    picture (numbers,): `height` times `picture_width` pixels RGBA, whose edge goes on beside it. matrix (3, 3): its
+    pixels from the raster's, pixel centres at integers; rows must stay nearly level. columns (numbers,), shares
+    (pixels,), weights (4, pixels), places (pixels,): to work in.
     """
-    height, picture_width = red.shape
-    half, none, one, most = np.float32(0.5), np.float32(0), np.float32(1), np.float32(255)
+    none, one, stride = np.float32(0), np.float32(1), U(weights.shape[1])
+    line = U(picture_width * CHANNELS)
     for v in range(first, last):
         # Where the row begins and ends in the picture: a straight line.
         w = matrix[2, 1] * v + matrix[2, 2]
@@ -116,62 +156,66 @@ def warp(
                 end += 1
             a, b = U(min(max(top - 1, 0), height - 1)), U(min(max(top, 0), height - 1))
             c, d = U(min(max(top + 1, 0), height - 1)), U(min(max(top + 2, 0), height - 1))
-            at, to = U(begin + k), U(k)
-            for n in range(3):
-                plane = red if n == 0 else (green if n == 1 else blue)
-                for i in range(end - k):
-                    upper = np.float32(plane[a, U(i) + at]) * weights[0, U(i) + to]
-                    upper += np.float32(plane[b, U(i) + at]) * weights[1, U(i) + to]
-                    lower = np.float32(plane[c, U(i) + at]) * weights[2, U(i) + to]
-                    lower += np.float32(plane[d, U(i) + at]) * weights[3, U(i) + to]
-                    columns[n, U(i) + to] = upper + lower
+            for i in range(k, end):
+                x = U(begin + i) * U(CHANNELS)
+                places_of = a * line + x, b * line + x, c * line + x, d * line + x
+                _weigh_bytes(picture, *places_of, weights, U(i), stride, columns, U(i) * U(CHANNELS))
             k = end
-        for n in range(3):
-            for i in range(min(inner_begin, count)):
-                columns[n, U(i)] = columns[n, U(min(inner_begin, count - 1))]
-            for i in range(max(inner_end, 0), count):
-                columns[n, U(i)] = columns[n, U(max(inner_end - 1, 0))]
+        for k in range(min(inner_begin, count) * CHANNELS):
+            columns[U(k)] = columns[U(min(inner_begin, count - 1) * CHANNELS + k % CHANNELS)]
+        for k in range(max(inner_end, 0) * CHANNELS, count * CHANNELS):
+            columns[U(k)] = columns[U(max(inner_end - 1, 0) * CHANNELS + k % CHANNELS)]
         # Along the row: x as a share of two straight lines.
         w = matrix[2, 1] * v + matrix[2, 2]
         offset, slope = np.float32((matrix[0, 1] * v + matrix[0, 2]) / w - begin), matrix[0, 0] - begin * matrix[2, 0]
         _divide(offset, np.float32(slope / w), np.float32(matrix[2, 0] / w), one, width, shares, weights, places)
-        stride, u = U(weights.shape[1]), 0
-        while u < width:
-            source, end = places[U(u)], u + 1
-            while end < width and end < u + PIECE and places[U(end)] - end == source - u:
-                end += 1
-            _weigh_piece(columns[0], U(source - 1), weights, U(u), stride, line[0])
-            _weigh_piece(columns[1], U(source - 1), weights, U(u), stride, line[1])
-            _weigh_piece(columns[2], U(source - 1), weights, U(u), stride, line[2])
-            u = end
-        for n in range(3):
-            for u in range(width):
-                line[n, U(u)] = min(max(line[n, U(u)] + half, none), most)
-        row, pixel = U(v + v0), U(u0)
-        for u in range(width):
-            low = np.uint32(np.int32(line[0, U(u)])) | np.uint32(np.int32(line[1, U(u)])) << np.uint32(8)
-            high = np.uint32(np.int32(line[2, U(u)])) << np.uint32(16) | np.uint32(0xFF000000)
-            out[row, U(u) + pixel] = np.uint32(low | high)
+        to = U(v + v0) * U(out.shape[1]) + U(u0) * U(CHANNELS)
+        for i in range(width):
+            source = U(places[U(i)] - 1) * U(CHANNELS)
+            _weigh_pixels(columns, source, weights, U(i), stride, out, to + U(i) * U(CHANNELS))
 
 
-def warped(picture: U8, matrix: F64, *, out: U8, rows: slice, columns: slice, threads: int) -> None:
+@njit(**PASS)
+def warp_linear(
+    picture, height, picture_width, matrix, out, first, last, v0, u0, width, sums, shares, places, within
+):  # pragma: no cover
+    """The same by linear samples, of rows that may lie in any way. sums (numbers,), shares (2, pixels), places
+    (2, pixels), within (pixels,): to work in."""
+    half, opaque = np.float32(0.5), np.float32(255)
+    for v in range(first, last):
+        locate(matrix, v, 0, width, picture_width, height, places[0], places[1], shares[0], shares[1], within)
+        for k in range(width * CHANNELS):
+            sums[U(k)] = half
+        sample_pixels(picture, places[0], places[1], shares[0], shares[1], width, sums)
+        for k in range(width):
+            sums[U(k * CHANNELS + CHANNELS - 1)] = opaque
+        row, begin = U(v + v0), U(u0) * U(CHANNELS)
+        for k in range(width * CHANNELS):
+            out[row, begin + U(k)] = np.uint8(np.int32(sums[U(k)]))
+
+
+def warped(picture: U8, matrix: F64, *, out: U8, rows: slice, columns: slice, linear: bool = False) -> None:
     """A picture (h, w, 4) on rows and columns of a raster: into out (rows, columns, 4), opaque.
 
     matrix: 3x3, last entry 1, the picture's pixels from those of the drawn rows and columns, pixel centres at integers.
+    linear: by linear samples, where cubic ones take rows that are nearly level.
     """
-    planes = [np.ascontiguousarray(plane) for plane in cv2.split(picture)[:3]]
     height, width = rows.stop - rows.start, columns.stop - columns.start
-    pixels = out.view(np.uint32)[..., 0]
+    source = np.ascontiguousarray(picture).reshape(-1), *picture.shape[:2], matrix, out.reshape(out.shape[0], -1)
+    place = rows.start, columns.start, width
 
-    def share(index: int) -> None:
-        numbers = max(width, picture.shape[1] + 2 * MARGIN_PX) + 4 * PIECE
-        line, found, weights = (np.zeros((n, numbers), np.float32) for n in (3, 3, TAPS))
-        work = line, found, np.zeros(numbers, np.float32), weights, np.zeros(numbers, np.int32)
-        first, last = (height * part // threads for part in (index, index + 1))
-        warp(*planes, matrix, pixels, rows.start, columns.start, width, first, last, *work)
+    def share(first: int, last: int) -> None:
+        if linear:
+            sums, within = np.zeros(width * CHANNELS, np.float32), np.zeros(width, np.float32)
+            work = sums, np.zeros((2, width), np.float32), np.zeros((2, width), np.int32), within
+            warp_linear(*source, first, last, *place, *work)
+            return
+        pixels = max(width, picture.shape[1] + 2 * MARGIN_PX) + TAPS
+        sampled, shares = np.zeros(pixels * CHANNELS, np.float32), np.zeros(pixels, np.float32)
+        weights, places = np.zeros((TAPS, pixels), np.float32), np.zeros(pixels, np.int32)
+        warp(*source, first, last, *place, sampled, shares, weights, places)
 
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(share, range(threads)))
+    on_rows(share, 0, height)
 
 
 def is_level(matrix: F64, *, rows: slice, columns: slice, size: tuple[int, int]) -> bool:
@@ -185,3 +229,9 @@ def is_level(matrix: F64, *, rows: slice, columns: slice, size: tuple[int, int])
     across = x[1::2] - x[::2]
     far = x.min() < -MARGIN_PX or x.max() > size[0] + MARGIN_PX or x[::2].max() >= size[0] or x[1::2].min() <= 0
     return not far and across.min() > 0 and bool((np.abs(y[1::2] - y[::2]) < RISE_MOST * across).all())
+
+
+def is_before_the_eye(matrix: F64, *, rows: slice, columns: slice) -> bool:
+    """Whether all of a raster (3x3 as above) is."""
+    right, down = columns.stop - columns.start - 1.0, rows.stop - rows.start - 1.0
+    return bool(min(matrix[2] @ corner for corner in product((0.0, right), (0.0, down), (1.0,))) > LEAST_WEIGHT)

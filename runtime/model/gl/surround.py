@@ -24,11 +24,11 @@ from runtime.model.contract import Contract
 from runtime.model.fade import CORRECTED_SHARE
 from runtime.model.gl.assembly import left_in
 from runtime.model.gl.programs import Image, Passes
-from runtime.model.pyramid_level import CENTRE, FRONT, I16, NEUTRAL, OUTER, REAR, START, pixels_in_line, spreads
+from runtime.model.pyramid_level import CENTRE, FRONT, NEUTRAL, OUTER, REAR, START, pixels_in_line, spreads
 from runtime.model.schedule import Picture, Problem, reductions
 from runtime.model.transfer import phase_codes
 from runtime.optics.stack import PanelStack, PlaneRaster
-from runtime.records import F64, U8, Layers
+from runtime.records import F64, I16, U8, Layers
 from runtime.support.gl import DrawnPicture, finish
 from runtime.support.gl_sharing import LayerPool, wait_until_drawn
 
@@ -65,10 +65,11 @@ class GlSurround:
         self._layers: U8 | None = None  # where they are read back
         self._read: dict[tuple[int, ...], tuple[I16, I16]] = {}
         self._closed = False
+        self._outer: dict[tuple[int, int], str] = {}  # which of two images a panel is in
         self._at_once = at_once
 
     @contextmanager
-    def begin(self, pictures: Sequence[Picture], problem: Problem) -> Iterator[None]:
+    def begin(self, pictures: Sequence[Picture], problem: Problem, *, again: bool = False) -> Iterator[None]:
         with self._passes.drawing():
             self._problem = problem
             self._grey = problem.channels == 1
@@ -88,8 +89,9 @@ class GlSurround:
             )
             sloped = self._contract.slope_floor < 1
             self._defines = tuple(name for name, on in (("PACKED", self._packed), ("SLOPED", sloped)) if on)
-            self._outer: dict[tuple[int, int], str] = {}  # which of two images a panel is in
-            self._want(self._taken(pictures))
+            if not again:
+                self._outer = {}
+            self._want(self._taken(pictures), (1,) if again else tuple(self._rasters))
             yield
 
     def network_pictures(self) -> tuple[I16, I16]:
@@ -219,11 +221,11 @@ class GlSurround:
             taken.append(image)
         return taken
 
-    def _want(self, pictures: Sequence[Image]) -> None:
-        """Both eyes' phase sums on every raster."""
+    def _want(self, pictures: Sequence[Image], coarser_by: Sequence[int]) -> None:
+        """Both eyes' phase sums on some rasters."""
         box = self._problem.boxes[CENTRE]
-        for reduction, rasters in self._rasters.items():
-            width, height = _size(rasters[CENTRE])
+        for reduction in coarser_by:
+            width, height = _size(self._rasters[reduction][CENTRE])
             wanted = self._wanted(reduction)
             self._draw(
                 "wanted",

@@ -1,0 +1,48 @@
+"""The phase sums that the eyes' pictures ask for, on rasters of the centre panel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+
+from runtime.model.channels import without_alpha
+from runtime.model.rows import RowPool
+from runtime.model.transfer import phase_codes, pre_emphasised
+from runtime.optics.malus import Branch
+from runtime.optics.rect import PixelRect
+from runtime.records import I16, U8
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """What is asked for: both eyes' pictures within a box of the centre panel."""
+
+    arrays: Sequence[U8]  # (h, w, 4) of the whole panel, left and right
+    box: PixelRect
+    channels: int  # 1 or 3
+    emphasis: float  # how strongly they are sharpened (`transfer.pre_emphasised`)
+    branch: Branch
+
+    @property
+    def table(self) -> I16:
+        """(256,) phase sum of each code."""
+        return phase_codes(self.branch)
+
+
+def fill_wanted(pictures: Pictures, pairs: Sequence[Sequence[I16]], *, rows: RowPool) -> None:
+    """Phase sums at the size of pairs of images (h, w[, 3]), left and right, averaged as codes: into them."""
+
+    def sharpened(picture: U8) -> U8:
+        return pre_emphasised(without_alpha(picture[pictures.box.slices], pictures.channels), pictures.emphasis)
+
+    def fill(item: tuple[U8, I16]) -> None:
+        picture, image = item
+        size = image.shape[1::-1]
+        same = picture.shape[1::-1] == size
+        cv2.LUT(picture if same else cv2.resize(picture, size, interpolation=cv2.INTER_AREA), pictures.table, dst=image)
+
+    sharp = rows.map(sharpened, pictures.arrays)
+    for pair in pairs:
+        rows.map(fill, list(zip(sharp, pair, strict=True)))

@@ -1,0 +1,41 @@
+"""Work on a few threads at once that release the interpreter's lock, as numpy's, OpenCV's and compiled loops do."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from itertools import pairwise
+from typing import TypeVar
+
+import cv2
+
+PIECE_ROWS = 128  # of a picture, that are done at once where `at_once` works on it in pieces
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def at_once(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """`work` of every item, on as many threads as OpenCV may use; what it raises is raised here."""
+    threads = cv2.getNumThreads()
+    if threads < 2 or len(items) < 2:
+        return [work(item) for item in items]
+    return list(_pool(threads).map(work, items))
+
+
+def on_rows(work: Callable[[int, int], None], first: int, last: int) -> None:
+    """`work(first, last)` on as many rows for each of OpenCV's threads."""
+    threads = max(1, cv2.getNumThreads())
+    bounds = [first + (last - first) * k // threads for k in range(threads + 1)]
+    at_once(lambda rows: work(*rows), list(pairwise(bounds)))
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Threads that stay: a new one begins two milliseconds late."""
+    return ThreadPoolExecutor(threads, "at-once")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # a child has none of its parent's threads
