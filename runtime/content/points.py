@@ -18,7 +18,7 @@ from runtime.content.ply import Table, read_vertices
 from runtime.errors import InputError
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64
-from runtime.support.gl import DrawnPicture
+from runtime.support.gl import DrawnPicture, linked_program
 
 COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 GREY = (0.45, 0.45, 0.45)  # of points without a colour
@@ -117,7 +117,7 @@ class PointSource(DrawingSource):
         self._disc_m = DISC_PER_GAP * min(max(gap_m, extent_m / 1000), max(extent_m / 20, 1e-4)) or 1e-3
         self._context = self.draws_in = context
         self._canvas = Canvas(context, samples=1, background=background)
-        self._program = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
+        self._program = linked_program(context, vertex=VERTEX, fragment=FRAGMENT)
         self._buffer = context.buffer(np.concatenate([positions, cloud.colours], axis=1, dtype=np.float32))
         self._vertices = context.vertex_array(
             self._program, [(self._buffer, "3f 3f", "in_position", "in_colour")], mode=moderngl.POINTS

@@ -12,7 +12,7 @@ from runtime.content.canvas import Canvas
 from runtime.content.gaussians import Gaussians, colours_towards, moved, seen_splats
 from runtime.optics.rect import PixelRect
 from runtime.records import F64
-from runtime.support.gl import DrawnPicture
+from runtime.support.gl import DrawnPicture, linked_program
 
 OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
 FLOATS = 8  # a corner: place in clip space (2), place in standard deviations (2), colour and opacity (4)
@@ -59,7 +59,7 @@ class SplatSource(DrawingSource):
         self._scene_from_stack_rotation = (np.linalg.inv(linear) * np.cbrt(np.linalg.det(linear))).astype(np.float32)
         self._context = self.draws_in = context
         self._canvas = Canvas(context, samples=0, background=background, deep=True)
-        self._program = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
+        self._program = linked_program(context, vertex=VERTEX, fragment=FRAGMENT)
         count = len(gaussians.centres)
         self._corners = np.empty((count, 4, FLOATS), np.float32)
         self._buffer = context.buffer(reserve=max(self._corners.nbytes, 1), dynamic=True)

@@ -19,7 +19,7 @@ from runtime.content.fringe import Edges, edges_of, ramps, silhouette
 from runtime.content.shapes import Shape
 from runtime.optics.rect import PixelRect, union
 from runtime.records import F32, F64, U8
-from runtime.support.gl import DrawnPicture
+from runtime.support.gl import DrawnPicture, linked_program
 
 MOST_OUTLINED = 200_000  # triangles of a part; beyond, finding its outline costs more than drawing it
 MOST_PROJECTED = 5000  # vertices of a part that are projected to tell where it lies; beyond, its box is
@@ -271,9 +271,7 @@ class TrianglePainter:
     def _program(self, features: tuple[str, ...]) -> Any:
         if features not in self._programs:
             head = "#version 330\n" + "".join(f"#define {name}\n" for name in features)
-            self._programs[features] = self._context.program(
-                vertex_shader=head + VERTEX, fragment_shader=head + FRAGMENT
-            )
+            self._programs[features] = linked_program(self._context, vertex=head + VERTEX, fragment=head + FRAGMENT)
         return self._programs[features]
 
     def _texture(self, picture: U8) -> Any:

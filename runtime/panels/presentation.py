@@ -12,6 +12,7 @@ from runtime.optics.alignment import EVEN_CODE, is_identity, scale_and_shift
 from runtime.panels import lut
 from runtime.panels.geometry import layer_from_screen, permutes_pixels
 from runtime.records import F32, F64, Layers, PanelFrame, pixels_of
+from runtime.support.gl import linked_program
 from runtime.support.gl_sharing import LayerTextures, ShareGroup, lies_in
 
 VERTEX = """#version 330 core
@@ -225,7 +226,7 @@ class Painter:
     """The presentation shader in one context; vertex arrays and framebuffers are not shared between contexts."""
 
     def __init__(self, context: moderngl.Context, mounting: Mounting) -> None:
-        self._program = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
+        self._program = linked_program(context, vertex=VERTEX, fragment=FRAGMENT)
         self._array = context.vertex_array(self._program, [])
         table = np.ascontiguousarray(mounting.curve.T)
         self._curve = context.texture((lut.ENTRIES, 3), 1, table.tobytes(), dtype="f4")

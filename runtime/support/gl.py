@@ -12,6 +12,7 @@ import moderngl
 
 from runtime.errors import MissingPart
 from runtime.records import U8
+from runtime.support.interrupts import interrupts_held
 
 DEBIAN_PACKAGES = "libegl1 libgl1-mesa-dri libgles2 libgl1"
 MINIMUM_VERSION = 330
@@ -25,12 +26,20 @@ def offscreen_context() -> moderngl.Context:
     Use it on one thread only. Raises MissingPart, naming Debian's packages, where EGL can't give OpenGL 3.3.
     """
     try:
-        return moderngl.create_context(require=MINIMUM_VERSION, standalone=True, **EGL)
+        with interrupts_held():
+            return moderngl.create_context(require=MINIMUM_VERSION, standalone=True, **EGL)
     except Exception as error:  # moderngl and glcontext raise plain Exception
         raise MissingPart(
             f"no OpenGL without a screen ({str(error).strip() or 'EGL failed'}): "
             f"install Debian's packages {DEBIAN_PACKAGES}{_limited()}"
         ) from None
+
+
+def linked_program(context: moderngl.Context, *, vertex: str, fragment: str) -> Any:
+    """Two shaders as a program. moderngl makes its uniforms by calls of Python that it takes to succeed: an interrupt
+    in one of them was a segmentation fault."""
+    with interrupts_held():
+        return context.program(vertex_shader=vertex, fragment_shader=fragment)
 
 
 def _limited() -> str:

@@ -10,6 +10,7 @@ import moderngl
 import numpy as np
 
 from runtime.model.gl.programs import source
+from runtime.support.gl import linked_program
 
 SIDE_PX = 1024
 RUNS = 3  # timed, of which the fastest counts
@@ -34,7 +35,7 @@ def measured_speed(context: Any) -> Speed:
     size = (SIDE_PX, SIDE_PX)
     first, second = (context.texture(size, 4, dtype="i2") for _ in range(2))
     target = context.framebuffer([second])
-    program = context.program(vertex_shader=source("whole.vert.glsl"), fragment_shader=source("copy.frag.glsl"))
+    program = linked_program(context, vertex=source("whole.vert.glsl"), fragment=source("copy.frag.glsl"))
     array = context.vertex_array(program, [])
     held = np.empty((SIDE_PX, SIDE_PX, 4), np.int16)
     try:
