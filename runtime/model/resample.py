@@ -20,6 +20,7 @@ from runtime.optics.views import relative_scale_shift
 from runtime.records import F64
 
 MARGIN = 4  # pixels to spare, right and below, in buffers that are resampled into
+MARGIN_NUMBERS = 40  # to spare to the right: compiled loops read whole pieces of a row
 SEARCH = 96  # pixels among which a whole place in the source is looked for
 GOOD_PHASE = 1 / 24  # of a pixel: the search ends here; so small a shift leaves an error below -55 dB
 LEAST_RUN = 8  # pixels of source and result that are worth resizing
@@ -42,7 +43,7 @@ def buffer(height_px: int, width_px: int, dtype: Any = np.int16, *, channels: in
 
     It is a view with margins.
     """
-    shape = (height_px + MARGIN, width_px + MARGIN)
+    shape = (height_px + MARGIN, width_px + max(MARGIN, -(-MARGIN_NUMBERS // channels)))
     return np.zeros(shape if channels == 1 else (*shape, channels), dtype)[:height_px, :width_px]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import chain
 
 import cv2
@@ -10,6 +11,7 @@ import numpy as np
 from runtime.model.back_projection import add_what_is_lacked, gain_for
 from runtime.model.base import Prediction, Predictor
 from runtime.model.loops import inner_loops
+from runtime.model.unseen import is_whole, make_up, shown_of
 from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack
@@ -40,26 +42,30 @@ def solve_still(
     start = cv2.getTickCount()
     rasters, windows = predictor.rasters(eyes_m), predictor.windows(eyes_m)
     pictures = at_once(_with_alpha, (left, right))
-    images: list[list[U8]] = []
-    picture_from_raster: list[F64] = []  # of the first raster
-    for rgba, eye_m in zip(pictures, eyes_m, strict=True):
-        height, width = rgba.shape[:2]
-        projection = image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg)
-        images.append(
-            [
+    images: list[list[U8]] = [[], []]
+    picture_from_raster: list[F64] = []  # of each eye, from the first raster
+    for raster, (rows, columns) in zip(rasters, windows, strict=True):
+        matrices = []
+        for made, rgba, eye_m in zip(images, pictures, eyes_m, strict=True):
+            height, width = rgba.shape[:2]
+            matrix = image_from_raster(
+                image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg), raster
+            )
+            matrices.append(matrix)
+            made.append(
                 _warped(
                     rgba,
-                    image_from_raster(projection, raster),
+                    matrix,
                     raster,
                     rows=rows,
                     columns=columns,
                     interpolation=predictor.interpolation,
                     black_beside=predictor.black_beside,
                 )
-                for raster, (rows, columns) in zip(rasters, windows, strict=True)
-            ]
-        )
-        picture_from_raster.append(image_from_raster(projection, rasters[0]))
+            )
+        if not predictor.black_beside and raster.x_m == 0.0:
+            _make_up([made[-1] for made in images], matrices, pictures, rows=rows, columns=columns)
+        picture_from_raster = picture_from_raster or matrices
     warps_ms = (cv2.getTickCount() - start) / cv2.getTickFrequency() * 1e3
     prediction = predictor.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
     rows, columns = windows[0]
@@ -84,6 +90,17 @@ def solve_still(
     looks_ms = (cv2.getTickCount() - start) / cv2.getTickFrequency() * 1e3
     refined = predictor.refine(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
     return Prediction(refined.layers, _added(prediction.stage_ms, refined.stage_ms, {"prepare": warps_ms + looks_ms}))
+
+
+def _make_up(
+    images: Sequence[U8], matrices: Sequence[F64], pictures: Sequence[U8], *, rows: slice, columns: slice
+) -> None:
+    shown = [
+        shown_of(matrix, size=(picture.shape[1], picture.shape[0]), rows=rows, columns=columns)
+        for matrix, picture in zip(matrices, pictures, strict=True)
+    ]
+    if not all(is_whole(one, columns) for one in shown):
+        make_up(images, shown, rows=rows, columns=columns)
 
 
 def _with_alpha(picture: U8) -> U8:

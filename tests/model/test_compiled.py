@@ -109,6 +109,21 @@ def test_codes_are_those_of_exact_sampling(pose: str, channels: int, boxes: str,
     assert (found[beside] == 255).all()
 
 
+@pytest.mark.usefixtures("exactly")
+@pytest.mark.parametrize("floor", [0.25, 1.0])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_rolled_heads_eyes_see_a_strip_through_rows_that_lie_far_apart(
+    channels: int, floor: float, rows: RowPool
+) -> None:
+    """More rows apart than one eye's share of the residual has: they were written behind its end."""
+    stack = PanelStack(0.2592, 0.1458, (-0.15, 0.0, 0.15), 200, 112)
+    levels = [filled(kind, rows, stack, boxes="whole", channels=channels) for kind in (PyramidLevel, CompiledLevel)]
+    for level in levels:
+        level.slope_floor = floor
+    wanted, found = (solved(level, eyes(0.25, roll_deg=40), sigma_mm=0.0) for level in levels)
+    assert within_one(wanted, found) >= WITHIN_ONE
+
+
 @pytest.mark.parametrize("sigma_mm", [0.0, 2.0, 6.0, 50.0])
 @pytest.mark.parametrize("name", SHIPPED)
 def test_the_eyes_see_no_less_however_unsure_they_are(name: str, sigma_mm: float) -> None:

@@ -36,6 +36,16 @@ def _best(left, right, weights, weighed, most, count, best):  # pragma: no cover
             best[U(k)] = min(max((left[U(k)] + right[U(k)]) * half, none), most)
 
 
+@njit(**OPTIONS)
+def _rows_before(back, side, first, last, height):  # pragma: no cover
+    """The centre panel's rows, first and beyond, that an eye sees a panel's rows first to last through; none: 0, 0."""
+    begin, end = height, 0
+    for v in range(first, last):
+        if back.rows[side, v] >= 0:
+            begin, end = min(begin, back.rows[side, v]), max(end, back.rows[side, v] + 2)
+    return (begin, min(end, height)) if begin < end else (0, 0)
+
+
 @njit(**PASS)
 def correct(
     this,
@@ -89,13 +99,13 @@ def correct(
         weights[1, U(k)] = one
     for v0 in range(share * STRIP_ROWS, height, shares * STRIP_ROWS):
         v1 = min(v0 + STRIP_ROWS, height)
-        r0, r1 = centre_height, 0
-        for side in range(2):
-            for v in range(v0, v1):
-                if back.rows[side, v] >= 0:
-                    r0, r1 = min(r0, back.rows[side, v]), max(r1, back.rows[side, v] + 2)
-        r1 = min(r1, centre_height)
-        for r in range(r0, r1):
+        # Each eye sees the strip before rows of its own: those of a head that is rolled lie far apart.
+        l0, l1 = _rows_before(back, 0, v0, v1, centre_height)
+        r0, r1 = _rows_before(back, 1, v0, v1, centre_height)
+        for r in range(min(l0, r0), max(l1, r1)):
+            for_left, for_right = l0 <= r < l1, r0 <= r < r1
+            if not (for_left or for_right):
+                continue
             for tile in range(seen.tiles.shape[1] - 1):
                 count = min(size_of_tile, centre_width - tile * size_of_tile)
                 at = tile * size_of_tile
@@ -122,36 +132,38 @@ def correct(
                             row,
                             moved[side],
                         )
-                begin, down, line = U(at), fade_rows[U(r)], U(r - r0)
+                begin, down = U(at), fade_rows[U(r)]
                 if floor < one:
                     _weigh(left_wanted, U(r), begin, count, floor, most, weights[0])
                     _weigh(right_wanted, U(r), begin, count, floor, most, weights[1])
                 _best(left, right, weights, floor < one, most, count, part[0])
                 lefts, rights = (moved[0], moved[1]) if unsure else (left, right)
-                for k in range(count):
-                    weight = fade_columns[U(k) + begin] * down * weights[0, U(k)]
-                    residual[0, line, U(k) + begin] = np.int16(np.int32((lefts[U(k)] - part[0, U(k)]) * weight))
-                for k in range(count):
-                    weight = fade_columns[U(k) + begin] * down * weights[1, U(k)]
-                    residual[1, line, U(k) + begin] = np.int16(np.int32((rights[U(k)] - part[0, U(k)]) * weight))
-                if floor < one:
+                for side in range(2):
+                    if not (for_left if side == 0 else for_right):
+                        continue
+                    lacks, kept, line = (
+                        (lefts, residual[0], U(r - l0)) if side == 0 else (rights, residual[1], U(r - r0))
+                    )
                     for k in range(count):
-                        residual[2, line, U(k) + begin] = np.int16(np.int32(weights[0, U(k)] * weight_whole))
-                    for k in range(count):
-                        residual[3, line, U(k) + begin] = np.int16(np.int32(weights[1, U(k)] * weight_whole))
+                        weight = fade_columns[U(k) + begin] * down * weights[U(side), U(k)]
+                        kept[line, U(k) + begin] = np.int16(np.int32((lacks[U(k)] - part[0, U(k)]) * weight))
+                    if floor < one:
+                        kept = residual[2] if side == 0 else residual[3]
+                        for k in range(count):
+                            kept[line, U(k) + begin] = np.int16(np.int32(weights[U(side), U(k)] * weight_whole))
         for v in range(v0, v1):
             for tile in range(back.tiles.shape[1] - 1):
                 count = min(size_of_tile, width - tile * size_of_tile)
                 begin, down = U(tile * size_of_tile), U(v)
-                lack(even, 0, 0, residual[0], r0, centre_width, 0, v, tile, count, back, channels, none, row, part[0])
+                lack(even, 0, 0, residual[0], l0, centre_width, 0, v, tile, count, back, channels, none, row, part[0])
                 lack(part, 0, 0, residual[1], r0, centre_width, 1, v, tile, count, back, channels, none, row, left)
                 if floor < one:
                     for side in range(2):
-                        before, sums, seen_weights = (
-                            (even, part[0], residual[2]) if side == 0 else (part, right, residual[3])
+                        before, sums, seen_weights, begun = (
+                            (even, part[0], residual[2], l0) if side == 0 else (part, right, residual[3], r0)
                         )
                         tile_of = (centre_width, side, v, tile, count, back, channels, weight_whole, row, sums)
-                        lack(before, 0, 0, seen_weights, r0, *tile_of)
+                        lack(before, 0, 0, seen_weights, begun, *tile_of)
                     for k in range(count):
                         left[U(k)] *= np.float32(-2) * weight_whole / right[U(k)]
                 if shown:
