@@ -229,10 +229,10 @@ def _random_pairs(seed: int) -> Callable[[int], StillPair]:
 def _pairs_cache(seed: int) -> Path:
     """A folder of its own for each seed, and for each state of the code that draws and solves the pairs."""
     from model_export import data, scene, stills, textures
-    from runtime.model import sart, still
+    from runtime.model import sart, still, unseen
     from runtime.support.cache import digest, user_cache
 
-    modules = (data, scene, stills, textures, sart, still)
+    modules = (data, scene, stills, textures, sart, still, unseen)
     return user_cache("pairs") / digest([Path(str(module.__file__)) for module in modules], seed, ROBUST_SIZE)
 
 
