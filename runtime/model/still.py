@@ -21,6 +21,7 @@ from runtime.support.threads import at_once
 FINE_ENOUGH = 1.5  # pixels of a picture for one of the raster: finer ones are sampled as they are
 SMALL_PX = 960 * 540 // 2  # of a raster: below, OpenCV's cubic kernel takes a few milliseconds
 LEAST_RAYS, MOST_RAYS = 0.5, 2.0  # pixels of a picture for one of the raster, between which its rays are looked along
+EDGE_PX = 2.0  # of a raster, beside a picture, that its outermost rays are interpolated from: its edge goes on there
 KERNEL_PX = 4  # of a picture, that interpolation reads around what is shown
 
 
@@ -36,40 +37,28 @@ def solve_still(
     """Layers for two pictures (h, w, 3 or 4) that a left and a right eye (2, 3), frame `stack`, should see.
 
     The pictures' horizontal field of view is `fov_deg`; each eye looks at the stack's origin. Warps each picture
-    to the rasters that the predictor wants (EyeReal supplement, (47)). Where the predictor `refines`, what the
+    to the rasters that the predictor wants (EyeReal supplement, (47)); where one ends within the panels, nothing is
+    driven for what it does not show (`unseen`). Where the predictor `refines`, what the
     pictures' own rays lack is added once (`back_projection`). Its prepare time includes both.
     """
     start = cv2.getTickCount()
     rasters, windows = predictor.rasters(eyes_m), predictor.windows(eyes_m)
     pictures = at_once(_with_alpha, (left, right))
-    images: list[list[U8]] = [[], []]
-    picture_from_raster: list[F64] = []  # of each eye, from the first raster
-    for raster, (rows, columns) in zip(rasters, windows, strict=True):
-        matrices = []
-        for made, rgba, eye_m in zip(images, pictures, eyes_m, strict=True):
-            height, width = rgba.shape[:2]
-            matrix = image_from_raster(
-                image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg), raster
-            )
-            matrices.append(matrix)
-            made.append(
-                _warped(
-                    rgba,
-                    matrix,
-                    raster,
-                    rows=rows,
-                    columns=columns,
-                    interpolation=predictor.interpolation,
-                    black_beside=predictor.black_beside,
-                )
-            )
-        if not predictor.black_beside and raster.x_m == 0.0:
-            _make_up([made[-1] for made in images], matrices, pictures, rows=rows, columns=columns)
-        picture_from_raster = picture_from_raster or matrices
+    projections = [
+        image_from_stack(eye_m, width_px=picture.shape[1], height_px=picture.shape[0], fov_deg=fov_deg)
+        for picture, eye_m in zip(pictures, eyes_m, strict=True)
+    ]
+    pairs = [
+        _drawn(pictures, projections, raster, rows=rows, columns=columns, predictor=predictor)
+        for raster, (rows, columns) in zip(rasters, windows, strict=True)
+    ]
+    images = [list(of_eye) for of_eye in zip(*pairs, strict=True)]
     warps_ms = (cv2.getTickCount() - start) / cv2.getTickFrequency() * 1e3
     prediction = predictor.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
     rows, columns = windows[0]
-    rays_px = [_source_px(matrix, rows=rows, columns=columns) for matrix in picture_from_raster]
+    rays_px = [
+        _source_px(image_from_raster(projection, rasters[0]), rows=rows, columns=columns) for projection in projections
+    ]
     if not predictor.refines or min(rays_px) <= LEAST_RAYS or max(rays_px) >= MOST_RAYS:
         return Prediction(prediction.layers, _added(prediction.stage_ms, {"prepare": warps_ms}))
     start = cv2.getTickCount()
@@ -92,15 +81,43 @@ def solve_still(
     return Prediction(refined.layers, _added(prediction.stage_ms, refined.stage_ms, {"prepare": warps_ms + looks_ms}))
 
 
-def _make_up(
-    images: Sequence[U8], matrices: Sequence[F64], pictures: Sequence[U8], *, rows: slice, columns: slice
-) -> None:
+def _drawn(
+    pictures: Sequence[U8],
+    projections: Sequence[F64],
+    raster: PlaneRaster,
+    *,
+    rows: slice,
+    columns: slice,
+    predictor: Predictor,
+) -> list[U8]:
+    """Both eyes' pictures on a raster, for a predictor. On the centre panel's, what one does not show is made up."""
+    matrices = [image_from_raster(projection, raster) for projection in projections]
+    window = {"rows": rows, "columns": columns}
+    images = [
+        _warped(
+            picture,
+            matrix,
+            raster,
+            **window,
+            interpolation=predictor.interpolation,
+            black_beside=predictor.black_beside,
+        )
+        for picture, matrix in zip(pictures, matrices, strict=True)
+    ]
+    if predictor.black_beside or raster.x_m != predictor.stack.x_m[predictor.stack.count // 2]:
+        return images
     shown = [
-        shown_of(matrix, size=(picture.shape[1], picture.shape[0]), rows=rows, columns=columns)
-        for matrix, picture in zip(matrices, pictures, strict=True)
+        shown_of(
+            matrix,
+            size=(picture.shape[1], picture.shape[0]),
+            **window,
+            margin_px=EDGE_PX * _source_px(matrix, **window),
+        )
+        for picture, matrix in zip(pictures, matrices, strict=True)
     ]
     if not all(is_whole(one, columns) for one in shown):
-        make_up(images, shown, rows=rows, columns=columns)
+        make_up(images, shown, **window)
+    return images
 
 
 def _with_alpha(picture: U8) -> U8:

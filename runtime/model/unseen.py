@@ -32,17 +32,20 @@ class Shown(NamedTuple):
         return self.last > self.first
 
 
-def shown_of(image_from_raster: F64, *, size: tuple[int, int], rows: slice, columns: slice) -> Shown:
-    """What a picture of (width, height) shows of a raster's rows and columns, whose pixels' centres are at halves.
+def shown_of(
+    image_from_raster: F64, *, size: tuple[int, int], rows: slice, columns: slice, margin_px: float = 0.0
+) -> Shown:
+    """What a picture of (width, height), and so many of its pixels around it, shows of a raster's rows and columns.
 
-    image_from_raster: 3x3, of a positive weight before the eye. Each side of the picture is a line on the raster, and
-    what is before the eye and within all four is one run of every row.
+    image_from_raster: 3x3, of a positive weight before the eye; the centres of the raster's pixels are at halves. Each
+    side of the picture is a line on the raster, and what is before the eye and within all four is one run of every row.
     """
     width, height = size
     x, y, w = image_from_raster
     v = np.arange(rows.start, rows.stop) + 0.5
     first, last = np.full(len(v), columns.start + 0.5), np.full(len(v), columns.stop - 0.5)
-    for side in (w, x, y, width * w - x, height * w - y):  # each at least 0 within
+    low, right, down = margin_px * w, (width + margin_px) * w, (height + margin_px) * w
+    for side in (w, x + low, y + low, right - x, down - y):  # each at least 0 within
         offset = side[1] * v + side[2]
         if side[0] == 0:
             last = np.where(offset >= 0, last, columns.start - 0.5)
