@@ -16,7 +16,17 @@ from runtime.support.cache import digest, user_cache
 
 log = logging.getLogger("phasestack.model")
 
-SOURCES = ("sampling.py", "passes.py", "enlarge.py", "pixels.py", "warp.py", "sight.py", "unseen.py", "wanted.py")
+SOURCES = (
+    "sampling.py",
+    "passes.py",
+    "enlarge.py",
+    "fade.py",
+    "pixels.py",
+    "warp.py",
+    "sight.py",
+    "unseen.py",
+    "wanted.py",
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from runtime.model.assembly import Assembly
 from runtime.model.chain import ChainFrame, ColumnLaw
 from runtime.model.contract import Contract, Step
 from runtime.model.fade import Fade
+from runtime.model.loops import inner_loops
 from runtime.model.pyramid_level import CENTRE, FRONT, OUTER, REAR, coarser
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
@@ -73,7 +74,7 @@ class Problem:
         return ColumnLaw(law.bend, law.middle + self.frame.cell_px)
 
     def faded(self, panels: Answer, *, start: int) -> Answer:
-        """The network's answer that ends, at `start`, within a part of the panels."""
+        """The network's answer that ends, at `start`, within a part of the panels; in place."""
         if self.fade is None:
             return panels
         frame, first = self.frame, next(iter(panels.values()))
@@ -84,13 +85,18 @@ class Problem:
             self.centre_from(plane_from_wave), rows=rows, columns=columns, law=self.answer_columns
         )
         channels = first.size // (rows * columns)
+        if inner_loops().compiled:
+            from runtime.model.compiled.fade import fade_codes  # noqa: PLC0415 - imports numba
+
+            ends = weights[..., 0]
+            at_once(lambda panel: fade_codes(panel.reshape(rows, -1), ends, start, channels), list(panels.values()))
+            return panels
         weights = np.repeat(weights[..., 0], channels, axis=1)  # else numpy's innermost loop has three turns
         rest = start * (1 - weights) + np.float32(0.5)  # rounded
-
-        def fade(panel: I16) -> I16:
-            return np.asarray(panel.reshape(rows, -1) * weights + rest, np.int16).reshape(panel.shape)
-
-        return dict(zip(panels, at_once(fade, list(panels.values())), strict=True))
+        for panel in panels.values():
+            numbers = panel.reshape(rows, -1)
+            numbers[...] = numbers * weights + rest
+        return panels
 
     def centre_from(self, plane_from_raster: F64) -> F64:
         """3x3: the centre panel's pixels from a raster's on its plane."""

@@ -68,21 +68,22 @@ def make_up(images: Sequence[U8], shown: Sequence[Shown], *, rows: slice, column
     known = shown[0].any | shown[1].any
     if not known.any():
         return
-    pixels = [image.view(np.uint32)[rows, columns, 0] for image in images]
+    pixels = [image.view(np.uint32)[..., 0] for image in images]
     if inner_loops().compiled:
         from runtime.model.compiled.unseen import make_up_rows  # noqa: PLC0415 - imports numba
 
-        make_up_rows(*pixels, *shown[0], *shown[1], columns.start)
+        make_up_rows(*pixels, *shown[0], *shown[1], rows.start, columns.start, columns.stop)
     else:
         for index in np.flatnonzero(known):
-            runs = [slice(one.first[index] - columns.start, one.last[index] - columns.start) for one in shown]
-            _make_up_row([image[index] for image in pixels], runs)
-    there = np.flatnonzero(known)  # they follow each other
+            runs = [slice(one.first[index], one.last[index]) for one in shown]
+            _make_up_row([image[rows.start + index] for image in pixels], runs, columns)
+    there = np.flatnonzero(known)
     for image in pixels:
-        image[: there[0]], image[there[-1] + 1 :] = image[there[0]], image[there[-1]]
+        drawn = image[rows, columns]
+        drawn[: there[0]], drawn[there[-1] + 1 :] = drawn[there[0]], drawn[there[-1]]
 
 
-def _make_up_row(lines: Sequence[U32], runs: Sequence[slice]) -> None:
+def _make_up_row(lines: Sequence[U32], runs: Sequence[slice], columns: slice) -> None:
     for line, own, other, others in zip(lines, runs, lines[::-1], runs[::-1], strict=True):
         new = np.arange(others.start, others.stop)
         new = new[(new < own.start) | (new >= own.stop)]
@@ -91,4 +92,4 @@ def _make_up_row(lines: Sequence[U32], runs: Sequence[slice]) -> None:
     begin, low = min(((run.start, line[run.start]) for line, run in some), key=itemgetter(0))
     end, high = max(((run.stop, line[run.stop - 1]) for line, run in some), key=itemgetter(0))
     for line in lines:
-        line[:begin], line[end:] = low, high
+        line[columns.start : begin], line[end : columns.stop] = low, high

@@ -18,7 +18,9 @@ from runtime.config import ModelSettings
 from runtime.evaluation.displayed import displayed, expected_db
 from runtime.model import loops
 from runtime.model.compiled import passes, sampling, warp
+from runtime.model.compiled.fade import fade_codes
 from runtime.model.compiled.level import CompiledLevel, warm_up
+from runtime.model.compiled.unseen import make_up_rows
 from runtime.model.fade import Softening
 from runtime.model.opencv_surround import OpenCvBackend
 from runtime.model.predictor import SHIPPED, load_predictor
@@ -241,7 +243,7 @@ def test_nothing_is_written_beside_the_images(rows: RowPool) -> None:
 
 def test_what_was_compiled_at_the_start_serves_every_case(rows: RowPool) -> None:
     warm_up()
-    compiled = (passes.correct, passes.blur, passes.close_centre, passes.show, warp.warp)
+    compiled = (passes.correct, passes.blur, passes.close_centre, passes.show, warp.warp, make_up_rows, fade_codes)
     for boxes in BOXES:
         for channels in (1, 3):
             level = filled(CompiledLevel, rows, STACK, boxes=boxes, channels=channels)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from runtime.config import ModelSettings
+from runtime.model.compiled.fade import fade_codes
 from runtime.model.fade import Fade
 from runtime.model.predictor import load_predictor
 from runtime.model.unrolled import UnrolledPredictor
@@ -30,6 +32,17 @@ def test_a_sheared_raster_is_weighed_in_the_panel_s_own_directions() -> None:
     assert weights[0, 0] < 0.1
     assert weights[0, 30] == 1.0  # fifteen rows further down
     assert weights[20, 0] == 1.0
+
+
+@pytest.mark.parametrize("rows", [1, 6])
+def test_compiled_and_plain_fades_are_the_same(rows: int) -> None:
+    codes = np.random.default_rng(4).integers(-300, 4400, (6, 8, 3)).astype(np.int16)
+    weights = np.linspace(0, 1.2, rows * 8, dtype=np.float32).reshape(rows, 8).clip(0, 1)
+    wanted = (codes * weights[..., None] + (2040 * (1 - weights[..., None]) + np.float32(0.5))).astype(np.int16)
+    wanted = np.where(weights[..., None] < 1, wanted, codes)
+    found = codes.copy()
+    fade_codes(found.reshape(6, -1), weights, 2040, 3)
+    assert (found == wanted).all()
 
 
 def test_outer_panels_stay_even_beside_what_is_kept() -> None:

@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.model.compiled.enlarge import enlarge
+from runtime.model.compiled.fade import fade_codes
 from runtime.model.compiled.passes import STRIP_ROWS, blur, close_centre, correct, show
 from runtime.model.compiled.sampling import SLACK, Samplings, numbers_of, samplings, work_row, work_tiles
 from runtime.model.compiled.sight import add_at_raster, lack_at_rays
+from runtime.model.compiled.unseen import make_up_rows
 from runtime.model.compiled.warp import warped
 from runtime.model.pyramid_level import (
     CENTRE,
@@ -266,6 +268,9 @@ def warm_up() -> None:
     whole, same = (slice(0, 32), slice(0, 64)), np.eye(3)
     for linear in (False, True):
         warped(layers[0], same, out=layers[1], rows=whole[0], columns=whole[1], linear=linear)
+    fade_codes(np.zeros((2, 6), np.int16), np.zeros((1, 2), np.float32), START, 3)
+    every = np.zeros(32, np.int64), np.full(32, 64)
+    make_up_rows(_pixels(layers[0]), _pixels(layers[1]), *every, *every, 0, 0, 64)
     lack = lack_at_rays(layers, layers[0], np.stack([same] * 3), least=0.0, most=1.0)
     add_at_raster(layers[1], lack, same, gain=1.0, rows=whole[0], columns=whole[1])
     rows.close()

@@ -8,14 +8,14 @@ from runtime.model.compiled.sampling import PASS
 
 
 @njit(**PASS)
-def make_up_rows(left, right, left_first, left_last, right_first, right_last, start):  # pragma: no cover
-    """As `runtime.model.unseen.make_up`, of rows that a picture shows a part of: RGBA (rows, pixels) uint32, whose
-    first pixels are the raster's pixel `start`."""
-    width = left.shape[1]
-    for v in range(left.shape[0]):
-        a, b, c, d = left_first[v] - start, left_last[v] - start, right_first[v] - start, right_last[v] - start
+def make_up_rows(left, right, left_first, left_last, right_first, right_last, v0, start, stop):  # pragma: no cover
+    """As `runtime.model.unseen.make_up`, of rows from v0 on that a picture shows a part of: RGBA (rows, pixels) uint32,
+    of which pixels start to stop are drawn."""
+    for row in range(left_first.shape[0]):
+        a, b, c, d = left_first[row], left_last[row], right_first[row], right_last[row]
         if b <= a and d <= c:
             continue
+        v = row + v0
         for k in range(c, d):
             if k < a or k >= b:
                 left[v, k] = right[v, k]
@@ -25,7 +25,7 @@ def make_up_rows(left, right, left_first, left_last, right_first, right_last, st
         by_left, by_right = b > a and (d <= c or a <= c), b > a and (d <= c or b >= d)
         begin, low = (a, left[v, a]) if by_left else (c, right[v, c])
         end, high = (b, left[v, b - 1]) if by_right else (d, right[v, d - 1])
-        for k in range(begin):
+        for k in range(start, begin):
             left[v, k], right[v, k] = low, low
-        for k in range(end, width):
+        for k in range(end, stop):
             left[v, k], right[v, k] = high, high
