@@ -148,7 +148,7 @@ class ArrayAssembly:
             sharp = pre_emphasised(rest.picture[grown.slices], rest.emphasis)
             rows = slice(part.v0 - grown.v0, part.v1 - grown.v0)
             columns = slice(part.u0 - grown.u0, part.u1 - grown.u0)
-            centre[part.slices] = cv2.LUT(np.ascontiguousarray(sharp[rows, columns]), codes)
+            cv2.LUT(sharp[rows, columns], codes, dst=centre[part.slices])
 
         hole = but or PixelRect(0, 0, 0, 0)
         parts = hole.beside(width_px=self._stack.width_px, height_px=self._stack.height_px)

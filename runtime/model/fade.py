@@ -45,11 +45,12 @@ class Fade:
         if m[0, 1] or m[1, 0] or m[2, 0]:
             w = m[2, 0] * t + m[2, 2]
             across, down = (across + m[0, 1] * v) / w, (down + m[1, 0] * t) / w
-        u, v = across, down
-        weights = np.ones((1, columns))
-        for inside, over_px in (*self._across(u, self.over_px[0]), *self._down(v, self.over_px[1])):
-            weights = weights * np.clip(inside / over_px, 0.0, 1.0)
-        return np.asarray(weights, np.float32)[..., None]
+        right, below = np.ones((1, columns), np.float32), np.ones((1, 1), np.float32)
+        for inside, over_px in self._across(across, self.over_px[0]):
+            right = right * np.clip(inside / over_px, 0.0, 1.0).astype(np.float32)
+        for inside, over_px in self._down(down, self.over_px[1]):
+            below = below * np.clip(inside / over_px, 0.0, 1.0).astype(np.float32)
+        return np.asarray(right * below)[..., None]
 
     def softening(self, centre_from_raster: F64, *, rows: int, columns: int) -> Softening:
         """How corrections on a raster of the centre panel end: none must drive the panels beyond their edges."""

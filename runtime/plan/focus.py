@@ -37,6 +37,7 @@ from runtime.plan.active import (
 )
 from runtime.records import F64, U8
 from runtime.support.gl import DrawnPicture
+from runtime.support.threads import at_once
 
 SIZES_KEPT = 6
 
@@ -257,8 +258,8 @@ class FocusedPredictor(Predictor):
 
 def _cut(images: Sequence[Sequence[Picture]], window: Window) -> list[list[Picture]]:
     """Both eyes' pictures within a window."""
-    arrays = [image for (image,) in images if not isinstance(image, DrawnPicture)]
-    return [[np.ascontiguousarray(array[window.box.slices])] for array in arrays]
+    parts = [image[window.box.slices] for (image,) in images if not isinstance(image, DrawnPicture)]
+    return [[part] for part in at_once(np.ascontiguousarray, parts)]
 
 
 def _ms_since(begin_ns: int) -> float:
