@@ -212,7 +212,8 @@ def test_codes_on_tilted_panels(pose: str, sigma_mm: float, gl: GlBackend) -> No
     wanted, found = (layers_of(p, pictures, pair, sigma_mm=sigma_mm) for p in both("balanced", stack, gl))
     assert within_one(wanted, found) >= WITHIN_ONE
     _, even = both("balanced", STACK, gl)
-    assert within_one(layers_of(even, pictures, pair, sigma_mm=sigma_mm), found) < 0.9  # the tilt is felt
+    # The tilt is felt, but for what neither picture shows: there outer panels stay even.
+    assert within_one(layers_of(even, pictures, pair, sigma_mm=sigma_mm), found) < 0.95
 
 
 def test_corrections_in_one_pass_on_tilted_panels(gl: GlBackend, monkeypatch: pytest.MonkeyPatch) -> None:
