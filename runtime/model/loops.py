@@ -10,6 +10,7 @@ from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
 
+from runtime.model.fade import FadeCodes, fade_codes
 from runtime.model.pyramid_level import PyramidLevel
 from runtime.model.wanted import fill_wanted
 from runtime.support.cache import digest, user_cache
@@ -36,6 +37,7 @@ class Loops:
     level: type[PyramidLevel]
     why: str  # one line
     fill_wanted: Callable[..., None] = fill_wanted
+    fade_codes: FadeCodes = fade_codes
 
     @property
     def compiled(self) -> bool:
@@ -53,7 +55,7 @@ def inner_loops() -> Loops:
         numba.config.CACHE_DIR = str(folder or "")  # type: ignore[attr-defined]
         if folder is not None and not any(folder.iterdir()):
             log.debug("inner loops are compiled, once: some ten seconds")
-        from runtime.model.compiled import wanted  # noqa: PLC0415 - imports numba
+        from runtime.model.compiled import fade, wanted  # noqa: PLC0415 - imports numba
         from runtime.model.compiled.level import CompiledLevel, warm_up  # noqa: PLC0415
 
         warm_up()
@@ -63,7 +65,7 @@ def inner_loops() -> Loops:
         log.warning("inner loops: OpenCV's, the compiled ones failed (%s: %s)", type(error).__name__, error)
         return Loops(PyramidLevel, f"OpenCV's, the compiled ones failed ({type(error).__name__}: {error})")
     why = f"compiled, kept in {folder}" if folder else "compiled, at every start anew"
-    return Loops(CompiledLevel, why, wanted.fill_wanted)
+    return Loops(CompiledLevel, why, wanted.fill_wanted, fade.fade_codes)
 
 
 def _kept() -> Path | None:

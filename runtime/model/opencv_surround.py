@@ -9,6 +9,7 @@ import numpy as np
 
 from runtime.model.assembly import ArrayAssembly
 from runtime.model.contract import Contract
+from runtime.model.fade import FadeCodes
 from runtime.model.loops import Loops, inner_loops
 from runtime.model.pyramid_level import CENTRE, EYES, NEUTRAL, PyramidLevel
 from runtime.model.resample import resample
@@ -32,9 +33,15 @@ class OpenCvBackend:
         """compiled: whether corrections are done by compiled loops, where there are any."""
         self.compiled = compiled
 
+    @property
+    def fade_codes(self) -> FadeCodes:
+        return self._loops().fade_codes
+
+    def _loops(self) -> Loops:
+        return inner_loops() if self.compiled else Loops(PyramidLevel, "OpenCV's, as asked for")
+
     def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> OpenCvSurround:
-        loops = inner_loops() if self.compiled else Loops(PyramidLevel, "OpenCV's, as asked for")
-        return OpenCvSurround(contract, stack, threads=threads, loops=loops)
+        return OpenCvSurround(contract, stack, threads=threads, loops=self._loops())
 
     def assembly(self, stack: PanelStack) -> ArrayAssembly:
         return ArrayAssembly(stack)

@@ -16,8 +16,7 @@ import numpy as np
 from runtime.model.assembly import Assembly
 from runtime.model.chain import ChainFrame, ColumnLaw
 from runtime.model.contract import Contract, Step
-from runtime.model.fade import Fade
-from runtime.model.loops import inner_loops
+from runtime.model.fade import Fade, FadeCodes
 from runtime.model.pyramid_level import CENTRE, FRONT, OUTER, REAR, coarser
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
@@ -73,8 +72,9 @@ class Problem:
         law = self.frame.columns
         return ColumnLaw(law.bend, law.middle + self.frame.cell_px)
 
-    def faded(self, panels: Answer, *, start: int) -> Answer:
-        """The network's answer that ends, at `start`, within a part of the panels; in place."""
+    def faded(self, panels: Answer, *, start: int, fade_codes: FadeCodes) -> Answer:
+        """The network's answer that ends, at `start`, within a part of the panels; in place. fade_codes: the
+        backend's."""
         if self.fade is None:
             return panels
         frame, first = self.frame, next(iter(panels.values()))
@@ -84,18 +84,8 @@ class Problem:
         weights = self.fade.wave_weights(
             self.centre_from(plane_from_wave), rows=rows, columns=columns, law=self.answer_columns
         )
-        channels = first.size // (rows * columns)
-        if inner_loops().compiled:
-            from runtime.model.compiled.fade import fade_codes  # noqa: PLC0415 - imports numba
-
-            ends = weights[..., 0]
-            at_once(lambda panel: fade_codes(panel.reshape(rows, -1), ends, start, channels), list(panels.values()))
-            return panels
-        weights = np.repeat(weights[..., 0], channels, axis=1)  # else numpy's innermost loop has three turns
-        rest = start * (1 - weights) + np.float32(0.5)  # rounded
-        for panel in panels.values():
-            numbers = panel.reshape(rows, -1)
-            numbers[...] = numbers * weights + rest
+        ends, channels = weights[..., 0], first.size // (rows * columns)
+        at_once(lambda panel: fade_codes(panel.reshape(rows, -1), ends, start, channels), list(panels.values()))
         return panels
 
     def centre_from(self, plane_from_raster: F64) -> F64:
@@ -148,6 +138,10 @@ class Backend(Protocol):
 
     name: str  # as `model.backend` calls it
     context: object  # of OpenGL, whose textures it reads; None: it reads arrays
+
+    @property
+    def fade_codes(self) -> FadeCodes:
+        """What ends the network's answer, which is an array, within a part of the panels (`fade.fade_codes`)."""
 
     def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> Surround:
         """One for a model and a stack. Raises InputError where the stack does not fit."""

@@ -190,7 +190,7 @@ class UnrolledPredictor(Predictor):
         watch.lap("inference")
         tail = seen[0].shape[2:]
         panels = {n: answer[name].reshape(frame.rows, -1, *tail) for n, name in ((REAR, "rear"), (FRONT, "front"))}
-        return problem.faded(panels, start=START)
+        return problem.faded(panels, start=START, fade_codes=self.surroundings.fade_codes)
 
 
 def _is_grey(picture: Picture, box: PixelRect) -> bool:

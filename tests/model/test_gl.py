@@ -15,6 +15,7 @@ from model_export.stills import random_still
 from runtime.config import ModelSettings, Settings
 from runtime.errors import ContextLost, InputError, MissingPart
 from runtime.evaluation.displayed import displayed, expected_db
+from runtime.model import still
 from runtime.model.backends import choose
 from runtime.model.fade import Fade
 from runtime.model.gl.backend import GlBackend
@@ -206,14 +207,15 @@ def test_codes_at_every_gap(gap_m: float, gl: GlBackend) -> None:
 @pytest.mark.usefixtures("exactly")
 @pytest.mark.parametrize("sigma_mm", [0.0, 3.0, UNSURE_MM])
 @pytest.mark.parametrize("pose", ["straight", "rolled by 20 degrees", "above each other"])
-def test_codes_on_tilted_panels(pose: str, sigma_mm: float, gl: GlBackend) -> None:
+def test_codes_on_tilted_panels(pose: str, sigma_mm: float, gl: GlBackend, monkeypatch: pytest.MonkeyPatch) -> None:
     stack, pair = replace(STACK, tilt=TILT), POSES[pose]
     pictures = cards(pair, stack)
     wanted, found = (layers_of(p, pictures, pair, sigma_mm=sigma_mm) for p in both("balanced", stack, gl))
     assert within_one(wanted, found) >= WITHIN_ONE
-    _, even = both("balanced", STACK, gl)
-    # The tilt is felt, but for what neither picture shows: there outer panels stay even.
-    assert within_one(layers_of(even, pictures, pair, sigma_mm=sigma_mm), found) < 0.95
+    # The tilt is felt; by pictures that are driven for beside their edge too: else outer panels are even there.
+    monkeypatch.setattr(still, "make_up", lambda *_, **__: None)
+    flat, tilted = (both("balanced", panels, gl)[1] for panels in (STACK, stack))
+    assert within_one(*(layers_of(p, pictures, pair, sigma_mm=sigma_mm) for p in (flat, tilted))) < 0.9
 
 
 def test_corrections_in_one_pass_on_tilted_panels(gl: GlBackend, monkeypatch: pytest.MonkeyPatch) -> None:

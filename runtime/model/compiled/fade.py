@@ -10,8 +10,7 @@ from runtime.model.compiled.sampling import PASS
 
 @njit(**PASS)
 def fade_codes(codes, weights, start, channels):  # pragma: no cover
-    """codes (rows, numbers) int16 towards `start`, as far as weights (rows or 1, pixels) float32 are below 1; in
-    place."""
+    """As `runtime.model.fade.fade_codes`."""
     one, half, end = np.float32(1), np.float32(0.5), np.float32(start)
     for v in range(codes.shape[0]):
         row = min(v, weights.shape[0] - 1)
