@@ -26,6 +26,7 @@ COPY requirements/runtime.lock requirements/runtime.lock
 RUN python -m venv /opt/phasestack \
  && /opt/phasestack/bin/pip install --no-cache-dir -r requirements/runtime.lock
 COPY pyproject.toml README.md ./
+COPY phasestack phasestack
 COPY runtime runtime
 COPY calib calib
 COPY model_export model_export

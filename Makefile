@@ -7,12 +7,11 @@ PYTEST_ARGS ?=
 TEST_WORKERS ?= logical
 FUZZ_ARGS ?=
 GOLDEN_ARGS ?=
-MUTANT_ARGS ?=
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 NIGHTLY := out/nightly
 
-.PHONY: demo test test-slow golden mutants lint types secrets coverage nightly package bench fuzz soak install uninstall system docs gallery hashes clean
+.PHONY: demo test test-slow golden lint types secrets coverage nightly package bench fuzz soak install uninstall system eye-models gallery hashes clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/phasestack demo $(DEMO_ARGS)
@@ -27,17 +26,13 @@ test-slow: $(VENV)/.test
 golden: $(VENV)/.test
 	$(BIN)/python -m tests.golden --renew $(GOLDEN_ARGS)
 
-# Mutants of the modules that compute, and what of them the tests notice (half an hour); docs/testing.md.
-mutants: $(VENV)/.mutation
-	$(BIN)/python -m tests.mutation $(MUTANT_ARGS)
-
 # Style, layers, spelling, shell; `pre-commit install` has them run, with types and secrets, before every commit.
 lint: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/typos
-	$(BIN)/shellcheck .ci/run systemd/*.sh requirements/*.sh systemd/x-authority
+	$(BIN)/shellcheck .ci/run systemd/*.sh requirements/*.sh docs/*.sh systemd/x-authority
 
 types: $(VENV)/.test
 	$(BIN)/mypy
@@ -77,9 +72,10 @@ install: system
 uninstall:
 	sh systemd/uninstall.sh
 
-# The commands' pages from their helps; the gallery's pictures from the commands (minutes).
-docs: $(VENV)/.runtime
-	$(BIN)/python docs/make_pages.py
+# The gallery's pictures from the commands (minutes).
+# The networks that find eyes anew from their publishers' files, beside those that are shipped.
+eye-models:
+	sh docs/make_eye_models.sh out/eye-models
 
 gallery: $(VENV)/.test
 	$(BIN)/python docs/make_gallery.py
@@ -105,10 +101,6 @@ $(VENV)/.test: $(VENV)/.runtime requirements/test.lock requirements/torch.lock
 	@sh systemd/packages.sh test
 	$(BIN)/python -m pip install --quiet -r requirements/test.lock
 	$(BIN)/python -m pip install --quiet -r requirements/torch.lock
-	@touch $@
-
-$(VENV)/.mutation: $(VENV)/.test requirements/mutation.lock
-	$(BIN)/python -m pip install --quiet -r requirements/mutation.lock
 	@touch $@
 
 clean:

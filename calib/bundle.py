@@ -1,7 +1,7 @@
 """Bundle adjustment: one camera, its places, and six degrees of freedom of every panel, from saddles in photographs.
 
 The panels' own pixel pitch is the metre. The reference panel defines the stack's frame: it lies at its ideal place,
-and all else is told relative to it. Robust first (soft L1), then what lies far off is left out and the rest is
+and all else is relative to it. Robust first (soft L1), then what lies far off is left out and the rest is
 fitted by plain least squares, so that the covariance is what it says. Derivatives are exact (OpenCV's projection and
 the exponential map), the normal equations small: about a hundred unknowns, thousands of coordinates.
 """
@@ -28,7 +28,7 @@ POSE = 6
 FOCAL_GUESSES = (0.6, 0.8, 1.1, 1.6, 2.4)  # of the longer side
 ROBUST_PX = 0.3  # residuals beyond this count by their size, not their square
 OUTLIER_SIGMAS = 4.0
-LEAST_SIGMA_PX = 0.01
+MIN_SIGMA_PX = 0.01
 NO_FIT_PX = 5.0  # median distance of points beyond which nothing like the configuration was photographed
 # What is known of any camera before its first photograph, standard deviations: square pixels, a lens over the
 # sensor's middle, distortion of a few per cent. They decide nothing that twelve photographs tell.
@@ -286,7 +286,7 @@ def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> B
     for _ in range(6):
         distance = np.linalg.norm(problem.residuals(x)[: 2 * count].reshape(-1, 2), axis=1)
         # The median length of a vector of two normal coordinates is 1.1774 of their standard deviation.
-        sigma = max(float(np.median(distance[used])) / 1.1774, LEAST_SIGMA_PX)
+        sigma = max(float(np.median(distance[used])) / 1.1774, MIN_SIGMA_PX)
         good = distance < OUTLIER_SIGMAS * sigma
         x = _solved(problem, x, good, robust=False)
         if (good == used).all():

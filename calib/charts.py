@@ -1,20 +1,37 @@
-"""Calibration charts as arrays: black lines on white at the thirds of each eye's image (EyeReal, 2.3, figure S4)."""
+"""Calibration charts: black lines on white at the thirds of each eye's image (EyeReal, 2.3, figure S4).
+
+Layers for both eyes at once: at the viewpoint the lines fuse, single and clean; off it they grow ghosts and stripes.
+"""
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 
-from calib.viewpoints import Viewpoint
-from runtime.optics.rpu import corners_in_front
+from calib.display import FONT, PanelDisplay, show_pages
+from calib.viewpoints import IPD_M, Viewpoint
+from runtime.config import Settings
+from runtime.model.predictor import load_predictor
+from runtime.model.still import solve_still
+from runtime.model.visible import visible_boxes
+from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
-from runtime.optics.views import image_from_raster, image_from_stack
+from runtime.optics.views import relative_scale_shift
 from runtime.records import F64, U8
+from runtime.report.progress import tracked
+from runtime.support.artifacts import OutputFolder, write_json, write_png
 
-Kind = Literal["solved", "seed"]
+MODEL = "best"
 LINE_PX = 10.0
 WIDEST_FOV_DEG = 40.0  # horizontal, of the eyes' images, as the published code has it
+CAPTION_SHARE = 0.07  # of the height, for words
+CAPTION_ROOM_M = 0.015  # by which all panels are clear beyond the words: who reads is not there yet
+UNFUSED_M = 0.03  # beside the viewpoint: what lines that do not fuse look like
 
 
 def chart_fov_deg(viewpoint: Viewpoint, stack: PanelStack) -> float:
@@ -27,51 +44,133 @@ def chart_fov_deg(viewpoint: Viewpoint, stack: PanelStack) -> float:
 
 def line_picture(*, width_px: int, height_px: int) -> U8:
     """(h, w, 3) what an eye should see: lines of 10 pixels at the thirds of width and height."""
-    u: F64 = np.arange(width_px, dtype=np.float64) + 0.5
-    v: F64 = (np.arange(height_px, dtype=np.float64) + 0.5)[:, None]
-    ink = np.maximum(_ink(u, width_px, 1.0), _ink(v, height_px, 1.0))
-    return np.repeat(_white_less(ink)[..., None], 3, axis=2)
+    ink = np.maximum(_ink(width_px), _ink(height_px)[:, None])
+    return np.repeat(np.rint(255 * (1 - ink)).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def eye_chart(viewpoint: Viewpoint, stack: PanelStack, *, side: int, index: int, ipd_m: float) -> U8:
-    """(H, W) the EyeReal supplement's own chart: panel `index` alone shows the lines to one eye (0: left, 1: right).
-
-    Panel pixels look up the eye's image through H (EyeReal, (40)), so the lines are straight, and at the thirds, only
-    from that eye's place. Raises ValueError where a corner of the panel is behind the eye.
-    """
-    raster = stack.panel(index)
-    projection = image_from_stack(
-        viewpoint.eyes_m(ipd_m)[side],
-        width_px=stack.width_px,
-        height_px=stack.height_px,
-        fov_deg=chart_fov_deg(viewpoint, stack),
-    )
-    if not corners_in_front(projection, raster):
-        raise ValueError(f"panel {index} is not before the eye at {viewpoint.name}")
-    h = image_from_raster(projection, raster)
-    x, y = np.arange(stack.width_px) + 0.5, (np.arange(stack.height_px) + 0.5)[:, None]
-    weight = h[2, 0] * x + h[2, 1] * y + h[2, 2]
-    u, v = ((h[row, 0] * x + h[row, 1] * y + h[row, 2]) / weight for row in (0, 1))
-    # Image pixels in one panel pixel, across each family of lines: what softens the edge by one pixel there.
-    per_pixel_u = np.hypot(h[0, 0] - u * h[2, 0], h[0, 1] - u * h[2, 1]) / weight
-    per_pixel_v = np.hypot(h[1, 0] - v * h[2, 0], h[1, 1] - v * h[2, 1]) / weight
-    ink = np.maximum(_ink(u, stack.width_px, per_pixel_u), _ink(v, stack.height_px, per_pixel_v))
-    return _white_less(ink)
-
-
-def alone(picture: U8, stack: PanelStack, *, index: int) -> U8:
-    """(N, H, W, 4) layers in which one panel shows a grey (H, W) picture and the others turn no light."""
-    layers = np.zeros((stack.count, *picture.shape, 4), np.uint8)
-    layers[..., 3] = 255
-    layers[index, ..., :3] = picture[..., None]
-    return layers
-
-
-def _ink(position: F64, length_px: int, softness_px: F64 | float) -> F64:
-    """Share of a pixel that lines at the thirds of a length cover."""
+def _ink(length_px: int) -> F64:
+    """(length,) share of each pixel that lines at the thirds cover."""
+    position = np.arange(length_px, dtype=np.float64) + 0.5
     distance = np.minimum(np.abs(position - length_px / 3), np.abs(position - 2 * length_px / 3))
-    return np.clip((LINE_PX / 2 - distance) / softness_px + 0.5, 0.0, 1.0)
+    return np.clip(LINE_PX / 2 - distance + 0.5, 0.0, 1.0)
 
 
-def _white_less(ink: F64) -> U8:
-    return np.rint(255 * (1 - ink)).astype(np.uint8)
+class Drawer:
+    """Draws the charts of one stack; the model is loaded when the first one needs it."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.stack = settings.stack.stack()
+        self.ipd_m = settings.calibration.ipd_m or IPD_M
+        self._settings = settings.model
+        self._predictor: Any = None
+        self.layers = lru_cache(maxsize=2)(self._layers)  # a person goes back by one
+
+    def _layers(self, viewpoint: Viewpoint) -> U8:
+        """(N, H, W, 4) layers through which both eyes see the line picture at the viewpoint.
+
+        Raises InputError, MissingPart.
+        """
+        if self._predictor is None:
+            self._predictor = load_predictor(MODEL, self.stack, self._settings)
+        picture = line_picture(width_px=self.stack.width_px, height_px=self.stack.height_px)
+        eyes_m, fov_deg = viewpoint.eyes_m(self.ipd_m), chart_fov_deg(viewpoint, self.stack)
+        prediction = solve_still(picture, picture, eyes_m=eyes_m, fov_deg=fov_deg, predictor=self._predictor)
+        return np.array(prediction.layers)  # a copy: the predictor uses its own again
+
+    def close(self) -> None:
+        """Release the model. May be called twice."""
+        if self._predictor is not None:
+            self._predictor.close()
+            self._predictor = None
+
+
+def make_charts(out: Path, viewpoints: Sequence[Viewpoint], drawer: Drawer) -> dict[str, Any]:
+    """Write a PNG for each panel and viewpoint, `charts.json`, and what an eye sees at the first viewpoint and 3 cm
+    beside it. Raises InputError, MissingPart."""
+    stack = drawer.stack
+    entries: list[dict[str, Any]] = []
+    with OutputFolder(out) as folder:
+        for viewpoint in tracked("charts", viewpoints):
+            layers = drawer.layers(viewpoint)
+            files = [f"chart-{viewpoint.name}-layer-{index}.png" for index in range(stack.count)]
+            for name, layer in zip(files, layers, strict=True):
+                write_png(folder.staging / name, layer)
+            if not entries:
+                for name, aside_m in (("fused", 0.0), ("unfused", UNFUSED_M)):
+                    eye_m = viewpoint.eyes_m(drawer.ipd_m)[1] + np.array([0.0, aside_m, 0.0])
+                    seen = seen_by(eye_m, layers, stack, fov_deg=chart_fov_deg(viewpoint, stack)).image
+                    picture = np.rint(255 * np.clip(seen, 0, 1)).astype(np.uint8)
+                    write_png(folder.staging / f"reference-{name}.png", picture)
+            entries.append({
+                "viewpoint": viewpoint.name,
+                "midpoint_m": viewpoint.midpoint_m,
+                "eyes_m": viewpoint.eyes_m(drawer.ipd_m),
+                "fov_deg": chart_fov_deg(viewpoint, stack),
+                "files": files,
+            })  # fmt: skip
+        write_json(folder.staging / "charts.json", {"ipd_m": drawer.ipd_m, "model": MODEL, "charts": entries})
+    return {"out": str(out), "viewpoints": [v.name for v in viewpoints], "files": len(entries) * stack.count}
+
+
+def show_charts(settings: Settings, viewpoints: Sequence[Viewpoint], drawer: Drawer) -> None:
+    """One after the other on the panels. Raises as `PanelDisplay`."""
+    display = PanelDisplay(settings, drawer.stack, registered=True)
+    show_pages(display, [v.name for v in viewpoints], lambda number: drawer.layers(viewpoints[number]))
+
+
+class ChartDisplay:
+    """The panels, showing one viewpoint's chart at a time, with a line of words."""
+
+    def __init__(self, settings: Settings) -> None:
+        """Opens the panels. Raises InputError, MissingPart, PanelLost."""
+        self._drawer = Drawer(settings)
+        self.display = PanelDisplay(settings, self._drawer.stack, registered=True)
+        self._viewpoint: Viewpoint | None = None
+
+    def show(self, viewpoint: Viewpoint) -> None:
+        """The viewpoint's chart. Raises PanelLost."""
+        self._viewpoint = viewpoint
+        self.display.show(self._drawer.layers(viewpoint))
+
+    def caption(self, text: str) -> None:
+        """A line of words below the chart. Raises PanelLost."""
+        if self._viewpoint is not None:
+            eyes_m, layers = self._viewpoint.eyes_m(self._drawer.ipd_m), self._drawer.layers(self._viewpoint)
+            self.display.show(captioned(layers, text, stack=self._drawer.stack, eyes_m=eyes_m))
+
+    def close(self) -> None:
+        """Close the panels and the model. May be called twice."""
+        self.display.close()
+        self._drawer.close()
+
+
+def captioned(layers: U8, text: str, *, stack: PanelStack, eyes_m: F64) -> U8:
+    """(N, H, W, 4) layers with a line of words that eyes (2, 3) about there read: on the middle panel, low down.
+
+    All panels are clear where these eyes look through them at it, and `CAPTION_ROOM_M` around.
+    """
+    shown, middle = layers.copy(), stack.count // 2
+    box, pitch_m = visible_boxes(eyes_m, stack)[middle], stack.height_m / stack.height_px
+    tall_px = round(CAPTION_SHARE * stack.height_px)
+    bottom = box.v1 - round(CAPTION_ROOM_M / 2 / pitch_m)
+    top = max(bottom - tall_px, 0)
+    edges_m = stack.height_m / 2 - np.array([top, bottom]) * pitch_m
+    for index, x_m in enumerate(stack.x_m):
+        seen_m = []
+        for eye_m in eyes_m:
+            scale, shift_m = relative_scale_shift(eye_m, from_x_m=stack.x_m[middle], to_x_m=x_m)
+            seen_m.append(edges_m * scale + shift_m[1])
+        rims_m = np.array([np.max(seen_m) + CAPTION_ROOM_M, np.min(seen_m) - CAPTION_ROOM_M])
+        rows = (stack.height_m / 2 - rims_m) / pitch_m
+        first, last = np.clip(np.rint(rows), 0, stack.height_px).astype(int)
+        shown[index, first:last, :, :3] = 0
+    (long, tall), below = cv2.getTextSize(text, FONT, 1.0, 2)
+    scale = min(0.6 * tall_px / tall, 0.8 * box.width_px / max(long, 1))
+    page = np.zeros((stack.height_px, stack.width_px), np.uint8)
+    place = (
+        round((box.u0 + box.u1 - scale * long) / 2),
+        round((top + bottom + scale * (tall - below)) / 2),
+    )
+    cv2.putText(page, text, place, FONT, scale, 255, max(1, round(2 * scale)), cv2.LINE_AA)
+    shown[middle, top:bottom, :, :3] = page[top:bottom, :, None]
+    return shown

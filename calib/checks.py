@@ -119,11 +119,10 @@ def _listed(pairs: Pairs, index: list[int]) -> str:
 
 
 def _refuse_units(pairs: Pairs, scale: float) -> None:
-    for wrong, side, option in ((1e-3, "sensor", "--sensor-unit 0.001"), (1e3, "stack", "--stack-unit 0.001")):
+    for wrong, side in ((1e-3, "sensor"), (1e3, "stack")):
         if 0.8 < scale / wrong < 1.25:
-            raise InputError(
-                pairs.source, f"{side}_x", f"units are mixed (scale {scale:.4g}): {side} is in millimetres? ({option})"
-            )
+            problem = f"units are mixed (scale {scale:.4g}): {side} is in millimetres? Metres are wanted"
+            raise InputError(pairs.source, f"{side}_x", problem)
 
 
 def _is_mirrored(pairs: Pairs) -> bool:

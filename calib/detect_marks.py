@@ -13,12 +13,12 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 
 DETECTION_PX = 2400  # photographs are searched at this size; corners are found in their own
-LEAST_MARKS = 3  # of a panel: twelve points, to place it
-LEAST_EXTENT = 0.3  # of a panel: a corner of it tells little about the others
-LEAST_UNIT_PX = 1.7  # photograph's pixels in one bit of a marker: below this nothing is read reliably
+MIN_MARKS = 3  # of a panel: twelve points, to place it
+MIN_EXTENT = 0.3  # of a panel: a corner of it says little about the others
+MIN_UNIT_PX = 1.7  # photograph's pixels in one bit of a marker: below this nothing is read reliably
 BLURRED_BITS = 1.1  # an edge that is wider than this many bits is not worth its noise
-LEAST_CONTRAST = 0.35  # of a saddle against its mark's own
-LEAST_DYNAMIC = 24  # code values between black and white
+MIN_CONTRAST = 0.35  # of a saddle against its mark's own
+MIN_DYNAMIC = 24  # code values between black and white
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,21 +42,21 @@ class SeenMarks:
         """Why it cannot be used; empty: it can."""
         least = min(self.marks)
         for panel, (straight, turned) in enumerate(zip(self.marks, self.mirrored, strict=True)):
-            if turned >= LEAST_MARKS and straight < LEAST_MARKS:
-                if sum(self.marks) == 0 or max(self.marks) < LEAST_MARKS:
+            if turned >= MIN_MARKS and straight < MIN_MARKS:
+                if sum(self.marks) == 0 or max(self.marks) < MIN_MARKS:
                     return "is mirrored (a selfie camera's habit; or the panels' `mirror` is wrong)"
                 return f"shows panel {panel} mirrored: its `mirror` in the configuration is wrong"
         if sum(self.marks) == 0:
             return "shows no mark of the board: blurred, too dark, or of something else"
         if self.edge_bits > BLURRED_BITS:
             return f"is blurred: its edges are {self.edge_bits * self.unit_px:.1f} px wide"
-        if self.unit_px < LEAST_UNIT_PX:
+        if self.unit_px < MIN_UNIT_PX:
             return f"is too small: {self.unit_px:.1f} px for one bit of a mark; go nearer or use more pixels"
-        if least < LEAST_MARKS:
+        if least < MIN_MARKS:
             panel = self.marks.index(least)
-            return f"shows {least} marks of panel {panel}, less than {LEAST_MARKS}: covered, cut off or too oblique"
+            return f"shows {least} marks of panel {panel}, less than {MIN_MARKS}: covered, cut off or too oblique"
         for panel, share in enumerate(self.extents):
-            if share < LEAST_EXTENT:
+            if share < MIN_EXTENT:
                 return f"is covered or cut off: of panel {panel} {100 * share:.0f}% of its width or height are seen"
         return ""
 
@@ -92,7 +92,7 @@ def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
     known = {mark.number: mark for mark in marks(stack)}
     found = _markers(picture, known)
     mirrored = [0] * stack.count
-    if len(found) < LEAST_MARKS * stack.count:
+    if len(found) < MIN_MARKS * stack.count:
         for mark, _ in _markers(np.ascontiguousarray(picture[:, ::-1]), known):
             mirrored[mark.panel] += 1
     height, width = picture.shape
@@ -161,7 +161,7 @@ def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F
     white, black = values[:2].min(axis=0), values[2:].max(axis=0)
     whole = float(np.ptp(_samples(picture, np.stack([guess.mean(axis=0)[None] + (quad - guess.mean(axis=0)) * s
                                                       for s in (0.9, 1.3)]))))  # fmt: skip
-    return near & (white - black > max(LEAST_CONTRAST * whole, LEAST_DYNAMIC)), refined
+    return near & (white - black > max(MIN_CONTRAST * whole, MIN_DYNAMIC)), refined
 
 
 def _quarter(out: F64, guess: F64) -> F64:

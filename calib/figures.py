@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from calib.experiment import Case, Timing
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
 from runtime.report.plots import drawing, png
 
 BARS = 200  # of more points each is a dot
 AXES = ("X", "Y", "Z")
-COLOURS = ("#c0392b", "#27803b", "#2260a8", "#c77d0a", "#6b3fa0", "#222222")
-
-
-def finish(axes: Any, *, x: str, y: str, title: str) -> None:
-    """Name the axes of a plot of lines, and give it a legend."""
-    axes.set(xlabel=x, ylabel=y, title=title)
-    axes.legend(fontsize=8)
+COLOURS = ("#c0392b", "#27803b", "#2260a8")
 
 
 def residual_figure(residual_m: F64, used: Any, *, limit_m: float) -> bytes:
@@ -85,72 +77,4 @@ def geometry_figure(
             panel.set_aspect("equal", adjustable="datalim")
             panel.set(xlabel="x: towards the viewer (m)", ylabel=label, title=f"Seen {title}")
         canvas.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
-        return png(canvas)
-
-
-def eye_error_figure(distances_m: F64, straight_m: F64, aside_m: F64) -> bytes:
-    """Expected error at the eye against distance, straight ahead and 25 degrees aside, millimetres."""
-    with drawing(6.5, 3.6) as canvas:
-        axes = canvas.subplots()
-        axes.plot(distances_m, straight_m * 1e3, color="#2260a8", label="straight ahead")
-        axes.plot(distances_m, aside_m * 1e3, color="#c0392b", linestyle="--", label="25° to the side")
-        axes.set_ylim(bottom=0)
-        title = "What the calibration's own uncertainty does at the eye"
-        finish(axes, x="distance of the eyes (m)", y="expected error (mm)", title=title)
-        return png(canvas)
-
-
-def methods_figure(cases: Sequence[Case], *, title: str) -> bytes:
-    """Mean and 95th percentile of the error at the eye against noise, for each method."""
-    names = list(cases[0].mean_m)
-    noisy = [case for case in cases if case.sigma_m > 0]
-    with drawing(13, 4.2) as canvas:
-        axes = canvas.subplots(ncols=3)
-        axes[0].sharey(axes[1])
-        kinds = (("mean_m", "mean"), ("p95_m", "95th percentile"), ("mean_m", "mean, over the default's"))
-        for panel, (figures, label) in zip(axes, kinds, strict=True):
-            relative = panel is axes[2]
-            for name, colour in zip(names, COLOURS, strict=False):
-                values = [
-                    getattr(case, figures)[name] / (case.mean_m["default"] if relative else 1e-3) for case in noisy
-                ]
-                style = {"color": colour, "marker": "o", "markersize": 4, "label": name, "linewidth": 1.3}
-                if name == "default":
-                    style |= {"linewidth": 4, "alpha": 0.25, "marker": "", "zorder": 0}
-                panel.plot([case.sigma_m * 1e3 for case in noisy], values, **style)
-            panel.set_xscale("log")
-            panel.set_yscale("log")
-            if relative and panel.get_ylim()[1] < 15:
-                panel.set_yscale("linear")
-            panel.set_xticks([case.sigma_m * 1e3 for case in noisy], [f"{case.sigma_m * 1e3:g}" for case in noisy])
-            panel.set(xlabel="noise of each sensor coordinate (mm)", title=label)
-        axes[0].set_ylabel("error at the eye (mm)")
-        axes[2].set_ylabel("times the default's error")
-        axes[0].legend(fontsize=8)
-        canvas.suptitle(title, fontsize=11)
-        return png(canvas)
-
-
-def timing_figure(timings: Sequence[Timing]) -> bytes:
-    """Error at the eye against run time; each point a number of pairs."""
-    with drawing(7, 4.3) as canvas:
-        axes = canvas.subplots()
-        for name, colour in zip(dict.fromkeys(t.method for t in timings), COLOURS[1:], strict=False):
-            chosen = [t for t in timings if t.method == name]
-            axes.plot(
-                [t.ms_p50 for t in chosen],
-                [t.error_m * 1e3 for t in chosen],
-                "o-",
-                color=colour,
-                label=name,
-                markersize=4,
-            )
-            for t in chosen:
-                axes.annotate(f"{t.pairs:,}", (t.ms_p50, t.error_m * 1e3), fontsize=7, xytext=(4, 4),
-                              textcoords="offset points")  # fmt: skip
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.margins(x=0.12)
-        title = "Error against run time; numbers: pairs; noise 3 mm"
-        finish(axes, x="time of one solution (ms)", y="mean error at the eye (mm)", title=title)
         return png(canvas)

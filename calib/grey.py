@@ -13,24 +13,26 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import BaseModel
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import least_squares
 from scipy.special import comb
 
+from calib.tables import Number, read_table, validated_rows
 from runtime.errors import InputError
 from runtime.optics.malus import intensity_from_phase, phase_from_intensity
 from runtime.panels.lut import COLUMNS
 from runtime.records import F64
-from runtime.support import foreign
 
 CHANNELS = ("red", "green", "blue")
-LEAST_LEVELS = 4
-HIGHEST_DEGREE = 6
+MIN_LEVELS = 4
+MAX_DEGREE = 6
 LUT_ROWS = 256
 EXACT = 1e-14  # mean square, of the range, below which a fit cannot be bettered
 
@@ -92,8 +94,8 @@ def fit_grey_curve(grey: F64, luminance: F64) -> GreyCurve:
     Raises ValueError, saying what is wrong with the series.
     """
     levels = np.unique(grey)
-    if len(levels) < LEAST_LEVELS:
-        raise ValueError(f"{len(levels)} grey levels: at least {LEAST_LEVELS} are needed")
+    if len(levels) < MIN_LEVELS:
+        raise ValueError(f"{len(levels)} grey levels: at least {MIN_LEVELS} are needed")
     if levels[0] > 0.02 or levels[-1] < 0.98:
         raise ValueError("the series must reach from black to full white")
     low, high = float(np.mean(luminance[grey == levels[0]])), float(np.mean(luminance[grey == levels[-1]]))
@@ -102,7 +104,7 @@ def fit_grey_curve(grey: F64, luminance: F64) -> GreyCurve:
     values = (luminance - low) / (high - low)
     best: tuple[float, GreyCurve] | None = None
     for of_intensity in (False, True):
-        for degree in range(1, HIGHEST_DEGREE + 1):
+        for degree in range(1, MAX_DEGREE + 1):
             parameters = 3 + degree - 1
             if degree > 1 and parameters + 2 > len(levels):
                 break
@@ -164,44 +166,48 @@ class Series:
     luminance: F64  # (n, 3) red, green, blue, any unit; a grey series has three equal columns
 
 
+class GreyRow(BaseModel):
+    """One luminance of a grey."""
+
+    grey: Number
+    luminance: Number
+
+    @property
+    def channels(self) -> tuple[float, float, float]:
+        return self.luminance, self.luminance, self.luminance
+
+
+class ColourRow(BaseModel):
+    """The luminances of the three channels at a grey."""
+
+    grey: Number
+    red: Number
+    green: Number
+    blue: Number
+
+    @property
+    def channels(self) -> tuple[float, float, float]:
+        return self.red, self.green, self.blue
+
+
 def read_series(path: Path) -> Series:
     """CSV with columns grey and luminance, or grey, red, green, blue. Greys above 1 are taken as 0 to 255.
 
-    Raises InputError, naming the row and the column.
+    Raises InputError, naming every row and column that is wrong.
     """
-    try:
-        with io.StringIO(foreign.read_text(path), newline="") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            header = [(name or "").strip().lower() for name in reader.fieldnames or ()]
-            reader.fieldnames = header
-            names = CHANNELS if set(CHANNELS) <= set(header) else ("luminance",)
-            for name in ("grey", *names):
-                if name not in header:
-                    raise InputError(
-                        path, name, "column is missing (wanted: grey, luminance or grey, red, green, blue)"
-                    )
-            rows = [[_cell(path, reader.line_num, name, row.get(name)) for name in ("grey", *names)] for row in reader]
-    except csv.Error as error:
-        raise InputError(path, "", f"malformed: {error}") from None
+    table = read_table(path)
+    coloured = set(CHANNELS) <= table.columns
+    rows: Sequence[GreyRow | ColourRow] = validated_rows(table, ColourRow if coloured else GreyRow)
     if not rows:
         raise InputError(path, "grey", "there are no rows")
-    table = np.array(rows)
-    grey = table[:, 0] / (255.0 if table[:, 0].max() > 1.0 else 1.0)
+    grey = np.array([row.grey for row in rows])
+    grey = grey / (255.0 if grey.max() > 1.0 else 1.0)
     if grey.min() < 0.0 or grey.max() > 1.0:
         raise InputError(path, "grey", "must lie between 0 and 1, or 0 and 255")
-    if table[:, 1:].min() < 0.0:
+    luminance = np.array([row.channels for row in rows])
+    if luminance.min() < 0.0:
         raise InputError(path, "luminance", "must not be negative")
-    return Series(grey, np.broadcast_to(table[:, 1:], (len(table), 3)).copy())
-
-
-def _cell(path: Path, line: int, name: str, value: str | None) -> float:
-    try:
-        number = float(value or "")
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise InputError(path, f"line {line}, {name}", f"is not a number: {value}")
-    return number
+    return Series(grey, luminance)
 
 
 def fit_series(series: Series, source: Path | str) -> tuple[GreyCurve, GreyCurve, GreyCurve]:

@@ -1,6 +1,6 @@
-"""A chart from which any camera tells a panel's grey curve, whatever its own tone curve is.
+"""A chart from which any camera measures a panel's grey curve, whatever its own tone curve is.
 
-Patches of every grey, many of each and scattered, so that an uneven light is told apart from the greys; and patches
+Patches of every grey, many of each and scattered, so that an uneven light is separated from the greys; and patches
 of black and white pixels mixed in known shares, whose light is known however the panel's greys are: they measure the
 camera. The board's marks among them tell where each patch lies in a photograph.
 """
@@ -27,14 +27,14 @@ PATCHES_ACROSS = 32
 MARGIN = 0.15  # of a panel on each side: seen from nearby, its rim has no other panel behind it and no light
 INNER = 0.5  # share of a patch's side that is measured
 SAMPLES = 24  # by as many, of a patch
-LEAST_MARKS = 4
+MIN_MARKS = 4
 FALLS = 0.01  # of the range: a brighter grey that is darker by more is no grey curve
 CLIPPED = 0.02
 BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
 
 
 class Unusable(ValueError):
-    """A photograph that tells no grey curve; the text says why."""
+    """A photograph without a grey curve; the text says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ def histograms(picture: U8, stack: PanelStack, panel: int) -> NDArray[np.float64
     """
     seen = find_marks(picture, stack, name="")
     mine = seen.panel == panel
-    if seen.marks[panel] < LEAST_MARKS:
+    if seen.marks[panel] < MIN_MARKS:
         raise Unusable(f"shows {seen.marks[panel]} marks of panel {panel}: blurred, cut off, or another panel's chart")
     image_from_panel, _ = cv2.findHomography(seen.panel_px[mine], seen.image_px[mine], cv2.RANSAC, 8.0)
     step = (np.arange(SAMPLES) + 0.5) / SAMPLES * INNER + (1 - INNER) / 2

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import select
 import sys
-from collections.abc import Callable
 from enum import Enum, auto
 from typing import Any
 
@@ -154,12 +153,3 @@ class WindowKeys:
         for handle in handles:
             glfw.set_key_callback(handle, pressed)
         self._watched = handles
-
-
-def first_of(*sources: Callable[[], Key | None]) -> Callable[[], Key | None]:
-    """One source of keys from several: whichever has one."""
-
-    def poll() -> Key | None:
-        return next((key for source in sources if (key := source()) is not None), None)
-
-    return poll

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
 
-EYE = np.array([0.0, 0.0, 1.0])  # picks the homogeneous one of a pixel (u, v, 1)
+HOMOGENEOUS = np.array([0.0, 0.0, 1.0])  # picks the homogeneous one of a pixel (u, v, 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +40,18 @@ class PlacedPanel:
         return float(normal @ self.centre_m / normal[0])
 
 
+def through(matrix: F64, points_px: F64) -> F64:
+    """(K, 2) pixels through a 3x3 homography."""
+    moved = points_px @ matrix[:, :2].T + matrix[:, 2]
+    return moved[:, :2] / moved[:, 2:]
+
+
+def corner_pixels(stack: PanelStack) -> F64:
+    """(4, 2) a panel's corners: (0, 0), (W, 0), (W, H), (0, H)."""
+    w, h = stack.width_px, stack.height_px
+    return np.array([[0, 0], [w, 0], [w, h], [0, h]], dtype=np.float64)
+
+
 def panel_from_pixels(stack: PanelStack) -> F64:
     """(3, 3): a point (metres, the panel's own frame) from a pixel (u, v, 1)."""
     pitch_u, pitch_v = stack.width_m / stack.width_px, stack.height_m / stack.height_px
@@ -48,7 +60,7 @@ def panel_from_pixels(stack: PanelStack) -> F64:
 
 def stack_from_pixels(panel: PlacedPanel, stack: PanelStack) -> F64:
     """(3, 3): a point of `stack` (metres) from a panel's true pixel (u, v, 1)."""
-    return panel.rotation @ panel_from_pixels(stack) + np.outer(panel.centre_m, EYE)
+    return panel.rotation @ panel_from_pixels(stack) + np.outer(panel.centre_m, HOMOGENEOUS)
 
 
 def ideal_panel(stack: PanelStack, index: int) -> PlacedPanel:
@@ -63,7 +75,7 @@ def true_from_ideal_seen(panel: PlacedPanel, eye_m: ArrayLike, stack: PanelStack
     crosses the panel. For a panel that is parallel to the stack and at its x_m the answer is the same for every
     eye; a tilted one is right only for this eye. Raises ValueError for an eye in the panel's plane.
     """
-    eye = np.outer(np.asarray(eye_m, dtype=np.float64), EYE)
+    eye = np.outer(np.asarray(eye_m, dtype=np.float64), HOMOGENEOUS)
     seen = stack_from_pixels(panel, stack) - eye
     if abs(np.linalg.det(seen)) < 1e-18:
         raise ValueError("an eye in a panel's plane sees nothing through it")

@@ -1,222 +1,253 @@
-"""Where the panels really are: a homography per panel from vernier settings, with its uncertainty.
+"""From photographs of the boards to what the runtime needs: distances, homographies, and how far to trust them.
 
-`true_from_ideal` of a panel takes the pixel at which a point of a perfectly mounted panel would lie to the pixel
-that really lies there (the homography of the panels' configuration). It is held as the displacement of the panel's
-four corners, eight numbers in pixels, so that the fit and its covariance are well scaled.
-
-What verniers cannot tell is where all panels are together: one panel is the reference, at its ideal place.
+The stack's frame is the reference (middle) panel's: it stays where it is and its picture is not resampled. The other
+panels get their true distance, and a homography that puts each of their pixels where a panel parallel to the
+reference would have it: exact for every eye where the panel is parallel, and for an eye at the viewing place where
+it is tilted. The models get the tilts, and solve for what other eyes see of such a panel.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
 
-from runtime.optics.rpu import image_from_panel_four_points
-from runtime.optics.stack import PanelStack
-from runtime.optics.views import relative_scale_shift
+from calib.bundle import Bundle, Undetermined, adjust
+from calib.detect_marks import SeenMarks
+from calib.placed import PlacedPanel, corner_pixels, found_stack, through, true_from_ideal_seen
+from runtime.optics.stack import PanelStack, Tilt
 from runtime.records import F64
 
-VIEWPOINT_SIGMA_M = 0.002  # of a marked viewpoint, each axis
-SETTING_SIGMA_PX = 0.15  # of one vernier setting: assumed until the residuals say otherwise
-CONDITION_LIMIT = 1e6
+MIN_PHOTOGRAPHS = 5
+WANTED_PHOTOGRAPHS = 8
+MIN_SPAN_DEG = 15.0  # between the two directions that lie farthest apart
+DISAGREES = 0.4  # share of a photograph's points that do not fit
+MISFIT_PX = 1.5  # of a photograph: panels that move, or no rigid stack at all
+IMPLAUSIBLE_M = 0.010  # a panel farther off than hands put it
+DOUBTFUL_PX = 0.3  # a corner that is not known better is not worth writing
+FEWER_IS_NOTED_PX = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
-    """One vernier, nudged until its halves met for an eye."""
+class Verdict:
+    """What became of one photograph."""
 
-    reference: int  # panel that shows the fixed half
-    panel: int  # panel that shows the moved half
-    eye_m: tuple[float, float, float]  # frame `stack`
-    reference_px: tuple[float, float]  # true pixel (u, v) of the fixed half
-    panel_px: tuple[float, float]  # true pixel of the moved half when they met
+    name: str
+    used: bool
+    points: int
+    rms_px: float  # of its residuals that were used, in the photograph; infinite where it was not
+    reason: str  # why it was left out; empty: it was not
 
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """Where one panel is."""
+    """Where the panels are, and how that is known."""
 
-    true_from_ideal: F64  # (3, 3), last entry 1
-    corners_px: F64  # (4, 2) displacement of the corners (0, 0), (W, 0), (W, H), (0, H)
-    setting_covariance: F64  # (8, 8) of the corners, px², from the scatter of the settings
-    viewpoint_covariance: F64  # (8, 8) from not knowing the viewpoint better than `VIEWPOINT_SIGMA_M`
-    settings: int
+    bundle: Bundle
+    stack: PanelStack  # the geometry to configure: true distances, or even ones near them, and tilts
+    true_x_m: F64  # (N,)
+    gap_sigma_m: F64  # (N-1,)
+    homographies: F64  # (N, 3, 3) true pixels from ideal ones of `stack`
+    corners_px: F64  # (N, 4, 2) displacement of the corners (0, 0), (W, 0), (W, H), (0, H)
+    corner_sigma_px: F64  # (N, 4, 2)
+    eye_m: F64  # (3,) the viewing place
+    verdicts: tuple[Verdict, ...]
+    notes: tuple[str, ...]
 
     @property
-    def setting_sigma_px(self) -> float:
-        """RMS uncertainty of a corner's place from the settings' scatter."""
-        return float(np.sqrt(np.trace(self.setting_covariance) / 4))
+    def tilt_deg(self) -> F64:
+        """(N, 2) by how much each panel's right edge, and its top edge, come towards the viewer."""
+        return np.degrees(np.arctan([panel.slope for panel in self.bundle.panels]))
 
     @property
-    def viewpoint_sigma_px(self) -> float:
-        """The same from the viewpoint: a shift that every setting from one place shares."""
-        return float(np.sqrt(np.trace(self.viewpoint_covariance) / 4))
+    def turn_deg(self) -> F64:
+        """(N,) by how much each panel is turned in its own plane, counter-clockwise as the viewer sees it."""
+        rows = np.array([panel.rotation[:, 1] for panel in self.bundle.panels])
+        return np.asarray(np.degrees(np.arctan2(rows[:, 2], rows[:, 1])), dtype=np.float64)
+
+    @property
+    def sigma_panel_px(self) -> F64:
+        """(N,) RMS uncertainty of a panel's corner, distance in pixels of the panel."""
+        return np.asarray(np.sqrt((self.corner_sigma_px**2).sum(-1).mean(-1)), dtype=np.float64)
+
+    def eye_error_mm(self) -> float:
+        """The eye's displacement that would look like the worst panel's uncertainty."""
+        reference = self.bundle.reference
+        pitch_m, found = self.stack.width_m / self.stack.width_px, 0.0
+        for index, sigma in enumerate(self.sigma_panel_px):
+            gap = abs(self.stack.x_m[index] - self.stack.x_m[reference])
+            if gap:
+                found = max(found, float(sigma) * pitch_m * float(self.eye_m[0]) / gap)
+        return found * 1e3
 
 
-@dataclass(frozen=True, slots=True)
-class StackRegistration:
-    """All panels, and how well the settings fit."""
-
-    panels: tuple[Registration, ...]  # rear to front
-    reference: int
-    residual_px: F64  # (K, 2)
-    sigma_px: float  # of one coordinate of a setting
+def homographies(panels: Sequence[PlacedPanel], stack: PanelStack, eye_m: F64) -> F64:
+    """(N, 3, 3) true pixels from ideal ones, as an eye sees them."""
+    return np.stack([true_from_ideal_seen(panel, eye_m, stack, index) for index, panel in enumerate(panels)])
 
 
-def true_from_ideal(corners_px: F64, *, width_px: int, height_px: int) -> F64:
-    """3x3 homography from the displacement (4, 2) of a panel's corners. Raises ValueError for degenerate ones."""
-    ideal = np.array([[0, 0], [width_px, 0], [width_px, height_px], [0, height_px]], dtype=np.float64)
-    return image_from_panel_four_points(ideal + corners_px, width_px=width_px, height_px=height_px)
+def evenly_spaced(stack: PanelStack, *, reference: int) -> PanelStack:
+    """The even distances nearest to a stack's, the reference panel kept: what the shipped networks serve."""
+    steps = np.arange(stack.count) - reference
+    gap = float((steps * (np.array(stack.x_m) - stack.x_m[reference])).sum() / (steps**2).sum())
+    x_m = tuple(stack.x_m[reference] + gap * step for step in steps.tolist())
+    return replace(stack, x_m=x_m)
 
 
-def through(matrix: F64, points_px: F64) -> F64:
-    """(K, 2) pixels through a 3x3 homography."""
-    moved = points_px @ matrix[:, :2].T + matrix[:, 2]
-    return moved[:, :2] / moved[:, 2:]
+def tilt_of(panels: Sequence[PlacedPanel], eye_m: F64) -> Tilt:
+    """What models need to know of tilted panels whose homographies are for an eye (3,)."""
+    x, y, z = np.asarray(eye_m, dtype=np.float64).tolist()
+    depth = tuple((0.0, float(right), float(up)) for right, up in (panel.slope + 0.0 for panel in panels))
+    return Tilt(depth, (x, y, z))
 
 
-def _inverse(matrix: F64) -> F64:
-    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+def geometry_of(
+    panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64, even: bool | None, reference: int
+) -> PanelStack:
+    """The geometry to configure for panels that stand so: their distances, or even ones near them, and tilts.
 
-
-def ideal_partner(points_px: F64, eye_m: ArrayLike, stack: PanelStack, *, reference: int, panel: int) -> F64:
-    """(K, 2) ideal pixels of `panel` behind or before ideal pixels (K, 2) of `reference`, as one eye sees them."""
-    scale, shift = relative_scale_shift(eye_m, from_x_m=stack.x_m[reference], to_x_m=stack.x_m[panel])
-    source, target = stack.panel(reference), stack.panel(panel)
-    plane = through(source.plane_from_raster(), points_px) * scale + shift
-    return through(target.raster_from_plane(), plane)
-
-
-def register(settings: Sequence[Setting], stack: PanelStack, *, reference: int) -> StackRegistration:
-    """Fit every panel but the reference to all settings at once (Levenberg-Marquardt, linear loss).
-
-    Raises ValueError, saying which panel, where the settings do not determine it.
+    even: as in `register_photographs`. Raises ValueError where the panels do not stand in order.
     """
-    moving = [index for index in range(stack.count) if index != reference]
-    _refuse_too_few(settings, stack, moving)
-    groups = _grouped(settings)
+    true = found_stack(panels, stack)
+    if even is None:
+        even = not true.is_evenly_spaced
+    return replace(evenly_spaced(true, reference=reference) if even else true, tilt=tilt_of(panels, eye_m))
 
-    def residuals(parameters: F64, eye_offset_m: F64 | None = None) -> F64:
-        matrices = _matrices(parameters, stack, moving)
-        found = np.empty((len(settings), 2))
-        for (eye, first, second), (index, first_px, second_px) in groups.items():
-            place = np.array(eye) if eye_offset_m is None else np.array(eye) + eye_offset_m
-            ideal = through(_inverse(matrices[first]), first_px)
-            partner = ideal_partner(ideal, place, stack, reference=first, panel=second)
-            found[index] = through(matrices[second], partner) - second_px
-        return found.ravel()
 
-    fit = least_squares(residuals, np.zeros(8 * len(moving)), method="trf", x_scale=1.0, xtol=1e-12, ftol=1e-14)
-    values = np.linalg.svd(fit.jac, compute_uv=False)
-    if values[-1] * CONDITION_LIMIT <= values[0]:
-        raise ValueError("the settings lie too close together or on a line: some panel's corners are not determined")
-    freedom = fit.jac.shape[0] - fit.jac.shape[1]
-    sigma_px = float(np.sqrt((fit.fun**2).sum() / freedom)) if freedom > 0 else SETTING_SIGMA_PX
-    inverse = np.linalg.pinv(fit.jac)
-    setting = inverse @ inverse.T * sigma_px**2
-    by_eye = _viewpoint_covariance(settings, fit.x, inverse, residuals)
-    panels = []
-    for index in range(stack.count):
-        if index == reference:
-            panels.append(Registration(np.eye(3), np.zeros((4, 2)), np.zeros((8, 8)), np.zeros((8, 8)), 0))
-            continue
-        part = slice(8 * moving.index(index), 8 * moving.index(index) + 8)
-        corners = fit.x[part].reshape(4, 2)
-        panels.append(
-            Registration(
-                true_from_ideal(corners, width_px=stack.width_px, height_px=stack.height_px),
-                corners,
-                setting[part, part],
-                by_eye[part, part],
-                sum(index in (s.reference, s.panel) for s in settings),
-            )
+def register_photographs(
+    seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m: F64, even: bool | None
+) -> Registration:
+    """Fit and judge. Raises Undetermined, saying what is wrong.
+
+    even: write even distances near the true ones; None: where those are too uneven for the shipped networks.
+    """
+    reference = stack.count // 2
+    faults = {s.name: s.fault for s in seen if s.fault}
+    faults |= _other_sizes([s for s in seen if not s.fault])
+    bundle, good = None, [s for s in seen if s.name not in faults]
+    while True:
+        _refuse_few(good, seen, faults)
+        bundle = adjust(good, stack, reference=reference)
+        odd = _disagreeing(bundle, good)
+        if not odd:
+            break
+        faults[odd] = "does not agree with the others: another stack, or something moved"
+        good = [s for s in good if s.name != odd]
+    _refuse_one_place(bundle)
+    if bundle.sigma_px > MISFIT_PX:
+        raise Undetermined(
+            f"the photographs do not show one rigid stack: points are {bundle.sigma_px:.1f} px off on average"
         )
-    return StackRegistration(tuple(panels), reference, fit.fun.reshape(-1, 2), sigma_px)
+    try:
+        model = geometry_of(bundle.panels, stack, eye_m=eye_m, even=even, reference=reference)
+    except ValueError as problem:
+        raise Undetermined(str(problem)) from None
+    _refuse_implausible(bundle, stack)
+    corners = corner_pixels(stack)
 
+    def moved(panels: Sequence[PlacedPanel]) -> F64:
+        matrices = homographies(panels, model, eye_m)
+        return np.stack([through(matrix, corners) - corners for matrix in matrices])
 
-def _grouped(settings: Sequence[Setting]) -> dict[tuple[tuple[float, ...], int, int], tuple[F64, F64, F64]]:
-    """Settings of one eye and one pair of panels: their rows, and (k, 2) pixels on either panel."""
-    rows: dict[tuple[tuple[float, ...], int, int], list[int]] = {}
-    for row, s in enumerate(settings):
-        rows.setdefault((s.eye_m, s.reference, s.panel), []).append(row)
-    return {
-        key: (
-            np.array(index),
-            np.array([settings[row].reference_px for row in index], dtype=np.float64),
-            np.array([settings[row].panel_px for row in index], dtype=np.float64),
+    def gaps(panels: Sequence[PlacedPanel]) -> F64:
+        return np.diff([panel.axis_x_m for panel in panels])
+
+    corner_sigma_px = bundle.sigma_of(moved)
+    worst = float(np.linalg.norm(corner_sigma_px, axis=-1).max())
+    if worst > DOUBTFUL_PX:
+        raise Undetermined(
+            f"the photographs leave a panel's corner uncertain by {worst:.2f} px: take more, from more directions"
         )
-        for key, index in rows.items()
-    }
-
-
-def _matrices(parameters: F64, stack: PanelStack, moving: Sequence[int]) -> list[F64]:
-    matrices = [np.eye(3)] * stack.count
-    for number, index in enumerate(moving):
-        corners = parameters[8 * number : 8 * number + 8].reshape(4, 2)
-        matrices[index] = true_from_ideal(corners, width_px=stack.width_px, height_px=stack.height_px)
-    return matrices
-
-
-def _viewpoint_covariance(
-    settings: Sequence[Setting], parameters: F64, inverse: F64, residuals: Callable[[F64, F64], F64]
-) -> F64:
-    """Covariance from each marked viewpoint's own error, shared by all that was set from it."""
-    step_m = 1e-4
-    covariance = np.zeros((len(parameters), len(parameters)))
-    eyes = np.repeat([s.eye_m for s in settings], 2, axis=0)
-    for eye in np.unique(eyes, axis=0):
-        here = (eyes == eye).all(axis=1)
-        for axis in range(3):
-            offset = step_m * np.eye(3)[axis]
-            slope = (residuals(parameters, offset) - residuals(parameters, -offset)) / (2 * step_m) * here
-            moved = inverse @ slope * VIEWPOINT_SIGMA_M
-            covariance += np.outer(moved, moved)
-    return covariance
-
-
-def _refuse_too_few(settings: Sequence[Setting], stack: PanelStack, moving: Sequence[int]) -> None:
-    for index in moving:
-        count = sum(index in (s.reference, s.panel) for s in settings)
-        if count < 4:
-            raise ValueError(f"panel {index} has {count} settings: at least 4 are needed")
-
-
-@dataclass(frozen=True, slots=True)
-class Parts:
-    """A registration in words a person can use, about the panel's middle."""
-
-    shift_px: tuple[float, float]
-    rotation_deg: float
-    scale: tuple[float, float]
-    keystone_px: float  # how far the corners are from where a similarity and a stretch would put them
-
-
-def parts(matrix: F64, *, width_px: int, height_px: int) -> Parts:
-    """Shift, rotation, scale and keystone of a homography near the identity."""
-    middle = np.array([[width_px / 2, height_px / 2]])
-    corners = np.array([[0, 0], [width_px, 0], [width_px, height_px], [0, height_px]], dtype=np.float64)
-    shift = (through(matrix, middle) - middle)[0]
-    arms, moved = corners - middle, through(matrix, corners) - through(matrix, corners).mean(axis=0)
-    affine = np.linalg.lstsq(arms, moved, rcond=None)[0].T
-    left, values, right = np.linalg.svd(affine)
-    rotation = left @ right
-    stretch = right.T @ np.diag(values) @ right
-    return Parts(
-        (float(shift[0]), float(shift[1])),
-        float(np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))),
-        (float(stretch[0, 0]), float(stretch[1, 1])),
-        float(np.abs(moved - arms @ affine.T).max()),
+    return Registration(
+        bundle=bundle,
+        stack=model,
+        true_x_m=np.array([panel.axis_x_m for panel in bundle.panels]),
+        gap_sigma_m=bundle.sigma_of(gaps),
+        homographies=homographies(bundle.panels, model, eye_m),
+        corners_px=moved(bundle.panels),
+        corner_sigma_px=corner_sigma_px,
+        eye_m=np.asarray(eye_m, dtype=np.float64),
+        verdicts=_verdicts(bundle, good, seen, faults),
+        notes=_notes(good, seen, faults, worst),
     )
 
 
-def error_over_panel_px(found: F64, truth: F64, *, width_px: int, height_px: int) -> F64:
-    """(N,) distance between two homographies at an even grid of a panel's points, pixels."""
-    u, v = np.meshgrid(np.linspace(0, width_px, 17), np.linspace(0, height_px, 10))
-    points = np.column_stack([u.ravel(), v.ravel()])
-    apart_px: F64 = np.linalg.norm(through(found, points) - through(truth, points), axis=1)
-    return apart_px
+def _other_sizes(good: Sequence[SeenMarks]) -> dict[str, str]:
+    sizes = [(s.width_px, s.height_px) for s in good]
+    if not sizes:
+        return {}
+    usual = max(set(sizes), key=sizes.count)
+    text = f"has another size than the others ({usual[0]}x{usual[1]}): one camera, one setting"
+    return {s.name: text for s, size in zip(good, sizes, strict=True) if size != usual}
+
+
+def _refuse_few(good: Sequence[SeenMarks], seen: Sequence[SeenMarks], faults: dict[str, str]) -> None:
+    if len(good) >= MIN_PHOTOGRAPHS:
+        return
+    why = "; ".join(f"{name} {fault}" for name, fault in faults.items())
+    raise Undetermined(
+        f"{len(good)} of {len(seen)} photographs can be used, at least {MIN_PHOTOGRAPHS} are needed"
+        + (f": {why}" if why else "")
+    )
+
+
+def _refuse_one_place(bundle: Bundle) -> None:
+    directions = bundle.places_m - bundle.panels[bundle.reference].centre_m
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    span = float(np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1, 1))))
+    if span < MIN_SPAN_DEG:
+        raise Undetermined(
+            f"the photographs are all from one place (their directions span {span:.0f} degrees, at least "
+            f"{MIN_SPAN_DEG:.0f} are needed): take some from the left and the right, from above and below"
+        )
+
+
+def _refuse_implausible(bundle: Bundle, stack: PanelStack) -> None:
+    for index, panel in enumerate(bundle.panels):
+        off = panel.centre_m - [stack.x_m[index], 0.0, 0.0]
+        if abs(off[0]) > IMPLAUSIBLE_M:
+            origin_m = stack.x_m[bundle.reference]
+            raise Undetermined(
+                f"panel {index} stands {abs(panel.axis_x_m - origin_m) * 1e3:.1f} mm from panel {bundle.reference}, "
+                f"the configuration says {abs(stack.x_m[index] - origin_m) * 1e3:.1f}: photographs of "
+                "another stack, or stack.x_m, width_m and height_m are not this stack's"
+            )
+        if np.abs(off[1:]).max() > IMPLAUSIBLE_M:
+            raise Undetermined(
+                f"panel {index} lies {np.linalg.norm(off[1:]) * 1e3:.0f} mm beside panel {bundle.reference}: "
+                "photographs of another stack, or a panel that is to be put right by hand first"
+            )
+
+
+def _disagreeing(bundle: Bundle, good: Sequence[SeenMarks]) -> str:
+    """The name of the photograph that fits the others worst, if it does not fit; empty: all do."""
+    shares = [1 - float(bundle.used[bundle.photograph == number].mean()) for number in range(len(good))]
+    worst = int(np.argmax(shares))
+    return good[worst].name if shares[worst] > DISAGREES else ""
+
+
+def _verdicts(
+    bundle: Bundle, good: Sequence[SeenMarks], seen: Sequence[SeenMarks], faults: dict[str, str]
+) -> tuple[Verdict, ...]:
+    numbers = {s.name: number for number, s in enumerate(good)}
+    found = []
+    for s in seen:
+        if s.name in faults:
+            found.append(Verdict(s.name, False, len(s.panel), float("inf"), faults[s.name]))
+            continue
+        mine = (bundle.photograph == numbers[s.name]) & bundle.used
+        rms = float(np.sqrt((bundle.residual_px[mine] ** 2).sum(1).mean()))
+        found.append(Verdict(s.name, True, int(mine.sum()), rms, ""))
+    return tuple(found)
+
+
+def _notes(
+    good: Sequence[SeenMarks], seen: Sequence[SeenMarks], faults: dict[str, str], worst_px: float
+) -> tuple[str, ...]:
+    notes = [f"{s.name} {faults[s.name]}: left out" for s in seen if s.name in faults]
+    if len(good) < WANTED_PHOTOGRAPHS:
+        notes.append(f"{len(good)} photographs were used: 8 to 20 are better, and tell whether one of them is wrong")
+    if worst_px > FEWER_IS_NOTED_PX:
+        notes.append(f"a corner is uncertain by {worst_px:.2f} px: more photographs, from farther aside, would help")
+    return tuple(notes)

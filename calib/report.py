@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import model_validator
 
 from calib.checks import RESIDUAL_LIMIT_M
-from calib.figures import eye_error_figure, geometry_figure, residual_figure
-from calib.pairs import Pairs, read_pairs
-from calib.viewpoints import spherical_m, viewing_volume_m
-from runtime.config import CalibrationSettings, read_table
-from runtime.errors import InputError
-from runtime.eyes.calibration import Calibration, load_calibration, similarity_defect
+from calib.figures import geometry_figure, residual_figure
+from calib.viewpoints import viewing_volume_m
+from runtime.config import CalibrationSettings, read_table, validated
+from runtime.eyes.calibration import Calibration, Lenient, Vector3, load_calibration, similarity_defect
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
 from runtime.report.page import Figure, Page, Section, section_of
@@ -23,13 +22,36 @@ from runtime.report.page import Figure, Page, Section, section_of
 LISTED_POINTS = 200
 
 
+class StoredPairs(Lenient):
+    """`[data]` of a calibration file: the pairs behind it, where it holds them."""
+
+    sensor_m: tuple[Vector3, ...]
+    stack_m: tuple[Vector3, ...]
+    used: tuple[bool, ...] = ()
+    names: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _fit_together(self) -> StoredPairs:
+        count = len(self.sensor_m)
+        sizes = {len(self.stack_m), len(self.used or self.sensor_m), len(self.names or self.sensor_m)}
+        if sizes != {count} or not count or (self.used and not any(self.used)):
+            raise ValueError("names, used, sensor_m and stack_m do not fit together")
+        return self
+
+
 @dataclass(frozen=True, slots=True)
 class Points:
     """The pairs behind a calibration."""
 
-    pairs: Pairs
+    names: tuple[str, ...]
+    stack_m: F64  # (K, 3) known
+    fitted_m: F64  # (K, 3) where the calibration puts them, frame `stack`
     used: NDArray[np.bool_]  # (K,)
-    residual_m: F64  # (K, 3) calibrated minus known, frame `stack`
+
+    @property
+    def residual_m(self) -> F64:
+        """(K, 3) calibrated minus known."""
+        return self.fitted_m - self.stack_m
 
 
 def stored_points(path: Path, calibration: Calibration) -> Points | None:
@@ -37,33 +59,17 @@ def stored_points(path: Path, calibration: Calibration) -> Points | None:
     data = read_table(path).get("data")
     if not isinstance(data, dict) or "sensor_m" not in data:
         return None
-    try:
-        sensor_m, stack_m = (np.array(data[name], dtype=np.float64) for name in ("sensor_m", "stack_m"))
-        used = np.array(data.get("used", [True] * len(sensor_m)), dtype=bool)
-        names = tuple(str(name) for name in data.get("names", range(1, len(sensor_m) + 1)))
-    except (KeyError, ValueError, TypeError):
-        raise InputError(path, "data", "sensor_m and stack_m must be lists of three numbers each") from None
-    count = len(sensor_m)
-    if not count or sensor_m.shape != (count, 3) or stack_m.shape != (count, 3):
-        raise InputError(path, "data", "sensor_m and stack_m must be lists of three numbers each, equally long")
-    if used.shape != (count,) or len(names) != count or not np.isfinite([sensor_m, stack_m]).all() or not used.any():
-        raise InputError(path, "data", "names, used, sensor_m and stack_m do not fit together")
-    pairs = Pairs(sensor_m, stack_m, names, str(path))
-    return Points(pairs, used, calibration.points(sensor_m) - stack_m)
+    found = validated(StoredPairs, data, source=f"{path}: data")
+    names = found.names or tuple(str(number + 1) for number in range(len(found.sensor_m)))
+    used = np.array(found.used or [True] * len(found.sensor_m))
+    return Points(names, np.array(found.stack_m), calibration.points(found.sensor_m), used)
 
 
-def write_report(
-    file: Path, out: Path, *, pairs_path: Path | None, stack: PanelStack, viewing: CalibrationSettings
-) -> dict[str, Any]:
+def write_report(file: Path, out: Path, *, stack: PanelStack, viewing: CalibrationSettings) -> dict[str, Any]:
     """Write `index.html`, its PNGs and `report.json`. Raises InputError."""
     calibration = load_calibration(file)
     points = stored_points(file, calibration)
-    if pairs_path is not None:
-        pairs = read_pairs(pairs_path)
-        if not len(pairs):
-            raise InputError(pairs_path, "pairs", "there are none")
-        points = Points(pairs, np.ones(len(pairs), bool), calibration.points(pairs.sensor_m) - pairs.stack_m)
-    pictures = _pictures(calibration, points, stack, viewing)
+    pictures = _pictures(calibration, points, stack)
     summary = _summary(calibration, points, viewing_volume_m(viewing))
     sections = [
         section_of("Numbers", _numbers(calibration, summary)),
@@ -71,7 +77,7 @@ def write_report(
         Section("Pictures", figures=pictures),
     ]
     if points is not None:
-        heading = "Points" if len(points.pairs) <= LISTED_POINTS else f"The {LISTED_POINTS} worst points"
+        heading = "Points" if len(points.names) <= LISTED_POINTS else f"The {LISTED_POINTS} worst points"
         sections.append(section_of(heading, _point_rows(points)))
     lead = "Where the depth camera stands before the stack of panels, and how well that is known."
     page = Page(f"Calibration {file.name}", lead, sections, notes=_notes(calibration, points, file))
@@ -79,9 +85,7 @@ def write_report(
     return summary | {"out": str(out), "pictures": [f"{picture.name}.png" for picture in pictures]}
 
 
-def _pictures(
-    calibration: Calibration, points: Points | None, stack: PanelStack, viewing: CalibrationSettings
-) -> list[Figure]:
+def _pictures(calibration: Calibration, points: Points | None, stack: PanelStack) -> list[Figure]:
     matrix = calibration.stack_from_sensor
     gaze = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
     found = []
@@ -100,26 +104,13 @@ def _pictures(
                 matrix[:3, 3],
                 gaze,
                 stack,
-                points_m=None if points is None else points.pairs.stack_m,
-                fitted_m=None if points is None else calibration.points(points.pairs.sensor_m),
+                points_m=None if points is None else points.stack_m,
+                fitted_m=None if points is None else points.fitted_m,
                 used=None if points is None else points.used,
             ),
             "Camera, panels and points; the arrow is the camera's line of sight",
         )
     )
-    distances_m = np.linspace(0.2, max(1.5, 1.5 * viewing.viewing_m[1]), 40)
-    straight, aside = (
-        calibration.position_error_m(np.array([spherical_m(r, phi_deg=90, theta_deg=t) for r in distances_m]))
-        for t in (90, 65)
-    )
-    if straight is not None and aside is not None:
-        found.append(
-            Figure(
-                "eye-error",
-                eye_error_figure(distances_m, straight, aside),
-                "Expected error at the eye from the parameters' covariance",
-            )
-        )
     return found
 
 
@@ -142,7 +133,7 @@ def _summary(calibration: Calibration, points: Points | None, volume_m: F64) -> 
         residual_m = points.residual_m[points.used]
         distance_m = np.linalg.norm(residual_m, axis=-1)
         found |= {
-            "points": len(points.pairs),
+            "points": len(points.names),
             "rejected": int((~points.used).sum()),
             "rms_mm": float(np.sqrt((distance_m**2).mean())) * 1e3,
             "max_mm": float(distance_m.max()) * 1e3,
@@ -157,7 +148,7 @@ def _notes(calibration: Calibration, points: Points | None, file: Path) -> list[
     if isinstance(stored, list):
         notes += [str(text) for text in stored]
     if points is None:
-        notes.append("This file holds no pairs (or too many): give them with --pairs to see each point's error.")
+        notes.append("This file holds no pairs (or too many): the error of each point is not known.")
     if calibration.covariance is None:
         notes.append("This file holds no covariance: the error at the eye is not known.")
     return notes
@@ -210,7 +201,7 @@ def _point_rows(points: Points) -> list[list[str]]:
     rows = [["", "point", "X error, mm", "Y error, mm", "Z error, mm", "distance, mm", ""]]
     worst_first = np.argsort(-np.linalg.norm(points.residual_m, axis=1))
     for index in sorted(worst_first[:LISTED_POINTS].tolist()):
-        number, name = index + 1, points.pairs.names[index]
+        number, name = index + 1, points.names[index]
         error, used = points.residual_m[index] * 1e3, bool(points.used[index])
         rows.append([str(number), name, *[f"{value:.2f}" for value in error], f"{np.linalg.norm(error):.2f}",
                      "" if used else "rejected"])  # fmt: skip

@@ -18,9 +18,10 @@ from runtime.records import F64
 STARTS = 120
 START_PAIRS = 4
 KEPT_STARTS = 8
-MAXIMUM_SCORED = 2000  # of more pairs than these a sample picks the start; the rejection sees them all
+MAX_SCORED = 2000  # of more pairs than these a sample picks the start; the rejection sees them all
 REJECTION_PROBABILITY = 1e-4  # of a good pair, Gaussian noise
-LEAST_NOISE = 1e-12  # of the points' extent: exact data reject nothing for their rounding
+RULE: ScaleRule = "inverse"
+MIN_NOISE = 1e-12  # of the points' extent: exact data reject nothing for their rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,27 +41,27 @@ def _residuals(candidate: Similarity, sensor_m: F64, stack_m: F64) -> F64:
 
 
 def _concentrated(
-    candidate: Similarity, sensor_m: F64, stack_m: F64, *, keep: int, rule: ScaleRule, steps: int
+    candidate: Similarity, sensor_m: F64, stack_m: F64, *, keep: int, steps: int
 ) -> tuple[Similarity, F64]:
     """Refit to the `keep` best pairs of each candidate, repeatedly: never worse. Returns the fits and their sums."""
     for _ in range(steps):
         squared = np.nan_to_num(_residuals(candidate, sensor_m, stack_m), nan=np.inf)
         chosen = np.argpartition(squared, keep - 1, axis=-1)[..., :keep]
-        candidate = fit_batch(sensor_m[chosen], stack_m[chosen], rule=rule)
+        candidate = fit_batch(sensor_m[chosen], stack_m[chosen], rule=RULE)
     squared = np.nan_to_num(_residuals(candidate, sensor_m, stack_m), nan=np.inf)
     return candidate, np.partition(squared, keep - 1, axis=-1)[..., :keep].sum(-1)
 
 
-def _best_half(sensor_m: F64, stack_m: F64, *, rule: ScaleRule, random: np.random.Generator) -> NDArray[np.intp]:
+def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> NDArray[np.intp]:
     """Indices of the half of the pairs that agree best."""
     count = len(sensor_m)
     keep = min(count, max(3, (count + 5) // 2))
     subsets = np.argsort(random.random((STARTS, count)), axis=1)[:, : min(START_PAIRS, count)]
-    starts = fit_batch(sensor_m[subsets], stack_m[subsets], rule=rule)
-    starts, sums = _concentrated(starts, sensor_m, stack_m, keep=keep, rule=rule, steps=2)
+    starts = fit_batch(sensor_m[subsets], stack_m[subsets], rule=RULE)
+    starts, sums = _concentrated(starts, sensor_m, stack_m, keep=keep, steps=2)
     best = np.argsort(sums)[:KEPT_STARTS]
     finalists = Similarity(starts.scale[best], starts.rotation[best], starts.translation_m[best])
-    finalists, sums = _concentrated(finalists, sensor_m, stack_m, keep=keep, rule=rule, steps=10)
+    finalists, sums = _concentrated(finalists, sensor_m, stack_m, keep=keep, steps=10)
     winner = int(np.argmin(sums))
     if not np.isfinite(sums[winner]):
         raise Degenerate("no half of the pairs agrees on a similarity")
@@ -68,36 +69,34 @@ def _best_half(sensor_m: F64, stack_m: F64, *, rule: ScaleRule, random: np.rando
     return np.argsort(_residuals(chosen, sensor_m, stack_m))[:keep]
 
 
-def fit_robust(sensor_m: F64, stack_m: F64, *, rule: ScaleRule = "inverse", seed: int = 0) -> RobustFit:
+def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
     """The similarity of the pairs that agree, and which those are; (K, 3) each, K >= 3.
 
-    Up to 5 pairs there is nothing to out-vote: all are kept. Deterministic for a given seed.
+    Up to 5 pairs there is nothing to out-vote: all are kept. Deterministic.
     Raises Degenerate as `fit` does.
     """
     count = len(sensor_m)
-    everything = fit(sensor_m, stack_m, rule=rule)
+    everything = fit(sensor_m, stack_m, rule=RULE)
     spread = float(np.sqrt(((stack_m - stack_m.mean(0)) ** 2).sum(-1).mean()))
     if count <= 5:
         return RobustFit(everything, np.ones(count, bool), _noise(everything, sensor_m, stack_m, np.ones(count, bool)))
-    random = np.random.default_rng(seed)
-    scored = random.permutation(count)[:MAXIMUM_SCORED] if count > MAXIMUM_SCORED else np.arange(count)
+    random = np.random.default_rng(0)
+    scored = random.permutation(count)[:MAX_SCORED] if count > MAX_SCORED else np.arange(count)
     # Centred and to one size: the batched fits have no polish and no units.
-    half = scored[
-        _best_half(sensor_m[scored] - sensor_m.mean(0), stack_m[scored] - stack_m.mean(0), rule=rule, random=random)
-    ]
+    half = scored[_best_half(sensor_m[scored] - sensor_m.mean(0), stack_m[scored] - stack_m.mean(0), random=random)]
     limit = float(chi2.ppf(1 - REJECTION_PROBABILITY, 3))
     inlier = np.zeros(count, bool)
     inlier[half] = True
-    current = fit(sensor_m[inlier], stack_m[inlier], rule=rule)
+    current = fit(sensor_m[inlier], stack_m[inlier], rule=RULE)
     squared = ((current.points(sensor_m) - stack_m) ** 2).sum(-1)
     # The median of the squared distances of chi² with three degrees of freedom; small samples look too quiet.
     noise_m = np.sqrt(np.partition(squared[scored], len(half) - 1)[len(half) - 1] / _quantile(len(half) / len(scored)))
     noise_m *= 1 + 5 / max(len(scored) - 3, 1)
     for _ in range(20):
-        kept = squared <= limit * max(noise_m, LEAST_NOISE * spread) ** 2
+        kept = squared <= limit * max(noise_m, MIN_NOISE * spread) ** 2
         if kept.sum() < 3:
             break
-        current = fit(sensor_m[kept], stack_m[kept], rule=rule)
+        current = fit(sensor_m[kept], stack_m[kept], rule=RULE)
         squared = ((current.points(sensor_m) - stack_m) ** 2).sum(-1)
         noise_m = max(_noise(current, sensor_m, stack_m, kept), noise_m * 0.5)
         if np.array_equal(kept, inlier):

@@ -18,7 +18,7 @@ from runtime.records import F64
 
 EXACT_SHARE = 0.8
 FARTHEST = np.log(10.0)  # a sensor is not off by more than a factor of ten: what the prior is normalised for
-LEAST_SIGMA = 1e-12  # of the logarithm: exact pairs
+MIN_SIGMA = 1e-12  # of the logarithm: exact pairs
 REACH = np.sinh(np.linspace(-6.0, 6.0, 161))  # steps of a quadrature, in standard deviations: dense in the middle
 
 
@@ -28,7 +28,6 @@ class PosteriorScale:
 
     log_scale: F64  # (...)
     sigma: F64  # (...) its standard deviation
-    exact: F64  # (...) probability that the sensor's metre is ours
 
 
 def posterior_scale(log_scale: F64 | float, *, sigma: F64 | float, freedom: int, prior_sigma: float) -> PosteriorScale:
@@ -37,7 +36,7 @@ def posterior_scale(log_scale: F64 | float, *, sigma: F64 | float, freedom: int,
     prior_sigma: how far off a sensor that is off is at least, in the order of magnitude; above 0.
     """
     fitted = np.asarray(log_scale, dtype=np.float64)[..., None]
-    spread = np.maximum(np.asarray(sigma, dtype=np.float64), LEAST_SIGMA)[..., None]
+    spread = np.maximum(np.asarray(sigma, dtype=np.float64), MIN_SIGMA)[..., None]
     exact = EXACT_SHARE * student.pdf(fitted / spread, freedom) / spread
     places = np.sort(
         np.concatenate(np.broadcast_arrays(fitted + spread * REACH, prior_sigma * REACH + 0 * fitted), axis=-1), axis=-1
@@ -50,4 +49,4 @@ def posterior_scale(log_scale: F64 | float, *, sigma: F64 | float, freedom: int,
     chance = np.asarray(exact[..., 0] / total)
     mean = (1 - chance) * fitted[..., 0]
     variance = (1 - chance) * (spread[..., 0] ** 2 + chance * fitted[..., 0] ** 2)
-    return PosteriorScale(mean, np.sqrt(variance), chance)
+    return PosteriorScale(mean, np.sqrt(variance))

@@ -54,15 +54,11 @@ class Similarity:
         return np.asarray(sensor_m) @ np.swapaxes(linear, -1, -2) + self.translation_m[..., None, :]
 
 
-def _centred(points: F64, weights: F64 | None) -> tuple[F64, F64]:
-    """Points about their (weighted) mean, and the mean; two passes, so that a far origin costs no digits."""
+def _centred(points: F64) -> tuple[F64, F64]:
+    """Points about their mean, and the mean; two passes, so that a far origin costs no digits."""
     mean = np.zeros((*points.shape[:-2], 1, 3))
     for _ in range(2):
-        rest = points - mean
-        if weights is None:
-            mean = mean + rest.mean(axis=-2, keepdims=True)
-        else:
-            mean = mean + (weights[..., None] * rest).sum(axis=-2, keepdims=True) / weights.sum(-1)[..., None, None]
+        mean = mean + (points - mean).mean(axis=-2, keepdims=True)
     return points - mean, mean[..., 0, :]
 
 
@@ -76,24 +72,22 @@ def _scale(rule: ScaleRule, *, sensor_power: F64, stack_power: F64, correlation:
     return np.full(np.shape(correlation), float(rule))
 
 
-def fit_batch(sensor_m: F64, stack_m: F64, *, rule: ScaleRule, weights: F64 | None = None) -> Similarity:
+def fit_batch(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
     """Similarities of a batch of well-conditioned pairs, without checks.
 
-    sensor_m, stack_m: (..., K, 3), weights: (..., K) or none. Degenerate members give infinities or NaN.
+    sensor_m, stack_m: (..., K, 3). Degenerate members give infinities or NaN.
     """
-    sensor, sensor_mean = _centred(sensor_m, weights)
-    stack, stack_mean = _centred(stack_m, weights)
-    weighted = stack if weights is None else stack * weights[..., None]
-    left, values, right = np.linalg.svd(np.swapaxes(sensor, -1, -2) @ weighted)
+    sensor, sensor_mean = _centred(sensor_m)
+    stack, stack_mean = _centred(stack_m)
+    left, values, right = np.linalg.svd(np.swapaxes(sensor, -1, -2) @ stack)
     sign = np.sign(np.linalg.det(left) * np.linalg.det(right))
     right = np.concatenate([right[..., :2, :], right[..., 2:, :] * sign[..., None, None]], axis=-2)
     rotation = np.swapaxes(left @ right, -1, -2)
-    squares = (sensor**2, stack * weighted) if weights is None else (sensor**2 * weights[..., None], stack * weighted)
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = _scale(
             rule,
-            sensor_power=squares[0].sum((-1, -2)),
-            stack_power=squares[1].sum((-1, -2)),
+            sensor_power=(sensor**2).sum((-1, -2)),
+            stack_power=(stack**2).sum((-1, -2)),
             correlation=values[..., 0] + values[..., 1] + sign * values[..., 2],
         )
         turned = (rotation @ sensor_mean[..., None])[..., 0]
@@ -102,7 +96,7 @@ def fit_batch(sensor_m: F64, stack_m: F64, *, rule: ScaleRule, weights: F64 | No
 
 def extents(points_m: F64) -> F64:
     """(3,) singular values of K points about their mean, over the root of K: RMS extents along principal axes, m."""
-    centred, _ = _centred(points_m, None)
+    centred, _ = _centred(points_m)
     size = float(np.abs(centred).max(initial=0.0))
     if size == 0.0:
         return np.zeros(3)
@@ -118,7 +112,7 @@ def rotation_rounding_rad(*, second_extent_m: float, magnitude_m: float) -> floa
     return float(np.inf) if second_extent_m == 0.0 else 4 * EPSILON * magnitude_m / second_extent_m
 
 
-def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule, weights: F64 | None = None) -> Similarity:
+def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
     """The similarity of K >= 3 pairs, (K, 3) each, to the digits that float64 can give.
 
     Raises Degenerate: too few, not finite, coincident, collinear, uncorrelated, or so thin or so far away that
@@ -128,16 +122,15 @@ def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule, weights: F64 | None = N
         raise Degenerate(f"{len(sensor_m)} pairs: at least 3 are needed")
     if not (np.isfinite(sensor_m).all() and np.isfinite(stack_m).all()):
         raise Degenerate("not every coordinate is finite")
-    used = slice(None) if weights is None else weights > 0
-    _refuse_degenerate("sensor", sensor_m[used])
-    first, second = _refuse_degenerate("stack", stack_m[used])
+    _refuse_degenerate("sensor", sensor_m)
+    first, second = _refuse_degenerate("stack", stack_m)
     # Squares of 1e-200 m or 1e200 m would leave float64; powers of two cost no digits.
     sensor_unit, stack_unit = (float(np.exp2(np.frexp(np.abs(p).max())[1])) for p in (sensor_m, stack_m))
     unit_rule = rule if isinstance(rule, str) else rule * sensor_unit / stack_unit
     unit_sensor, unit_stack = sensor_m / sensor_unit, stack_m / stack_unit
-    unit = fit_batch(unit_sensor, unit_stack, rule=unit_rule, weights=weights)
+    unit = fit_batch(unit_sensor, unit_stack, rule=unit_rule)
     if first > POLISH_ABOVE * second:
-        unit = _polished(unit, unit_sensor, unit_stack, rule=unit_rule, weights=weights)
+        unit = _polished(unit, unit_sensor, unit_stack, rule=unit_rule)
     if not (np.isfinite(unit.scale) and unit.scale > 0):
         raise Degenerate("sensor and stack points are not correlated: the pairs do not belong together")
     return Similarity(unit.scale * (stack_unit / sensor_unit), unit.rotation, unit.translation_m * stack_unit)
@@ -159,20 +152,19 @@ def _refuse_degenerate(name: str, points_m: F64) -> tuple[float, float]:
     return float(first), float(second)
 
 
-def _polished(start: Similarity, sensor_m: F64, stack_m: F64, *, rule: ScaleRule, weights: F64 | None) -> Similarity:
+def _polished(start: Similarity, sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
     """The same fit for long thin clouds, whose cross-covariance holds the square of their aspect.
 
     In the stack's principal frame the turn about the long axis has a closed form of small numbers only; the rest
     follows by Gauss-Newton with a QR solver, so that the error grows with the aspect and not with its square.
     """
-    sensor, sensor_mean = _centred(sensor_m, weights)
-    stack, stack_mean = _centred(stack_m, weights)
-    root = np.ones(len(sensor)) if weights is None else np.sqrt(weights)
-    _, _, axes = np.linalg.svd(stack * root[:, None], full_matrices=False)
+    sensor, sensor_mean = _centred(sensor_m)
+    stack, stack_mean = _centred(stack_m)
+    _, _, axes = np.linalg.svd(stack, full_matrices=False)
     target = stack @ axes.T
     rotation = axes @ start.rotation  # principal frame of the stack from the sensor
-    norm = float(np.sqrt(((stack * root[:, None]) ** 2).sum() / ((sensor * root[:, None]) ** 2).sum()))
-    y, w = norm * (sensor @ rotation.T)[:, 1:] * root[:, None], target[:, 1:] * root[:, None]
+    norm = float(np.sqrt((stack**2).sum() / (sensor**2).sum()))
+    y, w = norm * (sensor @ rotation.T)[:, 1:], target[:, 1:]
     angle = np.arctan2((y[:, 0] * w[:, 1] - y[:, 1] * w[:, 0]).sum(), (y * w).sum())
     rotation = Rotation.from_rotvec([angle, 0.0, 0.0]).as_matrix() @ rotation
     for _ in range(20):
@@ -181,21 +173,16 @@ def _polished(start: Similarity, sensor_m: F64, stack_m: F64, *, rule: ScaleRule
         jacobian[:, 0, 1], jacobian[:, 0, 2] = moved[:, 2], -moved[:, 1]
         jacobian[:, 1, 0], jacobian[:, 1, 2] = -moved[:, 2], moved[:, 0]
         jacobian[:, 2, 0], jacobian[:, 2, 1] = moved[:, 1], -moved[:, 0]
-        columns = (jacobian * root[:, None, None]).reshape(-1, 3)
+        columns = jacobian.reshape(-1, 3)
         length = np.linalg.norm(columns, axis=0)
-        residual = ((target - moved) * root[:, None]).ravel()
+        residual = (target - moved).ravel()
         step = np.linalg.lstsq(columns / length, residual, rcond=None)[0] / length
         rotation = Rotation.from_rotvec(step).as_matrix() @ rotation
         if np.abs(step).max() < 4 * EPSILON:
             break
     # One Newton-Schulz step: products of rotations drift from orthogonality by an ulp each.
     rotation = rotation @ (1.5 * np.eye(3) - 0.5 * rotation.T @ rotation)
-    correlation = ((sensor @ rotation.T) * target * root[:, None] ** 2).sum()
-    scale = _scale(
-        rule,
-        sensor_power=((sensor * root[:, None]) ** 2).sum(),
-        stack_power=((stack * root[:, None]) ** 2).sum(),
-        correlation=correlation,
-    )
+    correlation = ((sensor @ rotation.T) * target).sum()
+    scale = _scale(rule, sensor_power=(sensor**2).sum(), stack_power=(stack**2).sum(), correlation=correlation)
     rotation = axes.T @ rotation
     return Similarity(np.asarray(scale), rotation, stack_mean - scale * (rotation @ sensor_mean))

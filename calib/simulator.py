@@ -3,19 +3,19 @@
 Every ray of the camera crosses every panel where that panel truly is; the panels' phases along it add up and
 sin² of the sum is what is seen (EyeReal, (7)). The lens distorts (Brown), darkens the corners and is out of focus; the
 panels' pixel grids beat with each other and with the sensor's (moiré); the sensor adds shot and read noise; the
-picture has a tone curve, eight bits and JPEG's losses. Glass shifts what lies behind it.
+picture has a tone curve, eight bits and JPEG's losses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.placed import PlacedPanel, panel_from_pixels, stack_from_pixels
+from calib.placed import PlacedPanel, stack_from_pixels
 from runtime.optics.malus import intensity_from_phase
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
@@ -46,7 +46,6 @@ class Exposure:
     """How a photograph comes out."""
 
     blur_px: float = 0.7  # standard deviation: lens, focus and the sensor's own pixels
-    motion_px: tuple[float, float] = (0.0, 0.0)  # smear along (u, v) during the exposure
     gain: float = 0.8  # of full scale, white in the middle of the picture
     dark: float = 0.01  # light through crossed polarizers, of full scale
     electrons: float = 4000.0  # at full scale: shot noise
@@ -59,21 +58,12 @@ class Exposure:
 
 
 @dataclass(frozen=True, slots=True)
-class Glass:
-    """The plates that every panel is made of: what lies behind is seen nearer, the more so at an angle."""
-
-    thickness_m: float = 0.0
-    index: float = 1.5
-
-
-@dataclass(frozen=True, slots=True)
 class Scene:
     """A stack that hands built, and what each panel shows."""
 
     stack: PanelStack  # the geometry that is believed
     panels: tuple[PlacedPanel, ...]  # the true one
     layers: U8  # (N, H, W) phases of one channel, 255 is a phase of 1
-    glass: Glass = field(default_factory=Glass)
 
 
 def phone(*, random: np.random.Generator, width_px: int = 4000, height_px: int = 3000) -> Lens:
@@ -98,16 +88,14 @@ def camera_from_stack(place_m: F64, *, towards_m: F64, roll_rad: float = 0.0) ->
     return pose
 
 
-def by_hand(
-    count: int, stack: PanelStack, *, random: np.random.Generator, distance_m: tuple[float, float] | None = None
-) -> list[F64]:
+def by_hand(count: int, stack: PanelStack, *, random: np.random.Generator) -> list[F64]:
     """`count` poses (4, 4) of a camera that is held by hand round a display, as `docs/setup.md` asks for.
 
-    In turn from the middle, the left, the right, above and below; some with the camera on its side. Without a
-    distance, so near that the panel fills most of the picture.
+    In turn from the middle, the left, the right, above and below; some with the camera on its side; so near that the
+    panel fills most of the picture.
     """
     width = stack.width_m
-    near, far = distance_m or (0.95 * width, 1.35 * width)
+    near, far = 0.95 * width, 1.35 * width
     directions = [(0, 0), (-32, 4), (32, 4), (0, 24), (0, -22), (-22, 20), (22, 20), (-22, -18), (22, -18), (-38, 0),
                   (38, 0), (12, -26)]  # fmt: skip
     poses = []
@@ -121,8 +109,8 @@ def by_hand(
     return poses
 
 
-def _directions(lens: Lens) -> tuple[F32, F32]:
-    """(h, w) x/z and y/z of the ray of every picture element, its lens's distortion undone."""
+def camera_rays(lens: Lens) -> tuple[F32, F32]:
+    """(h, w) x/z and y/z of the ray of every picture element, its lens's distortion undone: what `photograph` needs."""
     step = 16  # distortion is smooth: undone on a grid, between it interpolated
     columns, rows = lens.width_px // step + 3, lens.height_px // step + 3
     u, v = np.meshgrid(np.arange(columns) * step - step, np.arange(rows) * step - step)
@@ -148,13 +136,10 @@ def _weights(length_px: int, nodes: int, step: int) -> F32:
 
 
 def photograph(
-    scene: Scene, lens: Lens, pose: F64, exposure: Exposure, *, random: np.random.Generator, rays: object = None
+    scene: Scene, lens: Lens, pose: F64, exposure: Exposure, *, random: np.random.Generator, rays: tuple[F32, F32]
 ) -> U8:
-    """(h, w) the photograph from a camera at `pose` (4, 4; camera_from_stack).
-
-    rays: what `camera_rays` of the same lens gave, to save the time.
-    """
-    x, y = rays if isinstance(rays, tuple) else _directions(lens)
+    """(h, w) the photograph from a camera at `pose` (4, 4; camera_from_stack). rays: `camera_rays(lens)`."""
+    x, y = rays
     if exposure.samples > 1:
         light = _light_of_areas(scene, lens, pose, exposure, x, y)
     else:
@@ -191,43 +176,17 @@ def _light(scene: Scene, layers: Sequence[U8], pose: F64, exposure: Exposure, x:
     return np.asarray(light * inside, dtype=np.float32)
 
 
-def camera_rays(lens: Lens) -> tuple[F32, F32]:
-    """What `photograph` needs of a lens, once for many photographs."""
-    return _directions(lens)
-
-
 def crossing(scene: Scene, index: int, pose: F64, x: F32, y: F32) -> tuple[F32, F32]:
     """(h, w) true pixels u, v of a panel where a camera's rays cross it; x, y: (h, w) the rays' x/z and y/z.
 
     pose: (4, 4) camera_from_stack.
     """
     panel = scene.panels[index]
-    if scene.glass.thickness_m:
-        return _crossing_through_glass(scene, index, panel, pose, x, y)
     camera_from_pixels = pose[:3, :3] @ stack_from_pixels(panel, scene.stack) + np.outer(pose[:3, 3], [0, 0, 1])
     h = np.linalg.inv(camera_from_pixels).astype(np.float64)
     h = (h / h[2, 2]).astype(np.float32)
     weight = h[2, 0] * x + h[2, 1] * y + h[2, 2]
     return (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / weight, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / weight
-
-
-def _crossing_through_glass(scene: Scene, index: int, panel: PlacedPanel, pose: F64, x: F32, y: F32) -> tuple[F32, F32]:
-    """The same behind as many parallel plates as stand before the panel, and half of its own (Snell)."""
-    turn = panel.rotation.T @ pose[:3, :3].T  # panel_from_camera
-    camera_m = panel.rotation.T @ (-pose[:3, :3].T @ pose[:3, 3] - panel.centre_m)
-    d = [turn[row, 0] * x + turn[row, 1] * y + turn[row, 2] for row in range(3)]
-    tan2 = (d[1] ** 2 + d[2] ** 2) / d[0] ** 2
-    sin2 = tan2 / (1 + tan2)
-    # tan in the glass over tan in the air: what a plate of thickness t lets the ray go aside is t·tan of this.
-    share = np.sqrt((1 - sin2) / (scene.glass.index**2 - sin2))
-    plates = scene.stack.count - 1 - index + 0.5
-    path = np.float32(camera_m[0]) - np.float32(plates * scene.glass.thickness_m) * (1 - share)
-    across = [np.float32(camera_m[axis]) - d[axis] / d[0] * path for axis in (1, 2)]
-    m = panel_from_pixels(scene.stack)
-    return (
-        ((across[0] - m[1, 2]) / m[1, 0]).astype(np.float32),
-        ((across[1] - m[2, 2]) / m[2, 1]).astype(np.float32),
-    )
 
 
 def _grid(position: F32, depth: float) -> F32:
@@ -237,19 +196,7 @@ def _grid(position: F32, depth: float) -> F32:
 
 
 def _softened(light: F32, exposure: Exposure) -> F32:
-    smear = np.array(exposure.motion_px)
-    if np.abs(smear).max() > 0:
-        length = int(np.ceil(np.linalg.norm(smear))) | 1
-        kernel = np.zeros((length, length), np.float32)
-        half = smear / 2
-        centre = np.array([length // 2] * 2)
-        for share in np.linspace(-1, 1, 8 * length):
-            u, v = np.rint(centre + share * half).astype(int)
-            kernel[v, u] += 1
-        light = np.asarray(cv2.filter2D(light, -1, kernel / kernel.sum()))
-    if exposure.blur_px:
-        light = np.asarray(cv2.GaussianBlur(light, (0, 0), exposure.blur_px))
-    return light
+    return np.asarray(cv2.GaussianBlur(light, (0, 0), exposure.blur_px)) if exposure.blur_px else light
 
 
 def _developed(light: F32, lens: Lens, exposure: Exposure, random: np.random.Generator) -> U8:

@@ -8,7 +8,6 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.eye_separation import SeparationScale, joined
 from calib.robust import fit_robust
 from calib.scale_prior import posterior_scale
 from calib.similarity import Similarity, fit
@@ -17,7 +16,7 @@ from runtime.records import F64
 
 Method = Literal["seed", "least-squares", "inverse", "robust", "fixed-scale"]
 METHODS: tuple[Method, ...] = get_args(Method)
-SCALE_SIGMA = 0.02  # of a sensor's metre, unless configured
+SCALE_SIGMA = 0.02  # by how much the metre of a sensor is off that is not exact
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,25 +138,21 @@ def solve(sensor_m: F64, stack_m: F64, *, method: Method, known_scale: float = 1
     )
 
 
-def solve_default(
-    sensor_m: F64, stack_m: F64, *, scale_sigma: float = SCALE_SIGMA, separation: SeparationScale | None = None
-) -> Solution:
-    """The method that the error table (docs/calibration.md) shows to be best at the eye for pairs like these.
+def solve_default(sensor_m: F64, stack_m: F64) -> Solution:
+    """The method that has the least error at the eye for pairs like these (tests/calib/test_methods.py).
 
-    `robust` where pairs are grossly wrong; else `fixed-scale` at what is believed of the scale after the pairs
-    (`scale_prior`): 1 unless they tell another. scale_sigma: how far off a sensor's metre may be; 0: it is exact.
-    separation: what the eyes' own tells of the scale, besides the pairs. Raises `similarity.Degenerate`.
+    `robust` where pairs are grossly wrong; else `fixed-scale` at the posterior mean of the scale (`scale_prior`):
+    1 unless the pairs show another. Raises `similarity.Degenerate`.
     """
     robust = solve(sensor_m, stack_m, method="robust")
     rejected = int((~robust.used).sum())
     if rejected:
         return replace(robust, reason=f"{rejected} of {len(sensor_m)} pairs do not agree with the others")
-    if scale_sigma == 0.0:
-        return solve(sensor_m, stack_m, method="fixed-scale", reason="the sensor's metre is exact, as configured")
     inverse = solve(sensor_m, stack_m, method="inverse")
     fitted = float(inverse.similarity.scale)
-    told, told_sigma = joined(np.log(fitted), inverse.scale_sigma, separation)
-    believed = posterior_scale(told, sigma=told_sigma, freedom=3 * len(sensor_m) - 7, prior_sigma=scale_sigma)
+    believed = posterior_scale(
+        np.log(fitted), sigma=inverse.scale_sigma, freedom=3 * len(sensor_m) - 7, prior_sigma=SCALE_SIGMA
+    )
     scale, sigma = float(np.exp(believed.log_scale)), float(believed.sigma)
     found = solve(
         sensor_m,
@@ -165,12 +160,7 @@ def solve_default(
         method="fixed-scale",
         known_scale=scale,
         reason=f"scale {scale:.5g} ± {sigma * scale:.2g}: fitted {fitted:.5g} ± {inverse.scale_sigma * fitted:.2g}, "
-        + (
-            f"by the eyes' separation {np.exp(separation.log_scale):.5g} ± {separation.sigma:.2g}, "
-            if separation
-            else ""
-        )
-        + f"beforehand 1 or off by some {100 * scale_sigma:g}%",
+        f"beforehand 1 or off by some {100 * SCALE_SIGMA:g}%",
     )
     unit = found.unit_covariance.copy()
     # About the pairs' centre the scale is independent of rotation and shift.

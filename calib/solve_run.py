@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import datetime
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calib.checks import check_pairs, check_solution
-from calib.eye_separation import separation_scale
 from calib.pairs import Pairs, read_pairs
 from calib.similarity import Degenerate
 from calib.solution import METHODS, Solution, solve, solve_default
@@ -22,40 +20,21 @@ from runtime.records import F64
 
 
 def solve_file(
-    pairs_path: Path,
-    out: Path,
-    *,
-    method: str,
-    settings: Settings,
-    serial: str,
-    sensor_unit_m: float,
-    stack_unit_m: float,
-    known_scale: float,
+    pairs_path: Path, out: Path, *, settings: Settings, method: str = "", known_scale: float = 1.0
 ) -> tuple[dict[str, Any], str]:
-    """Write the calibration; answers the summary and a table for people. Raises InputError."""
+    """Write the calibration; returns the summary and a table for people. Raises InputError.
+
+    method: empty: the one with the least error at the eye for such pairs; known_scale: of `fixed-scale`.
+    """
     if method and method not in METHODS:
         raise InputError("calibrate solve", "--method", f"must be one of {', '.join(METHODS)}, not {method}")
-    raw = read_pairs(pairs_path)
-    raw = replace(
-        raw,
-        sensor_m=raw.sensor_m * sensor_unit_m,
-        stack_m=raw.stack_m * stack_unit_m,
-        separation_m=raw.separation_m * sensor_unit_m,
-    )
-    checked = check_pairs(raw)
+    checked = check_pairs(read_pairs(pairs_path))
     pairs = checked.pairs
     try:
         chosen = (
             solve(pairs.sensor_m, pairs.stack_m, method=method, known_scale=known_scale, reason="asked for")
             if method
-            else solve_default(
-                pairs.sensor_m,
-                pairs.stack_m,
-                scale_sigma=settings.calibration.scale_sigma,
-                separation=separation_scale(
-                    pairs.separation_m, ipd_m=settings.calibration.ipd_m, ipd_sigma_m=settings.calibration.ipd_sigma_m
-                ),
-            )
+            else solve_default(pairs.sensor_m, pairs.stack_m)
         )
     except Degenerate as problem:
         raise InputError(pairs.source, "pairs", str(problem)) from None
@@ -64,7 +43,7 @@ def solve_file(
     origin = Origin(
         date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         sensor_driver=settings.sensor.driver,
-        sensor_serial=serial or pairs.sensor_serial,
+        sensor_serial=pairs.sensor_serial,
         panel_ids=tuple(panel.edid_serial for panel in settings.output.panels),
     )
     kept = save(out, calibration_text(chosen, pairs, origin=origin, warnings=warnings, volume_m=volume_m))

@@ -1,4 +1,4 @@
-"""Calibration files: written atomically, with their past versions beside them, and rolled back."""
+"""Calibration files: written atomically, with their past versions beside them."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ import tomlkit
 
 from calib.pairs import Pairs
 from calib.solution import Solution
-from runtime.errors import InputError
-from runtime.eyes.calibration import load_calibration
 from runtime.records import F64
 from runtime.support import foreign
 from runtime.support.artifacts import write_bytes, write_text
@@ -107,22 +105,3 @@ def save(path: Path, text: str) -> Path | None:
             old.unlink(missing_ok=True)
     write_text(path, text)
     return kept
-
-
-def roll_back(path: Path) -> Path:
-    """Put the newest past version back, and take it from the history. Raises InputError where there is none.
-
-    It is checked first: a rollback never leaves a file that the runtime refuses. What it replaces is left as
-    `NAME.undone.toml`.
-    """
-    past = history(path)
-    if not past:
-        raise InputError(path, "--rollback", "there is no past version")
-    newest = past[-1]
-    load_calibration(newest)
-    if foreign.is_there(path):
-        write_bytes(
-            path.with_name(f"{path.stem}.undone{path.suffix}"), foreign.read_bytes(path, most_bytes=KEPT_BYTES_MAX)
-        )
-    newest.replace(path)
-    return newest

@@ -1,18 +1,16 @@
-"""The person's way through the viewpoints: what each key does, and when a pair is good enough to keep."""
+"""The person's way through the viewpoints: what each key does, where to go, when a pair is good enough to keep."""
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from calib.capture import EyeWindow, Measured
-from calib.guidance import rough_similarity, way_to
+from calib.capture import MAX_SPREAD_M, EyeWindow
 from calib.keys import Key
-from calib.pairs import CapturedPair, PairsFile
+from calib.pairs import PairsFile, points_of
+from calib.similarity import Degenerate, Similarity, extents, fit
 from calib.viewpoints import Viewpoint
 from runtime.clock import NS_PER_S
 from runtime.records import F64, EyePoints
@@ -20,64 +18,75 @@ from runtime.records import F64, EyePoints
 HERE = "here: till the lines fuse; then hold still, or Enter"
 GUIDE_NS = NS_PER_S // 2  # between two words of guidance
 HOLD_S = 1.5  # eyes that were still for so long are taken without a key
-DRIFT_M = 0.005  # that still eyes may wander meanwhile: noise and breath
-REACH_M = 0.06  # of the viewpoint, as the pairs so far tell it: nearer, holding still means that the lines fuse
+MAX_DRIFT_M = 0.005  # of still eyes meanwhile: noise and breath
+REACH_M = 0.06  # of the viewpoint, by the pairs so far: nearer, holding still means that the lines fuse
 MOVED_M = 0.02  # since the last pair or its undoing: a person who has not moved does not mean this viewpoint
+MIN_PAIRS = 3  # that show roughly where the camera stands
+MIN_WIDTH_M = 0.02  # of these across their longest direction: nearly a line leaves the turn about it open
+NEAR_M = 0.015  # nearer than this the lines themselves are the better guide
 
 
-def accept(measured: Measured | None, viewpoint: Viewpoint, *, max_spread_m: float) -> CapturedPair | str:
-    """The pair, or why there is none."""
-    if measured is None:
-        return "the sensor sees no pair of eyes"
-    if measured.spread_m > max_spread_m:
-        return f"the eyes moved or scattered by {measured.spread_m * 1e3:.1f} mm: hold still"
-    return captured(measured, viewpoint.midpoint_m, viewpoint.name)
+class Chart(Protocol):
+    """What shows the charts and a line of words on the panels."""
+
+    def show(self, viewpoint: Viewpoint) -> None:
+        """The viewpoint's chart."""
+
+    def caption(self, text: str) -> None:
+        """A line of words below it."""
 
 
-def captured(measured: Measured, stack_m: F64, name: str) -> CapturedPair:
-    """A measured midpoint with its true place (3,) in `stack`, as a row of the file."""
-    x, y, z = measured.midpoint_m.tolist()
-    u, v, w = stack_m.tolist()
-    return CapturedPair(
-        sensor_m=(x, y, z),
-        stack_m=(u, v, w),
-        viewpoint=name,
-        spread_mm=measured.spread_m * 1e3,
-        samples=measured.samples,
-        separation_m=measured.separation_m,
-        accepted_at=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+def rough_similarity(sensor_m: F64, stack_m: F64) -> Similarity | None:
+    """`stack_from_sensor` of the pairs so far, metres on both sides; None where they do not determine it yet."""
+    if len(sensor_m) < MIN_PAIRS or extents(stack_m)[1] < MIN_WIDTH_M:
+        return None
+    try:
+        return fit(sensor_m, stack_m, rule=1.0)
+    except Degenerate:
+        return None
+
+
+def way_to(viewpoint_m: F64, eyes_m: F64) -> str:
+    """The way from where the eyes (3,) are to a viewpoint (3,), frame `stack`, as "7 cm to the right, 3 cm nearer".
+
+    Empty where they are there.
+    """
+    step_m = np.asarray(viewpoint_m) - eyes_m
+    if np.linalg.norm(step_m) < NEAR_M:
+        return ""
+    words: Sequence[tuple[float, str, str]] = (
+        (float(step_m[1]), "to the right", "to the left"),
+        (float(step_m[2]), "up", "down"),
+        (float(step_m[0]), "farther away", "nearer"),
     )
+    parts = [
+        f"{abs(round(100 * distance))} cm {positive if distance > 0 else negative}"
+        for distance, positive, negative in words
+        if abs(round(100 * distance)) >= 1
+    ]
+    return ", ".join(parts)
 
 
 class Walk:
-    """The person's way through the viewpoints: what each key does. No clock, no threads."""
+    """The person's way through the viewpoints. No clock, no threads."""
 
     def __init__(
         self,
         file: PairsFile,
         viewpoints: Sequence[Viewpoint],
         *,
-        again: bool,
-        window_s: float,
-        max_spread_m: float,
         say: Callable[[str], None],
-        chart: Any = None,
-        hold_s: float = HOLD_S,
+        chart: Chart | None = None,
     ) -> None:
-        """chart: has `show(viewpoint)` and `caption(text)`; None: the person follows the charts elsewhere.
-
-        hold_s: how long eyes are still before they are taken by themselves, as soon as three pairs tell roughly where
-        they are; 0: never.
-        """
+        """chart: None: the person follows the charts elsewhere."""
         self._file, self._say, self._chart = file, say, chart
-        self._left = [v for v in viewpoints if again or v.name not in file.viewpoints]
-        self._window, self._max_spread_m = EyeWindow(window_s), max_spread_m
-        self._held = EyeWindow(hold_s) if hold_s else None
+        self._left = [v for v in viewpoints if v.name not in file.viewpoints]
+        self._window, self._held = EyeWindow(), EyeWindow(HOLD_S)
         self._before_m: F64 | None = None  # where the eyes were when this viewpoint came up, frame `sensor`
         self._index = 0
         self._serial = ""
         self._accepted = 0
-        self._rough = rough_similarity(*file.points())
+        self._rough = rough_similarity(*points_of(file.rows))
         self._guided_ns = 0
         self._guide = ""
         self.finished = not self._left
@@ -96,14 +105,15 @@ class Walk:
 
     def see(self, capture_ns: int, eyes: EyePoints | None, *, serial: str) -> None:
         """Take in a sample in frame `sensor`."""
-        self._window.add(capture_ns, eyes)
+        if self.finished:
+            return
         self._serial = serial
-        if self._held is not None and not self.finished:
-            self._held.add(capture_ns, eyes)
-            if self._holds_still():
-                self._accept(self._held, how="held still, ")
+        self._window.add(capture_ns, eyes)
+        self._held.add(capture_ns, eyes)
+        if self._holds_still():
+            self._accept(self._held, how="held still, ")
         if capture_ns - self._guided_ns >= GUIDE_NS and not self.finished:
-            self._tell_way(capture_ns)
+            self._say_way(capture_ns)
 
     def press(self, key: Key | None) -> None:
         """Do what a key says; None: nothing was pressed."""
@@ -132,26 +142,29 @@ class Walk:
 
     def _holds_still(self) -> bool:
         """Whether a person stands about where they should, has come there, and does not move any more."""
-        if self._held is None or self._rough is None or not self._held.still(DRIFT_M):
+        if self._rough is None or not self._held.still(MAX_DRIFT_M):
             return False
-        measured = self._held.measure()
-        if measured is None or measured.spread_m > self._max_spread_m:
+        seen = self._held.measure()
+        if seen is None or seen.spread_m > MAX_SPREAD_M:
             return False
-        if self._before_m is not None and np.linalg.norm(measured.midpoint_m - self._before_m) < MOVED_M:
+        if self._before_m is not None and np.linalg.norm(seen.midpoint_m - self._before_m) < MOVED_M:
             return False
-        off_m = self._rough.points(measured.midpoint_m[None])[0] - self._left[self._index].midpoint_m
+        off_m = self._rough.points(seen.midpoint_m[None])[0] - self.current.midpoint_m
         return float(np.linalg.norm(off_m)) <= REACH_M
 
     def _accept(self, window: EyeWindow, *, how: str = "") -> None:
-        viewpoint = self._left[self._index]
-        result = accept(window.measure(), viewpoint, max_spread_m=self._max_spread_m)
-        if isinstance(result, str):
-            self._say(f"{viewpoint.name}: not taken: {result}")
+        viewpoint, seen = self.current, window.measure()
+        if seen is None:
+            self._say(f"{viewpoint.name}: not taken: the sensor sees no pair of eyes")
             return
-        self._file.accept(replace(result, sensor_serial=self._serial))
+        spread = f"{seen.spread_m * 1e3:.1f} mm"
+        if seen.spread_m > MAX_SPREAD_M:
+            self._say(f"{viewpoint.name}: not taken: the eyes moved or scattered by {spread}: hold still")
+            return
+        self._file.accept(seen.paired(viewpoint.midpoint_m, viewpoint.name, serial=self._serial))
         self._accepted += 1
-        self._rough = rough_similarity(*self._file.points())
-        self._say(f"{viewpoint.name}: {how}taken, spread {result.spread_mm:.1f} mm, {len(self._file)} pairs in all")
+        self._rough = rough_similarity(*points_of(self._file.rows))
+        self._say(f"{viewpoint.name}: {how}taken, spread {spread}, {len(self._file)} pairs in all")
         if self._index + 1 == len(self._left):
             self.finished = True
         else:
@@ -162,7 +175,7 @@ class Walk:
         if not name:
             self._say("nothing to undo")
             return
-        self._rough = rough_similarity(*self._file.points())
+        self._rough = rough_similarity(*points_of(self._file.rows))
         self._accepted = max(0, self._accepted - 1)
         self._say(f"{name}: taken back, {len(self._file)} pairs in all")
         places = [viewpoint.name for viewpoint in self._left]
@@ -170,14 +183,14 @@ class Walk:
         if name in places:
             self._go(places.index(name) - self._index)
 
-    def _tell_way(self, now_ns: int) -> None:
-        """Where to move, as soon as three pairs tell roughly where the camera stands."""
-        measured = self._window.measure()
-        if self._rough is None or measured is None:
+    def _say_way(self, now_ns: int) -> None:
+        """Where to move, as soon as three pairs show roughly where the camera stands."""
+        seen = self._window.measure()
+        if self._rough is None or seen is None:
             return
         self._guided_ns = now_ns
-        eyes_m = self._rough.points(measured.midpoint_m[None])[0]
-        way = way_to(self._left[self._index].midpoint_m, eyes_m) or HERE
+        eyes_m = self._rough.points(seen.midpoint_m[None])[0]
+        way = way_to(self.current.midpoint_m, eyes_m) or HERE
         if way != self._guide:
             self._guide = way
             self._say(way)
@@ -193,21 +206,20 @@ class Walk:
 
     def _forget(self) -> None:
         """What was seen so far does not belong to the viewpoint that comes."""
-        measured = self._window.measure()
-        if measured is not None:
-            self._before_m = measured.midpoint_m
+        seen = self._window.measure()
+        if seen is not None:
+            self._before_m = seen.midpoint_m
         self._window.clear()
-        if self._held is not None:
-            self._held.clear()
+        self._held.clear()
 
     def _announce(self) -> None:
-        viewpoint = self._left[self._index]
+        viewpoint = self.current
         x, y, z = viewpoint.midpoint_m
+        hold = ", or hold still" if self._rough is not None else ""
         self._say(
             f"{viewpoint.name} ({self._index + 1} of {len(self._left)}): {x * 100:.0f} cm before the display, "
             f"{abs(y) * 100:.0f} cm to its {'right' if y > 0 else 'left'}, {z * 100:.0f} cm up; "
-            f"Enter: fused{', or hold still' if self._held is not None and self._rough is not None else ''}, n: next, "
-            "p: previous, u: undo, q: stop"
+            f"Enter: fused{hold}, n: next, p: previous, u: undo, q: stop"
         )
         if self._chart is not None:
             self._chart.show(viewpoint)

@@ -1,8 +1,8 @@
-"""Makes docs/images/ and docs/gallery.md anew by the commands in docs/gallery.toml. `make gallery`, or
+"""Writes docs/performance.md and its pictures from one demo and one report. `make gallery` (minutes), or
 
-    python docs/make_gallery.py [--work FOLDER] [--keep] [NAME ...]
+    python docs/make_gallery.py [--work FOLDER] [--keep] [REPORT OPTION ...]
 
-With names, those pictures only. `--keep` takes what an earlier call left in the work folder and runs what is missing.
+`--keep` takes what an earlier call left in the work folder. Other options (`--quick`, say) are the report's.
 """
 
 from __future__ import annotations
@@ -10,152 +10,145 @@ from __future__ import annotations
 import argparse
 import io
 import json
-import shlex
-import shutil
 import subprocess
 import sys
-import tomllib
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 
-from runtime.report.machine import describe
-
 DOCS = Path(__file__).resolve().parent
 IMAGES = DOCS / "images"
-PICTURES = DOCS / "gallery.toml"
-PAGE = DOCS / "gallery.md"
-MADE = IMAGES / "made.json"
-WORK = DOCS.parent / "out" / "gallery"
-LIMIT_BYTES = 200_000
-NOTICE = "<!-- Made by `make gallery`: change docs/gallery.toml, not this page. -->\n\n"
-INTRODUCTION = """\
-# Gallery
+WIDTH_PX, LIMIT_BYTES = 1200, 200_000
+PICTURES = {  # in docs/images: what the commands leave
+    "contact-sheet.jpg": "demo/contact-sheet.png",
+    "frontier.png": "report/frontier-scenes.png",
+    "moving-viewer.png": "report/moving-viewer.png",
+    "focal-slices.jpg": "report/focal-slices.png",
+}
+HEAD = """\
+<!-- Written by `make gallery`: change docs/make_gallery.py, not this page. -->
 
-Every picture here was made by the commands beneath it, on the machine and day named there, and scaled down. All of
-them are made anew by `make gallery` (some minutes). Milliseconds in a plot hold for that machine: compare ratios.
+# Performance: light against run time
+
+    phasestack report --out report            # the page is there within a minute, and grows; stop it when you like
+    phasestack report --pairs DIR --focal     # on your own pairs too, and with focal parallax
+    phasestack bench --out new.json           # the regression file
+    phasestack bench compare old.json new.json
+
+**Quote light, of eyes sure to 1 mm** (`light_db`, `"1"`): a panel's pixel is an even box, an eye makes of a pixel of
+its picture the mean intensity of nine rays through it, and 1 mm is what a pupil alone amounts to. It is the PSNR of
+displayed layers, clipped and rounded to 8 bits, against that picture, over eye errors of that size. The other
+figures:
+
+* *one ray* (`psnr_db`, `expected_db`): panels sampled bilinearly along one ray a pixel, as published evaluations do;
+  a solver can polish those rays without the light getting better.
+* *carried*: what eyes that are elsewhere by now see, against the picture that the layers were solved for.
+* *time*: of a whole solution, from two decoded pictures to 8-bit layers; p50 and p99. Every method runs in a process
+  of its own, whose peak is its memory. Times hold for one machine and hour: compare ratios.
+* The published network (`eyereal`) is timed with untrained weights where torch is installed; with trained ones, as
+  `--model FILE.onnx`, it has a picture too.
+
+`bench compare` divides times by a yardstick of the same run, does not compare them where the machine was busy, and
+exits with 1 where a model got slower by more than the noise, lost 0.1 dB or took 15% more memory.
+
+A case file is any `*.json` in DIR like this one; eyes are left, right, metres, frame `stack`; `fov` is horizontal;
+`off` (optional) is what should be seen `mm` beside an eye:
+
+    {"panels": {"width_m": 0.5184, "height_m": 0.2916, "x_m": [-0.06, 0.0, 0.06]},
+     "eyes": [[0.78, -0.03, 0.24], [0.78, 0.03, 0.24]], "images": ["left.png", "right.png"], "fov": 40.0,
+     "off": [{"mm": 2, "eye": [0.78, -0.028, 0.24], "image": "left-2mm-right.png"}]}
+
+![what the demo leaves: layers, and what each eye should see, sees, and the difference](images/contact-sheet.jpg)
+
 """
-GAP_PX = 8
 
 
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """One picture of the gallery: from which files of which commands it is put together."""
-
-    name: str
-    title: str
-    text: str
-    commands: tuple[str, ...]
-    sources: tuple[str, ...]
-    columns: int = 1
-    photo: bool = False
-    width_px: int = 1000
-
-    @property
-    def file(self) -> str:
-        return f"{self.name}.{'jpg' if self.photo else 'png'}"
-
-
-def pictures() -> dict[str, Picture]:
-    """The gallery's pictures by name, in its order. Raises TypeError for a key that no picture has."""
-    table = tomllib.loads(PICTURES.read_text(encoding="utf-8"))["picture"]
-    lists = ("commands", "sources")
-    return {entry["name"]: Picture(**entry | {key: tuple(entry[key]) for key in lists}) for entry in table}
-
-
-def page(made: dict[str, str]) -> str:
-    """The text of docs/gallery.md; `made` says of each picture on which machine and day it was made."""
-    parts = [NOTICE + INTRODUCTION]
-    for picture in pictures().values():
-        commands = "\n".join(f"    phasestack {command}" for command in picture.commands)
-        parts.append(
-            f"## {picture.title}\n\n![{picture.title}](images/{picture.file})\n\n{picture.text}\n\n{commands}\n\n"
-            f"*{made[picture.name]}*\n"
-        )
-    return "\n".join(parts)
-
-
-def run_commands(chosen: list[Picture], work: Path, *, keep: bool) -> None:
-    """Run what the pictures need, each command once. Raises SystemExit where one cannot do it."""
-    commands = dict.fromkeys(command for picture in chosen for command in picture.commands)
-    for command in commands:
-        words = shlex.split(command)
-        target = work / words[words.index("--out") + 1]
-        if keep and target.exists():
-            continue
-        if target.is_dir():
-            shutil.rmtree(target)
-        target.unlink(missing_ok=True)
-        print(f"phasestack {command}", flush=True)
-        done = subprocess.run([sys.executable, "-m", "runtime.cli", *words], cwd=work, stdout=subprocess.DEVNULL)
-        # 1: what the command checks has failed; its picture is there and shows it.
-        if done.returncode not in (0, 1):
-            raise SystemExit(f"phasestack {command}: exit {done.returncode}")
+def page(report: dict[str, Any]) -> str:
+    """The text of docs/performance.md."""
+    machine = report["machine"]
+    facts = f"{machine['processor']}, {machine['cores']} cores, phasestack {machine['phasestack']}, {machine['date']}"
+    methods = sorted(report["methods"], key=lambda method: method["ms_p50"])
+    quickest = methods[0]["ms_p50"]
+    size = f"{methods[0]['width_px']}x{methods[0]['height_px']}"
+    rows = [
+        [method["name"], f"{method['ms_p50'] / quickest:.1f}", f"{method['ms_p50']:.0f}", f"{method['memory_mib']:.0f}"]
+        + [_number(method["light_db"].get(key) if method["trained"] else None) for key in ("0", "1", "2")]
+        + [_number(method["psnr_db"] if method["trained"] else None)]
+        for method in methods
+    ]
+    moving = [
+        [
+            one["motion"],
+            f"{one['solver_ms']:g}",
+            *map(_number, (one["light_db"], one["tracker_mm"][0], one["behind_mm"])),
+        ]
+        for one in report["moving"]
+    ]
+    cards = [[f"{1000 * card[key]:.0f}" for key in card] for card in report["focal"]["cards"]]
+    return "\n".join(
+        [
+            HEAD,
+            f"## Error against run time\n\nBuilt-in scenes, panels of {size}; `{report['command']}`; {facts}.\n",
+            _table(["method", "× fastest", "ms", "MiB", "light 0 mm, dB", "**1 mm**", "2 mm", "one ray"], rows),
+            "![light against run time](images/frontier.png)\n",
+            "## What a moving viewer sees\n",
+            "The daemon's own loop on the simulated clock, with solvers that take as long as written; light is what\n"
+            "the eyes see from where they truly are.\n",
+            _table(["motion", "solver, ms", "light, dB", "tracker off, mm", "moved since solved, mm"], moving),
+            "![light at the true eyes](images/moving-viewer.png)\n",
+            "## Focal parallax\n",
+            "Three cards, seen by a pupil of 4 mm: where the eyes converge on each, where its picture is sharpest\n"
+            "through the layers, and where in truth.\n",
+            _table(["card at, mm", "sharpest through the layers", "sharpest in truth"], cards),
+            "![focused behind, in and before the panels](images/focal-slices.jpg)",
+            "",
+        ]
+    )
 
 
-def put_together(picture: Picture, work: Path) -> bytes:
-    """The picture's file: its sources side by side, scaled down. Raises SystemExit where it stays too large."""
-    tiles = [Image.open(work / source).convert("RGB") for source in picture.sources]
-    width = (picture.width_px - GAP_PX * (picture.columns - 1)) // picture.columns
-    small = [tile.resize((width, round(tile.height * width / tile.width)), Image.Resampling.LANCZOS) for tile in tiles]
-    height = max(tile.height for tile in small)
-    rows = -(-len(small) // picture.columns)
-    sheet = Image.new("RGB", (picture.width_px, rows * height + GAP_PX * (rows - 1)), "white")
-    for index, tile in enumerate(small):
-        row, column = divmod(index, picture.columns)
-        sheet.paste(tile, (column * (width + GAP_PX), row * (height + GAP_PX)))
-    data = _jpeg(sheet) if picture.photo else _png(sheet)
-    if len(data) > LIMIT_BYTES:
-        raise SystemExit(f"{picture.file}: {len(data)} bytes, more than {LIMIT_BYTES}: make it smaller")
-    return data
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.1f}"
 
 
-def _png(sheet: Image.Image) -> bytes:
-    """A palette of 256 colours: what plots and test pictures need, at a third of the size."""
-    file = io.BytesIO()
-    sheet.quantize(256, dither=Image.Dither.NONE).save(file, "PNG", optimize=True)
-    return file.getvalue()
+def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [headings, ["---"] * len(headings), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
-def _jpeg(sheet: Image.Image) -> bytes:
-    """The best quality, from 85 down to 55, that keeps within the limit."""
-    for quality in range(85, 50, -5):
+def smaller(source: Path, name: str) -> bytes:
+    """A picture as the pages show it. Raises SystemExit where it stays too large."""
+    image = Image.open(source).convert("RGB")
+    image.thumbnail((WIDTH_PX, 10 * WIDTH_PX), Image.Resampling.LANCZOS)
+    for quality in range(90, 50, -5):
         file = io.BytesIO()
-        sheet.save(file, "JPEG", quality=quality, optimize=True)
+        if name.endswith(".jpg"):
+            image.save(file, "JPEG", quality=quality, optimize=True)
+        else:
+            image.quantize(256, dither=Image.Dither.NONE).save(file, "PNG", optimize=True)
         if file.tell() <= LIMIT_BYTES:
-            break
-    return file.getvalue()
+            return file.getvalue()
+    raise SystemExit(f"{name}: more than {LIMIT_BYTES} bytes")
 
 
 def main() -> None:
-    """Run, put together, and only then write: a command that fails leaves the gallery as it was."""
+    """Run, and only then write: a command that fails leaves the page as it was."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(pictures()))
-    parser.add_argument("--work", type=Path, default=WORK)
+    parser.add_argument("--work", type=Path, default=DOCS.parent / "out" / "gallery")
     parser.add_argument("--keep", action="store_true")
-    arguments = parser.parse_args()
-    known = pictures()
-    if unknown := [name for name in arguments.names if name not in known]:
-        parser.error(f"no such picture: {', '.join(unknown)}")
-    chosen = [known[name] for name in arguments.names] or list(known.values())
-    arguments.work.mkdir(parents=True, exist_ok=True)
-    run_commands(chosen, arguments.work, keep=arguments.keep)
-    files = {picture.file: put_together(picture, arguments.work) for picture in chosen}
-
-    facts = describe()
-    stamp = f"Made {facts['date'][:10]}: phasestack {facts['phasestack']}, {facts['processor']}, {facts['cores']} cores"
-    made = json.loads(MADE.read_text(encoding="utf-8")) if MADE.exists() else {}
-    made = {name: text for name, text in made.items() if name in known} | {picture.name: stamp for picture in chosen}
-    if missing := known.keys() - made.keys():
-        raise SystemExit(f"never made: {', '.join(sorted(missing))}")
+    arguments, options = parser.parse_known_args()
+    for command in (["demo"], ["report", "--focal", *options]):
+        out = arguments.work / command[0]
+        if not (arguments.keep and out.is_dir()):
+            subprocess.run([sys.executable, "-m", "runtime.cli", *command, "--out", str(out)], check=True)
+    files = {name: smaller(arguments.work / source, name) for name, source in PICTURES.items()}
+    text = page(json.loads((arguments.work / "report" / "report.json").read_text(encoding="utf-8")))
+    for old in IMAGES.iterdir():
+        old.unlink()
     for name, data in files.items():
         (IMAGES / name).write_bytes(data)
-    for old in IMAGES.iterdir():
-        if old.name not in {MADE.name, *(picture.file for picture in known.values())}:
-            old.unlink()
-    MADE.write_text(json.dumps(dict(sorted(made.items())), indent=2) + "\n", encoding="utf-8")
-    PAGE.write_text(page(made), encoding="utf-8")
+    (DOCS / "performance.md").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

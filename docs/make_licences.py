@@ -26,10 +26,10 @@ PyPI, unchanged, and brings its licence texts along in its `*.dist-info`. Made b
 TAIL = """
 Wheels of binary packages bundle further libraries, each under the licence in that wheel's texts: among them
 OpenBLAS and the GCC runtime (numpy, scipy), FFmpeg under LGPL-2.1 (opencv), GLFW under Zlib (glfw).
-opencv's wheel also carries the Haar cascades that find faces (Intel License Agreement, BSD-like, in the files).
 
-The schemas of black boxes (`runtime/blackbox/schemas/foxglove.*.json`) are those of the npm package @foxglove/schemas
-2.1.0 (MIT, Foxglove Technologies Inc; its text is beside them).
+The networks that find eyes (`runtime/eyes/models`) are under Apache-2.0 (the text in LICENSE): `yunet.onnx` is YuNet as
+its authors publish it (ShiqiYu/libfacedetection.train); `face_mesh.onnx` and `iris.onnx` are MediaPipe's face landmark
+and iris models (Google LLC), converted by `docs/make_eye_models.sh`.
 
 At run time phasestack loads, and does not ship, the system's OpenGL and EGL (Mesa: MIT), Xlib and RandR (MIT),
 libusb (LGPL-2.1) and OpenNI2 (Apache-2.0).

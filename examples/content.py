@@ -137,7 +137,7 @@ def points(folder: Path) -> Made:
     cloud = np.column_stack([0.35 * np.sin(v), (1 + 0.35 * np.cos(v)) * np.cos(u), (1 + 0.35 * np.cos(v)) * np.sin(u)])
     colours = np.column_stack([127 + 120 * np.cos(u), 127 + 120 * np.sin(u), 127 + 120 * np.cos(v), 255 + 0 * u])
     trimesh.PointCloud(cloud, colors=colours.astype(np.uint8)).export(folder / "ring.ply")
-    return str(folder / "ring.ply"), "rotation_deg = [0, 25, 20]"
+    return str(folder / "ring.ply"), "axes = '+z +x'\nrotation_deg = [0, 25, 20]"
 
 
 def splats(folder: Path) -> Made:
@@ -157,7 +157,7 @@ def splats(folder: Path) -> Made:
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n"
     head += "".join(f"property float {name}\n" for name in names) + "end_header\n"
     (folder / "splats.ply").write_bytes(head.encode() + table.astype("<f4").tobytes())
-    return str(folder / "splats.ply"), "rotation_deg = [0, 25, 20]"
+    return str(folder / "splats.ply"), "axes = '+z +x'\nrotation_deg = [0, 25, 20]"
 
 
 def gltf(folder: Path) -> Made:

@@ -96,11 +96,11 @@ def random_pair(
 
 
 def endless_pairs(
-    seed: int, *, first: int = 0, step: int = 1, width_px: int, height_px: int, eye_sigma_mm: tuple[float, float]
+    seed: int, *, first: int = 0, width_px: int, height_px: int, eye_sigma_mm: tuple[float, float]
 ) -> Iterator[TrainingPair]:
-    """Pairs number `first`, `first + step`, ..: each is made from (seed, number) alone, so any can be resumed at."""
+    """Pairs number `first` and on: each is made from (seed, number) alone, so any can be resumed at."""
     number = first
     while True:
         random = np.random.default_rng([seed, number])
         yield random_pair(random, width_px=width_px, height_px=height_px, eye_sigma_mm=eye_sigma_mm)
-        number += step
+        number += 1

@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from model_export import eyereal, network
 from model_export.checkpoint import FILE_BYTES_MAX, load_eyereal, load_spectral, solver_of
 from model_export.eyereal import LEAST_PX, OFFSET, PICTURE_FOV_DEG, EyeRealNet
 from model_export.network import SpectralSolver
-from model_export.onnx_files import eyereal_bytes, half_precision, ports, quantised, spectral_bytes, with_contract
+from model_export.onnx_files import eyereal_bytes, ports, spectral_bytes, with_contract
 from model_export.recipe import DESIGN_RANGE, Recipe, read_recipe
-from model_export.stress import eyereal_feeds, ordinary_pictures
-from model_export.validate import OPSETS, Report, check_model
+from model_export.stress import Feeds
+from model_export.validate import Reference, Report, check_model
 from runtime.errors import InputError
 from runtime.model.contract import Contract
 from runtime.model.predictor import SHIPPED
 from runtime.support import foreign
 from runtime.support.artifacts import write_bytes
-
-CALIBRATION_PAIRS = 8
-CALIBRATION_SIZE = (270, 480)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,31 +37,32 @@ class ExportRequest:
     random_init: int | None = None
     width_px: int = 1920
     height_px: int = 1080
-    base_width: int = 32
     eye_order: Literal["left-right", "right-left"] = "left-right"
-    precision: str = "fp32"
-    opset: int = OPSETS[0]
-    dynamic: bool = False
 
 
 def export_model(request: ExportRequest) -> Report:
     """Make, check, and write where every check passed. Raises InputError."""
     _check_request(request)
     data, module = eyereal_model(request) if request.arch == "eyereal" else spectral_model(request)
-    report = check_model(data, source=str(request.out), reference=module)
+    report = check_model(data, source=str(request.out), reference=in_torch(module))
     if report.passed:
         write_bytes(request.out, data)
     return report
 
 
+def in_torch(module: nn.Module) -> Reference:
+    """A module as a reference of its export."""
+
+    def run(feeds: Feeds) -> Sequence[np.ndarray]:
+        with torch.no_grad():
+            answer = module(*map(torch.from_numpy, feeds.values()))
+        return [part.numpy() for part in ((answer,) if isinstance(answer, Tensor) else answer)]
+
+    return run
+
+
 def spectral_model(request: ExportRequest) -> tuple[bytes, nn.Module]:
     """One of the shipped family: its recipe's weights, a checkpoint's, or untrained ones."""
-    if request.precision == "int8":
-        raise InputError(
-            "export",
-            "--precision",
-            f"int8 is for eyereal: {request.arch} has no convolutions, and 8 bits ruin its modes",
-        )
     recipe = read_recipe(request.arch)
     if request.checkpoint is not None:
         net, recipe = load_spectral(request.checkpoint, name=request.arch)
@@ -73,16 +73,12 @@ def spectral_model(request: ExportRequest) -> tuple[bytes, nn.Module]:
     else:
         net = solver_of(recipe, source=request.arch)
     trained = recipe.weights is not None
-    return spectral_file(net, recipe, precision=request.precision, opset=request.opset, trained=trained), net
+    return spectral_file(net, recipe, trained=trained), net
 
 
-def spectral_file(
-    net: SpectralSolver, recipe: Recipe, *, precision: str = "fp32", opset: int = OPSETS[0], trained: bool = True
-) -> bytes:
+def spectral_file(net: SpectralSolver, recipe: Recipe, *, trained: bool = True) -> bytes:
     """The ONNX file of a recipe's network, with its contract; `trained`: on the pairs of `phasestack train`."""
-    data = spectral_bytes(net, cell_px=recipe.cell_px, opset=opset)
-    if precision == "fp16":
-        data = half_precision(data)
+    data = spectral_bytes(net, cell_px=recipe.cell_px)
     contract = Contract(
         version=2,
         arch="spectral",
@@ -100,7 +96,6 @@ def spectral_file(
         recipe_sha256=recipe.sha256(),
         inputs=ports(network.INPUTS),
         outputs=ports(network.OUTPUTS),
-        precision=precision,
         parameters=_parameters(net),
         cell_px=recipe.cell_px,
         reduction=recipe.reduction,
@@ -121,16 +116,9 @@ def eyereal_model(request: ExportRequest) -> tuple[bytes, nn.Module]:
         origin = hashlib.sha256(foreign.read_bytes(request.checkpoint, most_bytes=FILE_BYTES_MAX))
     else:
         torch.manual_seed(request.random_init or 0)
-        net = EyeRealNet(request.base_width).eval()
-        origin = hashlib.sha256(f"eyereal {request.base_width} random {request.random_init}".encode())
-    size = {"width_px": request.width_px, "height_px": request.height_px}
-    whole = request.dynamic or request.precision == "int8"
-    data = eyereal_bytes(net, **size, dynamic=whole, opset=request.opset)
-    if request.precision == "fp16":
-        data = half_precision(data)
-    elif request.precision == "int8":
-        samples = [eyereal_feeds(ordinary_pictures(*CALIBRATION_SIZE, number=k)) for k in range(CALIBRATION_PAIRS)]
-        data = quantised(data, samples, size=None if request.dynamic else (request.height_px, request.width_px))
+        net = EyeRealNet().eval()
+        origin = hashlib.sha256(f"eyereal 32 random {request.random_init}".encode())
+    data = eyereal_bytes(net, width_px=request.width_px, height_px=request.height_px)
     contract = Contract(
         version=2,
         arch="eyereal",
@@ -147,11 +135,10 @@ def eyereal_model(request: ExportRequest) -> tuple[bytes, nn.Module]:
         trained_for=None,  # a checkpoint does not tell what it was trained on
         picture_fov_deg=PICTURE_FOV_DEG,
         recipe_sha256=origin.hexdigest(),
-        width_px=0 if request.dynamic else request.width_px,
-        height_px=0 if request.dynamic else request.height_px,
+        width_px=request.width_px,
+        height_px=request.height_px,
         inputs=ports((eyereal.INPUT,)),
         outputs=ports((eyereal.OUTPUT,)),
-        precision=request.precision,
         parameters=_parameters(net),
     )
     return with_contract(data, contract), net
@@ -171,7 +158,3 @@ def _check_request(request: ExportRequest) -> None:
     for option, value in (("--width", request.width_px), ("--height", request.height_px)):
         if value < LEAST_PX or value > 8192 or value % 2:
             raise InputError("export", option, f"{value} must be an even number from {LEAST_PX} to 8192")
-    if not 1 <= request.base_width <= 256:
-        raise InputError("export", "--base-width", f"{request.base_width} must be from 1 to 256")
-    if request.opset not in OPSETS:
-        raise InputError("export", "--opset", f"{request.opset}: there are {OPSETS[0]} to {OPSETS[-1]}")

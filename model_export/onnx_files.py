@@ -1,17 +1,14 @@
-"""torch modules to ONNX bytes, at a precision, with the contract in them."""
+"""torch modules to ONNX bytes, with the contract in them."""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import logging
-import tempfile
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import onnx
 import torch
 from torch import nn
@@ -34,17 +31,15 @@ CELL_AXES = {
     "check": ("one",),
 }
 PICTURE_AXES = {name: ("one", "channels", "height", "width") for name in (eyereal.INPUT, eyereal.OUTPUT)}
+OPSET = 17
 FIXED = {"one", "channels", "doubts"}
-Feeds = dict[str, np.ndarray]
 
 
-def spectral_bytes(net: nn.Module, *, cell_px: int, opset: int) -> bytes:
+def spectral_bytes(net: nn.Module, *, cell_px: int) -> bytes:
     """The solver along the eyes' line: rows, cells and columns are whatever a pose asks for."""
     sides = (torch.zeros(16, 8, 6 * cell_px, dtype=torch.int16),) * 2
     modes = tuple(torch.from_numpy(part) for part in chain_modes(8))
-    return _exported(
-        net, (*sides, *modes, torch.ones(3)), network.INPUTS, network.OUTPUTS, CELL_AXES, opset, folded=False
-    )
+    return _exported(net, (*sides, *modes, torch.ones(3)), network.INPUTS, network.OUTPUTS, CELL_AXES, folded=False)
 
 
 def ports(names: Sequence[str]) -> tuple[Port, ...]:
@@ -52,11 +47,9 @@ def ports(names: Sequence[str]) -> tuple[Port, ...]:
     return tuple(Port(name=name, axes=(CELL_AXES | PICTURE_AXES)[name]) for name in names)
 
 
-def eyereal_bytes(net: nn.Module, *, width_px: int, height_px: int, dynamic: bool, opset: int) -> bytes:
-    """The published network, of one picture size or of any."""
-    example = torch.zeros(1, 18, *((64, 96) if dynamic else (height_px, width_px)))
-    axes = PICTURE_AXES if dynamic else {}
-    return _exported(net, (example,), (eyereal.INPUT,), (eyereal.OUTPUT,), axes, opset)
+def eyereal_bytes(net: nn.Module, *, width_px: int, height_px: int) -> bytes:
+    """The published network, of one picture size."""
+    return _exported(net, (torch.zeros(1, 18, height_px, width_px),), (eyereal.INPUT,), (eyereal.OUTPUT,), {})
 
 
 def with_contract(data: bytes, contract: Contract) -> bytes:
@@ -71,58 +64,12 @@ def with_contract(data: bytes, contract: Contract) -> bytes:
     return bytes(model.SerializeToString(deterministic=True))
 
 
-def half_precision(data: bytes) -> bytes:
-    """Weights and products in 16 bits; inputs and outputs stay 32."""
-    from onnxruntime.transformers.float16 import convert_float_to_float16
-    from onnxruntime.transformers.onnx_model import OnnxModel
-
-    converted = OnnxModel(convert_float_to_float16(onnx.load_from_string(data), keep_io_types=True))
-    converted.topological_sort()  # the conversion puts its casts of the inputs last
-    return bytes(converted.model.SerializeToString())
-
-
-def quantised(data: bytes, samples: Sequence[Feeds], *, size: tuple[int, int] | None) -> bytes:
-    """Static 8-bit convolutions (QDQ, a scale per channel), calibrated on samples.
-
-    size: (height, width) to fix a model of any size to, afterwards; None: leave it.
-    """
-    from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
-    from onnxruntime.tools.onnx_model_utils import make_dim_param_fixed
-
-    class Reader(CalibrationDataReader):  # type: ignore[misc]
-        def __init__(self) -> None:
-            self._rest = iter(samples)
-
-        def get_next(self) -> Any:
-            return next(self._rest, None)
-
-    with tempfile.TemporaryDirectory() as folder, _quiet():
-        plain, small = Path(folder) / "plain.onnx", Path(folder) / "int8.onnx"
-        plain.write_bytes(data)
-        quantize_static(
-            plain,
-            small,
-            Reader(),
-            quant_format=QuantFormat.QDQ,
-            per_channel=True,
-            activation_type=QuantType.QUInt8,
-            weight_type=QuantType.QInt8,
-            op_types_to_quantize=["Conv"],
-        )
-        model = onnx.load(small)
-    if size is not None:
-        make_dim_param_fixed(model.graph, "height", size[0])
-        make_dim_param_fixed(model.graph, "width", size[1])
-    return bytes(model.SerializeToString())
-
-
 def _exported(
     net: nn.Module,
     example: tuple[Any, ...],
     inputs: Sequence[str],
     outputs: Sequence[str],
     axes: Mapping[str, tuple[str, ...]],
-    opset: int,
     *,
     folded: bool = True,
 ) -> bytes:
@@ -133,7 +80,7 @@ def _exported(
             net.eval(),
             example,
             buffer,  # type: ignore[arg-type]
-            opset_version=opset,
+            opset_version=OPSET,
             input_names=list(inputs),
             output_names=list(outputs),
             dynamic_axes={

@@ -7,11 +7,11 @@ import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from runtime.config import Section, validated
 from runtime.errors import InputError
-from runtime.model.contract import LEAST_SPREAD_PX, LeastSpread, Refining, SlopeFloor, Steps, TrainedFor, check_refining
+from runtime.model.contract import LEAST_SPREAD_PX, LeastSpread, Refining, SlopeFloor, Steps, TrainedFor
 from runtime.model.predictor import SHIPPED
 from runtime.support import foreign
 
@@ -54,14 +54,9 @@ class Recipe(Section):
     least_spread_px: LeastSpread = LEAST_SPREAD_PX
     slope_floor: SlopeFloor = 1.0
     steps: Annotated[Steps, Field(min_length=1)]
-    refining: Refining = 0
+    refining: Refining = ()
     training: Training = Training()
     weights: dict[str, Any] | None = Field(None, description="state_dict as nested lists; none: the analytic start")
-
-    @model_validator(mode="after")
-    def _can_refine(self) -> Recipe:
-        check_refining(self.refining, self.steps)
-        return self
 
     def canonical(self) -> bytes:
         """The same bytes for the same recipe."""

@@ -65,7 +65,7 @@ def sight_of(pair: TrainingPair, recipe: Recipe, *, device: torch.device) -> Sig
         for need, eye in zip((-half, half), pair.eyes_m, strict=True)
     ]
     modes = [torch.from_numpy(part) for part in chain_modes(frame.cells)]
-    doubt = torch.from_numpy(frame.doubt(pair.stack, eye_sigma_mm=pair.eye_sigma_mm))
+    doubt = torch.from_numpy(frame.eye_sigma_px(pair.stack, eye_sigma_mm=pair.eye_sigma_mm))
     left, right = (
         torch.from_numpy(through(image, frame.middle_m).astype(np.float32) / FULL).permute(2, 0, 1).to(device)
         for image in phases

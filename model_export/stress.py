@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from model_export.data import endless_pairs
-from model_export.onnx_files import Feeds
 from runtime.model.chain import chain_modes
+from runtime.model.contract import Contract
 from runtime.model.transfer import FULL
 from runtime.optics.malus import phase_from_intensity
 from runtime.records import F32
 
+Feeds = dict[str, np.ndarray]
 ORDINARY = "ordinary pair"
 EXTRA = ("one eye black", "noise")
 LARGE_PX = 1_000_000
@@ -64,16 +65,20 @@ def spectral_cases(cell_px: int) -> dict[str, Feeds]:
     return cases
 
 
-def eyereal_cases(height: int, width: int) -> dict[str, Feeds]:
-    """Inputs of the published network: every panel gets the same pictures."""
+def picture_cases(contract: Contract, height: int, width: int) -> dict[str, Feeds]:
+    """Inputs of a network of whole pictures: every panel that it takes pictures of gets the same ones."""
     cases = {ORDINARY: ordinary_pictures(height, width), **stress_pictures(height, width)}
-    if height * width > LARGE_PX:  # torch takes some ten seconds for each
+    if height * width > LARGE_PX:  # the published network takes seconds for each
         for name in EXTRA:
             del cases[name]
-    return {name: eyereal_feeds(pictures) for name, pictures in cases.items()}
+    panels = contract.panels if contract.input_frame == "panel" else 1
+    return {name: picture_feeds(pictures, contract, panels) for name, pictures in cases.items()}
 
 
-def eyereal_feeds(pictures: tuple[F32, F32]) -> Feeds:
-    """(1, 18, h, w): panel-major, then eye, then RGB."""
+def picture_feeds(pictures: tuple[F32, F32], contract: Contract, panels: int) -> Feeds:
+    """(1, panels x 6, h, w): panel-major, then eye, then RGB."""
+    if contract.input_value == "phase":
+        left, right = (phase_from_intensity(picture, contract.branch) for picture in pictures)
+        pictures = left, right
     eyes = np.concatenate([picture.transpose(2, 0, 1) for picture in pictures])
-    return {"eyes": np.ascontiguousarray(np.tile(eyes, (3, 1, 1))[None], np.float32)}
+    return {contract.inputs[0].name: np.ascontiguousarray(np.tile(eyes, (panels, 1, 1))[None], np.float32)}

@@ -16,7 +16,6 @@ from torch import Tensor
 from model_export.checkpoint import fill, load_checkpoint, plain_weights, save_checkpoint, solver_of
 from model_export.curves import Point, write_curves
 from model_export.data import TrainingPair, endless_pairs
-from model_export.distributed import World, together
 from model_export.folders import folder_pairs, mixed
 from model_export.network import SpectralSolver
 from model_export.recipe import Recipe, Training, read_recipe
@@ -47,57 +46,53 @@ class TrainRequest:
     resume: bool
 
 
-def run_training(request: TrainRequest) -> dict[str, Any] | None:
-    """Train, write checkpoint, recipe and curves; None in all but the first process. Raises InputError."""
+def run_training(request: TrainRequest) -> dict[str, Any]:
+    """Train, write checkpoint, recipe and curves. Raises InputError."""
     recipe = _asked(read_recipe(request.recipe), request)
     torch.set_num_threads(request.threads)
-    with together(request.device) as world:
-        device = world.device
-        model = solver_of(recipe, source=request.recipe).to(device)
-        training = recipe.training
-        rate = training.learning_rate
-        optimiser = torch.optim.Adam([{"params": list(model.parameters()), "lr": rate, "base": rate}])
-        size = {"width_px": training.width_px, "height_px": training.height_px}
-        own = folder_pairs(request.data, scene=request.scene, **size)
-        held_out = held_out_pairs(training.validation_pairs, **size)
-        path = request.out / "checkpoint.pth"
-        data = {"scene": request.scene if own else "", "pairs": len(own)}
-        first, points, before_s = _resumed(path, model, optimiser, recipe, data) if request.resume else (0, [], 0.0)
-        start = time.monotonic()
-        if not points:
-            points = [Point(0, math.nan, *validate(model, held_out, recipe))]
-        # What a process has taken in the steps before: with folders, every other pair is one of theirs.
-        taken = first * PAIRS_A_STEP
-        own_taken = taken // 2 if own else 0
-        stream = mixed(_share(training, taken - own_taken, world), own, first=own_taken)
-        losses: list[float] = []
-        with progress_bar(f"training {recipe.name}") as progress:
-            for iteration in range(first, training.iterations):
-                for group in optimiser.param_groups:
-                    group["lr"] = group["base"] * _annealed(iteration / training.iterations)
-                losses.append(_step(model, optimiser, stream, world, recipe))
-                done = iteration + 1
-                progress(done, training.iterations)
-                if done % training.validate_every == 0 or done == training.iterations:
-                    points.append(Point(done, float(np.mean(losses)), *validate(model, held_out, recipe)))
-                    losses = []
-                    if world.rank == 0:
-                        seconds = before_s + time.monotonic() - start
-                        _save(request.out, model, optimiser, recipe, done, points, seconds, data)
-        if world.rank != 0:
-            return None
-        seconds = before_s + time.monotonic() - start
-        last = points[-1]
-        return {
-            "name": recipe.name,
-            "iterations": last.iteration,
-            "seconds": round(seconds, 1),
-            "start_db": round(points[0].exact_db, 3),
-            "held_out_db": round(last.exact_db, 3),
-            "start_expected_db": round(points[0].expected_db, 3),
-            "held_out_expected_db": round(last.expected_db, 3),
-            "checkpoint": str(path),
-        }
+    device = chosen_device(request.device)
+    model = solver_of(recipe, source=request.recipe).to(device)
+    training = recipe.training
+    rate = training.learning_rate
+    optimiser = torch.optim.Adam([{"params": list(model.parameters()), "lr": rate, "base": rate}])
+    size = {"width_px": training.width_px, "height_px": training.height_px}
+    own = folder_pairs(request.data, scene=request.scene, **size)
+    held_out = held_out_pairs(training.validation_pairs, **size)
+    path = request.out / "checkpoint.pth"
+    data = {"scene": request.scene if own else "", "pairs": len(own)}
+    first, points, before_s = _resumed(path, model, optimiser, recipe, data) if request.resume else (0, [], 0.0)
+    start = time.monotonic()
+    if not points:
+        points = [Point(0, math.nan, *validate(model, held_out, recipe))]
+    # With folders, every other pair is one of theirs.
+    taken = first * PAIRS_A_STEP
+    own_taken = taken // 2 if own else 0
+    stream = mixed(_procedural(training, taken - own_taken), own, first=own_taken)
+    losses: list[float] = []
+    with progress_bar(f"training {recipe.name}") as progress:
+        for iteration in range(first, training.iterations):
+            for group in optimiser.param_groups:
+                group["lr"] = group["base"] * _annealed(iteration / training.iterations)
+            losses.append(_step(model, optimiser, stream, recipe))
+            done = iteration + 1
+            progress(done, training.iterations)
+            if done % training.validate_every == 0 or done == training.iterations:
+                points.append(Point(done, float(np.mean(losses)), *validate(model, held_out, recipe)))
+                losses = []
+                seconds = before_s + time.monotonic() - start
+                _save(request.out, model, optimiser, recipe, done, points, seconds, data)
+    seconds = before_s + time.monotonic() - start
+    last = points[-1]
+    return {
+        "name": recipe.name,
+        "iterations": last.iteration,
+        "seconds": round(seconds, 1),
+        "start_db": round(points[0].exact_db, 3),
+        "held_out_db": round(last.exact_db, 3),
+        "start_expected_db": round(points[0].expected_db, 3),
+        "held_out_expected_db": round(last.expected_db, 3),
+        "checkpoint": str(path),
+    }
 
 
 def pair_loss(model: SpectralSolver, pair: TrainingPair, recipe: Recipe) -> Tensor:
@@ -147,10 +142,9 @@ def _step(
     model: SpectralSolver,
     optimiser: torch.optim.Optimizer,
     stream: Iterator[TrainingPair],
-    world: World,
     recipe: Recipe,
 ) -> float:
-    """One step of the optimiser over all processes' pairs. A pair that nobody can see is passed over."""
+    """One step of the optimiser. A pair that nobody can see is passed over."""
     optimiser.zero_grad()
     total, used = 0.0, 0
     for _ in range(PAIRS_A_STEP):
@@ -161,22 +155,30 @@ def _step(
         if bool(torch.isfinite(loss)):
             (loss / PAIRS_A_STEP).backward()  # type: ignore[no-untyped-call]
             total, used = total + float(loss.detach()), used + 1
-    world.average_gradients(model.parameters())
     torch.nn.utils.clip_grad_norm_(model.parameters(), GRADIENT_MAX)
     optimiser.step()
     return total / used if used else math.nan
 
 
-def _share(training: Training, taken: int, world: World) -> Iterator[TrainingPair]:
-    """This process's procedural pairs after the first `taken` of them: every `world.size`-th of the stream."""
-    return endless_pairs(
-        training.seed,
-        first=taken * world.size + world.rank,
-        step=world.size,
-        width_px=training.width_px,
-        height_px=training.height_px,
-        eye_sigma_mm=training.eye_sigma_mm,
-    )
+def _procedural(training: Training, taken: int) -> Iterator[TrainingPair]:
+    """The procedural pairs after the first `taken` of them."""
+    size = {"width_px": training.width_px, "height_px": training.height_px}
+    return endless_pairs(training.seed, first=taken, eye_sigma_mm=training.eye_sigma_mm, **size)
+
+
+def chosen_device(name: str) -> torch.device:
+    """`auto`: a GPU where there is one. Raises InputError for what isn't there."""
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        device = torch.device("meta")
+    if device.type not in {"cpu", "cuda"}:
+        raise InputError("train", "--device", f"{name!r} is neither auto, cpu nor cuda")
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise InputError("train", "--device", f"{name} isn't there: torch sees {torch.cuda.device_count()} GPUs")
+    return device
 
 
 def _save(

@@ -31,18 +31,18 @@ def main() -> None:
             from runtime.commands.app import app
             from runtime.support.crash import watch_threads
             from runtime.support.privacy import keep_quiet
-            from runtime.support.progress import TerminalLine, listening
+            from runtime.support.progress import ShownProgress, listening
 
         keep_quiet()
         watch_threads()
-        with listening(TerminalLine(sys.stderr)):
+        with listening(ShownProgress(sys.stderr)):
             code = _code_of(app, output)
     except BaseException as error:
-        code = _ended(_told, error, output)
+        code = _ended(_reported, error, output)
     code = _ended(_flushed, code, output)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt now would find the interpreter half taken down
-    if _has_hung_solver():  # taking down what a library's own thread still runs in would end in an abort
+    if _has_hung_thread():  # taking down what a library's own thread still runs in would end in an abort
         from runtime.support import logs
 
         logs.flush()
@@ -58,19 +58,24 @@ def _ended(step: Callable[..., int], *arguments: object) -> int:
         return INTERRUPTED
 
 
-def _has_hung_solver() -> bool:
-    """Whether a solver's thread is in a call that did not return (`frame.solver_thread`)."""
+def _has_hung_thread() -> bool:
+    """Whether a solver's thread (`frame.solver_thread`) or a job (`support.background`) is in a call that hangs."""
     import threading
 
-    return any(thread.name.startswith("solver-") for thread in threading.enumerate())
+    return any(thread.name.startswith(("solver-", "job ")) for thread in threading.enumerate())
 
 
 def _code_of(app: Any, output: _Output) -> int:
+    from runtime.support.removed import removed_command
+
+    if gone := removed_command(sys.argv[1:]):
+        _say(f"phasestack: {gone[0]}: is gone: {gone[1]}")
+        return BAD_INPUT
     try:
         app()
     except SystemExit as error:
         if isinstance(error.__context__, BrokenPipeError):  # typer ends any of them so, a socket's too
-            return _told(error.__context__, output)
+            return _reported(error.__context__, output)
         if isinstance(error.code, str):
             _say(error.code)
             return 1
@@ -78,7 +83,7 @@ def _code_of(app: Any, output: _Output) -> int:
     return 0
 
 
-def _told(error: BaseException, output: _Output) -> int:
+def _reported(error: BaseException, output: _Output) -> int:
     """The exit code of what a command was ended by, told in one line."""
     from runtime.errors import PhasestackError, TransientError, one_line
 
@@ -133,7 +138,7 @@ def _flushed(code: int, output: _Output) -> int:
             stream.flush()
         except (OSError, ValueError) as error:
             problem = output.problem if stream is sys.stdout else error
-            code = code or _told(problem or error, output)
+            code = code or _reported(problem or error, output)
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, stream.fileno())
             os.close(nowhere)

@@ -7,17 +7,29 @@ file are relative to the folder of the file.
 from __future__ import annotations
 
 import tomllib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
-from runtime.errors import InputError
+from runtime.errors import InputError, one_line
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.support import foreign
 from runtime.support.live import LIVE
 from runtime.support.plausible import check_text, nearest, socket_path, within
+from runtime.support.plugins import is_plugin
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, RECORD_MOST_S
+from runtime.support.removed import REMOVED_SETTINGS
 
 TABLE_BYTES_MAX = 4 << 20
 
@@ -33,7 +45,7 @@ class Section(BaseModel):
         return check_text(value) if isinstance(value, str) else value
 
 
-S = TypeVar("S", bound=Section)
+M = TypeVar("M", bound=BaseModel)
 
 MOST = 1e9  # of any number that has no narrower range
 PIXEL_ASPECT_TOLERANCE = 0.03
@@ -72,7 +84,7 @@ class StackGeometry(Section):
     tilt: Annotated[tuple[tuple[Slope, Slope], ...], Field(max_length=PANELS_MOST)] = Field(
         (),
         description="per panel, how much farther out it stands per metre to the viewer's right, and per metre up; "
-        "written by `calibrate panels photo`; empty: the panels are parallel",
+        "written by `calibrate panels`; empty: the panels are parallel",
     )
     registered_from_m: tuple[Place, Place, Place] = Field(
         (0.5, 0.0, 0.0), description="where the homographies make tilted panels look parallel from, frame `stack`"
@@ -117,7 +129,9 @@ class StackGeometry(Section):
 class SensorSettings(Section):
     """Which depth sensor delivers eye positions or images."""
 
-    driver: str = Field("replay", description="driver name: replay, openni2, usb-eyes, fixed, or one registered")
+    driver: str = Field(
+        "replay", description="replay, openni2, usb-camera, usb-eyes, fixed, or a class of yours: `module:Class`"
+    )
     source: str = Field("demo", description="what to open: a recording, `demo`, a serial number, a device URI")
     timeout_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
         0.5, description="without a new sample for this long the sensor counts as stalled"
@@ -139,7 +153,7 @@ class SensorSettings(Section):
         "", description="driver `openni2`: folder of libOpenNI2.so and OpenNI2/Drivers; empty: the system's"
     )
     fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
-        0.0, description="driver `openni2`: horizontal field of view of a camera that does not tell; 0: unknown"
+        0.0, description="horizontal field of view of a camera that does not tell (usb-camera never does); 0: unknown"
     )
     record_max_s: Annotated[float, within(0.01, RECORD_MOST_S, "s")] = Field(
         600.0, description="`record` stops after this"
@@ -148,80 +162,23 @@ class SensorSettings(Section):
     fixed_eyes_m: tuple[tuple[Place, Place, Place], tuple[Place, Place, Place]] | None = Field(
         None, description="driver `fixed`: left and right eye in the stack frame; no sensor is opened"
     )
-
-
-class DetectorSettings(Section):
-    """Finding two eyes in colour and depth images. How far apart eyes may be is the tracker's business."""
-
-    kind: Literal["haar", "yunet"] = Field("haar", description="face finder: bundled cascades, or OpenCV's YuNet")
-    yunet_model: str = Field("", description="path of face_detection_yunet_*.onnx, for kind = yunet")
-    range_min_m: Annotated[float, within(0.01, 20.0, "m")] = Field(
-        0.2, description="nearer measurements are not a viewer's face"
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="what a class of your own is made with; its own model checks it"
     )
-    range_max_m: Annotated[float, within(0.01, 20.0, "m")] = Field(
-        4.0, description="farther measurements are not a viewer's face"
-    )
-    lock_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
-        0.3, description="a viewer not seen for this long makes way for another; less than tracker.hold_s"
-    )
-
-    @model_validator(mode="after")
-    def _ordered(self) -> DetectorSettings:
-        if self.range_min_m >= self.range_max_m:
-            raise ValueError(f"range_min_m: {self.range_min_m:g} m is not below range_max_m ({self.range_max_m:g} m)")
-        return self
 
 
 class TrackerSettings(Section):
-    """Gating, filtering and prediction of the two eyes."""
+    """Following of the two eyes."""
 
-    horizon_max_s: Annotated[float, within(0.0, 1.0, "s")] = Field(
-        0.12, description="never predict further ahead than this"
-    )
     hold_s: Annotated[float, within(0.0, 60.0, "s")] = Field(
         0.5, description="hold the last eyes for this long after a loss, then go flat"
     )
     blend_s: Annotated[float, within(0.0, 60.0, "s")] = Field(
         0.3, description="time to blend to the flat picture and back"
     )
-    ipd_min_m: Annotated[float, within(0.001, 0.2, "m")] = Field(
-        0.050, description="smaller eye separations are implausible for a person"
-    )
-    ipd_max_m: Annotated[float, within(0.001, 0.2, "m")] = Field(
-        0.075, description="larger eye separations are implausible for a person"
-    )
     noise_m: Annotated[float, within(1e-6, 0.2, "m")] = Field(
-        0.003, description="the sensor's noise on an eye, standard deviation of an axis"
+        0.003, description="noise on an eye of a sensor that does not say its own, standard deviation of an axis"
     )
-    acceleration: tuple[Positive, ...] = Field(
-        (0.01, 0.1, 0.5),
-        min_length=1,
-        max_length=4,
-        description="how freely a calm, a moving and a hasty head start and stop: noise density, m²/s³, ascending",
-    )
-    stay_s: Annotated[float, within(0.01, 600.0, "s")] = Field(
-        1.0, description="how long a head keeps being calm, moving or hasty, on average"
-    )
-    turn_acceleration: Positive = Field(0.0003, description="the same of half the line between the eyes, m²/s³")
-    speed_max: Annotated[float, within(0.05, 50.0, "m/s")] = Field(
-        2.0, description="faster heads, in m/s, are outliers until a second sample confirms"
-    )
-    confidence_min: Unit = Field(0.3, description="less certain samples (a blink) are not used")
-    loss_s: Annotated[float, within(0.0, 60.0, "s")] = Field(
-        0.2, description="without any sample for this long the eyes are held, not predicted"
-    )
-    decay_s: Annotated[float, within(0.001, 60.0, "s")] = Field(
-        0.06, description="time constant with which a lost head comes to rest"
-    )
-    revive_s: Annotated[float, within(0.001, 60.0, "s")] = Field(
-        0.06, description="time in which the picture slides to eyes that were lost and found"
-    )
-
-    @model_validator(mode="after")
-    def _ordered(self) -> TrackerSettings:
-        if self.ipd_min_m >= self.ipd_max_m:
-            raise ValueError(f"ipd_min_m: {self.ipd_min_m:g} m is not below ipd_max_m ({self.ipd_max_m:g} m)")
-        return self
 
 
 class CalibrationSettings(Section):
@@ -229,13 +186,8 @@ class CalibrationSettings(Section):
 
     file: str = Field("", description="calibration TOML; empty: the built-in one of the demo recording")
     ipd_m: Annotated[float, within(0.04, 0.08, "m", zero=True)] = Field(
-        0.0, description="the viewer's known eye separation, metres, 0: unknown; checks for drift"
+        0.0, description="the viewer's known eye separation, metres, 0: unknown; for charts, and to check for drift"
     )
-    ipd_sigma_m: Annotated[float, within(0.0001, 0.02, "m")] = Field(
-        0.001,
-        description="how exactly ipd_m is known (a standard deviation): `calibrate solve` learns the scale from it",
-    )
-    ipd_tolerance: Positive = Field(0.04, description="warn where the measured one parts by more than this share")
     viewing_m: tuple[Annotated[float, within(0.05, 20.0, "m")], Annotated[float, within(0.05, 20.0, "m")]] = Field(
         (0.4, 0.6), description="nearest and farthest viewer: charts and registration are for there"
     )
@@ -243,9 +195,6 @@ class CalibrationSettings(Section):
         10.0, description="how far to either side viewers stand, seen from the display's middle"
     )
     viewing_up_deg: tuple[float, float] = Field((0.0, 20.0), description="how far up their eyes are: lowest, highest")
-    scale_sigma: NonNegative = Field(
-        0.02, description="how far off the sensor's metre may be, standard deviation; 0: it is exact"
-    )
 
     @model_validator(mode="after")
     def _viewing(self) -> CalibrationSettings:
@@ -257,48 +206,46 @@ class CalibrationSettings(Section):
         return self
 
 
-Layout = Literal["auto", "mono", "side-by-side", "half-side-by-side", "top-bottom", "half-top-bottom", "quilt", "rgbd"]
+LAYOUT = r"^(auto|mono|(half-)?side-by-side|(half-)?top-bottom|rgbd|qs\d{1,6}x\d{1,6}(a\d+(\.\d+)?)?)$"
 
 
 class ContentSettings(Section):
     """What is shown."""
 
-    scene: str = Field("demo", description="a preset's name, `demo`, or a file or folder")
+    scene: str = Field("demo", description="a built-in scene, a preset, a file or folder, or a class: `module:Class`")
+    options: dict[str, Any] = Field(default_factory=dict, description="of a scene that is a class: its own settings")
     reading: Literal["seed", "published-code", "published-training"] = Field(
         "seed", description="how a preset's d_thick is read, and where its panels stand"
     )
     fov_deg: Annotated[float, within(*FOV_RANGE_DEG, "degrees")] = Field(
         40.0, description="horizontal field of view of eye images"
     )
-    background: tuple[Unit, Unit, Unit] = Field((1.0, 1.0, 1.0), description="colour behind the scene, 0-1")
-    file: str = Field("", description="a preset's data: its .ply or .glb, or its data-set folder; empty: a stand-in")
-    layout: Layout = Field(
-        "auto",
-        description="how a picture or video holds its views; auto: by its name (_sbs, _hsbs, _tb, _htb, _qs8x6, _rgbd)",
+    background: tuple[Unit, Unit, Unit] | None = Field(
+        None, description="colour behind the scene, 0-1; without: dark, and white behind the built-in scenes"
     )
-    quilt: tuple[int, int] = Field((0, 0), description="columns and rows of a quilt; 0, 0: from the file's name")
+    file: str = Field("", description="a preset's data: its .ply or .glb, or its data-set folder; empty: a stand-in")
+    layout: Annotated[str, Field(pattern=LAYOUT)] = Field(
+        "auto",
+        description="how a picture or video holds its views: mono, side-by-side, top-bottom, half-side-by-side, "
+        "half-top-bottom, rgbd or a quilt's qs8x6a0.75; auto: by its name (_sbs, _tb, _hsbs, _htb, _rgbd, _qs8x6a0.75)",
+    )
     cone_deg: Annotated[float, Field(gt=0, lt=180)] = Field(40.0, description="angle that a quilt's views span")
     depth_m: tuple[Annotated[float, within(-10.0, 10.0, "m")], Annotated[float, within(-10.0, 10.0, "m")]] = Field(
-        (-0.05, 0.05), description="rear and front between which an RGBD picture or a fitted mesh lies, along x"
+        (-0.05, 0.05),
+        description="rear and front, along x, of an RGBD picture or a fitted mesh, which may be twice as deep",
     )
     picture_rate_hz: Annotated[float, within(0.01, 1000.0, "Hz")] = Field(
         30.0, description="pictures a second of a folder of pictures"
     )
-    at_end: Literal["repeat", "hold"] = Field("repeat", description="what a video does at its end")
     fit: bool = Field(True, description="scale and centre a mesh or splat without a preset to the display")
-    up: Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"] = Field(
-        "auto", description="the axis of a mesh or splat that is up; auto: +y, for PLY +z (see `out`)"
-    )
-    out: Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"] = Field(
-        "auto", description="the axis of a mesh or splat that faces the viewer; auto: +z, for PLY +x"
+    axes: Annotated[str, Field(pattern=r"^(auto|[+-][xyz] [+-][xyz])$")] = Field(
+        "auto",
+        description="the axes of a mesh, points or splats that are up and towards the viewer, as `+z -y`; auto: glTF's "
+        "own, else guessed from the extent",
     )
     animation: str = Field(
         "", description="which animation of a glTF plays: its name or number (from 0), `none`; empty: the first"
     )
-    samples: Annotated[int, Field(ge=0, le=16)] = Field(
-        0, description="samples a pixel for outlines; 0: smooth outlines that a software rasteriser draws faster"
-    )
-    external: SocketPath = Field("/run/phasestack/content.sock", description="socket of another program's pictures")
     library: str = Field("", description="folder whose pictures, films, models and playlists the page offers")
     stream_options: dict[str, str] = Field(
         default_factory=dict,
@@ -322,9 +269,14 @@ class ContentSettings(Section):
     def _ordered(self) -> ContentSettings:
         if self.depth_m[0] >= self.depth_m[1]:
             raise ValueError("depth_m: must be rear, then front")
-        if (self.up == "auto") != (self.out == "auto") or (self.up != "auto" and self.up[1] == self.out[1]):
-            raise ValueError("up and out: must be two different axes, or both auto")
+        if self.axes != "auto" and self.axes[1] == self.axes[4]:
+            raise ValueError("axes: must be two different ones")
         return self
+
+
+def _today(name: Any) -> Any:
+    """A backend's name; scripts still have the processor's old one."""
+    return "cpu" if name == "opencv" else name
 
 
 class ModelSettings(Section):
@@ -332,9 +284,9 @@ class ModelSettings(Section):
 
     name: str = Field("balanced", description="fast, balanced, best, sart, or an ONNX file with our contract")
     provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = Field("cpu", description="execution provider")
-    backend: Literal["auto", "opencv", "gl"] = Field(
+    backend: Annotated[Literal["auto", "cpu", "gl"], BeforeValidator(_today)] = Field(
         "auto",
-        description="what does all that surrounds the network: OpenCV on the processor, or OpenGL's shaders; "
+        description="what does all that surrounds the network: the processor, or OpenGL's shaders; "
         "auto: both are measured at the start, and the faster one is taken",
     )
     threads: Annotated[int, Field(ge=0, le=256)] = Field(2, description="inference threads; 0: all cores")
@@ -346,7 +298,9 @@ class ModelSettings(Section):
     pupil_mm: Annotated[float, within(0.0, 20.0, "mm")] = Field(
         4.0, description="diameter of a pupil, millimetres, for eye_sigma_mm = auto"
     )
-    budget_ms: NonNegative = Field(0.0, description="time for one frame; 0: none. Picks model and resolution")
+    budget_ms: NonNegative = Field(
+        0.0, description="time for one solution, drawing included, after which no further step begins; 0: none"
+    )
 
 
 class PanelSettings(Section):
@@ -438,48 +392,30 @@ class LoopSettings(Section):
 
 
 class PlanSettings(Section):
-    """What may be left out; each saving can be switched off."""
+    """What may be left out."""
 
-    enabled: bool = Field(True, description="switches every saving at once")
-    reuse: bool = Field(True, description="present again while neither content nor eyes moved")
-    focus: bool = Field(True, description="run the network only where the two eyes' pictures differ")
-    one_channel: bool = Field(True, description="solve one channel instead of three while the pictures are grey")
-    one_eye: bool = Field(True, description="solve for one eye alone while the other can't see the display")
+    enabled: bool = Field(
+        True, description="leave out what the scene and a resting head do not need; false: draw and solve all of it"
+    )
     align: bool = Field(True, description="shift and scale the panels at every refresh to where the eyes are then")
-    dead_band_mm: NonNegative = Field(
-        0.0, description="eye motion that is not solved for anew; 0: only while the head rests"
-    )
-    most_band_mm: NonNegative = Field(1.0, description="a resting head may drift so far until its place is renewed")
-    range_deg: Annotated[float, Field(gt=0, le=90)] = Field(
-        80.0, description="an eye farther off the display's axis than this can't see it"
-    )
 
 
-class LimitSettings(Section):
+@dataclass(frozen=True, slots=True)
+class LimitSettings:
     """What a file from outside may hold: more is refused with its figure, before memory is taken for it."""
 
-    file_mib: Annotated[float, Field(gt=0, le=1_000_000)] = Field(
-        1024.0, description="one file of content or of a recording, MiB"
-    )
-    pixels: Annotated[int, Field(ge=1)] = Field(134_217_728, description="pixels of one picture; 16384 x 8192")
-    triangles: Annotated[int, Field(ge=1)] = Field(2_000_000, description="triangles of a mesh, all instances together")
-    splats: Annotated[int, Field(ge=1)] = Field(3_000_000, description="Gaussians of a splat file")
-    instances: Annotated[int, Field(ge=1)] = Field(2000, description="times that meshes stand in a glTF scene")
-    nodes: Annotated[int, Field(ge=1)] = Field(5000, description="nodes of a glTF scene that moves, bones among them")
-    points: Annotated[int, Field(ge=1)] = Field(5_000_000, description="points of a cloud")
-    depth: Annotated[int, Field(ge=1, le=512)] = Field(64, description="how deep JSON or a glTF scene may nest")
-    load_s: Annotated[float, within(0.01, 86_400.0, "s")] = Field(
-        120.0, description="loading of one piece of content is given up after this"
-    )
-    start_s: Annotated[float, within(1.0, 86_400.0, "s")] = Field(
-        600.0, description="a start is given up where content and model are not ready after this"
-    )
-    recording_s: Annotated[float, Field(gt=0, le=1_000_000)] = Field(
-        21_600.0, description="length of a recording that is replayed, seconds"
-    )
-    chunk_mib: Annotated[float, Field(gt=0, le=4096)] = Field(
-        32.0, description="one chunk or message of a recording, unpacked, MiB"
-    )
+    file_mib: float = 1024.0  # one file of content or of a recording
+    pixels: int = 134_217_728  # of one picture; 16384 x 8192
+    triangles: int = 2_000_000  # of a mesh, all instances together
+    splats: int = 3_000_000
+    instances: int = 2000  # times that meshes stand in a glTF scene
+    nodes: int = 5000  # of a glTF scene that moves, bones among them
+    points: int = 5_000_000  # of a cloud
+    depth: int = 64  # how deep JSON or a glTF scene may nest
+    load_s: float = 120.0  # loading of one piece of content is given up after this
+    start_s: float = 600.0  # a start is given up where content and model are not ready after this
+    recording_s: float = 21_600.0  # length of a recording that is replayed
+    chunk_mib: float = 32.0  # one chunk or message of a recording, unpacked
 
 
 class ServiceSettings(Section):
@@ -493,14 +429,8 @@ class ServiceSettings(Section):
     blackbox_minutes: Annotated[float, within(0.0, 60.0, "min")] = Field(
         2.0, description="what the black box keeps in memory, to be written at a fault or by `ctl blackbox`; 0: none"
     )
-    blackbox_mib: Annotated[float, within(1.0, 4096.0, "MiB")] = Field(
-        32.0, description="the black box keeps no more than this in memory"
-    )
     blackbox_folder: str = Field(
         "", description="where black boxes are written; empty: `blackbox` in the service's or the person's state folder"
-    )
-    blackbox_files: Annotated[int, Field(ge=1, le=1000)] = Field(
-        10, description="black boxes that stay in the folder; the oldest make way"
     )
 
 
@@ -509,7 +439,6 @@ class Settings(Section):
 
     stack: StackGeometry = Field(default_factory=StackGeometry, description="geometry of the panels")
     sensor: SensorSettings = Field(default_factory=SensorSettings, description="depth sensor")
-    detector: DetectorSettings = Field(default_factory=DetectorSettings, description="eyes from images")
     tracker: TrackerSettings = Field(default_factory=TrackerSettings, description="filter and prediction")
     calibration: CalibrationSettings = Field(default_factory=CalibrationSettings, description="sensor to stack")
     content: ContentSettings = Field(default_factory=ContentSettings, description="what is shown")
@@ -518,7 +447,11 @@ class Settings(Section):
     loop: LoopSettings = Field(default_factory=LoopSettings, description="pacing")
     plan: PlanSettings = Field(default_factory=PlanSettings, description="what is left out")
     service: ServiceSettings = Field(default_factory=ServiceSettings, description="socket, metrics, logs")
-    limits: LimitSettings = Field(default_factory=LimitSettings, description="what files from outside may hold")
+
+    @property
+    def limits(self) -> LimitSettings:
+        """Of files; the same for every display."""
+        return LimitSettings()
 
     @model_validator(mode="after")
     def _agree(self) -> Settings:
@@ -529,33 +462,27 @@ class Settings(Section):
         return self
 
 
-class Overrides(BaseModel):
-    """What the command line says instead of the configuration; checked where it is applied."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    replay: str | None = None
-    headless: bool = False
-    scene: str | None = None
-    model: str | None = None
-    budget_ms: float | None = None
-    backend: str | None = None
-
-    def applied(self, settings: Settings) -> Settings:
-        """The settings with these in force. Raises InputError, naming the option."""
-        if self.replay is not None:
-            settings = changed(settings, "sensor", {"driver": "replay", "source": self.replay}, source="--replay")
-        if self.headless:
-            settings = changed(settings, "output", {"kind": "offscreen"}, source="--headless")
-        if self.scene is not None:
-            settings = changed(settings, "content", {"scene": self.scene}, source="--scene")
-        if self.model is not None:
-            settings = changed(settings, "model", {"name": self.model}, source="--model")
-        if self.budget_ms is not None:
-            settings = changed(settings, "model", {"budget_ms": self.budget_ms}, source="--budget-ms")
-        if self.backend is not None:
-            settings = changed(settings, "model", {"backend": self.backend}, source="--backend")
-        return settings
+def with_options(
+    settings: Settings,
+    *,
+    replay: str | None = None,
+    headless: bool = False,
+    scene: str | None = None,
+    model: str | None = None,
+    backend: str | None = None,
+) -> Settings:
+    """The settings with what a command line says in force. Raises InputError, naming the option."""
+    given: tuple[tuple[str, str, dict[str, Any] | None], ...] = (
+        ("--replay", "sensor", None if replay is None else {"driver": "replay", "source": replay}),
+        ("--headless", "output", {"kind": "offscreen"} if headless else None),
+        ("--scene", "content", None if scene is None else {"scene": scene}),
+        ("--model", "model", None if model is None else {"name": model}),
+        ("--backend", "model", None if backend is None else {"backend": backend}),
+    )
+    for option, section, values in given:
+        if values is not None:
+            settings = changed(settings, section, values, source=option)
+    return settings
 
 
 def changed(settings: Settings, section: str, values: dict[str, Any], *, source: str) -> Settings:
@@ -582,20 +509,28 @@ def read_table(path: Path) -> dict[str, Any]:
     return table
 
 
-def validated(model: type[S], table: dict[str, Any], *, source: str | Path) -> S:
-    """A table as settings. Raises InputError with the first wrong field's full name, and what may have been meant."""
+def validated(model: type[M], table: dict[str, Any], *, source: str | Path) -> M:
+    """A table as settings. Raises InputError with every wrong field's full name, and what may have been meant."""
     try:
         return model.model_validate(table)
     except ValidationError as error:
-        first = error.errors()[0]
-        name = ".".join(str(part) for part in first["loc"])
-        message = first["msg"].removeprefix("Value error, ")
-        if first["type"] == "extra_forbidden":
-            message = "is no setting" + nearest(str(first["loc"][-1]), _fields(model, first["loc"][:-1]))
-        field, colon, rest = message.partition(": ")
-        if colon and first["type"] == "value_error" and field.partition(".")[0] in _fields(model, first["loc"]):
-            name, message = ".".join(filter(None, (name, field))), rest  # of a rule about several fields
-        raise InputError(source, name, message) from None
+        (name, problem), *others = dict(_wrong_field(model, each) for each in error.errors()).items()
+        rest = [f"{field}: {one_line(text)}" if field else one_line(text) for field, text in others]
+        raise InputError(source, name, "; ".join([one_line(problem), *rest])) from None
+
+
+def _wrong_field(model: type[BaseModel], error: Any) -> tuple[str, str]:
+    """The full name of a field that one of pydantic's errors is about, and what is wrong with it."""
+    name = ".".join(str(part) for part in error["loc"])
+    message = error["msg"].removeprefix("Value error, ")
+    if error["type"] == "extra_forbidden":
+        if model is Settings and name in REMOVED_SETTINGS:
+            return name, f"is no setting any more: {REMOVED_SETTINGS[name]}"
+        return name, "is no setting" + nearest(str(error["loc"][-1]), _fields(model, error["loc"][:-1]))
+    field, colon, rest = message.partition(": ")
+    if colon and error["type"] == "value_error" and field.partition(".")[0] in _fields(model, error["loc"]):
+        return ".".join(filter(None, (name, field))), rest  # of a rule about several fields
+    return name, message
 
 
 def _fields(model: type[BaseModel], place: tuple[int | str, ...]) -> list[str]:
@@ -610,8 +545,8 @@ def _fields(model: type[BaseModel], place: tuple[int | str, ...]) -> list[str]:
 
 # What is always a path, and what is one where it has a slash or a suffix: a bare word is a name (`demo`, `balanced`).
 PATHS = (
-    ("sensor", "openni2_folder"), ("detector", "yunet_model"), ("calibration", "file"), ("content", "file"),
-    ("content", "library"),    ("content", "external"), ("service", "socket"), ("service", "blackbox_folder"),
+    ("sensor", "openni2_folder"), ("calibration", "file"), ("content", "file"),
+    ("content", "library"), ("service", "socket"), ("service", "blackbox_folder"),
 )  # fmt: skip
 NAMES_OR_PATHS = (("content", "scene"), ("model", "name"))
 
@@ -619,11 +554,11 @@ NAMES_OR_PATHS = (("content", "scene"), ("model", "name"))
 def located(name: str, folder: Path) -> str:
     """A name as it is; a path that is relative, seen from a folder. A bare word without a suffix is a name.
 
-    What has a scheme (`rtsp://...`) is no path; what is shown as it comes (`live:FILE`) is one behind its mark.
+    What has a scheme (`rtsp://...`) is no path, nor is a class (`module:Class`); `live:FILE` is one behind its mark.
     """
     if name.startswith(LIVE) and "://" not in name:
         return LIVE + located(name.removeprefix(LIVE), folder)
-    if "://" in name:
+    if "://" in name or is_plugin(name):
         return name
     if not name or "\0" in name or not ("/" in name or Path(name).suffix):
         return name

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 PART_CHARACTERS_MAX = 300  # of a message: a foreign name must not fill the screen, nor forge a line of the log
+PROBLEM_CHARACTERS_MAX = 1500  # of what is wrong with a file, all its fields together
 
 
 def one_line(text: str, *, most: int = PART_CHARACTERS_MAX) -> str:
@@ -36,7 +37,8 @@ class InputError(FatalError):
 
     def __init__(self, source: str | Path, field: str, problem: str) -> None:
         self.source, self.field, self.problem = str(source), field, problem
-        super().__init__(": ".join(one_line(part) for part in (self.source, field, problem) if part))
+        where = [one_line(part) for part in (self.source, field) if part]
+        super().__init__(": ".join([*where, one_line(problem, most=PROBLEM_CHARACTERS_MAX)]))
 
 
 class MissingPart(FatalError):

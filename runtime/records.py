@@ -72,6 +72,7 @@ class EyePoints:
     eyes_m: F64  # (2, 3) left, right (the viewer's own); metres; frame `sensor` or `stack`, as its carrier says
     confidence: F64  # (2,) in [0, 1], left, right
     completed: Literal["", "left", "right"] = ""  # the eye that was hidden and filled in from the head's pose
+    covariance_m2: F64 | None = None  # (3, 3) of the middle between the eyes, same frame; None: the driver does not say
 
 
 @dataclass(frozen=True, slots=True)

@@ -70,7 +70,6 @@ def test_solve_leaves_layers_and_what_the_eyes_see(pair: Path) -> None:
         ({"left": "missing.png"}, "missing.png"),
         ({"panels": "missing.json"}, "missing.json"),
         ({"left_eye": (0.05, -0.03, 0.0)}, "--left-eye"),
-        ({"left_eye": (-0.5, -0.03, 0.0)}, "--left-eye"),
         ({"left_eye": ("nan", 0, 0)}, "--left-eye"),
         ({"right_eye": (0.6, -0.03, 0.0)}, "--right-eye"),
         ({"left_eye": (0.061, 40.0, 0.0), "right_eye": (0.061, 40.06, 0.0)}, "--left-eye"),
@@ -129,8 +128,6 @@ def test_pictures_of_different_sizes_are_refused(pair: Path) -> None:
 @pytest.mark.parametrize(
     ("table", "field"),
     [
-        ({**PANELS, "x_m": [0.06, 0.0, -0.06]}, "x_m"),
-        ({**PANELS, "width_m": "wide"}, "width_m"),
         ({**PANELS, "depth_m": 1}, "depth_m"),
         ({"width_m": 0.5, "height_m": 0.3}, "x_m"),
         ({**PANELS, "x_m": [0.01 * n for n in range(9)]}, "x_m: must list 2 to 8 panels"),
@@ -148,9 +145,6 @@ def test_panels_that_make_no_stack_are_refused_by_field(pair: Path, table: dict[
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("[loop]\nrate_hz = 'fast'\n", "loop.rate_hz"),
-        ("[loop]\nrate = 60\n", "loop.rate"),
-        ("[lop]\n", "lop"),
         ("[loop\n", "malformed"),
         ("[model]\nname = 'quick'\n", "quick"),
         ("[calibration]\nfile = 'missing.toml'\n", "missing.toml"),
@@ -190,30 +184,3 @@ def test_a_recording_that_is_none_is_refused(tmp_path: Path, content: bytes | No
     assert "eyes.mcap" in result.stderr
     assert "Traceback" not in result.stderr
     assert not out.exists()
-
-
-def test_config_prints_a_valid_configuration_of_defaults(tmp_path: Path) -> None:
-    printed = phasestack("config")
-    assert printed.returncode == 0
-    file = tmp_path / "defaults.toml"
-    file.write_text(printed.stdout)
-    assert phasestack("config", "--check", file).returncode == 0
-    from runtime.config import Settings, load_settings
-
-    assert load_settings(file) == Settings()
-
-
-@pytest.mark.parametrize("command", [[], ["demo"], ["run"], ["solve"], ["config"], ["status"], ["ctl"], ["calibrate"]])
-def test_every_command_has_help(command: list[str]) -> None:
-    result = phasestack(*command, "--help")
-    assert result.returncode == 0
-    assert "Usage" in result.stdout
-
-
-def test_starting_the_command_line_imports_nothing_heavy() -> None:
-    code = (
-        "import sys, runtime.cli, runtime.commands.app\n"
-        "heavy = {'torch', 'cv2', 'onnxruntime', 'scipy', 'numpy', 'matplotlib', 'pydantic', 'moderngl', 'glfw'}\n"
-        "print(sorted(heavy & set(sys.modules)))"
-    )
-    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"

@@ -38,11 +38,6 @@ def broken(body: str, home: Path, **how: Any) -> subprocess.CompletedProcess[str
     return run("config", code=BROKEN.format(body=body), home=home, **how)
 
 
-def test_the_version_is_told() -> None:
-    answer = run("--version")
-    assert answer.returncode == 0 and answer.stdout.startswith("phasestack ") and answer.stdout.split()[1][0].isdigit()
-
-
 @pytest.mark.parametrize(
     "body",
     [
@@ -78,15 +73,6 @@ def test_without_a_home_the_file_is_in_the_temporary_folder(tmp_path: Path) -> N
     assert answer.returncode == 70 and f"{tmp_path}/phasestack-error-" in answer.stderr
 
 
-def test_the_files_do_not_fill_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from runtime.support import crash
-
-    monkeypatch.setenv("LOGS_DIRECTORY", str(tmp_path))
-    for _ in range(crash.KEPT + 5):
-        crash.written(ValueError("again"))
-    assert len(list(tmp_path.iterdir())) == crash.KEPT
-
-
 def test_an_error_in_a_thread_is_told_so_too(tmp_path: Path) -> None:
     body = "import threading; t = threading.Thread(target=lambda: 1 / 0); t.start(); t.join()"
     answer = broken(body, tmp_path)
@@ -106,17 +92,6 @@ def test_an_interrupt_that_a_library_turned_into_something_else_is_still_one(tmp
 def test_without_memory_it_may_pass(tmp_path: Path) -> None:
     answer = broken("raise MemoryError", tmp_path)
     assert (answer.returncode, answer.stderr) == (75, "phasestack: out of memory (this may pass: start again)\n")
-
-
-def test_an_interrupt_while_an_interrupt_is_told_is_still_one_without_a_word(tmp_path: Path) -> None:
-    body = """
-    import runtime.cli
-    def told(*_):
-        raise KeyboardInterrupt
-    runtime.cli._told = runtime.cli._flushed = told
-    raise KeyboardInterrupt"""
-    answer = broken(body, tmp_path)
-    assert (answer.returncode, answer.stderr) == (130, "")
 
 
 @pytest.mark.parametrize(

@@ -46,7 +46,7 @@ def test_the_wheel_holds_every_file_of_the_packages_and_the_sdist_too(packages: 
         in_sdist = {name.partition("/")[2] for name in archive.getnames()}
     wanted = {
         str(path.relative_to(ROOT))
-        for package in ("runtime", "calib", "model_export")
+        for package in ("phasestack", "runtime", "calib", "model_export")
         for path in (ROOT / package).rglob("*")
         if path.is_file() and "__pycache__" not in path.parts
     }

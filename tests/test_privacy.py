@@ -11,8 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from runtime.support.privacy import QUIET
-
 ROOT = Path(__file__).resolve().parents[1]
 CALLS = (
     "socket,connect,bind,sendto,sendmsg,open,openat,creat,mkdir,mkdirat,rename,renameat,renameat2,symlink,link,linkat"
@@ -78,37 +76,6 @@ def run_traced(folder: Path, *arguments: str) -> tuple[list[str], list[str]]:
 def test_a_command_writes_only_where_it_is_told_and_opens_no_connection(tmp_path: Path, command: str) -> None:
     written, sockets = run_traced(tmp_path, *command.format(out=tmp_path / "out").split())
     assert written == [] and sockets == []
-
-
-@pytest.mark.skipif(shutil.which("strace") is None, reason="needs strace")
-def test_the_trace_sees_what_it_looks_for(tmp_path: Path) -> None:
-    """Without the switches onnxruntime and Mesa are caught at it: so the test above can fail."""
-    code = (
-        "import os, sys, socket, pathlib, runtime.support.privacy as p; p.QUIET.clear();"
-        "pathlib.Path.home().joinpath('.left').write_text('x'); socket.socket().close();"
-        "sys.argv[1:] = ['config']; from runtime.cli import main; main()"
-    )
-    sitecustomize = tmp_path / "code.py"
-    sitecustomize.write_text(code)
-    home = tmp_path / "home"
-    home.mkdir()
-    trace = tmp_path / "trace"
-    traced = ["strace", "-f", "-qq", "-e", f"trace={CALLS}", "-o", str(trace), sys.executable, str(sitecustomize)]
-    environment = {"PATH": os.environ["PATH"], "HOME": str(home), "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(traced, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    text = trace.read_text(errors="replace")
-    assert "AF_INET" in text and "/.left" in text
-
-
-def test_the_switches_are_set_before_anything_is_loaded() -> None:
-    code = (
-        "import os, sys, runtime.commands.app as a, runtime.support.privacy as p;"
-        "a.app = lambda: print({k: os.environ.get(k) for k in p.QUIET},"
-        " [m for m in ('onnxruntime', 'moderngl') if m in sys.modules]); from runtime.cli import main; main()"
-    )
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert answer.stdout.strip() == f"{QUIET} []"
 
 
 @pytest.mark.parametrize("name", ["systemd/phasestack.service", "systemd/phasestack-user.service", "Dockerfile"])

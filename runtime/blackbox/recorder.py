@@ -1,384 +1,222 @@
-"""Watches a run: keeps its last minutes, writes them when asked or at a fault, or writes all of it to a file.
+"""Keeps the last minutes of a run in memory, and writes them to an MCAP file when asked or at a fault.
 
-The presenter's thread only puts what happened into a bounded queue; a thread of low priority makes messages and
-pictures of it. Where it does not keep up, entries are lost and counted; the presenter never waits. On a simulated
-clock nothing is lost: the presenter makes the messages itself.
+The file is a recording too: `run --replay` plays its samples through the same code, other tools read the rest. What
+happens is made into bytes at once (the garbage collector never looks through them); a thread of its own writes files.
 """
 
 from __future__ import annotations
 
-import contextlib
+import json
 import logging
 import os
 import threading
 import time
-from base64 import b64encode
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from runtime.blackbox.file import BlackBoxFile
-from runtime.blackbox.messages import Message
-from runtime.blackbox.pictures import Pictures, pictures_of, what_shows
-from runtime.blackbox.ring import Ring
-from runtime.blackbox.transcript import Entry, Logged, Refreshed, Sampled, Transcript, line_of
-from runtime.clock import NS_PER_S, Clock
-from runtime.errors import ContextLost, PhasestackError, one_line
+import numpy as np
+
+from runtime.blackbox import messages
+from runtime.clock import NS_PER_S
 from runtime.frame.presenter import Presenter, Refresh
-from runtime.optics.stack import PanelStack
-from runtime.records import SensorFrame
+from runtime.records import F64, SensorFrame
+from runtime.sensor import recording_format as fmt
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.support.background import Job
 from runtime.support.logs import ROOTS
-from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
-from runtime.support.waiting import wait_for
+from runtime.support.version import version
 
 log = logging.getLogger("phasestack.blackbox")
 
-QUEUED_MAX = 4096  # entries: some 40 s of refreshes and samples
-IMAGES_QUEUED_MAX = 64  # the same where samples carry pictures
-TURN_S = 0.05
-KEPT_PICTURES_EVERY_NS = NS_PER_S  # in memory
-FILE_PICTURES_EVERY_NS = NS_PER_S // 4
-ASKED_PICTURES_EVERY_NS = NS_PER_S // 2
-ASKED_FOR_NS = 3 * NS_PER_S  # pictures are made so long after somebody has asked for them
-AFTER_FAULT_NS = 5 * NS_PER_S  # what follows a fault is in its black box too
+Message = tuple[str, int, bytes, int]  # topic, wall clock in nanoseconds since 1970, JSON, sequence number
+Saved = Callable[[str, Path | None], None]  # why it could not be written (empty: it was), and the file
+
+BYTES_MAX = 32 << 20  # that are kept in memory
+OVERHEAD_BYTES = 150  # of a message besides its data
+AFTER_FAULT_NS = 5 * NS_PER_S  # what follows a fault is in its file too
 FAULTS_APART_NS = 60 * NS_PER_S  # a fault that repeats does not fill the disk
+STATE_EVERY_NS = NS_PER_S
 WRITTEN_WITHIN_S = 5.0
-LINES_KEPT, STATES_KEPT = 200, 50  # for who looks in
-MIB = 1 << 20
-
-
-class _Line:
-    """A log line for who looks in: put into words when it is first asked for, not by who logs."""
-
-    def __init__(self, record: logging.LogRecord) -> None:
-        self._record = record
-
-    @cached_property
-    def told(self) -> dict[str, Any]:
-        record = self._record
-        text = one_line(line_of(record))
-        return {"time_s": round(record.created, 3), "level": record.levelname.lower(), "text": text}
-
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """What is recorded, and where to."""
-
-    minutes: float = 0.0  # that are kept in memory; 0: none
-    most_bytes: int = 32 * MIB  # of what is kept in memory
-    folder: Path = Path()
-    files: int = 10  # that are kept in the folder; the oldest make way
-    record: Path | None = None  # all the way, to this file
-    record_bytes: int = 2048 * MIB
-    images: bool = False  # the sensor's pictures too: faces
+LINES_KEPT, STATES_KEPT = 200, 50  # for the operator's page
+FILES_MAX = 20  # in the folder
+PREFIX = "blackbox-"
+ASKED = "asked"
+METADATA_NAME = "phasestack.blackbox"
 
 
 class Recorder:
     """An observer of a run. `watches` begins; `close` ends it."""
 
-    def __init__(self, plan: Plan) -> None:
-        self._plan = plan
-        self._queue: deque[Entry] = deque()
-        self._most = IMAGES_QUEUED_MAX if plan.images else QUEUED_MAX
-        self.lost = 0
-        self._latest: Refresh | None = None
+    def __init__(self, folder: Path, *, minutes: float) -> None:
+        """folder: where files are written; minutes: kept in memory; 0: none, and nothing is written."""
+        self._folder, self._most_ns = folder, round(60 * minutes * NS_PER_S)
+        self._lock = threading.Lock()  # of what is kept
+        self._kept: deque[tuple[int, Message]] = deque()  # and when, by the run's clock: the wall's may be set
+        self._bytes = 0
         self._presenter: Presenter | None = None
-        self._transcript: Transcript | None = None
-        self._ring = Ring(most_s=60.0 * plan.minutes, most_bytes=plan.most_bytes) if plan.minutes > 0 else None
-        self._file: BlackBoxFile | None = None
-        self._saves: deque[tuple[str, Callable[[str, Path | None], None]]] = deque()  # asked for, and who to tell
-        self._job: Job[None] | None = None
-        self._fault_ns: int | None = None  # a fault waits for what follows it
-        self._saved_ns = -FAULTS_APART_NS
-        self._was_degraded = False
-        self._pictured_ns = -NS_PER_S
-        self._pictured_frame = -1
-        self._pictured: Any = None  # what the newest pictures show
-        self._asked_ns = -ASKED_FOR_NS
-        self.pictures: Pictures | None = None  # the newest
-        self._lines: deque[_Line] = deque(maxlen=LINES_KEPT)
+        self._sensor_from_stack: F64 | None = None
+        self._state, self._state_ns = ("", ""), 0
+        self._fault: tuple[int, str] | None = None  # since when, and its kind: it waits for what follows it
+        self._faults_ns: dict[str, int] = {}  # by kind: when its file was written
+        self._files: dict[str, list[Path]] = {}  # of this run, by kind: the first, and the last
+        self._lines: deque[dict[str, Any]] = deque(maxlen=LINES_KEPT)
         self._passed: deque[dict[str, Any]] = deque(maxlen=STATES_KEPT)
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-        self._tap: _LogTap | None = None
-        self.last_file: Path | None = None  # that was written because of a fault, or asked for
-
-    def watches(self, presenter: Presenter, *, stack: PanelStack, simulated: bool, in_stack_frame: bool) -> None:
-        """Begin, with a run that is about to. Raises InputError where the file to record to can't be written."""
-        self._presenter, self._stack, self._simulated = presenter, stack, simulated
-        self._clock: Clock = presenter.clock
-        state = presenter.run_cell.state
-        self._transcript = Transcript(
-            stack,
-            state.settings,
-            stack_from_sensor=state.calibration.stack_from_sensor,
-            in_stack_frame=in_stack_frame,
-            images=self._plan.images,
-        )
-        now_ns = self._clock.now_ns()
-        self._transcript.set_clock(monotonic_ns=now_ns, wall_ns=time.time_ns())
-        if self._plan.record is not None:
-            self._file = BlackBoxFile(self._plan.record, self._header(), why="record", settings=self._settings())
-            self._file.write_all(self._transcript.standing(at_ns=now_ns))
+        self._jobs: list[Job[None]] = []
         self._tap = _LogTap(self._logged)
+
+    def watches(self, presenter: Presenter, *, in_stack_frame: bool) -> None:
+        """Begin. in_stack_frame: the sensor's points are in `stack`: they are written as a sensor would see them."""
+        self._presenter = presenter
+        if in_stack_frame:
+            self._sensor_from_stack = np.asarray(np.linalg.inv(presenter.run_cell.state.calibration.stack_from_sensor))
         for name in ROOTS:
             logging.getLogger(name).addHandler(self._tap)
-        if not simulated:
-            self._thread = threading.Thread(target=self._run, name="black box", daemon=True)
-            self._thread.start()
-
-    # On the presenter's thread.
 
     def sampled(self, sample: SensorFrame) -> None:
-        self._put(Sampled(self._clock.now_ns(), sample))
+        eyes, matrix = sample.eyes, self._sensor_from_stack
+        if eyes is not None and matrix is not None:
+            eyes_m = eyes.eyes_m @ matrix[:3, :3].T + matrix[:3, 3]
+            sample = replace(sample, eyes=replace(eyes, eyes_m=eyes_m, covariance_m2=None))
+        self._keep(fmt.EYES_TOPIC, fmt.eyes_message(sample), sample.sequence)
 
     def refreshed(self, refresh: Refresh) -> None:
         assert self._presenter is not None
-        machine = self._presenter.machine
-        self._latest = refresh
-        self._put(Refreshed(refresh.account, machine.name, machine.reason))
-        if self._simulated:
-            self._turn()
+        account, machine = refresh.account, self._presenter.machine
+        at_ns, state = account.present_ns, (machine.name, machine.reason)
+        if state != self._state or at_ns - self._state_ns >= STATE_EVERY_NS:
+            if machine.name != self._state[0]:
+                self._state_changed(machine.name, machine.reason, at_ns)
+            self._state, self._state_ns = state, at_ns
+            self._keep(messages.STATE, messages.state(*state, monotonic_ns=at_ns))
+        self._keep(messages.REFRESH, messages.refresh(account), account.frame)
+        if self._fault is not None and at_ns - self._fault[0] >= AFTER_FAULT_NS:
+            kind, self._fault = self._fault[1], None
+            self.save(kind)
+
+    def _state_changed(self, name: str, reason: str, at_ns: int) -> None:
+        self._passed.append({"time_s": round(time.time(), 3), "state": name, "reason": reason})
+        was_degraded = self._state[0].startswith("degraded")
+        if not name.startswith("degraded") or was_degraded or self._fault is not None or not self._most_ns:
+            return
+        kind = "fault-" + name.partition(": ")[2].replace(", ", "+")
+        if at_ns - self._faults_ns.get(kind, -FAULTS_APART_NS) >= FAULTS_APART_NS:
+            self._fault, self._faults_ns[kind] = (at_ns, kind), at_ns
 
     def _logged(self, record: logging.LogRecord) -> None:
         """On whichever thread logs."""
-        self._lines.append(_Line(record))
-        self._put(Logged(self._clock.now_ns(), record))
+        line = {"time_s": round(record.created, 3), "level": record.levelname.lower()}
+        self._lines.append(line | {"text": messages.text_of(record)})
+        self._keep(messages.LOG, messages.log(record))
 
-    def _put(self, entry: Entry) -> None:
-        if len(self._queue) < self._most or (self._thread is None and self._transcript is not None):
-            self._queue.append(entry)
-        else:
-            self.lost += 1
+    def _keep(self, topic: str, data: bytes, sequence: int = 0) -> None:
+        assert self._presenter is not None
+        at_ns = self._presenter.clock.now_ns()
+        with self._lock:
+            self._kept.append((at_ns, (topic, time.time_ns(), data, sequence & 0xFFFFFFFF)))
+            self._bytes += len(data) + OVERHEAD_BYTES
+            while self._kept and (self._bytes > BYTES_MAX or at_ns - self._kept[0][0] > self._most_ns):
+                self._bytes -= len(self._kept.popleft()[1][2]) + OVERHEAD_BYTES
 
-    # On any thread.
-
-    def save(self, why: str, told: Callable[[str, Path | None], None] = lambda problem, path: None) -> None:
-        """Write what is kept to a file as the run goes on. told: why not (empty: done), and the file; from a thread."""
-        if self._ring is None:
-            told("nothing is kept in memory (service.blackbox_minutes is 0)", None)
+    def save(self, kind: str, saved: Saved = lambda problem, path: None) -> None:
+        """Write what is kept to a file as the run goes on; kind: `asked`, or of a fault. saved: called at its end."""
+        if not self._most_ns or self._presenter is None:
+            saved("nothing is kept in memory (service.blackbox_minutes is 0)", None)
             return
-        self._saves.append((why, told))
+        with self._lock:
+            kept = [message for _, message in self._kept]
+        settings = self._presenter.run_cell.state.settings
+        header = RecordingHeader(settings.sensor.driver, self._presenter.samples.serial)
 
-    def look_at_pictures(self) -> dict[str, Any]:
-        """The newest pictures, JPEG in base64; from now on they are made for some seconds."""
-        self._asked_ns = time.monotonic_ns()
-        made = self.pictures
-        if made is None:
-            return {"frame": None, "jpegs": {}}
-        return {"frame": made.frame, "jpegs": {name: b64encode(jpeg).decode() for name, jpeg in made.jpegs.items()}}
+        def work() -> None:
+            try:
+                path = _written(self._folder, kind, kept, header, settings.model_dump_json())
+                self._make_room(kind, path)
+            except OSError as error:
+                log.error("the black box could not be written: %s", error)
+                saved(f"{self._folder}: cannot be written ({error.strerror})", None)
+                return
+            log.info("black box written: %s", path, extra={"always": True})
+            saved("", path)
+
+        self._jobs = [job for job in self._jobs if not job.done] + [Job("black box", work)]
+
+    def _make_room(self, kind: str, path: Path) -> None:
+        """Of a run's faults of one kind the first and the last stay; no kind's flood takes another kind's place."""
+        mine = self._files.setdefault(kind, [])
+        mine.append(path)
+        if kind != ASKED and len(mine) > 2:
+            mine.pop(1).unlink(missing_ok=True)
+        kinds: dict[str, list[Path]] = {}
+        for file in sorted(self._folder.glob(f"{PREFIX}*.mcap")):
+            kinds.setdefault(file.stem.partition("Z-")[2].partition("~")[0], []).append(file)
+        for _ in range(sum(map(len, kinds.values())) - FILES_MAX):
+            largest = max(kinds.values(), key=len)
+            largest.pop(1 if len(largest) > 2 else 0).unlink(missing_ok=True)
 
     def look_at_log(self) -> dict[str, Any]:
         """The newest log lines and states, the oldest first; times since 1970."""
-        return {"lines": [line.told for line in list(self._lines)], "states": list(self._passed)}
+        return {"lines": list(self._lines), "states": list(self._passed)}
 
     def describe(self) -> dict[str, Any]:
         """For the status."""
-        ring, file = self._ring, self._file
+        with self._lock:
+            kept_ns = self._kept[-1][0] - self._kept[0][0] if self._kept else 0
+            held_bytes = self._bytes
+        newest = max((paths[-1] for paths in self._files.values()), default=None)
         return {
-            "kept_s": round(ring.seconds, 1) if ring is not None else None,
-            "kept_mib": round(ring.bytes_held / MIB, 2) if ring is not None else None,
-            "recording": str(file.path) if file is not None else None,
-            "lost": self.lost,
-            "last_file": str(self.last_file) if self.last_file is not None else None,
+            "kept_s": round(kept_ns / NS_PER_S, 1),
+            "kept_mib": round(held_bytes / (1 << 20), 2),
+            "last_file": str(newest) if newest is not None else None,
         }
 
     def close(self, *, crashed: str = "") -> None:
         """No more; crashed: why the run ended with an error: what is kept is written. May be called twice."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(timeout=5.0)
-        if self._tap is not None:
-            for name in ROOTS:
-                logging.getLogger(name).removeHandler(self._tap)
-            self._tap = None
-        if self._transcript is None:
-            return
-        with contextlib.suppress(Exception):
-            self._drain()
-        if self._job is not None:
-            wait_for(lambda: self._job is None or self._job.done, timeout_s=WRITTEN_WITHIN_S)
-        if crashed and self._ring is not None:
-            self._write(f"error: {crashed}", lambda *_: None)
-        elif self._fault_ns is not None:
-            self._write("fault", lambda *_: None)
-        while self._saves:
-            self._write(*self._saves.popleft())
-        if self._file is not None:
-            file, self._file = self._file, None
-            try:
-                file.finish()
-            except OSError as error:
-                log.error("%s: the recording could not be finished (%s)", file.path, error.strerror)
-        self._transcript = None
-
-    # On the recorder's thread.
-
-    def _run(self) -> None:
-        set_niceness(BACKGROUND_NICENESS)
-        while not self._stop.wait(TURN_S):
-            try:
-                self._turn()
-            except Exception:
-                log.exception("the black box's turn failed")
-
-    def _turn(self) -> None:
-        if not self._simulated:
-            assert self._transcript is not None
-            self._transcript.set_clock(monotonic_ns=self._clock.now_ns(), wall_ns=time.time_ns())
-        self._drain()
-        self._make_pictures()
-        now_ns = self._clock.now_ns()
-        if self._fault_ns is not None and now_ns - self._fault_ns >= AFTER_FAULT_NS:
-            self._fault_ns, self._saved_ns = None, now_ns
-            self.save("fault")
-        if self._saves and (self._job is None or self._job.done):
-            self._begin_writing(*self._saves.popleft())
-
-    def _drain(self) -> None:
-        assert self._transcript is not None
-        while self._queue:
-            entry = self._queue.popleft()
-            if isinstance(entry, Refreshed):
-                self._notice(entry)
-            for message in self._transcript.of(entry, lost=self.lost):
-                self._keep(message)
-        self._flush()
-
-    def _notice(self, entry: Refreshed) -> None:
-        degraded = entry.account.state == "degraded"
-        at_ns = entry.account.present_ns
-        begins = degraded and not self._was_degraded and self._fault_ns is None and self._ring is not None
-        if begins and at_ns - self._saved_ns >= FAULTS_APART_NS:
-            self._fault_ns = at_ns
-        self._was_degraded = degraded
-        if not self._passed or self._passed[-1]["state"] != entry.state:
-            assert self._transcript is not None
-            time_s = self._transcript.wall_ns(at_ns) / NS_PER_S
-            self._passed.append({"time_s": round(time_s, 3), "state": entry.state, "reason": entry.reason})
-
-    def _keep(self, message: Message) -> None:
-        if self._ring is not None:
-            self._ring.add(message, at_ns=self._clock.now_ns())
-        if self._file is not None:
-            self._to_file(lambda file: file.write(message))
-
-    def _flush(self) -> None:
-        if self._file is None:
-            return
-        self._to_file(BlackBoxFile.flush)
-        if self._file is not None and self._file.bytes_written > self._plan.record_bytes:
-            log.warning("%s: is as large as it may be (sensor.record_max_mib): it ends here", self._file.path)
-            self._to_file(BlackBoxFile.finish)
-            self._file = None
-
-    def _to_file(self, do: Callable[[BlackBoxFile], None]) -> None:
-        assert self._file is not None
-        try:
-            do(self._file)
-        except OSError as error:
-            log.error("%s: cannot be written (%s): it ends here", self._file.path, error.strerror)
-            self._file.abandon()  # what was flushed stays: it is read up to the break
-            self._file = None
-
-    def _make_pictures(self) -> None:
-        latest, now_ns = self._latest, self._clock.now_ns()
-        every_ns = self._pictures_every_ns()
-        if latest is None or every_ns is None or now_ns - self._pictured_ns < every_ns:
-            return
-        if latest.account.frame == self._pictured_frame:
-            return
-        self._pictured_ns, self._pictured_frame = now_ns, latest.account.frame
-        shows = what_shows(latest)
-        if self.pictures is not None and shows == self._pictured:  # of a resting head, of a flat picture: the same
-            account = latest.account
-            self.pictures = made = replace(self.pictures, frame=account.frame, time_ns=account.present_ns)
-        else:
-            try:
-                self.pictures = made = pictures_of(latest, self._stack)
-            except ContextLost:  # its layers were in textures: the next refresh has others
-                return
-        self._pictured = shows
-        del latest
-        if self._transcript is not None:
-            for message in self._transcript.of(made, lost=self.lost):
-                self._keep(message)
-
-    def _pictures_every_ns(self) -> int | None:
-        wanted = []
-        if self._ring is not None:
-            wanted.append(KEPT_PICTURES_EVERY_NS)
-        if self._file is not None:
-            wanted.append(FILE_PICTURES_EVERY_NS)
-        if time.monotonic_ns() - self._asked_ns < ASKED_FOR_NS:
-            wanted.append(ASKED_PICTURES_EVERY_NS)
-        return min(wanted, default=None)
-
-    def _header(self) -> RecordingHeader:
-        assert self._presenter is not None
-        driver = self._presenter.run_cell.state.settings.sensor.driver
-        images = self._plan.images
-        return RecordingHeader(driver, self._presenter.samples.serial, colour=images, depth=images)
-
-    def _settings(self) -> str:
-        """Those in force, as JSON."""
-        assert self._presenter is not None
-        return self._presenter.run_cell.state.settings.model_dump_json()
-
-    def _begin_writing(self, why: str, told: Callable[[str, Path | None], None]) -> None:
-        work = self._writing(why, told)
-        self._job = Job("black box file", work)
-
-    def _write(self, why: str, told: Callable[[str, Path | None], None]) -> None:
-        self._writing(why, told)()
-
-    def _writing(self, why: str, told: Callable[[str, Path | None], None]) -> Callable[[], None]:
-        """What writes all that is kept now."""
-        assert self._ring is not None and self._transcript is not None
-        held = self._ring.held()
-        at_ns = held[0].wall_ns - self._transcript.wall_ns(0) if held else self._clock.now_ns()
-        standing = self._transcript.standing(at_ns=at_ns)
-        header, settings, plan = self._header(), self._settings(), self._plan
-
-        def work() -> None:
-            try:
-                path = _written(plan.folder, [*standing, *held], header, why=why, settings=settings)
-                _make_room(plan.folder, plan.files)
-            except (PhasestackError, OSError) as error:
-                log.error("the black box could not be written: %s", one_line(str(error)))
-                told(str(error), None)
-                return
-            self.last_file = path
-            log.info("black box written: %s (%s)", path, why, extra={"always": True})
-            told("", path)
-
-        return work
+        if crashed and self._presenter is not None:
+            log.error("%s", crashed)
+        for name in ROOTS:
+            logging.getLogger(name).removeHandler(self._tap)
+        if crashed:
+            self.save("error")
+        elif self._fault is not None:
+            self.save(self._fault[1])
+        self._fault = None
+        for job in self._jobs:
+            job.wait(WRITTEN_WITHIN_S)
+        self._presenter = None
 
 
-def _written(folder: Path, messages: list[Message], header: RecordingHeader, *, why: str, settings: str) -> Path:
-    """A new file in a folder, whole or not there. Raises InputError, OSError."""
-    stem = f"blackbox-{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{os.getpid()}"
-    path = next(path for n in range(1000) if not (path := folder / f"{stem}{f'-{n}' if n else ''}.mcap").exists())
-    file = BlackBoxFile(path, header, why=why, settings=settings)
+def _written(folder: Path, kind: str, kept: list[Message], header: RecordingHeader, settings: str) -> Path:
+    """A new file in a folder, whole or not there, for its owner alone: who was here is private. Raises OSError."""
+    from mcap.writer import CompressionType, Writer
+
+    folder.mkdir(parents=True, exist_ok=True)
+    stem = f"{PREFIX}{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{kind}"
+    path = next(path for n in range(1000) if not (path := folder / f"{stem}{f'~{n}' if n else ''}.mcap").exists())
+    part = path.with_name(f".{path.name}.part")
     try:
-        file.write_all(messages)
-        file.finish()
+        with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o600), "wb") as file:
+            writer: Any = Writer(file, compression=CompressionType.LZ4)
+            writer.start(profile="phasestack", library=f"phasestack {version()}")
+            writer.add_metadata(fmt.METADATA_NAME, header.metadata())
+            writer.add_metadata(METADATA_NAME, {"why": kind, "version": version()})
+            writer.add_attachment(0, 0, "settings.json", "application/json", settings.encode())
+            channels: dict[str, int] = {}
+            for topic, wall_ns, data, sequence in kept:
+                if topic not in channels:
+                    schema = messages.SCHEMAS[topic]
+                    number = writer.register_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
+                    channels[topic] = writer.register_channel(topic, "json", number)
+                writer.add_message(channels[topic], wall_ns, data, wall_ns, sequence)
+            writer.finish()
+        part.replace(path)
     except BaseException:
-        file.abandon()
+        part.unlink(missing_ok=True)
         raise
     return path
-
-
-def _make_room(folder: Path, files: int) -> None:
-    """The oldest black boxes make way."""
-    for path in sorted(folder.glob("blackbox-*.mcap"))[:-files]:
-        path.unlink(missing_ok=True)
 
 
 class _LogTap(logging.Handler):
@@ -386,7 +224,7 @@ class _LogTap(logging.Handler):
 
     def __init__(self, put: Callable[[logging.LogRecord], None]) -> None:
         super().__init__()
-        self._hand_on = put
+        self._put = put
 
     def emit(self, record: logging.LogRecord) -> None:
-        self._hand_on(record)
+        self._put(record)

@@ -14,6 +14,7 @@ from runtime.commands.config import config
 from runtime.commands.ctl import app as ctl_app
 from runtime.commands.demo import demo
 from runtime.commands.doctor import doctor
+from runtime.commands.eyes import eyes
 from runtime.commands.identify import identify
 from runtime.commands.page import page
 from runtime.commands.plan import plan
@@ -39,6 +40,7 @@ COMMANDS: tuple[Callable[..., None] | tuple[str, typer.Typer], ...] = (
     run,
     setup,
     solve,
+    eyes,
     record,
     ("calibrate", calibrate_app),
     plan,

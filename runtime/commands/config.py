@@ -13,7 +13,6 @@ def config(
     check: Annotated[
         Path | None, typer.Option(help="a configuration to check instead of printing: values, names and files")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="defaults as one JSON object")] = False,
 ) -> None:
     """Print a complete configuration: every setting, its default and what it means. It is valid TOML.
 
@@ -32,8 +31,6 @@ def config(
 
         check_names(settings, source=check)
         typer.echo(f"{check}: valid")
-    elif as_json:
-        typer.echo(json.dumps(settings.model_dump(mode="json")))
     else:
         print("# Paths are relative to this file's folder.")
         typer.echo("\n".join(_lines(type(settings), settings, "")))

@@ -7,8 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from runtime.support.options import number, number_argument
-from runtime.support.ranges import BUDGET_MOST_MS
+from runtime.support.options import number
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -24,7 +23,7 @@ Socket = Annotated[Path | None, typer.Option(help="the socket itself, whatever t
 
 @app.command()
 def scene(
-    name: Annotated[str, typer.Argument(help="what `content.scene` of the configuration takes")],
+    name: Annotated[str, typer.Argument(help="what `content.scene` takes; `next`: of the playlist that is shown")],
     config: Config = None,
     socket: Socket = None,
 ) -> None:
@@ -36,16 +35,8 @@ def scene(
     """
     from runtime.daemon.names import scene_from_here
 
-    tell({"command": "scene", "value": scene_from_here(name)}, config, socket)
-
-
-@app.command("next")
-def next_one(config: Config = None, socket: Socket = None) -> None:
-    """Go to the next scene of the playlist that is shown.
-
-    Example: phasestack ctl next
-    """
-    tell({"command": "next"}, config, socket)
+    request = {"command": "next"} if name == "next" else {"command": "scene", "value": scene_from_here(name)}
+    tell(request, config, socket)
 
 
 @app.command()
@@ -97,15 +88,6 @@ def model(
 
 
 @app.command()
-def restart(config: Config = None, socket: Socket = None) -> None:
-    """End the daemon so that its unit starts it again; refused where it is not run by a unit that does.
-
-    Example: phasestack ctl restart
-    """
-    tell({"command": "restart"}, config, socket)
-
-
-@app.command()
 def pause(config: Config = None, socket: Socket = None) -> None:
     """Freeze the picture as it is, until `resume`.
 
@@ -133,21 +115,10 @@ def flat(config: Config = None, socket: Socket = None) -> None:
 
 
 @app.command()
-def budget(
-    milliseconds: Annotated[float, number_argument(0, BUDGET_MOST_MS, "ms", help="time for one frame; 0: none")],
-    config: Config = None,
-    socket: Socket = None,
-) -> None:
-    """Set the time for one frame: model and resolution are chosen to fit.
-
-    Example: phasestack ctl budget 16
-    """
-    tell({"command": "budget", "value": milliseconds}, config, socket)
-
-
-@app.command()
 def reload(config: Config = None, socket: Socket = None) -> None:
     """Read the configuration again; a bad one is refused and the old one stays.
+
+    Scene, model and place that `ctl` chose stay, but where the file says something new of them.
 
     Example: phasestack ctl reload
     """
@@ -156,16 +127,16 @@ def reload(config: Config = None, socket: Socket = None) -> None:
 
 @app.command()
 def blackbox(config: Config = None, socket: Socket = None) -> None:
-    """Write the last minutes to a file (MCAP), and print its name: eyes, states, times, pictures, log.
+    """Write the last minutes to a file (MCAP), and print its name: eyes, states, times, log.
 
     Example: phasestack ctl blackbox
     """
-    typer.echo(tell({"command": "blackbox"}, config, socket).get("file", ""))
+    tell({"command": "blackbox"}, config, socket)
 
 
-def tell(request: dict[str, Any], config: Path | None, socket: Path | None) -> dict[str, Any]:
-    """Send one request; the daemon's answer. Exits with 1 where no daemon answers, 2 where it refuses."""
-    from runtime.commands.status import sockets
+def tell(request: dict[str, Any], config: Path | None, socket: Path | None) -> None:
+    """Send one request; prints what holds now. Exits with 1 where no daemon answers, 2 where it refuses."""
+    from runtime.commands.status import holds, sockets
     from runtime.daemon.client import NotRunning, ask
     from runtime.errors import InputError
 
@@ -176,6 +147,4 @@ def tell(request: dict[str, Any], config: Path | None, socket: Path | None) -> d
         raise typer.Exit(1) from None
     if not answer.get("ok"):
         raise InputError(f"ctl {request['command']}", "", str(answer.get("error", "refused")))
-    if answer.get("note"):
-        typer.echo(answer["note"], err=True)
-    return answer
+    typer.echo(answer.get("note") or answer.get("file") or holds(answer))

@@ -23,22 +23,18 @@ def demo(
     Example: phasestack demo --out out/demo
     """
     from runtime.clock import NS_PER_S
-    from runtime.config import Settings
+    from runtime.config import Settings, with_options
     from runtime.daemon.build import RunOptions
     from runtime.daemon.drive import drive, print_summary
     from runtime.sensor.recording import Recording
     from runtime.sensor.replay import demo_recording_path
 
-    settings = Settings()
-    if model is not None:
-        settings = settings.model_copy(update={"model": settings.model.model_copy(update={"name": model})})
+    settings = with_options(Settings(), model=model)
     captures_ns = [sample.capture_ns for sample in Recording(demo_recording_path()).samples()]
     refreshes = round((captures_ns[-1] - captures_ns[0]) / NS_PER_S * settings.loop.rate_hz)
     summary = drive(
         settings,
-        RunOptions(max_speed=True, measure=True, scale=scale),
-        out=out,
-        frames=frames,
+        RunOptions(max_speed=True, measure=True, scale=scale, frames=frames, out=out),
         total=min(refreshes, frames or refreshes),
         progress=True,
     )

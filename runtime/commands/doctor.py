@@ -44,7 +44,9 @@ def _print(rows: list[Row]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table("check", "state", "what was found", "what to do", expand=False)
+    table = Table(expand=False)
+    for title in ("check", "state", "what was found", "what to do"):
+        table.add_column(title, overflow="fold")  # a path or a command is of no use without its end
     for row in rows:
         colour = COLOURS[row.state]
         table.add_row(row.name, f"[{colour}]{row.state}[/]", escape(row.detail), escape(row.remedy))

@@ -67,10 +67,19 @@ def sensor(settings: Settings) -> Iterator[Row]:
         return
     finally:
         driver.close()
+    seen = ""
+    if frame.eyes is None and frame.colour is not None:
+        from runtime.eyes.detect import EyeFinder
+
+        finder = EyeFinder(settings)
+        found = finder.find(frame)
+        seen = f"; a viewer {found.eyes_m[:, 2].mean():.2f} m away" if found is not None else f"; {finder.reason}"
     kinds = ("eyes" if frame.eyes is not None else "", "colour" if frame.colour is not None else "",
              "depth" if frame.depth_mm is not None else "")  # fmt: skip
     serial = f", serial {driver.serial}" if driver.serial else ""
-    yield Row("sensor", "ok", f"{what} delivers {', '.join(filter(None, kinds)) or 'frames without a face'}{serial}")
+    yield Row(
+        "sensor", "ok", f"{what} delivers {', '.join(filter(None, kinds)) or 'frames without a face'}{serial}{seen}"
+    )
     yield from _calibrated_for(settings, driver.serial)
 
 
@@ -87,7 +96,7 @@ def usb(settings: Settings) -> Iterator[Row]:
     from runtime.errors import MissingPart
     from runtime.sensor.usb_devices import usb_report
 
-    needed = settings.sensor.driver not in NO_DEVICE
+    needed = settings.sensor.driver not in (*NO_DEVICE, "usb-camera")
     try:
         devices = usb_report()
     except MissingPart as error:
@@ -167,10 +176,19 @@ def monitors(settings: Settings) -> Iterator[Row]:
         yield Row("panels", "warn", difference, "set them to the same mode")
 
 
+def eyes(settings: Settings) -> Iterator[Row]:
+    """The networks that find eyes load and run, and see nobody in an empty picture."""
+    import numpy as np
+
+    from runtime.eyes.pupils import find_eyes
+
+    nobody = find_eyes(np.zeros((480, 640, 3), np.uint8)) is None
+    yield Row("eyes", "ok" if nobody else "fail", "eyes are found by networks that run here")
+
+
 def model(settings: Settings) -> Iterator[Row]:
     """The network loads, its contract fits the stack, and the provider is there."""
     from runtime.model.backends import choose
-    from runtime.model.loops import inner_loops
     from runtime.model.predictor import load_predictor
     from runtime.model.session import told_nodes
     from runtime.support.gl import offscreen_context
@@ -201,10 +219,11 @@ def model(settings: Settings) -> Iterator[Row]:
             "they cross to the processor and back: model.provider = \"cpu\" may be faster",
         )  # fmt: skip
     yield Row("backend", "ok", f"{choice.backend.name} around the network: {choice.why}")
-    if choice.backend.name == "opencv":
-        loops = inner_loops()
-        remedy = "" if loops.compiled else "corrections take two to three times as long: install numba"
-        yield Row("inner loops", "ok" if loops.compiled else "warn", loops.why, remedy)
+    if choice.backend.name == "cpu":
+        from runtime.model.compiled import KEPT_IN
+
+        yield Row("kernels", "ok" if KEPT_IN else "warn", f"compiled code is kept in {KEPT_IN or 'no folder'}",
+                  "" if KEPT_IN else "every start compiles it anew: make the user's cache folder writable")  # fmt: skip
 
 
 def calibration(settings: Settings) -> Iterator[Row]:
@@ -243,8 +262,7 @@ def service(settings: Settings) -> Iterator[Row]:
 
 def _daemon(settings: Settings) -> dict[str, Any] | None:
     """What the running daemon says of itself; None where none runs."""
-    from runtime.daemon.client import NotRunning, ask
-    from runtime.daemon.location import candidates
+    from runtime.daemon.client import NotRunning, ask, candidates
 
     try:
         return ask(candidates(settings.service.socket), {"command": "status"}, timeout_s=2.0)
@@ -258,6 +276,7 @@ CHECKS: dict[str, Check] = {
     "usb": usb,
     "sensor": sensor,
     "calibration": calibration,
+    "eyes": eyes,
     "model": model,
     "service": service,
 }

@@ -21,168 +21,54 @@ if TYPE_CHECKING:
 
 def identify(
     config: Annotated[Path | None, typer.Option(help="configuration; without one, every monitor is shown")] = None,
-    panel: Annotated[int, typer.Option(help="show this panel (or monitor) alone; -1: one after the other")] = -1,
-    all_at_once: Annotated[bool, typer.Option("--all", help="all at once: for panels that lie side by side")] = False,
-    ask: Annotated[bool, typer.Option("--ask", help="ask which is which, and write the answers into --config")] = False,
-    seconds: Annotated[float, number(0, 86_400, "s", help="how long; 0: until q")] = 0.0,
-    out: Annotated[
-        Path | None, typer.Option(help="write what each monitor would be sent as PNG; needs no screen")
+    panel: Annotated[
+        int | None, typer.Option(min=0, help="show this panel (or monitor) alone; default: one after the other")
     ] = None,
+    seconds: Annotated[float, number(0, 86_400, "s", help="how long; 0: until q")] = 0.0,
 ) -> None:
     """Show a panel its index, its monitor, an arrow that should point up, colour bars and its edges.
 
     Panels stand behind one another: one shows its card, the others are clear; Enter or n goes to the next, p back, q
     ends. With panels in the configuration they are bound, turned, mirrored and registered as they will be when it
-    runs. Without any, every monitor tells how to name it in the configuration; or --ask goes through the panels from
-    rear to front, asks which monitor each is and how it is mounted, and writes the configuration's tables.
+    runs. Without any, every monitor tells how to name it in the configuration; `phasestack setup` asks for that.
 
     Exits with 75 where the X server dies.
 
-    Example: phasestack identify --config phasestack.toml --ask
+    Example: phasestack identify --config phasestack.toml
     """
+    from calib.keys import TerminalKeys, WindowKeys
     from runtime.config import load_settings
-    from runtime.errors import InputError
-    from runtime.support.foreign import is_there
-
-    if ask and config is None:
-        raise InputError("identify", "--ask", "needs --config (it is made where it is not there)")
-    settings = load_settings(config if config is None or not ask or is_there(config) else None)
-    if out is not None:
-        _write(settings, out, panel)
-    elif ask:
-        assert config is not None
-        _ask(settings, config)
-    else:
-        _show(settings, seconds, panel, all_at_once)
-
-
-def _cards(settings: Settings, monitors: tuple[Monitor, ...] | None) -> list[U8]:
-    from runtime.panels.card import identity_card
-    from runtime.panels.registry import panel_settings
-
-    stack = settings.stack.stack()
-    cards = []
-    for index, panel in enumerate(panel_settings(settings.output, stack.count)):
-        place = {0: "rear", stack.count - 1: "front"}.get(index, "between")
-        lines = [f"{place}, {index + 1} of {stack.count}, at x = {stack.x_m[index] * 100:+.1f} cm"]
-        if monitors is not None:
-            lines += str(monitors[index]).replace(" (", "\n(").splitlines()
-        lines.append(f"mounted at {panel.rotation_deg} degrees, mirroring {panel.mirror}")
-        cards.append(identity_card(stack.width_px, stack.height_px, title=f"PANEL {index}", lines=lines))
-    return cards
-
-
-def _write(settings: Settings, out: Path, panel: int) -> None:
-    from runtime.clock import MonotonicClock
-    from runtime.panels.offscreen import OffscreenPanels
-    from runtime.panels.registry import panel_settings
-    from runtime.records import PanelFrame
-    from runtime.support.artifacts import OutputFolder, write_png
-    from runtime.support.gl import offscreen_context
-
-    stack = settings.stack.stack()
-    cards = _cards(settings, None)
-    _check_panel(panel, len(cards))
-    panels = OffscreenPanels(
-        offscreen_context(),
-        clock=MonotonicClock(),
-        width_px=stack.width_px,
-        height_px=stack.height_px,
-        panels=panel_settings(settings.output, stack.count),
-    )
-    with OutputFolder(out) as folder:
-        panels.present(PanelFrame(0, alone(cards, panel), 0))
-        for index, picture in enumerate(panels.read_back()):
-            write_png(folder.staging / f"monitor-{index}.png", picture)
-    typer.echo(f"{stack.count} pictures in {out}")
-
-
-def alone(cards: list[U8], index: int) -> U8:
-    """(N, H, W, 4) layers with one card, the other panels clear; -1: all of them."""
-    import numpy as np
-
-    layers = np.stack(cards)
-    for other in range(len(cards)):
-        if index not in (-1, other):
-            layers[other, ..., :3] = 0
-    return layers
-
-
-def _check_panel(panel: int, count: int) -> None:
-    from runtime.errors import InputError
-
-    if not -1 <= panel < count:
-        raise InputError("identify", "--panel", f"must be 0 to {count - 1}")
-
-
-def _show(settings: Settings, seconds: float, panel: int, all_at_once: bool) -> None:
-    from calib.keys import TerminalKeys, WindowKeys, first_of
     from runtime.errors import InputError, PanelLost
 
+    settings = load_settings(config)
     if settings.output.panels:
         _check_panel(panel, len(settings.output.panels))
     try:
-        panels, cards, _ = _bound(settings) if settings.output.panels else every_monitor()
+        panels, cards = _bound(settings) if settings.output.panels else every_monitor()[:2]
     except PanelLost as error:
         raise InputError("output", "panels", str(error)) from None
     keys = TerminalKeys(quit_at_end=False)
     try:
         _check_panel(panel, len(cards))
-        order = [-1] if all_at_once else [panel] if panel >= 0 else list(range(len(cards)))
-        _hold(panels, cards, order, seconds, first_of(keys.poll, WindowKeys(panels).poll))
+        order = list(range(len(cards))) if panel is None else [panel]
+        windows = WindowKeys(panels)
+        _hold(panels, cards, order, seconds, lambda: keys.poll() or windows.poll())
     finally:
         keys.close()
         panels.close()
 
 
-def _ask(settings: Settings, config: Path) -> None:
-    from calib.config_file import put_monitors, read_document, save_document
-    from calib.interview import Interview
-    from calib.keys import TerminalKeys, WindowKeys, first_of
-    from runtime.errors import InputError, PanelLost
-    from runtime.records import PanelFrame
+def _check_panel(panel: int | None, count: int) -> None:
+    from runtime.errors import InputError
 
-    document = read_document(config)
-    try:
-        panels, cards, monitors = every_monitor()
-    except PanelLost as error:
-        raise InputError("output", "panels", str(error)) from None
-    keys = TerminalKeys()
-    try:
-        try:
-            interview = Interview(monitors, panels=settings.stack.stack().count, say=lambda text: typer.echo(text))
-        except ValueError as problem:
-            raise InputError(config, "stack.x_m", str(problem)) from None
-        poll = first_of(keys.poll, WindowKeys(panels).poll)
-        interview.ask()
-        number = 0
-        while not interview.finished:
-            number += 1
-            panels.present(PanelFrame(number, alone(cards, interview.shown), number))
-            key = poll()
-            if key is not None:
-                interview.press(key)
-            else:
-                _pause()
-    finally:
-        keys.close()
-        panels.close()
-    if not interview.done:
-        typer.echo("stopped: nothing is written", err=True)
-        return
-    put_monitors(document, interview.tables)
-    kept = save_document(config, document)
-    typer.echo(f"{config}: {len(interview.tables)} panels written" + (f"; it was {kept}" if kept else ""))
+    if panel is not None and panel >= count:
+        raise InputError("identify", "--panel", f"must be 0 to {count - 1}")
 
 
-def _pause() -> None:
-    import time
-
-    time.sleep(0.05)
-
-
-def _bound(settings: Settings) -> tuple[PanelSink, list[U8], tuple[Monitor, ...]]:
+def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
+    """The configured panels and their cards. Raises InputError, PanelLost."""
     from runtime.clock import MonotonicClock
+    from runtime.panels.card import identity_card
     from runtime.panels.registry import panel_settings
     from runtime.panels.window import WindowPanels
     from runtime.support.gl import offscreen_context
@@ -190,10 +76,30 @@ def _bound(settings: Settings) -> tuple[PanelSink, list[U8], tuple[Monitor, ...]
     kind = "span" if settings.output.kind == "span" else "windows"
     output = settings.output.model_copy(update={"kind": kind})
     stack = settings.stack.stack()
-    panels = WindowPanels(output, panel_settings(output, stack.count), stack, MonotonicClock(), offscreen_context())
-    for index, monitor in enumerate(panels.monitors):
+    mounted = panel_settings(output, stack.count)
+    panels = WindowPanels(output, mounted, stack, MonotonicClock(), offscreen_context())
+    cards = []
+    for index, (panel, monitor) in enumerate(zip(mounted, panels.monitors, strict=True)):
         typer.echo(f"panel {index}: {monitor}")
-    return panels, _cards(settings, panels.monitors), panels.monitors
+        place = {0: "rear", stack.count - 1: "front"}.get(index, "between")
+        lines = [
+            f"{place}, at x = {stack.x_m[index] * 100:+.1f} cm",
+            *str(monitor).replace(" (", "\n(").splitlines(),
+            f"mounted at {panel.rotation_deg} degrees, mirroring {panel.mirror}",
+        ]
+        cards.append(identity_card(stack.width_px, stack.height_px, title=f"PANEL {index}", lines=lines))
+    return panels, cards
+
+
+def alone(cards: list[U8], index: int) -> U8:
+    """(N, H, W, 4) layers with one card, the other panels clear."""
+    import numpy as np
+
+    layers = np.stack(cards)
+    for other in range(len(cards)):
+        if index != other:
+            layers[other, ..., :3] = 0
+    return layers
 
 
 def every_monitor() -> tuple[PanelSink, list[U8], tuple[Monitor, ...]]:
@@ -255,6 +161,6 @@ def _hold(panels: PanelSink, cards: list[U8], order: list[int], seconds: float, 
                 number += 1
                 frame = PanelFrame(number, alone(cards, order[place]), number)
             elif key is None:
-                _pause()
+                time.sleep(0.05)
     except KeyboardInterrupt:
         return

@@ -38,7 +38,7 @@ def page(
 
         from runtime.page.server import application
     except ImportError as error:
-        raise MissingPart(f"page: {error.name} is not installed: pip install 'phasestack[page]'") from None
+        raise MissingPart(f"page: {error.name} is not installed: pip install starlette uvicorn") from None
 
     from runtime.blackbox.location import state_folder
     from runtime.commands.status import sockets

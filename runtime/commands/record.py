@@ -147,7 +147,7 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
     worker = SensorWorker(
         lambda: DetectingDriver(
             open_sensor(s, clock, limits=settings.limits),
-            lambda: EyeFinder(settings.detector).find,
+            lambda: EyeFinder(settings).find,
             keep_images=images,
         ),
         s,
@@ -187,7 +187,7 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
             if count == 0:
                 raise
     told = {"file": str(out), "samples": count, "seconds": (last_ns - first_ns) / 1e9, "stopped": stopped}
-    return told | {"holds": list(holds), "images_asked": images, "overtaken": worker.stale_inputs}
+    return told | {"holds": list(holds), "images_asked": images, "skipped": worker.stale_inputs}
 
 
 def _streams(frame: SensorFrame) -> list[str]:

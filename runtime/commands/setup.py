@@ -15,11 +15,9 @@ def setup(
     out: Annotated[Path, typer.Option(help="folder for pairs, calibration, reports and the page of figures")] = Path(
         "setup"
     ),
-    photos: Annotated[Path | None, typer.Option(help="folder in which the photographs of the boards will lie")] = None,
-    device: Annotated[str | None, typer.Option(help="a video device (number or path) instead of photographs")] = None,
+    photos: Annotated[Path, typer.Option(help="folder in which the photographs will lie")] = Path("photos"),
     simulate: Annotated[bool, typer.Option("--simulate", help="a display that is not there, to try it out")] = False,
     seed: Annotated[int, typer.Option(min=0, help="of the simulated display")] = 0,
-    again: Annotated[bool, typer.Option("--again", help="begin at the first step, whatever is done")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout, at the end")] = False,
 ) -> None:
     """Set a display up: which monitor is which panel, sizes, registration by photographs, sensor, calibration.
@@ -31,13 +29,8 @@ def setup(
     Example: phasestack setup --simulate --config try.toml --out try
     """
     from calib.setup_run import run_setup
-    from runtime.errors import InputError
 
-    if photos is not None and device is not None:
-        raise InputError("setup", "--photos", "or --device, not both")
-    summary, text = run_setup(
-        config, out=out, simulate=simulate, seed=seed, photos=photos, device=device, again=again, to_stderr=as_json
-    )
+    summary, text = run_setup(config, out=out, photos=photos, simulate=simulate, seed=seed, to_stderr=as_json)
     if as_json:
         from runtime.support.artifacts import to_json
 

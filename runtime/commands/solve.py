@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from runtime.support.options import number, place, told_by_option
+from runtime.support.options import blame_option, number, place
 from runtime.support.ranges import FOV_RANGE_DEG
 
 
@@ -29,7 +29,7 @@ def solve(
     ] = 1.0,
     backend: Annotated[
         str | None,
-        typer.Option(help="what surrounds the network: opencv, gl, or auto: the faster one here, from --repeat 10 on"),
+        typer.Option(help="what surrounds the network: cpu, gl, or auto: the faster one here, from --repeat 10 on"),
     ] = None,
     no_plan: Annotated[bool, typer.Option("--no-plan", help="leave nothing out, whatever the pictures allow")] = False,
     config: Annotated[Path | None, typer.Option(help="configuration, for the model's settings")] = None,
@@ -40,11 +40,11 @@ def solve(
     Example: phasestack solve --left l.png --right r.png --left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0 --fov 40
     --panels panels.json --out out/solve
     """
-    from runtime.commands.solving import SolveRequest, solve_pair
+    from runtime.commands.solving import SolveOptions, solve_pair
 
-    with told_by_option("solve", model=model):
+    with blame_option("solve", model=model):
         result = solve_pair(
-            SolveRequest(
+            SolveOptions(
                 left,
                 right,
                 left_eye,
@@ -63,13 +63,11 @@ def solve(
     if as_json:
         typer.echo(json.dumps(result))
     else:
-        expected = ", ".join(
-            f"{value:.2f} dB {who}"
-            for who, value in zip(("a pupil (1 mm)", "a tracker (2 mm)"), result["expected_db"].values(), strict=True)
-            if value is not None
-        )
+        light = " / ".join("-" if value is None else f"{value:.1f}" for value in result["light_db"].values())
+        wall = ", ".join(f"{seconds:.1f} s {part}" for part, seconds in result["wall_s"].items())
         typer.echo(
-            f"{result['model']}: displayed {result['psnr_db']:.2f} dB to two points, SSIM {result['ssim']:.4f}; "
-            f"{f'expected: {expected}; ' if expected else ''}"
-            f"{result['total_ms']:.1f} ms in all, {result['inference_ms']:.1f} ms of it the network; {out}"
+            f"{result['model']}: light {light} dB for eyes sure to 0 / 1 / 2 mm (1: a pupil, the figure to quote); "
+            f"one ray a pixel {result['psnr_db']:.1f} dB, SSIM {result['ssim']:.4f}\n"
+            f"{result['total_ms']:.1f} ms a solution, {result['inference_ms']:.1f} ms of it the network; "
+            f"wall time: {wall}\nsee {out / 'contact-sheet.png'}"
         )

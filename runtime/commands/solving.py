@@ -12,23 +12,22 @@ from typing import Any
 import cv2
 import numpy as np
 
-from runtime.config import ModelSettings, Overrides, changed, load_settings, load_stack
+from runtime.config import ModelSettings, changed, load_settings, load_stack, with_options
 from runtime.content.base import ContentInfo
 from runtime.errors import EyesNotServed, InputError
-from runtime.evaluation.displayed import EyeViews, Picture, displayed, expected_db
-from runtime.evaluation.trials import timed, timed_in_turn
+from runtime.evaluation.displayed import Picture, displayed
+from runtime.evaluation.solved import SolvedPair, judged
+from runtime.evaluation.trials import Stopwatch, timed, timed_in_turn
 from runtime.model.backends import choose
+from runtime.model.job import Job
 from runtime.model.predictor import Prediction, Predictor, load_predictor
-from runtime.model.schedule import Backend
+from runtime.model.steps import SolverBackend
 from runtime.model.still import solve_still
-from runtime.optics.carried import intensities
-from runtime.optics.retina import as_codes
+from runtime.model.trim import Savings, Scene, trim
 from runtime.optics.stack import PanelStack
-from runtime.plan.planner import focused_part, observed
-from runtime.plan.predictors import planned_predictor
 from runtime.plan.savings import Measured, Saving, network_items
 from runtime.records import F64, U8, PlanItem
-from runtime.support.artifacts import OutputFolder, in_8_bits, read_picture, write_json, write_png
+from runtime.support.artifacts import OutputFolder, in_8_bits, read_picture, write_json
 
 SEPARATION_MIN_M = 0.005
 MEASURED_FROM = 10  # runs that are worth a look at which backend is faster
@@ -36,7 +35,7 @@ COMPARED = 3  # timed runs with and without the plan
 
 
 @dataclass(frozen=True, slots=True)
-class SolveRequest:
+class SolveOptions:
     """The command line of `solve`."""
 
     left: Path
@@ -54,9 +53,10 @@ class SolveRequest:
     no_plan: bool = False
 
 
-def solve_pair(request: SolveRequest) -> dict[str, Any]:
+def solve_pair(request: SolveOptions) -> dict[str, Any]:
     """Layers, what the eyes see of them, and solve.json (docs/contracts.md). Raises InputError."""
-    settings = Overrides(backend=request.backend).applied(load_settings(request.config))
+    clock = Stopwatch()
+    settings = with_options(load_settings(request.config), backend=request.backend)
     if request.no_plan:
         settings = changed(settings, "plan", {"enabled": False}, source="--no-plan")
     model_settings = settings.model
@@ -71,31 +71,40 @@ def solve_pair(request: SolveRequest) -> dict[str, Any]:
     eyes_m = checked_eyes(request.left_eye, request.right_eye, stack)
     model_settings = model_settings.model_copy(update={"name": request.model})
     settings = settings.model_copy(update={"model": model_settings})
-    predictor = planned_predictor(settings, stack)
+    clock.ended("read pictures")
+    predictor = load_predictor(model_settings.name, stack, model_settings)
     with ExitStack() as contexts, ExitStack() as cleanup:
         cleanup.callback(predictor.close)
         backend = _backend(model_settings, predictor, request, contexts)
-        predictor.surround_with(backend)
-        prediction, timing = _timed(pictures, eyes_m, request, predictor)
+        predictor.set_backend(backend)
+        clock.ended("load model")
+        solver = PairSolver(pictures, eyes_m, request, predictor)
+        prediction, timing = _timed(solver, trimmed=settings.plan.enabled and predictor.trims)
+        clock.ended("solve, warm-up included")
         with OutputFolder(request.out) as folder:
-            measured = _write(folder.staging, prediction.layers, stored, eyes_m, stack, request)
-            plain = load_predictor(model_settings.name, stack, model_settings)
-            cleanup.callback(plain.close)
-            plain.surround_with(backend)
-            plan = _left_out(pictures, stored, eyes_m, request, predictor, plain, measured["psnr_db"])
+            pair = _judged(prediction.layers, stored, solver)
+            where = f"{request.left.name} and {request.right.name}, model {request.model}, solved for eyes unsure by "
+            where += f"{request.eye_sigma_mm:g} mm; one ray a pixel, as published: {pair.quality.psnr_db:.1f} dB"
+            pair.write(folder.staging, lines=[where])
+            clock.ended("measure and write")
+            plan = _left_out(solver, stored, pair.quality.psnr_db)
+            clock.ended("compare with the plan off")
             named = {
                 "model": predictor.name,
                 "provider": predictor.provider,
                 "backend": predictor.backend,
                 "eye_sigma_mm": request.eye_sigma_mm,
+                "steps": prediction.steps,
                 "plan": [asdict(item) for item in plan],
             }
-            result = measured | timing | named
+            result = pair.quality.table() | timing | named | {"wall_s": clock.seconds}
             write_json(folder.staging / "solve.json", result)
     return result
 
 
-def _backend(settings: ModelSettings, predictor: Predictor, request: SolveRequest, contexts: ExitStack) -> Backend:
+def _backend(
+    settings: ModelSettings, predictor: Predictor, request: SolveOptions, contexts: ExitStack
+) -> SolverBackend:
     """What surrounds the network: one solution is sooner made than two backends are measured.
 
     contexts: releases what was made, once nothing uses it any more.
@@ -110,50 +119,74 @@ def _backend(settings: ModelSettings, predictor: Predictor, request: SolveReques
 
     wanted = settings.backend
     if wanted == "auto" and request.repeat < MEASURED_FROM:
-        wanted = "opencv"
+        wanted = "cpu"
     return choose(wanted, predictor, context).backend
 
 
-def _left_out(
-    pictures: list[U8],
-    stored: Sequence[Picture],
-    eyes_m: F64,
-    request: SolveRequest,
-    predictor: Predictor,
-    plain: Predictor,
-    planned_db: float,
-) -> list[PlanItem]:
-    """What the model left out of these pictures, and what that saved and cost against a model that leaves out nothing.
+class PairSolver:
+    """Both pictures of the command line, solved with what they do not need left out, or not."""
+
+    def __init__(self, pictures: list[U8], eyes_m: F64, options: SolveOptions, predictor: Predictor) -> None:
+        self.pictures, self.eyes_m, self.options, self.predictor = pictures, eyes_m, options, predictor
+        self.left_out = Savings()  # of the newest trimmed job
+
+    def solved(self, changed: Callable[[Job], Job] = lambda job: job) -> Prediction:
+        """changed: the job that is solved instead. Raises InputError for eyes that the model does not serve: here they
+        will not move on."""
+        try:
+            return solve_still(
+                *self.pictures,
+                eyes_m=self.eyes_m,
+                fov_deg=self.options.fov_deg,
+                predictor=self.predictor,
+                eye_sigma_mm=self.options.eye_sigma_mm,
+                changed=changed,
+            )
+        except EyesNotServed as error:
+            raise InputError(
+                "solve",
+                "--left-eye, --right-eye",
+                f"{error}: {self.predictor.name} can't serve them (try --model sart)",
+            ) from None
+
+    def trimmed(self, job: Job) -> Job:
+        """What the pictures need of a job."""
+        job, self.left_out = trim(job, Scene(self.predictor.stack))
+        return job
+
+
+def _left_out(solver: PairSolver, stored: Sequence[Picture], planned_db: float) -> list[PlanItem]:
+    """What was left out of these pictures, and what that saved and cost against a model that leaves out nothing.
 
     stored: the same pictures in their files' own bits, which is what the eyes should see.
-    Both are timed again, in turn, so that what slows one slows the other.
+    All ways are timed again, in turn, so that what slows one slows the others.
     """
-    numbers = observed(Measured(), predictor)
-    info = ContentInfo(request.left.name)
+    left_out, options, stack = solver.left_out, solver.options, solver.predictor.stack
+    numbers, info = Measured(left_out=left_out), ContentInfo(options.left.name)
     if not network_items(info, numbers):
         return []
-    stack = predictor.stack
-    part = focused_part(predictor)
-    # In colour, or unfocused, one saving is all there is.
-    between = part.whole if part is not None and numbers.channels == 1 and numbers.active_fraction < 1 else None
-    ways = {"plain": plain, "planned": predictor} | ({"between": between} if between else {})
-
-    def solved_by(way: Predictor) -> Callable[[int], U8]:
-        return lambda _: _solved(pictures, eyes_m, request, way).layers
-
-    calls = {name: solved_by(way) for name, way in ways.items()}
+    calls: dict[str, Callable[[int], U8]] = {
+        "plain": lambda _: solver.solved().layers,
+        "planned": lambda _: solver.solved(solver.trimmed).layers,
+    }
+    middle = "plain" if left_out.channels == 3 else "planned"  # in colour, or of the whole, one saving is all there is
+    if left_out.channels == 1 and left_out.solved_share < 1:
+        middle = "between"
+        calls[middle] = lambda _: solver.solved(lambda job: replace(job, channels=1)).layers
     done = timed_in_turn(calls, runs=COMPARED, keep=lambda layers: layers.copy())
     shown_db = {
-        name: planned_db if name == "planned" else _shown(way.answer, stored, eyes_m, stack, request).quality.psnr_db
+        name: planned_db
+        if name == "planned"
+        else displayed(
+            way.answer, stored, stack, eyes_m=solver.eyes_m, fov_deg=options.fov_deg, similarity=False
+        ).quality.psnr_db
         for name, way in done.items()
     }
 
     def saving(without: str, with_it: str) -> Saving:
         return Saving(done[without].median_ms - done[with_it].median_ms, shown_db[without] - shown_db[with_it])
 
-    middle = "between" if between else "plain" if numbers.channels == 3 else "planned"
-    numbers = replace(numbers, one_channel=saving("plain", middle), focus=saving(middle, "planned"))
-    return network_items(info, numbers)
+    return network_items(info, replace(numbers, one_channel=saving("plain", middle), focus=saving(middle, "planned")))
 
 
 def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stack: PanelStack) -> F64:
@@ -169,58 +202,27 @@ def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stac
     return np.array([left_eye, right_eye])
 
 
-def _solved(pictures: list[U8], eyes_m: F64, request: SolveRequest, predictor: Predictor) -> Prediction:
-    """Raises InputError for eyes that the model does not serve: here they will not move on."""
-    try:
-        return solve_still(
-            *pictures, eyes_m=eyes_m, fov_deg=request.fov_deg, predictor=predictor, eye_sigma_mm=request.eye_sigma_mm
-        )
-    except EyesNotServed as error:
-        raise InputError(
-            "solve", "--left-eye, --right-eye", f"{error}: {predictor.name} can't serve them (try --model sart)"
-        ) from None
-
-
-def _timed(
-    pictures: list[U8], eyes_m: F64, request: SolveRequest, predictor: Predictor
-) -> tuple[Prediction, dict[str, float]]:
+def _timed(solver: PairSolver, *, trimmed: bool) -> tuple[Prediction, dict[str, float]]:
     """A warm-up, then `repeat` timed runs; medians."""
     inference_ms: list[float] = []
 
     def solved() -> Prediction:
-        prediction = _solved(pictures, eyes_m, request, predictor)
+        prediction = solver.solved(solver.trimmed) if trimmed else solver.solved()
         inference_ms.append(prediction.stage_ms["inference"])
         return prediction
 
-    done = timed(solved, runs=request.repeat)
+    repeat = solver.options.repeat
+    done = timed(solved, runs=repeat)
     return done.answer, {
-        "inference_ms": round(float(np.median(inference_ms[-request.repeat :])), 3),
+        "inference_ms": round(float(np.median(inference_ms[-repeat:])), 3),
         "total_ms": round(done.median_ms, 3),
     }
 
 
-def _write(
-    folder: Path, layers: U8, pictures: Sequence[Picture], eyes_m: F64, stack: PanelStack, request: SolveRequest
-) -> dict[str, Any]:
-    for n, layer in enumerate(layers):
-        write_png(folder / f"layer-{n}.png", layer)
-    eye_views = _shown(layers, pictures, eyes_m, stack, request)
-    for name, retina, target in zip(("left", "right"), eye_views.seen, eye_views.wanted, strict=True):
-        write_png(folder / f"seen-{name}.png", as_codes(retina.image))
-        write_png(folder / f"wanted-{name}.png", as_codes(intensities(target)))
-    measured = eye_views.quality
-    expected = expected_db(eye_views, layers, stack, eyes_m=eyes_m, fov_deg=request.fov_deg)
-    return {
-        "psnr_db": round(measured.psnr_db, 3),
-        "expected_db": {sigma: None if value is None else round(value, 3) for sigma, value in expected.items()},
-        "ssim": round(measured.ssim, 4),
-        "eye_psnr_db": [round(value, 3) for value in measured.eye_psnr_db],
-    }
-
-
-def _shown(layers: U8, pictures: Sequence[Picture], eyes_m: F64, stack: PanelStack, request: SolveRequest) -> EyeViews:
+def _judged(layers: U8, pictures: Sequence[Picture], solver: PairSolver) -> SolvedPair:
     """What the eyes see, and what they should see. Raises InputError where they see nothing."""
+    stack, fov_deg = solver.predictor.stack, solver.options.fov_deg
     try:
-        return displayed(layers, pictures, stack, eyes_m=eyes_m, fov_deg=request.fov_deg)
+        return judged(layers, pictures, stack, eyes_m=solver.eyes_m, fov_deg=fov_deg)
     except ValueError as error:
         raise InputError("solve", "--left-eye", f"{error}: nothing of the display can be seen from there") from None

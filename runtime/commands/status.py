@@ -48,7 +48,7 @@ def sockets(config: Path | None, socket: Path | None) -> tuple[Path, ...]:
     """Where the daemon may listen: the one given, or the configured one and the person's own."""
     if socket is not None:
         return (socket,)
-    from runtime.daemon.location import candidates, configured_socket
+    from runtime.daemon.client import candidates, configured_socket
 
     return candidates(configured_socket(config))
 
@@ -76,16 +76,26 @@ def describe(answer: dict[str, Any]) -> Iterator[str]:
         yield row(f"faults {part}", str(count))
     if answer.get("log_lines_lost"):
         yield row("log", f"{answer['log_lines_lost']} lines were lost: they could not be written")
-    if budget := answer.get("budget"):
-        held = {True: "held", False: "not held"}.get(budget.get("held"), "")
-        remark = ", ".join(
-            text for text in (held, budget.get("measuring") and f"measuring {budget['measuring']}") if text
-        )
-        yield row("budget", f"{budget['budget_ms']:g} ms: {budget['level']}", remark)
     for item in answer.get("plan") or ():
         yield row("left out", str(item.get("what", "")), str(item.get("why", "")))
 
 
+def holds(answer: dict[str, Any]) -> str:
+    """What an operator chooses, as it is now, on one line."""
+    placing = answer.get("placing") or {}
+    moved = [f"{name.partition('_')[0]} {value}" for name, value in placing.items() if value != UNMOVED.get(name)]
+    scene, content = str(answer.get("scene", "")), str(answer.get("content", ""))
+    parts = [
+        f"scene {scene}" + (f" ({content})" if content not in ("", scene) else ""),
+        f"model {answer.get('model', '')}",
+        *moved,
+        "paused" if answer.get("paused") else "",
+        "flat" if answer.get("flat_asked") else "",
+    ]
+    return one_line(", ".join(filter(None, parts)), most=2000)
+
+
+UNMOVED = {"scale": 1.0, "offset_m": [0.0] * 3, "rotation_deg": [0.0] * 3, "turntable_per_min": 0.0}
 TOLD_AS = {"photon_ms": "capture to light", "solution_age_ms": "solution's age", "interval_ms": "between frames"}
 
 

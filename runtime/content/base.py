@@ -1,11 +1,18 @@
-"""What every content source answers: what does an eye at this pose see, in these pixels?"""
+"""What every content source answers: what does an eye at this pose see, in these pixels?
+
+`ContentSource` is the base of scenes of a user's own, too: `scene = "mypackage.tunnel:Tunnel"`. Of its methods only
+`render` must be written; the others say what can be left out, and their defaults are right for any scene.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
+from pydantic import BaseModel
+
+from runtime.config import Section
 from runtime.errors import ContentFailure
 from runtime.optics.rect import PixelRect
 from runtime.records import F64, U8
@@ -23,7 +30,9 @@ class View:
     pixels_from_stack: F64  # (3, 4) projection; third coordinate: positive before the eye, metres
     width_px: int
     height_px: int
-    turned: F64 | None = None  # 3x3 rotation of this view's frame into the display's own, whose lamp stands still
+    display_from_view: F64 | None = (
+        None  # 3x3 rotation out of a frame that was placed; the lamp stands in the display's
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,14 +46,21 @@ class ContentInfo:
     depth_range_m: tuple[float, float] | None = None  # nearest to farthest along +x of `stack`: (rear, front)
     background: tuple[float, float, float] | None = (1.0, 1.0, 1.0)  # uniform colour behind it, 0-1; None: none
     flat_x_m: float | None = None  # all of it lies in this plane of `stack` and looks alike to both eyes
-    left_out: tuple[str, ...] = ()  # what its renderer does without here: lights, textures, harmonics, sorting
 
 
 class ContentSource(ABC):
-    """A scene, a picture or another program's pictures. One thread, the one with its GL context, uses it."""
+    """A scene. One thread, the one with its GL context, makes, uses and closes it."""
 
+    Options: ClassVar[type[BaseModel]] = Section  # of a class of the user's own: what [content.options] may hold
     info: ContentInfo
     draws_in: object = None  # the GL context that its textures are in; None: it has arrays
+
+    def __init__(self, options: Any, *, stack: Any, context: Any) -> None:
+        """How a class of the user's own is made; raises InputError where it cannot be shown.
+
+        options: an instance of `Options`; stack: the panels (`PanelStack`); context: moderngl's, current.
+        """
+        self.info = ContentInfo(type(self).__name__, moving=True, background=None)
 
     @abstractmethod
     def render(self, view: View, *, time_ns: int) -> U8:
@@ -62,7 +78,7 @@ class ContentSource(ABC):
         return None
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
-        """A box of the view's pixels beside which only the background shows, told without drawing; None: not known."""
+        """A box of the view's pixels beside which only the background shows, without drawing it; None: not known."""
         return None
 
     def revision(self, *, time_ns: int) -> int:
@@ -70,7 +86,7 @@ class ContentSource(ABC):
         return time_ns if self.info.moving else 0
 
     def is_empty(self, view: View, *, time_ns: int) -> bool:
-        """True where the eye sees nothing of it in the view; False too where that can't be told yet."""
+        """True where the eye sees nothing of it in the view; False too where that can't be known yet."""
         try:
             return not self.render(view, time_ns=time_ns)[..., 3].any()
         except ContentFailure:

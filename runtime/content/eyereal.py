@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.images import WarpedPicture, image_from_view, rgba_from_rgb
-from runtime.content.presets import Preset
+from runtime.content.placing import SceneFile
+from runtime.content.presets import Preset, Reading, preset, preset_names
+from runtime.content.scenes import WHITE
 from runtime.errors import ContentFailure, InputError
 from runtime.optics.views import image_from_stack
 from runtime.records import F64, U8
@@ -100,9 +103,9 @@ def fitting_presets(folder: Path, presets: Iterable[Preset]) -> list[Preset]:
     own put them elsewhere.
     """
     found = []
-    for preset in presets:
+    for candidate in presets:
         try:
-            eyes_m = np.stack([pair.eyes_m for pair in read_folder(folder, preset)])
+            eyes_m = np.stack([pair.eyes_m for pair in read_folder(folder, candidate)])
         except InputError:
             continue
         apart_m = eyes_m[:, 1] - eyes_m[:, 0]
@@ -111,8 +114,28 @@ def fitting_presets(folder: Path, presets: Iterable[Preset]) -> list[Preset]:
         distance_m = np.linalg.norm(eyes_m.mean(1), axis=1)
         apart = abs(float(np.median(separation_m)) - USUAL_SEPARATION_M)
         if apart <= SEPARATION_DIFFERS_M and across.min() > 0.7 and NEAREST_M < distance_m.min() < FARTHEST_M:
-            found.append((round(apart, 4), preset))
-    return [preset for _, preset in sorted(found, key=lambda item: item[0])]
+            found.append((round(apart, 4), candidate))
+    return [candidate for _, candidate in sorted(found, key=lambda item: item[0])]
+
+
+def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
+    """Read a folder as the preset that was chosen, or that its name holds, or that its eyes fit. Raises InputError."""
+    path, settings = file.path, file.settings
+    # The data set was drawn by the published code: its scale holds in every reading.
+    reading: Reading = "published-code" if settings.reading == "seed" else settings.reading
+    chosen = file.preset.name if file.preset else ""
+    chosen = chosen or next((name for name in preset_names() if name in path.resolve().name), "")
+    name = chosen
+    if not chosen:
+        fitting = fitting_presets(path, (preset(known, reading) for known in preset_names()))
+        if not fitting:
+            problem = "names no preset, and its eyes fit none: set content.scene to one and content.file to the folder"
+            raise InputError(path, "name", problem)
+        chosen = fitting[0].name
+        name = f"{path.resolve().name} (read as {chosen}, which its eyes fit)"
+    pairs = read_folder(path, preset(chosen, reading))
+    source = EyeRealSource(pairs, fov_deg=settings.fov_deg, background=settings.background or WHITE, name=name)
+    return lambda context: source
 
 
 class EyeRealSource(ContentSource):

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
-from runtime.config import LimitSettings
-from runtime.content.ply import Table, read_vertices
+from runtime.content.ply import Header, read_vertices
 from runtime.errors import InputError
 from runtime.records import F32, F64
 
 LOW_PASS_PX2 = 0.3  # added to each splat's covariance: none falls between the pixels
-LEAST_ALPHA = 1 / 255
+ALPHA_MIN = 1 / 255
 LARGEST_RELATIVE_SCALE = 1000.0  # of a splat, in units of the scene's extent
 FARTHEST_RELATIVE = 1e6  # of a splat from the middle, in units of the median distance
 LARGEST_COEFFICIENT = 1e4  # of the harmonics: colours are blended as half floats, which end at 65504
-COEFFICIENTS = {0: 1, 9: 4, 24: 9, 45: 16}  # f_rest properties: spherical harmonics a channel
+COEFFICIENTS = (0, 9, 24, 45)  # f_rest properties: of harmonics to degree 0, 1, 2, 3
+PACKED = [0, 1, 2, 4, 5, 8]  # of a 3x3 matrix, row by row
 
 I64 = NDArray[np.int64]
 
@@ -46,85 +47,60 @@ class Splats:
     opacities: F32  # (m,)
 
 
-def load_gaussians(path: Path, *, limits: LimitSettings | None = None) -> Gaussians:
+def load_gaussians(header: Header) -> Gaussians:
     """Read a splat file as the reference implementation writes it.
 
-    Raises InputError: unreadable, a property missing, values that aren't finite, absurd scales.
+    Raises InputError: a property missing, values that aren't finite, absurd places, scales and colours.
     """
-    table = read_vertices(path, limits=limits)
+    path, table = header.path, read_vertices(header)
     names = set(table.dtype.names or ())
-    rest = [name for name in names if name.startswith("f_rest_")]
-    needed = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
-    needed += ["rot_0", "rot_1", "rot_2", "rot_3"]
-    for name in needed:
-        if name not in names:
-            raise InputError(path, name, "the property is missing: this is no 3D Gaussian splat file")
-    if len(rest) not in COEFFICIENTS:
-        raise InputError(path, "f_rest", f"{len(rest)} properties; 0, 9, 24 or 45 are needed")
-    for index in range(len(rest)):
-        if f"f_rest_{index}" not in names:
-            raise InputError(path, f"f_rest_{index}", "the property is missing")
+    rest = sum(name.startswith("f_rest_") for name in names)
+    if rest not in COEFFICIENTS:
+        raise InputError(path, "f_rest", f"{rest} properties; 0, 9, 24 or 45 are needed")
     if not len(table):
         raise InputError(path, "vertex", "there are none")
 
-    def columns(prefix: str, count: int) -> F32:
-        return _numbers(table, [f"{prefix}{index}" for index in range(count)], path, prefix.rstrip("_"))
+    def columns(field: str, *wanted: str) -> F32:
+        """(n, len(wanted)) finite numbers."""
+        if missing := [name for name in wanted if name not in names]:
+            raise InputError(path, missing[0], "the property is missing: this is no 3D Gaussian splat file")
+        with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite
+            values = np.column_stack([table[name] for name in wanted]).astype(np.float32)
+        refuse(field, ~np.isfinite(values).all(1), "are not finite")
+        return values
 
-    centres = _numbers(table, ["x", "y", "z"], path, "x, y, z")
+    def refuse(field: str, wrong: Any, problem: str) -> None:
+        if wrong.any():
+            raise InputError(path, field, f"{int(wrong.sum())} of {len(wrong)} splats {problem}")
+
+    centres = columns("x, y, z", "x", "y", "z")
     away = np.abs(centres.astype(np.float64) - np.median(centres, axis=0)).max(1)
-    stray = int((away > FARTHEST_RELATIVE * np.median(away)).sum()) if np.median(away) > 0 else 0
-    if stray:
-        raise InputError(path, "x, y, z", f"{stray} splats are over {FARTHEST_RELATIVE:g} times the scene's size away")
-    log_scales = columns("scale_", 3)
+    usual = float(np.median(away)) or np.inf
+    refuse("x, y, z", away > FARTHEST_RELATIVE * usual, f"are over {FARTHEST_RELATIVE:g} times the scene's size away")
+    log_scales = columns("scale", *(f"scale_{axis}" for axis in range(3)))
     extent = float(np.ptp(np.percentile(centres, [1, 99], axis=0), axis=0).max()) or 1.0
-    limit = np.log(LARGEST_RELATIVE_SCALE * extent)
-    for axis in range(3):
-        absurd = int((log_scales[:, axis] > limit).sum())
-        if absurd:
-            raise InputError(
-                path, f"scale_{axis}", f"{absurd} splats are over {LARGEST_RELATIVE_SCALE:g} times the scene"
-            )
-    higher = columns("f_rest_", len(rest)).reshape(len(table), 3, -1).transpose(0, 2, 1) if rest else None
-    first = columns("f_dc_", 3)[:, None]
-    harmonics = first if higher is None else np.ascontiguousarray(np.concatenate([first, higher], axis=1))
-    glaring = int((np.abs(harmonics) > LARGEST_COEFFICIENT).any((1, 2)).sum())
-    if glaring:
-        raise InputError(path, "f_dc, f_rest", f"{glaring} splats have coefficients over {LARGEST_COEFFICIENT:g}")
-    rotations = columns("rot_", 4)
-    undirected = int((~rotations.any(1)).sum())
-    if undirected:
-        raise InputError(path, "rot", f"{undirected} of {len(table)} are no rotations: all four numbers are 0")
-    opacity = _numbers(table, ["opacity"], path, "opacity")[:, 0].astype(np.float64)
-    opacities = np.asarray(expit(opacity), dtype=np.float32)
-    if not (opacities > LEAST_ALPHA).any():
+    absurd = (log_scales > np.log(LARGEST_RELATIVE_SCALE * extent)).any(1)
+    refuse("scale", absurd, f"are over {LARGEST_RELATIVE_SCALE:g} times the scene")
+    harmonics = columns("f_dc", *(f"f_dc_{channel}" for channel in range(3)))[:, None]
+    if rest:
+        higher = columns("f_rest", *(f"f_rest_{number}" for number in range(rest))).reshape(len(table), 3, -1)
+        harmonics = np.ascontiguousarray(np.concatenate([harmonics, higher.transpose(0, 2, 1)], axis=1))
+    glaring = (np.abs(harmonics) > LARGEST_COEFFICIENT).any((1, 2))
+    refuse("f_dc, f_rest", glaring, f"have coefficients over {LARGEST_COEFFICIENT:g}")
+    rotations = columns("rot", *(f"rot_{axis}" for axis in range(4)))
+    refuse("rot", ~rotations.any(1), "are no rotations: all four numbers are 0")
+    opacities = np.asarray(expit(columns("opacity", "opacity")[:, 0].astype(np.float64)), dtype=np.float32)
+    if not (opacities > ALPHA_MIN).any():
         raise InputError(path, "opacity", "no splat can be seen")
     return Gaussians(centres, covariances_of(np.exp(log_scales), rotations), opacities, harmonics)
 
 
-def _numbers(table: Table, names: list[str], path: Path, field: str) -> F32:
-    """(n, len(names)) finite float32 columns of a table. Raises InputError."""
-    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is told
-        values = np.column_stack([table[name] for name in names]).astype(np.float32)
-    broken = int((~np.isfinite(values).all(1)).sum())
-    if broken:
-        raise InputError(path, field, f"{broken} of {len(values)} are not finite")
-    return values
-
-
 def covariances_of(scales: F32, quaternions: F32) -> F32:
-    """(n, 6) R diag(s²) R^T of (n, 3) standard deviations and (n, 4) quaternions w, x, y, z of any length."""
-    unit = quaternions / np.maximum(np.linalg.norm(quaternions, axis=1, keepdims=True), 1e-12)
-    w, x, y, z = unit.T.astype(np.float64)
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    spread = rotation * scales.T.astype(np.float64)[None]
-    full = np.einsum("ikn,jkn->ijn", spread, spread)
-    return np.stack([full[0, 0], full[0, 1], full[0, 2], full[1, 1], full[1, 2], full[2, 2]], axis=1).astype(np.float32)
+    """(n, 6) R diag(s²) R^T of (n, 3) standard deviations and (n, 4) quaternions w, x, y, z of any length but 0."""
+    rotation = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
+    spread = rotation * scales.astype(np.float64)[:, None]
+    full = spread @ spread.transpose(0, 2, 1)
+    return np.asarray(full.reshape(-1, 9)[:, PACKED], dtype=np.float32)
 
 
 def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
@@ -133,8 +109,8 @@ def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
     centres = gaussians.centres @ linear.T + target_from_source[:3, 3]
     full = gaussians.covariances.astype(np.float64)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     turned = linear @ full @ linear.T
-    packed = turned.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
-    return Gaussians(centres.astype(np.float32), packed.astype(np.float32), gaussians.opacities, gaussians.harmonics)
+    packed = turned.reshape(-1, 9)[:, PACKED].astype(np.float32)
+    return Gaussians(centres.astype(np.float32), packed, gaussians.opacities, gaussians.harmonics)
 
 
 def seen_splats(
@@ -148,7 +124,7 @@ def seen_splats(
     projection = pixels_from_stack.astype(np.float32)
     homogeneous = gaussians.centres @ projection[:, :3].T + projection[:, 3]
     w = homogeneous[:, 2]
-    shown = np.flatnonzero((w > nearest_m) & (gaussians.opacities > LEAST_ALPHA))
+    shown = np.flatnonzero((w > nearest_m) & (gaussians.opacities > ALPHA_MIN))
     u, v = (homogeneous[shown, :2] / w[shown, None]).T
     p0, p1, p2 = projection[:, :3]
     weight = 1 / w[shown]
@@ -163,7 +139,7 @@ def seen_splats(
     l2 = xz * j1[0] + yz * j1[1] + zz * j1[2]
     c = j1[0] * l0 + j1[1] * l1 + j1[2] * l2 + LOW_PASS_PX2
     opacity = gaussians.opacities[shown]
-    reach = np.sqrt(2 * np.log(opacity / np.float32(LEAST_ALPHA)))
+    reach = np.sqrt(2 * np.log(opacity / np.float32(ALPHA_MIN)))
     half_u, half_v = reach * np.sqrt(a), reach * np.sqrt(c)
     inside = (u + half_u > 0) & (u - half_u < width_px) & (v + half_v > 0) & (v - half_v < height_px)
     keep = np.flatnonzero(inside)

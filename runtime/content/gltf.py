@@ -1,34 +1,43 @@
 """glTF 2.0: triangles with their materials, where their nodes stand, and what moves them.
 
-Read by ourselves, because what moves (animations, skins, morph targets) belongs to the same nodes and vertices; the
-file was checked by `gltf_header` before. Colours are taken as code values, as everywhere here.
+Sizes are held to the limits before memory is taken for them, and files beside it are named where they are not
+there; anything else that a damaged file provokes here is one line. Colours are taken as code values.
 """
 
 from __future__ import annotations
 
+import base64
 import io
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from runtime.config import LimitSettings
-from runtime.content.gltf_header import FAN, STRIP, TRIANGLES, GltfFile, check_gltf, picture_bytes
 from runtime.content.rig import Binding, Channel, Node, Rig, Skin
 from runtime.content.shapes import I32, Shape
 from runtime.content.triangles import Part
-from runtime.errors import InputError
+from runtime.errors import InputError, one_line
 from runtime.records import F32, F64, U8
 from runtime.support import foreign, progress
+from runtime.support.picture_header import check_picture
 
-COMPONENTS = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
+COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+TRIANGLES, STRIP, FAN = 4, 5, 6  # of `mode`
 LARGEST_TEXTURE_PX = 4096
-Alpha = Literal["OPAQUE", "MASK", "BLEND"]
+ELEMENTS_PER_TRIANGLE = 10  # all accessors together, for the limit on triangles
+UNDERSTOOD = {
+    "KHR_materials_unlit", "KHR_materials_pbrSpecularGlossiness", "KHR_materials_ior", "KHR_materials_specular",
+    "KHR_materials_emissive_strength", "KHR_materials_clearcoat", "KHR_materials_sheen", "KHR_materials_transmission",
+    "KHR_materials_volume", "KHR_lights_punctual", "EXT_texture_webp", "KHR_mesh_quantization",
+    "KHR_texture_transform",
+}  # fmt: skip
 Numbers = NDArray[Any]
+Table = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,401 +49,380 @@ class GltfScene:
 
 
 @dataclass(frozen=True, slots=True)
-class _Material:
+class _Look:
+    """What a material comes to."""
+
     picture: U8 | None = None
     colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
     lit: bool = True
     uv_set: int = 0
-    uv_from_uv: F64 | None = None  # 3x3 of KHR_texture_transform
+    uv_from_uv: F64 | None = None  # 3x3
 
 
 def load_gltf(path: Path, data: bytes, *, limits: LimitSettings, animation: str = "") -> GltfScene:
-    """Read a checked file. animation: which one plays, by name or number. Raises InputError."""
-    file = check_gltf(path, data, limits=limits)
-    return _Reader(file).scene(animation)
+    """Read a whole file. animation: which one plays, by name or number. Raises InputError."""
+    text, binary = data, b""
+    if path.suffix.lower() == ".glb" or data[:4] == b"glTF":
+        text, binary = _chunks(path, data)
+    table = foreign.parsed_json(text, source=path, most_depth=limits.depth)
+    try:
+        return _Reader(path, table, binary, limits).scene(animation)
+    except (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError) as error:
+        problem = one_line(f"{type(error).__name__}: {error}", most=120)
+        raise InputError(path, "", f"is damaged, or no glTF ({problem})") from None
+
+
+def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
+    """The JSON and the buffer of a GLB. Raises InputError for a file that is cut off."""
+    found: dict[bytes, bytes] = {}
+    at = 12
+    while data[:4] == b"glTF" and at + 8 <= len(data):
+        size, kind = int.from_bytes(data[at : at + 4], "little"), data[at + 4 : at + 8]
+        if at + 8 + size > len(data):
+            there = len(data) - at - 8
+            raise InputError(path, "", f"is cut off: a chunk of {size} bytes is promised, {there} are there")
+        found.setdefault(kind, data[at + 8 : at + 8 + size])
+        at += 8 + size + (-size % 4)
+    if b"JSON" not in found:
+        raise InputError(path, "", "malformed: a GLB file begins with a chunk of JSON")
+    return found[b"JSON"], found.get(b"BIN\0", b"")
+
+
+def file_of(uri: str, *, source: Path, field: str) -> Path:
+    """The file beside `source` that a URI names. Raises InputError."""
+    if "://" in uri or uri.startswith("data:"):
+        raise InputError(source, field, f"{foreign.shown(uri)}: only files beside this one are read")
+    name = foreign.checked_path(unquote(uri), source=source, field=field)
+    if name.is_absolute():
+        raise InputError(source, field, f"{foreign.shown(uri)} is an absolute path; files beside this one are read")
+    if not (source.parent / name).exists():
+        raise InputError(source, field, f"{foreign.shown(str(name), most=200)} is not there")
+    return source.parent / name
 
 
 class _Reader:
-    def __init__(self, file: GltfFile) -> None:
-        self._file = file
-        self._materials: dict[int | None, _Material] = {}
-        self._pictures: dict[tuple[int, Alpha, float], U8] = {}
+    def __init__(self, path: Path, table: Table, binary: bytes, limits: LimitSettings) -> None:
+        """binary: a GLB's own buffer."""
+        self._path, self._table, self._binary, self._limits = path, table, binary, limits
+        self._elements = 0  # that were read of all accessors
+        self._buffers: dict[int, bytes] = {}
+        self._meshes: dict[int, list[tuple[Part, Binding]]] = {}
+        self._looks: dict[int, _Look] = {}
+        self._pictures: dict[tuple[int, float], U8] = {}
 
     def scene(self, animation: str) -> GltfScene:
-        nodes, order = self._nodes()
-        skins = [self._skin(index, item, len(nodes)) for index, item in enumerate(self._file.objects("skins"))]
+        for name in self._table.get("extensionsRequired", []):
+            if name not in UNDERSTOOD:
+                raise InputError(self._path, "extensionsRequired", f"{foreign.shown(name)} is not understood")
+        tables = self._table.get("nodes", [])
+        nodes, order = self._nodes(tables)
+        bones = [table["joints"] for table in self._table.get("skins", [])]
+        if bones or self._table.get("animations"):  # each of them is worked out for every picture
+            moving = len(nodes) + sum(map(len, bones))
+            self._within(moving, self._limits.nodes, "nodes and bones")
+        skins = [self._skin(table) for table in self._table.get("skins", [])]
         channels = self._channels(animation)
-        parts: list[Part] = []
-        bindings: list[Binding] = []
-        tables = self._file.objects("nodes")
-        standing = [number for number in order if tables[number].get("mesh") is not None]
+        standing = [number for number in order if "mesh" in tables[number]]
+        placed: list[tuple[Part, Binding]] = []
+        triangles = 0
         for count, number in enumerate(standing):
-            progress.tell(f"{self._file.path.name}: parts", count, len(standing))
-            mesh = self._file.index("meshes", tables[number]["mesh"], f"nodes[{number}].mesh")
-            skin = tables[number].get("skin")
-            held = None if skin is None else skins[self._file.index("skins", skin, f"nodes[{number}].skin")]
-            for part, binding in self._primitives(mesh, number, held):
-                parts.append(part)
-                bindings.append(binding)
-        return GltfScene(tuple(parts), Rig(tuple(nodes), tuple(order), tuple(bindings), channels))
+            progress.tell(f"{self._path.name}: parts", count, len(standing))
+            table = tables[number]
+            skin = skins[_index(table["skin"])] if "skin" in table else None
+            for part, binding in self._mesh(_index(table["mesh"])):
+                triangles += len(part.shape.triangles)
+                self._within(triangles, self._limits.triangles, "meshes")
+                placed.append((part, _bound(binding, number, table.get("weights"), skin)))
+            self._within(len(placed), self._limits.instances, "nodes")
+        rig = Rig(tuple(nodes), tuple(order), tuple(binding for _, binding in placed), channels)
+        return GltfScene(tuple(part for part, _ in placed), rig)
 
-    # Numbers.
+    def _within(self, count: int, most: int, field: str) -> None:
+        foreign.within(count, most, source=self._path, field=field)
 
-    def _accessor(self, index: Any, field: str, *, kinds: tuple[str, ...]) -> Numbers:
+    def _at(self, key: str, index: Any) -> Table:
+        """The object of a list that an index names."""
+        found: Table = self._table[key][_index(index)]
+        return found
+
+    # Bytes and numbers.
+
+    def _bytes_of(self, item: Table, field: str) -> bytes | None:
+        """What an object's URI stands for; None without one."""
+        uri = item.get("uri")
+        if uri is None:
+            return None
+        if not uri.startswith("data:"):
+            most = round(self._limits.file_mib * foreign.MIB)
+            name = file_of(uri, source=self._path, field=field)
+            return foreign.read_bytes(name, most_bytes=most, source=self._path, field=field)
+        head, mark, coded = uri.partition("base64,")
+        return base64.b64decode(coded) if mark else unquote(head).encode()
+
+    def _view(self, index: Any) -> tuple[bytes, int]:
+        """What a buffer view holds, and its stride (0: none)."""
+        view = self._at("bufferViews", index)
+        number = _index(view["buffer"])
+        if number not in self._buffers:
+            item = self._at("buffers", number)
+            data = self._bytes_of(item, f"buffers[{number}].uri")
+            data = self._binary if data is None else data
+            if len(data) < item["byteLength"]:
+                problem = f"its {len(data)} bytes are fewer than the {item['byteLength']} promised"
+                raise InputError(self._path, f"buffers[{number}]", problem)
+            self._buffers[number] = data
+        start = _index(view.get("byteOffset", 0))
+        return self._buffers[number][start : start + _index(view["byteLength"])], _index(view.get("byteStride", 0))
+
+    def _accessor(self, index: Any, *kinds: str) -> Numbers:
         """(count, width) numbers; integers that stand for fractions as such."""
-        file = self._file
-        number = file.index("accessors", index, field)
-        table, field = file.objects("accessors")[number], f"accessors[{number}]"
-        kind, component = table.get("type"), table.get("componentType")
-        if kind not in kinds or kind not in WIDTHS:
-            raise file.refuse(f"{field}.type", f"is {foreign.shown(kind)}; {' or '.join(kinds)} is wanted")
-        if component not in COMPONENTS:
-            raise file.refuse(f"{field}.componentType", f"is {foreign.shown(component)}")
-        count = int(table["count"])  # known to be whole
-        dtype = np.dtype("<" + COMPONENTS[component])
-        if "bufferView" in table:
-            values = self._strided(table, table["bufferView"], dtype, count, WIDTHS[kind], field)
-        else:
-            values = np.zeros((count, WIDTHS[kind]), dtype)
-        if isinstance(table.get("sparse"), dict):
-            values = self._sparse(values, table["sparse"], dtype, field)
-        if table.get("normalized") and dtype.kind in "iu":
+        item = self._at("accessors", index)
+        count, width = _index(item["count"]), WIDTHS[item["type"]]
+        self._elements += count
+        most = ELEMENTS_PER_TRIANGLE * self._limits.triangles
+        self._within(self._elements, most, f"accessors[{index}].count")
+        if item["type"] not in kinds:
+            raise ValueError(f"accessors[{index}] is {item['type']}, not {' or '.join(kinds)}")
+        dtype = np.dtype(COMPONENTS[item["componentType"]])
+        values = self._strided(item, dtype, count, width) if "bufferView" in item else np.zeros((count, width), dtype)
+        if "sparse" in item:
+            sparse = item["sparse"]
+            changed, places = _index(sparse["count"]), sparse["indices"]
+            where = self._strided(places, np.dtype(COMPONENTS[places["componentType"]]), min(changed, count), 1)[:, 0]
+            values[where] = self._strided(sparse["values"], dtype, min(changed, count), width)
+        if item.get("normalized") and dtype.kind in "iu":
             values = np.maximum(values.astype(np.float32) / np.iinfo(dtype).max, -1.0)
         return values
 
-    def _strided(
-        self, table: dict[str, Any], view: Any, dtype: np.dtype[Any], count: int, width: int, field: str
-    ) -> Numbers:
-        file = self._file
-        data, stride = file.view_bytes(view, f"{field}.bufferView")
-        start = foreign.whole(
-            table.get("byteOffset", 0), least=0, most=1 << 40, source=file.path, field=f"{field}.byteOffset"
-        )
-        size = dtype.itemsize * width
-        stride = stride or size
-        if count and start + (count - 1) * stride + size > len(data):
-            raise file.refuse(f"{field}.count", f"its view holds {len(data)} bytes, too few for {count}")
+    def _strided(self, place: Table, dtype: np.dtype[Any], count: int, width: int) -> Numbers:
+        data, stride = self._view(place["bufferView"])
+        start = _index(place.get("byteOffset", 0))
         if not count:
             return np.zeros((0, width), dtype)
-        strides = (stride, dtype.itemsize)
+        strides = (stride or dtype.itemsize * width, dtype.itemsize)
         return np.ndarray((count, width), dtype, data, start, strides).copy()
 
-    def _sparse(self, values: Numbers, sparse: dict[str, Any], dtype: np.dtype[Any], field: str) -> Numbers:
-        file, field = self._file, f"{field}.sparse"
-        count = foreign.whole(sparse.get("count"), least=0, most=len(values), source=file.path, field=f"{field}.count")
-        indices, held = sparse.get("indices"), sparse.get("values")
-        if not isinstance(indices, dict) or not isinstance(held, dict):
-            raise file.refuse(field, "must name indices and values")
-        component = indices.get("componentType")
-        if component not in (5121, 5123, 5125):
-            raise file.refuse(f"{field}.indices.componentType", f"is {foreign.shown(component)}")
-        kind = np.dtype("<" + COMPONENTS[component])
-        where = self._strided(indices, indices.get("bufferView"), kind, count, 1, f"{field}.indices")[:, 0]
-        if count and int(where.max()) >= len(values):
-            raise file.refuse(f"{field}.indices", "name elements that are not there")
-        values[where] = self._strided(held, held.get("bufferView"), dtype, count, values.shape[1], f"{field}.values")
+    def _floats(self, index: Any, *kinds: str, count: int | None = None) -> F32:
+        """(n, width) finite numbers; count: how many there must be."""
+        values = np.asarray(self._accessor(index, *kinds), dtype=np.float32)
+        broken = int((~np.isfinite(values).all(1)).sum())
+        if broken:
+            raise InputError(self._path, f"accessors[{index}]", f"{broken} of {len(values)} are not finite")
+        if count is not None and len(values) != count:
+            raise ValueError(f"accessors[{index}] has {len(values)} of {count}")
         return values
-
-    def _floats(self, index: Any, field: str, *, kinds: tuple[str, ...]) -> F32:
-        return np.asarray(self._accessor(index, field, kinds=kinds), dtype=np.float32)
 
     # Nodes.
 
-    def _nodes(self) -> tuple[list[Node], list[int]]:
-        """Every node, and the order in which those of the scene can be worked out: parents first."""
-        file = self._file
-        tables = file.objects("nodes")
-        parents: dict[int, int] = {}
-        for number, table in enumerate(tables):
-            for child in table.get("children", []) or []:
-                parents.setdefault(file.index("nodes", child, f"nodes[{number}].children"), number)
-        scenes = file.objects("scenes")
-        if scenes:
-            roots = file.at("scenes", file.table.get("scene", 0), "scene").get("nodes", [])
+    def _nodes(self, tables: list[Table]) -> tuple[list[Node], list[int]]:
+        """Every node, and the order in which those of the scene can be worked out: parents first, each once."""
+        if self._table.get("scenes"):
+            roots = self._at("scenes", self._table.get("scene", 0)).get("nodes", [])
         else:
-            roots = [number for number in range(len(tables)) if number not in parents]
-        nodes = [self._node(number, table) for number, table in enumerate(tables)]
-        order: list[int] = []
-        seen: set[int] = set()
-        queue = [(-1, root) for root in reversed(roots)]
+            children = {child for table in tables for child in table.get("children", [])}
+            roots = [number for number in range(len(tables)) if number not in children]
+        nodes = [_node(table) for table in tables]
+        order: dict[int, None] = {}
+        queue = [(-1, root, 1) for root in reversed(roots)]
         while queue:
-            parent, child = queue.pop()
-            number = file.index("nodes", child, "scenes.nodes")
-            if number in seen:
-                continue
-            seen.add(number)
-            nodes[number] = replace(nodes[number], parent=parent)
-            order.append(number)
-            queue += [(number, below) for below in reversed(tables[number].get("children", []) or [])]
-        return nodes, order
-
-    def _node(self, number: int, table: dict[str, Any]) -> Node:
-        field = f"nodes[{number}]"
-        if "matrix" in table:
-            matrix = self._row(table["matrix"], 16, f"{field}.matrix").reshape(4, 4).T
-            return Node(matrix=matrix)
-        turn = self._row(table.get("rotation", [0, 0, 0, 1]), 4, f"{field}.rotation")
-        moved = self._row(table.get("translation", [0, 0, 0]), 3, f"{field}.translation")
-        scale = self._row(table.get("scale", [1, 1, 1]), 3, f"{field}.scale")
-        return Node(moved, turn, scale)
-
-    def _row(self, value: Any, count: int, field: str) -> F64:
-        if not isinstance(value, list) or len(value) != count:
-            raise self._file.refuse(field, f"must be {count} numbers")
-        path = self._file.path
-        return np.array([foreign.real(item, least=-1e15, most=1e15, source=path, field=field) for item in value])
+            parent, number, depth = queue.pop()
+            if depth > self._limits.depth:
+                raise InputError(self._path, "nodes", f"are nested deeper than {self._limits.depth}")
+            if number not in order:
+                nodes[_index(number)] = replace(nodes[number], parent=parent)
+                order[number] = None
+                queue += [(number, child, depth + 1) for child in reversed(tables[number].get("children", []))]
+        return nodes, list(order)
 
     # Meshes.
 
-    def _primitives(self, mesh: int, node: int, skin: Skin | None) -> list[tuple[Part, Binding]]:
-        table = self._file.objects("meshes")[mesh]
-        weights = table.get("weights") or []
-        own = self._file.objects("nodes")[node].get("weights")
-        rest = self._row(own, len(own), f"nodes[{node}].weights") if isinstance(own, list) and own else None
-        if rest is None and isinstance(weights, list) and weights:
-            rest = self._row(weights, len(weights), f"meshes[{mesh}].weights")
-        result = []
-        for number, primitive in enumerate(table.get("primitives", [])):
-            made = self._primitive(primitive, f"meshes[{mesh}].primitives[{number}]", node, skin, rest)
-            if made is not None:
-                result.append(made)
-        return result
+    def _mesh(self, index: int) -> list[tuple[Part, Binding]]:
+        """The parts of a mesh, which all its instances share."""
+        if index not in self._meshes:
+            mesh = self._at("meshes", index)
+            made = [self._primitive(primitive, mesh.get("weights")) for primitive in mesh["primitives"]]
+            self._meshes[index] = [item for item in made if item is not None]
+        return self._meshes[index]
 
-    def _primitive(
-        self, primitive: dict[str, Any], field: str, node: int, skin: Skin | None, rest: F64 | None
-    ) -> tuple[Part, Binding] | None:
-        file = self._file
-        attributes = primitive["attributes"]
-        mode = primitive.get("mode", TRIANGLES)
+    def _primitive(self, primitive: Table, weights: ArrayLike | None) -> tuple[Part, Binding] | None:
+        attributes, mode = primitive["attributes"], primitive.get("mode", TRIANGLES)
         if "POSITION" not in attributes or mode not in (TRIANGLES, STRIP, FAN):
             return None  # points and lines
-        positions = self._floats(attributes["POSITION"], f"{field}.attributes.POSITION", kinds=("VEC3",))
-        refuse_broken(positions, file.path)
-        triangles = self._triangles(primitive, mode, len(positions), field)
+        positions = self._floats(attributes["POSITION"], "VEC3")
+        count = len(positions)
+        triangles = self._triangles(primitive, mode, count)
         if not len(triangles):
             return None
-        material = self._material(primitive.get("material"), field)
+        look = self._look(primitive.get("material"))
 
         def attribute(name: str, *kinds: str) -> F32 | None:
-            if name not in attributes:
-                return None
-            values = self._floats(attributes[name], f"{field}.attributes.{name}", kinds=kinds)
-            if len(values) != len(positions):
-                raise file.refuse(f"{field}.attributes.{name}", f"has {len(values)} of {len(positions)}")
-            return values
+            return self._floats(attributes[name], *kinds, count=count) if name in attributes else None
 
-        uv = attribute(f"TEXCOORD_{material.uv_set}", "VEC2")
-        if uv is not None and not np.isfinite(uv).all():
-            raise file.refuse("texture coordinates", "are not all finite")
-        if uv is not None and material.uv_from_uv is not None:
-            uv = np.asarray(uv @ material.uv_from_uv[:2, :2].T + material.uv_from_uv[:2, 2], dtype=np.float32)
+        uv = attribute(f"TEXCOORD_{look.uv_set}", "VEC2")
+        if uv is not None and look.uv_from_uv is not None:
+            uv = np.asarray(uv @ look.uv_from_uv[:2, :2].T + look.uv_from_uv[:2, 2], dtype=np.float32)
         normals = attribute("NORMAL", "VEC3")
-        if normals is None or not np.isfinite(normals).all():
+        if normals is None:
             normals = smooth_normals(positions, triangles)
         colours = attribute("COLOR_0", "VEC3", "VEC4")
         part = Part(
-            Shape(positions, normals, uv if uv is not None else np.zeros((len(positions), 2), np.float32), triangles),
-            picture=material.picture if uv is not None else None,
-            colour=material.colour,
-            vertex_colours=None if colours is None else np.clip(np.nan_to_num(colours[:, :3]), 0.0, 1.0),
-            lit=material.lit,
+            Shape(positions, normals, uv if uv is not None else np.zeros((count, 2), np.float32), triangles),
+            picture=None if uv is None else look.picture,
+            colour=look.colour,
+            vertex_colours=None if colours is None else np.clip(colours[:, :3], 0.0, 1.0),
+            lit=look.lit,
         )
-        return part, self._binding(primitive, attribute, field, node, skin, rest, len(positions))
-
-    def _binding(
-        self,
-        primitive: dict[str, Any],
-        attribute: Callable[..., F32 | None],
-        field: str,
-        node: int,
-        skin: Skin | None,
-        rest: F64 | None,
-        count: int,
-    ) -> Binding:
-        """What moves the vertices of a part beside its node."""
-        file = self._file
-        morphs = []
-        for number, target in enumerate(primitive.get("targets") or []):
-            if not isinstance(target, dict) or "POSITION" not in target:
-                raise file.refuse(f"{field}.targets[{number}]", "moves no positions")
-            where = f"{field}.targets[{number}].POSITION"
-            moved = self._floats(target["POSITION"], where, kinds=("VEC3",))
-            if len(moved) != count or not np.isfinite(moved).all():
-                raise file.refuse(where, f"has {len(moved)} of {count}, or some that are not finite")
-            morphs.append(moved)
-        joints = weights = None
-        if skin is not None:
-            joints, weights = attribute("JOINTS_0", "VEC4"), attribute("WEIGHTS_0", "VEC4")
-            if joints is None or weights is None:
-                skin = None
-        if skin is not None and joints is not None and weights is not None:
-            if not np.isfinite(weights).all() or joints.max(initial=0) >= len(skin.joints):
-                raise file.refuse(
-                    f"{field}.attributes.JOINTS_0", f"names bones beyond the {len(skin.joints)} there are"
-                )
-            total = weights.sum(1, keepdims=True)
-            weights = np.divide(weights, total, out=np.zeros_like(weights), where=total > 0)
-            joints = joints.astype(np.int32)
-        return Binding(
-            node=node,
-            skin=skin,
-            joints=None if joints is None else np.asarray(joints, dtype=np.int32),
-            weights=weights,
+        targets = primitive.get("targets", [])
+        morphs = [self._floats(target["POSITION"], "VEC3", count=count) for target in targets]
+        joints, shares = attribute("JOINTS_0", "VEC4"), attribute("WEIGHTS_0", "VEC4")
+        if joints is not None and shares is not None:
+            total = shares.sum(1, keepdims=True)
+            shares = np.divide(shares, total, out=np.zeros_like(shares), where=total > 0)
+        return part, Binding(
+            node=-1,
+            joints=None if joints is None or shares is None else joints.astype(np.int32),
+            weights=shares,
             morphs=np.stack(morphs) if morphs else None,
-            rest_weights=np.zeros(len(morphs)) if rest is None or len(rest) != len(morphs) else rest,
+            rest_weights=np.zeros(len(morphs)) if weights is None else np.asarray(weights, dtype=np.float64),
         )
 
-    def _triangles(self, primitive: dict[str, Any], mode: int, count: int, field: str) -> I32:
+    def _triangles(self, primitive: Table, mode: int, count: int) -> I32:
+        indices = np.arange(count, dtype=np.int32)
         if "indices" in primitive:
-            indices = self._accessor(primitive["indices"], f"{field}.indices", kinds=("SCALAR",))[:, 0]
-            if indices.dtype.kind != "u":
-                raise self._file.refuse(f"{field}.indices", "are no whole numbers from 0 up")
-            if len(indices) and int(indices.max()) >= count:
-                raise self._file.refuse("faces", "refer to vertices that are not there")
-            indices = indices.astype(np.int32)
-        else:
-            indices = np.arange(count, dtype=np.int32)
+            found = self._accessor(primitive["indices"], "SCALAR")[:, 0]
+            if found.dtype.kind != "u" or found.max(initial=0) >= max(count, 1):
+                raise InputError(self._path, "faces", "refer to vertices that are not there")
+            indices = found.astype(np.int32)
         if mode == TRIANGLES:
             return np.ascontiguousarray(indices[: len(indices) // 3 * 3].reshape(-1, 3))
         if len(indices) < 3:
             return np.zeros((0, 3), np.int32)
-        if mode == FAN:
-            return np.column_stack([np.full(len(indices) - 2, indices[0]), indices[1:-1], indices[2:]]).astype(np.int32)
-        strip = np.column_stack([indices[:-2], indices[1:-1], indices[2:]])
-        strip[1::2] = strip[1::2, [1, 0, 2]]
-        return strip.astype(np.int32)
+        first = np.full(len(indices) - 2, indices[0]) if mode == FAN else indices[:-2]
+        strip = np.column_stack([first, indices[1:-1], indices[2:]]).astype(np.int32)
+        if mode == STRIP:
+            strip[1::2] = strip[1::2, [1, 0, 2]]
+        return strip
 
     # Materials.
 
-    def _material(self, index: Any, field: str) -> _Material:
+    def _look(self, index: Any) -> _Look:
         if index is None:
-            return _Material()
-        number = self._file.index("materials", index, f"{field}.material")
-        if number not in self._materials:
-            self._materials[number] = self._read_material(number)
-        return self._materials[number]
+            return _Look()
+        if index not in self._looks:
+            self._looks[index] = self._look_of(self._at("materials", index))
+        return self._looks[index]
 
-    def _read_material(self, number: int) -> _Material:
-        file, field = self._file, f"materials[{number}]"
-        table = file.objects("materials")[number]
-        extensions = _table(table.get("extensions"))
-        shading = _table(table.get("pbrMetallicRoughness"))
-        wanted, factor = shading.get("baseColorTexture"), shading.get("baseColorFactor")
-        other = extensions.get("KHR_materials_pbrSpecularGlossiness")
-        if wanted is None and factor is None and isinstance(other, dict):
-            wanted, factor = other.get("diffuseTexture"), other.get("diffuseFactor")
-        numbers = self._row(factor, 4, f"{field}.baseColorFactor") if factor is not None else np.ones(4)
-        red, green, blue, opacity = np.clip(numbers, 0.0, 1.0).tolist()
-        result = _Material(colour=(red, green, blue), lit="KHR_materials_unlit" not in extensions)
-        if not isinstance(wanted, dict):
-            return result
-        mode = table.get("alphaMode", "OPAQUE")
-        alpha: Alpha = mode if mode in ("MASK", "BLEND") else "OPAQUE"
-        cutoff = float(table.get("alphaCutoff", 0.5)) if alpha == "MASK" else 0.5
-        texture = file.at("textures", wanted.get("index"), f"{field}.baseColorTexture")
-        webp = _table(texture.get("extensions")).get("EXT_texture_webp")
-        source = webp.get("source") if isinstance(webp, dict) else texture.get("source")
-        image = file.index("images", source, f"{field}.baseColorTexture")
-        uv_set = foreign.whole(wanted.get("texCoord", 0), least=0, most=7, source=file.path, field=f"{field}.texCoord")
-        change = _table(wanted.get("extensions")).get("KHR_texture_transform")
-        moved = self._uv_change(change, field) if isinstance(change, dict) else None
-        picture = self._picture(image, alpha, cutoff / opacity if opacity > 0 else 2.0)
-        return replace(result, picture=picture, uv_set=uv_set, uv_from_uv=moved)
+    def _look_of(self, material: Table) -> _Look:
+        extensions = material.get("extensions", {})
+        shading = material.get("pbrMetallicRoughness", {})
+        use, factor = shading.get("baseColorTexture"), shading.get("baseColorFactor")
+        glossy = extensions.get("KHR_materials_pbrSpecularGlossiness")
+        if use is None and factor is None and glossy is not None:
+            use, factor = glossy.get("diffuseTexture"), glossy.get("diffuseFactor")
+        red, green, blue, opacity = np.clip(_row(factor or (1, 1, 1, 1), 4), 0.0, 1.0).tolist()
+        look = _Look(colour=(red, green, blue), lit="KHR_materials_unlit" not in extensions)
+        if use is None:
+            return look
+        texture = self._at("textures", use["index"])
+        source = texture.get("extensions", {}).get("EXT_texture_webp", texture).get("source")
+        if source is None:
+            raise InputError(self._path, "textures", "hold a picture in a format that is not understood")
+        cutoff = {"MASK": material.get("alphaCutoff", 0.5), "BLEND": 0.5}.get(str(material.get("alphaMode")), 0.0)
+        picture = self._picture(source, cutoff / opacity if opacity > 0 else 2.0)
+        change = use.get("extensions", {}).get("KHR_texture_transform")
+        moved = None if change is None else _uv_change(change)
+        return replace(look, picture=picture, uv_set=_index(use.get("texCoord", 0)), uv_from_uv=moved)
 
-    def _uv_change(self, table: dict[str, Any], field: str) -> F64:
-        field = f"{field}.KHR_texture_transform"
-        across, down = self._row(table.get("offset", [0, 0]), 2, f"{field}.offset")
-        wide, high = self._row(table.get("scale", [1, 1]), 2, f"{field}.scale")
-        turn = self._row([table.get("rotation", 0.0)], 1, f"{field}.rotation")[0]
-        cosine, sine = np.cos(turn), np.sin(turn)
-        return np.array([[cosine * wide, sine * high, across], [-sine * wide, cosine * high, down], [0.0, 0.0, 1.0]])
-
-    def _picture(self, image: int, alpha: Alpha, cutoff: float) -> U8:
-        """RGBA whose alpha is cut at a half, wherever the material cuts it."""
-        key = (image, alpha, cutoff)
-        if key not in self._pictures:
-            rgba = decoded_picture(picture_bytes(self._file, image))
-            if alpha == "OPAQUE":
-                rgba[..., 3] = 255
-            elif cutoff != 0.5:
-                rgba[..., 3] = np.clip(rgba[..., 3] * (0.5 / max(cutoff, 1e-3)), 0, 255).astype(np.uint8)
-            self._pictures[key] = rgba
-        return self._pictures[key]
+    def _picture(self, index: int, cutoff: float) -> U8:
+        """RGBA whose alpha is cut at a half, wherever the material cuts it; 0: nowhere."""
+        if (index, cutoff) not in self._pictures:
+            item = self._at("images", index)
+            coded = self._bytes_of(item, "texture")
+            if coded is None:
+                coded = self._view(item["bufferView"])[0]
+            name = f"images[{index}]"
+            check_picture(coded, source=self._path, field="texture", name=name, limits=self._limits)
+            rgba = decoded_picture(coded)
+            rgba[..., 3] = np.clip(rgba[..., 3] * (0.5 / max(cutoff, 1e-3)), 0, 255) if cutoff else 255
+            self._pictures[index, cutoff] = rgba
+        return self._pictures[index, cutoff]
 
     # What moves.
 
-    def _skin(self, index: int, table: dict[str, Any], nodes: int) -> Skin:
-        field = f"skins[{index}]"
-        joints = [self._file.index("nodes", joint, f"{field}.joints") for joint in table["joints"]]
+    def _skin(self, table: Table) -> Skin:
+        joints = tuple(_index(joint) for joint in table["joints"])
         bound = np.tile(np.eye(4), (len(joints), 1, 1))
-        if table.get("inverseBindMatrices") is not None:
-            where = f"{field}.inverseBindMatrices"
-            held = self._floats(table["inverseBindMatrices"], where, kinds=("MAT4",))
-            if len(held) < len(joints) or not np.isfinite(held).all():
-                raise self._file.refuse(where, f"has {len(held)} of {len(joints)}, or some that are not finite")
-            bound = held[: len(joints)].astype(np.float64).reshape(-1, 4, 4).transpose(0, 2, 1)
-        return Skin(tuple(joints), bound)
+        if "inverseBindMatrices" in table:
+            held = self._floats(table["inverseBindMatrices"], "MAT4").astype(np.float64)
+            bound = held[: len(joints)].reshape(len(joints), 4, 4).transpose(0, 2, 1)
+        return Skin(joints, bound)
 
     def _channels(self, animation: str) -> tuple[Channel, ...]:
         """Of the animation that plays; none where there is none."""
-        tables = self._file.objects("animations")
+        tables = self._table.get("animations", [])
         if not tables or animation == "none":
             return ()
         names = [str(table.get("name", "")) for table in tables]
-        if not animation:
-            number = 0
-        elif animation in names:
-            number = names.index(animation)
-        elif animation.isascii() and animation.isdigit() and int(animation[:9]) < len(tables):
-            number = int(animation[:9])
-        else:
+        numbers = [str(number) for number in range(len(tables))]
+        if animation and animation not in (*names, *numbers):
             known = ", ".join(foreign.shown(name) for name in names[:8])
             raise InputError("content", "animation", f"{animation!r} is none of the {len(tables)} of the file: {known}")
-        table, field = tables[number], f"animations[{number}]"
-        samplers = table.get("samplers")
-        if not isinstance(samplers, list) or not all(isinstance(item, dict) for item in samplers):
-            raise self._file.refuse(f"{field}.samplers", "must be a list of objects")
-        channels = []
-        for index, item in enumerate(table.get("channels") or []):
-            made = self._channel(item, samplers, f"{field}.channels[{index}]")
-            if made is not None:
-                channels.append(made)
-        return tuple(channels)
+        table = tables[names.index(animation) if animation in names else numbers.index(animation or "0")]
+        made = [
+            self._channel(channel["target"], table["samplers"][channel["sampler"]]) for channel in table["channels"]
+        ]
+        return tuple(channel for channel in made if channel is not None)
 
-    def _channel(self, item: Any, samplers: list[dict[str, Any]], field: str) -> Channel | None:
-        file = self._file
-        target = _table(_table(item).get("target"))
-        path = target.get("path")
-        if target.get("node") is None or path not in ("translation", "rotation", "scale", "weights"):
+    def _channel(self, target: Table, sampler: Table) -> Channel | None:
+        node, path = target.get("node"), target["path"]
+        if node is None or path not in ("translation", "rotation", "scale", "weights"):
             return None  # of an extension
-        node = file.index("nodes", target["node"], f"{field}.target.node")
-        which = foreign.whole(
-            _table(item).get("sampler"), least=0, most=max(len(samplers) - 1, 0), source=file.path, field=field
-        )
-        sampler = samplers[which] if which < len(samplers) else {}
-        times = self._floats(sampler.get("input"), f"{field}.input", kinds=("SCALAR",))[:, 0].astype(np.float64)
-        if not len(times) or not np.isfinite(times).all() or (np.diff(times) < 0).any() or times[0] < 0:
-            raise file.refuse(f"{field}.input", "its times must ascend from 0")
+        times = self._floats(sampler["input"], "SCALAR")[:, 0].astype(np.float64)
+        if not len(times) or (np.diff(times) < 0).any() or times[0] < 0:
+            raise ValueError("the times of an animation must ascend from 0")
+        values = self._floats(sampler["output"], {"rotation": "VEC4", "weights": "SCALAR"}.get(path, "VEC3"))
         kind = sampler.get("interpolation", "LINEAR")
-        if kind not in ("LINEAR", "STEP", "CUBICSPLINE"):
-            raise file.refuse(f"{field}.interpolation", f"is {foreign.shown(kind)}")
-        kinds = {"rotation": ("VEC4",), "weights": ("SCALAR",)}.get(path, ("VEC3",))
-        values = self._floats(sampler.get("output"), f"{field}.output", kinds=kinds).astype(np.float64)
-        keys = len(times) * (3 if kind == "CUBICSPLINE" else 1)
-        if not np.isfinite(values).all() or len(values) < keys or len(values) % keys:
-            raise file.refuse(f"{field}.output", f"has {len(values)} for {keys}, or some that are not finite")
-        width = len(values) // keys if path == "weights" else 1
-        if path != "weights" and len(values) != keys:
-            raise file.refuse(f"{field}.output", f"has {len(values)} for {keys}")
-        shaped = values.reshape(len(times), keys // len(times), width * values.shape[1])
-        return Channel(node, path, kind, times, shaped)
+        shape = (len(times), 3 if kind == "CUBICSPLINE" else 1, -1 if path == "weights" else values.shape[1])
+        return Channel(_index(node), path, kind, times, values.astype(np.float64).reshape(shape))
 
 
-def refuse_broken(positions: F32, path: Path) -> None:
-    """Raises InputError for vertices that are not finite."""
-    broken = int((~np.isfinite(positions).all(1)).sum())
-    if broken:
-        raise InputError(path, "vertices", f"{broken} of {len(positions)} are not finite")
+def _index(value: Any) -> int:
+    """A whole number from 0 up: lists take negative ones."""
+    if not isinstance(value, int) or not 0 <= value < 1 << 40:
+        raise ValueError(f"{foreign.shown(value)} is no index, count or size")
+    return value
+
+
+def _row(values: Any, count: int) -> F64:
+    row = np.asarray(values, dtype=np.float64)
+    if row.shape != (count,) or not (np.abs(row) <= 1e15).all():
+        raise ValueError(f"{foreign.shown(values)} must be {count} numbers")
+    return row
+
+
+def _node(table: Table) -> Node:
+    if "matrix" in table:
+        return Node(matrix=_row(table["matrix"], 16).reshape(4, 4).T)
+    turn, scale = _row(table.get("rotation", (0, 0, 0, 1)), 4), _row(table.get("scale", (1, 1, 1)), 3)
+    return Node(_row(table.get("translation", (0, 0, 0)), 3), turn, scale)
+
+
+def _bound(binding: Binding, node: int, weights: ArrayLike | None, skin: Skin | None) -> Binding:
+    """A part's binding where it stands. weights: of the node, which go before the mesh's."""
+    if binding.joints is None:
+        skin = None
+    elif skin is not None and binding.joints.max(initial=0) >= len(skin.joints):
+        raise ValueError(f"JOINTS_0 names bones beyond the {len(skin.joints)} there are")
+    count = 0 if binding.morphs is None else len(binding.morphs)
+    rest = binding.rest_weights if weights is None else np.asarray(weights, dtype=np.float64)
+    return replace(binding, node=node, skin=skin, rest_weights=_row(rest if count else (), count))
+
+
+def _uv_change(table: Table) -> F64:
+    """3x3 of KHR_texture_transform."""
+    (across, down), (wide, high) = _row(table.get("offset", (0, 0)), 2), _row(table.get("scale", (1, 1)), 2)
+    cosine, sine = np.cos(table.get("rotation", 0.0)), np.sin(table.get("rotation", 0.0))
+    return np.array([[cosine * wide, sine * high, across], [-sine * wide, cosine * high, down], [0.0, 0.0, 1.0]])
 
 
 def smooth_normals(positions: F32, triangles: I32) -> F32:
@@ -457,7 +445,3 @@ def decoded_picture(coded: bytes) -> U8:
         if max(image.size) > LARGEST_TEXTURE_PX:
             image.thumbnail((LARGEST_TEXTURE_PX, LARGEST_TEXTURE_PX))
         return np.array(image.convert("RGBA"))
-
-
-def _table(value: Any) -> dict[str, Any]:
-    return value if isinstance(value, dict) else {}

@@ -24,12 +24,12 @@ class Loaded:
     problem: str = ""
 
 
-class _Overtaken(Exception):
+class _Skipped(Exception):
     """A newer request made this one needless."""
 
 
 class ContentLoader:
-    """One request at a time; a newer one overtakes an older. `poll` belongs to the thread with the GL context."""
+    """One request at a time; a newer one skips an older. `poll` belongs to the thread with the GL context."""
 
     def __init__(self, stack: PanelStack, *, limits: LimitSettings | None = None) -> None:
         """limits: of what files may hold; None: the defaults."""
@@ -70,13 +70,13 @@ class ContentLoader:
         def tell(what: str, done: int, total: int | None) -> None:
             with self._lock:
                 if number != self._wanted:
-                    raise _Overtaken
+                    raise _Skipped
                 self.progress = f"{what}: {done} of {total}" if total else f"{what}: {done}" if done else what
 
         try:
             with progress.listening(tell):
                 opener = prepare_content(settings, self._stack, limits=self._limits)
-        except _Overtaken:
+        except _Skipped:
             return
         except PhasestackError as error:
             problem = str(error)

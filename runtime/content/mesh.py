@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import io
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,12 @@ from runtime.clock import NS_PER_S
 from runtime.config import LimitSettings
 from runtime.content import camera
 from runtime.content.base import ContentInfo, DrawingSource, View
-from runtime.content.gltf import LARGEST_TEXTURE_PX, GltfScene, load_gltf
-from runtime.content.gltf_header import file_of
-from runtime.content.ply import check_counts
+from runtime.content.gltf import LARGEST_TEXTURE_PX, GltfScene, file_of, load_gltf
+from runtime.content.placing import SceneFile
+from runtime.content.ply import read_header
 from runtime.content.rig import Pose, Rig, deformed
 from runtime.content.shapes import Shape
-from runtime.content.triangles import Part, ReadyPart, TrianglePainter
+from runtime.content.triangles import Part, ReadyPart, TrianglePainter, ready
 from runtime.errors import InputError, MissingPart, one_line
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64, U8
@@ -28,10 +29,11 @@ from runtime.support import foreign, progress
 from runtime.support.gl import DrawnPicture
 from runtime.support.picture_header import check_picture
 
-UNCOLOURED = (0.70, 0.74, 0.80)  # of an STL, which has no colours
+log = logging.getLogger("phasestack.content")
+
+UNCOLOURED = (0.70, 0.74, 0.80)  # of a file that says nothing of colours
 GLTF = (".glb", ".gltf")
 STL_HEAD, STL_FACET = 84, 50  # bytes of a binary file's head and of each of its triangles
-LIBRARY_BYTES_MAX = 16 << 20  # of an OBJ's materials
 LARGEST_COORDINATE = 1e15  # products of three still fit in float32's range
 
 
@@ -46,6 +48,19 @@ class MeshData:
     rig: Rig | None = None  # that moves it; None: it stands still
 
 
+def prepare(file: SceneFile) -> Callable[[Any], MeshSource]:
+    """Read it and make its outlines ready; the answer uploads them. Raises InputError."""
+    data = load_mesh(file.path, limits=file.limits, animation=file.settings.animation)
+    parts = []
+    for number, part in enumerate(data.parts):
+        progress.tell(f"{file.path.name}: outlines", number, len(data.parts))
+        parts.append(ready(part))
+    matrix = file.placed(data.low, data.high)
+    return lambda context: MeshSource(
+        data, stack_from_scene=matrix, context=context, background=file.background, parts=parts
+    )
+
+
 def load_mesh(path: Path, *, limits: LimitSettings | None = None, animation: str = "") -> MeshData:
     """Read a file. Raises InputError: unreadable, over a limit, no faces, NaN vertices, a texture missing.
 
@@ -58,37 +73,30 @@ def load_mesh(path: Path, *, limits: LimitSettings | None = None, animation: str
         return _of_gltf(path, load_gltf(path, data, limits=limits, animation=animation))
     if importlib.util.find_spec("trimesh") is None:
         raise MissingPart("meshes need trimesh: pip install trimesh")
-    _refuse_what_loaders_hide(path, data, limits)
-    progress.tell(f"{path.name}: triangles", 0)
-    try:
-        with np.errstate(all="ignore"):  # coordinates beyond any scene overflow in the loader; they are told below
-            geometries: list[Any] = list(_scene(path, data, limits).dump())
-    except InputError:
-        raise
-    except Exception as error:  # loaders raise whatever their parsers do
-        problem = one_line(str(error), most=120)
-        raise InputError(path, "", f"cannot be read as a mesh ({type(error).__name__}: {problem})") from None
-    meshes = [item for item in geometries if getattr(item, "faces", None) is not None and len(item.faces)]
+    _check_counts(path, data, limits)
     pictures: dict[int, U8] = {}
-    parts = []
-    for number, mesh in enumerate(meshes):
-        progress.tell(f"{path.name}: parts", number, len(meshes))
-        part = _part(mesh, path, pictures)
-        # White before white is hard to see.
-        parts.append(replace(part, colour=UNCOLOURED) if path.suffix.lower() == ".stl" else part)
-    _refuse_empty(path, parts)
+    with np.errstate(all="ignore"):  # coordinates beyond any scene overflow; they are refused below
+        parts = [_part(mesh, path, pictures) for mesh in _loaded(path, data, limits)]
+    triangles = sum(len(part.shape.triangles) for part in parts)
+    foreign.within(triangles, limits.triangles, source=path, field="faces")
+    _check(path, parts)
     return _boxed(path, parts, [part.shape.positions_m for part in parts])
 
 
-def _refuse_empty(path: Path, parts: Sequence[Part]) -> None:
+def _check(path: Path, parts: Sequence[Part]) -> None:
+    """Raises InputError where nothing could be seen, or not drawn."""
     if not parts:
         raise InputError(path, "faces", "there are none")
+    has_area = False
     for part in parts:
-        huge = int((np.abs(part.shape.positions_m) > LARGEST_COORDINATE).any(1).sum())
-        if huge:
-            problem = f"{huge} of {len(part.shape.positions_m)} are beyond {LARGEST_COORDINATE:g}"
+        points = part.shape.positions_m.astype(np.float64)
+        broken = int((~(np.abs(points) <= LARGEST_COORDINATE).all(1)).sum())  # NaN too
+        if broken:
+            problem = f"{broken} of {len(points)} are not finite, or beyond {LARGEST_COORDINATE:g}"
             raise InputError(path, "vertices", problem)
-    if not any(_has_area(part.shape) for part in parts):
+        corner = points[part.shape.triangles]
+        has_area |= bool(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).any())
+    if not has_area:
         raise InputError(path, "faces", "none has an area")
 
 
@@ -103,13 +111,13 @@ def _boxed(path: Path, parts: Sequence[Part], points: Sequence[F32], rig: Rig | 
 
 def _of_gltf(path: Path, scene: GltfScene) -> MeshData:
     """Parts that stand still are carried into the scene's frame once; those of a rig that moves stay in their own."""
-    _refuse_empty(path, scene.parts)
+    _check(path, scene.parts)
     rig = scene.rig
     points = []
     for number, time_s in enumerate(rig.times_s()):
         progress.tell(f"{path.name}: places", number)
         pose = rig.pose(time_s)
-        with np.errstate(all="ignore"):  # what overflows is told by its box
+        with np.errstate(all="ignore"):  # what overflows is refused by its box
             points += [shape.positions_m for shape in _shapes(scene.parts, rig, pose)]
     if rig.moves:
         return _boxed(path, scene.parts, points, rig)
@@ -148,94 +156,101 @@ def _carried(shape: Shape, matrix: F64) -> Shape:
     return Shape(positions, normals, shape.uv, triangles)
 
 
-def _scene(path: Path, data: bytes, limits: LimitSettings) -> Any:
+def _check_counts(path: Path, data: bytes, limits: LimitSettings) -> None:
+    """What a file promises, before its loader takes memory for it. Raises InputError."""
+    suffix, promised = path.suffix.lower(), 0
+    if suffix == ".ply":
+        read_header(path, limits)
+    elif suffix == ".stl":
+        text = data[:5] == b"solid" and b"facet normal" in data[:1024]
+        promised = data.count(b"facet normal") if text else (len(data) - STL_HEAD) // STL_FACET
+    elif suffix == ".obj":
+        promised = data.count(b"\nf ")
+    foreign.within(promised, limits.triangles, source=path, field="faces")
+
+
+def _loaded(path: Path, data: bytes, limits: LimitSettings) -> list[Any]:
+    """Every trimesh of a file that has faces. Raises InputError."""
     import trimesh
 
     kind = path.suffix.lower().removeprefix(".")
-    # Of an OBJ only names and comments can be other than ASCII, and exporters differ in how they write them.
-    file = io.StringIO(data.decode("utf-8", errors="replace")) if kind == "obj" else io.BytesIO(data)
-    return trimesh.load_scene(file, file_type=kind, resolver=_resolver(path, limits), process=False)
 
+    class Beside(trimesh.resolvers.FilePathResolver):
+        """What a loader reads beside a file: it passes over what it does not get, so that this keeps why."""
 
-def _resolver(path: Path, limits: LimitSettings) -> Any:
-    """What a loader reads beside a file: regular files there, within the limit."""
-    import trimesh
-
-    class Beside(trimesh.resolvers.Resolver):
-        def __init__(self) -> None:
-            pass
+        refused: InputError | None = None
+        has_materials = kind != "obj" or b"mtllib" in data
 
         def get(self, name: str) -> bytes:
-            beside = file_of(name, source=path, field="texture")
-            if beside is None:
-                raise InputError(path, "texture", "data in place of a name")
-            return foreign.read_bytes(
-                beside, most_bytes=round(limits.file_mib * foreign.MIB), source=path, field="texture"
-            )
+            most = round(limits.file_mib * foreign.MIB)
+            try:
+                beside = file_of(name, source=path, field="texture")
+                found = foreign.read_bytes(beside, most_bytes=most, source=path, field="texture")
+                if not name.lower().endswith(".mtl"):
+                    check_picture(found, source=path, field="texture", name=foreign.shown(name), limits=limits)
+            except InputError as error:
+                if name.lower().endswith(".mtl"):
+                    log.warning("%s: is drawn grey without its materials (%s)", path, error.problem)
+                    self.has_materials = False
+                    raise OSError from None
+                self.refused = error
+                raise
+            return found
 
-        def write(self, name: str, data: Any) -> None:
-            raise NotImplementedError  # only exporters do
-
-        def namespaced(self, namespace: str) -> Any:
-            return self
-
-        def keys(self) -> list[str]:
-            return []
-
-    return Beside()
-
-
-def _has_area(shape: Shape) -> bool:
-    corner = shape.positions_m.astype(np.float64)[shape.triangles]
-    return bool(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).any())
+    progress.tell(f"{path.name}: triangles", 0)
+    resolver = Beside(str(path))
+    # Of an OBJ only names and comments can be other than ASCII, and exporters differ in how they write them.
+    file = io.StringIO(data.decode("utf-8", errors="replace")) if kind == "obj" else io.BytesIO(data)
+    try:
+        geometries: list[Any] = list(trimesh.load_scene(file, file_type=kind, resolver=resolver, process=False).dump())
+    except Exception as error:  # loaders raise whatever their parsers do
+        problem = one_line(str(error), most=120)
+        raise InputError(path, "", f"cannot be read as a mesh ({type(error).__name__}: {problem})") from None
+    if resolver.refused is not None:
+        raise resolver.refused
+    meshes = [item for item in geometries if getattr(item, "faces", None) is not None and len(item.faces)]
+    for mesh in meshes:
+        if mesh.visual.kind == "texture" and not resolver.has_materials:  # it has the loader's own then
+            mesh.visual = trimesh.visual.ColorVisuals(mesh)
+    return meshes
 
 
 def _part(mesh: Any, path: Path, pictures: dict[int, U8]) -> Part:
-    vertices = np.asarray(mesh.vertices)
-    faces = np.asarray(mesh.faces)
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
-        raise InputError(path, "vertices", f"have {vertices.shape[-1]} coordinates and faces {faces.shape[-1]} corners")
-    if not np.isfinite(vertices).all():
-        broken = int((~np.isfinite(vertices).all(1)).sum())
-        raise InputError(path, "vertices", f"{broken} of {len(vertices)} are not finite")
-    huge = int((np.abs(vertices) > LARGEST_COORDINATE).any(1).sum())
-    if huge:  # beyond float32 too, perhaps
-        raise InputError(path, "vertices", f"{huge} of {len(vertices)} are beyond {LARGEST_COORDINATE:g}")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(path, "faces", "refer to vertices that are not there")
-    uv, picture, colour, colours = None, None, (1.0, 1.0, 1.0), None
-    kind = mesh.visual.kind
+    """Of a trimesh: its texture alone, as other viewers show it, or colours of its faces or vertices, or grey."""
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(path, "faces", "are no triangles of vertices that are there")
+    normals = np.asarray(mesh.vertex_normals)
+    visual, kind = mesh.visual, mesh.visual.kind
+    picture, colour, colours = None, (1.0, 1.0, 1.0), None
+    uv: Any
     if kind == "texture":
-        uv = mesh.visual.uv
-        picture, colour = _material(mesh.visual.material, pictures)
-        attributes = getattr(mesh.visual, "vertex_attributes", {})
-        if "color" in attributes:
-            colours = _unit(np.asarray(attributes["color"])[:, :3])
-    elif kind == "face":
-        colours_of_faces = _unit(np.asarray(mesh.visual.face_colors)[:, :3])
-        vertices, colours = vertices[faces].reshape(-1, 3), np.repeat(colours_of_faces, 3, axis=0)
-        normals = np.repeat(mesh.face_normals, 3, axis=0)
-        faces = np.arange(len(vertices)).reshape(-1, 3)
+        picture, colour = _material(visual.material, pictures)
+        if path.suffix.lower() == ".ply":  # which has no materials; the loader's own is grey
+            colour = (1.0, 1.0, 1.0)
     elif kind == "vertex":
-        colours = _unit(np.asarray(mesh.visual.vertex_colors)[:, :3])
-    if kind != "face":
-        normals = np.asarray(mesh.vertex_normals)
-    textured = picture is not None and uv is not None
-    flipped = (
-        np.column_stack([uv[:, 0], 1.0 - uv[:, 1]]) if textured and uv is not None else np.zeros((len(vertices), 2))
-    )
-    if not np.isfinite(flipped).all():
+        colours = visual.vertex_colors
+    elif kind == "face":
+        colours, normals = np.repeat(visual.face_colors, 3, axis=0), np.repeat(mesh.face_normals, 3, axis=0)
+        vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
+    else:
+        colour = UNCOLOURED
+    if picture is None or visual.uv is None:
+        picture, uv = None, np.zeros((len(vertices), 2))
+    else:
+        uv = np.column_stack([visual.uv[:, 0], 1.0 - visual.uv[:, 1]])
+    if not np.isfinite(uv).all():
         raise InputError(path, "texture coordinates", "are not all finite")
-    shape = Shape(
-        vertices.astype(np.float32), normals.astype(np.float32), flipped.astype(np.float32), faces.astype(np.int32)
-    )
-    return Part(shape, picture=picture if textured else None, colour=colour, vertex_colours=colours)
+    positions, normals, uv = (array.astype(np.float32) for array in (vertices, normals, uv))
+    shape = Shape(positions, normals, uv, faces.astype(np.int32))
+    return Part(shape, picture=picture, colour=colour, vertex_colours=None if colours is None else _unit(colours))
 
 
-def _unit(colours: Any) -> Any:
-    """Colours of either type as floats in [0, 1]."""
-    scale = 255.0 if colours.dtype.kind in "ui" and colours.dtype.itemsize == 1 else 1.0
-    return np.clip(colours.astype(np.float32) / scale, 0.0, 1.0)
+def _unit(colours: Any) -> F32:
+    """(n, 3) colours of either type as floats in [0, 1]."""
+    numbers = np.asarray(colours)[..., :3]
+    scale = np.float32(255.0 if numbers.dtype == np.uint8 else 1.0)
+    return np.asarray(np.clip(numbers.astype(np.float32) / scale, 0.0, 1.0), dtype=np.float32)
 
 
 def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, tuple[float, float, float]]:
@@ -244,81 +259,14 @@ def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, tuple[
     A texture's colour is white where it says black: exporters write so who mean the texture alone.
     """
     image, factor = getattr(material, "image", None), getattr(material, "diffuse", None)
-    numbers = np.ones(3) if factor is None else _unit(np.asarray(factor)[:3])
-    if image is not None and not numbers.any():
-        numbers = np.ones(3)
-    colour = (float(numbers[0]), float(numbers[1]), float(numbers[2]))
+    red, green, blue = _unit(np.ones(3) if factor is None else factor).tolist()
     if image is None:
-        return None, colour
+        return None, UNCOLOURED if factor is None else (red, green, blue)
     if id(image) not in pictures:
         if max(image.size) > LARGEST_TEXTURE_PX:
             image.thumbnail((LARGEST_TEXTURE_PX, LARGEST_TEXTURE_PX))
         pictures[id(image)] = np.asarray(image.convert("RGBA"))
-    return pictures[id(image)], colour
-
-
-def _refuse_what_loaders_hide(path: Path, data: bytes, limits: LimitSettings) -> None:
-    """The loader passes over textures that aren't there or aren't pictures, and over an OBJ's broken numbers."""
-    suffix = path.suffix.lower()
-    if suffix == ".ply":
-        check_counts(path, data, limits=limits)
-    elif suffix == ".stl":
-        _check_stl(path, data, limits)
-    elif suffix == ".obj":
-        for name in _of_obj(path, data, limits):
-            picture = file_of(name, source=path, field="texture")
-            if picture is None or not picture.is_file():
-                raise InputError(path, "texture", f"{foreign.shown(name, most=200)} is not there")
-            held = foreign.read_bytes(
-                picture, most_bytes=round(limits.file_mib * foreign.MIB), source=path, field="texture"
-            )
-            check_picture(held, source=path, field="texture", name=foreign.shown(name, most=200), limits=limits)
-
-
-def _check_stl(path: Path, data: bytes, limits: LimitSettings) -> None:
-    """How many triangles it promises. Raises InputError."""
-    promised = int.from_bytes(data[STL_HEAD - 4 : STL_HEAD], "little") if len(data) >= STL_HEAD else 0
-    if len(data) != STL_HEAD + STL_FACET * promised and data[:5] == b"solid":
-        promised = data.count(b"facet normal")  # of text
-    elif len(data) < STL_HEAD + STL_FACET * promised or len(data) < STL_HEAD:
-        held = max(len(data) - STL_HEAD, 0) // STL_FACET
-        raise InputError(path, "faces", f"the file is cut off: {promised:,} are promised and {held:,} there")
-    foreign.within(promised, limits.triangles, source=path, field="faces", limit="limits.triangles")
-
-
-def _of_obj(path: Path, data: bytes, limits: LimitSettings) -> list[str]:
-    """Names of the picture files of its materials. Raises InputError."""
-    lines = data.decode("utf-8", errors="replace").splitlines()
-    positions = [line for line in lines if line.startswith("v ")]
-    broken = sum("nan" in line.lower() or "inf" in line.lower() for line in positions)
-    if broken:
-        raise InputError(path, "vertices", f"{broken} of {len(positions)} are not finite")
-    foreign.within(len(positions), 3 * limits.triangles, source=path, field="v", limit="3 for each of limits.triangles")
-    triangles = 0
-    for line in lines:
-        if not line.startswith("f "):
-            continue
-        corners = line.split()[1:]
-        triangles += max(len(corners) - 2, 0)
-        # The loader takes a 0 for the last vertex; the format counts from 1, or from -1 backwards.
-        if any(corner.split("/")[0] == "0" for corner in corners):
-            raise InputError(path, "faces", "refer to vertex 0; the first is 1")
-    foreign.within(triangles, limits.triangles, source=path, field="f", limit="limits.triangles")
-    wanted = []
-    for line in lines:
-        if line.startswith("mtllib "):
-            name = line.split(maxsplit=1)[1].strip()
-            library = file_of(name, source=path, field="mtllib")
-            if library is None or not library.exists():
-                raise InputError(path, "mtllib", f"{foreign.shown(name, most=200)} is not there")
-            held = foreign.read_bytes(library, most_bytes=LIBRARY_BYTES_MAX, source=path, field="mtllib")
-            text = held.decode("utf-8", errors="replace").splitlines()
-            wanted += [item.split(maxsplit=1)[1].strip() for item in map(str.strip, text) if _names_texture(item)]
-    return wanted
-
-
-def _names_texture(line: str) -> bool:
-    return line.lower().startswith("map_kd ") and len(line.split()) > 1
+    return pictures[id(image)], (red, green, blue) if red or green or blue else (1.0, 1.0, 1.0)
 
 
 class MeshSource(DrawingSource):
@@ -330,27 +278,23 @@ class MeshSource(DrawingSource):
         *,
         stack_from_scene: F64,
         context: Any,
-        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
-        samples: int = 0,
+        background: tuple[float, float, float],
         parts: Sequence[ReadyPart] | None = None,
     ) -> None:
         """parts: those of `data`, where they were made ready on another thread."""
         self.draws_in = context
-        self._painter = TrianglePainter(parts or data.parts, context=context, background=background, samples=samples)
+        self._painter = TrianglePainter(parts or data.parts, context=context, background=background)
         self._data, self._rig = data, data.rig
         self._stack_from_scene = stack_from_scene
         self._placed = [stack_from_scene] * len(data.parts)
         self._posed_for: float | None = None
         box = camera.box_corners(data.low, data.high)
         x = box @ stack_from_scene[0, :3] + stack_from_scene[0, 3]
-        used = {feature for part in data.parts for feature in part.features}
-        names = {"PICTURE": "textures", "COLOURED": "vertex colours", "HOLES": "cut-outs"}
         self.info = ContentInfo(
             name=data.name,
             moving=data.rig is not None,
             depth_range_m=(float(x.min()), float(x.max())),
             background=background,
-            left_out=tuple(text for feature, text in names.items() if feature not in used),
         )
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,6 +17,7 @@ from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings, LimitSettings
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.images import WarpedPicture, rgba_from_rgb
+from runtime.content.placing import SceneFile
 from runtime.errors import ContentFailure, InputError
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack, PlaneRaster
@@ -25,8 +28,8 @@ from runtime.support.picture_header import check_size, size_of_file
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 VIDEOS = (".mp4", ".mkv", ".avi", ".mov", ".webm", ".m4v")
-QUILT_NAME = re.compile(r"_qs([0-9]+)x([0-9]+)(?:a([0-9]+(?:\.[0-9]+)?))?")
-ASPECT_LEAST, ASPECT_MOST = 0.05, 20.0  # width over height of one view
+QUILT = re.compile(r"qs([0-9]{1,6})x([0-9]{1,6})(?:a([0-9]+(?:\.[0-9]+)?))?(?![0-9])")
+ASPECT_MIN, ASPECT_MAX = 0.05, 20.0  # width over height of one view
 MARKS = (  # in a file's name, the longer ones first
     ("_rgbd", "rgbd"), ("_hsbs", "half-side-by-side"), ("_half_sbs", "half-side-by-side"),
     ("_htb", "half-top-bottom"), ("_hou", "half-top-bottom"), ("_half_ou", "half-top-bottom"),
@@ -43,43 +46,60 @@ VIDEO_PROPERTIES = (
 )
 
 
-def layout_of(path: Path, settings: ContentSettings) -> str:
-    """How a file holds its views: the setting, or what its name says. A pair's name is `_sbs`, else `mono`."""
-    if settings.layout != "auto":
-        return settings.layout
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How a picture holds its views."""
+
+    kind: str  # mono, rgbd, quilt, side-by-side, top-bottom
+    columns: int = 1
+    rows: int = 1
+    half: bool = False  # its views are squeezed to half their width or height
+    view_aspect: float = 0.0  # of a quilt's views, width over height; 0: as their pixels have it
+
+    def views(self, picture: U8) -> list[U8]:
+        """[left, right], [one], or a quilt's from the leftmost camera to the rightmost.
+
+        Raises ValueError for a picture that is smaller than one pixel a view.
+        """
+        height, width = picture.shape[:2]
+        if not 0 < self.columns <= width or not 0 < self.rows <= height:
+            raise ValueError(f"{width} x {height} pixels cannot hold {self.columns} x {self.rows} views")
+        wide, high = width // self.columns, height // self.rows
+        if self.kind != "quilt":  # an odd pixel in the middle is of neither view
+            rows, columns = (0, height - high)[: self.rows], (0, width - wide)[: self.columns]
+            return [picture[v : v + high, u : u + wide] for v in rows for u in columns]
+        # The first view is at the bottom left, then rightwards, then upwards.
+        return [
+            picture[height - (row + 1) * high : height - row * high, column * wide : (column + 1) * wide]
+            for row in range(self.rows)
+            for column in range(self.columns)
+        ]
+
+    def pixel_aspect(self, *, width_px: int, height_px: int) -> float:
+        """Width over height of a pixel of a view of that size."""
+        if self.half:
+            return float(self.columns) if self.columns > 1 else 1 / self.rows
+        return self.view_aspect * height_px / width_px if self.view_aspect else 1.0
+
+
+def layout_of(path: Path, settings: ContentSettings) -> Layout:
+    """How a file holds its views: the setting, or what its name says. Raises InputError."""
     stem = path.stem.lower()
-    if QUILT_NAME.search(stem):
-        return "quilt"
-    for mark, layout in MARKS:
-        if stem.endswith(mark) or f"{mark}_" in stem:
-            return layout
-    return "mono"
-
-
-def quilt_size(path: Path, settings: ContentSettings) -> tuple[int, int]:
-    """Columns and rows of a quilt. Raises InputError where neither the settings nor the name tell."""
-    if all(settings.quilt):
-        return settings.quilt
-    found = QUILT_NAME.search(path.stem.lower())
-    if not found or not int(found[1]) or not int(found[2]):
-        raise InputError(path, "quilt", "columns and rows are in neither the name (_qs8x6) nor content.quilt")
-    return int(found[1]), int(found[2])
-
-
-def pixel_aspect(path: Path, layout: str, *, width_px: int, height_px: int) -> float:
-    """Width over height of a pixel of a view of that size: of halves, and of a quilt whose name tells its aspect.
-
-    Raises InputError for an aspect that no picture has.
-    """
-    if layout.startswith("half"):
-        return 2.0 if layout == "half-side-by-side" else 0.5
-    found = QUILT_NAME.search(path.stem.lower()) if layout == "quilt" else None
-    if not found or not found[3]:
-        return 1.0
-    aspect = float(found[3])
-    if not ASPECT_LEAST <= aspect <= ASPECT_MOST:
-        raise InputError(path, "quilt", f"an aspect of {aspect:g}; must be {ASPECT_LEAST:g} to {ASPECT_MOST:g}")
-    return aspect * height_px / width_px
+    named = settings.layout
+    if named == "auto":
+        marked = [layout for mark, layout in MARKS if stem.endswith(mark) or f"{mark}_" in stem]
+        named = stem if QUILT.search(stem) else (*marked, "mono")[0]
+    if found := QUILT.search(named):
+        columns, rows, aspect = int(found[1]), int(found[2]), float(found[3] or 0)
+        if not columns or not rows:
+            raise InputError(path, "layout", f"a quilt of {columns} x {rows} views")
+        if aspect and not ASPECT_MIN <= aspect <= ASPECT_MAX:
+            problem = f"an aspect of {aspect:g}; must be {ASPECT_MIN:g} to {ASPECT_MAX:g}"
+            raise InputError(path, "layout", problem)
+        return Layout("quilt", columns, rows, view_aspect=aspect)
+    kind = named.removeprefix("half-")
+    columns, rows = {"side-by-side": (2, 1), "top-bottom": (1, 2)}.get(kind, (1, 1))
+    return Layout(kind, columns, rows, half=kind != named)
 
 
 def screen(stack: PanelStack, *, width_px: int, height_px: int, pixel_aspect: float = 1.0) -> PlaneRaster:
@@ -228,97 +248,83 @@ def open_frames(path: Path, settings: ContentSettings, *, limits: LimitSettings 
     return Picture(read_image(path))
 
 
-def split(rgb: U8, layout: str, quilt: tuple[int, int] = (1, 1)) -> list[U8]:
-    """The views of one picture: [left, right], [one], or a quilt's from the leftmost camera to the rightmost.
-
-    Raises ValueError for a picture that is smaller than one pixel a view.
-    """
-    height, width = rgb.shape[:2]
-    layout = layout.removeprefix("half-")
-    columns, rows = {"side-by-side": (2, 1), "top-bottom": (1, 2), "quilt": quilt}.get(layout, (1, 1))
-    if not 0 < columns <= width or not 0 < rows <= height:
-        raise ValueError(f"{width} x {height} pixels cannot hold {columns} x {rows} views")
-    if layout == "side-by-side":
-        return [rgb[:, : width // 2], rgb[:, width - width // 2 :]]
-    if layout == "top-bottom":
-        return [rgb[: height // 2], rgb[height - height // 2 :]]
-    if layout == "quilt":
-        wide, high = width // columns, height // rows
-        # The first view is at the bottom left, then rightwards, then upwards.
-        return [
-            rgb[height - (row + 1) * high : height - row * high, column * wide : (column + 1) * wide]
-            for row in range(rows)
-            for column in range(columns)
-        ]
-    return [rgb]
+def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
+    """Open a picture, a video or a folder of pictures. Raises InputError."""
+    layout = layout_of(file.path, file.settings)
+    frames = open_frames(file.path, file.settings, limits=file.limits)
+    source = ScreenPictures(frames, layout=layout, file=file)
+    return lambda context: source
 
 
 class ScreenPictures(ContentSource):
     """Views of pictures or videos that hang in the plane of the display's centre."""
 
-    def __init__(
-        self,
-        frames: Frames,
-        *,
-        layout: str,
-        stack: PanelStack,
-        settings: ContentSettings,
-        path: Path,
-        quilt: tuple[int, int],
-    ) -> None:
+    def __init__(self, frames: Frames, *, layout: Layout, file: SceneFile) -> None:
         """Raises InputError where the picture is too small for its layout."""
-        self._frames, self._layout, self._quilt = frames, layout, quilt
-        self._cone_rad = np.radians(settings.cone_deg)
-        self._repeat = settings.at_end == "repeat"
-        self._background = settings.background
-        try:
-            height, width = split(frames.frame(0), layout, quilt)[0].shape[:2]
-        except ValueError as error:
-            raise InputError(path, "quilt" if layout == "quilt" else "layout", str(error)) from None
-        aspect = pixel_aspect(path, layout, width_px=width, height_px=height)
-        self._screen = screen(stack, width_px=width, height_px=height, pixel_aspect=aspect)
-        self._shown: dict[int, WarpedPicture] = {}
-        self._at = -1
+        self._frames, self._layout, self._file = frames, layout, file
+        self._at = -1  # number of the picture whose views these are
         self._views: list[U8] = []
-        moving = frames.count > 1
+        self._screen: PlaneRaster | None = None
+        self._shown: dict[int, WarpedPicture] = {}
+        if not frames.count:
+            return  # none yet: a live one
+        first = frames.frame(0)
+        try:
+            self._take(0, first)
+        except ValueError as error:
+            raise InputError(file.path, "layout", str(error)) from None
+        moving, mono = frames.count > 1, layout.kind == "mono"
         self.info = ContentInfo(
-            name=path.stem,
+            name=file.path.stem,
             moving=moving,
-            grey=not moving and _is_grey(frames.frame(0)),
-            depth_range_m=(0.0, 0.0) if layout == "mono" else None,
-            background=settings.background,
-            flat_x_m=0.0 if layout == "mono" else None,
+            grey=not moving and _is_grey(first),
+            depth_range_m=(0.0, 0.0) if mono else None,
+            background=file.background,
+            flat_x_m=0.0 if mono else None,
         )
 
-    def index_at(self, time_ns: int) -> int:
-        """Which frame the run's clock calls for; a video that ended repeats or holds its last."""
-        index = int(time_ns * self._frames.rate_hz / NS_PER_S)
-        return index % self._frames.count if self._repeat else min(index, self._frames.count - 1)
+    def picture_at(self, time_ns: int) -> tuple[int, U8]:
+        """The number of the picture that the run's clock calls for, and it. Raises ContentFailure."""
+        number = self.revision(time_ns=time_ns)
+        return number, self._frames.frame(number)
 
     def revision(self, *, time_ns: int) -> int:
-        return self.index_at(time_ns)
-
-    def view_for(self, view: View) -> int:
-        """Which of the pictures an eye gets: its side's, or a quilt's nearest in angle about the vertical."""
-        if len(self._views) <= 2:
-            return min(view.side, len(self._views) - 1)
-        angle = np.arctan2(view.eye_m[1], view.eye_m[0])
-        place = (angle / self._cone_rad + 0.5) * (len(self._views) - 1)
-        return int(np.clip(np.rint(place), 0, len(self._views) - 1))
+        return int(time_ns * self._frames.rate_hz / NS_PER_S) % self._frames.count
 
     def render(self, view: View, *, time_ns: int) -> U8:
-        index = self.index_at(time_ns)
-        if index != self._at:
-            self._views = split(self._frames.frame(index), self._layout, self._quilt)
-            self._shown, self._at = {}, index
-        which = self.view_for(view)
+        number, picture = self.picture_at(time_ns)
+        if number != self._at:
+            try:
+                self._take(number, picture)
+            except ValueError as error:
+                raise ContentFailure(f"{self.info.name}: {error}") from None
+        assert self._screen is not None
+        which = self._view_for(view)
         if which not in self._shown:
-            self._shown[which] = WarpedPicture(rgba_from_rgb(self._views[which]), background=self._background)
+            shown = self._views[which]
+            shown = rgba_from_rgb(shown) if shown.shape[2] == 3 else shown
+            self._shown[which] = WarpedPicture(shown, background=self._file.background)
         matrix = panel_from_image(view.pixels_from_stack, self._screen)
         return self._shown[which].warped(matrix, width_px=view.width_px, height_px=view.height_px, side=view.side)
 
     def close(self) -> None:
         self._frames.close()
+
+    def _take(self, number: int, picture: U8) -> None:
+        """Raises ValueError where it is too small."""
+        views = self._layout.views(picture)
+        height, width = views[0].shape[:2]
+        aspect = self._layout.pixel_aspect(width_px=width, height_px=height)
+        self._screen = screen(self._file.stack, width_px=width, height_px=height, pixel_aspect=aspect)
+        self._views, self._shown, self._at = views, {}, number
+
+    def _view_for(self, view: View) -> int:
+        """Which of the pictures an eye gets: its side's, or a quilt's nearest in angle about the vertical."""
+        if len(self._views) <= 2:
+            return min(view.side, len(self._views) - 1)
+        angle = np.arctan2(view.eye_m[1], view.eye_m[0])
+        place = (angle / np.radians(self._file.settings.cone_deg) + 0.5) * (len(self._views) - 1)
+        return int(np.clip(np.rint(place), 0, len(self._views) - 1))
 
 
 def _is_grey(rgb: U8) -> bool:

@@ -93,7 +93,7 @@ def placed_source(source: ContentSource, placing: Placing, stack: PanelStack, *,
         name = inner.info.name
         if new:
             inner.close()
-        raise InputError("content", _field_of(placing), _told(name, placing, stack))
+        raise _refusal(name, placing, stack)
     return result
 
 
@@ -108,19 +108,15 @@ def _nothing_is_seen(source: PlacedSource, stack: PanelStack, time_ns: int) -> b
     return all(source.is_empty(view, time_ns=time) for time in times_ns for view in views)
 
 
-def _field_of(placing: Placing) -> str:
-    """What is most likely wrong."""
-    if placing.scale < 0.1:
-        return "scale"
-    return "offset_m" if any(placing.offset_m) else "scale" if placing.scale != 1.0 else "rotation_deg"
-
-
-def _told(name: str, placing: Placing, stack: PanelStack) -> str:
-    out, right, up = placing.offset_m
-    return (
-        f"leaves nothing of `{name}` to be seen: it stands at {placing.scale:g} times its size {out:g} m out, "
-        f"{right:g} m to the right and {up:g} m up, and the display reaches {stack.width_m / 2:.2f} m to the right and "
-        f"{stack.height_m / 2:.2f} m up"
+def _refusal(name: str, placing: Placing, stack: PanelStack) -> InputError:
+    """Names the field that is most likely wrong."""
+    field = "offset_m" if any(placing.offset_m) else "rotation_deg" if placing.scale == 1.0 else "scale"
+    field = "scale" if placing.scale < 0.1 else field
+    return InputError(
+        "content",
+        field,
+        f"leaves nothing of `{name}` to be seen: {placing.scale:g} times its size, at {placing.offset_m} m, where "
+        f"the display is {stack.width_m:.2f} m wide and {stack.height_m:.2f} m high",
     )
 
 
@@ -130,16 +126,16 @@ class PlacedSource(ContentSource):
     def __init__(self, source: ContentSource, placing: Placing) -> None:
         """source: closed with this one."""
         self.source, self.placing = source, placing
-        self._told: tuple[ContentInfo, ContentInfo] | None = None  # of the source, and as placed
+        self._infos: tuple[ContentInfo, ContentInfo] | None = None  # of the source, and as placed
         self._blank: dict[tuple[int, int], U8] = {}
 
     @property
     def info(self) -> ContentInfo:  # type: ignore[override]
         """The source's own, as far as it still holds here."""
         inner = self.source.info
-        if self._told is None or self._told[0] is not inner:
-            self._told = inner, _moved(inner, self.placing)
-        return self._told[1]
+        if self._infos is None or self._infos[0] is not inner:
+            self._infos = inner, _moved(inner, self.placing)
+        return self._infos[1]
 
     @property
     def problem(self) -> str:
@@ -188,8 +184,8 @@ class PlacedSource(ContentSource):
         matrix = self.placing.stack_from_scene(time_ns)
         turn = matrix[:3, :3] / self.placing.scale
         eye = turn.T @ (view.eye_m - matrix[:3, 3]) / self.placing.scale
-        turned = turn if view.turned is None else view.turned @ turn
-        return View(eye, view.side, view.pixels_from_stack @ matrix, view.width_px, view.height_px, turned)
+        lit = turn if view.display_from_view is None else view.display_from_view @ turn
+        return View(eye, view.side, view.pixels_from_stack @ matrix, view.width_px, view.height_px, lit)
 
     def _background(self, view: View) -> U8:
         size = (view.height_px, view.width_px)

@@ -1,76 +1,109 @@
-"""Where a scene's own coordinates lie in the stack frame: a preset's similarity, or a fit to the display."""
+"""A file that is to be shown, and where its coordinates lie in the stack frame: a preset's way, or fitted."""
 
 from __future__ import annotations
 
+import logging
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from runtime.config import ContentSettings
-from runtime.content.presets import axes_matrix
+from runtime.config import ContentSettings, LimitSettings
+from runtime.content.presets import Preset, axes_matrix
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
 
-FILL = 0.85  # of the display's width and height that a fitted scene takes
+log = logging.getLogger("phasestack.content")
+
+FILL = 0.75  # of the display's width and height that a fitted scene takes: its front is seen larger
+DEEPER = 2.0  # times `depth_m`, that a fitted scene may be
+FLAT = 0.1  # what is thinner than this share of its other sides is shown from its flat side
+STANDS = 0.2  # of its height: what stands so much higher above 0 along one axis than along another has that one up
 FARTHEST_VIEWER_M = 1.5
-Z_UP = (".ply", ".stl")
+DARK = (0.12, 0.12, 0.12)  # behind all but the built-in scenes: ghosts are seen on it, brighter and darker ones
 
 
-def axes_of(settings: ContentSettings, path: Path) -> F64:
-    """3x3 scene_from_stack rotation of a file: glTF and OBJ have y up and face +z; PLY and STL have z up, face +x."""
-    if settings.up != "auto" and settings.out != "auto":
-        return axes_matrix(out=settings.out, up=settings.up)
-    if path.suffix.lower() in Z_UP:
-        return axes_matrix(out="+x", up="+z")
-    return axes_matrix(out="+z", up="+y")
+@dataclass(frozen=True, slots=True)
+class SceneFile:
+    """What a source is made of."""
+
+    path: Path
+    settings: ContentSettings
+    stack: PanelStack
+    limits: LimitSettings
+    preset: Preset | None = None  # that the file is of
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """Behind it."""
+        return self.settings.background or DARK
+
+    def placed(self, low: F64, high: F64) -> F64:
+        """4x4 stack_from_scene of what has these corners: the preset's, else fitted, else its own metres.
+
+        Raises InputError for a scene that lies wholly behind every viewer.
+        """
+        settings = self.settings
+        if self.preset is not None:
+            matrix = np.asarray(np.linalg.inv(self.preset.scene_from_stack), dtype=np.float64)
+        else:
+            axes = self._axes(low, high)
+            if settings.fit:
+                matrix = fitted(low, high, axes=axes, stack=self.stack, depth_m=settings.depth_m)
+            else:
+                matrix = np.eye(4)
+                matrix[:3, :3] = axes.T
+        corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+        nearest_m = float((corners @ matrix[0, :3] + matrix[0, 3]).min())
+        if nearest_m > FARTHEST_VIEWER_M:
+            problem = f"the scene begins at x = {nearest_m:.2f} m, wholly behind the viewer"
+            raise InputError(self.path, "position", problem)
+        return matrix
+
+    def _axes(self, low: F64, high: F64) -> F64:
+        """3x3 scene_from_stack rotation: as set, else glTF's, else the display's own, else guessed and said."""
+        if self.settings.axes != "auto":
+            up, out = self.settings.axes.split()
+        elif self.path.suffix.lower() in (".glb", ".gltf"):
+            up, out = "+y", "+z"
+        elif not self.settings.fit:
+            up, out = "+z", "+x"
+        else:
+            up, out = guessed_axes(low, high)
+            log.info("%s: taken to have %s up and %s towards the viewer (content.axes)", self.path.name, up, out)
+        return axes_matrix(out=out, up=up)
+
+
+def guessed_axes(low: F64, high: F64) -> tuple[str, str]:
+    """The axis that is up, and the one that faces the viewer, of a file that does not say: y and +z, or z and -y.
+
+    What lies flat is shown from its flat side. Else the axis is up along which it stands on 0 or above, and not
+    around it; else the longer one.
+    """
+    size = np.maximum(high - low, 1e-30)
+    thinnest = int(size.argmin())
+    if size[thinnest] < FLAT * np.sort(size)[1] and thinnest > 0:
+        return ("+z", "-y") if thinnest == 1 else ("+y", "+z")
+    y, z = np.maximum(low / size + 0.5, 0.0)[1:]  # 0: around the origin; a half: stands on it
+    z_is_up = z > y if abs(z - y) > STANDS else size[2] > size[1]
+    return ("+z", "-y") if z_is_up else ("+y", "+z")
 
 
 def fitted(low: F64, high: F64, *, axes: F64, stack: PanelStack, depth_m: tuple[float, float]) -> F64:
-    """4x4 stack_from_scene that centres a box and scales it until the display's width, height or `depth_m` is full.
+    """4x4 stack_from_scene that centres a box and scales it until the display is full, or the depth that it can show.
 
+    What is deeper than `depth_m` (rear, front) begins at its front and reaches behind its rear, where most is hidden.
     low, high: (3,) corners in the scene's coordinates; axes: 3x3 scene_from_stack rotation.
     """
     size = np.abs(axes.T @ (high - low))
-    room = np.array([depth_m[1] - depth_m[0], stack.width_m * FILL, stack.height_m * FILL])
+    room = np.array([DEEPER * (depth_m[1] - depth_m[0]), stack.width_m * FILL, stack.height_m * FILL])
     with np.errstate(divide="ignore"):
         scale = float(np.min(np.where(size > 0, room / np.where(size > 0, size, 1.0), np.inf)))
     if not np.isfinite(scale):
         scale = 1.0
     matrix = np.eye(4)
     matrix[:3, :3] = axes.T * scale
-    matrix[:3, 3] = [sum(depth_m) / 2, 0.0, 0.0] - matrix[:3, :3] @ ((low + high) / 2)
+    middle_m = min(sum(depth_m) / 2, depth_m[1] - scale * float(size[0]) / 2)
+    matrix[:3, 3] = [middle_m, 0.0, 0.0] - matrix[:3, :3] @ ((low + high) / 2)
     return matrix
-
-
-def stack_from_scene(
-    low: F64,
-    high: F64,
-    *,
-    settings: ContentSettings,
-    path: Path,
-    stack: PanelStack,
-    scene_from_stack: F64 | None,
-) -> F64:
-    """4x4 of a loaded scene: the preset's where there is one, else fitted, else its own metres on the stack's axes.
-
-    Raises InputError for a scene that lies wholly behind every viewer.
-    """
-    axes = axes_of(settings, path)
-    if scene_from_stack is not None:
-        matrix = np.asarray(np.linalg.inv(scene_from_stack), dtype=np.float64)
-    elif settings.fit:
-        matrix = fitted(low, high, axes=axes, stack=stack, depth_m=settings.depth_m)
-    else:
-        matrix = np.eye(4)
-        matrix[:3, :3] = axes.T
-    nearest_m = float(_corner_x(matrix, low, high).min())
-    if nearest_m > FARTHEST_VIEWER_M:
-        raise InputError(path, "position", f"the scene begins at x = {nearest_m:.2f} m, wholly behind the viewer")
-    return matrix
-
-
-def _corner_x(matrix: F64, low: F64, high: F64) -> F64:
-    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    found: F64 = corners @ matrix[0, :3] + matrix[0, 3]
-    return found

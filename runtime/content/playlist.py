@@ -1,30 +1,29 @@
 """A playlist: scenes one after another, each for a time, each with settings of its own.
 
-Every one of them is loaded before the first is shown: what is missing is told then, and a change takes no time.
+Every one of them is loaded before the first is shown: what is missing is refused then, and a change takes no time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings, Section, located, read_table, validated
 from runtime.content.base import ContentInfo, ContentSource, View
-from runtime.content.placed import FIELDS, Placing
+from runtime.content.placed import FIELDS
 from runtime.errors import InputError
 from runtime.optics.rect import PixelRect
 from runtime.records import U8
-from runtime.support import foreign
 from runtime.support.gl import DrawnPicture
+from runtime.support.plausible import within
 
 ENTRIES_MAX = 64
-SECONDS_LEAST, SECONDS_MOST = 0.5, 86_400.0
-KEPT_FOR_ALL = ("background", "external")  # settings of content that entries share
 
 
 class PlaylistFile(Section):
@@ -34,12 +33,18 @@ class PlaylistFile(Section):
     show: list[dict[str, Any]] = Field(min_length=1, max_length=ENTRIES_MAX, description="the scenes, in this order")
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One scene of a playlist."""
+class Entry(ContentSettings):
+    """One scene of a playlist, with its own placing."""
 
-    settings: ContentSettings  # with its own placing
-    seconds: float
+    scene: str = Field(min_length=1, description="as content.scene, seen from the list's folder")
+    seconds: Annotated[float, within(0.5, 86_400.0, "s")] = Field(description="for how long it is shown")
+
+    @field_validator("scene")
+    @classmethod
+    def _no_list(cls, value: str) -> str:
+        if Path(value).suffix.lower() in (".toml", ".json"):
+            raise ValueError("another list is no scene of a playlist")
+        return value
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,29 +62,18 @@ def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
     settings: what holds where an entry says nothing; where the whole list is placed is not theirs.
     """
     file = validated(PlaylistFile, read_table(path), source=path)
-    unplaced = Placing()
-    common = settings.model_dump() | {name: getattr(unplaced, name) for name in FIELDS} | {"file": ""}
+    common = settings.model_dump(exclude={"scene", "file", *FIELDS})
     entries = []
-    for number, table in enumerate(file.show):
-        field = f"show[{number}]"
-        for name in KEPT_FOR_ALL:
-            if name in table:
-                raise InputError(path, f"{field}.{name}", "holds for the whole list: set it in [content]")
-        seconds = foreign.real(
-            table.get("seconds"), least=SECONDS_LEAST, most=SECONDS_MOST, source=path, field=f"{field}.seconds"
-        )
-        own = {name: value for name, value in table.items() if name != "seconds"}
-        if not isinstance(own.get("scene"), str) or not own["scene"]:
-            raise InputError(path, f"{field}.scene", "names no scene")
-        own["scene"] = located(own["scene"], path.absolute().parent)
-        if own["scene"] == "external" or Path(own["scene"]).suffix.lower() in (".toml", ".json"):
-            raise InputError(path, f"{field}.scene", "is no scene for a playlist: another list, or another program's")
-        if isinstance(own.get("file"), str) and own["file"]:
-            own["file"] = str(path.absolute().parent / own["file"])
+    for number, own in enumerate(file.show):
+        places = {
+            key: place(own[key], path.absolute().parent)
+            for key, place in (("scene", located), ("file", lambda name, folder: str(folder / name)))
+            if isinstance(own.get(key), str) and own[key]
+        }
         try:
-            entries.append(Entry(validated(ContentSettings, common | own, source=""), seconds))
+            entries.append(validated(Entry, common | own | places, source=""))
         except InputError as error:
-            raise InputError(path, f"{field}.{error.field}".rstrip("."), error.problem) from None
+            raise InputError(path, f"show[{number}].{error.field}".rstrip("."), error.problem) from None
     return Playlist(path, file.repeat, tuple(entries))
 
 
@@ -92,14 +86,12 @@ class PlaylistSource(ContentSource):
         openers: list[Callable[[Any], ContentSource]],
         *,
         context: Any,
-        background: tuple[float, float, float],
     ) -> None:
         """Raises InputError where one of them can't be shown."""
         self._list = playlist
-        self._ends_ns = _ends_ns(playlist)
+        self._ends_ns = list(accumulate(round(entry.seconds * NS_PER_S) for entry in playlist.entries))
         self._begin_ns: int | None = None
         self._number = 0  # of the entry at present, counted over all rounds
-        self._background = background
         self._sources: list[ContentSource] = []
         try:
             for number, opener in enumerate(openers):
@@ -114,18 +106,21 @@ class PlaylistSource(ContentSource):
     @property
     def info(self) -> ContentInfo:  # type: ignore[override]
         """Of the one at present, by the list's name."""
-        index = self._number % len(self._sources)
-        inner = self._sources[index].info
+        index, inner = self._number % len(self._sources), self._shown.info
         name = f"{self._list.path.stem}: {inner.name} ({index + 1} of {len(self._sources)})"
-        return replace(inner, name=name, moving=True, background=self._background)
+        return replace(inner, name=name, moving=True)
+
+    @property
+    def _shown(self) -> ContentSource:
+        return self._sources[self._number % len(self._sources)]
 
     @property
     def problem(self) -> str:
-        return self._sources[self._number % len(self._sources)].problem
+        return self._shown.problem
 
     def describe(self, *, time_ns: int) -> dict[str, Any]:
         """For the status: the scenes and their seconds, which one is shown, and for how long still."""
-        entries = [{"scene": entry.settings.scene, "seconds": entry.seconds} for entry in self._list.entries]
+        entries = [{"scene": entry.scene, "seconds": entry.seconds} for entry in self._list.entries]
         index, since_ns = self._at(time_ns)
         left_s = self._list.entries[index % len(entries)].seconds - since_ns / NS_PER_S
         last = not self._list.repeat and index >= len(entries) - 1
@@ -141,7 +136,7 @@ class PlaylistSource(ContentSource):
 
     @property
     def draws_in(self) -> object:  # type: ignore[override]
-        return self._sources[self._number % len(self._sources)].draws_in
+        return self._shown.draws_in
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
         source, since_ns = self._source(time_ns)
@@ -171,7 +166,7 @@ class PlaylistSource(ContentSource):
         if self._begin_ns is None:
             self._begin_ns = time_ns
         self._number, since_ns = self._at(time_ns)
-        return self._sources[self._number % len(self._sources)], since_ns
+        return self._shown, since_ns
 
     def _at(self, time_ns: int) -> tuple[int, int]:
         """Which entry, counted over all rounds, and for how long."""
@@ -183,11 +178,3 @@ class PlaylistSource(ContentSource):
         index = next(index for index, end in enumerate(self._ends_ns) if within_ns < end)
         begin_ns = self._ends_ns[index - 1] if index else 0
         return rounds * count + index, within_ns - begin_ns
-
-
-def _ends_ns(playlist: Playlist) -> list[int]:
-    ends, end = [], 0
-    for entry in playlist.entries:
-        end += round(entry.seconds * NS_PER_S)
-        ends.append(end)
-    return ends

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import moderngl
 import numpy as np
 from scipy.spatial import cKDTree
 
-from runtime.config import LimitSettings
 from runtime.content import camera
 from runtime.content.base import ContentInfo, DrawingSource, View
 from runtime.content.canvas import Canvas
-from runtime.content.ply import Table, read_vertices
+from runtime.content.placing import SceneFile
+from runtime.content.ply import Header, Table, read_header, read_vertices
 from runtime.errors import InputError
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64
@@ -27,6 +27,7 @@ NEIGHBOURS = 8  # the farthest of so many says how dense points lie, on a grid a
 DISC_PER_GAP = 1.25  # so that the surface closes
 LARGEST_COORDINATE = 1e15
 LARGEST_PX = 64.0
+STRAY = 0.5  # percent of the points at either end of an axis that do not decide the scale
 VERTEX = """
 #version 330
 uniform mat4 clip_from_stack;
@@ -61,9 +62,19 @@ class Cloud:
     gap: float  # median distance to the farthest of the nearest neighbours
 
 
-def load_points(path: Path, *, limits: LimitSettings | None = None) -> Cloud:
-    """The points of a PLY. Raises InputError: unreadable, over a limit, none, not finite."""
-    table = read_vertices(path, limits=limits, kind="points")
+def prepare(file: SceneFile) -> Callable[[Any], PointSource]:
+    """Read it; the answer uploads it. Raises InputError."""
+    cloud = load_points(read_header(file.path, file.limits))
+    low, high = np.percentile(cloud.positions.astype(np.float64), [STRAY, 100 - STRAY], axis=0)
+    matrix = file.placed(low, high)
+    return lambda context: PointSource(
+        cloud, stack_from_scene=matrix, context=context, background=file.background, name=file.path.stem
+    )
+
+
+def load_points(header: Header) -> Cloud:
+    """The points of a PLY. Raises InputError: unreadable, none, not finite."""
+    table, path = read_vertices(header), header.path
     names = table.dtype.names or ()
     for axis in "xyz":
         if axis not in names:
@@ -106,8 +117,8 @@ class PointSource(DrawingSource):
         *,
         stack_from_scene: F64,
         context: Any,
-        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
-        name: str = "points",
+        background: tuple[float, float, float],
+        name: str,
     ) -> None:
         linear = stack_from_scene[:3, :3]
         positions = (cloud.positions @ linear.T + stack_from_scene[:3, 3]).astype(np.float32)
@@ -129,7 +140,6 @@ class PointSource(DrawingSource):
             name=name,
             depth_range_m=(float(low[0]), float(high[0])),
             background=background,
-            left_out=("lights", "textures", "sorting"),
         )
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:

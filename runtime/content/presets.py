@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
+from scipy.spatial.transform import Rotation
 
 from runtime.config import Positive, Section, read_table, validated
 from runtime.errors import InputError
@@ -33,8 +34,6 @@ class Published(Section):
     width_cm: Positive = Field(description="active width of the panels")
     out: Axis = Field(description="the scene's axis out of the screen")
     up: Axis = Field(description="the scene's axis that is up")
-    left_index: Annotated[int, Field(ge=0, le=1)] | None = Field(None, description="the left eye's number in a pair")
-    earlier_thickness_cm: Positive | None = Field(None, description="of an earlier state of the code")
     shift: Triple = Field((0.0, 0.0, 0.0), description="of the panels along the scene's axes, digital units")
     ground: float | None = Field(None, description="half a gap behind the middle panel, along `out`, digital units")
     ground_coefficient: float | None = Field(None, description="the same in gaps, where the code has it so")
@@ -71,23 +70,17 @@ class Preset:
     """One scene in one reading."""
 
     name: str
-    title: str
     reading: Reading
     scale_per_m: float  # digital units per metre: 100 r_p2d
     gap_m: float  # between neighbouring panels
     width_m: float | None  # of the panels; None: the reading says nothing
     scene_from_stack: F64  # 4x4 similarity: digital coordinates of a point in metres of the stack frame
-    left_index: int | None  # which of pair.._0 and pair.._1 is the left eye
-
-    def panel_positions_m(self, panels: int = PANELS) -> tuple[float, ...]:
-        """Positions along +x of the stack, rear to front, around its centre."""
-        return tuple((index - (panels - 1) / 2) * self.gap_m for index in range(panels))
 
     def stack(self, current: PanelStack) -> PanelStack:
         """The display that the scene was made for: its panels' places and size, with the current pixels."""
         width_m = current.width_m if self.width_m is None else self.width_m
         height_m = current.height_m if self.width_m is None else self.width_m * ASPECT
-        x_m = self.panel_positions_m(current.count)
+        x_m = tuple((index - (current.count - 1) / 2) * self.gap_m for index in range(current.count))
         return PanelStack(width_m, height_m, x_m, current.width_px, current.height_px)
 
 
@@ -135,30 +128,21 @@ def preset(name: str, reading: Reading = "seed") -> Preset:
         gap_m, width_m = published.thickness_cm * CM, published.width_cm * CM
     return Preset(
         name=name,
-        title=table.title,
         reading=reading,
         scale_per_m=scale_per_m,
         gap_m=gap_m,
         width_m=width_m,
         scene_from_stack=scene_from_stack,
-        left_index=published.left_index,
     )
 
 
 def rotation_matrix(angles_deg: Triple, order: str) -> F64:
     """3x3 of three angles about x, y, z, applied in `order` (lower case: fixed axes, upper case: turning ones)."""
-    matrix = np.eye(3)
-    for letter in order.lower():
-        axis = "xyz".index(letter)
-        cosine, sine = np.cos(np.radians(angles_deg[axis])), np.sin(np.radians(angles_deg[axis]))
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        turn = np.eye(3)
-        turn[i, i], turn[i, j], turn[j, i], turn[j, j] = cosine, -sine, sine, cosine
-        matrix = turn @ matrix if order.islower() else matrix @ turn
-    return matrix
+    angles = [angles_deg["xyz".index(letter)] for letter in order.lower()]
+    return np.asarray(Rotation.from_euler(order, angles, degrees=True).as_matrix())
 
 
-def axes_matrix(*, out: Axis, up: Axis) -> F64:
+def axes_matrix(*, out: str, up: str) -> F64:
     """3x3 scene_from_stack rotation: columns are the scene's axes out of the screen, to the right and up."""
     columns = []
     for axis in (out, up):

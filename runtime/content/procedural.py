@@ -10,7 +10,7 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.content import shapes, textures
 from runtime.content.base import ContentInfo, DrawingSource, View
-from runtime.content.scenes import Scene, Thing, scene
+from runtime.content.scenes import WHITE, Scene, Thing, scene
 from runtime.content.triangles import Part, ReadyPart, TrianglePainter, ready
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
@@ -28,8 +28,8 @@ class ReadyScene:
     parts: tuple[ReadyPart, ...]
 
 
-def ready_scene(built_in: str | Scene, *, samples: int = 0) -> ReadyScene:
-    """The slow half of opening a scene. Needs no GL: may run on any thread. samples: as `ProceduralSource` has it."""
+def ready_scene(built_in: str | Scene) -> ReadyScene:
+    """The slow half of opening a scene. Needs no GL: may run on any thread."""
     chosen = scene(built_in) if isinstance(built_in, str) else built_in
     pictures = {name: textures.texture(name) for name in {thing.texture for thing in chosen.things}}
     parts = [
@@ -43,7 +43,7 @@ def ready_scene(built_in: str | Scene, *, samples: int = 0) -> ReadyScene:
         )
         for thing in chosen.things
     ]
-    return ReadyScene(chosen, tuple(ready(part, samples=samples) for part in parts))
+    return ReadyScene(chosen, tuple(ready(part) for part in parts))
 
 
 class ProceduralSource(DrawingSource):
@@ -55,15 +55,15 @@ class ProceduralSource(DrawingSource):
         *,
         stack: PanelStack,
         context: Any,
-        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
-        samples: int = 0,
+        background: tuple[float, float, float] | None = None,
     ) -> None:
-        """samples: per pixel, for outlines; 0: smooth outlines without (see `fringe`)."""
-        made = built_in if isinstance(built_in, ReadyScene) else ready_scene(built_in, samples=samples)
+        """background: None: the one that its pictures were made for, white."""
+        made = built_in if isinstance(built_in, ReadyScene) else ready_scene(built_in)
+        background = background or WHITE
         self._scene = made.scene
         self._scale = stack.height_m / MODELLED_HEIGHT_M
         self.draws_in = context
-        self._painter = TrianglePainter(made.parts, context=context, background=background, samples=samples)
+        self._painter = TrianglePainter(made.parts, context=context, background=background)
         self._still = [self._placed(thing, 0.0) for thing in self._scene.things]
         corners = self._painter.corners_m(self._still)
         self.info = ContentInfo(

@@ -6,16 +6,20 @@ what is seen beside them: a viewer who looks past an edge sees neither a hole no
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
 
 from runtime.content.base import ContentInfo, DrawingSource, View
 from runtime.content.images import rgba_from_rgb
-from runtime.content.pictures import screen
+from runtime.content.pictures import open_frames, screen
+from runtime.content.placing import SceneFile
 from runtime.content.shapes import I32, Shape
 from runtime.content.triangles import Part, TrianglePainter
 from runtime.errors import InputError
@@ -64,16 +68,13 @@ def surfaces(colour: U8, depth: F32, *, stack: PanelStack, depth_m: tuple[float,
     size = (columns, max(round(depth.shape[0] * columns / depth.shape[1]), 2))
     coarse = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
     coloured = np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_NEAREST), np.uint8)
-    behind, filled = background(coarse, coloured)
-    if not np.isnan(behind).all():
-        corners = np.isnan(np.stack([behind[:-1, :-1], behind[1:, :-1], behind[:-1, 1:], behind[1:, 1:]])).any(0)
-        first = np.flatnonzero(~corners.reshape(-1))
-        quads = _corners(first // (size[0] - 1), first % (size[0] - 1), size[0])
-        steps = np.ptp(behind.reshape(-1)[quads], axis=1) if len(quads) else np.empty(0)
-        quads = quads[steps <= TORN_RELATIVE]
-        if len(quads):
-            set_back = np.nan_to_num(behind) - SET_BACK
-            parts.append(_placed(set_back, quads, rgba_from_rgb(filled), stack=stack, depth_m=depth_m))
+    behind, filled, made_up = background(coarse, coloured)
+    row, column = np.nonzero(made_up[:-1, :-1])
+    quads = _corners(row, column, size[0])
+    if len(quads):
+        quads = quads[made_up.reshape(-1)[quads].all(1) & (np.ptp(behind.reshape(-1)[quads], axis=1) <= TORN_RELATIVE)]
+    if len(quads):
+        parts.append(_placed(behind - SET_BACK, quads, rgba_from_rgb(filled), stack=stack, depth_m=depth_m))
     return parts
 
 
@@ -86,65 +87,36 @@ def sharpened(depth: F32) -> F32:
 
 
 def unmixed(colour: U8, depth: F32) -> U8:
-    """(h, w, 3) colours; those beside an edge of the depth are taken from farther inside their own side."""
-    kernel = np.ones((2 * MIXED_PX + 1, 2 * MIXED_PX + 1), np.uint8)
-    unknown = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel) > TORN_RELATIVE
-    if not unknown.any():
+    """(h, w, 3) colours; those beside an edge of the depth are the nearest ones farther inside their own side."""
+    side = 2 * MIXED_PX + 1
+    kernel = np.ones((side, side), np.uint8)
+    mixed = cv2.dilate(depth, kernel) - cv2.erode(depth, kernel) > TORN_RELATIVE
+    beside = cv2.dilate(mixed.astype(np.uint8), np.ones((2 * side + 1, 2 * side + 1), np.uint8)).astype(bool) & ~mixed
+    if not beside.any():
         return colour
-    known, result = ~unknown, colour.astype(np.float32)
-    for _ in range(2 * MIXED_PX):
-        grown, values, _ = _grown(known, unknown & ~known, result, depth, depth)
-        result[grown], known = values[grown], known | grown
-    return np.clip(np.rint(result), 0, 255).astype(np.uint8)
+    there, wanted = np.argwhere(beside), np.argwhere(mixed)
+    far_apart = 4 * side / TORN_RELATIVE  # pixels that a unit of depth counts for: the other side is farther off
+    nearest = cKDTree(np.column_stack([there, depth[beside] * far_apart])).query(
+        np.column_stack([wanted, depth[mixed] * far_apart])
+    )[1]
+    result = colour.copy()
+    result[mixed] = colour[beside][nearest]
+    return result
 
 
-def background(depth: F32, colour: U8) -> tuple[F32, U8]:
-    """(h, w) depth and (h, w, 3) colour of what lies behind edges, made up from their far side; NaN elsewhere.
+def background(depth: F32, colour: U8) -> tuple[F32, U8, Mask]:
+    """(h, w) depth and (h, w, 3) colour of what lies behind edges, and where that is made up.
 
-    It grows from the far side under the near one, a pixel a step, each the mean of what it grows from; a ring of the
-    far side itself belongs to it, so that it has no gap there.
+    Under the near side it is as the far one is at the nearest edge; a ring of the far side itself belongs to it, so
+    that it has no gap there.
     """
-    steps = round(BEHIND_SHARE * depth.shape[1])
-    kernel = np.ones((5, 5), np.uint8)
-    far_side = depth < cv2.dilate(depth, kernel) - TORN_RELATIVE
-    behind = np.where(far_side, depth, np.float32(np.nan))
-    result = colour.astype(np.float32)
-    for _ in range(steps):
-        known = ~np.isnan(behind)
-        grown, values, depths = _grown(known, ~known, result, behind, depth, under=True)
-        if not grown.any():
-            break
-        behind[grown], result[grown] = depths[grown], values[grown]
-    return behind, np.clip(np.rint(result), 0, 255).astype(np.uint8)
-
-
-def _grown(
-    known: Mask, wanted: Mask, colour: F32, depth: F32, own: F32, *, under: bool = False
-) -> tuple[Mask, F32, F32]:
-    """Which of `wanted` have known neighbours of their own side, and the means of their colours and depths.
-
-    own: the depth of each pixel itself; under: neighbours count that lie behind it, rather than beside it.
-    """
-    sums = np.zeros((*own.shape, 4), np.float32)
-    count = np.zeros(own.shape, np.float32)
-    held = np.dstack([colour, np.nan_to_num(depth)])
-    for down in (-1, 0, 1):
-        for across in (-1, 0, 1):
-            if not (down or across):
-                continue
-            here, there = _shifted(down, own.shape[0]), _shifted(across, own.shape[1])
-            step = own[here[0], there[0]] - held[here[1], there[1], 3]
-            counts = known[here[1], there[1]] & ((step > TORN_RELATIVE / 2) if under else (abs(step) <= TORN_RELATIVE))
-            sums[here[0], there[0]] += counts[..., None] * held[here[1], there[1]]
-            count[here[0], there[0]] += counts
-    grown = wanted & (count > 0)
-    means: F32 = (sums / np.maximum(count, 1)[..., None]).astype(np.float32)
-    return grown, means[..., :3], means[..., 3]
-
-
-def _shifted(step: int, size: int) -> tuple[slice, slice]:
-    """Where pixels are along an axis, and where their neighbours a step on."""
-    return slice(max(-step, 0), size - max(step, 0)), slice(max(step, 0), size - max(-step, 0))
+    far_side = depth < cv2.dilate(depth, np.ones((5, 5), np.uint8)) - TORN_RELATIVE
+    if not far_side.any():
+        return depth, colour, far_side
+    distance, (row, column) = distance_transform_edt(~far_side, return_indices=True)
+    behind = depth[row, column]
+    under = (distance <= BEHIND_SHARE * depth.shape[1]) & (depth - behind > TORN_RELATIVE / 2)
+    return behind, colour[row, column], far_side | under
 
 
 def _quads(depth: F32) -> I32:
@@ -201,32 +173,24 @@ def _edge_to_edge(index: Any, count: int) -> F64:
     return np.where(index == 0, 0.0, np.where(index == count - 1, float(count), place))
 
 
+def prepare(file: SceneFile) -> Callable[[Any], RgbdSource]:
+    """Read it; the answer uploads it. Raises InputError where it holds no depth."""
+    colour, depth = split_rgbd(open_frames(file.path, file.settings, limits=file.limits).frame(0), file.path)
+    parts = surfaces(colour, depth, stack=file.stack, depth_m=file.settings.depth_m)
+    return lambda context: RgbdSource(parts, file=file, context=context)
+
+
 class RgbdSource(DrawingSource):
     """A picture with depth between two planes of the stack frame."""
 
-    def __init__(
-        self,
-        rgb: U8,
-        *,
-        path: Path,
-        stack: PanelStack,
-        depth_m: tuple[float, float],
-        context: Any,
-        background: tuple[float, float, float],
-        samples: int = 0,
-    ) -> None:
-        """samples: a pixel; 0: as many as the split edges need to look smooth."""
-        colour, depth = split_rgbd(rgb, path)
-        parts = surfaces(colour, depth, stack=stack, depth_m=depth_m)
+    def __init__(self, parts: list[Part], *, file: SceneFile, context: Any) -> None:
         # Outlines of a torn surface run through its inside: no ramps there.
         self.draws_in = context
-        self._painter = TrianglePainter(parts, context=context, background=background, samples=samples or SAMPLES)
+        self._painter = TrianglePainter(parts, context=context, background=file.background, samples=SAMPLES)
         self._places = [np.eye(4)] * len(parts)
         x_m = parts[0].shape.positions_m[:, 0]
         low, high = float(x_m.min()), float(x_m.max())
-        self.info = ContentInfo(
-            name=path.stem, depth_range_m=(low, high), background=background, left_out=("lights", "sorting")
-        )
+        self.info = ContentInfo(name=file.path.stem, depth_range_m=(low, high), background=file.background)
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         return self._painter.paint(view, self._places)

@@ -5,11 +5,12 @@ The equations are glTF 2.0's (appendix C for the interpolations, 3.7.3 for skins
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from runtime.records import F32, F64
 
@@ -22,9 +23,9 @@ TRIED = 24  # times of an animation at which its extent is looked at
 class Node:
     """One node at rest."""
 
-    moved: F64 | None = None  # (3,)
-    turn: F64 | None = None  # (4,) quaternion x, y, z, w
-    scale: F64 | None = None  # (3,)
+    moved: F64 = field(default_factory=lambda: np.zeros(3))
+    turn: F64 = field(default_factory=lambda: np.array([0.0, 0.0, 0.0, 1.0]))  # quaternion x, y, z, w
+    scale: F64 = field(default_factory=lambda: np.ones(3))
     matrix: F64 | None = None  # (4, 4) in place of the three
     parent: int = -1
 
@@ -181,31 +182,18 @@ def slerp(first: F64, second: F64, share: float) -> F64:
 
 
 def turn_of(quaternion: F64) -> F64:
-    """3x3 rotation of a quaternion x, y, z, w of any length but 0."""
-    x, y, z, w = quaternion / (np.linalg.norm(quaternion) or 1.0)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    """3x3 rotation of a quaternion x, y, z, w; of one that is 0, none."""
+    return np.asarray(Rotation.from_quat(quaternion).as_matrix()) if quaternion.any() else np.eye(3)
 
 
 def _local(node: Node, values: dict[tuple[int, str], F64], number: int) -> F64:
     """(4, 4) parent_from_node."""
     if node.matrix is not None:
         return node.matrix
-    moved, turn, scale = (
-        values.get((number, path), rest)
-        for path, rest in (("translation", node.moved), ("rotation", node.turn), ("scale", node.scale))
-    )
     matrix = np.eye(4)
-    matrix[:3, :3] = np.eye(3) if turn is None else turn_of(turn)
-    if scale is not None:
-        matrix[:3, :3] *= scale
-    if moved is not None:
-        matrix[:3, 3] = moved
+    turn, scale = values.get((number, "rotation"), node.turn), values.get((number, "scale"), node.scale)
+    matrix[:3, :3] = turn_of(turn) * scale
+    matrix[:3, 3] = values.get((number, "translation"), node.moved)
     return matrix
 
 

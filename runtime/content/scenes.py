@@ -105,14 +105,14 @@ def _thin() -> tuple[Thing, ...]:
     return (Thing(shapes.card(0.34, 0.20, repeat=(1.7, 1.0)), "globe", (-0.006, 0.0, 0.0), lit=False), near)
 
 
-SCENES: dict[str, tuple[str, Callable[[], Scene]]] = {
-    "demo": ("several objects before and behind the panels", lambda: Scene("demo", _demo())),
-    "sparse": ("one small object on the background", lambda: Scene("sparse", _sparse())),
-    "texture": ("texture over the whole picture, with depth", lambda: Scene("texture", _texture())),
-    "grey": ("the demo scene without colour", lambda: Scene("grey", _demo(), grey=True)),
-    "flat": ("a picture in the middle panel's plane", lambda: Scene("flat", _flat(), flat=True)),
-    "thin": ("little depth, around the middle panel", lambda: Scene("thin", _thin())),
-    "moving": ("the demo scene with turning objects", lambda: Scene("moving", _demo(turns_per_s=0.2), moving=True)),
+SCENES: dict[str, Callable[[], Scene]] = {
+    "demo": lambda: Scene("demo", _demo()),
+    "sparse": lambda: Scene("sparse", _sparse()),
+    "texture": lambda: Scene("texture", _texture()),
+    "grey": lambda: Scene("grey", _demo(), grey=True),
+    "flat": lambda: Scene("flat", _flat(), flat=True),
+    "thin": lambda: Scene("thin", _thin()),
+    "moving": lambda: Scene("moving", _demo(turns_per_s=0.2), moving=True),
 }
 
 
@@ -120,4 +120,4 @@ def scene(name: str) -> Scene:
     """A built-in scene by name. Raises InputError for another."""
     if name not in SCENES:
         raise InputError("content", "scene", f"`{name}` is none of {', '.join(SCENES)}")
-    return SCENES[name][1]()
+    return SCENES[name]()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import moderngl
@@ -9,12 +10,15 @@ import numpy as np
 
 from runtime.content.base import ContentInfo, DrawingSource, View
 from runtime.content.canvas import Canvas
-from runtime.content.gaussians import Gaussians, colours_towards, moved, seen_splats
+from runtime.content.gaussians import Gaussians, colours_towards, load_gaussians, moved, seen_splats
+from runtime.content.placing import SceneFile
+from runtime.content.ply import read_header
 from runtime.optics.rect import PixelRect
 from runtime.records import F64
 from runtime.support.gl import DrawnPicture, linked_program
 
 OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
+STRAY = 1.0  # percent of the splats at either end of an axis that do not decide the scale
 FLOATS = 8  # a corner: place in clip space (2), place in standard deviations (2), colour and opacity (4)
 VERTEX = """
 #version 330
@@ -42,6 +46,16 @@ void main() {
 """
 
 
+def prepare(file: SceneFile) -> Callable[[Any], SplatSource]:
+    """Read it; the answer uploads it. Raises InputError."""
+    gaussians = load_gaussians(read_header(file.path, file.limits))
+    low, high = np.percentile(gaussians.centres.astype(np.float64), [STRAY, 100 - STRAY], axis=0)
+    matrix = file.placed(low, high)
+    return lambda context: SplatSource(
+        gaussians, stack_from_scene=matrix, context=context, background=file.background, name=file.path.stem
+    )
+
+
 class SplatSource(DrawingSource):
     """A scene of splats at its place in the stack frame."""
 
@@ -51,8 +65,8 @@ class SplatSource(DrawingSource):
         *,
         stack_from_scene: F64,
         context: Any,
-        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
-        name: str = "splats",
+        background: tuple[float, float, float],
+        name: str,
     ) -> None:
         self._gaussians = moved(gaussians, stack_from_scene)
         linear = stack_from_scene[:3, :3]
@@ -75,7 +89,6 @@ class SplatSource(DrawingSource):
             name=name,
             depth_range_m=(float(x[0]), float(x[1])),
             background=background,
-            left_out=("lights", "textures") + (("harmonics",) if gaussians.harmonics.shape[1] == 1 else ()),
         )
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:

@@ -1,7 +1,7 @@
 """Live pictures: a stream, a capture card, or a file played as one; read and decoded alongside by PyAV.
 
-The newest whole picture is shown, for both eyes the same one. What ends is opened again, what stalls, changes its size
-or lies about its rate is told in one line, and the last good picture stays.
+The newest whole picture is shown, for both eyes the same one. What ends is opened again, what stalls or changes its
+size is reported in one line, and the last good picture stays.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import re
 import threading
 import time
 import weakref
-from collections.abc import Generator, Iterator
+from collections import deque
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,11 @@ import numpy as np
 
 from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings, LimitSettings
-from runtime.content.arrivals import Arrivals
-from runtime.content.base import ContentInfo, ContentSource, View
-from runtime.content.images import WarpedPicture
-from runtime.content.pictures import CONTAINERS, layout_of, pixel_aspect, quilt_size, screen, split
+from runtime.content.base import ContentInfo, ContentSource
+from runtime.content.pictures import CONTAINERS, Frames, Layout, ScreenPictures, layout_of
+from runtime.content.placing import SceneFile
 from runtime.errors import ContentFailure, InputError, MissingPart, one_line
-from runtime.optics.rpu import panel_from_image
-from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.stack import PanelStack
 from runtime.records import U8
 from runtime.support import foreign
 from runtime.support.live import LIVE
@@ -39,12 +38,12 @@ CARRIED_BY = "rtsp,rtsps,rtp,rtmp,http,https,udp,tcp,tls,srt,crypto,data"
 OPEN_S, READ_S = 5.0, 5.0  # a source that does not answer for so long is opened anew
 ANALYSED_US = "1000000"  # of a stream, before its first picture; FFmpeg would look at five seconds
 FIRST_PICTURE_S = 3.0  # that is waited for, where it comes soon
-STALLED_S = 2.0  # without a new picture it is told
-AGAIN_S, AGAIN_MOST_S = 0.5, 8.0  # between attempts; doubles
+STALLED_S = 2.0  # without a new picture it is reported
+AGAIN_S, AGAIN_MAX_S = 0.5, 8.0  # between attempts; doubles
 LONGEST_STEP_S = 2.0  # between two pictures of a file; a longer one is a lie
 USUAL_STEP_S = 1 / 30
-COUNTED = 50  # pictures over which a rate is measured
-RATE_DIFFERS = 1.5  # times, until it is told
+BEHIND = 8  # packets that wait, from which on all before the newest key picture are left out
+WAITING_MAX = 512  # packets; the oldest make way
 
 
 class Target:
@@ -97,25 +96,32 @@ class _Shared:
         self.first.set()
 
 
-class Feed:
+class Feed(Frames):
     """A source that is being read, from when this is made until it is closed or forgotten."""
+
+    count, rate_hz = 0, 1.0
 
     def __init__(self, target: Target, settings: ContentSettings, limits: LimitSettings) -> None:
         """Raises MissingPart without PyAV."""
         try:
             import av
         except ImportError:
-            raise MissingPart("live pictures need PyAV: pip install 'phasestack[stream]'") from None
+            raise MissingPart("live pictures need PyAV: pip install av") from None
         av.logging.set_level(av.logging.PANIC)
         self.target, self.shared = target, _Shared()
         reader = _Reader(target, settings, limits, self.shared)
         threading.Thread(target=reader.run, name="stream", daemon=True).start()
-        # A scene that was overtaken while it was loaded is dropped, and its thread ends with it.
-        self.close = weakref.finalize(self, self.shared.ending.set)
+        # A scene that was skipped while it was loaded is dropped, and its thread ends with it.
+        self._end = weakref.finalize(self, self.shared.ending.set)
 
-    def wait(self) -> None:
-        """Until the first picture is there, or too long."""
-        self.shared.first.wait(FIRST_PICTURE_S)
+    def frame(self, index: int) -> U8:
+        """The newest, whichever is asked for."""
+        if self.shared.newest is None:
+            raise ContentFailure(f"{self.target.shown}: {self.shared.problem or 'waiting for its first picture'}")
+        return self.shared.newest[1]
+
+    def close(self) -> None:
+        self._end()
 
 
 class _Reader:
@@ -124,9 +130,8 @@ class _Reader:
     def __init__(self, target: Target, settings: ContentSettings, limits: LimitSettings, shared: _Shared) -> None:
         self._target, self._limits, self._shared = target, limits, shared
         self._options = dict(settings.stream_options)
-        self._repeat = settings.at_end == "repeat"
         self._size: tuple[int, int] | None = None
-        self._told = ""
+        self._reported = ""
 
     def run(self) -> None:
         wait_s = AGAIN_S
@@ -137,11 +142,9 @@ class _Reader:
                 return
             came = self._shared.newest is not before
             if self._target.is_file and came and not problem:
-                if not self._repeat:
-                    return
                 continue
-            wait_s = AGAIN_S if came else min(2 * wait_s, AGAIN_MOST_S)
-            self._tell(problem or "it has ended")
+            wait_s = AGAIN_S if came else min(2 * wait_s, AGAIN_MAX_S)
+            self._report(problem or "it has ended")
             self._shared.ending.wait(wait_s)
 
     def _played(self) -> str:
@@ -151,7 +154,7 @@ class _Reader:
         try:
             for picture in self._pictures():
                 self._shared.put(picture)
-                self._told = ""
+                self._reported = ""
         except InputError as error:
             return error.problem
         except av.error.ExitError:  # a time limit has passed
@@ -171,11 +174,9 @@ class _Reader:
         kind = "v4l2" if self._target.is_device else None
         options = self._target.options(self._options)
         with closing(av.open(self._target.url, format=kind, options=options, timeout=(OPEN_S, READ_S))) as container:
-            if not container.streams.video:
-                raise InputError(self._target.shown, "", "holds no pictures")
+            if not container.streams.video or container.streams.video[0].codec_context is None:
+                raise InputError(self._target.shown, "", "holds no pictures that can be decoded")
             stream = container.streams.video[0]
-            if stream.codec_context is None:  # a codec that FFmpeg does not know
-                raise InputError(self._target.shown, "", "holds pictures that cannot be decoded")
             self._check_size(stream.codec_context.width, stream.codec_context.height)
             # One for all pictures: made anew, with threads of its own, for each, it took longer than all the rest.
             reformatter = VideoReformatter()
@@ -198,9 +199,8 @@ class _Reader:
 
     def _as_they_come(self, container: Any, stream: Any) -> Generator[Any, None, None]:
         """The newest frame of a stream, whenever there is one."""
-        rate = _RateCheck(float(stream.average_rate or 0), self._target.shown)
-        with closing(Arrivals(container, stream, arrived=rate.count)) as arrivals:
-            for packets, broken in arrivals.batches():
+        with closing(_Packets(container, stream)) as arrived:
+            for packets, broken in arrived.batches():
                 if self._shared.ending.is_set():
                     return
                 if broken:
@@ -214,7 +214,7 @@ class _Reader:
                     yield newest
 
     def _check_size(self, width_px: int, height_px: int) -> None:
-        """Raises InputError for too many pixels; tells a change."""
+        """Raises InputError for too many pixels; reports a change."""
         check_size(width_px, height_px, source=self._target.shown, limits=self._limits)
         if self._size not in (None, (width_px, height_px)) and width_px:
             now = f"{width_px} x {height_px}"
@@ -222,136 +222,132 @@ class _Reader:
         if width_px:
             self._size = (width_px, height_px)
 
-    def _tell(self, problem: str) -> None:
+    def _report(self, problem: str) -> None:
         self._shared.problem = f"{problem}; it is tried again"
-        if problem != self._told:
-            self._told = problem
+        if problem != self._reported:
+            self._reported = problem
             stays = "; the last picture stays" if self._shared.newest is not None else ""
             log.warning("%s: %s%s", self._target.shown, problem, stays)
 
 
-class _RateCheck:
-    """Pictures that come much faster or slower than the source says: told once, and shown as they come."""
+class _Packets:
+    """A stream's packets, taken in by a thread of their own: who decodes slowly knows that it is behind."""
 
-    def __init__(self, told_hz: float, name: str) -> None:
-        """told_hz: 0 where it says nothing."""
-        self._told_hz, self._name = told_hz, name
-        self._times_s: list[float] = []
+    def __init__(self, container: Any, stream: Any) -> None:
+        """container: an open `av` container, which nobody else reads."""
+        self._source = container.demux(stream)
+        self._waiting: deque[Any] = deque(maxlen=WAITING_MAX)
+        self._broken = False  # something was left out: what follows cannot be decoded on from what was before
+        self._ended, self._closing = False, False
+        self._problem: Exception | None = None
+        self._news = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="stream packets", daemon=True)
+        self._thread.start()
 
-    def count(self) -> None:
-        if self._told_hz <= 0 or len(self._times_s) > COUNTED:
-            return
-        self._times_s.append(time.monotonic())
-        if len(self._times_s) <= COUNTED:
-            return
-        steps = sorted(b - a for a, b in zip(self._times_s, self._times_s[1:], strict=False))
-        hz = 1 / max(steps[len(steps) // 2], 1e-4)
-        if not self._told_hz / RATE_DIFFERS <= hz <= self._told_hz * RATE_DIFFERS:
-            log.warning(
-                "%s: says %.4g pictures a second and gives %.3g: shown as they come", self._name, self._told_hz, hz
-            )
+    def batches(self) -> Iterator[tuple[list[Any], bool]]:
+        """All packets that wait, each time that some do, and whether some were left out before them.
+
+        Ends with the stream. Raises what reading it raised.
+        """
+        while True:
+            with self._news:
+                self._news.wait_for(lambda: self._waiting or self._ended)
+                packets, broken = list(self._waiting), self._broken
+                self._waiting.clear()
+                self._broken = False
+            if not packets:
+                if self._problem is not None:
+                    raise self._problem
+                return
+            if len(packets) >= BEHIND:
+                newest_key = max((place for place, packet in enumerate(packets) if packet.is_keyframe), default=0)
+                packets, broken = packets[newest_key:], broken or newest_key > 0
+            yield packets, broken
+
+    def close(self) -> None:
+        """No more is read. Waits for the read that is under way, which has a time limit of its own."""
+        self._closing = True
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            for packet in self._source:
+                if self._closing:
+                    break
+                with self._news:
+                    self._broken |= len(self._waiting) == WAITING_MAX
+                    self._waiting.append(packet)
+                    self._news.notify()
+        except Exception as error:  # raised again by who takes
+            self._problem = error
+        with self._news:
+            self._ended = True
+            self._news.notify()
 
 
 def _step_s(before_s: float | None, now_s: float | None) -> float:
-    """From one picture of a file to the next; a usual one where the file tells nonsense."""
+    """From one picture of a file to the next; a usual one where the file says nonsense."""
     if before_s is None:
         return 0.0
     step_s = (now_s or 0.0) - before_s
     return step_s if 0 < step_s <= LONGEST_STEP_S else USUAL_STEP_S
 
 
-class LiveSource(ContentSource):
-    """The newest picture of a feed, hanging in the plane of the display's centre."""
+def prepare(
+    name: str, settings: ContentSettings, stack: PanelStack, limits: LimitSettings
+) -> Callable[[Any], ContentSource]:
+    """Begin to read, and wait a moment for the first picture. Raises InputError, MissingPart."""
+    target = Target(name)
+    layout = layout_of(target.path, settings)
+    if layout.kind == "rgbd":
+        raise InputError("content", "layout", "rgbd is not for live pictures")
+    feed = Feed(target, settings, limits)
+    feed.shared.first.wait(FIRST_PICTURE_S)
+    file = SceneFile(target.path, settings, stack, limits)
+    return lambda context: LiveSource(feed, layout=layout, file=file)
 
-    def __init__(
-        self, feed: Feed, *, layout: str, quilt: tuple[int, int], stack: PanelStack, settings: ContentSettings
-    ):
-        self._feed, self._layout, self._quilt = feed, layout, quilt
-        self._stack, self._background = stack, settings.background
+
+class LiveSource(ScreenPictures):
+    """The newest picture of a feed."""
+
+    _frames: Feed
+
+    def __init__(self, feed: Feed, *, layout: Layout, file: SceneFile) -> None:
+        super().__init__(feed, layout=layout, file=file)
         self._number = 0  # of the picture that is shown
-        self._views: list[U8] = []
-        self._screen: PlaneRaster | None = None
-        self._shown: dict[int, WarpedPicture] = {}
         self._looked_ns: int | None = None
         self._stalled = False
-        self._own_problem = ""
-        self.info = ContentInfo(name=feed.target.shown, moving=True, background=settings.background)
+        self.info = ContentInfo(name=feed.target.shown, moving=True, background=file.background)
 
     @property
     def problem(self) -> str:
-        shared = self._feed.shared
-        silent_s = (time.monotonic_ns() - shared.arrived_ns) / NS_PER_S
-        if self._own_problem:
-            return f"{self._feed.target.shown}: {self._own_problem}"
+        shared, shown = self._frames.shared, self._frames.target.shown
         if shared.problem:
-            return f"{self._feed.target.shown}: {shared.problem}"
-        if silent_s > STALLED_S and not self._has_ended:
-            return f"{self._feed.target.shown}: no new picture for {silent_s:.0f} s"
-        return ""
-
-    @property
-    def _has_ended(self) -> bool:
-        """A file that holds its last picture."""
-        return self._feed.target.is_file
+            return f"{shown}: {shared.problem}"
+        silent_s = self._silent_s()
+        return f"{shown}: no new picture for {silent_s:.0f} s" if silent_s > STALLED_S else ""
 
     def revision(self, *, time_ns: int) -> int:
-        self._take(time_ns)
+        self._look(time_ns)
         return self._number
 
-    def render(self, view: View, *, time_ns: int) -> U8:
+    def picture_at(self, time_ns: int) -> tuple[int, U8]:
         # Both eyes of one frame see one picture: two would be depth that isn't there.
         if time_ns != self._looked_ns:
-            self._take(time_ns)
-        if self._screen is None:
-            raise ContentFailure(self.problem or f"{self._feed.target.shown}: waiting for its first picture")
-        which = min(view.side, len(self._views) - 1)
-        if which not in self._shown:
-            self._shown[which] = WarpedPicture(self._views[which], background=self._background)
-        matrix = panel_from_image(view.pixels_from_stack, self._screen)
-        return self._shown[which].warped(matrix, width_px=view.width_px, height_px=view.height_px, side=view.side)
+            self._look(time_ns)
+        return self._number, self._picture if self._number else self._frames.frame(0)
 
-    def close(self) -> None:
-        self._feed.close()
-
-    def _take(self, time_ns: int) -> None:
+    def _look(self, time_ns: int) -> None:
         self._looked_ns = time_ns
-        newest = self._feed.shared.newest
-        self._tell_stall()
-        if newest is None or newest[0] == self._number:
-            return
-        number, picture = newest
-        self._number = number
-        try:
-            views = split(picture, self._layout, self._quilt)
-        except ValueError as error:
-            self._own_problem = str(error)
-            return
-        self._own_problem = ""
-        # Of a quilt the two views in its middle.
-        middle = len(views) // 2
-        self._views = views if len(views) <= 2 else views[middle - 1 : middle + 1]
-        height, width = self._views[0].shape[:2]
-        aspect = pixel_aspect(self._feed.target.path, self._layout, width_px=width, height_px=height)
-        self._screen = screen(self._stack, width_px=width, height_px=height, pixel_aspect=aspect)
-        self._shown = {}
+        if self._frames.shared.newest is not None:
+            self._number, self._picture = self._frames.shared.newest
+        silent_s = self._silent_s()
+        if (silent_s > STALLED_S) != self._stalled and self._number:  # once when it begins, once when it is over
+            self._stalled = not self._stalled
+            what = (
+                f"no new picture for {silent_s:.0f} s; the last one stays" if self._stalled else "pictures come again"
+            )
+            log.warning("%s: %s", self._frames.target.shown, what)
 
-    def _tell_stall(self) -> None:
-        """Once when it begins, once when it is over."""
-        silent_s = (time.monotonic_ns() - self._feed.shared.arrived_ns) / NS_PER_S
-        stalled = silent_s > STALLED_S and self._number > 0 and not self._has_ended
-        if stalled != self._stalled:
-            self._stalled = stalled
-            told = f"no new picture for {silent_s:.0f} s; the last one stays" if stalled else "pictures come again"
-            log.warning("%s: %s", self._feed.target.shown, told)
-
-
-def open_feed(name: str, settings: ContentSettings, limits: LimitSettings) -> tuple[Feed, str, tuple[int, int]]:
-    """A feed that has begun, its layout, and its quilt. Raises InputError, MissingPart."""
-    target = Target(name)
-    layout = layout_of(target.path, settings)
-    if layout == "rgbd":
-        raise InputError("content", "layout", "rgbd is not for live pictures")
-    quilt = quilt_size(target.path, settings) if layout == "quilt" else (1, 1)
-    feed = Feed(target, settings, limits)
-    feed.wait()
-    return feed, layout, quilt
+    def _silent_s(self) -> float:
+        return (time.monotonic_ns() - self._frames.shared.arrived_ns) / NS_PER_S

@@ -21,8 +21,8 @@ from runtime.optics.rect import PixelRect, union
 from runtime.records import F32, F64, U8
 from runtime.support.gl import DrawnPicture, linked_program
 
-MOST_OUTLINED = 200_000  # triangles of a part; beyond, finding its outline costs more than drawing it
-MOST_PROJECTED = 5000  # vertices of a part that are projected to tell where it lies; beyond, its box is
+OUTLINED_MAX = 200_000  # triangles of a part; beyond, finding its outline costs more than drawing it
+PROJECTED_MAX = 5000  # vertices of a part that are projected to see where it lies; beyond, its box is
 OUTLINE_BYTES = 6 * (5 + 8) * 4  # two triangles an edge: clip coordinates and coverage, then the attributes
 OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
 
@@ -123,8 +123,8 @@ class ReadyPart:
     corners_m: F64  # (8, 3) of the box that holds it; frame of the part
 
 
-def ready(part: Part, *, samples: int = 0) -> ReadyPart:
-    """Needs no GL: may run on any thread. samples: as `TrianglePainter` has it."""
+def ready(part: Part, *, outlined: bool = True) -> ReadyPart:
+    """Needs no GL: may run on any thread. outlined: with what ramps along its outline need."""
     mesh = part.shape
     attributes = _attributes(part)
     low, high = mesh.positions_m.min(0), mesh.positions_m.max(0)
@@ -136,7 +136,7 @@ def ready(part: Part, *, samples: int = 0) -> ReadyPart:
         features=part.features,
         attributes=attributes,
         packed=np.concatenate([mesh.positions_m, attributes], axis=1, dtype=np.float32),
-        edges=edges_of(mesh) if samples == 0 and len(mesh.triangles) <= MOST_OUTLINED else None,
+        edges=edges_of(mesh) if outlined and len(mesh.triangles) <= OUTLINED_MAX else None,
         corners_m=camera.box_corners(low, high),
     )
 
@@ -175,7 +175,7 @@ class TrianglePainter:
         self._programs: dict[tuple[str, ...], Any] = {}
         self._textures: dict[int, Any] = {}
         self._parts = [
-            self._upload(part if isinstance(part, ReadyPart) else ready(part, samples=samples)) for part in parts
+            self._upload(part if isinstance(part, ReadyPart) else ready(part, outlined=samples == 0)) for part in parts
         ]
 
     def corners_m(self, stack_from_parts: Sequence[F64]) -> F64:
@@ -189,7 +189,7 @@ class TrianglePainter:
         boxes = []
         for item, matrix in zip(self._parts, stack_from_parts, strict=True):
             vertices = item.positions
-            points = item.corners_m if len(vertices) > MOST_PROJECTED else vertices.astype(np.float64)
+            points = item.corners_m if len(vertices) > PROJECTED_MAX else vertices.astype(np.float64)
             placed = points @ matrix[:3, :3].T + matrix[:3, 3]
             if camera.depth_bounds(view.pixels_from_stack, placed) is not None:
                 boxes.append(camera.covered_box(view.pixels_from_stack, placed, align_px=1, **size))
@@ -284,7 +284,9 @@ class TrianglePainter:
         return self._textures[id(picture)]
 
     def _describe(self, program: Any, item: _Uploaded, stack_from_part: F64, view: View) -> None:
-        linear = stack_from_part[:3, :3] if view.turned is None else view.turned @ stack_from_part[:3, :3]
+        linear = stack_from_part[:3, :3]
+        if view.display_from_view is not None:
+            linear = view.display_from_view @ linear
         if "stack_from_part" in program:
             program["stack_from_part"].write(_gl(np.linalg.pinv(linear).T * np.cbrt(abs(np.linalg.det(linear)))))
         program["colour"] = item.part.colour

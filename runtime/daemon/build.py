@@ -4,32 +4,48 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import cv2
+
+from runtime.blackbox.recorder import Recorder
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock, SimulatedClock
 from runtime.config import OutputSettings, Settings
+from runtime.daemon.solver_parts import RunningSolver, SolverMaker
+from runtime.errors import PanelLost, Stopped
+from runtime.eyes.calibration import load_calibration
+from runtime.eyes.detect import EyeFinder
+from runtime.frame.observer import Output, RunObserver
+from runtime.frame.pacing import Pacer
+from runtime.frame.presenter import Observers, Presenter, Unsupervised
+from runtime.frame.samples import LiveSamples, RecordedSamples, Samples
+from runtime.frame.solver_host import SimulatedSolver, SolverHost, total_ns
+from runtime.frame.solver_thread import SolverThread
+from runtime.frame.viewer import Viewer
+from runtime.optics.stack import PanelStack
+from runtime.panels.base import PanelSink
+from runtime.panels.registry import open_panels
+from runtime.plan.savings import Saving
 from runtime.records import RefreshAccount
-from runtime.support.memory import settled
+from runtime.sensor.base import Sensor
+from runtime.sensor.detecting import DetectingDriver
+from runtime.sensor.registry import open_sensor
+from runtime.support.gl import offscreen_context
+from runtime.support.memory import gc_frozen
 from runtime.support.priority import PRESENTER_NICENESS, niceness
-
-if TYPE_CHECKING:
-    from runtime.blackbox.recorder import Recorder
-    from runtime.daemon.solver_parts import RunningSolver
-    from runtime.frame.observer import Output, RunObserver
-    from runtime.frame.presenter import Presenter, Supervisor
-    from runtime.frame.solver_host import SolverHost
-    from runtime.optics.stack import PanelStack
-    from runtime.panels.base import PanelSink
-    from runtime.sensor.base import SensorDriver
-    from runtime.support.progress import Listener
+from runtime.support.progress import listening
 
 log = logging.getLogger("phasestack.build")
 
 SWITCH_INTERVAL_S = 0.0005  # between Python threads: the presenter must not wait long for the solver's
+
+
+# Of summary.json: on the simulated clock these follow from what is configured, and nothing was measured.
+SIMULATED_FIGURES = ("seconds", "fps", "solutions_per_s", "interval_ms", "photon_ms", "stage_ms", "overhead_ms")
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +56,8 @@ class RunOptions:
     measure: bool = False
     scale: float = 1.0
     keep_light: int = 0
+    frames: int | None = None  # refreshes; None: to the end
+    out: Path | None = None  # folder for the run's files
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,20 +67,17 @@ class Run:
     presenter: Presenter
     observer: RunObserver
     solver: SolverHost
-    newest_parts: Callable[[], RunningSolver]
+    maker: SolverMaker
     simulated: bool
 
     @property
     def parts(self) -> RunningSolver:
         """The solver at present: for the status, and for tests."""
-        return self.newest_parts()
+        assert self.maker.parts is not None
+        return self.maker.parts
 
     def plan_items(self) -> list[dict[str, Any]]:
         """What is left out at present; a saving or a cost that this run did not measure is None."""
-        from dataclasses import asdict
-
-        from runtime.plan.savings import Saving
-
         solver = self.parts.solver
         known = replace(solver.measured, reuse=Saving(saves_ms=self.presenter.stats.reuse_saves_ms()))
         return [asdict(item) for item in solver.plan_items(known)]
@@ -75,6 +90,7 @@ class Run:
             "backend": self.presenter.run_cell.state.predictor.backend,
             "scene": self.presenter.run_cell.state.content.info.name,
             "plan": self.plan_items(),
+            "configured": list(SIMULATED_FIGURES) if self.simulated else [],
         }
 
 
@@ -88,16 +104,19 @@ def scaled_stack(settings: Settings, scale: float) -> PanelStack:
     )
 
 
-def _heard(on_start: Callable[[str], bool]) -> Listener:
-    """A listener to what is read before the first refresh, which ends it when it is told to stop."""
+class Host(Unsupervised):
+    """Who a run is for: asked before its first refresh, its supervisor from then on. This one asks for nothing."""
 
-    def heard(what: str, done: int, total: int | None) -> None:
-        from runtime.errors import Stopped
+    def starting(self, doing: str) -> bool:
+        """Something before the first refresh takes long. False: leave it."""
+        return True
 
-        if not on_start("reading the recording"):
-            raise Stopped("told to stop while starting")
+    def wait_for_panel(self, why: str) -> bool:
+        """A panel is not there yet. True: try again."""
+        return False
 
-    return heard
+    def watches(self, run: Run) -> None:
+        """The run has been put together."""
 
 
 def build_run(
@@ -105,35 +124,16 @@ def build_run(
     options: RunOptions,
     cleanup: ExitStack,
     *,
-    supervisor: Supervisor | None = None,
+    host: Host | None = None,
     output: Output | None = None,
     on_account: Callable[[RefreshAccount], None] | None = None,
-    wait_for_panels: Callable[[str], bool] | None = None,
-    on_start: Callable[[str], bool] = lambda _: True,
     recorder: Recorder | None = None,
 ) -> Run:
     """A run ready for its first refresh; whatever it holds is closed by `cleanup`.
 
-    wait_for_panels: asked when a panel is not there yet; True: try again. on_start: told what takes long before the
-    first refresh; False: leave it. recorder: begins to watch; who gives it closes it. Raises FatalError, PanelLost.
+    recorder: begins to watch; who gives it closes it. Raises FatalError, PanelLost, Stopped where the host says so.
     """
-    import cv2
-
-    from runtime.daemon.solver_parts import SolverMaker
-    from runtime.eyes.calibration import load_calibration
-    from runtime.eyes.detect import EyeFinder
-    from runtime.frame.observer import RunObserver
-    from runtime.frame.observers import Observers
-    from runtime.frame.presenter import Presenter
-    from runtime.frame.samples import LiveSamples, RecordedSamples, Samples
-    from runtime.frame.solver_host import SimulatedSolver, total_ns
-    from runtime.frame.solver_thread import SolverThread
-    from runtime.frame.viewer import Viewer
-    from runtime.sensor.detecting import DetectingDriver
-    from runtime.sensor.registry import open_sensor
-    from runtime.support.gl import offscreen_context
-    from runtime.support.progress import listening
-
+    host = host or Host()
     cv2.setNumThreads(settings.model.threads or -1)
     simulated = options.max_speed
     clock: Clock = SimulatedClock() if simulated else MonotonicClock()
@@ -142,15 +142,20 @@ def build_run(
     for warning in calibration.warnings:
         log.warning("%s", warning)
 
-    def make_driver() -> SensorDriver:
+    def make_driver() -> Sensor:
         latency_ms = settings.loop.sensor_latency_ms
         driver = open_sensor(settings.sensor, clock, latency_ms=latency_ms, limits=settings.limits)
-        return DetectingDriver(driver, lambda: EyeFinder(settings.detector).find)
+        return DetectingDriver(driver, lambda: EyeFinder(settings).find)
 
     driver = make_driver()
     samples: Samples
     if simulated:
-        with listening(_heard(on_start)):  # a recording may be long to skip through
+
+        def keep_on(what: str, done: int, total: int | None) -> None:
+            if not host.starting("reading the recording"):
+                raise Stopped("told to stop while starting")
+
+        with listening(keep_on):  # a recording may be long to skip through
             samples = RecordedSamples(driver)
         cleanup.callback(samples.close)
     context = offscreen_context()
@@ -158,9 +163,9 @@ def build_run(
     output_settings = settings.output
     if options.scale != 1.0:  # asked for: no monitor's mode fits such a stack
         output_settings = output_settings.model_copy(update={"allow_rescaling": True})
-    panels = _open_panels(output_settings, stack, clock, context, wait_for_panels)
+    panels = _open_panels(output_settings, stack, clock, context, host)
     cleanup.callback(panels.close)
-    maker = SolverMaker(settings, stack, calibration, on_start=on_start, panels_group=lambda: panels.group)
+    maker = SolverMaker(settings, stack, calibration, panels_group=lambda: panels.group)
     solver: SolverHost
     if simulated:
         solver = SimulatedSolver(maker(context=context, simulated=True), clock)
@@ -176,13 +181,11 @@ def build_run(
         )
         solver = thread
         cleanup.callback(solver.close)
-        thread.wait_ready(lambda: on_start("loading content and model"), most_s=settings.limits.start_s)
+        thread.wait_ready(lambda: host.starting("loading content and model"), most_s=settings.limits.start_s)
         samples = LiveSamples(make_driver, settings.sensor, clock)
         cleanup.callback(samples.close)
     run = maker.run
     if run is None:
-        from runtime.errors import Stopped
-
         raise Stopped("told to stop while starting")
     viewer = Viewer(settings, calibration, front_m=max(stack.x_m), in_stack_frame=driver.capabilities.in_stack_frame)
     observer = RunObserver(
@@ -206,28 +209,24 @@ def build_run(
         solver=solver,
         panels=panels,
         stage_ms=settings.loop.simulated_stage_ms,
-        supervisor=supervisor,
+        supervisor=host,
         observer=observer if recorder is None else Observers(observer, recorder),
     )
     if recorder is not None:
         in_stack_frame = driver.capabilities.in_stack_frame
-        recorder.watches(presenter, stack=stack, simulated=simulated, in_stack_frame=in_stack_frame)
+        recorder.watches(presenter, in_stack_frame=in_stack_frame)
     if not simulated:
-        cleanup.enter_context(settled())
+        cleanup.enter_context(gc_frozen())
         cleanup.enter_context(niceness(PRESENTER_NICENESS))  # this thread's, once all others have been started
-    return Run(presenter, observer, solver, lambda: _newest(maker), simulated)
+    built = Run(presenter, observer, solver, maker, simulated)
+    host.watches(built)
+    return built
 
 
-def _newest(maker: Any) -> RunningSolver:
-    parts: RunningSolver = maker.parts
-    return parts
-
-
-def _pacer(settings: Settings, panels: PanelSink) -> Any:
-    from runtime.frame.pacing import Pacer
-
+def _pacer(settings: Settings, panels: PanelSink) -> Pacer:
     period_ns = panels.period_ns or round(NS_PER_S / settings.loop.rate_hz)
-    work_ms = _refresh_ms(settings.loop.simulated_stage_ms)
+    stage_ms = settings.loop.simulated_stage_ms
+    work_ms = sum(stage_ms.get(stage, 0.0) for stage in ("sensor", "track", "present"))
     return Pacer(
         period_ns=period_ns,
         photon_ns=round(settings.loop.scanout_ms * NS_PER_MS),
@@ -235,19 +234,10 @@ def _pacer(settings: Settings, panels: PanelSink) -> Any:
     )
 
 
-def _refresh_ms(stage_ms: Mapping[str, float]) -> float:
-    return sum(stage_ms.get(stage, 0.0) for stage in ("sensor", "track", "present"))
-
-
-def _open_panels(
-    settings: OutputSettings, stack: PanelStack, clock: Clock, context: Any, wait: Callable[[str], bool] | None
-) -> PanelSink:
-    from runtime.errors import PanelLost
-    from runtime.panels.registry import open_panels
-
+def _open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, context: Any, host: Host) -> PanelSink:
     while True:
         try:
             return open_panels(settings, stack, clock, context)
         except PanelLost as error:
-            if wait is None or not wait(str(error)):
+            if not host.wait_for_panel(str(error)):
                 raise

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +10,7 @@ from runtime.errors import InputError
 from runtime.support import foreign
 from runtime.support.live import LIVE, is_live
 from runtime.support.plausible import nearest
+from runtime.support.plugins import is_plugin
 
 if TYPE_CHECKING:
     from runtime.config import ContentSettings, Settings
@@ -22,11 +23,14 @@ def scene_names() -> tuple[str, ...]:
     from runtime.content.presets import preset_names
     from runtime.content.scenes import SCENES
 
-    return (*SCENES, *preset_names(), "external")
+    return (*SCENES, *preset_names())
 
 
 def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
-    """What can be shown of the library's folder, by its whole path; as many as a page can offer."""
+    """What can be shown of the library's folder, by its whole path; as many as a page can offer.
+
+    A name that is not UTF-8 (no setting can hold it) or that can't be printed is left out.
+    """
     from runtime.content.pictures import PICTURES, VIDEOS
     from runtime.content.registry import MESHES, PLAYLISTS
 
@@ -37,7 +41,7 @@ def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
         entries = sorted(Path(settings.library).absolute().iterdir())[:LIBRARY_LOOKED_AT]
     except (OSError, ValueError):
         return ()
-    entries = [path for path in entries if not path.name.startswith(".")]
+    entries = [path for path in entries if not path.name.startswith(".") and path.name.isprintable()]
     found = [str(path) for path in entries if path.suffix.lower() in shown or path.is_dir()]
     return tuple(found[:LIBRARY_MOST])
 
@@ -73,63 +77,79 @@ def _from_here(name: str, known: Callable[[], tuple[str, ...]]) -> str:
         return name
 
 
+Problems = Iterator[tuple[str, str]]  # a setting, and what is wrong with it
+
+
 def check_recording(settings: Settings, *, source: str | Path) -> None:
     """Raise InputError where a recording is to be replayed that is not there."""
-    sensor = settings.sensor
-    if sensor.driver == "replay" and sensor.source != "demo":
-        _there("sensor.source", sensor.source, source)
+    _refuse(_recording(settings), source)
 
 
 def check_names(settings: Settings, *, source: str | Path) -> None:
-    """Raise InputError for the first name that nobody knows, or file that is not there, naming its field."""
+    """Raise InputError for all names that nobody knows, and files that are not there, naming their fields."""
+    _refuse(_problems(settings), source)
+
+
+def _refuse(problems: Problems, source: str | Path) -> None:
+    found = list(problems)
+    if found:
+        (field, problem), *others = found
+        raise InputError(source, field, "; ".join([problem, *(f"{name}: {text}" for name, text in others)]))
+
+
+def _recording(settings: Settings) -> Problems:
+    sensor = settings.sensor
+    if sensor.driver == "replay" and sensor.source != "demo":
+        yield from _there("sensor.source", sensor.source)
+
+
+def _problems(settings: Settings) -> Problems:
     from runtime.eyes.calibration import load_calibration
     from runtime.sensor.registry import driver_names
 
     sensor, content, output = settings.sensor, settings.content, settings.output
-    if sensor.driver not in driver_names():
-        _unknown("sensor.driver", sensor.driver, driver_names(), source)
-    check_recording(settings, source=source)
+    if sensor.driver not in driver_names() and not is_plugin(sensor.driver):
+        yield from _unknown("sensor.driver", sensor.driver, driver_names())
+    yield from _recording(settings)
     if sensor.openni2_folder:
-        _there("sensor.openni2_folder", sensor.openni2_folder, source)
-    if settings.detector.kind == "yunet":
-        _there("detector.yunet_model", settings.detector.yunet_model, source)
+        yield from _there("sensor.openni2_folder", sensor.openni2_folder)
     if settings.calibration.file:
-        _there("calibration.file", settings.calibration.file, source)
-        load_calibration(Path(settings.calibration.file))
-    if content.scene not in scene_names() and not is_live(content.scene):
-        _known_or_there("content.scene", content.scene, scene_names(), source)
+        yield from _there("calibration.file", settings.calibration.file)
+        try:
+            load_calibration(Path(settings.calibration.file))
+        except InputError as error:
+            if foreign.is_there(settings.calibration.file):
+                yield "calibration.file", str(error)
+    if content.scene not in scene_names() and not (is_live(content.scene) or is_plugin(content.scene)):
+        yield from _known_or_there("content.scene", content.scene, scene_names())
     if content.file:
-        _there("content.file", content.file, source)
+        yield from _there("content.file", content.file)
     if content.library:
-        _there("content.library", content.library, source)
+        yield from _there("content.library", content.library)
     if settings.model.name not in model_names():
-        _known_or_there("model.name", settings.model.name, model_names(), source)
+        yield from _known_or_there("model.name", settings.model.name, model_names())
     for number, panel in enumerate(output.panels):
         if panel.lut:
-            _there(f"output.panels.{number}.lut", panel.lut, source)
+            yield from _there(f"output.panels.{number}.lut", panel.lut)
         if output.kind != "offscreen" and not (panel.edid_serial or panel.connector or panel.index >= 0):
-            raise InputError(source, f"output.panels.{number}", "names no monitor: set edid_serial or connector")
+            yield f"output.panels.{number}", "names no monitor: set edid_serial or connector"
     if output.kind != "offscreen" and not output.panels:
-        raise InputError(
-            source,
-            "output.panels",
-            f"{output.kind} need one table a panel that names its monitor (phasestack identify)",
-        )
+        yield "output.panels", f"{output.kind} need one table a panel that names its monitor (phasestack identify)"
 
 
-def _there(field: str, path: str, source: str | Path) -> None:
+def _there(field: str, path: str) -> Problems:
     if not path or not foreign.is_there(Path(path)):
-        raise InputError(source, field, f"{path!r} is not there")
+        yield field, f"{path!r} is not there"
 
 
-def _unknown(field: str, name: str, known: tuple[str, ...], source: str | Path) -> None:
-    hint = nearest(name, known) or f"; known: {', '.join(known)}"
-    raise InputError(source, field, f"nobody knows {name!r}{hint}")
+def _unknown(field: str, name: str, known: tuple[str, ...]) -> Problems:
+    yield field, f"nobody knows {name!r}" + (nearest(name, known) or f"; known: {', '.join(known)}")
 
 
-def _known_or_there(field: str, name: str, known: tuple[str, ...], source: str | Path) -> None:
+def _known_or_there(field: str, name: str, known: tuple[str, ...]) -> Problems:
     if Path(name).exists():
         return
     if "/" in name or Path(name).suffix:
-        _there(field, name, source)
-    _unknown(field, name, known, source)
+        yield from _there(field, name)
+    else:
+        yield from _unknown(field, name, known)

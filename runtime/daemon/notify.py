@@ -12,7 +12,6 @@ from runtime.clock import NS_PER_S, Clock
 from runtime.records import State
 
 NS_PER_US = 1000
-RESTARTS = "PHASESTACK_UNIT_RESTARTS"
 
 
 class Notifier:
@@ -93,11 +92,6 @@ class Notifier:
     def _send(self, message: str) -> None:
         if self._channel is not None:
             self._channel.notify(message)
-
-
-def may_restart(environment: Mapping[str, str] = os.environ) -> bool:
-    """Whether the unit says of itself that it starts the daemon again after a failure (systemd/phasestack.service)."""
-    return bool(environment.get("NOTIFY_SOCKET")) and environment.get(RESTARTS) == "1"
 
 
 def watchdog_ns(environment: Mapping[str, str]) -> int:

@@ -82,7 +82,7 @@ class Reconfiguration:
         predictor = self._model.take() if self._model is not None else None
         if predictor is not None:
             try:
-                parts.surround(predictor, self.settings)
+                parts.set_backend(predictor, self.settings)
             except PhasestackError:
                 predictor.close()
                 raise
@@ -96,7 +96,6 @@ class Reconfiguration:
             before.content.close()
         if predictor is not None:
             before.predictor.close()
-        parts.budget.changed(content=self._source is not None, model=predictor is not None)
         give_back_later()
 
     def _discard(self) -> None:
@@ -109,8 +108,5 @@ class Reconfiguration:
 
 
 def _model_part(settings: Settings) -> Any:
-    """All that decides which predictor there is, but the budget and what is asked anew for every solution."""
-    plan = settings.plan
-    savings = plan.enabled and (plan.focus, plan.one_channel)
-    fixed = {"budget_ms": 0.0, "eye_sigma_mm": "auto", "pupil_mm": 4.0}
-    return settings.model.model_copy(update=fixed), savings
+    """All that decides which predictor there is, but what is asked anew for every solution."""
+    return settings.model.model_copy(update={"budget_ms": 0.0, "eye_sigma_mm": "auto", "pupil_mm": 4.0})

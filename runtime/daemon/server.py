@@ -1,7 +1,12 @@
-"""The status and control socket: JSON lines over a local socket of mode 0660, answered alongside the loop."""
+"""The status and control socket: JSON lines over a local socket of mode 0660, answered alongside the loop.
+
+Whoever trickles, hangs or comes in crowds holds up nobody: a request has so long to arrive, an answer so long to be
+read, and where all places are taken the client that has waited longest for a whole request goes.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import fcntl
 import grp
@@ -11,25 +16,26 @@ import os
 import queue
 import socket
 import stat
+import threading
+from asyncio import StreamReader, StreamWriter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from runtime.clock import NS_PER_S, Clock, MonotonicClock
+from runtime.clock import NS_PER_S, Clock
 from runtime.config import ServiceSettings
+from runtime.daemon.client import user_socket
 from runtime.daemon.commands import Command, parse
-from runtime.daemon.location import user_socket
-from runtime.daemon.request_server import Limits, Pending, RequestServer
 from runtime.errors import InputError, TransientError
 from runtime.support.artifacts import to_json
-from runtime.support.foreign import nesting
+from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
 
 log = logging.getLogger("phasestack.service")
 
 LINE_MAX_BYTES = 65536
-DEPTH_MAX = 8
+BACKLOG = 64
 CLIENTS_MAX = 64
-REQUEST_S = 5.0
+REQUEST_S = 5.0  # for a whole request to come, and for its answer to be read
 LOOP_ANSWERS_WITHIN_S = 5.0
 LOADED_WITHIN_S = 60.0  # what has begun is waited for so long
 OWN_MODE = 0o600
@@ -37,6 +43,10 @@ OWN_MODE = 0o600
 
 class SocketInUse(TransientError):
     """Another phasestack has the socket; the text says which."""
+
+
+class _Refusal(Exception):
+    """Why a client is sent away."""
 
 
 class StatusServer:
@@ -54,6 +64,8 @@ class StatusServer:
         self._clock = clock
         self._started_ns = clock.now_ns()
         self._snapshot: tuple[int, Callable[[], dict[str, Any]]] = (self._started_ns, dict)
+        self._clients: set[asyncio.Task[None]] = set()
+        self._reading: dict[asyncio.Task[None], None] = {}  # who waits for a whole request, the longest first
         self._lock = _claim(path)
         try:
             listening = _bound(path, group)
@@ -61,8 +73,12 @@ class StatusServer:
             os.close(self._lock)
             raise
         self._own = _identity(path)
-        limits = Limits(clients=CLIENTS_MAX, request_bytes=LINE_MAX_BYTES, request_s=REQUEST_S)
-        self._server: RequestServer | None = RequestServer(listening, _Lines(self), limits, name="status")
+        self._loop = asyncio.new_event_loop()
+        self._server = self._loop.run_until_complete(
+            asyncio.start_unix_server(self._serve, sock=listening, limit=LINE_MAX_BYTES, backlog=BACKLOG)
+        )
+        self._thread: threading.Thread | None = threading.Thread(target=self._run, name="status", daemon=True)
+        self._thread.start()
 
     def publish(self, snapshot: Callable[[], dict[str, Any]]) -> None:
         """The newest account of the loop, once a turn; called (if ever) on the server's thread.
@@ -71,36 +87,37 @@ class StatusServer:
         """
         self._snapshot = (self._clock.now_ns(), snapshot)
 
+    @property
+    def connections(self) -> int:
+        """Clients that are connected now."""
+        return len(self._clients)
+
     def close(self) -> None:
-        """Stop answering and remove the socket. May be called twice."""
-        if self._server is None:
+        """Answer what waits, stop, and remove the socket. May be called twice."""
+        if self._thread is None:
             return
-        self._server.close()
-        self._server = None
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(timeout=2.0)
+        self._thread = None
         if _identity(self.path) == self._own:  # where it was deleted, another daemon's may be there
             self.path.unlink(missing_ok=True)
         os.close(self._lock)
 
-    def answer(self, line: bytes) -> dict[str, Any] | Waiting:
-        """One request to one answer (`ok` says whether it was done, `error` why not), or to a command's wait."""
+    def answer(self, line: bytes) -> dict[str, Any] | Command:
+        """One request to one answer (`ok` says whether it was done, `error` why not), or to a command for the loop."""
         try:
-            if nesting(line, most=DEPTH_MAX) > DEPTH_MAX:
-                raise ValueError
             request = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             return {"ok": False, "error": "a request is one JSON object on one line"}
-        if isinstance(request, dict) and request.get("command") == "status":
+        name = request.get("command") if isinstance(request, dict) else None
+        if name == "status":
             return self._status()
-        looked_up = self.lookups.get(str(request.get("command"))) if isinstance(request, dict) else None
-        if looked_up is not None:
-            return {"ok": True, **looked_up()}
+        if isinstance(name, str) and name in self.lookups:
+            return {"ok": True, **self.lookups[name]()}
         try:
-            command = parse(request)
+            return parse(request)
         except ValueError as error:
             return {"ok": False, "error": str(error)}
-        log.info("asked for: %s %s", command.name, "" if command.value is None else command.value)
-        self.commands.put(command)
-        return Waiting(command)
 
     def _status(self) -> dict[str, Any]:
         published_ns, snapshot = self._snapshot
@@ -113,54 +130,101 @@ class StatusServer:
             **snapshot(),
         }
 
+    # On the server's thread.
 
-class _Lines:
-    """The service of the socket: one JSON object a line, as many as the client likes."""
+    def _run(self) -> None:
+        set_niceness(BACKGROUND_NICENESS)
+        self._loop.run_forever()
+        self._loop.run_until_complete(self._end())
+        self._loop.close()
 
-    one_request = False
+    async def _end(self) -> None:
+        self._server.close()
+        clients = list(self._clients)
+        for client in clients:
+            client.cancel("the daemon stops")
+        await asyncio.gather(*clients, return_exceptions=True)
+        await asyncio.sleep(0)  # their channels are closed in the loop's next turn
 
-    def __init__(self, owner: StatusServer) -> None:
-        self._owner = owner
+    async def _serve(self, reader: StreamReader, writer: StreamWriter) -> None:
+        """One client, as many requests as it likes."""
+        task = asyncio.current_task()
+        assert task is not None
+        self._clients.add(task)
+        writer.transport.set_write_buffer_limits(high=0)  # `drain` waits until all of an answer is on its way
+        try:
+            self._make_room()
+            while line := await self._request(task, reader):
+                await self._reply(line, writer)
+        except _Refusal as error:
+            self._send(writer, {"ok": False, "error": str(error)})
+        except asyncio.CancelledError as error:
+            self._send(writer, {"ok": False, "error": error.args[0]})
+        except (OSError, TimeoutError):  # it is gone, or does not read
+            writer.transport.abort()
+        finally:
+            self._clients.discard(task)
+            if writer.transport.get_write_buffer_size():
+                writer.transport.abort()
+            writer.close()
 
-    def cut(self, received: bytes, *, ended: bool) -> tuple[bytes, bytes] | None:
-        line, broken, rest = received.partition(b"\n")
-        return (line, rest) if broken or (ended and line) else None
+    def _make_room(self) -> None:
+        """Send away who has waited longest for a whole request; raises _Refusal where all are being answered."""
+        if len(self._clients) > CLIENTS_MAX:
+            longest = next(iter(self._reading), None)
+            if longest is None:
+                raise _Refusal("too many clients")
+            self._reading.pop(longest)
+            longest.cancel("too many clients")
 
-    def answer(self, request: bytes) -> bytes | Pending:
-        answer = self._owner.answer(request)
-        return answer if isinstance(answer, Waiting) else _line(answer)
+    async def _request(self, task: asyncio.Task[None], reader: StreamReader) -> bytes:
+        """The next line; what there is of it where nothing more will come."""
+        self._reading[task] = None
+        try:
+            async with asyncio.timeout(REQUEST_S):
+                return await reader.readuntil(b"\n")
+        except asyncio.IncompleteReadError as end:
+            return end.partial
+        except asyncio.LimitOverrunError:
+            raise _Refusal("the request is too long") from None
+        except TimeoutError:
+            raise _Refusal("the request did not come in time") from None
+        finally:
+            self._reading.pop(task, None)
 
-    def refusal(self, why: str) -> bytes:
-        return _line({"ok": False, "error": why})
+    async def _reply(self, line: bytes, writer: StreamWriter) -> None:
+        try:
+            answer = self.answer(line)
+        except Exception:
+            log.exception("a request could not be answered")
+            answer = {"ok": False, "error": "the request could not be answered: see the log"}
+        if isinstance(answer, Command):
+            log.info("asked for: %s %s", answer.name, "" if answer.value is None else answer.value)
+            self.commands.put(answer)
+            answer = await _outcome(answer)
+        self._send(writer, answer)
+        async with asyncio.timeout(REQUEST_S):
+            await writer.drain()
+
+    @staticmethod
+    def _send(writer: StreamWriter, answer: dict[str, Any]) -> None:
+        writer.write(to_json(answer).encode() + b"\n")
 
 
-class Waiting:
-    """A client that waits for what becomes of its command."""
-
-    def __init__(self, command: Command) -> None:
-        self._command, self._clock = command, MonotonicClock()
-        self._asked_ns = self._clock.now_ns()
-
-    def poll(self) -> bytes | None:
-        """The answer, once there is one. A command that nobody has taken in time is given up: it is never done."""
-        refused = self._command.wait(0.0)
-        if refused is not None:
-            return _line({"ok": False, "error": refused} if refused else {"ok": True, **self._command.told})
-        waited_s = (self._clock.now_ns() - self._asked_ns) / NS_PER_S
-        if waited_s > LOOP_ANSWERS_WITHIN_S and self._command.give_up():
+async def _outcome(command: Command) -> dict[str, Any]:
+    """What becomes of a command. One that the loop has not taken in time is given up: it is never done."""
+    answer = asyncio.wrap_future(command.answer)
+    try:
+        done, _ = await asyncio.wait({answer}, timeout=LOOP_ANSWERS_WITHIN_S)
+        if not done and command.answer.cancel():
             problem = f"the loop did not answer within {LOOP_ANSWERS_WITHIN_S:g} s: nothing was done"
-            return _line({"ok": False, "error": problem})
-        if waited_s > LOADED_WITHIN_S:
-            return _line({"ok": True, "note": f"still loading after {LOADED_WITHIN_S:g} s: ask `phasestack status`"})
-        return None
-
-    def abandon(self) -> bytes:
-        problem = "the daemon stops" + (": nothing was done" if self._command.give_up() else "")
-        return _line({"ok": False, "error": problem})
-
-
-def _line(answer: dict[str, Any]) -> bytes:
-    return to_json(answer).encode() + b"\n"
+            return {"ok": False, "error": problem}
+        done, _ = await asyncio.wait({answer}, timeout=LOADED_WITHIN_S)
+    except asyncio.CancelledError as stops:
+        raise _Refusal(stops.args[0] + (": nothing was done" if command.answer.cancel() else "")) from None
+    if done:
+        return answer.result()
+    return {"ok": True, "note": f"still loading after {LOADED_WITHIN_S:g} s: ask `phasestack status`"}
 
 
 def _claim(path: Path) -> int:

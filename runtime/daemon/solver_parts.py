@@ -1,10 +1,9 @@
-"""A solver with its GL context, content, model and time budget: what one solver thread makes, uses and releases."""
+"""A solver with its GL context, content and model: what one solver thread makes, uses and releases."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,14 +14,10 @@ from runtime.content.registry import open_content
 from runtime.errors import ContextLost
 from runtime.eyes.calibration import Calibration
 from runtime.frame.run_state import RunCell, RunState
-from runtime.frame.solver import Solver, Step
-from runtime.frame.timing import SOLVING_STAGES
+from runtime.frame.solver import Solver, SolverStep
 from runtime.model.backends import Choice, Wanted, choose
-from runtime.model.predictor import Predictor
+from runtime.model.predictor import Predictor, load_predictor
 from runtime.optics.stack import PanelStack
-from runtime.plan.budget import BudgetControl
-from runtime.plan.predictors import planned_predictor
-from runtime.plan.savings import Saving
 from runtime.records import SolveRequest
 from runtime.support.gl import offscreen_context
 from runtime.support.gl_sharing import ShareGroup, SharingContext, leave_context
@@ -56,21 +51,15 @@ class RunningSolver:
         self._group, self._panels_group = group, panels_group
         self._wanted_backend = run.state.settings.model.backend
         self._held: RunState = run.state
-        self.solver = Solver(run, stack)
-        self.budget = BudgetControl(self, stack, simulated=simulated)
-
-    @property
-    def settings(self) -> Settings:
-        """Those in force."""
-        return self.run.state.settings
+        self.solver = Solver(run, stack, timed=not simulated)
 
     @property
     def content(self) -> ContentSource:
         """What is drawn at present."""
         return self.run.state.content
 
-    def surround(self, predictor: Predictor, settings: Settings) -> None:
-        """Have this run's backend surround a model; chosen anew where the settings ask for another.
+    def set_backend(self, predictor: Predictor, settings: Settings) -> None:
+        """Give a model this run's backend; chosen anew where the settings ask for another.
 
         Raises PhasestackError where that can't be had; nothing has changed then.
         """
@@ -78,39 +67,20 @@ class RunningSolver:
         if wanted != self._wanted_backend:
             self.backend = choose(wanted, predictor, lambda: self.context, group=self._group)
             self._wanted_backend = wanted
-        predictor.surround_with(self.backend.backend)
+        predictor.set_backend(self.backend.backend)
         if before is not self.backend:
             before.backend.close()
 
-    def surround_level(self, predictor: Predictor) -> None:
-        """Have this run's backend surround a model that a budget may choose."""
-        predictor.surround_with(self.backend.backend)
-
-    def use(self, predictor: Predictor) -> Predictor:
-        """Another model, surrounded already, from the next solution on. Answers the one before it, which is the
-        caller's to close."""
-        return self.run.replace(predictor=predictor).predictor
-
-    def tell_level(self, label: str, saving: Saving) -> None:
-        """What the plan says of the level that is shown."""
-        self.solver.measured = replace(self.solver.measured, level=label, level_saving=saving)
-
-    def step(self, request: SolveRequest) -> Step:
+    def step(self, request: SolveRequest) -> SolverStep:
         if self._panels_group() is not self._group or (self._group is not None and self._group.lost):
             raise ContextLost("the panels have another OpenGL context")
         self._held = self.run.state
-        step = self.solver.step(request)
-        solution = step.solution
-        stages = self.simulated_stage_ms() if self.budget.simulated else solution.stage_ms if solution else {}
-        took_ms = sum(stages.get(stage, 0.0) for stage in SOLVING_STAGES) if solution is not None else None
-        self.budget.step(eyes_m=request.eyes_m, time_ns=request.time_ns, took_ms=took_ms)
-        return step
+        return self.solver.step(request)
 
     def simulated_stage_ms(self) -> Mapping[str, float]:
-        return self.budget.stage_ms
+        return self.run.state.settings.loop.simulated_stage_ms
 
     def close(self, *, abandoned: bool = False) -> None:
-        self.budget.close()
         stand_in = self._stand_in()
         state = self._held if abandoned else self.run.state
         own = [leave_context, self.context.release] if self._owns_context else []
@@ -142,12 +112,10 @@ class SolverMaker:
         stack: PanelStack,
         calibration: Calibration,
         *,
-        on_start: Callable[[str], bool],
         panels_group: PanelsGroup = lambda: None,
     ) -> None:
-        """on_start: told what takes long before the first solution; False: leave it. panels_group: the share group
-        that solutions are shown from, asked from any thread."""
-        self._settings, self._stack, self._calibration, self._on_start = settings, stack, calibration, on_start
+        """panels_group: the share group that solutions are shown from, asked from any thread."""
+        self._settings, self._stack, self._calibration = settings, stack, calibration
         self.run: RunCell | None = None  # from the first solver on
         self.parts: RunningSolver | None = None  # the newest
         self._wanted: Wanted = settings.model.backend
@@ -165,7 +133,7 @@ class SolverMaker:
                 content = open_content(settings.content, self._stack, made, limits=settings.limits)
                 try:
                     backend = self._chosen(predictor, made, group, simulated=simulated)
-                    predictor.surround_with(backend.backend)
+                    predictor.set_backend(backend.backend)
                 except BaseException:
                     content.close()
                     raise
@@ -190,13 +158,12 @@ class SolverMaker:
             backend=backend,
             simulated=simulated,
         )
-        parts.budget.start(self._on_start)
         self.parts = parts
         return parts
 
     def _shared_group(self) -> ShareGroup | None:
         """Of the panels, where solutions may be left in textures; a solver that never draws any is kept apart."""
-        group = None if self._settings.model.backend == "opencv" else self._panels_group()
+        group = None if self._settings.model.backend == "cpu" else self._panels_group()
         return None if group is None or group.lost else group
 
     def _chosen(self, predictor: Predictor, context: Any, group: ShareGroup | None, *, simulated: bool) -> Choice:
@@ -204,9 +171,9 @@ class SolverMaker:
 
         Simulated time has no use for a faster one, and two of its runs are the same to the byte.
         """
-        wanted = "opencv" if simulated and self._wanted == "auto" else self._wanted
+        wanted = "cpu" if simulated and self._wanted == "auto" else self._wanted
         choice = choose(wanted, predictor, lambda: context, group=group)
-        self._wanted = "gl" if choice.backend.name == "gl" else "opencv"
+        self._wanted = "gl" if choice.backend.name == "gl" else "cpu"
         return choice
 
 
@@ -217,7 +184,7 @@ def own_context(group: ShareGroup | None) -> Any:
 
 def ready_predictor(settings: Settings, stack: PanelStack) -> Predictor:
     """The model of the settings, warm. Raises InputError, MissingPart."""
-    predictor = planned_predictor(settings, stack)
+    predictor = load_predictor(settings.model.name, stack, settings.model)
     try:
         predictor.warm_up(np.array(WARM_EYES_M))
     except BaseException:

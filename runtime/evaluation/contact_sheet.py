@@ -2,56 +2,64 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from runtime.evaluation.displayed import EyeViews
 from runtime.optics.carried import intensities
-from runtime.optics.quality import Quality
 from runtime.optics.retina import as_codes
 from runtime.records import U8
 
 TILE_WIDTH = 640
 MARGIN = 12
-TITLE = 34
+HEADLINE, TITLE = 52, 34
 ERROR_GAIN = 8
 INK = (40, 40, 40)
 PAPER = 246
 
 
-def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str) -> U8:
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """One refresh of a run, as its sheet shows it."""
+
+    layers: U8  # (N, h, w, 3 or 4), as the panels showed them
+    eye_views: EyeViews
+    light_db: float  # of a pupil (1 mm)
+    lines: tuple[str, ...]  # where the eyes were, and how well that was known
+
+
+def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str, lines: Sequence[str] = ()) -> U8:
     """(h, w, 3) RGB: a row of layers, and for each eye a row of what it should see, sees, and the difference.
 
-    Under the headline, displayed quality at the eyes used and, where they are known, at the true ones.
+    headline: the one figure to quote; lines: what stands below it.
     """
     height, width = layers.shape[1:3]
     tile = (TILE_WIDTH, round(TILE_WIDTH * height / width))
     names = {0: "layer 0 (rear, at the backlight)", len(layers) - 1: f"layer {len(layers) - 1} (front)"}
     rows = [[(names.get(n, f"layer {n}"), np.ascontiguousarray(layers[n, ..., :3])) for n in range(len(layers))]]
-    lines = [headline]
     if eye_views is not None:
-        lines += list(_figures(eye_views))
         for side, eye in enumerate(("left", "right")):
             seen = eye_views.seen[side]
             target = intensities(eye_views.wanted[side])
             shown = np.where(seen.mask[..., None], seen.image, 0.94)
             error = np.where(seen.mask[..., None], np.abs(seen.image - target) * ERROR_GAIN, 0.94)
-            decibels = eye_views.quality.eye_psnr_db[side]
             rows.append(
                 [
                     (f"{eye} eye: wanted", as_codes(target)),
-                    (f"{eye} eye: seen through the layers, {decibels:.1f} dB", as_codes(shown)),
+                    (f"{eye} eye: seen through the layers", as_codes(shown)),
                     (f"{eye} eye: error x {ERROR_GAIN} (black is perfect)", as_codes(error)),
                 ]
             )
     columns = max(len(row) for row in rows)
     cell = (tile[0] + MARGIN, tile[1] + MARGIN + TITLE)
-    head = TITLE * len(lines)
+    head = HEADLINE + TITLE * len(lines)
     sheet = np.full((head + MARGIN + cell[1] * len(rows), MARGIN + cell[0] * columns, 3), PAPER, np.uint8)
+    _write(sheet, headline, x=MARGIN, y=HEADLINE - 14, scale=1.0)
     for n, line in enumerate(lines):
-        _write(sheet, line, x=MARGIN, y=TITLE * (n + 1) - 8, scale=0.62)
+        _write(sheet, line, x=MARGIN, y=HEADLINE + TITLE * (n + 1) - 12, scale=0.62)
     for r, row in enumerate(rows):
         for c, (title, picture) in enumerate(row):
             x, y = MARGIN + c * cell[0], head + r * cell[1]
@@ -61,20 +69,11 @@ def contact_sheet(layers: U8, eye_views: EyeViews | None, *, headline: str) -> U
     return sheet
 
 
-def _figures(eye_views: EyeViews) -> Iterator[str]:
-    """A line for the eyes used, and one for the true ones where anything is known of them."""
-    for where, exact, carried in (
-        ("at the eyes used", eye_views.quality, eye_views.carried),
-        ("at the true eyes", eye_views.true, eye_views.carried_true),
-    ):
-        parts = [f"exact {_told(exact)} (against what these eyes should see now)"] if exact else []
-        parts += [f"carried {_told(carried)} (against the picture that the layers were solved for)"] if carried else []
-        if parts:
-            yield f"this frame, {where}: " + ", ".join(parts)
-
-
-def _told(quality: Quality) -> str:
-    return f"{quality.psnr_db:.1f} dB"
+def headline(light_db: float | None) -> str:
+    """The figure to quote, in words."""
+    if light_db is None:
+        return "the light at these eyes was not measured"
+    return f"{light_db:.1f} dB of light: what both eyes make of the panels' pixels, with pupils 4 mm wide"
 
 
 def _write(sheet: U8, text: str, *, x: int, y: int, scale: float) -> None:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import cv2
 
-from runtime.optics.carried import expected_psnrs_db, intensities
+from runtime.optics.carried import expected_psnrs_db, intensities, light_psnrs_db
 from runtime.optics.quality import Quality, quality
 from runtime.optics.retina import Retina, seen_by
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8, U16
 
 Picture = U8 | U16 | F32  # (h, w, 3): code values, or intensities in [0, 1]
+SIGMAS_MM = (0.0, 1.0, 2.0)  # two points, a pupil alone, a pupil and a good tracker
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,9 +26,6 @@ class EyeViews:
     seen: tuple[Retina, ...]
     wanted: tuple[Picture, ...]
     quality: Quality  # exact, at the eyes that the layers were made (or aligned) for
-    carried: Quality | None = None  # the same eyes, against the pictures that the layers were solved for
-    true: Quality | None = None  # at the true eyes, against their own truth
-    carried_true: Quality | None = None  # at the true eyes, against the pictures that the layers were solved for
 
 
 def displayed(
@@ -61,20 +60,42 @@ def expected_db(
     *,
     eyes_m: F64,
     fov_deg: float,
-    sigmas_mm: Sequence[float] = (1.0, 2.0),
+    sigmas_mm: Sequence[float] = SIGMAS_MM,
     step: int = 1,
 ) -> dict[str, float | None]:
-    """Expected PSNR (docs/contracts.md, Error) of layers, by the eyes' uncertainty in millimetres: "1", "2".
+    """Expected PSNR (docs/contracts.md, Error) of layers, by the eyes' uncertainty in millimetres: "0", "1", "2".
 
     step: only every so-manieth ray of every so-manieth row. None where such an error would take an eye to where it
     sees nothing.
     """
-    try:
-        values = expected_psnrs_db(
-            layers, eye_views.wanted, stack, eyes_m=eyes_m, fov_deg=fov_deg, sigmas_mm=sigmas_mm, step=step
-        )
-    except ValueError:
-        return {f"{sigma_mm:g}": None for sigma_mm in sigmas_mm}
+    return _by_sigma(expected_psnrs_db, eye_views, layers, stack, sigmas_mm, eyes_m=eyes_m, fov_deg=fov_deg, step=step)
+
+
+def light_db(
+    eye_views: EyeViews,
+    layers: U8,
+    stack: PanelStack,
+    *,
+    eyes_m: F64,
+    fov_deg: float,
+    sigmas_mm: Sequence[float] = SIGMAS_MM,
+    step: int = 1,
+) -> dict[str, float | None]:
+    """What light leaves the panels' pixels (docs/contracts.md, Error): as `expected_db`. "1" is the one to quote."""
+    return _by_sigma(light_psnrs_db, eye_views, layers, stack, sigmas_mm, eyes_m=eyes_m, fov_deg=fov_deg, step=step)
+
+
+def _by_sigma(
+    measure: Callable[..., dict[float, float]],
+    eye_views: EyeViews,
+    layers: U8,
+    stack: PanelStack,
+    sigmas_mm: Sequence[float],
+    **how: Any,
+) -> dict[str, float | None]:
+    values: dict[float, float | None] = dict.fromkeys(sigmas_mm)
+    with contextlib.suppress(ValueError):
+        values |= measure(layers, eye_views.wanted, stack, sigmas_mm=sigmas_mm, **how)
     return {f"{sigma_mm:g}": value for sigma_mm, value in values.items()}
 
 

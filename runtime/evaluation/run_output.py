@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from runtime.errors import InputError
-from runtime.evaluation.contact_sheet import contact_sheet
+from runtime.evaluation.contact_sheet import Moment, contact_sheet, headline
 from runtime.evaluation.displayed import EyeViews
 from runtime.optics.carried import intensities
 from runtime.optics.retina import as_codes
@@ -112,8 +112,10 @@ class RunOutput:
 
         self._later(write)
 
-    def finish(self, summary: dict[str, Any], layers: U8 | None, eye_views: EyeViews | None) -> None:
-        """The pictures of the last frame, the contact sheet and the summary."""
+    def finish(
+        self, summary: dict[str, Any], layers: U8 | None, eye_views: EyeViews | None, moment: Moment | None = None
+    ) -> None:
+        """The pictures of the last frame, the summary, and the contact sheet: of a good moment, where one was seen."""
 
         def write() -> None:
             folder = self._folder.staging
@@ -126,7 +128,12 @@ class RunOutput:
                 for side, eye in enumerate(("left", "right")):
                     write_png(folder / f"seen-{eye}.png", as_codes(eye_views.seen[side].image))
                     write_png(folder / f"wanted-{eye}.png", as_codes(intensities(eye_views.wanted[side])))
-            write_png(folder / "contact-sheet.png", contact_sheet(layers, eye_views, headline=headline(summary)))
+            if moment is None:
+                sheet = contact_sheet(layers, eye_views, headline=headline(None), lines=[in_one_line(summary)])
+            else:
+                lines = [*moment.lines, in_one_line(summary)]
+                sheet = contact_sheet(moment.layers, moment.eye_views, headline=headline(moment.light_db), lines=lines)
+            write_png(folder / "contact-sheet.png", sheet)
 
         self._work.put(write)
 
@@ -171,20 +178,11 @@ class RunOutput:
             self._lines.close()
 
 
-def headline(summary: dict[str, Any]) -> str:
-    """A run in one line."""
-    parts = [f"phasestack: {summary['presented']} of {summary['frames']} frames presented"]
-    parts.append(f"model {summary['model']} on {summary['provider']}")
-    means = [
-        (name, summary.get(key))
-        for name, key in (
-            ("exact", "psnr_db"),
-            ("carried", "carried_db"),
-            ("carried at the true eyes", "carried_db_true_eyes"),
-        )
-    ]
-    told = [f"{name} {value:.1f} dB" for name, value in means if value is not None]
-    if told:
-        similarity = f", SSIM {summary['ssim']:.3f}" if summary.get("ssim") is not None else ""
-        parts.append(f"displayed, mean of sampled frames: {', '.join(told)}{similarity}")
-    return "   |   ".join(parts)
+def in_one_line(summary: dict[str, Any]) -> str:
+    """The whole run, of which a sheet shows one moment."""
+    line = f"The run: {summary['presented']} of {summary['frames']} refreshes presented, model {summary['model']}"
+    if summary.get("light_db") is not None:
+        line += f"; light {summary['light_db']:.1f} dB, mean of {summary['quality_frames']} refreshes looked at"
+    if summary.get("carried_db_true_eyes") is not None:
+        line += f"; from where the eyes truly were, one ray a pixel: {summary['carried_db_true_eyes']:.1f} dB"
+    return line

@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from runtime.clock import NS_PER_MS
+from runtime.clock import NS_PER_MS, NS_PER_S
 
 T = TypeVar("T")
 
@@ -33,16 +33,14 @@ def timed(
     most: int | None = None,
     enough_s: float = 0.0,
     slow_s: float = float("inf"),
-    warm_up: int = 1,
 ) -> Timed[T]:
-    """`warm_up` runs that don't count, then at least `runs`; then more until they add up to `enough_s` or are `most`.
+    """A run that doesn't count, then at least `runs`; then more until they add up to `enough_s` or are `most`.
 
-    slow_s: where the first warm-up takes longer, it counts and is the only run.
+    slow_s: where the first takes longer, it counts and is the only run.
     """
-    for run in range(warm_up):
-        answer, took_ms = _timed(call)
-        if run == 0 and took_ms >= slow_s * 1e3:
-            return Timed(answer, (took_ms,))
+    answer, took_ms = _timed(call)
+    if took_ms >= slow_s * 1e3:
+        return Timed(answer, (took_ms,))
     times_ms: list[float] = []
     while len(times_ms) < runs or (sum(times_ms) < enough_s * 1e3 and len(times_ms) < (most or runs)):
         answer, took_ms = _timed(call)
@@ -54,23 +52,23 @@ def timed_in_turn(
     ways: Mapping[str, Callable[[int], T]],
     *,
     runs: int,
-    warm_up: int = 1,
     keep: Callable[[T], T] = lambda answer: answer,
 ) -> dict[str, Timed[T]]:
     """Several calls that take turns, run by run: what slows the machine slows all of them.
 
-    Each is told the number of its run, warm-ups included. keep: makes the last answer one's own, outside of the time.
+    The first run of each doesn't count. Each is told the number of its run.
+    keep: makes the last answer one's own, outside of the time.
     """
     times: dict[str, list[float]] = {name: [] for name in ways}
     answers: dict[str, T] = {}
-    for run in range(warm_up + runs):
+    for run in range(1 + runs):
         for name, way in ways.items():
             begin_ns = perf_counter_ns()
             answer = way(run)
             took_ms = (perf_counter_ns() - begin_ns) / NS_PER_MS
-            if run >= warm_up:
+            if run > 0:
                 times[name].append(took_ms)
-            if run == warm_up + runs - 1:
+            if run == runs:
                 answers[name] = keep(answer)
     return {name: Timed(answers[name], tuple(times[name])) for name in ways}
 
@@ -79,3 +77,17 @@ def _timed(call: Callable[[], T]) -> tuple[T, float]:
     begin_ns = perf_counter_ns()
     answer = call()
     return answer, (perf_counter_ns() - begin_ns) / NS_PER_MS
+
+
+class Stopwatch:
+    """Where the time went, part by part: each part ends where the next begins."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._began_ns = perf_counter_ns()
+
+    def ended(self, part: str) -> None:
+        """The time since the last part's end was this one's."""
+        now_ns = perf_counter_ns()
+        self.seconds[part] = round((now_ns - self._began_ns) / NS_PER_S, 3)
+        self._began_ns = now_ns

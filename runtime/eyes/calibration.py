@@ -19,11 +19,12 @@ from pydantic import ConfigDict, Field, field_validator
 from runtime.config import MOST, Section, read_table, validated
 from runtime.errors import InputError
 from runtime.records import F64, EyePoints
-from runtime.support.ranges import SCALE
 
 DEMO_FILE = Path(__file__).parent / "data" / "demo-calibration.toml"
 SIMILARITY_TOLERANCE = 1e-3  # relative; printed matrices of four digits pass, sheared ones do not
 PLAUSIBLE_SCALE = (0.8, 1.25)  # both frames are in metres
+SCALE = (5e-4, 2e3)  # beyond: not even millimetres on one side
+NEAR_M, MAX_DISTANCE_M = 5.0, 20.0  # of the sensor from the display: farther is odd; no sensor sees a face from there
 
 Number = Annotated[float, Field(strict=True, ge=-MOST, le=MOST)]  # "1.0" and true are not numbers
 Row4 = tuple[Number, Number, Number, Number]
@@ -125,7 +126,12 @@ class Calibration:
 
     def apply(self, eyes: EyePoints) -> EyePoints:
         """The same eyes in `stack`; `eyes` are in `sensor`."""
-        return replace(eyes, eyes_m=self.points(eyes.eyes_m))
+        turn, covariance = self.stack_from_sensor[:3, :3], eyes.covariance_m2
+        return replace(
+            eyes,
+            eyes_m=self.points(eyes.eyes_m),
+            covariance_m2=None if covariance is None else turn @ covariance @ turn.T,
+        )
 
     def position_covariance(self, stack_m: ArrayLike) -> F64 | None:
         """(..., 3, 3) covariance, m², of points (..., 3) in `stack` due to the calibration alone; None: not known."""
@@ -175,7 +181,7 @@ def similarity_defect(matrix: ArrayLike) -> float:
 def check_similarity(matrix: F64, *, source: str | Path) -> None:
     """Raise InputError, naming the field, where a finite 4x4 matrix is no similarity that a display can have.
 
-    Its determinant must be positive and its scale within `SCALE`, which takes any units that lengths are told in.
+    Its determinant must be positive, its scale within `SCALE`, and the sensor within `MAX_DISTANCE_M`.
     """
     name = "stack_from_sensor"
     if not np.abs(matrix).max() <= MOST:
@@ -192,18 +198,26 @@ def check_similarity(matrix: F64, *, source: str | Path) -> None:
     if volume <= 0.0:
         raise InputError(source, name, "mirrors space (determinant not positive): check the axes' directions")
     scale = largest * float(np.cbrt(volume))  # of the matrix itself the determinant may leave float64
-    if not SCALE[0] / 2 <= scale <= SCALE[1] * 2:  # a fit is off by a little
-        raise InputError(source, name, f"has scale {scale:.3g}: no unit is that; {SCALE[0]:g} to {SCALE[1]:g} are")
+    if not SCALE[0] <= scale <= SCALE[1]:
+        raise InputError(source, name, f"has scale {scale:.3g}: both frames are in metres, it is about 1")
+    distance_m = float(np.linalg.norm(matrix[:3, 3]))
+    if distance_m > MAX_DISTANCE_M:
+        problem = f"puts the sensor {distance_m:.4g} m from the display; at most {MAX_DISTANCE_M:g} m"
+        raise InputError(source, name, problem)
 
 
 def _warnings(matrix: F64, source: str) -> tuple[str, ...]:
+    found = []
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    if PLAUSIBLE_SCALE[0] <= scale <= PLAUSIBLE_SCALE[1]:
-        return ()
-    reason = "are both frames in metres?"
-    if 800 < scale < 1250 or 0.0008 < scale < 0.00125:
-        reason = "millimetres on one side, it seems"
-    return (f"{source}: stack_from_sensor: scale {scale:.6g} is far from 1: {reason}",)
+    if not PLAUSIBLE_SCALE[0] <= scale <= PLAUSIBLE_SCALE[1]:
+        reason = "are both frames in metres?"
+        if 800 < scale < 1250 or 0.0008 < scale < 0.00125:
+            reason = "millimetres on one side, it seems"
+        found.append(f"{source}: stack_from_sensor: scale {scale:.6g} is far from 1: {reason}")
+    distance_m = float(np.linalg.norm(matrix[:3, 3]))
+    if distance_m > NEAR_M:
+        found.append(f"{source}: stack_from_sensor: the sensor is {distance_m:.3g} m from the display: is that so?")
+    return tuple(found)
 
 
 def _residuals(table: ResidualTable | None) -> Residuals | None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from runtime.records import EyePoints
 
+TOLERANCE = 0.04  # by which the measured separation may part from the known one
 SAMPLES = 300  # ten seconds of a common depth camera
 LEAST_SAMPLES = 90
 LEAST_CONFIDENCE = 0.5

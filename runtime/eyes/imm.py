@@ -1,143 +1,137 @@
-"""Interacting multiple models (Blom and Bar-Shalom 1988): constant-velocity Kalman filters that share one point.
+"""Interacting multiple models (Blom and Bar-Shalom 1988): Kalman filters of one point's motion that differ in haste.
 
-A still head wants a heavy filter, a hasty one a light filter, and which it is changes in a tenth of a second. Each
-model is the filter with white-noise acceleration of Bar-Shalom, Li, Kirubarajan (2001), 6.2.2. With equal noise on all
-axes its gain is the same for all and its covariance that of one axis, three numbers that can't lose symmetry; where
-means are mixed their spread is shared equally among the axes. With one model it is the plain Kalman filter.
-Plain floats: for three models of three axes they take a quarter of the time of small arrays.
+Each model has Singer's acceleration (1970): it fades with a time constant and is renewed by noise of its own strength.
+A still head wants a heavy filter, a hasty one a light filter, and which it is changes in a tenth of a second. The noise
+of a measurement is a covariance matrix: a camera knows right and up twenty times as well as depth.
+
+A state is nine numbers, position, velocity, acceleration, each along x, y, z; metres and seconds.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
-VARIANCE_FLOOR = 1e-14
+import numpy as np
+
+from runtime.records import F64
+
+FADE_S = 0.25  # time constant with which an acceleration fades
 WEIGHT_FLOOR = 1e-6
-
-Vector = tuple[float, float, float]
-
-
-class Model(NamedTuple):
-    """One filter: position (m), velocity (m/s), one axis' covariance, and how much it is believed."""
-
-    x: float
-    y: float
-    z: float
-    u: float  # velocity along x
-    v: float
-    w: float
-    var_position: float
-    covariance: float
-    var_velocity: float
-    weight: float
+_NODES, _SHARES = np.polynomial.legendre.leggauss(10)
+_AXES = np.eye(3)
 
 
-def started(place: Sequence[float], *, count: int, variance: float, speed: float) -> tuple[Model, ...]:
-    """At a first measurement, at rest, with a velocity that is only known to be about `speed` m/s or less."""
-    x, y, z = place
-    return (Model(x, y, z, 0.0, 0.0, 0.0, variance, 0.0, speed * speed, 1 / count),) * count
+class Belief(NamedTuple):
+    """What is known of the motion, by every model."""
+
+    state: F64  # (models, 9)
+    covariance: F64  # (models, 9, 9)
+    weight: F64  # (models,) how much each is believed; they add up to one
 
 
-def predicted(
-    models: tuple[Model, ...], dt_s: float, *, acceleration: Sequence[float], stay_s: float
-) -> tuple[Model, ...]:
-    """After dt_s >= 0: the models mix, then each moves on.
+def _response(times_s: F64) -> F64:
+    """(3, n) what an acceleration of one at time 0 has become: position, velocity, acceleration."""
+    x = times_s / FADE_S
+    gone = -np.expm1(-x)
+    return np.array([FADE_S**2 * (x - gone), FADE_S * gone, 1 - gone])
 
-    acceleration: each model's density of white acceleration noise, m²/s³; stay_s: mean time in one model.
+
+def _of_each_axis(matrix: F64) -> F64:
+    """(9, 9) the same (3, 3) for x, y and z: Kronecker's product with one."""
+    return (matrix[:, None, :, None] * _AXES[:, None, :]).reshape(9, 9)
+
+
+@lru_cache(maxsize=8)
+def _transition(dt_s: float) -> F64:
+    """(9, 9) the state after dt_s from the state now."""
+    step = np.eye(3)
+    step[0, 1] = dt_s
+    step[:, 2] = _response(np.array([dt_s]))[:, 0]
+    return _of_each_axis(step)
+
+
+@lru_cache(maxsize=8)
+def _noise(dt_s: float) -> F64:
+    """(9, 9) covariance that accelerations of one m/s² (standard deviation) add in dt_s.
+
+    Gauss and Legendre's sum of what arrives from every moment: never negative, where the closed form cancels.
     """
-    stay = math.exp(-dt_s / stay_s)
-    leave = (1 - stay) / (len(models) - 1) if len(models) > 1 else 0.0
-    stay = 1 - leave * (len(models) - 1)
-    result = []
-    for into, q in enumerate(acceleration):
-        shares = [m.weight * (stay if i == into else leave) for i, m in enumerate(models)]
-        weight = sum(shares)
-        x = y = z = u = v = w = a = b = c = 0.0
-        for share, m in zip(shares, models):
-            share /= weight
-            x, y, z = x + share * m.x, y + share * m.y, z + share * m.z
-            u, v, w = u + share * m.u, v + share * m.v, w + share * m.w
-            a, b, c = a + share * m.var_position, b + share * m.covariance, c + share * m.var_velocity
-        for share, m in zip(shares, models):
-            share /= 3 * weight
-            dx, dy, dz, du, dv, dw = m.x - x, m.y - y, m.z - z, m.u - u, m.v - v, m.w - w
-            a += share * (dx * dx + dy * dy + dz * dz)
-            b += share * (dx * du + dy * dv + dz * dw)
-            c += share * (du * du + dv * dv + dw * dw)
-        noise = q * dt_s
-        result.append(
-            Model(
-                x + u * dt_s,
-                y + v * dt_s,
-                z + w * dt_s,
-                u,
-                v,
-                w,
-                a + dt_s * (2 * b + dt_s * (c + noise / 3)),
-                b + dt_s * (c + noise / 2),
-                c + noise,
-                weight,
-            )
-        )
-    return tuple(result)
+    response = _response(dt_s * (_NODES + 1) / 2)
+    return _of_each_axis((response * (_SHARES * dt_s / FADE_S)) @ response.T)
 
 
-def surprise(models: tuple[Model, ...], measured: Sequence[float], *, variance: float) -> float:
+def started(place: F64, *, noise: F64, speed: float, acceleration: Sequence[float]) -> Belief:
+    """At a first measurement (3,) with its covariance (3, 3): at rest, as far as is known.
+
+    speed: m/s; acceleration: m/s², one for each model: standard deviations of an axis.
+    """
+    count = len(acceleration)
+    state, covariance = np.zeros((count, 9)), np.zeros((count, 9, 9))
+    state[:, :3] = place
+    covariance[:, :3, :3] = noise
+    covariance[:, 3:6, 3:6] = speed**2 * _AXES
+    covariance[:, 6:, 6:] = np.square(acceleration)[:, None, None] * _AXES
+    return Belief(state, covariance, np.full(count, 1 / count))
+
+
+def predicted(belief: Belief, dt_s: float, *, acceleration: Sequence[float], stay_s: float) -> Belief:
+    """After dt_s >= 0: the models mix, then each moves on. stay_s: mean time in one model."""
+    count = len(belief.weight)
+    leave = -math.expm1(-dt_s / stay_s) / count  # evenly, to stay among them
+    change = np.full((count, count), leave) + (1 - count * leave) * np.eye(count)
+    shares = belief.weight[:, None] * change
+    weight = shares.sum(0)
+    shares = shares / weight
+    mean = shares.T @ belief.state
+    apart = belief.state[:, None] - mean
+    covariance = np.tensordot(shares.T, belief.covariance, 1)
+    apart = apart.transpose(1, 2, 0)  # (into, 9, from)
+    covariance += (apart * shares.T[:, None]) @ apart.transpose(0, 2, 1)
+    step = _transition(dt_s)
+    added = np.square(acceleration)[:, None, None] * _noise(dt_s)
+    return Belief(mean @ step.T, step @ covariance @ step.T + added, weight)
+
+
+def surprise(belief: Belief, measured: F64, *, noise: F64) -> float:
     """Least squared distance of a measurement from any model, in units of its variance (chi² of three axes)."""
-    x, y, z = measured
-    return min(((x - m.x) ** 2 + (y - m.y) ** 2 + (z - m.z) ** 2) / (m.var_position + variance) for m in models)
+    return float(_chi2(measured - belief.state[:, :3], belief.covariance[:, :3, :3] + noise).min())
 
 
-def corrected(models: tuple[Model, ...], measured: Sequence[float], *, variance: float) -> tuple[Model, ...]:
-    """With a measurement taken in; variance of one of its axes, m²."""
-    x, y, z = measured
-    logs = []
-    for m in models:
-        total = m.var_position + variance
-        logs.append(-0.5 * (((x - m.x) ** 2 + (y - m.y) ** 2 + (z - m.z) ** 2) / total + 3 * math.log(total)))
-    best = max(logs)
-    weights = [m.weight * math.exp(value - best) + WEIGHT_FLOOR for m, value in zip(models, logs)]
-    whole = sum(weights)
-    result = []
-    for (px, py, pz, u, v, w, a, b, c, _), weight in zip(models, weights):
-        total = a + variance
-        dx, dy, dz = x - px, y - py, z - pz
-        k, kv, kept = a / total, b / total, variance / total
-        # The forms that rounding can't turn negative: a·R/(a+R), and c - b²/(a+R) with a floor.
-        a = max(a * kept, VARIANCE_FLOOR)
-        c = max(c - b * kv, VARIANCE_FLOOR)
-        limit = math.sqrt(a * c)
-        b = min(max(b * kept, -limit), limit)
-        place = px + k * dx, py + k * dy, pz + k * dz
-        result.append(Model(*place, u + kv * dx, v + kv * dy, w + kv * dz, a, b, c, weight / whole))
-    return tuple(result)
+def _chi2(off: F64, covariance: F64) -> F64:
+    """(n,) squared lengths of vectors (n, 3) in units of their variances (n, 3, 3)."""
+    result: F64 = (off * np.linalg.solve(covariance, off[..., None])[..., 0]).sum(1)
+    return result
 
 
-def combined(models: tuple[Model, ...]) -> tuple[Vector, Vector]:
-    """Position and velocity: the models' mean by belief."""
-    x = y = z = u = v = w = 0.0
-    for m in models:
-        share = m.weight
-        x, y, z = x + share * m.x, y + share * m.y, z + share * m.z
-        u, v, w = u + share * m.u, v + share * m.v, w + share * m.w
-    return (x, y, z), (u, v, w)
+def corrected(belief: Belief, measured: F64, *, noise: F64) -> Belief:
+    """With a measurement (3,) of that covariance (3, 3) taken in."""
+    total = belief.covariance[:, :3, :3] + noise
+    gain = np.linalg.solve(total, belief.covariance[:, :3, :]).transpose(0, 2, 1)
+    off = measured - belief.state[:, :3]
+    likely = -0.5 * (_chi2(off, total) + np.linalg.slogdet(total)[1])
+    weight = belief.weight * np.exp(likely - likely.max()) + WEIGHT_FLOOR
+    # Joseph's form: rounding can't turn a variance negative.
+    keep = np.repeat(np.eye(9)[None], len(weight), axis=0)
+    keep[:, :, :3] -= gain
+    covariance = keep @ belief.covariance @ keep.transpose(0, 2, 1) + gain @ noise @ gain.transpose(0, 2, 1)
+    state = belief.state + (gain @ off[..., None])[..., 0]
+    return Belief(state, (covariance + covariance.transpose(0, 2, 1)) / 2, weight / weight.sum())
 
 
-def deviation(models: tuple[Model, ...], ahead_s: float, *, acceleration: Sequence[float]) -> float:
-    """Standard deviation of an axis of the models' common position, metres, so many seconds ahead.
+def ahead(belief: Belief, dt_s: float) -> F64:
+    """(3,) position so many seconds ahead: the models' mean by belief."""
+    place: F64 = _transition(dt_s)[:3] @ (belief.weight @ belief.state)
+    return place
 
-    The mixture's: each model's own variance carried on, and the spread of what they predict (shared among the axes).
-    """
-    x = y = z = 0.0
-    ahead = []
-    for m in models:
-        place = m.x + m.u * ahead_s, m.y + m.v * ahead_s, m.z + m.w * ahead_s
-        ahead.append(place)
-        x, y, z = x + m.weight * place[0], y + m.weight * place[1], z + m.weight * place[2]
-    variance = VARIANCE_FLOOR
-    for m, q, (px, py, pz) in zip(models, acceleration, ahead):
-        own = m.var_position + ahead_s * (2 * m.covariance + ahead_s * (m.var_velocity + q * ahead_s / 3))
-        variance += m.weight * (own + ((px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2) / 3)
-    return math.sqrt(variance)
+
+def spread(belief: Belief, dt_s: float, *, acceleration: Sequence[float], about: F64) -> F64:
+    """(3, 3) mean square, m², of how far the position is from a place (3,) so many seconds ahead."""
+    step = _transition(dt_s)[:3]
+    added = np.square(acceleration)[:, None, None] * _noise(dt_s)[:3, :3]
+    apart = belief.state @ step.T - about
+    each = step @ belief.covariance @ step.T + added + apart[:, :, None] * apart[:, None, :]
+    result: F64 = np.tensordot(belief.weight, each, 1)
+    return result

@@ -1,4 +1,4 @@
-"""Does the head stand still? Told from the sensor's own samples, whose noise a prediction would only enlarge.
+"""Does the head stand still? Told from the samples that the tracker took, whose noise a prediction would only enlarge.
 
 What the tracker predicts jitters by several times the sensor's noise, since the noise of the speed is multiplied by
 the horizon. A head at rest has no speed: the median of its samples is where it is, and the picture need not follow.
@@ -18,30 +18,32 @@ EVERY = 8  # samples, noise and drift are looked at: neither changes quickly
 FEWEST = 8  # samples that anything is told from
 KEPT = 256
 GRACE_M = 0.0005  # of every test, for sensors without noise
+NOISE_MAX_M = 0.005  # what scatters by more is no resting head's, whatever the sensor: it could never be seen to leave
 # In standard deviations of one sample; each is exceeded by white noise once in hours at 60 samples a second.
 SINGLE = 4.5  # two samples in a row, the same way off
 MEDIAN_OF_FIVE = 2.6
 HALVES = 4.5  # of the difference of two halves' means, over the root of their length
-MAD_TO_SIGMA = 1.4826 / 6**0.5  # median of absolute second differences of white noise to its standard deviation
+MAD_TO_SIGMA = 1.4826
+MEDIAN_EFFICIENCY = 1.25  # a median is a quarter less sure than a mean
+LEVER_M = 0.15  # of a display of half a metre: root mean square of a point's distance from its middle
+NEAREST_M = 0.1  # from the display; nearer eyes count as so near
 
 
 class RestWatch:
-    """Takes every sample as the sensor gave it, and says where the head rests. One thread uses it; no clock."""
+    """Takes every sample that is believed, and says where the head rests. One thread uses it; no clock."""
 
-    def __init__(self, *, most_m: float) -> None:
-        """most_m: a resting head may have drifted so far, and by what noise leaves unsure, until it is renewed."""
-        self._most_m = most_m
+    def __init__(self, *, max_drift_m: float) -> None:
+        """max_drift_m: a resting head may drift so far, and by what noise leaves unsure, until it is renewed."""
+        self._max_drift_m = max_drift_m
         self._times = np.zeros(2 * KEPT, np.int64)
         self._eyes = np.zeros((2 * KEPT, 2, 3))
         self._count = 0
         self.place: F64 | None = None  # (2, 3) the resting eyes, the same array as long as they rest; None: they move
-        self.noise_m = 0.0  # standard deviation of one sample, laterally; the worse axis of the worse eye
+        self.noise_m = np.zeros(6)  # standard deviation of one sample, as `_shifts` measures it
         self.sigma_m = 0.0  # how sure `place` is: standard deviation of an axis, with the drift that it may have made
 
     def update(self, eyes_m: F64, *, capture_ns: int) -> None:
-        """One sample (2, 3), any frame whose x points from the display to the viewer (`stack`)."""
-        if not np.isfinite(eyes_m).all() or eyes_m[:, 0].min() <= 0:
-            return
+        """One sample (2, 3), frame `stack`."""
         if self._count and not 0 < capture_ns - self._times[self._count - 1] < LOST_NS:
             self.forget()
         self._append(eyes_m, capture_ns)
@@ -50,7 +52,9 @@ class RestWatch:
         slow_checks = self._count % EVERY == 0 or self.place is None
         if slow_checks:
             self._measure_noise()
-        if self.place is None:
+        if self.noise_m.max() > NOISE_MAX_M:
+            self.place = None
+        elif self.place is None:
             if self._stands():
                 self._settle(capture_ns - REST_NS)
         elif self._left(self.place):
@@ -84,17 +88,21 @@ class RestWatch:
     def _settle(self, since_ns: int) -> None:
         recent = self._since(since_ns)
         self.place = np.median(recent, axis=0)
-        # A median is a quarter less sure than a mean; what drifts is renewed beyond this (`_drifted`), even below it.
-        unsure_m = 1.25 * self.noise_m / len(recent) ** 0.5
-        drift_m = self._most_m + 2 * 1.25 * self.noise_m * (4 / max(len(recent), FEWEST)) ** 0.5
-        self.sigma_m = float(np.hypot(unsure_m, drift_m / 3**0.5))
+        noise_m = float(self.noise_m.max())
+        unsure_m = MEDIAN_EFFICIENCY * noise_m / len(recent) ** 0.5
+        # What drifts is renewed beyond this (`_drifted`), even below it.
+        drift_m = self._max_drift_m + 2 * MEDIAN_EFFICIENCY * noise_m * (4 / max(len(recent), FEWEST)) ** 0.5
+        self.sigma_m = float(np.hypot(unsure_m, drift_m / 2**0.5))  # it drifts one way longer than the other
 
     def _measure_noise(self) -> None:
-        """From second differences: an even motion does not count."""
-        recent = self._eyes[max(0, self._count - KEPT // 4) : self._count]
-        lateral = _lateral(recent, recent[-1])
-        second = np.abs(lateral[2:] - 2 * lateral[1:-1] + lateral[:-2])
-        self.noise_m = float(np.median(second, axis=0).max()) * MAD_TO_SIGMA
+        """From how far each sample lies off the line between its neighbours: an even motion does not count."""
+        first = max(0, self._count - KEPT // 2)
+        times, shifts = self._times[first : self._count], _shifts(self._eyes[first : self._count], self._eyes[first])
+        later = ((times[1:-1] - times[:-2]) / (times[2:] - times[:-2]))[:, None]  # neighbours may be missing
+        off = shifts[1:-1] - (1 - later) * shifts[:-2] - later * shifts[2:]
+        scale = np.sqrt(1 + later**2 + (1 - later) ** 2)
+        right, up, deep = MAD_TO_SIGMA * np.median(np.abs(off / scale), axis=0).reshape(2, 3).max(axis=0)
+        self.noise_m = np.tile([max(right, up), max(right, up), deep], 2)
 
     def _stands(self) -> bool:
         """The two halves of the last second agree, and so does the newest moment."""
@@ -103,20 +111,19 @@ class RestWatch:
             return False
         recent = self._since(now_ns - REST_NS)
         half = len(recent) // 2
-        lateral = _lateral(recent, recent[-1])
-        before, after = np.median(lateral[:half], axis=0), np.median(lateral[half:], axis=0)
-        # A median is a quarter less sure than a mean.
-        unsure_m = HALVES * 1.25 * self.noise_m * (2 / half) ** 0.5
-        if np.abs(after - before).max() > unsure_m + GRACE_M:
+        shifts = _shifts(recent, recent[-1])
+        before, after = np.median(shifts[:half], axis=0), np.median(shifts[half:], axis=0)
+        unsure_m = HALVES * MEDIAN_EFFICIENCY * self.noise_m * (2 / half) ** 0.5
+        if (np.abs(after - before) > unsure_m + GRACE_M).any():
             return False
         return not self._left(np.median(recent, axis=0))
 
     def _left(self, place: F64) -> bool:
         """The newest samples are further off than noise can be."""
-        lateral = _lateral(self._eyes[self._count - 5 : self._count], place)
-        if np.abs(np.sort(lateral, axis=0)[2]).max() > MEDIAN_OF_FIVE * self.noise_m + GRACE_M:
+        shifts = _shifts(self._eyes[self._count - 5 : self._count], place)
+        if (np.abs(np.median(shifts, axis=0)) > MEDIAN_OF_FIVE * self.noise_m + GRACE_M).any():
             return True
-        last, newest = lateral[-2:]
+        last, newest = shifts[-2:]
         reach = SINGLE * self.noise_m + GRACE_M
         # Outliers lie anywhere: two in a row must be off the same way.
         together = np.minimum(last, newest) > reach
@@ -128,15 +135,19 @@ class RestWatch:
         if now_ns - self._times[0] < DRIFT_NS:
             return False
         recent = self._since(now_ns - DRIFT_NS)
-        shift = _lateral(np.median(recent, axis=0)[None], place)
+        shift = _shifts(np.median(recent, axis=0)[None], place)[0]
         # The place itself is the median of a third as many.
-        unsure_m = 1.25 * self.noise_m * (4 / len(recent)) ** 0.5
-        most_m: float = self._most_m + 2 * unsure_m
-        return float(np.abs(shift).max()) > most_m
+        unsure_m = MEDIAN_EFFICIENCY * self.noise_m * (4 / len(recent)) ** 0.5
+        return bool((np.abs(shift) > self._max_drift_m + 2 * unsure_m).any())
 
 
-def _lateral(eyes_m: F64, place: F64) -> F64:
-    """(n, 4) how far samples (n, 2, 3) lie from a place (2, 3) as the display shows it, metres at that distance."""
-    slopes = eyes_m[..., 1:] / eyes_m[..., :1] - place[:, 1:] / place[:, :1]
-    lateral: F64 = (slopes * place[:, :1]).reshape(len(eyes_m), 4)
-    return lateral
+def _shifts(eyes_m: F64, place: F64) -> F64:
+    """(n, 6) how far samples (n, 2, 3) lie from a place (2, 3) as the display shows it, metres at the eyes.
+
+    Of each eye: right and up, seen from the display's middle, and what its distance does to points off the middle.
+    """
+    away = eyes_m - place
+    distance = np.maximum(place[:, :1], NEAREST_M)
+    sideways = away[..., 1:] - away[..., :1] * place[:, 1:] / distance
+    shifts: F64 = np.concatenate([sideways, away[..., :1] * LEVER_M / distance], axis=2).reshape(len(eyes_m), 6)
+    return shifts

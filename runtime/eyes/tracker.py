@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections import deque
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -12,116 +13,225 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.config import TrackerSettings
 from runtime.eyes import imm
+from runtime.eyes.plausibility import NOT_NEWER, reason_against
 from runtime.records import F64, EyePoints, EyesEstimate, EyesLabel
 
 HISTORY = 256  # filtered samples kept: four seconds at 60 Hz
+CONFIDENCE_MIN = 0.3  # less certain samples (a blink) are not used
 CHI2_GATE = 21.1  # of three axes: one honest sample in 10 000 is refused
-FARTHEST_M = 100.0  # no sensor sees a face from there; larger numbers overflow when squared
-KEEP_S = 0.4  # after a longer gap nothing of a head's motion is left
-CLOCK_RESET_NS = NS_PER_S  # a capture this far in the past is a clock that was set back, not a late sample
+CHI2_DOUBT = 11.3  # one honest sample in 100: it is taken back where the next two fit better without it
+ACCELERATION = (0.05, 0.4, 2.0)  # m/s², standard deviations: of a calm, a moving and a hasty head
+STAY_S = 1.0  # how long a head keeps being calm, moving or hasty, on average
+TURN_ACCELERATION = (0.03, 0.4)  # m/s², of half the line between the eyes: hardly turning, and shaking the head
 FIRST_SPEED = 0.3  # m/s, of a head that was just found
+REACH_SPEED, REACH_ACCELERATION = 2.0, 30.0  # m/s, m/s²: no head is faster, or sets off faster
+KEEP_S = 0.4  # after a longer gap nothing of a head's motion is left
+ANOTHER_AFTER_S = 0.5  # a viewer who was not seen for so long makes way for another, and after hold_s at once
+LOSS_S = 0.2  # without any sample for so long the eyes are held, not predicted
+HORIZON_S = 0.2  # never predict further ahead than this
+DECAY_S = 0.06  # time constant with which a lost head comes to rest
+REVIVE_S = 0.06  # in which the picture slides to eyes that were lost and found
+CLOCK_RESET_NS = NS_PER_S  # a capture this far in the past is a clock that was set back, not a late sample
 COMPLETED_NOISE = 2.0  # an eye that was filled in is this much less certain
+NOISE_FLOOR_M = 2e-5  # a driver that says less than this is not believed: nothing measures a pupil so well
+ESTABLISHED = 3  # samples of a head; one of fewer may have been a mistake
+SIGMA_AHEAD_S = 1.0  # how sure a guess is, is not told further ahead
+NEAREST_M = 0.1  # from the display; nearer eyes count as so near, for what their depth matters
+PANEL_M = (0.5184, 0.2916)  # width and height, where nobody says
 NO_JUMP = np.zeros((2, 3))
+
+UNCERTAIN = "uncertain"
+ELSEWHERE = "elsewhere than the viewer"
+
+
+class _Head(NamedTuple):
+    """One head's motion, as it is known from its newest sample."""
+
+    capture_ns: int
+    middle: imm.Belief  # between the eyes, frame `stack`
+    half: imm.Belief  # from the middle to the right eye
+    samples: int  # that it is known from
+    surprise: float  # of the newest (chi²)
+
+    def age_s(self, time_ns: int) -> float:
+        return (time_ns - self.capture_ns) / NS_PER_S
+
+    def eyes_m(self, ahead_s: float) -> F64:
+        """(2, 3) left and right eye, so many seconds after the newest sample."""
+        middle, half = imm.ahead(self.middle, ahead_s), imm.ahead(self.half, ahead_s)
+        return np.array([middle - half, middle + half])
 
 
 class _Sample(NamedTuple):
-    """A filtered sample."""
+    """A measurement that may be a person's."""
 
     capture_ns: int
-    middle: tuple[imm.Model, ...]  # between the eyes, frame `stack`
-    half: tuple[imm.Model, ...]  # from the middle to the right eye
+    middle_m: F64  # (3,)
+    half_m: F64  # (3,)
+    noise_m2: F64  # (3, 3) of the middle, and of half the line between the eyes
+
+    def begun(self) -> _Head:
+        """A head of which nothing else is known."""
+        middle = imm.started(self.middle_m, noise=self.noise_m2, speed=FIRST_SPEED, acceleration=ACCELERATION)
+        half = imm.started(self.half_m, noise=self.noise_m2, speed=FIRST_SPEED / 3, acceleration=TURN_ACCELERATION)
+        return _Head(self.capture_ns, middle, half, 1, 0.0)
+
+    def continued(self, head: _Head) -> _Head | None:
+        """The head with this sample taken in; None where it can't be that head's."""
+        age_s = head.age_s(self.capture_ns)
+        if age_s > KEEP_S:
+            return None
+        middle = imm.predicted(head.middle, age_s, acceleration=ACCELERATION, stay_s=STAY_S)
+        half = imm.predicted(head.half, age_s, acceleration=TURN_ACCELERATION, stay_s=STAY_S)
+        surprise = max(
+            imm.surprise(middle, self.middle_m, noise=self.noise_m2),
+            imm.surprise(half, self.half_m, noise=self.noise_m2),
+        )
+        if surprise > CHI2_GATE:
+            return None
+        return _Head(
+            self.capture_ns,
+            imm.corrected(middle, self.middle_m, noise=self.noise_m2),
+            imm.corrected(half, self.half_m, noise=self.noise_m2),
+            head.samples + 1,
+            surprise,
+        )
+
+    def is_within_reach_of(self, head: _Head) -> bool:
+        """Whether that head can have come here since it was seen."""
+        age_s = head.age_s(self.capture_ns)
+        reach_m = min(REACH_SPEED * age_s, REACH_ACCELERATION * age_s**2 / 2)
+        noise_m = math.sqrt(np.trace(self.noise_m2 + head.middle.covariance[0, :3, :3]))
+        expected_m = imm.ahead(head.middle, min(age_s, HORIZON_S))
+        return bool(np.linalg.norm(self.middle_m - expected_m) <= reach_m + 4 * noise_m)
+
+
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """The viewer's head after a sample, and the jump that is being hidden."""
+
+    head: _Head
     jump_m: F64  # (2, 3) from here back to what was shown last, at `jump_ns`; fades from then on
     jump_ns: int
+
+    def eyes_m(self, ahead_s: float, time_ns: int) -> F64:
+        """(2, 3) as they are served for an instant, predicted so far."""
+        eyes = self.head.eyes_m(ahead_s)
+        if self.jump_m is not NO_JUMP:
+            fraction = min(max((time_ns - self.jump_ns) / NS_PER_S / REVIVE_S, 0.0), 1.0)
+            eyes += self.jump_m * (1 - fraction * fraction * (3 - 2 * fraction))
+        return eyes
+
+
+class _Other(NamedTuple):
+    """A head that is elsewhere than the viewer's."""
+
+    head: _Head
+    may_be_viewer: bool  # who can have got there since they were seen
 
 
 class Tracker:
     """One viewer's eyes. `update` takes samples as they come; `at` answers for any instant.
 
-    Eyes that return after a loss take over from where `at` last said that they were, and fade to where they are.
+    The first person seen is the viewer, for as long as they are seen. Eyes that return after a loss take over from
+    where `at` last said that they were, and fade to where they are; between two people nothing fades.
     """
 
-    def __init__(self, settings: TrackerSettings | None = None) -> None:
+    def __init__(
+        self,
+        settings: TrackerSettings | None = None,
+        *,
+        panel_m: tuple[float, float] = PANEL_M,
+        in_front_m: float = 0.0,
+    ) -> None:
+        """panel_m: width and height, by which an error in depth counts; in_front_m: no viewer's x is less."""
         self.settings = settings or TrackerSettings()
-        self._variance = self.settings.noise_m**2 / 2  # of the middle, and of half the line between the eyes
-        self._history: deque[_Sample] = deque(maxlen=HISTORY)
-        self._refused: tuple[int, imm.Vector] | None = None
+        self._panel_m, self._in_front_m = panel_m, in_front_m
+        self._history: deque[_Shown] = deque(maxlen=HISTORY)
+        self._other: _Other | None = None
         self._lost_ns: int | None = None
         self._newest_ns = -1
         self._asked_ns = 0  # the latest instant that `at` answered for: what was shown last
-        self.outliers = 0
 
-    def update(self, points: EyePoints | None, *, capture_ns: int) -> None:
+    def update(self, points: EyePoints | None, *, capture_ns: int) -> str:
         """Take in a sample in the `stack` frame; None: the sensor looked and saw no face.
 
-        What is not finite, implausible for a person, uncertain (a blink), old or doubled is refused; eyes
-        that are really elsewhere are believed at their second sample in a row.
+        Answers why the sample is refused, or an empty text: it is old, uncertain (a blink), can't be a person's, or
+        lies elsewhere than the viewer. Where the viewer can just have got to, the second sample in a row is believed;
+        another person's only once the viewer is gone.
         """
         if capture_ns <= self._newest_ns:
             if self._newest_ns - capture_ns < CLOCK_RESET_NS:
-                return
+                return NOT_NEWER
             self.forget()
         self._newest_ns = capture_ns
         if points is None:
             self._lost_ns = capture_ns if self._lost_ns is None else self._lost_ns
-            return
-        if not min(points.confidence.tolist()) >= self.settings.confidence_min:
-            return
-        (lx, ly, lz), (rx, ry, rz) = points.eyes_m.tolist()
-        half = (rx - lx) / 2, (ry - ly) / 2, (rz - lz) / 2
-        middle = lx + half[0], ly + half[1], lz + half[2]
-        ipd_m = 2 * math.hypot(*half)
-        is_person = self.settings.ipd_min_m <= ipd_m <= self.settings.ipd_max_m
-        if not (is_person and math.hypot(*middle) <= FARTHEST_M):  # NaN is refused as well
-            self.outliers += 1
-            return
-        self._take(middle, half, capture_ns=capture_ns, completed=bool(points.completed))
+            return ""
+        if not min(points.confidence.tolist()) >= CONFIDENCE_MIN:
+            return UNCERTAIN
+        if why := reason_against(points.eyes_m, in_front_m=self._in_front_m):
+            return why
+        left, right = points.eyes_m
+        return self._take(_Sample(capture_ns, (left + right) / 2, (right - left) / 2, self._noise(points)))
 
     def forget(self) -> None:
         """As if nothing had ever been seen."""
         self._history.clear()
-        self._refused = self._lost_ns = None
+        self._other = self._lost_ns = None
         self._newest_ns, self._asked_ns = -1, 0
 
-    def _take(self, middle: imm.Vector, half: imm.Vector, *, capture_ns: int, completed: bool) -> None:
-        s = self.settings
-        variance = self._variance * (COMPLETED_NOISE**2 if completed else 1.0)
-        last = self._history[-1] if self._history else None
-        age_s = (capture_ns - last.capture_ns) / NS_PER_S if last else math.inf
-        jump_m, jump_ns = (last.jump_m, last.jump_ns) if last else (NO_JUMP, 0)
-        is_held = self._lost_ns is not None or age_s > s.loss_s
-        found = side = None
-        if last is not None and age_s <= KEEP_S:
-            now = imm.predicted(last.middle, age_s, acceleration=s.acceleration, stay_s=s.stay_s)
-            turned = imm.predicted(last.half, age_s, acceleration=(s.turn_acceleration,), stay_s=s.stay_s)
-            if (
-                imm.surprise(now, middle, variance=variance) <= CHI2_GATE
-                and imm.surprise(turned, half, variance=variance) <= CHI2_GATE
-            ):
-                found = imm.corrected(now, middle, variance=variance)
-                side = imm.corrected(turned, half, variance=variance)
-            elif not is_held and not self._is_confirmed(middle, capture_ns):
-                self._refused = capture_ns, middle
-                self.outliers += 1
-                return
-        is_new = found is None or side is None
-        if found is None or side is None:
-            found = imm.started(middle, count=len(s.acceleration), variance=variance, speed=FIRST_SPEED)
-            side = imm.started(half, count=1, variance=variance, speed=FIRST_SPEED / 3)
-        if is_held or is_new:
-            jump_ns = max(self._asked_ns, capture_ns)
-            before = self.at(jump_ns).eyes_m
-            ahead_s = min((jump_ns - capture_ns) / NS_PER_S, s.horizon_max_s)
-            jump_m = NO_JUMP if before is None else before - _eyes(found, side, ahead_s)
-        self._history.append(_Sample(capture_ns, found, side, jump_m, jump_ns))
-        self._refused = self._lost_ns = None
+    def _noise(self, points: EyePoints) -> F64:
+        """(3, 3) covariance of the middle between the eyes, m²: the driver's, held to what can be, or the settings'."""
+        noise: F64 = self.settings.noise_m**2 / 2 * np.eye(3)
+        if points.covariance_m2 is not None and np.isfinite(points.covariance_m2).all():
+            variances, axes = np.linalg.eigh((points.covariance_m2 + points.covariance_m2.T) / 2)
+            noise = (axes * np.maximum(variances, NOISE_FLOOR_M**2)) @ axes.T
+        return noise * COMPLETED_NOISE**2 if points.completed else noise
 
-    def _is_confirmed(self, middle: imm.Vector, capture_ns: int) -> bool:
-        """True where the sample before was refused for being in the same other place."""
-        if self._refused is None:
-            return False
-        then_ns, then = self._refused
-        reach_m = 4 * self.settings.noise_m + self.settings.speed_max * (capture_ns - then_ns) / NS_PER_S
-        return math.dist(middle, then) <= reach_m
+    def _take(self, sample: _Sample) -> str:
+        if not self._history:
+            self._follow(sample.begun())
+            return ""
+        last = self._history[-1]
+        age_s = last.head.age_s(sample.capture_ns)
+        is_held = self._lost_ns is not None or age_s > LOSS_S
+        known = self._other
+        again = sample.continued(known.head) if known is not None else None
+        if head := sample.continued(last.head):
+            is_others = again is not None and again.surprise < head.surprise and not (known and known.may_be_viewer)
+            if head.surprise <= CHI2_DOUBT or not is_others:
+                self._follow(head, is_return=is_held)
+                return ""
+        if known is not None and again is not None:
+            other = known._replace(head=again)
+        else:
+            other = _Other(sample.begun(), sample.is_within_reach_of(last.head))
+        is_second = again is not None
+        if other.may_be_viewer and (self._lost_ns is not None or is_second):
+            self._follow(other.head, is_return=True)
+        elif is_second and last.head.surprise > CHI2_DOUBT and (head := sample.continued(self._history[-2].head)):
+            self._history.pop()  # it was a mistake: two fit better without it
+            self._follow(head, is_return=True)
+        elif age_s > min(ANOTHER_AFTER_S, self.settings.hold_s) or (is_second and last.head.samples < ESTABLISHED):
+            self._history.clear()
+            self._follow(other.head)
+        else:
+            self._other = other
+            return ELSEWHERE
+        return ""
+
+    def _follow(self, head: _Head, *, is_return: bool = False) -> None:
+        """From now on this is the viewer's; is_return: after a loss, or where nobody expected them."""
+        jump_m, jump_ns = (self._history[-1].jump_m, self._history[-1].jump_ns) if self._history else (NO_JUMP, 0)
+        if is_return:
+            jump_ns = max(self._asked_ns, head.capture_ns)
+            before = self.at(jump_ns).eyes_m
+            jump_m = NO_JUMP if before is None else before - head.eyes_m(min(head.age_s(jump_ns), HORIZON_S))
+        self._history.append(_Shown(head, jump_m, jump_ns))
+        self._lost_ns = None
+        if self._other is not None and (self._other.may_be_viewer or is_return):
+            self._other = None
 
     def ahead(self, time_ns: int) -> EyesEstimate:
         """As `at`, for an instant that is not (yet) shown: what `at` answers later does not depend on it."""
@@ -134,55 +244,57 @@ class Tracker:
         """Where the eyes are at an instant of the samples' clock that is shown.
 
         exact: a sample was taken then; interpolated: between two samples; predicted: after the newest, at
-        most `horizon_max_s` ahead; held: the face is lost, the eyes drift to rest; none: never seen, lost
+        most `HORIZON_S` ahead; held: the face is lost, the eyes drift to rest; none: never seen, lost
         for longer than `hold_s`, or forgotten.
         """
-        if not self._history or time_ns < self._history[0].capture_ns:
+        if not self._history or time_ns < self._history[0].head.capture_ns:
             return EyesEstimate(time_ns, 0, None, "none")
         newest = self._history[-1]
-        age_ns = time_ns - newest.capture_ns
-        if age_ns <= 0:
-            return self._past(time_ns, age_ns)
-        age_s = age_ns / NS_PER_S
+        capture_ns = newest.head.capture_ns
+        if time_ns <= capture_ns:
+            return self._past(time_ns)
+        age_s = newest.head.age_s(time_ns)
         if age_s > self.settings.hold_s:
-            return EyesEstimate(time_ns, newest.capture_ns, None, "none", age_ns)
+            return EyesEstimate(time_ns, capture_ns, None, "none", time_ns - capture_ns)
         self._asked_ns = max(self._asked_ns, time_ns)
-        label: EyesLabel = "predicted"
-        ahead_s = min(age_s, self.settings.horizon_max_s)
+        label: EyesLabel = "held" if self._lost_ns is not None or age_s > LOSS_S else "predicted"
+        ahead_s = min(age_s, HORIZON_S)
         if self._lost_ns is not None:
-            known_s = min((self._lost_ns - newest.capture_ns) / NS_PER_S, ahead_s)
-            rest_s = self.settings.decay_s
-            label, ahead_s = "held", known_s + rest_s * -math.expm1(-(ahead_s - known_s) / rest_s)
-        elif age_s > self.settings.loss_s:
-            label = "held"
-        eyes = self._eyes(newest, ahead_s, time_ns)
-        return EyesEstimate(time_ns, newest.capture_ns, eyes, label, age_ns, self._sigma_m(newest, ahead_s))
+            known_s = min(newest.head.age_s(self._lost_ns), ahead_s)
+            ahead_s = known_s + DECAY_S * -math.expm1(-(ahead_s - known_s) / DECAY_S)
+        eyes_m = newest.eyes_m(ahead_s, time_ns)
+        return self._estimate(time_ns, newest.head, eyes_m, label)
 
-    def _sigma_m(self, sample: _Sample, ahead_s: float) -> float:
-        return imm.deviation(sample.middle, ahead_s, acceleration=self.settings.acceleration)
-
-    def _past(self, time_ns: int, age_ns: int) -> EyesEstimate:
-        index = bisect_left(self._history, time_ns, key=lambda sample: sample.capture_ns)
+    def _past(self, time_ns: int) -> EyesEstimate:
+        index = bisect_left(self._history, time_ns, key=lambda shown: shown.head.capture_ns)
         after = self._history[index]
-        if after.capture_ns == time_ns:
-            eyes = self._eyes(after, 0.0, time_ns)
-            return EyesEstimate(time_ns, time_ns, eyes, "exact", 0, self._sigma_m(after, 0.0))
+        eyes_m = after.eyes_m(0.0, time_ns)
+        if after.head.capture_ns == time_ns:
+            return self._estimate(time_ns, after.head, eyes_m, "exact")
         before = self._history[index - 1]
-        weight = (time_ns - before.capture_ns) / (after.capture_ns - before.capture_ns)
-        eyes = (1 - weight) * self._eyes(before, 0.0, time_ns) + weight * self._eyes(after, 0.0, time_ns)
-        sigma_m = self._sigma_m(after, 0.0)
-        return EyesEstimate(time_ns, after.capture_ns, eyes, "interpolated", time_ns - after.capture_ns, sigma_m)
+        weight = before.head.age_s(time_ns) / before.head.age_s(after.head.capture_ns)
+        eyes_m = (1 - weight) * before.eyes_m(0.0, time_ns) + weight * eyes_m
+        return self._estimate(time_ns, after.head, eyes_m, "interpolated")
 
-    def _eyes(self, sample: _Sample, ahead_s: float, time_ns: int) -> F64:
-        eyes = _eyes(sample.middle, sample.half, ahead_s)
-        if sample.jump_m is not NO_JUMP:
-            fraction = min(max((time_ns - sample.jump_ns) / NS_PER_S / self.settings.revive_s, 0.0), 1.0)
-            eyes += sample.jump_m * (1 - fraction * fraction * (3 - 2 * fraction))
-        return eyes
+    def _estimate(self, time_ns: int, head: _Head, eyes_m: F64, label: EyesLabel) -> EyesEstimate:
+        """How far off the served eyes are, told from what the head can have done since its newest sample."""
+        age_s = min(max(head.age_s(time_ns), 0.0), SIGMA_AHEAD_S)
+        middle_m, half_m = (eyes_m[0] + eyes_m[1]) / 2, (eyes_m[1] - eyes_m[0]) / 2
+        if label in ("exact", "interpolated"):
+            middle_m, half_m = imm.ahead(head.middle, 0.0), imm.ahead(head.half, 0.0)
+        error_m2 = imm.spread(head.middle, age_s, acceleration=ACCELERATION, about=middle_m)
+        error_m2 += imm.spread(head.half, age_s, acceleration=TURN_ACCELERATION, about=half_m)
+        sigma_m = sideways_sigma_m(error_m2, middle_m, panel_m=self._panel_m)
+        return EyesEstimate(time_ns, head.capture_ns, eyes_m, label, time_ns - head.capture_ns, sigma_m)
 
 
-def _eyes(middle: tuple[imm.Model, ...], half: tuple[imm.Model, ...], ahead_s: float) -> F64:
-    """(2, 3) left and right eye, so many seconds after the filters' instant."""
-    place, velocity = np.array([*zip(imm.combined(middle), imm.combined(half), strict=True)])
-    centre, side = place + velocity * ahead_s
-    return np.array([centre - side, centre + side])
+def sideways_sigma_m(error_m2: F64, eye_m: F64, *, panel_m: tuple[float, float]) -> float:
+    """Standard deviation of an axis, right or up, that does as much harm as an eye's error (3, 3) covariance, `stack`.
+
+    An eye that is d nearer than it is believed sees a point of the display through the other panels as one that is
+    d·u/x farther from the point's foot, u: the distance from there, x: the eye's. The mean square over the display.
+    """
+    x, y, z = max(float(eye_m[0]), NEAREST_M), float(eye_m[1]), float(eye_m[2])
+    lever2 = (y * y + z * z + (panel_m[0] ** 2 + panel_m[1] ** 2) / 12) / (x * x)
+    both = error_m2[1, 1] + error_m2[2, 2] - 2 * (y * error_m2[0, 1] + z * error_m2[0, 2]) / x
+    return math.sqrt(max(float(both + lever2 * error_m2[0, 0]), 0.0) / 2)

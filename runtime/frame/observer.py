@@ -17,12 +17,14 @@ import numpy as np
 
 from runtime.content.base import ContentSource
 from runtime.errors import ContextLost
+from runtime.evaluation.contact_sheet import Moment
 from runtime.evaluation.displayed import EyeViews, displayed
 from runtime.frame.presenter import Refresh
 from runtime.frame.solver_host import SolverHost
 from runtime.frame.truth import TrueEyes, Unknown
 from runtime.optics.alignment import shown_layers
-from runtime.optics.carried import carried_quality
+from runtime.optics.carried import carried_quality, light_psnrs_db
+from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.quality import Quality
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import retina_pictures
@@ -32,6 +34,7 @@ from runtime.support.waiting import wait_for
 
 log = logging.getLogger("phasestack.quality")
 
+LIGHT_STEP = 2  # of the pixels whose light is measured
 WAITING_MAX = 2048  # lines that wait for the truth; older ones go without
 
 
@@ -51,13 +54,9 @@ class Measured:
 
     eye_views: EyeViews  # at the eyes aligned to, against their own truth
     carried: Quality  # at the eyes aligned to
+    moment: Moment  # the same, as a sheet shows it
     true_views: EyeViews | None = None  # at the true eyes, against their own truth
     carried_true: Quality | None = None
-
-    def all_views(self) -> EyeViews:
-        """What the eyes aligned to see, with all else that was measured: what the contact sheet tells."""
-        true = self.true_views.quality if self.true_views else None
-        return replace(self.eye_views, carried=self.carried, true=true, carried_true=self.carried_true)
 
 
 @dataclass(slots=True)
@@ -68,6 +67,7 @@ class Means:
 
     def add(self, measured: Measured) -> None:
         found: dict[str, float | None] = {
+            "light_db": measured.moment.light_db,
             "psnr_db": measured.eye_views.quality.psnr_db,
             "ssim": measured.eye_views.quality.ssim,
             "carried_db": measured.carried.psnr_db,
@@ -80,7 +80,7 @@ class Means:
 
     def summary(self) -> dict[str, Any]:
         """The measured part of summary.json; None where nothing was measured."""
-        names = ("psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
+        names = ("light_db", "psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
         means = {name: round(float(np.mean(self.values[name])), 3) if self.values.get(name) else None for name in names}
         return {**means, "quality_frames": len(self.values.get("psnr_db", []))}
 
@@ -108,6 +108,7 @@ class RunObserver:
         self.truth = TrueEyes()
         self.means = Means()
         self.eye_views: EyeViews | None = None  # of the newest measured refresh
+        self.moment: Moment | None = None  # the best of those measured
         self.last: Refresh | None = None
         self._lines: deque[RefreshAccount] = deque()
         self._samples: deque[Refresh] = deque()
@@ -137,9 +138,9 @@ class RunObserver:
         if last is not None and wants_last:
             measured = self._measured_now(last)
             if measured is not None:
-                self.eye_views = measured.all_views()
+                self.eye_views = measured.eye_views
                 if not self.means.values and last.account.state is State.TRACKING:
-                    self.means.add(measured)
+                    self._take(measured)
 
     @property
     def _busy(self) -> bool:
@@ -244,11 +245,23 @@ class RunObserver:
             carried = carried_quality(
                 layers, drawn["solved"], stack, solved_for_m=solved_for_m, eyes_m=account.eyes_m, fov_deg=fov_deg
             )
+            light = light_psnrs_db(
+                layers,
+                drawn["solved"],
+                stack,
+                eyes_m=solved_for_m,
+                seen_from_m=account.eyes_m,
+                fov_deg=fov_deg,
+                sigmas_mm=(PUPIL_SIGMA_MM,),
+                step=LIGHT_STEP,
+            )
+            moment = Moment(layers, eye_views, light[PUPIL_SIGMA_MM], _told(account))
             if true_m is None:
-                return Measured(eye_views, carried)
+                return Measured(eye_views, carried, moment)
             return Measured(
                 eye_views,
                 carried,
+                moment,
                 displayed(layers, drawn["true"], stack, eyes_m=true_m, fov_deg=fov_deg),
                 carried_quality(
                     layers, drawn["solved"], stack, solved_for_m=solved_for_m, eyes_m=true_m, fov_deg=fov_deg
@@ -260,7 +273,9 @@ class RunObserver:
 
     def _take(self, measured: Measured | None) -> None:
         if measured is not None:
-            self.eye_views = measured.all_views()
+            self.eye_views = measured.eye_views
+            if self.moment is None or measured.moment.light_db > self.moment.light_db:
+                self.moment = measured.moment
             self.means.add(measured)
 
     def _measured_now(self, refresh: Refresh) -> Measured | None:
@@ -273,6 +288,21 @@ class RunObserver:
         if not self._simulated:
             wait_for(lambda: bool(jobs), timeout_s=10.0)
         return self._compared(refresh, known_m, jobs[0]) if jobs else None
+
+
+def _told(account: RefreshAccount) -> tuple[str, ...]:
+    """Where the eyes are in a moment, what they do, and how well that is known."""
+    assert account.eyes_m is not None and account.solved_for_m is not None
+    x, y, z = 100 * account.eyes_m.mean(axis=0)
+    where = f"{x:.0f} cm before the panels, {abs(y):.0f} cm to the {'right' if y > 0 else 'left'}, "
+    where += f"{abs(z):.0f} cm {'above' if z > 0 else 'below'} their middle"
+    sure = "" if account.eye_sigma_mm is None else f" to {account.eye_sigma_mm:.1f} mm"
+    line = f"This moment (refresh {account.frame}) is the best of those looked at. The eyes are followed{sure}: {where}"
+    if account.solution_age_ms is None:
+        return (line,)
+    moved_mm = 1000 * float(np.linalg.norm((account.eyes_m - account.solved_for_m).mean(axis=0)))
+    age = f"{moved_mm:.0f} mm in the {account.solution_age_ms:.0f} ms since the instant that the layers were solved for"
+    return line, f"They have moved {age}; the outer panels were shifted along"
 
 
 def _has_picture(refresh: Refresh) -> bool:

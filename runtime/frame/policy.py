@@ -1,7 +1,7 @@
 """What is to be made and shown: flat or solved, anew or as it is. Decisions alone; no clock, no I/O.
 
 Stillness is decided in one place, by the rest watch on the sensor's samples (`eyes.rest`): here, eyes labelled
-`rested` are solved for once. Whatever else moves them is solved for anew, unless a fixed dead band says otherwise.
+`rested` are solved for once. Whatever else moves them is solved for anew.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 from runtime.clock import NS_PER_S
-from runtime.plan.reuse import lateral_shift_m
 from runtime.plan.savings import Plan, selected_eyes
 from runtime.records import F64, EyesEstimate, SolveRequest
 
@@ -18,7 +17,7 @@ Kind = Literal["solve", "flat", "nothing"]
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class SolutionKey:
     """What the newest solution, or the newest flat picture, was made of."""
 
     state_version: int
@@ -55,8 +54,8 @@ class FramePolicy:
         plan: Plan | None,
         state_version: int,
         revision: int,
-        solved: Made | None,
-        flat: Made | None,
+        solved: SolutionKey | None,
+        flat: SolutionKey | None,
     ) -> Decision:
         """plan: what may be left out; solved, flat: what there is; revision: of the content at `request.time_ns`."""
         if request.flat_wanted and not self._flat_wanted:
@@ -76,7 +75,7 @@ class FramePolicy:
         return Decision("nothing") if eyes_m is None else Decision("solve", eyes_m)
 
     def _eyes_to_solve(
-        self, request: SolveRequest, plan: Plan | None, *, state_version: int, revision: int, solved: Made | None
+        self, request: SolveRequest, plan: Plan | None, *, state_version: int, revision: int, solved: SolutionKey | None
     ) -> F64 | None:
         """None: the newest solution will do, or there is nobody to solve for."""
         if request.eyes_m is None:
@@ -85,11 +84,7 @@ class FramePolicy:
         if solved is None or (solved.state_version, solved.revision) != (state_version, revision):
             return eyes_m
         assert solved.eyes_m is not None
-        if (solved.eyes_m == eyes_m).all():
-            return None
-        if plan is not None and plan.reuse and plan.dead_band_m:
-            return None if lateral_shift_m(solved.eyes_m, eyes_m) <= plan.dead_band_m else eyes_m
-        return eyes_m
+        return None if (solved.eyes_m == eyes_m).all() else eyes_m
 
 
 def wants_flat(eyes: EyesEstimate, *, flat_asked: bool, flatness: float) -> bool:

@@ -89,14 +89,19 @@ class Observer(Protocol):
         """A refresh is complete."""
 
 
-class Unobserved:
-    """Nobody looks."""
+class Observers:
+    """Tells each of them everything, in their order."""
+
+    def __init__(self, *observers: Observer) -> None:
+        self._observers = observers
 
     def sampled(self, sample: SensorFrame) -> None:
-        return
+        for observer in self._observers:
+            observer.sampled(sample)
 
     def refreshed(self, refresh: Refresh) -> None:
-        return
+        for observer in self._observers:
+            observer.refreshed(refresh)
 
 
 class Presenter:
@@ -121,7 +126,7 @@ class Presenter:
         self.run_cell, self.stack, self.clock = run, stack, clock
         self.pacer, self.samples, self.viewer, self.solver, self.panels = pacer, samples, viewer, solver, panels
         self._stage_ms = stage_ms
-        self._supervisor, self._observer = supervisor or Unsupervised(), observer or Unobserved()
+        self._supervisor, self._observer = supervisor or Unsupervised(), observer or Observers()
         self._adopted = run.state.version
         self.stats = RunStats()
         self.machine = StateMachine(now_ns=clock.now_ns())
@@ -220,7 +225,7 @@ class Presenter:
     def _alignment(self, eyes: EyesEstimate, solution: Solution | None) -> tuple[tuple[F64, ...], str]:
         """One matrix a panel; the last one where no eyes are known; () where none is needed."""
         plan = self.run_cell.state.settings.plan
-        if solution is None or solution.solved_for_m is None or not (plan.enabled and plan.align):
+        if solution is None or solution.solved_for_m is None or not plan.align:
             return (), ""
         if eyes.eyes_m is None:
             last = self._aligned

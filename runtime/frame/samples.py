@@ -9,7 +9,7 @@ from runtime.clock import NS_PER_S, Clock
 from runtime.config import SensorSettings
 from runtime.errors import EndOfRecording, FatalError, InputError
 from runtime.records import SensorFrame
-from runtime.sensor.base import SensorDriver, SteppedDriver
+from runtime.sensor.base import Sensor, SteppedSensor
 from runtime.sensor.worker import SensorState, SensorWorker
 
 AHEAD_NS = NS_PER_S // 10  # more than from a sample to the light of a refresh that used it
@@ -50,9 +50,9 @@ class Samples(ABC):
 class RecordedSamples(Samples):
     """A recording on the simulated clock: each sample arrives at its capture plus the configured latency."""
 
-    def __init__(self, driver: SensorDriver) -> None:
+    def __init__(self, driver: Sensor) -> None:
         """Raises InputError where the driver can't be stepped, or the recording can't be read."""
-        if not isinstance(driver, SteppedDriver):
+        if not isinstance(driver, SteppedSensor):
             raise InputError("run", "--max-speed", f"needs a recording, not the sensor {driver.name}")
         self._driver = driver
         self.stale_inputs = 0
@@ -101,14 +101,14 @@ class RecordedSamples(Samples):
 class LiveSamples(Samples):
     """A sensor in its own thread."""
 
-    def __init__(self, make_driver: Callable[[], SensorDriver], settings: SensorSettings, clock: Clock) -> None:
+    def __init__(self, make_driver: Callable[[], Sensor], settings: SensorSettings, clock: Clock) -> None:
         self._worker = SensorWorker(make_driver, settings, clock)
-        self._overtaken = 0
+        self._skipped = 0
         self._worker.start()
 
     def arrived(self, now_ns: int) -> list[SensorFrame]:
         frames = self._worker.take()
-        self._overtaken += max(0, len(frames) - 1)
+        self._skipped += max(0, len(frames) - 1)
         if frames:
             return frames
         state = self._worker.state
@@ -125,7 +125,7 @@ class LiveSamples(Samples):
 
     @property
     def stale_inputs(self) -> int:  # type: ignore[override]
-        return self._overtaken + self._worker.stale_inputs
+        return self._skipped + self._worker.stale_inputs
 
     @property
     def refused_inputs(self) -> Mapping[str, int]:

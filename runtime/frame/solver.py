@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field
+import sys
+from dataclasses import dataclass, field, replace
+from time import perf_counter_ns
 
 import numpy as np
 
+from runtime.clock import NS_PER_MS
 from runtime.content.base import View
 from runtime.errors import ContentFailure, ContextLost, ModelFailure
 from runtime.frame.buffers import LayerBuffers
-from runtime.frame.policy import FramePolicy, Made
+from runtime.frame.policy import FramePolicy, SolutionKey
 from runtime.frame.run_state import RunCell, RunState
 from runtime.frame.timing import Stopwatch
 from runtime.model.flat import flat_layers
+from runtime.model.job import Part
+from runtime.model.trim import Savings
 from runtime.optics.pupil import configured_sigma_mm
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
 from runtime.plan.drawing import drawn_for
-from runtime.plan.planner import Planner, observed
-from runtime.plan.savings import Measured, Plan, seeing_eyes
+from runtime.plan.savings import Measured, Plan, make_plan, seeing_eyes
 from runtime.records import F64, U8, PlanItem, Solution, SolveRequest
 
 log = logging.getLogger("phasestack.solver")
@@ -28,36 +32,33 @@ FLAT_EYE_M = (0.7, 0.0, 0.0)  # where the flat picture is drawn from before any 
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class SolverStep:
     """What became of one request."""
 
     solution: Solution | None = None  # a new one for two eyes
     flat: Solution | None = None  # a new flat picture
     missing: dict[str, str] = field(default_factory=dict)  # parts that failed (content, model), and why
 
-    @property
-    def idle(self) -> bool:
-        """There was nothing to do."""
-        return self.solution is None and self.flat is None and not self.missing
-
 
 class Solver:
     """One solution or flat picture a step, from whatever the run is made with at its beginning."""
 
-    def __init__(self, run: RunCell, stack: PanelStack) -> None:
-        self.run, self.stack = run, stack
+    def __init__(self, run: RunCell, stack: PanelStack, *, timed: bool = True) -> None:
+        """timed: `model.budget_ms` holds; on a simulated clock nothing may depend on the machine."""
+        self.run, self.stack, self._timed = run, stack, timed
         self.measured = Measured()  # what is known of the plan's times and errors
         self.plan: Plan | None = None
-        self._planned_for: tuple[int, tuple[bool, bool], Measured] | None = None
+        self._planned_for: tuple[int, tuple[bool, bool]] | None = None
         self._seeing = (True, True)
         self._policy = FramePolicy()
         self._buffers = LayerBuffers()
-        self._solved: Made | None = None
-        self._flat: Made | None = None
+        self._solved: SolutionKey | None = None
+        self._flat: SolutionKey | None = None
+        self._part: Part | None = None  # of the panels, that the newest solution is of
         self._middle_m: F64 = np.array(FLAT_EYE_M)
         self._missing: dict[str, str] = {}
 
-    def step(self, request: SolveRequest) -> Step:
+    def step(self, request: SolveRequest) -> SolverStep:
         """Do what the request calls for, if anything. A part that fails is named; what there is stays good.
 
         Raises ContextLost: this solver is of no more use.
@@ -68,7 +69,7 @@ class Solver:
         try:
             revision = state.content.revision(time_ns=time_ns)
         except Exception as error:
-            return Step(missing=self._failed("content", error, expected=ContentFailure))
+            return SolverStep(missing=self._failed("content", error, expected=ContentFailure))
         job = self._policy.next_job(
             request,
             plan=self.plan,
@@ -84,27 +85,38 @@ class Solver:
             return self._solve(state, request, job.eyes_m, revision=revision)
         if request.eyes_m is not None and not request.paused:
             self._missing = {}  # what there is is what was asked for
-        return Step(missing=dict(self._missing))
+        return SolverStep(missing=dict(self._missing))
 
-    def _solve(self, state: RunState, request: SolveRequest, eyes_m: F64, *, revision: int) -> Step:
+    def _solve(self, state: RunState, request: SolveRequest, eyes_m: F64, *, revision: int) -> SolverStep:
         settings, watch = state.settings.model, Stopwatch()
         stages: dict[str, float] = {}
-        try:
-            images = drawn_for(state.predictor, state.content, eyes_m, time_ns=request.time_ns)
-        except ContextLost:  # content and model are in it: whoever made this solver makes another
-            raise
-        except Exception as error:
-            return Step(missing=self._failed("content", error, expected=ContentFailure))
-        stages["render"] = watch.lap_ms()
         sigma_mm = configured_sigma_mm(
             settings.eye_sigma_mm, pupil_mm=settings.pupil_mm, tracker_sigma_m=request.sigma_m
         )
+        limited = self._timed and settings.budget_ms > 0
+        deadline_ns = perf_counter_ns() + round(settings.budget_ms * NS_PER_MS) if limited else None
         try:
-            prediction = state.predictor.predict(images, eyes_m, eye_sigma_mm=sigma_mm)
+            job = drawn_for(
+                state.predictor,
+                state.content,
+                eyes_m,
+                time_ns=request.time_ns,
+                trimmed=state.settings.plan.enabled,
+                before=self._part,
+                eye_sigma_mm=sigma_mm,
+                deadline_ns=deadline_ns,
+            )
+        except ContextLost:  # content and model are in it: whoever made this solver makes another
+            raise
+        except Exception as error:
+            return SolverStep(missing=self._failed("content", error, expected=ContentFailure))
+        stages["render"] = watch.lap_ms()
+        try:
+            prediction = state.predictor.solve(job)
         except ContextLost:
             raise
         except Exception as error:
-            return Step(missing=self._failed("model", error, expected=ModelFailure))
+            return SolverStep(missing=self._failed("model", error, expected=ModelFailure))
         made = prediction.made
         if isinstance(made, np.ndarray):
             made = self._buffers.copy_of(made)
@@ -112,7 +124,10 @@ class Solver:
         stages |= prediction.stage_ms
         stages["finish"] = stages.get("finish", 0.0) + rest_ms
         self._missing = {}
-        self._solved = Made(state.version, revision, eyes_m)
+        self._part = job.part if job.part is not None and job.part.box.width_px else None
+        left_out = Savings(job.solved_share(self.stack), job.channels)
+        self.measured = replace(self.measured, left_out=left_out)
+        self._solved = SolutionKey(state.version, revision, eyes_m)
         self._middle_m = eyes_m.mean(axis=0)
         solution = Solution(
             self.run.next_number(),
@@ -124,9 +139,9 @@ class Solver:
             stage_ms=stages,
             machine_ms=stages,
         )
-        return Step(solution=solution)
+        return SolverStep(solution=solution)
 
-    def _draw_flat(self, state: RunState, *, revision: int, time_ns: int) -> Step:
+    def _draw_flat(self, state: RunState, *, revision: int, time_ns: int) -> SolverStep:
         watch = Stopwatch()
         missing: dict[str, str] = {}
         try:
@@ -137,34 +152,37 @@ class Solver:
         except Exception as error:
             missing = self._failed("content", error, expected=ContentFailure)
             if self._flat is not None:
-                return Step(missing=missing)
+                return SolverStep(missing=missing)
             picture = np.full((self.stack.height_px, self.stack.width_px, 4), 255, np.uint8)
         layers: U8 = flat_layers(picture, self.stack)
         if not missing:
             self._missing.pop("content", None)
-            self._flat = Made(state.version, revision, None, self._policy.episode)
+            self._flat = SolutionKey(state.version, revision, None, self._policy.episode)
         stages = {"render": watch.lap_ms()}
         flat = Solution(self.run.next_number(), layers, None, time_ns, stage_ms=stages, machine_ms=stages)
-        return Step(flat=flat, missing=missing)
+        return SolverStep(flat=flat, missing=missing)
 
     def plan_items(self, measured: Measured | None = None) -> tuple[PlanItem, ...]:
         """What is left out now, with what is known of its time and error. Any thread may ask."""
         state = self.run.state
-        numbers = observed(measured or self.measured, state.predictor)
-        planner = Planner(state.settings, self.stack)
-        return planner.plan(state.content.info, state.predictor, seeing=self._seeing, measured=numbers).items
+        return self._plan_of(state, self._seeing, measured or self.measured).items
 
     def _replan(self, state: RunState, eyes_m: F64 | None) -> None:
         """Make the plan again where the content, the model, the settings or what the eyes can see have changed."""
-        range_deg = state.settings.plan.range_deg
-        seeing = self._seeing if eyes_m is None else seeing_eyes(eyes_m, self._seeing, range_deg=range_deg)
+        seeing = self._seeing if eyes_m is None else seeing_eyes(eyes_m, self._seeing)
         if seeing != self._seeing:
             log.info("plan: %s", _who_sees(seeing))
         self._seeing = seeing
-        made_for = (state.version, seeing, self.measured)
+        made_for = (state.version, seeing)
         if made_for != self._planned_for:
             self._planned_for = made_for
-            self.plan = Planner(state.settings, self.stack).plan(state.content.info, state.predictor, seeing=seeing)
+            self.plan = self._plan_of(state, seeing, self.measured)
+
+    @staticmethod
+    def _plan_of(state: RunState, seeing: tuple[bool, bool], measured: Measured) -> Plan:
+        return make_plan(
+            state.content.info, state.settings, seeing=seeing, measured=measured, loaded_modules=sys.modules
+        )
 
     def _failed(self, part: str, error: Exception, *, expected: type[Exception]) -> dict[str, str]:
         self._missing[part] = str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from runtime.clock import NS_PER_MS, Clock
-from runtime.frame.solver import Step
+from runtime.frame.solver import SolverStep
 from runtime.frame.timing import SOLVING_STAGES
 from runtime.records import Solution, SolveRequest
 
@@ -19,9 +19,9 @@ COST_GAIN = 0.2  # of the newest solution in the running mean of what one costs
 
 
 class SolverParts(Protocol):
-    """A solver and what belongs to its thread: GL context, time budget."""
+    """A solver and what belongs to its thread, such as a GL context."""
 
-    def step(self, request: SolveRequest) -> Step:
+    def step(self, request: SolveRequest) -> SolverStep:
         """One request."""
 
     def simulated_stage_ms(self) -> Mapping[str, float]:
@@ -71,7 +71,7 @@ class SolverHost(ABC):
         """Stop, and release what the solver holds. May be called twice."""
 
 
-def taken_in(news: News, step: Step) -> News:
+def taken_in(news: News, step: SolverStep) -> News:
     """The news with what a step made; the newest wins, and what failed is as the last step found it."""
     return News(
         step.solution or news.solution,
@@ -101,7 +101,7 @@ class SimulatedSolver(SolverHost):
         self._parts, self._clock = parts, clock
         self._news = taken_in(News(), parts.step(FIRST_REQUEST))
         self._posted: tuple[int, SolveRequest] | None = None
-        self._under_way: tuple[int, Step] | None = None  # when it is complete
+        self._under_way: tuple[int, SolverStep] | None = None  # when it is complete
         self._idle_since_ns = clock.now_ns()
         self._tasks: list[Task] = []
         self._closed = False
@@ -143,7 +143,7 @@ class SimulatedSolver(SolverHost):
             step = self._timed(self._parts.step(request))
             self._under_way = begun_ns + self._cost_of(step), step
 
-    def _timed(self, step: Step) -> Step:
+    def _timed(self, step: SolverStep) -> SolverStep:
         """With the stage times that the configuration says."""
         stages = dict(self._parts.simulated_stage_ms())
         self.solve_cost_ns = total_ns(stages)
@@ -156,6 +156,6 @@ class SimulatedSolver(SolverHost):
         return replace(step, solution=solution, flat=flat)
 
     @staticmethod
-    def _cost_of(step: Step) -> int:
+    def _cost_of(step: SolverStep) -> int:
         made = step.solution or step.flat
         return total_ns(made.stage_ms) if made is not None else 0

@@ -6,17 +6,21 @@ import logging
 import math
 import queue
 import threading
+from collections import deque
 from collections.abc import Callable
 
-from runtime.clock import NS_PER_S, Clock
+from runtime.clock import NS_PER_MS, NS_PER_S, Clock
 from runtime.errors import ContextLost, FatalError, PhasestackError
 from runtime.frame.solver_host import COST_GAIN, FIRST_REQUEST, News, SolverHost, SolverParts, Task, taken_in, total_ns
 from runtime.records import SolveRequest
+from runtime.support.memory import give_back
 from runtime.support.priority import SOLVER_NICENESS, set_niceness
 
 log = logging.getLogger("phasestack.solver")
 
 IDLE_S = 0.02  # between two looks at tasks while nothing is asked
+LATE_STEPS = 3  # in a row that are late begin a fault, so many in time end it: a busy processor is none
+ANSWER_STEP_MS = 500  # of how long no answer came, as it is reported
 ABANDONED_MAX = 4  # hung threads that are left behind; with more, the solver stays as it is
 
 
@@ -27,7 +31,7 @@ class _Attempt:
         self.number, self.abandoned = number, threading.Event()
         self.ready = threading.Event()
         self.busy_since_ns = 0  # 0: it waits
-        self.last_step_ns = 0  # what the last step took
+        self.took_ns: deque[int] = deque(maxlen=LATE_STEPS)  # the last steps
         self.error: BaseException | None = None
         self.thread: threading.Thread | None = None
 
@@ -40,7 +44,8 @@ class SolverThread(SolverHost):
     ) -> None:
         """make: a solver with its own GL context, called on the thread that will use it, again after it hung.
 
-        late_s: a step that takes longer is told as missing; abandon_s: after this the thread is left behind.
+        late_s: steps that take longer, one after the other, or one that takes twice as long, are a fault; abandon_s:
+        after this the thread is left behind.
         """
         self._make, self._clock = make, clock
         self._late_ns, self._abandon_ns = round(late_s * NS_PER_S), round(abandon_s * NS_PER_S)
@@ -50,6 +55,7 @@ class SolverThread(SolverHost):
         self._tasks: queue.SimpleQueue[Task] = queue.SimpleQueue()
         self._closing = threading.Event()
         self._hung: list[_Attempt] = []
+        self._is_late = False
         self.solve_cost_ns = first_cost_ns
         self.restarts = 0
         self._attempt = self._begin(1)
@@ -64,7 +70,7 @@ class SolverThread(SolverHost):
             if not tell():
                 return
             if self._clock.now_ns() - begun_ns > most_s * NS_PER_S:
-                raise FatalError(f"content and model: not ready after {most_s:g} s (limits.start_s)")
+                raise FatalError(f"content and model: not ready after {most_s:g} s")
         if self._attempt.error is not None:
             raise self._attempt.error
 
@@ -105,10 +111,12 @@ class SolverThread(SolverHost):
             if busy_ns > self._abandon_ns:
                 self._attempt = self._begin(attempt.number + 1)
             return f"the solver failed, it is made anew by and by ({_line(attempt.error)})"
-        if busy_ns <= self._late_ns:
-            # Until a step is in time again: a state that changed with every solution would say nothing.
-            late = attempt.last_step_ns > self._late_ns
-            return f"the last solution took {attempt.last_step_ns / NS_PER_S:.1f} s" if late else ""
+        if busy_ns <= 2 * self._late_ns:
+            steps = tuple(attempt.took_ns)
+            late = sum(took_ns > self._late_ns for took_ns in steps)
+            self._is_late = late == LATE_STEPS or (self._is_late and late > 0)
+            took_ms, limit_ms = max(steps, default=0) / NS_PER_MS, self._late_ns / NS_PER_MS
+            return f"solutions take {took_ms:.0f} ms (late: more than {limit_ms:.0f} ms)" if self._is_late else ""
         if busy_ns > self._abandon_ns:
             self._hung = [hung for hung in self._hung if hung.thread is not None and hung.thread.is_alive()]
         if busy_ns > self._abandon_ns and len(self._hung) < ABANDONED_MAX:
@@ -117,7 +125,8 @@ class SolverThread(SolverHost):
             self._hung.append(attempt)
             self.restarts += 1
             self._attempt = self._begin(attempt.number + 1)
-        return f"the solver has not answered for {int(busy_ns / NS_PER_S)} s"
+        busy_ms = busy_ns // NS_PER_MS // ANSWER_STEP_MS * ANSWER_STEP_MS
+        return f"the solver has not answered for {busy_ms} ms"
 
     def _begin(self, number: int) -> _Attempt:
         attempt = _Attempt(number)
@@ -158,6 +167,9 @@ class SolverThread(SolverHost):
             attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
         finally:
             parts.close(abandoned=attempt.abandoned.is_set())
+            if attempt.abandoned.is_set():  # what it held is hundreds of MiB
+                attempt.error = parts = None
+                give_back()
 
     def _next_request(self) -> SolveRequest | None:
         with self._lock:
@@ -169,7 +181,7 @@ class SolverThread(SolverHost):
     def _step(self, attempt: _Attempt, parts: SolverParts, request: SolveRequest) -> None:
         attempt.busy_since_ns = self._clock.now_ns()
         step = parts.step(request)
-        attempt.last_step_ns = self._clock.now_ns() - attempt.busy_since_ns
+        attempt.took_ns.append(self._clock.now_ns() - attempt.busy_since_ns)
         attempt.busy_since_ns = 0
         if attempt.abandoned.is_set():
             return

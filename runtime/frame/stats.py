@@ -10,7 +10,7 @@ import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.frame.timing import SOLVING_STAGES, STAGES
-from runtime.records import F64, RefreshAccount
+from runtime.records import F64, RefreshAccount, State
 
 WINDOW = 8192  # values that quantiles are taken over
 RECENT_SHARE = 1 / 64  # of the values held, that a quantile which is nearly the newest may be without
@@ -97,7 +97,7 @@ class RunStats:
             self._interval.add((now_ns - self._last_presented_ns) / NS_PER_MS)
         self._last_presented_ns = now_ns
         self._skew.add(account.skew_ms)
-        if account.capture_ns:
+        if account.capture_ns and account.state is State.TRACKING:
             self._photon.add((account.photon_ns - account.capture_ns) / NS_PER_MS)
         if account.solution_age_ms is not None:
             self._age.add(account.solution_age_ms)

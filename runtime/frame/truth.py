@@ -34,11 +34,6 @@ class TrueEyes:
         """No more samples will come."""
         self._ended = True
 
-    @property
-    def known(self) -> bool:
-        """True where this recording has told any truth."""
-        return bool(self._known)
-
     def at(self, time_ns: int) -> F64 | Unknown | None:
         """(2, 3) at an instant; None: it will never be known."""
         if not self._known:

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
-
-import numpy as np
 
 from runtime.clock import NS_PER_S
 from runtime.config import Settings
 from runtime.eyes.calibration import Calibration
-from runtime.eyes.calibration_drift import SeparationWatch
-from runtime.eyes.plausibility import PlausibilityWatch
+from runtime.eyes.calibration_drift import TOLERANCE, SeparationWatch
+from runtime.eyes.plausibility import RefusalWatch
 from runtime.eyes.rest import RestWatch
 from runtime.eyes.tracker import Tracker
-from runtime.records import EyesEstimate, SensorFrame
+from runtime.records import EyePoints, EyesEstimate, SensorFrame
 
 log = logging.getLogger("phasestack.viewer")
 
+MAX_REST_DRIFT_M = 0.001  # of a resting head, until its place is renewed
 IN_FRONT_M = 0.01  # nearer to the front panel than this, or behind it, no eye is served
 
 
@@ -31,40 +30,38 @@ class Viewer:
     ) -> None:
         """front_m: x of the front panel; in_stack_frame: the sensor's points need no calibration."""
         self._settings, self._calibration = settings, calibration
-        self._front_m, self._in_stack_frame = front_m, in_stack_frame
-        self._tracker = Tracker(settings.tracker)
+        self._nearest_m, self._in_stack_frame = front_m + IN_FRONT_M, in_stack_frame
+        self._tracker = self._new_tracker()
         self._rest = _rest_watch(settings)
         self._drift = _drift_watch(settings)
-        self._plausible = _plausibility_watch(settings)
+        self._refusals = RefusalWatch()
         self._serial_checked = False
         self._captures_ns: deque[int] = deque(maxlen=64)
-        self.dropped: Counter[str] = Counter()  # eyes that were not used, by reason
 
     def adopt(self, settings: Settings, calibration: Calibration) -> None:
         """Other settings hold from now on. The tracker forgets only where its own have changed."""
         before, self._settings, self._calibration = self._settings, settings, calibration
         if settings.tracker != before.tracker:
-            self._tracker = Tracker(settings.tracker)
-            self._plausible = _plausibility_watch(settings)
+            self._tracker = self._new_tracker()
         if (settings.plan, settings.model) != (before.plan, before.model):
             self._rest = _rest_watch(settings)
         if settings.calibration != before.calibration:
             self._drift = _drift_watch(settings)
 
+    def _new_tracker(self) -> Tracker:
+        stack = self._settings.stack
+        panel_m = stack.width_m, stack.height_m
+        return Tracker(self._settings.tracker, panel_m=panel_m, in_front_m=self._nearest_m)
+
     @property
     def warning(self) -> str:
         """What most samples of late can't be (exchanged, in millimetres, ...); empty: all is well."""
-        return self._plausible.warning
+        return self._refusals.warning
 
     @property
-    def implausible(self) -> Mapping[str, int]:
-        """Samples that can't be a viewer's eyes, by reason."""
-        return self._plausible.counts
-
-    @property
-    def outliers(self) -> int:
-        """Samples that the tracker refused."""
-        return self._tracker.outliers
+    def refused(self) -> Mapping[str, int]:
+        """Samples that were not used, by reason; each is counted once."""
+        return self._refusals.counts
 
     @property
     def rate_hz(self) -> float | None:
@@ -74,22 +71,27 @@ class Viewer:
         return round((len(self._captures_ns) - 1) * NS_PER_S / (self._captures_ns[-1] - self._captures_ns[0]), 2)
 
     def take(self, frame: SensorFrame, *, serial: str) -> None:
-        """One sample, as it came."""
+        """One sample, as it came. What the tracker refuses is counted, and seen by nobody else."""
         self._captures_ns.append(frame.capture_ns)
         points = frame.eyes
         if points is not None and not self._in_stack_frame:
             points = self._calibration.apply(points)
-            if drift := self._drift.update(points):
-                log.warning("%s", drift)
-        if points is not None and (told := self._plausible.update(points.eyes_m)):
-            log.warning("%s", told)
-        self._tracker.update(points, capture_ns=frame.capture_ns)
-        if self._rest is not None and points is not None:
-            self._rest.update(points.eyes_m, capture_ns=frame.capture_ns)
+        refused = self._tracker.update(points, capture_ns=frame.capture_ns)
+        if points is not None:
+            if line := self._refusals.update(refused):
+                log.warning("%s", line)
+            if not refused:
+                self._believe(points, frame.capture_ns)
         if not self._serial_checked and serial:
             self._serial_checked = True
             if warning := self._calibration.serial_warning(serial):
                 log.warning("%s", warning)
+
+    def _believe(self, points: EyePoints, capture_ns: int) -> None:
+        if self._rest is not None:
+            self._rest.update(points.eyes_m, capture_ns=capture_ns)
+        if not self._in_stack_frame and (line := self._drift.update(points)):
+            log.warning("%s", line)
 
     def at(self, light_ns: int) -> EyesEstimate:
         """The eyes at the light of a refresh: what is shown next is aligned to them."""
@@ -97,36 +99,24 @@ class Viewer:
 
     def ahead(self, time_ns: int) -> EyesEstimate:
         """The eyes at an instant that is not shown yet: for the solver."""
-        return self._served(self._tracker.ahead(time_ns), count=False)
+        return self._served(self._tracker.ahead(time_ns))
 
-    def _served(self, eyes: EyesEstimate, *, count: bool = True) -> EyesEstimate:
-        """Where the head rests, as long as it does; without eyes that can't see every panel from the front."""
+    def _served(self, eyes: EyesEstimate) -> EyesEstimate:
+        """Where the head rests, as long as it does; nobody, where a head is predicted into the panels."""
         if eyes.eyes_m is None:
             return eyes
-        place = self._rest.place if self._rest is not None else None
-        if place is not None:
-            assert self._rest is not None
+        if self._rest is not None and self._rest.place is not None:
             label = eyes.label if eyes.label == "held" else "rested"
-            eyes = replace(eyes, eyes_m=place, label=label, sigma_m=self._rest.sigma_m)
-        assert eyes.eyes_m is not None
-        if np.isfinite(eyes.eyes_m).all() and float(eyes.eyes_m[:, 0].min()) > self._front_m + IN_FRONT_M:
-            return eyes
-        if count:
-            self.dropped["not in front of the panels"] += 1
-            log.warning("eyes: at %s, not in front of the panels: dropped", np.round(eyes.eyes_m, 3).tolist())
-        return EyesEstimate(eyes.time_ns, eyes.capture_ns, None, "none", eyes.age_ns)
+            return replace(eyes, eyes_m=self._rest.place, label=label, sigma_m=self._rest.sigma_m)
+        if float(eyes.eyes_m[:, 0].min()) <= self._nearest_m:
+            return EyesEstimate(eyes.time_ns, eyes.capture_ns, None, "none", eyes.age_ns)
+        return eyes
 
 
 def _rest_watch(settings: Settings) -> RestWatch | None:
     """None where the plan may not show a picture again for eyes that are only nearly the same."""
-    plan = settings.plan
-    most_m = (plan.dead_band_mm or plan.most_band_mm) / 1000
-    return RestWatch(most_m=most_m) if plan.enabled and plan.reuse and most_m > 0 else None
-
-
-def _plausibility_watch(settings: Settings) -> PlausibilityWatch:
-    return PlausibilityWatch(ipd_min_m=settings.tracker.ipd_min_m, ipd_max_m=settings.tracker.ipd_max_m)
+    return RestWatch(max_drift_m=MAX_REST_DRIFT_M) if settings.plan.enabled else None
 
 
 def _drift_watch(settings: Settings) -> SeparationWatch:
-    return SeparationWatch(known_ipd_m=settings.calibration.ipd_m, tolerance=settings.calibration.ipd_tolerance)
+    return SeparationWatch(known_ipd_m=settings.calibration.ipd_m, tolerance=TOLERANCE)

@@ -1,7 +1,4 @@
-"""Layers of whole panels from what was solved: a window among the rest, fewer pixels enlarged, rows for columns.
-
-The plan says which window and what is beside it; a backend carries it out where its layers lie.
-"""
+"""Layers of whole panels from what was solved: a window among the rest, rows for columns, where the layers lie."""
 
 from __future__ import annotations
 
@@ -54,15 +51,11 @@ class Assembly(Protocol):
     def assembled(self, rest: Rest, window: Placed | None) -> Layers:
         """(N, h, w, 4): a window, if any, among the rest; an array is the assembly's own until the next frame."""
 
-    def enlarged(self, layers: Layers) -> Layers:
-        """(N, h, w, 4): layers of fewer pixels, bilinear, with their outermost pixels repeated; an array is the
-        assembly's own until the next frame."""
-
-    def turned_picture(self, picture: U8 | DrawnPicture, side: int) -> U8 | DrawnPicture:
+    def transposed_picture(self, picture: U8 | DrawnPicture, side: int) -> U8 | DrawnPicture:
         """(w, h, 4): an eye's picture of the whole centre panel with rows for columns, until the next of its side."""
 
-    def turned(self, layers: Layers) -> Layers:
-        """(N, h, w, 4): layers (N, w, h, 4) of turned panels with rows for columns; an array is the assembly's own
+    def transposed(self, layers: Layers) -> Layers:
+        """(N, h, w, 4): layers (N, w, h, 4) of transposed panels with rows for columns; an array is the assembly's own
         until the next frame."""
 
     def close(self) -> None:
@@ -75,7 +68,7 @@ class ArrayAssembly:
     def __init__(self, stack: PanelStack) -> None:
         self._stack = stack
         self._layers: U8 | None = None  # assembled
-        self._large: U8 | None = None  # enlarged, or turned
+        self._transposed: U8 | None = None
         self._solved: PixelRect | None = None  # where the outer panels are not even
         self._colour: tuple[int, ...] | None = None  # that fills the centre panel beside the window
 
@@ -93,29 +86,19 @@ class ArrayAssembly:
             self._place(layers, window)
         return layers
 
-    def enlarged(self, layers: Layers) -> U8:
-        found = self._own()
-        for layer, out in zip(pixels_of(layers), found, strict=True):
-            cv2.resize(layer, out.shape[1::-1], dst=out, interpolation=cv2.INTER_LINEAR)
-        return found
-
-    def turned_picture(self, picture: U8 | DrawnPicture, side: int) -> U8:
+    def transposed_picture(self, picture: U8 | DrawnPicture, side: int) -> U8:
         pixels = picture.pixels() if isinstance(picture, DrawnPicture) else picture
         return np.asarray(cv2.transpose(pixels), np.uint8)
 
-    def turned(self, layers: Layers) -> U8:
-        found = self._own()
-        for layer, out in zip(pixels_of(layers), found, strict=True):
+    def transposed(self, layers: Layers) -> U8:
+        if self._transposed is None:
+            self._transposed = self._empty(0)
+        for layer, out in zip(pixels_of(layers), self._transposed, strict=True):
             cv2.transpose(layer, dst=out)
-        return found
+        return self._transposed
 
     def close(self) -> None:
         """It holds nothing."""
-
-    def _own(self) -> U8:
-        if self._large is None:
-            self._large = self._empty(0)
-        return self._large
 
     def _empty(self, code: int) -> U8:
         return np.full((self._stack.count, self._stack.height_px, self._stack.width_px, 4), code, np.uint8)

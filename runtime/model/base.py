@@ -1,28 +1,29 @@
-"""What every model answers: which pictures it wants drawn, and the layers it makes of them."""
+"""What every model answers: which pictures it wants drawn, and the layers it makes of a job."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from runtime.optics.pupil import PUPIL_SIGMA_MM
+from runtime.model.contract import Step
+from runtime.model.job import Job
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, U8, Layers, pixels_of
 
 if TYPE_CHECKING:
-    from runtime.model.schedule import Backend
+    from runtime.model.steps import SolverBackend
 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """The layers for two eyes, and what they took."""
+    """The layers for a job, and what they took."""
 
     made: Layers  # (N, height_px, width_px, 4) RGBA, rear to front; an array is the predictor's until its next call
     stage_ms: dict[str, float] = field(default_factory=dict)  # prepare, inference (the network alone), finish
+    steps: int = 1  # of the model, that were done
 
     @property
     def layers(self) -> U8:
@@ -31,26 +32,26 @@ class Prediction:
 
 
 class Predictor(ABC):
-    """Two pictures in, N layers out. One thread uses it."""
+    """A job in, N layers out. One thread uses it."""
 
     name: str
     provider: str
     parameters: int
     stack: PanelStack
-    backend: str = "opencv"  # what does all that surrounds the network at present
+    backend: str = "cpu"  # what does all that surrounds the network at present
     fell_back: tuple[str, ...] = ()  # nodes of the network that run on another provider than the wished one
-    channels: int = 3  # that the last pictures were solved in: one, where grey ones may be
+    trims: bool = False  # whether it solves a part of the panels, or one channel (`trim`)
 
     def reads_textures_of(self, context: object) -> bool:
-        """Whether `predict` takes pictures that were left in textures of a GL context (`DrawnPicture`)."""
+        """Whether `solve` takes pictures that were left in textures of a GL context (`DrawnPicture`)."""
         return False
 
     def on_panels(self, stack: PanelStack) -> Predictor | None:
         """The same model for other panels of the same kind, to measure backends with; None: it has one backend."""
         return None
 
-    def surround_with(self, backend: Backend) -> None:  # noqa: B027 - most have one backend
-        """Have what surrounds the network done in another way from the next call on. On the thread that predicts."""
+    def set_backend(self, backend: SolverBackend) -> None:  # noqa: B027 - most have one
+        """Have what surrounds the network done by another backend from the next call on. On the thread that solves."""
 
     @abstractmethod
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
@@ -62,49 +63,32 @@ class Predictor(ABC):
         return "linear"
 
     @property
-    def pre_emphasis(self) -> float:
-        """How strongly it sharpens pictures against the blur of interpolation (`transfer.pre_emphasised`)."""
-        return 0.0
-
-    @property
     def black_beside(self) -> bool:
         """Whether still pictures end in black, not in their repeated edge."""
         return False
 
     def windows(self, eyes_m: F64) -> tuple[tuple[slice, slice], ...]:
-        """Rows and columns of each raster that `predict` will look at: all of them, where it doesn't know better."""
+        """Rows and columns of each raster that `solve` will look at: all of them, where it doesn't know better."""
         return tuple((slice(0, raster.height_px), slice(0, raster.width_px)) for raster in self.rasters(eyes_m))
 
     @abstractmethod
-    def predict(
-        self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = PUPIL_SIGMA_MM
-    ) -> Prediction:
-        """Layers for `images[eye][raster]`, (h, w, 4) RGBA, left eye first, drawn on `rasters(eyes_m)`.
-
-        eye_sigma_mm: standard deviation, an axis, of where light enters the eyes, common to both, to the right and
-        up; 0 asks for two points.
+    def solve(self, job: Job) -> Prediction:
+        """The layers of a job.
 
         Raises ModelFailure where inference fails or does not answer with finite numbers; of these EyesNotServed where
         the model has no picture for two eyes like these.
         """
 
     @property
-    def refines(self) -> bool:
-        """Whether `refine` may follow the last call of `predict`."""
-        return False
-
-    def refine(
-        self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = PUPIL_SIGMA_MM
-    ) -> Prediction:
-        """Layers for images that differ a little from those of the last call, for the same eyes: its panels, changed by
-        the last steps alone. Raises ModelFailure."""
-        raise NotImplementedError(f"{self.name} has no steps to do again")
+    def refining(self) -> tuple[Step, ...]:
+        """Joint steps that a still picture's layers are to be changed by, along its own rays (`own_rays.refined`)."""
+        return ()
 
     def warm_up(self, eyes_m: F64) -> None:
-        """Run once on grey pictures, so that the first frame does not pay for allocation."""
+        """Solve once for grey pictures, so that the first frame does not pay for allocation."""
         rasters = self.rasters(eyes_m)
         grey = [np.full((raster.height_px, raster.width_px, 4), 128, np.uint8) for raster in rasters]
-        self.predict([grey, grey], eyes_m)
+        self.solve(Job([grey, grey], eyes_m))
 
     def close(self) -> None:  # noqa: B027 - most hold nothing
         """Release threads and sessions. May be called twice."""

@@ -86,7 +86,7 @@ class ChainFrame:
         found = np.linalg.inv(self.plane_from_frame(self.middle_m, x_m=x_m))
         return np.asarray(found / found[2, 2], np.float64)
 
-    def doubt(self, stack: PanelStack, *, eye_sigma_mm: float) -> F32:
+    def eye_sigma_px(self, stack: PanelStack, *, eye_sigma_mm: float) -> F32:
         """(3,): how far the outer panels' pictures move, columns and rows, for eyes off by one standard deviation to
         the right and up; and the centre panel's own parallax beside this raster's plane, in columns."""
         reach = (stack.x_m[-1] - self.x_m) / (self.middle_m[0] - stack.x_m[-1])

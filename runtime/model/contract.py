@@ -16,13 +16,27 @@ METADATA_KEY = "phasestack.contract"
 VERSION = 2
 
 
+Places = Literal["middle", "rising", "falling"]
+
+
 class Step(Section):
     """One step of a `chain` model."""
 
-    kind: Literal["chain", "front", "rear"] = Field(
-        description="the network along the eyes' line, or a local correction of one outer panel"
+    kind: Literal["chain", "front", "rear", "joint"] = Field(
+        description="the network along the eyes' line, a local correction of one outer panel, or a step of all panels"
     )
-    size: Annotated[float, Field(gt=0, le=2)] = Field(1.0, description="of a correction, for two points")
+    size: Annotated[float, Field(gt=0, le=2)] = Field(1.0, description="of a correction (for two points) or joint step")
+    momentum: Annotated[float, Field(ge=0, lt=1)] = Field(
+        0.0, description="of a joint step: so much of its change is gone again, ahead of the next one"
+    )
+    floor: Annotated[float, Field(gt=0, le=1)] = Field(
+        0.1, description="a joint step takes the squared slope of what an eye sees for so much at least"
+    )
+    places: Places = Field(
+        "middle",
+        description="where a joint step takes unsure eyes to be: where they are, or a standard deviation to either "
+        "side, the right one higher or lower",
+    )
     reduction: Literal[1, 2, 4] = Field(1, description="the step works on a raster so much coarser than a panel")
 
 
@@ -32,6 +46,10 @@ def checked_steps(steps: tuple[Step, ...]) -> tuple[Step, ...]:
         raise ValueError("must begin with a chain step, the only one")
     if any(after.reduction > before.reduction for before, after in pairwise(steps)):
         raise ValueError("reduction must not grow from step to step")
+    if any(before.kind == "joint" != after.kind for before, after in pairwise(steps)):
+        raise ValueError("nothing but joint steps may follow a joint one")
+    if any(step.kind == "joint" and step.reduction != 1 for step in steps):
+        raise ValueError("joint steps work on every pixel: reduction must be 1")
     return steps
 
 
@@ -52,21 +70,20 @@ SlopeFloor = Annotated[
     float,
     Field(gt=0, le=1, description="corrections weigh a ray by the slope of sin² there, and by so much at least"),
 ]
+
+
+def checked_refining(steps: tuple[Step, ...]) -> tuple[Step, ...]:
+    """Joint steps alone. Raises ValueError."""
+    if any(step.kind != "joint" or step.reduction != 1 for step in steps):
+        raise ValueError("must be joint steps on every pixel")
+    return steps
+
+
 Refining = Annotated[
-    int,
-    Field(
-        ge=0,
-        le=16,
-        description="last steps that are done once more for a still picture, by what its own rays lack (0: none)",
-    ),
+    tuple[Step, ...],
+    AfterValidator(checked_refining),
+    Field(description="joint steps along a still picture's own rays, once it is solved"),
 ]
-
-
-def check_refining(refining: int, steps: tuple[Step, ...]) -> None:
-    """Raises ValueError where the last steps can't be done once more."""
-    again = steps[len(steps) - refining :] if refining else ()
-    if refining > len(steps) or any(step.kind == "chain" or step.reduction != 1 for step in again):
-        raise ValueError("refining: more than the last corrections on every pixel")
 
 
 class TrainedFor(Section):
@@ -128,13 +145,12 @@ class Contract(Section):
     least_spread_px: LeastSpread = LEAST_SPREAD_PX
     slope_floor: SlopeFloor = 1.0
     steps: Steps = ()
-    refining: Refining = 0
+    refining: Refining = ()
 
     @model_validator(mode="after")
     def _has_steps(self) -> Contract:
         if self.input_frame == "chain" and not self.steps:
             raise ValueError("steps: a chain model needs one at least")
-        check_refining(self.refining, self.steps)
         return self
 
 

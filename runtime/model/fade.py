@@ -40,7 +40,7 @@ class Fade:
     right: bool = True
     bottom: bool = True
 
-    def turned(self) -> Fade:
+    def transposed(self) -> Fade:
         """The same with rows for columns."""
         box = PixelRect(self.kept.v0, self.kept.u0, self.kept.v1, self.kept.u1)
         return Fade(box, self.over_px[::-1], left=self.top, top=self.left, right=self.bottom, bottom=self.right)

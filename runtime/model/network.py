@@ -10,11 +10,11 @@ import numpy as np
 
 from runtime.errors import InputError, ModelFailure
 from runtime.model.base import Prediction, Predictor
+from runtime.model.job import Job
 from runtime.model.resample import buffer, resample, target_from_source
 from runtime.model.session import ModelSession
 from runtime.model.timing import Stopwatch
 from runtime.optics.malus import phase_from_intensity
-from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack
 from runtime.records import F32, F64, U8
@@ -57,10 +57,8 @@ class NetworkPredictor(Predictor):
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         return tuple(self.stack.panel(n) for n in self._panels)
 
-    def predict(
-        self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = PUPIL_SIGMA_MM
-    ) -> Prediction:
-        watch = Stopwatch()
+    def solve(self, job: Job) -> Prediction:
+        watch, images, eyes_m = Stopwatch(), job.arrays, job.eyes_m
         channel = 0
         for raster in range(len(self._panels)):
             for side in self._order:

@@ -6,10 +6,9 @@ from importlib import resources
 from pathlib import Path
 
 from runtime.config import ModelSettings
-from runtime.errors import InputError
+from runtime.errors import FatalError, InputError
 from runtime.model.allocator import keep_freed_memory
 from runtime.model.base import Prediction, Predictor
-from runtime.model.loops import inner_loops
 from runtime.optics.stack import PanelStack
 
 __all__ = ["SHIPPED", "Prediction", "Predictor", "load_predictor", "model_path"]
@@ -63,10 +62,14 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
     if session.contract.input_frame == "chain":
         if not stack.is_evenly_spaced:
             raise InputError(path, "contract.panels", "needs evenly spaced panels; use the model sart")
+        from runtime.model.compiled import KEPT_IN
+        from runtime.model.compiled.level import warm_up
         from runtime.model.unrolled import UnrolledPredictor
 
-        if settings.backend != "gl":
-            inner_loops()  # compiled or loaded before the first frame
+        try:
+            warm_up()  # compiled or loaded before the first frame
+        except OSError as error:
+            raise FatalError(f"compiled kernels can't be kept in {KEPT_IN}: {error}") from None
         return UnrolledPredictor(session, stack, threads=settings.threads)
     from runtime.model.network import NetworkPredictor
 

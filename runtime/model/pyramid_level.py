@@ -77,10 +77,11 @@ class PyramidLevel:
 
     def crop(self, boxes: Sequence[PixelRect], stack: PanelStack) -> None:
         """Cut every raster and buffer to what the eyes look through."""
+        self._stack = stack
         self.rasters = tuple(coarser(box.cut(stack.panel(n)), self.reduction) for n, box in enumerate(boxes))
         self.outer = {n: self._view("outer", n, 0, on=n) for n in OUTER}
         self.seen = {(n, side): self._view("seen", n, side, on=CENTRE) for n in OUTER for side in EYES}
-        self.wanted = tuple(self._view("wanted", CENTRE, side, on=CENTRE) for side in EYES)  # phase sums
+        self.target = tuple(self._view("wanted", CENTRE, side, on=CENTRE) for side in EYES)  # phase sums
         self.residual = tuple(self._view("residual", CENTRE, side, on=CENTRE) for side in EYES)
         self._back = {n: tuple(self._view("back", CENTRE, side, on=n) for side in EYES) for n in OUTER}
 
@@ -106,7 +107,7 @@ class PyramidLevel:
 
     def update_residuals(self) -> None:
         """Find what each eye still lacks when the centre panel is the best one for the outer panels."""
-        seen, residual, wanted = self.seen, self.residual, self.wanted
+        seen, residual, wanted = self.seen, self.residual, self.target
 
         def work(rows: slice, best: I16) -> None:
             for side in EYES:
@@ -131,7 +132,7 @@ class PyramidLevel:
         """Change one outer panel by what both eyes lack along the rays through each of its pixels."""
         back, outer = self._back[panel], self.outer[panel]
         other = REAR if panel == FRONT else FRONT
-        slopes = [self._slope(image) for image in self.wanted] if self.slope_floor < 1 else None
+        slopes = [self._slope(image) for image in self.target] if self.slope_floor < 1 else None
         for side, eye_m in enumerate(eyes_m):
             residual = self.residual[side]
             if self.spread:
@@ -207,7 +208,7 @@ class PyramidLevel:
 
     def close_centre(self, out: U8) -> None:
         """The best centre panel for the outer ones, per pixel and in closed form, in 8-bit codes."""
-        seen, wanted = self.seen, self.wanted
+        seen, wanted = self.seen, self.target
 
         def work(rows: slice, best: I16) -> None:
             if self.slope_floor < 1:
@@ -235,6 +236,13 @@ class PyramidLevel:
                 cv2.convertScaleAbs(self.outer[n], dst=codes, alpha=1 / SUBCODE)
             layers[n][box.slices] = cv2.cvtColor(codes, RGBA_FROM[self._channels])
 
+    def show_panels(self, panels: I16, layers: U8, boxes: Sequence[PixelRect]) -> None:
+        """Panels (3, rows, numbers) in 8-bit codes, into layers (N, H, W, 4), each within its box."""
+        for numbers, layer, box in zip(panels, layers, boxes, strict=True):
+            part = numbers[: box.height_px, : box.width_px * self._channels].reshape(box.height_px, -1, *self._tail)
+            codes = np.ascontiguousarray((part + SUBCODE // 2) // SUBCODE).astype(np.uint8)
+            layer[box.slices] = cv2.cvtColor(codes, RGBA_FROM[self._channels])
+
     def _blurred(self, image: I16, panel: int, *, twice: bool = False) -> I16:
         """What is left of an image in the mean over where the eyes may be, as an outer panel's pixels move."""
         spread = self.spread.get(panel)
@@ -258,11 +266,11 @@ class PyramidLevel:
         """Panel `of`'s pixels on panel `on`'s raster, as an eye sees them in line. outside: what is beside them."""
         if outside is None:
             outside = 0 if of == CENTRE else START
-        matrix = pixels_in_line(self._stack, self.rasters, eye_m, of=of, on=on)
+        matrix = reprojection(self._stack, self.rasters, eye_m, of=of, on=on)
         return resample(image, image_from_result=matrix, out=out, outside=outside)
 
 
-def pixels_in_line(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: F64, *, of: int, on: int) -> F64:
+def reprojection(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: F64, *, of: int, on: int) -> F64:
     """3x3, last entry 1: panel `of`'s pixels from panel `on`'s, as an eye (3,) sees them in line; one is the centre.
 
     A scale and a shift, but where panels are tilted (`optics.tilt`).

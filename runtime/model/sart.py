@@ -1,12 +1,11 @@
 """The iterative reference solver: simultaneous algebraic reconstruction on the second branch of Malus' law.
 
-Any stack of 2 to 8 panels. Each eye in turn corrects every panel by an equal share of what it still lacks
+Any stack of 2 to 8 panels. Each eye in turn corrects every panel by an equal share of its residual
 (Andersen and Kak 1984; on polarization fields Lanman et al. 2011).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -15,13 +14,13 @@ from numpy.typing import NDArray
 
 from runtime.errors import ModelFailure
 from runtime.model.base import Prediction, Predictor
+from runtime.model.job import Job
 from runtime.model.resample import target_from_source
 from runtime.model.timing import Stopwatch
 from runtime.optics.malus import phase_from_intensity
-from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen, layer_pixels_from_seen
-from runtime.records import F32, F64, U8
+from runtime.records import F32, F64
 
 ITERATIONS = 10
 
@@ -41,23 +40,21 @@ class SartPredictor(Predictor):
     def rasters(self, eyes_m: F64) -> tuple[PlaneRaster, ...]:
         return (self.stack.panel(self.stack.count // 2),)
 
-    def predict(
-        self, images: Sequence[Sequence[U8]], eyes_m: F64, *, eye_sigma_mm: float = PUPIL_SIGMA_MM
-    ) -> Prediction:
+    def solve(self, job: Job) -> Prediction:
         watch = Stopwatch()
         stack = self.stack
         table = phase_from_intensity(np.arange(256, dtype=np.float32) / np.float32(255)).astype(np.float32)
-        wanted = [cv2.LUT(np.ascontiguousarray(image[0][..., :3]), table) for image in images]
+        target = [cv2.LUT(np.ascontiguousarray(image[0][..., :3]), table) for image in job.arrays]
         shape = (stack.height_px, stack.width_px, 3)
         panels: list[NDArray[np.float32]] = [np.full(shape, self._start, np.float32) for _ in range(stack.count)]
-        forward = [[self._panel_from_middle(eye, n) for n in range(stack.count)] for eye in eyes_m]
+        forward = [[self._panel_from_middle(eye, n) for n in range(stack.count)] for eye in job.eyes_m]
         back = [[np.linalg.inv(matrix) for matrix in matrices] for matrices in forward]
         watch.lap("prepare")
         for _ in range(self.iterations):
             for side in range(2):
-                lack = wanted[side] - sum(_warp(p, m) for p, m in zip(panels, forward[side], strict=True))
+                residual = target[side] - sum(_warp(p, m) for p, m in zip(panels, forward[side], strict=True))
                 for n in range(stack.count):
-                    panels[n] += _warp(lack, back[side][n]) / np.float32(stack.count)
+                    panels[n] += _warp(residual, back[side][n]) / np.float32(stack.count)
                     np.clip(panels[n], 0, 1, out=panels[n])
         watch.lap("inference")
         layers = np.full((stack.count, stack.height_px, stack.width_px, 4), 255, np.uint8)
@@ -66,7 +63,7 @@ class SartPredictor(Predictor):
                 raise ModelFailure("the solver diverged")
             layers[n, ..., :3] = np.rint(panel * 255)
         watch.lap("finish")
-        return Prediction(layers, watch.stage_ms)
+        return Prediction(layers, watch.stage_ms, self.iterations)
 
     def _panel_from_middle(self, eye_m: F64, index: int) -> F64:
         """3x3: a layer's pixels from the middle panel's, as an eye sees them in line; OpenCV's pixel centres."""

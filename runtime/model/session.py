@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from runtime.errors import InputError, MissingPart, ModelFailure
 from runtime.model.contract import Contract, parse_contract
 from runtime.model.onnx_bytes import digest, has_external_data
-from runtime.model.onnx_runtime import onnxruntime
 from runtime.support import foreign
+from runtime.support.onnx_runtime import onnxruntime
 
 FILE_BYTES_MAX = 1 << 30
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import chain
 
 import cv2
 import numpy as np
 
-from runtime.model.back_projection import add_what_is_lacked, gain_for
 from runtime.model.base import Prediction, Predictor
-from runtime.model.loops import inner_loops
-from runtime.model.unseen import is_whole, make_up, shown_of
+from runtime.model.job import Job
+from runtime.model.own_rays import refined
+from runtime.model.unseen import extrapolate_border, is_whole, shown_of
 from runtime.optics.pupil import PUPIL_SIGMA_MM
+from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack
 from runtime.records import F64, U8
@@ -20,7 +21,7 @@ from runtime.support.threads import at_once
 
 FINE_ENOUGH = 1.5  # pixels of a picture for one of the raster: finer ones are sampled as they are
 SMALL_PX = 960 * 540 // 2  # of a raster: below, OpenCV's cubic kernel takes a few milliseconds
-LEAST_RAYS, MOST_RAYS = 0.5, 2.0  # pixels of a picture for one of the raster, between which its rays are looked along
+MIN_RAYS, MAX_RAYS = 0.5, 2.0  # pixels of a picture for one of the raster, between which its rays are looked along
 EDGE_PX = 2.0  # of a raster, beside a picture, that its outermost rays are interpolated from: its edge goes on there
 KERNEL_PX = 4  # of a picture, that interpolation reads around what is shown
 
@@ -33,13 +34,15 @@ def solve_still(
     fov_deg: float,
     predictor: Predictor,
     eye_sigma_mm: float = PUPIL_SIGMA_MM,
+    changed: Callable[[Job], Job] = lambda job: job,
 ) -> Prediction:
     """Layers for two pictures (h, w, 3 or 4) that a left and a right eye (2, 3), frame `stack`, should see.
 
     The pictures' horizontal field of view is `fov_deg`; each eye looks at the stack's origin. Warps each picture
     to the rasters that the predictor wants (EyeReal supplement, (47)); where one ends within the panels, nothing is
-    driven for what it does not show (`unseen`). Where the predictor `refines`, what the
-    pictures' own rays lack is added once (`back_projection`). Its prepare time includes both.
+    driven for what it does not show (`unseen`). Where the predictor has steps for it, the layers are improved along the
+    pictures' own rays (`own_rays`). Its prepare time includes the warps. changed: the job that is solved instead, as
+    `trim` has it.
     """
     start = cv2.getTickCount()
     rasters, windows = predictor.rasters(eyes_m), predictor.windows(eyes_m)
@@ -53,32 +56,32 @@ def solve_still(
         for raster, (rows, columns) in zip(rasters, windows, strict=True)
     ]
     images = [list(of_eye) for of_eye in zip(*pairs, strict=True)]
+    job = changed(Job(images, eyes_m, eye_sigma_mm=eye_sigma_mm))
     warps_ms = (cv2.getTickCount() - start) / cv2.getTickFrequency() * 1e3
-    prediction = predictor.predict(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
+    prediction = predictor.solve(job)
     rows, columns = windows[0]
     rays_px = [
         _source_px(image_from_raster(projection, rasters[0]), rows=rows, columns=columns) for projection in projections
     ]
-    if not predictor.refines or min(rays_px) <= LEAST_RAYS or max(rays_px) >= MOST_RAYS:
-        return Prediction(prediction.layers, _added(prediction.stage_ms, {"prepare": warps_ms}))
+    box = PixelRect(0, 0, predictor.stack.width_px, predictor.stack.height_px) if job.part is None else job.part.box
+    steps, stage_ms, layers = predictor.refining, _added(prediction.stage_ms, {"prepare": warps_ms}), prediction.layers
+    if not steps or not box.width_px or min(rays_px) <= MIN_RAYS or max(rays_px) >= MAX_RAYS:
+        return Prediction(layers, stage_ms, prediction.steps)
     start = cv2.getTickCount()
-    gain = gain_for(predictor.stack, eyes_m, eye_sigma_mm=eye_sigma_mm)
-    for rgba, (image,), eye_m in zip(pictures, images, eyes_m, strict=True):
-        add_what_is_lacked(
-            image,
-            rasters[0],
-            prediction.layers,
-            rgba,
-            predictor.stack,
-            eye_m=eye_m,
-            fov_deg=fov_deg,
-            gain=gain,
-            rows=rows,
-            columns=columns,
-        )
-    looks_ms = (cv2.getTickCount() - start) / cv2.getTickFrequency() * 1e3
-    refined = predictor.refine(images, eyes_m, eye_sigma_mm=eye_sigma_mm)
-    return Prediction(refined.layers, _added(prediction.stage_ms, refined.stage_ms, {"prepare": warps_ms + looks_ms}))
+    layers = refined(
+        layers,
+        pictures,
+        predictor.stack,
+        eyes_m=eyes_m,
+        projections=projections,
+        eye_sigma_mm=eye_sigma_mm,
+        steps=steps,
+        box=box,
+        channels=job.channels,
+        threads=max(1, cv2.getNumThreads()),
+    )
+    steps_ms = (cv2.getTickCount() - start) / cv2.getTickFrequency() * 1e3
+    return Prediction(layers, _added(stage_ms, {"finish": steps_ms}), prediction.steps + len(steps))
 
 
 def _drawn(
@@ -116,7 +119,7 @@ def _drawn(
         for picture, matrix in zip(pictures, matrices, strict=True)
     ]
     if not all(is_whole(one, columns) for one in shown):
-        make_up(images, shown, **window)
+        extrapolate_border(images, shown, **window)
     return images
 
 
@@ -153,7 +156,7 @@ def _warped(
     matrix = _shifted(-0.5, -0.5) @ image_from_raster @ _shifted(columns.start + 0.5, rows.start + 0.5)
     linear = interpolation == "linear"
     wide = rgba.shape[1] > 1  # compiled loops read two pixels of a row at once
-    if wide and not black_beside and (linear or source_px < FINE_ENOUGH) and inner_loops().compiled:
+    if wide and not black_beside and (linear or source_px < FINE_ENOUGH):
         from runtime.model.compiled.warp import is_before_the_eye, is_level, warped  # noqa: PLC0415 - imports numba
 
         size, place = (rgba.shape[1], rgba.shape[0]), matrix / matrix[2, 2]

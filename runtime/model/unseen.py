@@ -8,16 +8,12 @@ the other one, as a point of the centre panel looks the same to both; what neith
 from __future__ import annotations
 
 from collections.abc import Sequence
-from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.model.loops import inner_loops
 from runtime.records import F64, U8
-
-U32 = NDArray[np.uint32]
 
 
 class Shown(NamedTuple):
@@ -63,33 +59,16 @@ def is_whole(shown: Shown, columns: slice) -> bool:
     return bool((shown.first == columns.start).all() and (shown.last == columns.stop).all())
 
 
-def make_up(images: Sequence[U8], shown: Sequence[Shown], *, rows: slice, columns: slice) -> None:
+def extrapolate_border(images: Sequence[U8], shown: Sequence[Shown], *, rows: slice, columns: slice) -> None:
     """In place, rows and columns of both eyes' images (h, w, 4) that their pictures do not show (see above)."""
     known = shown[0].any | shown[1].any
     if not known.any():
         return
     pixels = [image.view(np.uint32)[..., 0] for image in images]
-    if inner_loops().compiled:
-        from runtime.model.compiled.unseen import make_up_rows  # noqa: PLC0415 - imports numba
+    from runtime.model.compiled.unseen import extrapolate_rows  # noqa: PLC0415 - imports numba
 
-        make_up_rows(*pixels, *shown[0], *shown[1], rows.start, columns.start, columns.stop)
-    else:
-        for index in np.flatnonzero(known):
-            runs = [slice(one.first[index], one.last[index]) for one in shown]
-            _make_up_row([image[rows.start + index] for image in pixels], runs, columns)
+    extrapolate_rows(*pixels, *shown[0], *shown[1], rows.start, columns.start, columns.stop)
     there = np.flatnonzero(known)
     for image in pixels:
         drawn = image[rows, columns]
         drawn[: there[0]], drawn[there[-1] + 1 :] = drawn[there[0]], drawn[there[-1]]
-
-
-def _make_up_row(lines: Sequence[U32], runs: Sequence[slice], columns: slice) -> None:
-    for line, own, other, others in zip(lines, runs, lines[::-1], runs[::-1], strict=True):
-        new = np.arange(others.start, others.stop)
-        new = new[(new < own.start) | (new >= own.stop)]
-        line[new] = other[new]
-    some = [(line, run) for line, run in zip(lines, runs, strict=True) if run.stop > run.start]
-    begin, low = min(((run.start, line[run.start]) for line, run in some), key=itemgetter(0))
-    end, high = max(((run.stop, line[run.stop - 1]) for line, run in some), key=itemgetter(0))
-    for line in lines:
-        line[columns.start : begin], line[end : columns.stop] = low, high

@@ -9,8 +9,7 @@ import cv2
 
 from runtime.model.channels import without_alpha
 from runtime.model.rows import RowPool
-from runtime.model.transfer import phase_codes, pre_emphasised
-from runtime.optics.malus import Branch
+from runtime.model.transfer import pre_emphasised
 from runtime.optics.rect import PixelRect
 from runtime.records import I16, U8
 
@@ -23,15 +22,10 @@ class Pictures:
     box: PixelRect
     channels: int  # 1 or 3
     emphasis: float  # how strongly they are sharpened (`transfer.pre_emphasised`)
-    branch: Branch
-
-    @property
-    def table(self) -> I16:
-        """(256,) phase sum of each code."""
-        return phase_codes(self.branch)
+    table: I16  # (256,) what is asked for each code: its phase sum
 
 
-def fill_wanted(pictures: Pictures, pairs: Sequence[Sequence[I16]], *, rows: RowPool) -> None:
+def fill_targets(pictures: Pictures, pairs: Sequence[Sequence[I16]], *, rows: RowPool) -> None:
     """Phase sums at the size of pairs of images (h, w[, 3]), left and right, averaged as codes: into them."""
 
     def sharpened(picture: U8) -> U8:

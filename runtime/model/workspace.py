@@ -27,14 +27,14 @@ class Workspace:
     ) -> None:
         self._channels = channels
         self.levels = {r: level(stack, reduction=r, rows=rows, channels=channels) for r in reductions}
-        self._boxes: tuple[PixelRect, ...] = ()
+        self._cropped: tuple[tuple[PixelRect, ...], PanelStack] | None = None
         self._chain: tuple[tuple[int, int], tuple[I16, I16]] | None = None
 
     def crop(self, boxes: tuple[PixelRect, ...], stack: PanelStack) -> None:
-        """Cut every raster and buffer to boxes of the panels."""
-        if boxes == self._boxes:
+        """Cut every raster and buffer to boxes of the panels of a stack of this size."""
+        if (boxes, stack) == self._cropped:
             return
-        self._boxes = boxes
+        self._cropped = boxes, stack
         for level in self.levels.values():
             level.crop(boxes, stack)
 

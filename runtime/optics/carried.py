@@ -1,4 +1,4 @@
-"""What eyes see that are not where the layers were solved for: carried and expected quality (docs/contracts.md).
+"""What eyes see that are not where the layers were solved for: carried, expected and light quality (docs/contracts.md).
 
 The picture that the layers were solved for is carried along on the centre panel: the ray of each of its pixels is
 replaced by the one from the true eye through the same point of that panel. So ghosts and colour fringes count, and
@@ -7,13 +7,14 @@ the parallax that a late picture lacks does not.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from runtime.optics.quality import Quality, psnr_db, quality, squared_error
+from runtime.optics.light import RAYS, squared_error
+from runtime.optics.quality import Quality, psnr_db, quality
 from runtime.optics.retina import Rays, Retina, checked_eye, through_layers
 from runtime.optics.stack import PanelStack
 from runtime.optics.tilt import layer_from_seen, layer_pixels_from_seen
@@ -92,60 +93,41 @@ def carried_quality(
 
 
 def expected_psnr_db(
-    layers: U8 | F32,
-    drawn: Sequence[U8 | U16 | F32],
-    stack: PanelStack,
-    *,
-    eyes_m: ArrayLike,
-    fov_deg: float,
-    sigma_mm: float,
-    step: int = 1,
+    layers: U8, drawn: Sequence[U8 | U16 | F32], stack: PanelStack, *, sigma_mm: float, **how: Any
 ) -> float:
-    """PSNR of the carried squared error expected over normal errors of the eyes' common place (docs/contracts.md).
-
-    Standard deviation `sigma_mm` to the right and up, by five points: no error with weight 1/2, two standard
-    deviations to either side with 1/8 each, which is exact for second moments. eyes_m: (2, 3), solved for.
-    The other arguments, and the errors raised, are those of `carried_quality`.
-    """
-    (value,) = expected_psnrs_db(
-        layers, drawn, stack, eyes_m=eyes_m, fov_deg=fov_deg, sigmas_mm=(sigma_mm,), step=step
-    ).values()
-    return value
+    """`expected_psnrs_db` of one standard deviation."""
+    return expected_psnrs_db(layers, drawn, stack, sigmas_mm=(sigma_mm,), **how)[sigma_mm]
 
 
 def expected_psnrs_db(
-    layers: U8 | F32,
+    layers: U8,
     drawn: Sequence[U8 | U16 | F32],
     stack: PanelStack,
     *,
     eyes_m: ArrayLike,
     fov_deg: float,
     sigmas_mm: Sequence[float],
+    seen_from_m: ArrayLike | None = None,
     step: int = 1,
+    rays: int = 0,
 ) -> dict[float, float]:
-    """`expected_psnr_db` for several standard deviations; what they share is looked at once."""
+    """PSNR of the carried squared error expected over normal errors of the eyes' common place (docs/contracts.md).
+
+    For each standard deviation to the right and up, by five points: no error with weight 1/2, two standard deviations
+    to either side with 1/8 each, which is exact for second moments. drawn: an (h, w, 3) picture for each of the eyes
+    (2, 3) that the layers were solved for; seen_from_m: (2, 3) where they really are, without: there; rays: of light,
+    along and down a pixel; 0: one ray, bilinear. The other arguments and errors are those of `carried_quality`.
+    """
     eyes = np.asarray(eyes_m, dtype=np.float64)
-    views = [_view(eye, picture, stack, fov_deg=fov_deg, step=step) for eye, picture in zip(eyes, drawn, strict=True)]
-    wanted = [intensities(picture, step) for picture in drawn]
-    right = stack_from_eye(eyes.mean(axis=0))[:3, 0]
+    true = eyes if seen_from_m is None else np.asarray(seen_from_m, dtype=np.float64)
+    targets = [intensities(picture) for picture in drawn]
+    right, up = stack_from_eye(eyes.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
 
     def error(move_m: F64) -> float:
-        def of_eye(side: int) -> tuple[float, int]:
-            retina = views[side].seen_from(eyes[side] + move_m, layers)
-            return squared_error(retina.image, wanted[side], retina.mask)
+        return squared_error(
+            layers, targets, stack, solved_for_m=eyes, eyes_m=true + move_m, fov_deg=fov_deg, rays=rays, step=step
+        )
 
-        squared, counted = map(sum, zip(*pool.map(of_eye, range(len(views))), strict=True))
-        if counted == 0:
-            raise ValueError("no ray of these eyes crosses every panel")
-        return squared / counted
-
-    with ThreadPoolExecutor(len(views)) as pool:  # numpy and OpenCV let go of the interpreter's lock
-        return _five_points(error, right=right, sigmas_mm=sigmas_mm)
-
-
-def _five_points(error: Callable[[F64], float], *, right: F64, sigmas_mm: Sequence[float]) -> dict[float, float]:
-    """PSNR of the expected error for each standard deviation. error: of a move (3,) in metres."""
-    up = np.array([0.0, 0.0, 1.0])
     unmoved = error(np.zeros(3))
     result = {}
     for sigma_mm in sigmas_mm:
@@ -153,6 +135,13 @@ def _five_points(error: Callable[[F64], float], *, right: F64, sigmas_mm: Sequen
         moved = sum(error(move) for move in moves) / 8 if sigma_mm > 0 else unmoved / 2
         result[sigma_mm] = psnr_db(unmoved / 2 + moved)
     return result
+
+
+def light_psnrs_db(
+    layers: U8, drawn: Sequence[U8 | U16 | F32], stack: PanelStack, *, rays: int = RAYS, **how: Any
+) -> dict[float, float]:
+    """The same of the light that leaves real pixels (`light`): the figure to quote."""
+    return expected_psnrs_db(layers, drawn, stack, rays=rays, **how)
 
 
 def intensities(picture: U8 | U16 | F32, step: int = 1) -> F32:

@@ -125,10 +125,14 @@ class Rays:
 
     def toward_panels(self) -> Mask:
         """(h, w) True where the ray goes towards the panels (not away behind the eye)."""
-        # A ray's direction is the inverse of the projection's left part times (u, v, 1); its x must be negative.
-        toward = np.linalg.inv(self.from_stack[:, :3])[0]
+        toward = self.toward()
         result: Mask = toward[0] * self.u + toward[1] * self.v + toward[2] < 0.0
         return result
+
+    def toward(self) -> F64:
+        """(3,) what gives a ray's x when multiplied by (u, v, 1): negative for one that goes towards the panels."""
+        # A ray's direction is the inverse of the projection's left part times (u, v, 1).
+        return np.asarray(np.linalg.inv(self.from_stack[:, :3])[0])
 
 
 def panel_positions(

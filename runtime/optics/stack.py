@@ -81,7 +81,7 @@ class PanelStack:
         gaps = np.diff(self.x_m)
         return bool(gaps.size == 0 or np.ptp(gaps) <= UNEVEN_MOST * gaps.mean())
 
-    def turned(self) -> PanelStack:
+    def transposed(self) -> PanelStack:
         """The panels with rows for columns: what was down (-z) is to the right (+y), what was right is down."""
         tilt = self.tilt
         if tilt is not None:

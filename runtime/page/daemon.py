@@ -33,6 +33,8 @@ class Daemon:
             if time.monotonic() - asked_s < LOOKED_UP_AGAIN_S[name]:
                 return answer
             answer = self._asked({"command": name}, timeout_s=LOOKED_UP_WITHIN_S)
+            if name == "about" and answer.get("ok"):
+                answer["pictured"] = [scene for scene in answer.get("scenes", ()) if self.thumbnails.jpeg(scene)]
             self._answers[name] = time.monotonic(), answer
         if name == "status" and answer.get("ok"):
             self._note(answer)

@@ -21,19 +21,25 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 from starlette.routing import Route
 
+from runtime.daemon.commands import NAMES
 from runtime.errors import InputError
 from runtime.page.daemon import LOOKED_UP_AGAIN_S, Daemon
 from runtime.page.token import cookie_of, same
+from runtime.support.artifacts import to_json
 from runtime.support.foreign import parsed_json
 
 COOKIE = "phasestack"
-COMMANDS = (
-    "scene", "playlist", "next", "place", "model", "pause", "resume", "flat", "budget", "reload", "blackbox", "restart",
-)  # fmt: skip
 BODY_MAX_BYTES = 65536
 WRONG_TOKEN_S = 0.5  # so long a wrong token is thought about
 ASSETS = {"page.js": "text/javascript", "page.css": "text/css"}
 Handler = Callable[[Request], Awaitable[Response]]
+
+
+class Answer(JSONResponse):
+    """JSON in plain ASCII: a name need not be UTF-8."""
+
+    def render(self, content: Any) -> bytes:
+        return to_json(content).encode()
 
 
 class TooLong(ValueError):
@@ -53,7 +59,7 @@ def application(daemon: Daemon, token: str, *, any_host: bool) -> Starlette:
     def guarded(handler: Handler) -> Handler:
         async def answer(request: Request) -> Response:
             if not permitted(request):
-                return JSONResponse({"ok": False, "error": "log in first"}, 401, {"WWW-Authenticate": "Bearer"})
+                return Answer({"ok": False, "error": "log in first"}, 401, {"WWW-Authenticate": "Bearer"})
             return await handler(request)
 
         return answer
@@ -70,9 +76,9 @@ def application(daemon: Daemon, token: str, *, any_host: bool) -> Starlette:
     async def look_up(request: Request) -> Response:
         name = request.path_params["name"]
         if name not in LOOKED_UP_AGAIN_S:
-            return JSONResponse({"ok": False, "error": "there is no such thing to look up"}, 404)
+            return Answer({"ok": False, "error": "there is no such thing to look up"}, 404)
         answer = await run_in_threadpool(daemon.look_up, name)
-        return JSONResponse(answer, 200 if answer.get("ok") else 503)
+        return Answer(answer, 200 if answer.get("ok") else 503)
 
     async def thumbnail(request: Request) -> Response:
         jpeg = await run_in_threadpool(daemon.thumbnails.jpeg, request.query_params.get("scene", ""))
@@ -84,14 +90,14 @@ def application(daemon: Daemon, token: str, *, any_host: bool) -> Starlette:
         try:
             asked = parsed_json(await _body(request), source="the request")
         except TooLong:
-            return JSONResponse({"ok": False, "error": "the request is too long"}, 413)
+            return Answer({"ok": False, "error": "the request is too long"}, 413)
         except (InputError, ValueError):
             asked = None
-        if not isinstance(asked, dict) or asked.get("command") not in COMMANDS:
-            return JSONResponse({"ok": False, "error": f"command: one of {', '.join(COMMANDS)}"}, 400)
+        if not isinstance(asked, dict) or asked.get("command") not in NAMES:
+            return Answer({"ok": False, "error": f"command: one of {', '.join(NAMES)}"}, 400)
         answer = await run_in_threadpool(daemon.tell, asked["command"], asked.get("value"))
         code = 200 if answer.get("ok") else 503 if answer.get("running") is False else 409
-        return JSONResponse(answer, code)
+        return Answer(answer, code)
 
     async def login(request: Request) -> Response:
         try:
@@ -143,7 +149,7 @@ class _Guard:
             await send(message)
 
         if refused:
-            await JSONResponse({"ok": False, "error": refused}, 403)(scope, receive, send_with_headers)
+            await Answer({"ok": False, "error": refused}, 403)(scope, receive, send_with_headers)
         else:
             await self._app(scope, receive, send_with_headers)
 

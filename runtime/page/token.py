@@ -40,6 +40,8 @@ def _read(path: Path) -> str:
         found = os.fstat(opened.fileno())
         if not stat.S_ISREG(found.st_mode):
             raise InputError(path, "", "is not a file")
+        if found.st_uid != os.geteuid():
+            raise InputError(path, "", f"belongs to another user (number {found.st_uid}), who knows what is in it")
         if found.st_mode & 0o077:
             raise InputError(path, "", f"others may read it (mode {found.st_mode & 0o777:o}): chmod 600, or delete it")
         token = (opened.read(MOST_BYTES) or b"").decode("ascii", "replace").strip()

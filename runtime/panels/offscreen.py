@@ -5,7 +5,7 @@ from __future__ import annotations
 import moderngl
 import numpy as np
 
-from runtime.clock import NS_PER_MS, Clock
+from runtime.clock import Clock
 from runtime.config import PanelSettings
 from runtime.errors import PanelLost
 from runtime.panels.base import PanelSink
@@ -18,8 +18,7 @@ class OffscreenPanels(PanelSink):
     """N panels of equal size in one EGL context.
 
     `present` only keeps the frame: nobody looks, and an upload would cost a refresh up to 6 ms (three layers at
-    1080p, llvmpipe). `read_back` uploads what is not there yet and draws. With `draw`, `present` does so too (13 to
-    28 ms a panel at 1080p on llvmpipe, next to nothing on a GPU), as windows do.
+    1080p, llvmpipe). `read_back` uploads what is not there yet and draws.
     """
 
     name = "offscreen"
@@ -32,10 +31,9 @@ class OffscreenPanels(PanelSink):
         width_px: int,
         height_px: int,
         panels: tuple[PanelSettings, ...],
-        draw: bool = False,
     ) -> None:
         """`width_px` by `height_px` is the panel as the viewer sees it. Raises InputError for a bad curve."""
-        self._context, self._clock, self._draw = context, clock, draw
+        self._context, self._clock = context, clock
         self._size = (width_px, height_px)
         self._count = len(panels)
         self._frame: PanelFrame | None = None
@@ -63,16 +61,13 @@ class OffscreenPanels(PanelSink):
         return self._group
 
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
-        """Keep it (and draw, if asked to at construction); skew is between the first and the last panel drawn."""
+        """Keep it, unless it is the one before."""
         check(frame, width_px=self._size[0], height_px=self._size[1], count=self._count)
         if self._textures is None:
             raise PanelLost("offscreen panels: closed")
-        if unchanged and self._frame is not None:
-            return PresentReport(frame.number, self._clock.now_ns(), 0.0)
-        finished_ns = self._drawn(frame) if self._draw else []
-        self._frame = frame
-        skew_ns = finished_ns[-1] - finished_ns[0] if finished_ns else 0
-        return PresentReport(frame.number, self._clock.now_ns(), skew_ns / NS_PER_MS)
+        if not unchanged or self._frame is None:
+            self._frame = frame
+        return PresentReport(frame.number, self._clock.now_ns(), 0.0)
 
     def read_back(self) -> tuple[U8, ...]:
         """The monitors' pictures of the last frame, rear to front: (h, w, 4) RGBA each, top row first.
@@ -81,7 +76,7 @@ class OffscreenPanels(PanelSink):
         """
         if self._frame is None:
             raise ValueError("nothing has been presented yet")
-        self._drawn(self._frame)
+        self._draw(self._frame)
         pictures = []
         for target in self._targets:
             width, height = target.size
@@ -106,21 +101,17 @@ class OffscreenPanels(PanelSink):
             self._group.close()
         self._textures, self._painters, self._targets = None, [], []
 
-    def _drawn(self, frame: PanelFrame) -> list[int]:
-        """Upload and draw; when each panel was finished."""
+    def _draw(self, frame: PanelFrame) -> None:
+        """Upload and draw. Raises PanelLost."""
         try:
             assert self._textures is not None
             self._textures.upload(frame)
-            finished_ns = [self._paint(self._textures, frame, index) for index in range(self._count)]
+            for index, (target, painter) in enumerate(zip(self._targets, self._painters, strict=True)):
+                target.use()
+                painter.draw(self._textures, frame, index)
+                self._context.finish()
             fault = self._context.error
         except Exception as error:  # a released or lost context answers with whatever moderngl has at hand
             raise PanelLost(f"offscreen panels: {error}") from error
         if fault != "GL_NO_ERROR":
             raise PanelLost(f"offscreen panels: {fault}")
-        return finished_ns
-
-    def _paint(self, textures: FrameTextures, frame: PanelFrame, index: int) -> int:
-        self._targets[index].use()
-        self._painters[index].draw(textures, frame, index)
-        self._context.finish()
-        return self._clock.now_ns()

@@ -15,6 +15,7 @@ from runtime.panels import xlib
 from runtime.panels.display import Display, Window
 from runtime.panels.monitors import Monitor
 
+EVERY_NS = NS_PER_S  # a round of all questions
 REFRESH_TOLERANCE = 1e-3  # of a monitor's rate
 
 
@@ -31,16 +32,13 @@ class Place:
 
 
 class PlacementWatch:
-    """Every window and every monitor is looked at once in `every_ns`, one of them a call.
+    """Every window and every monitor is looked at once in EVERY_NS, one of them a call.
 
     All at once where the X server has refused a request since the last look: something has gone.
     """
 
-    def __init__(
-        self, display: Display, monitors: Sequence[Monitor], places: Sequence[Place], clock: Clock,
-        *, every_ns: int = NS_PER_S,
-    ) -> None:  # fmt: skip
-        """monitors: as they were bound, one a panel. Nothing is asked in the first `every_ns`."""
+    def __init__(self, display: Display, monitors: Sequence[Monitor], places: Sequence[Place], clock: Clock) -> None:
+        """monitors: as they were bound, one a panel. Nothing is asked in the first EVERY_NS."""
         self._display, self._clock = display, clock
         # Against what was there when it was bound; what came between binding and here differs from the monitor.
         self._states = [display.output_state(monitor.connector) for monitor in monitors]
@@ -49,8 +47,8 @@ class PlacementWatch:
             *(lambda place=place: self._window_fault(place) for place in places),
             *(lambda panel=panel: self._monitor_fault(panel) for panel in range(len(monitors))),
         ]
-        self._every_ns, self._next = every_ns, 0
-        self._due_ns = clock.now_ns() + every_ns
+        self._next = 0
+        self._due_ns = clock.now_ns() + EVERY_NS
         self._refusals = xlib.refusals()
 
     def look(self) -> str:
@@ -62,7 +60,7 @@ class PlacementWatch:
         now_ns = self._clock.now_ns()
         if now_ns < self._due_ns:
             return ""
-        self._due_ns = now_ns + self._every_ns // len(self._questions)
+        self._due_ns = now_ns + EVERY_NS // len(self._questions)
         question = self._questions[self._next]
         self._next = (self._next + 1) % len(self._questions)
         return question()

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from runtime.content.base import ContentSource, View
 from runtime.errors import ContextLost, PhasestackError
+from runtime.model.job import Job, Part, Picture
 from runtime.model.predictor import Predictor
+from runtime.model.trim import Scene, trim
+from runtime.optics.pupil import PUPIL_SIGMA_MM
+from runtime.optics.rect import PixelRect, union
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack, raster_from_stack
-from runtime.plan.planner import focused_part
 from runtime.records import F64, U8
 from runtime.support.gl import DrawnPicture
 
@@ -48,17 +50,33 @@ def retina_pictures(
     return left, right
 
 
-def drawn_for(predictor: Predictor, content: ContentSource, eyes_m: F64, *, time_ns: int) -> list[list[Any]]:
-    """images[side][raster] that a model wants for eyes (2, 3), aimed where the content lies.
+def drawn_for(
+    predictor: Predictor,
+    content: ContentSource,
+    eyes_m: F64,
+    *,
+    time_ns: int,
+    trimmed: bool = False,
+    before: Part | None = None,
+    eye_sigma_mm: float = PUPIL_SIGMA_MM,
+    deadline_ns: int | None = None,
+) -> Job:
+    """What a model is asked for eyes (2, 3), with the pictures that it wants.
 
     They stay in textures where the model reads those. Arrays are copied only where a source's own would be drawn over
-    by the next raster: else they are the source's.
+    by the next raster: else they are the source's. trimmed: what the scene does not need is left out (`trim`), also of
+    the drawing where the content knows where it lies; before: of the job before.
     """
-    images: list[list[Any]] = [[], []]
-    part = focused_part(predictor)
-    if part is not None:
-        part.aim(content, eyes_m, time_ns=time_ns)
+    stack, trimmed = predictor.stack, trimmed and predictor.trims
+    job, scene = Job((), eyes_m, eye_sigma_mm, deadline_ns=deadline_ns), Scene(stack, before=before)
+    if trimmed and content.info.background is not None:
+        colour = tuple(round(value * 255) for value in content.info.background)
+        extent = _extent(content, eyes_m, stack, time_ns=time_ns)
+        job, _ = trim(job, replace(scene, extent=extent, colour=colour))
     rasters = predictor.rasters(eyes_m)
+    if job.part is not None:
+        rasters = tuple(job.part.box.cut(raster) for raster in rasters)
+    images: list[list[Picture]] = [[], []]
     for raster in rasters:
         for view in raster_views(eyes_m, raster):
             if len(rasters) == 1 and (drawn := _drawn(predictor, content, view, time_ns=time_ns)) is not None:
@@ -66,7 +84,16 @@ def drawn_for(predictor: Predictor, content: ContentSource, eyes_m: F64, *, time
                 continue
             picture = content.render(view, time_ns=time_ns)
             images[view.side].append(picture.copy() if len(rasters) > 1 else picture)
-    return images
+    job = replace(job, pictures=images)
+    return trim(job, scene)[0] if trimmed else job
+
+
+def _extent(content: ContentSource, eyes_m: F64, stack: PanelStack, *, time_ns: int) -> PixelRect | None:
+    """The centre panel's pixels beside which both eyes see the background alone; None: the content doesn't know."""
+    views = raster_views(eyes_m, stack.panel(stack.count // 2))
+    boxes = [content.extent(view, time_ns=time_ns) for view in views]
+    known = [box for box in boxes if box is not None]
+    return union(known) if len(known) == len(boxes) else None
 
 
 def _drawn(predictor: Predictor, content: ContentSource, view: View, *, time_ns: int) -> DrawnPicture | None:

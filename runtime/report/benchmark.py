@@ -1,40 +1,34 @@
-"""The frontier's regression file: a quick frontier and the stages' times, beside a yardstick of the machine's speed."""
+"""The frontier's regression file: time, light and memory of the shipped models, beside a yardstick of the machine."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import monotonic, perf_counter_ns
+from time import monotonic
 from typing import Any
 
 import cv2
 import numpy as np
 
-from runtime.clock import NS_PER_MS
-from runtime.config import ModelSettings, StackGeometry, read_table
+from runtime.config import StackGeometry, read_table
 from runtime.errors import InputError
 from runtime.evaluation.trials import timed
-from runtime.model.backends import Wanted
-from runtime.optics.stack import PanelStack
-from runtime.plan.drawing import drawn_for
-from runtime.records import F64
 from runtime.report.frontier import measure
 from runtime.report.machine import describe
-from runtime.report.methods import Method
+from runtime.report.methods import SHIPPED, Method
 from runtime.report.pairs import FOV_DEG, Painter, eyes_at
 
-VERSION = 1
-MODELS = ("fast", "balanced", "best")
+VERSION = 2
 SIZES = ((960, 540), (1920, 1080))
-RUNS = 15
 WORSE_DB = 0.1  # more than rounding and the order of threads can change
 SLOWER = 0.15  # at least; more where the runs themselves scatter more
 MORE_MEMORY = 0.15
 UNSTEADY = 1.3  # times the least yardstick: the machine's speed changed by more than a difference that counts
 OTHERS_CORES = 0.5
 SCATTERS = 3.0  # of the medians' own scatter before a difference counts
+NUMBERS = ("ms_p50", "scatter", "psnr_db", "worst_eye_psnr_db", "memory_mib", "width_px", "height_px")
 
 
 def yardstick_ms() -> float:
@@ -60,58 +54,25 @@ def scatter(values: Sequence[float]) -> float:
     return relative
 
 
-def stage_times(model: str, stack: PanelStack, eyes_m: F64, *, backend: Wanted = "opencv") -> dict[str, Any]:
-    """Medians of what a frame costs, stage by stage, drawn and predicted as the daemon does."""
-    from runtime.model.backends import choose
-    from runtime.model.predictor import load_predictor
-
-    predictor = load_predictor(model, stack, ModelSettings())
-    stages: dict[str, list[float]] = {}
-    with Painter("demo", stack) as painter:
-        # Drawn and solved in one context, as the daemon does.
-        predictor.surround_with(choose(backend, predictor, lambda: painter.context).backend)
-
-        def frame() -> None:
-            start_ns = perf_counter_ns()
-            images = drawn_for(predictor, painter.content, eyes_m, time_ns=0)
-            render_ms = (perf_counter_ns() - start_ns) / NS_PER_MS
-            prediction = predictor.predict(images, eyes_m)
-            for name, value in ({"render": render_ms} | prediction.stage_ms).items():
-                stages.setdefault(name, []).append(value)
-
-        done = timed(frame, runs=RUNS, warm_up=2)
-        predictor.close()
-    return {
-        "name": model,
-        "backend": predictor.backend,
-        "width_px": stack.width_px,
-        "height_px": stack.height_px,
-        "stage_ms": {name: float(np.median(values[-RUNS:])) for name, values in stages.items()},
-        "total_ms": done.median_ms,
-        "total_scatter": scatter(done.times_ms),
-    }
-
-
 def measured(
-    *,
-    sizes: Sequence[tuple[int, int]] = SIZES,
-    backend: Wanted = "opencv",
-    progress: Callable[[str], None] = lambda text: None,
+    *, sizes: Sequence[tuple[int, int]] = SIZES, progress: Callable[[str], None] = lambda text: None
 ) -> dict[str, Any]:
     """The regression file's content. Takes about a minute."""
-    yardsticks, stages, methods = [yardstick_ms()], [], []
+    yardsticks, methods = [yardstick_ms()], []
     others = OthersLoad()
-    eyes = eyes_at(distance_m=0.6, height_m=0.05)
+    shipped = [Method(name, "network", name) for name in SHIPPED]
     for width, height in sizes:
         stack = replace(StackGeometry().stack(), width_px=width, height_px=height)
         with Painter("demo", stack) as painter:
-            pair = painter.pair("demo", eyes, stack, fov_deg=FOV_DEG, off_mm=(2,))
-        for model in MODELS:
-            progress(f"{model} {width}x{height}")
-            stages.append(stage_times(model, stack, eyes, backend=backend))
-            result = measure([Method(model, "network", model, backend=backend)], [pair])[0]
-            methods.append({key: value for key, value in result.record().items() if key != "pairs"})
+            pair = painter.pair("demo", eyes_at(distance_m=0.6, height_m=0.05), stack, fov_deg=FOV_DEG, off_mm=())
+        for done, so_far in measure(shipped, [pair]):
+            progress(f"{width}x{height}: {done} is done")
             yardsticks.append(yardstick_ms())
+            results = so_far
+        for result in results:
+            record = result.record()
+            runs = [ms for one in record.pop("pairs") for ms in one["run_ms"]]
+            methods.append(record | {"scatter": scatter(runs)})
     return {
         "version": VERSION,
         "machine": describe(seed=0),
@@ -119,7 +80,6 @@ def measured(
         "yardsticks_ms": yardsticks,  # over the whole measurement: whether the machine stayed as fast
         "others_cores": others.cores(),
         "methods": methods,
-        "stages": stages,
     }
 
 
@@ -153,8 +113,8 @@ def _own_s() -> float:
 
 def too_busy(table: dict[str, Any]) -> str:
     """Why a file's times can't be compared: the machine had other things to do. Empty: they can."""
-    yardsticks = table.get("yardsticks_ms") or []
-    if len(yardsticks) > 1 and max(yardsticks) > UNSTEADY * min(yardsticks):
+    yardsticks = table["yardsticks_ms"]
+    if max(yardsticks) > UNSTEADY * min(yardsticks):
         return f"the same work took {min(yardsticks):.1f} to {max(yardsticks):.1f} ms while it was measured"
     others = table.get("others_cores")
     if isinstance(others, int | float) and others > OTHERS_CORES:
@@ -176,83 +136,65 @@ def compare(old: dict[str, Any], new: dict[str, Any]) -> list[Change]:
 
     Where the machine was too busy in either (`too_busy`) they are not compared at all.
     """
-    changes: list[Change] = []
+    later = {_name(entry): entry for entry in new["methods"]}
     machine = new["yardstick_ms"] / old["yardstick_ms"]
     comparable = not (too_busy(old) or too_busy(new))
-    for before, after in _matched(old["stages"], new["stages"], changes):
-        if not comparable:
+    changes: list[Change] = []
+    for before in old["methods"]:
+        name = _name(before)
+        if name not in later:
+            changes.append(Change(name, True, "is missing from the new file"))
             continue
-        ratio = after["total_ms"] / before["total_ms"] / machine
-        noise = max(SLOWER, SCATTERS * float(np.hypot(before["total_scatter"], after["total_scatter"])))
-        if ratio > 1 + noise or ratio < 1 / (1 + noise):
-            text = f"{ratio:.2f} times the time of a frame (noise {noise:.0%})"
-            changes.append(Change(_name(after), ratio > 1, text))
-    for before, after in _matched(old["methods"], new["methods"], changes):
-        for key, label in (("psnr_db", "at the eyes"), ("worst_eye_psnr_db", "at the worse eye")):
-            gain = after[key] - before[key]
+        after = later[name]
+        if comparable:
+            noise = max(SLOWER, SCATTERS * float(np.hypot(before["scatter"], after["scatter"])))
+            ratio = after["ms_p50"] / before["ms_p50"] / machine
+            changes += _times(name, ratio, noise, f"the time of a solution (noise {noise:.0%})")
+        changes += _times(name, after["memory_mib"] / before["memory_mib"], MORE_MEMORY, "the memory")
+        for label, gain in _gains(before, after):
             if abs(gain) > WORSE_DB:
-                changes.append(Change(_name(after), gain < 0, f"{gain:+.2f} dB {label}"))
-        for sigma in sorted(before.get("expected_db", {}).keys() & after.get("expected_db", {}).keys()):
-            gain = after["expected_db"][sigma] - before["expected_db"][sigma]
-            if abs(gain) > WORSE_DB:
-                changes.append(Change(_name(after), gain < 0, f"{gain:+.2f} dB expected of eyes unsure by {sigma} mm"))
-        gain = after["psnr_db_off_eye"].get("2mm", 0.0) - before["psnr_db_off_eye"].get("2mm", 0.0)
-        if abs(gain) > WORSE_DB:
-            changes.append(Change(_name(after), gain < 0, f"{gain:+.2f} dB 2 mm off the eyes"))
-        ratio = after["memory_mib"] / before["memory_mib"]
-        if ratio > 1 + MORE_MEMORY or ratio < 1 / (1 + MORE_MEMORY):
-            changes.append(Change(_name(after), ratio > 1, f"{ratio:.2f} times the memory"))
+                changes.append(Change(name, gain < 0, f"{gain:+.2f} dB {label}"))
     return changes
 
 
-def _matched(
-    old: Sequence[dict[str, Any]], new: Sequence[dict[str, Any]], changes: list[Change]
-) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    after = {_name(entry): entry for entry in new}
-    pairs = []
-    for entry in old:
-        if _name(entry) in after:
-            pairs.append((entry, after[_name(entry)]))
-        elif not any(change.what == _name(entry) for change in changes):
-            changes.append(Change(_name(entry), True, "is missing from the new file"))
-    return pairs
+def _times(name: str, ratio: float, noise: float, of_what: str) -> list[Change]:
+    beyond = ratio > 1 + noise or ratio < 1 / (1 + noise)
+    return [Change(name, ratio > 1, f"{ratio:.2f} times {of_what}")] if beyond else []
+
+
+def _gains(before: dict[str, Any], after: dict[str, Any]) -> Iterator[tuple[str, float]]:
+    for sigma in sorted(before["light_db"].keys() & after["light_db"].keys()):
+        yield f"of light, eyes sure to {sigma} mm", after["light_db"][sigma] - before["light_db"][sigma]
+    yield "one ray a pixel", after["psnr_db"] - before["psnr_db"]
+    yield "one ray a pixel, at the worse eye", after["worst_eye_psnr_db"] - before["worst_eye_psnr_db"]
 
 
 def _name(entry: dict[str, Any]) -> str:
     return f"{entry['name']} {entry['width_px']}x{entry['height_px']}"
 
 
-NUMBERS = {
-    "stages": ("total_ms", "total_scatter", "width_px", "height_px"),
-    "methods": ("psnr_db", "worst_eye_psnr_db", "memory_mib", "width_px", "height_px"),
-}
-
-
 def read(path: Path) -> dict[str, Any]:
     """A regression file. Raises InputError, naming file and field, for anything else."""
     table = read_table(path)
     if table.get("version") != VERSION:
-        raise InputError(path, "version", f"must be {VERSION}: made by `phasestack bench`")
+        raise InputError(path, "version", f"must be {VERSION}: made by `phasestack bench` of this version")
     if not _is_positive(table.get("yardstick_ms")):
         raise InputError(path, "yardstick_ms", "must be a positive number")
-    yardsticks = table.get("yardsticks_ms", [])  # files of earlier versions have none
-    if not isinstance(yardsticks, list) or not all(_is_positive(value) for value in yardsticks):
+    yardsticks = table.get("yardsticks_ms")
+    if not isinstance(yardsticks, list) or not yardsticks or not all(_is_positive(value) for value in yardsticks):
         raise InputError(path, "yardsticks_ms", "must be a list of positive numbers")
-    for name, keys in NUMBERS.items():
-        entries = table.get(name)
-        if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-            raise InputError(path, name, "must be a list of tables")
-        for index, entry in enumerate(entries):
-            for key in keys:
-                if not isinstance(entry.get(key), int | float):
-                    raise InputError(path, f"{name}[{index}].{key}", "must be a number")
-            if not isinstance(entry.get("name"), str):
-                raise InputError(path, f"{name}[{index}].name", "must be a name")
-            if name == "methods" and not isinstance(entry.get("psnr_db_off_eye"), dict):
-                raise InputError(path, f"{name}[{index}].psnr_db_off_eye", "must be a table")
-            expected = entry.get("expected_db", {})  # files of earlier versions have none
-            if not isinstance(expected, dict) or not all(isinstance(db, int | float) for db in expected.values()):
-                raise InputError(path, f"{name}[{index}].expected_db", "must be a table of numbers")
+    entries = table.get("methods")
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError(path, "methods", "must be a list of tables")
+    for index, entry in enumerate(entries):
+        for key in NUMBERS:
+            if not isinstance(entry.get(key), int | float):
+                raise InputError(path, f"methods[{index}].{key}", "must be a number")
+        if not isinstance(entry.get("name"), str):
+            raise InputError(path, f"methods[{index}].name", "must be a name")
+        light = entry.get("light_db")
+        if not isinstance(light, dict) or not all(isinstance(db, int | float) for db in light.values()):
+            raise InputError(path, f"methods[{index}].light_db", "must be a table of numbers")
     return table
 
 

@@ -16,7 +16,9 @@ import numpy as np
 from runtime.config import ModelSettings
 from runtime.content import shapes
 from runtime.content.scenes import Scene, Thing
+from runtime.model.job import Job
 from runtime.model.predictor import load_predictor
+from runtime.optics.carried import intensities
 from runtime.optics.malus import intensity_from_phase
 from runtime.optics.quality import psnr_db
 from runtime.optics.retina import Mask, average, pupil_points, sample_bilinear
@@ -24,7 +26,6 @@ from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_camera, raster_from_stack, stack_from_eye
 from runtime.records import F32, F64, U8
-from runtime.report.eyesight import as_intensity
 from runtime.report.pairs import Painter, eyes_at
 
 WIDTH_PX, HEIGHT_PX, FOV_DEG = 720, 300, 18.0
@@ -134,7 +135,7 @@ def focal_stack(
         [painter.draw(eye, raster_from_stack(eye, r), width_px=r.width_px, height_px=r.height_px) for r in rasters]
         for eye in eyes
     ]
-    layers = np.array(predictor.predict(pictures, eyes).layers)
+    layers = np.array(predictor.solve(Job(pictures, eyes)).layers)
     predictor.close()
     eye, points = eyes[1], pupil_points(PUPIL_M)
     gaze = -stack_from_eye(eye)[:3, 2]
@@ -149,7 +150,7 @@ def focal_stack(
             shown.append(image)
             masks.append(mask)
             drawn = painter.draw(eye, matrix, width_px=WIDTH_PX, height_px=HEIGHT_PX)
-            true.append(as_intensity(drawn))
+            true.append(intensities(drawn))
         seen, wanted, mask = average(shown), average(true), np.logical_and.reduce(masks)
         error = float(np.square(seen[mask] - wanted[mask], dtype=np.float64).mean())
         slices.append(
@@ -166,7 +167,7 @@ def focal_stack(
         progress(index + 1, len(PLANES_M))
     matrix = projection(eye, np.zeros(2), focus_m=DISTANCE_M)
     image, mask = through_layers(matrix, layers, stack)
-    sharp = as_intensity(painter.draw(eye, matrix, width_px=WIDTH_PX, height_px=HEIGHT_PX))
+    sharp = intensities(painter.draw(eye, matrix, width_px=WIDTH_PX, height_px=HEIGHT_PX))
     pinhole_db = psnr_db(float(np.square(image[mask] - sharp[mask], dtype=np.float64).mean()))
     away = [float(np.linalg.norm(np.array([x, 0.0, 0.0]) - eye)) for x in PLANES_M]
     cards = tuple(

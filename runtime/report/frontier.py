@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from runtime.errors import InputError
+from runtime.evaluation.displayed import displayed, expected_db, light_db
 from runtime.evaluation.trials import timed
+from runtime.optics.carried import intensities
+from runtime.optics.light import squared_error
+from runtime.optics.quality import psnr_db
 from runtime.records import U8
-from runtime.report.eyesight import Seen, judged
-from runtime.report.kept import measured_anew
 from runtime.report.methods import Kind, Method, opened
 from runtime.report.pairs import StillPair
 from runtime.report.worker import apart
@@ -23,6 +26,9 @@ ENOUGH_S = 2.0  # of timed runs on one pair; slow methods run once
 MOST_RUNS = 25
 FEWEST_RUNS = 3
 SLOW_S = 4.0  # a first run that takes longer counts, and is the only one
+ENOUGH_PIXELS = 200_000  # of an eye's picture, for an expected error: within some hundredths of a decibel
+OFF_STEP = 3  # away from the eyes, every third ray of every third row is enough
+QUOTED = "1"  # of `light_db`: eyes sure to 1 mm, a pupil
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +40,6 @@ class MethodRun:
     memory_mib: float  # the process's peak
     parameters: int
     precision: str
-    multiply_adds: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,17 +47,19 @@ class PairResult:
     """One method on one pair."""
 
     pair: str
-    psnr_db: float  # exact
+    run_ms: list[float]
+    memory_mib: float
+    light_db: dict[str, float]  # by how sure the eyes are, millimetres: "0", "1", "2"
+    expected_db: dict[str, float]  # the same, one ray a pixel
+    psnr_db: float
     ssim: float
     eye_psnr_db: tuple[float, ...]
     psnr_db_off_eye: dict[str, float]
-    ms_p50: float
-    expected_db: dict[str, float]  # by the eyes' uncertainty in millimetres: "1", "2"
 
 
 @dataclass(frozen=True, slots=True)
 class MethodResult:
-    """One method over all pairs of one resolution: an entry of `methods` in report.json."""
+    """One method over all pairs of one resolution so far: an entry of `methods` in report.json. Means over pairs."""
 
     name: str
     kind: Kind
@@ -64,15 +71,19 @@ class MethodResult:
     runs: int
     memory_mib: float
     parameters: int
-    psnr_db: float  # exact; mean over pairs
+    light_db: dict[str, float]
+    expected_db: dict[str, float]
+    psnr_db: float
     ssim: float
     worst_eye_psnr_db: float  # least of all eyes and pairs
     psnr_db_off_eye: dict[str, float]
-    multiply_adds: float  # of one prediction, mean over pairs
-    expected_db: dict[str, float] = field(default_factory=dict)  # by the eyes' uncertainty in mm; mean over pairs
-    scale: float = 1.0  # of the panels' columns and rows that a network works at
     trained: bool = True  # where not, the picture is nobody's: time, memory and sizes count, the error does not
     pairs: list[PairResult] = field(default_factory=list)
+
+    @property
+    def quoted_db(self) -> float:
+        """The one figure to quote. NaN where such eyes see nothing."""
+        return self.light_db.get(QUOTED, math.nan)
 
     def record(self) -> dict[str, Any]:
         """As report.json has it."""
@@ -88,9 +99,7 @@ def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:
     _forget_peak()
     done = timed(lambda: ready.solve(pair), runs=FEWEST_RUNS, most=MOST_RUNS, enough_s=ENOUGH_S, slow_s=SLOW_S)
     layers, peak_mib = np.array(done.answer[..., :3]), _peak_mib()
-    return MethodRun(
-        layers, list(done.times_ms), peak_mib, ready.parameters, ready.precision, ready.multiply_adds(pair)
-    )
+    return MethodRun(layers, list(done.times_ms), peak_mib, ready.parameters, ready.precision)
 
 
 def _forget_peak() -> None:
@@ -108,82 +117,80 @@ def _peak_mib() -> float:
 
 
 def measure(
-    methods: Sequence[Method],
-    pairs: Sequence[StillPair],
-    *,
-    threads: int = 2,
-    progress: Callable[[int, int], None] = lambda done, of: None,
-    keep: Callable[[str, Callable[[], Any]], Any] = measured_anew,
-) -> list[MethodResult]:
-    """Every method on every pair; one without training on the first alone. Pairs of one call share a resolution.
+    methods: Sequence[Method], pairs: Iterable[StillPair], *, threads: int = 2
+) -> Iterator[tuple[str, list[MethodResult]]]:
+    """Every method on every pair, pair by pair; one without training on the first alone. Pairs share a resolution.
 
-    keep: takes each method's name and how to measure it. Raises FatalError where a method fails.
+    Yields what was measured last and the results so far, in the methods' order. Raises FatalError where one fails.
     """
-    results: list[MethodResult] = []
-    for index, method in enumerate(methods):
-        results.append(keep(method.name, partial(_measured, method, pairs, threads)))
-        progress(index + 1, len(methods))
-    return results
+    found: dict[str, MethodResult] = {}
+    for number, pair in enumerate(pairs):
+        for method in methods if number == 0 else [method for method in methods if method.trained]:
+            run = apart(run_method, method, replace(pair, off=()), threads)
+            so_far = found[method.name].pairs if method.name in found else []
+            found[method.name] = _together(method, pair, run, [*so_far, judged(pair, run)])
+            yield f"{method.name}, {pair.name}", list(found.values())
 
 
-def _measured(method: Method, pairs: Sequence[StillPair], threads: int) -> MethodResult:
-    runs = []
-    for pair in pairs if method.trained else pairs[:1]:
-        run = apart(run_method, method, replace(pair, off=()), threads)
-        runs.append((pair, run, judged(pair, run.layers)))
-    return _together(method, runs)
+def judged(pair: StillPair, run: MethodRun) -> PairResult:
+    """Displayed quality (docs/contracts.md, Error) at the eyes, expected of unsure ones, and at places beside them."""
+    layers, stack = run.layers, pair.stack
+    where: Any = {"eyes_m": pair.eyes_m, "fov_deg": pair.fov_deg}
+    eye_views = displayed(layers, pair.wanted, stack, **where)
+    where["step"] = max(1, math.isqrt(pair.images[0].shape[0] * pair.images[0].shape[1] // ENOUGH_PIXELS))
+    off: dict[str, list[float]] = {}
+    for view in pair.off:
+        place, target = view.eye_m[None], [intensities(view.image)]
+        with contextlib.suppress(ValueError):  # nothing is seen from there
+            error = squared_error(
+                layers, target, stack, solved_for_m=place, eyes_m=place, fov_deg=pair.fov_deg, rays=0, step=OFF_STEP
+            )
+            off.setdefault(f"{view.mm:g}mm", []).append(psnr_db(error))
+    light, expected = (
+        {sigma: value for sigma, value in measured(eye_views, layers, stack, **where).items() if value is not None}
+        for measured in (light_db, expected_db)
+    )
+    exact = eye_views.quality
+    beside = {name: float(np.mean(values)) for name, values in off.items()}
+    figures = (light, expected, exact.psnr_db, exact.ssim, exact.eye_psnr_db, beside)
+    return PairResult(pair.name, run.run_ms, run.memory_mib, *figures)
 
 
-def _together(method: Method, runs: Sequence[tuple[StillPair, MethodRun, Seen]]) -> MethodResult:
-    all_ms = np.concatenate([run.run_ms for _, run, _ in runs])
-    pairs = [
-        PairResult(
-            pair.name,
-            seen.quality.psnr_db,
-            seen.quality.ssim,
-            seen.quality.eye_psnr_db,
-            seen.off_db,
-            float(np.median(run.run_ms)),
-            seen.expected_db,
-        )
-        for pair, run, seen in runs
-    ]
-    distances = list(dict.fromkeys(name for result in pairs for name in result.psnr_db_off_eye))
-    first = runs[0][0].stack
+def _together(method: Method, pair: StillPair, run: MethodRun, pairs: list[PairResult]) -> MethodResult:
+    all_ms = np.concatenate([one.run_ms for one in pairs])
+
+    def means(name: str) -> dict[str, float]:
+        tables = [getattr(one, name) for one in pairs]
+        keys = dict.fromkeys(key for table in tables for key in table)
+        return {key: float(np.mean([table[key] for table in tables if key in table])) for key in keys}
+
     return MethodResult(
         name=method.name,
         kind=method.kind,
-        precision=runs[0][1].precision,
-        width_px=first.width_px,
-        height_px=first.height_px,
+        precision=run.precision,
+        width_px=pair.stack.width_px,
+        height_px=pair.stack.height_px,
         ms_p50=float(np.median(all_ms)),
         ms_p99=float(np.percentile(all_ms, 99)),
         runs=len(all_ms),
-        memory_mib=max(run.memory_mib for _, run, _ in runs),
-        parameters=runs[0][1].parameters,
-        psnr_db=float(np.mean([result.psnr_db for result in pairs])),
-        ssim=float(np.mean([result.ssim for result in pairs])),
-        worst_eye_psnr_db=min(min(result.eye_psnr_db) for result in pairs),
-        psnr_db_off_eye={
-            name: float(np.mean([r.psnr_db_off_eye[name] for r in pairs if name in r.psnr_db_off_eye]))
-            for name in distances
-        },
-        expected_db={
-            name: float(np.mean([r.expected_db[name] for r in pairs if name in r.expected_db]))
-            for name in dict.fromkeys(name for result in pairs for name in result.expected_db)
-        },
-        multiply_adds=float(np.mean([run.multiply_adds for _, run, _ in runs])),
-        scale=method.scale,
+        memory_mib=max(one.memory_mib for one in pairs),
+        parameters=run.parameters,
+        light_db=means("light_db"),
+        expected_db=means("expected_db"),
+        psnr_db=float(np.mean([one.psnr_db for one in pairs])),
+        ssim=float(np.mean([one.ssim for one in pairs])),
+        worst_eye_psnr_db=min(min(one.eye_psnr_db) for one in pairs),
+        psnr_db_off_eye=means("psnr_db_off_eye"),
         trained=method.trained,
         pairs=pairs,
     )
 
 
 def pareto(results: Sequence[MethodResult]) -> list[MethodResult]:
-    """Those that nothing else beats in both time and quality, fastest first; the untrained have no quality."""
+    """Those that nothing else beats in both time and light, fastest first; the untrained have no picture."""
     front: list[MethodResult] = []
-    for result in sorted((r for r in results if r.trained), key=lambda r: (r.ms_p50, -r.psnr_db)):
-        if not front or result.psnr_db > front[-1].psnr_db:
+    for result in sorted((r for r in results if r.trained), key=lambda r: (r.ms_p50, -r.quoted_db)):
+        if not front or result.quoted_db > front[-1].quoted_db:
             front.append(result)
     return front
 

@@ -91,14 +91,12 @@ class Page:
         """Every picture of the page, in its order."""
         return [figure for section in self.sections for figure in section.figures]
 
-    def write(self, out: Path, *, record: str, data: Any, texts: Mapping[str, str] | None = None) -> None:
-        """index.html, its pictures as PNGs, `data` as JSON under the name `record`, and further texts by name:
-        all of them in the folder `out`, or none. Raises InputError."""
+    def write(self, out: Path, *, record: str, data: Any) -> None:
+        """index.html, its pictures as PNGs and `data` as JSON under the name `record`, in the folder `out`: all of
+        them or none. Raises InputError."""
         with OutputFolder(out) as folder:
             write_json(folder.staging / record, data)
             write_text(folder.staging / "index.html", self.html())
-            for name, text in (texts or {}).items():
-                write_text(folder.staging / name, text)
             for figure in self.figures():
                 write_bytes(folder.staging / f"{figure.name}.png", figure.png)
 

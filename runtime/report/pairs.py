@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -128,11 +128,11 @@ def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0,
     return np.array([middle - right * ipd_m / 2, middle + right * ipd_m / 2])
 
 
-def beside(eye_m: ArrayLike, mm: float, directions: int = 4) -> list[F64]:
-    """(3,) places `mm` away from an eye: right, up, left, down (or more) in its own frame."""
+def beside(eye_m: ArrayLike, mm: float) -> list[F64]:
+    """(3,) places `mm` away from an eye: right, up, left, down in its own frame."""
     pose = stack_from_eye(eye_m)
-    angles = [2 * math.pi * index / directions for index in range(directions)]
-    return [pose[:3, 3] + mm / 1000 * (math.cos(a) * pose[:3, 0] + math.sin(a) * pose[:3, 1]) for a in angles]
+    directions = ((1, 0), (0, 1), (-1, 0), (0, -1))
+    return [pose[:3, 3] + mm / 1000 * (right * pose[:3, 0] + up * pose[:3, 1]) for right, up in directions]
 
 
 class Painter:
@@ -187,10 +187,9 @@ PROCEDURAL = (
 )
 
 
-def procedural_pairs(stack: PanelStack) -> list[StillPair]:
-    """The report's own pairs: built-in scenes from three places, with the views beside the eyes."""
-    pairs = []
+def procedural_pairs(stack: PanelStack) -> Iterator[StillPair]:
+    """The report's own pairs, one after the other: built-in scenes from three places, with views beside the eyes."""
     for scene, name, place in PROCEDURAL:
         with Painter(scene, stack) as painter:
-            pairs.append(painter.pair(name, eyes_at(**place), stack))
-    return pairs
+            pair = painter.pair(name, eyes_at(**place), stack)
+        yield pair

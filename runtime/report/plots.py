@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -57,17 +56,9 @@ def png(figure: Any) -> bytes:
     return buffer.getvalue()
 
 
-def label_points(
-    figure: Any,
-    axes: Any,
-    points: Sequence[tuple[float, float, str]],
-    *,
-    lines: Sequence[tuple[float, float]] = (),
-    colours: Sequence[str] = (),
-) -> None:
+def label_points(figure: Any, axes: Any, points: Sequence[tuple[float, float, str]]) -> None:
     """Name dots so that no name lies on another, on a dot or beyond the axes: each takes the first free place.
 
-    lines: corners of a line that names should keep off, if they can; colours: of the names, without: all alike.
     To be called when everything else is drawn. Where no place is free, the least crowded one is taken.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -81,15 +72,12 @@ def label_points(
     renderer = canvas.get_renderer()  # type: ignore[no-untyped-call]
     dots = axes.transData.transform([(x, y) for x, y, _ in points])
     frame, point = axes.get_window_extent(renderer), figure.dpi / 72
-    corners = axes.transData.transform(lines) if len(lines) else np.empty((0, 2))
-    steps = [np.linspace(a, b, 200) for a, b in pairwise(corners)]
-    kept_off = np.concatenate([np.empty((0, 2)), *steps])
     halo = [withStroke(linewidth=2.5, foreground="white")]
     taken = [text.get_window_extent(renderer) for text in axes.texts]
     for index in np.argsort(dots[:, 0]):
         x, y, text = points[index]
         style: dict[str, Any] = {"textcoords": "offset points", "va": "center", "fontsize": 8.5, "path_effects": halo}
-        style["color"] = colours[index] if colours else INK
+        style["color"] = INK
         label = axes.annotate(text, (x, y), xytext=(0, 0), ha="left", **style)
         size = label.get_window_extent(renderer)
         others = np.delete(dots, index, axis=0)
@@ -101,9 +89,8 @@ def label_points(
         def crowding(place: tuple[float, float], others: Any = others, box: Any = box) -> float:
             own = box(*place)
             inside = frame.x0 <= own.x0 and own.x1 <= frame.x1 and frame.y0 <= own.y0 and own.y1 <= frame.y1
-            crossed = bool((_apart(own, kept_off) == 0).any())
             dots_on_it = (_apart(own, others) < 5 * point).sum()
-            return float(dots_on_it + sum(map(own.overlaps, taken)) + 3 * (not inside) + 0.5 * crossed)
+            return float(dots_on_it + sum(map(own.overlaps, taken)) + 3 * (not inside))
 
         place = min(LABEL_PLACES, key=crowding)
         taken.append(box(*place))

@@ -6,8 +6,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
+from typing import ClassVar, Self
 
+from pydantic import BaseModel
+
+from runtime.config import Section
 from runtime.records import SensorFrame
 
 
@@ -17,23 +20,27 @@ class Capabilities:
 
     colour: bool = False
     depth: bool = False
-    infrared: bool = False
     eye_points: bool = False  # it finds the eyes itself: no detector is needed
     in_stack_frame: bool = False  # its eye points are in frame `stack` already: no calibration is applied
     may_pause: bool = False  # silence is its own (a gap in a recording): it is neither stalled nor reopened for it
 
 
-class SensorDriver(ABC):
+class Sensor(ABC):
     """One depth sensor, eye tracker or recording.
 
     A constructor only keeps its settings; `open` acquires and cleans up after itself when it fails.
     One thread uses a driver; that thread may be abandoned when an SDK hangs.
+
+    A class of the user's own is named by `sensor.driver = "module:Class"` and made as `Class(options, clock=clock)`:
+    `options` is what `Options` makes of `[sensor.options]`, `clock` the run's clock, which its captures are told in.
     """
+
+    Options: ClassVar[type[BaseModel]] = Section  # of a class of the user's own: what [sensor.options] may hold
 
     name: str
     capabilities: Capabilities
     serial: str = ""  # known after `open`, empty where the device has none; set before: `open` takes that device only
-    overtaken: int = 0  # samples that arrived and that `read_newest` passed over for a newer one
+    skipped: int = 0  # samples that arrived and that `read_newest` passed over for a newer one
     missed: int = 0  # samples that never arrived: gaps in the device's own count
 
     @abstractmethod
@@ -73,7 +80,7 @@ class SensorDriver(ABC):
         self.close()
 
 
-class SteppedDriver(SensorDriver):
+class SteppedSensor(Sensor):
     """A driver that also delivers sample after sample without waiting, for runs on a simulated clock."""
 
     @abstractmethod

@@ -10,15 +10,15 @@ from dataclasses import replace
 
 from runtime.errors import InputError
 from runtime.records import EyePoints, SensorFrame
-from runtime.sensor.base import SensorDriver, SteppedDriver
+from runtime.sensor.base import Sensor, SteppedSensor
 
 FindEyes = Callable[[SensorFrame], EyePoints | None]
 
 
-class DetectingDriver(SteppedDriver):
+class DetectingDriver(SteppedSensor):
     """Adds eye points to the frames of a driver that has none, and hands those of others through."""
 
-    def __init__(self, driver: SensorDriver, make_find: Callable[[], FindEyes], *, keep_images: bool = False) -> None:
+    def __init__(self, driver: Sensor, make_find: Callable[[], FindEyes], *, keep_images: bool = False) -> None:
         """make_find: builds the finder when the driver is opened, if it is needed at all."""
         self._driver, self._make_find, self._keep_images = driver, make_find, keep_images
         self._find: FindEyes | None = None
@@ -41,7 +41,7 @@ class DetectingDriver(SteppedDriver):
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
         frame = self._driver.read_newest(timeout_s)
-        self.overtaken, self.missed = self._driver.overtaken, self._driver.missed
+        self.skipped, self.missed = self._driver.skipped, self._driver.missed
         return self._with_eyes(frame)
 
     def read_arrived(self, timeout_s: float) -> list[SensorFrame]:
@@ -49,7 +49,7 @@ class DetectingDriver(SteppedDriver):
             # A search takes as long as some cameras' period: only the newest picture is searched.
             return [self.read_newest(timeout_s)]
         frames = self._driver.read_arrived(timeout_s)
-        self.overtaken, self.missed = self._driver.overtaken, self._driver.missed
+        self.skipped, self.missed = self._driver.skipped, self._driver.missed
         return [self._with_eyes(frame) for frame in frames]
 
     @property
@@ -65,8 +65,8 @@ class DetectingDriver(SteppedDriver):
     def available_ns(self, frame: SensorFrame) -> int:
         return self._stepped().available_ns(frame)
 
-    def _stepped(self) -> SteppedDriver:
-        if not isinstance(self._driver, SteppedDriver):
+    def _stepped(self) -> SteppedSensor:
+        if not isinstance(self._driver, SteppedSensor):
             raise InputError("run", "--max-speed", f"needs a recording, not the sensor {self.name}")
         return self._driver
 

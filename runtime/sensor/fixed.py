@@ -8,12 +8,12 @@ from runtime.clock import NS_PER_S, Clock
 from runtime.config import SensorSettings
 from runtime.errors import InputError, SensorLost, SensorTimeout
 from runtime.records import EyePoints, SensorFrame
-from runtime.sensor.base import Capabilities, SteppedDriver
+from runtime.sensor.base import Capabilities, SteppedSensor
 
 PERIOD_NS = NS_PER_S // 30
 
 
-class FixedDriver(SteppedDriver):
+class FixedDriver(SteppedSensor):
     """Thirty samples a second of one pair of eyes in the `stack` frame."""
 
     name = "fixed"
@@ -56,7 +56,7 @@ class FixedDriver(SteppedDriver):
             self._clock.sleep_until_ns(now_ns + round(timeout_s * NS_PER_S))
             raise SensorTimeout("the next sample is not due yet")
         self._clock.sleep_until_ns(due_ns)
-        self.overtaken += due - self._count
+        self.skipped += due - self._count
         self._count = due
         return self.next_sample()
 

@@ -34,7 +34,7 @@ def mcap_records(file: IO[bytes], *, source: Path, most_bytes: int) -> Iterator[
 
 
 def _over(count: int, most_bytes: int, what: str) -> str:
-    return f"{what} {count / MIB:.1f} MiB; at most {most_bytes / MIB:g} (limits.chunk_mib)"
+    return f"{what} {count / MIB:.1f} MiB; at most {most_bytes / MIB:g}"
 
 
 class _Guarded:

@@ -15,10 +15,10 @@ from runtime.clock import NS_PER_S, Clock
 from runtime.config import SensorSettings
 from runtime.errors import EndOfRecording, InputError, SensorLost, SensorTimeout
 from runtime.records import U8, U16, Intrinsics, SensorFrame
-from runtime.sensor.base import Capabilities, SensorDriver
+from runtime.sensor.base import Capabilities, Sensor
 from runtime.sensor.device_clock import DeviceClock
-from runtime.sensor.lasting_thread import LastingThread, borrowed, give_back
 from runtime.sensor.openni2_library import load, needs
+from runtime.sensor.persistent_thread import PersistentThread, borrowed, give_back
 
 SERIAL_PROPERTY = 3
 DEPTH_1_MM, DEPTH_100_UM, RGB888, GRAY8 = 100, 101, 200, 202
@@ -36,10 +36,10 @@ class _Picture(NamedTuple):
     pixels: Any  # U8 (h, w, 3) or U16 (h, w)
 
 
-class OpenNI2Driver(SensorDriver):
+class OpenNI2Driver(Sensor):
     """Depth in millimetres and colour, registered by the camera where it can.
 
-    The library is called on a thread that outlives whoever reads (`lasting_thread`).
+    The library is called on a thread that outlives whoever reads (`persistent_thread`).
     """
 
     name = "openni2"
@@ -48,7 +48,7 @@ class OpenNI2Driver(SensorDriver):
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
         """settings.source: `demo` or empty for the only camera, a serial number, a device URI, `Dummy`, or a .oni."""
         self._settings, self._clock = settings, clock
-        self._thread: LastingThread | None = None  # while it is open
+        self._thread: PersistentThread | None = None  # while it is open
         self._openni: Any = None
         self._device: Any = None
         self._streams: dict[str, Any] = {}
@@ -183,7 +183,7 @@ class OpenNI2Driver(SensorDriver):
 
     def _count(self, index: int, passed: int) -> None:
         ahead = index - self._index if self._index and index > self._index else 1
-        self.overtaken += passed
+        self.skipped += passed
         self.missed += max(ahead - 1 - passed, 0)
         self._index, self._sequence = index, self._sequence + ahead
 

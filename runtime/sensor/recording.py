@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import logging
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -45,16 +47,15 @@ class RecordingWriter:
         header: RecordingHeader,
         *,
         limits: RecordingLimits | None = None,
-        chunk_bytes: int = CHUNK_BYTES,
     ) -> None:
         from mcap.writer import CompressionType, IndexType, Writer
 
         self._file, self._limits = file, limits or RecordingLimits()
-        self._images, self._eye_points = header.colour or header.depth, header.eye_points
+        self._images, self._eye_points = header.colour or header.depth, header.eye_points or header.truth
         # Eye points alone are so few that plain bytes, the same with every version of a library, are worth more.
         compression = CompressionType.LZ4 if self._images else CompressionType.NONE
         index = IndexType.CHUNK | IndexType.METADATA
-        self._writer: Any = Writer(file, chunk_size=chunk_bytes, compression=compression, index_types=index)
+        self._writer: Any = Writer(file, chunk_size=CHUNK_BYTES, compression=compression, index_types=index)
         self._writer.start(profile="phasestack", library="phasestack")
         self._writer.add_metadata(fmt.METADATA_NAME, header.metadata())
         self._channels: dict[str, int] = {}
@@ -111,12 +112,20 @@ def recording_to(
     """A writer whose file appears under its name with the first sample, and is kept from then on.
 
     Until then an older file of that name stays; what a crash leaves is readable up to its last whole chunk.
-    Raises InputError where the file can't be written.
+    One with pictures is its owner's alone. Raises InputError where it can't be written, or another process writes it.
     """
     part = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = part.open("wb")
+        if path.is_file():
+            with path.open("rb") as present:
+                fcntl.flock(present, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        file = os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600), "wb")
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until it is closed, under either name
+        file.truncate()
+        os.fchmod(file.fileno(), 0o600 if header.colour or header.depth else 0o644)  # a face is private
+    except BlockingIOError:
+        raise InputError(path, "", "is being recorded by another process") from None
     except OSError as error:
         raise InputError(path, "", f"cannot be written ({error.strerror})") from None
     try:
@@ -224,8 +233,8 @@ class Recording:
     def samples(self) -> Iterator[SensorFrame]:
         """All whole samples in the order of recording. Raises InputError for a sample that is not one of ours.
 
-        A message of eye points completes a sample. A recording that has none (pictures alone) has a sample for each
-        time stamp: pictures of one stamp that follow each other are one sample, numbered from 1.
+        A message of eye points, or of the truth alone, completes a sample. A recording that has none (pictures alone)
+        has a sample for each time stamp: pictures of one stamp that follow each other are one sample, numbered from 1.
         """
         parts: dict[str, Any] = {}
         stamp_ns: int | None = None  # of the pictures in `parts`

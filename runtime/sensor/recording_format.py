@@ -39,6 +39,10 @@ EYES_SCHEMA = {
         "capture_ns": {"type": "integer", "description": "monotonic clock when the light was integrated"},
         "eyes_m": _PAIR | {"description": "frame `sensor` (+x right, +y down, +z away); null: no face"},
         "confidence": {"type": "array", "description": "0 to 1, left and right"},
+        "covariance_m2": {
+            "type": "array",
+            "description": "3x3, of the middle between the eyes; where it is known",
+        },
         "completed": {"enum": ["", "left", "right"], "description": "the eye that was hidden and filled in"},
         "true_eyes_m": _PAIR | {"description": "frame `stack`; only where the truth is known"},
     },
@@ -114,6 +118,8 @@ def eyes_message(frame: SensorFrame) -> bytes:
         record["confidence"] = [round(float(c), 4) if np.isfinite(c) else 0.0 for c in frame.eyes.confidence]
         if frame.eyes.completed:
             record["completed"] = frame.eyes.completed
+        if frame.eyes.covariance_m2 is not None and np.isfinite(frame.eyes.covariance_m2).all():
+            record["covariance_m2"] = [[float(f"{x:.4g}") for x in row] for row in frame.eyes.covariance_m2]
     if frame.true_eyes_m is not None:
         record["true_eyes_m"] = _points(frame.true_eyes_m)
     return json.dumps(record, separators=(",", ":"), allow_nan=False).encode()
@@ -125,6 +131,19 @@ def _pair(value: Any) -> F64 | None:
     if not (_has(value, 2) and all(_has(point, 3) for point in value)):
         raise ValueError(f"two points of three coordinates expected, got {shown(value)}")
     return np.array([[_coordinate(number) for number in point] for point in value])
+
+
+def _covariance(value: Any) -> F64 | None:
+    if value is None:
+        return None
+    if not (_has(value, 3) and all(_has(row, 3) for row in value)):
+        raise ValueError(f"covariance_m2: three rows of three numbers expected, got {shown(value)}")
+    limit = COORDINATE_MAX_M**2
+    rows = [[real(x, least=-limit, most=limit, problem=_of("covariance_m2")) for x in row] for row in value]
+    matrix = np.array(rows)
+    if not np.allclose(matrix, matrix.T, rtol=1e-3, atol=0) or np.linalg.eigvalsh(matrix)[0] < -1e-3 * matrix.max():
+        raise ValueError("covariance_m2 is no covariance")
+    return matrix
 
 
 def _has(value: Any, count: int) -> bool:
@@ -169,7 +188,7 @@ def frame_from_eyes_message(data: bytes) -> SensorFrame:
         if not _has(confidence, 2) or completed not in ("", "left", "right"):
             raise ValueError("malformed confidence or completed")
         certain = [real(c, least=0, most=1, problem=_of("confidence")) for c in confidence]
-        eyes = EyePoints(eyes_m, np.array(certain), completed)
+        eyes = EyePoints(eyes_m, np.array(certain), completed, _covariance(record.get("covariance_m2")))
     return SensorFrame(
         sequence=whole(_required(record, "sequence"), least=0, most=SEQUENCE_MAX, problem=_of("sequence")),
         capture_ns=whole(_required(record, "capture_ns"), least=0, most=TIME_MAX_NS, problem=_of("capture_ns")),
@@ -213,7 +232,7 @@ def colour_from_message(data: bytes, *, most_pixels: int = 1 << 26) -> U8:
     coded = _coded_bytes(_table(data))
     width, height = picture_size(coded)
     if max(width, height) > IMAGE_SIDE_MAX_PX or width * height > most_pixels:
-        raise ValueError(f"a colour image has {width} by {height} pixels; at most {most_pixels:,} (limits.pixels)")
+        raise ValueError(f"a colour image has {width} by {height} pixels; at most {most_pixels:,}")
     image = None if is_cut_off(coded) else cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise ValueError("a colour image cannot be decoded")

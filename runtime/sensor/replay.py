@@ -13,7 +13,7 @@ from runtime.clock import NS_PER_MS, NS_PER_S, Clock
 from runtime.config import LimitSettings
 from runtime.errors import EndOfRecording, InputError, SensorLost, SensorTimeout
 from runtime.records import SensorFrame
-from runtime.sensor.base import Capabilities, SteppedDriver
+from runtime.sensor.base import Capabilities, SteppedSensor
 from runtime.sensor.recording import Recording
 
 ROUND_INTERVAL_MIN_NS = NS_PER_S // 240  # between the rounds of a looped recording: the fastest sensor's period
@@ -28,7 +28,7 @@ def demo_recording_path() -> Path:
     return Path(str(files("runtime.sensor") / "data" / "demo.mcap"))
 
 
-class ReplayDriver(SteppedDriver):
+class ReplayDriver(SteppedSensor):
     """Recorded times are shifted on to the run's clock: the first sample is captured at `open`.
 
     Any rate and any gap is played as it was recorded. A sample that is no later than the one before it is not
@@ -58,7 +58,7 @@ class ReplayDriver(SteppedDriver):
         """
         self._limits = limits or LimitSettings()
         if not 0 <= start_s <= self._limits.recording_s:
-            problem = f"is {start_s:g}; a recording has at most {self._limits.recording_s:g} s (limits.recording_s)"
+            problem = f"is {start_s:g}; a recording has at most {self._limits.recording_s:g} s"
             raise InputError("sensor", "start_s", problem)
         self.path = demo_recording_path() if source == "demo" else Path(source)
         self._clock, self._loop, self._start_ns = clock, loop, round(start_s * NS_PER_S)
@@ -77,7 +77,7 @@ class ReplayDriver(SteppedDriver):
         recording = Recording(self.path, limits=self._limits)
         header = recording.header
         self.serial = header.serial
-        self.capabilities = Capabilities(header.colour, header.depth, False, header.eye_points, may_pause=True)
+        self.capabilities = Capabilities(header.colour, header.depth, header.eye_points, may_pause=True)
         self._refused = Counter()
         self._frames = self._shifted(recording)
         self._next = next(self._frames, None)
@@ -96,7 +96,7 @@ class ReplayDriver(SteppedDriver):
             if frame.capture_ns - recording.first.capture_ns > self._limits.recording_s * NS_PER_S:
                 seconds = (frame.capture_ns - recording.first.capture_ns) / NS_PER_S
                 problem = f"sample {number} is {seconds:.6g} s after the first; at most {self._limits.recording_s:g}"
-                raise InputError(self.path, "capture_ns", f"{problem} (limits.recording_s)")
+                raise InputError(self.path, "capture_ns", f"{problem}")
             last_ns = frame.capture_ns
             if frame.capture_ns >= start_ns:
                 yield frame
@@ -146,7 +146,7 @@ class ReplayDriver(SteppedDriver):
         frame = self._first_due(timeout_s)
         now_ns = self._clock.now_ns()
         while self._is_due(now_ns):
-            frame, self.overtaken = self.next_sample(), self.overtaken + 1
+            frame, self.skipped = self.next_sample(), self.skipped + 1
         return frame
 
     def read_arrived(self, timeout_s: float) -> list[SensorFrame]:

@@ -10,7 +10,7 @@ from runtime.clock import NS_PER_S, Clock
 from runtime.config import SensorSettings
 from runtime.errors import SensorLost, SensorTimeout
 from runtime.records import SensorFrame
-from runtime.sensor.base import Capabilities, SensorDriver
+from runtime.sensor.base import Capabilities, Sensor
 from runtime.sensor.device_clock import DeviceClock
 from runtime.sensor.eye_packets import EyePacket, PacketReader
 from runtime.sensor.usb_devices import UDEV_RULE, UsbDevice, find_device, reset_device
@@ -23,7 +23,7 @@ STALLS = 3  # stalls in a row after which a device is reset
 log = logging.getLogger(__name__)
 
 
-class UsbEyesDriver(SensorDriver):
+class UsbEyesDriver(Sensor):
     """The newest packet wins. A device that is silent, or sends only garbage, is reset and given up."""
 
     name = "usb-eyes"
@@ -74,7 +74,7 @@ class UsbEyesDriver(SensorDriver):
             packets += more
         arrival_ns = self._clock.now_ns()
         capture_ns = [self._times.host_ns(p.device_time_us * 1000, arrival_ns=arrival_ns) for p in packets]
-        self.overtaken += len(packets) - 1
+        self.skipped += len(packets) - 1
         self.missed = self._reader.missed
         self._silent = 0
         return SensorFrame(packets[-1].sequence, capture_ns[-1], packets[-1].points)

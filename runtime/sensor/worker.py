@@ -6,20 +6,24 @@ import logging
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from enum import StrEnum
 
 from runtime.clock import NS_PER_S, Clock
 from runtime.config import SensorSettings
 from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout, TransientError
 from runtime.records import SensorFrame
-from runtime.sensor.base import Capabilities, SensorDriver
-from runtime.support.transient import may_pass
+from runtime.sensor.base import Capabilities, Sensor
+from runtime.sensor.device_clock import DeviceClock
+from runtime.support.transient import is_retryable
 
 TIMEOUTS_TO_REOPEN = 2
 HANG_MARGIN_S = 0.5
 ABANDONED_MAX = 8
 QUEUE_MAX = 1024  # samples that wait to be read: four seconds of the fastest sensor
 PICTURES_MAX = 8  # the same of samples that carry pictures
+AHEAD_NS = NS_PER_S // 1000  # a capture so far after its arrival is no time of this machine's clock
+BEHIND_NS = 60 * NS_PER_S  # nor is one so far before it
 
 log = logging.getLogger(__name__)
 
@@ -45,12 +49,13 @@ class _Attempt:
         self.deadline_ns = now_ns + round(limit_s * NS_PER_S)
         self.thread: threading.Thread | None = None
         self.received = 0
+        self.times: DeviceClock | None = None  # of stamps that are not of this machine's clock
 
 
 class SensorWorker:
     """Runs a driver in a thread of its own. No method blocks, `stop` but for its time-out."""
 
-    def __init__(self, make_driver: Callable[[], SensorDriver], settings: SensorSettings, clock: Clock) -> None:
+    def __init__(self, make_driver: Callable[[], Sensor], settings: SensorSettings, clock: Clock) -> None:
         """make_driver: an unopened driver, a fresh one at each call."""
         self._make, self._settings, self._clock = make_driver, settings, clock
         self._lock, self._watching = threading.Lock(), threading.Lock()
@@ -58,9 +63,9 @@ class SensorWorker:
         self._attempt: _Attempt | None = None
         self._hung: list[_Attempt] = []
         self._state, self.reason = SensorState.STOPPED, ""
-        self._passed_over = self._overtaken = 0
+        self._passed_over = self._skipped = 0
         self._refused: Counter[str] = Counter()
-        self._driver: SensorDriver | None = None
+        self._driver: Sensor | None = None
         self._serial = ""
         self.error: FatalError | None = None
         self.reopened = 0
@@ -104,7 +109,7 @@ class SensorWorker:
     @property
     def stale_inputs(self) -> int:
         """Samples that a newer one overtook and that `take` never handed out."""
-        return self._passed_over + self._overtaken + (self._driver.overtaken if self._driver else 0)
+        return self._passed_over + self._skipped + (self._driver.skipped if self._driver else 0)
 
     @property
     def refused_inputs(self) -> Mapping[str, int]:
@@ -164,11 +169,11 @@ class SensorWorker:
                     log.info("sensor: %s%s", state, f" ({reason})" if reason else "")
                 self._state, self.reason = state, reason
 
-    def _account(self, driver: SensorDriver | None) -> None:
+    def _account(self, driver: Sensor | None) -> None:
         """Keep a driver's counts when it goes."""
         with self._lock:
             if driver is not None and driver is self._driver:
-                self._overtaken += driver.overtaken
+                self._skipped += driver.skipped
                 self._refused.update(driver.refused)
                 self._driver = None
 
@@ -179,7 +184,7 @@ class SensorWorker:
         s = self._settings
         backoff_s = s.reopen_backoff_s
         while not attempt.abandoned.wait(wait_s):
-            driver: SensorDriver | None = None
+            driver: Sensor | None = None
             attempt.received = 0
             try:
                 driver = self._make()
@@ -191,7 +196,7 @@ class SensorWorker:
                 self._set(attempt, SensorState.ENDED, str(error))
                 return
             except FatalError as error:
-                if not may_pass(error):
+                if not is_retryable(error):
                     if not attempt.abandoned.is_set():
                         self.error = error
                     self._set(attempt, SensorState.FAILED, str(error))
@@ -216,7 +221,7 @@ class SensorWorker:
             self._allow(attempt, wait_s + s.open_timeout_s)
             self.reopened += 1
 
-    def _receive(self, attempt: _Attempt, driver: SensorDriver) -> None:
+    def _receive(self, attempt: _Attempt, driver: Sensor) -> None:
         """Read until the driver fails or the worker stops."""
         s = self._settings
         timeouts = 0
@@ -241,9 +246,23 @@ class SensorWorker:
                 if attempt.abandoned.is_set():
                     return
                 for frame in frames:
-                    self._keep(frame)
+                    self._keep(self._dated(frame, attempt))
             if self._state is not SensorState.RUNNING:
                 self._set(attempt, SensorState.RUNNING, "")
+
+    def _dated(self, frame: SensorFrame, attempt: _Attempt) -> SensorFrame:
+        """With a capture on this machine's clock: a driver's stamps may be ahead of it, or of a clock of its own.
+
+        From the first such stamp on, all of that driver are dated by when the quickest of them arrive.
+        """
+        now_ns = self._clock.now_ns()
+        if attempt.times is None and not -AHEAD_NS <= now_ns - frame.capture_ns <= BEHIND_NS:
+            ahead_s = (frame.capture_ns - now_ns) / NS_PER_S
+            log.warning("sensor: captures are stamped %+.3f s from now: they are dated by their arrival", ahead_s)
+            attempt.times = DeviceClock()
+        if attempt.times is None:
+            return frame
+        return replace(frame, capture_ns=attempt.times.host_ns(frame.capture_ns, arrival_ns=now_ns))
 
     def _keep(self, frame: SensorFrame) -> None:
         """Let a sample wait to be read; where too many wait, the oldest goes."""

@@ -38,7 +38,7 @@ class Job(Generic[T]):
         self.done = False
         self.result: T | None = None
         self.problem = ""  # one line, where it failed
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"job {name}", daemon=True)
         _running.add(self._thread)
         self._thread.start()
 

@@ -215,10 +215,10 @@ def real(
     return float(value)
 
 
-def within(count: int | float, most: int | float, *, source: str | Path, field: str, limit: str) -> None:
-    """Raises InputError where a count is over its limit: told with both figures and the setting's name."""
+def within(count: int | float, most: int | float, *, source: str | Path, field: str) -> None:
+    """Raises InputError where a count is over its limit: with both figures."""
     if count > most:
-        raise InputError(source, field, f"{count:,} is over the limit of {most:,} ({limit})")
+        raise InputError(source, field, f"{count:,} is over the limit of {most:,}")
 
 
 def shown(value: Any, *, most: int = 40) -> str:

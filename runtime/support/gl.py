@@ -6,13 +6,14 @@ import ctypes
 import resource
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
-
-import moderngl
+from typing import TYPE_CHECKING, Any
 
 from runtime.errors import MissingPart
 from runtime.records import U8
 from runtime.support.interrupts import interrupts_held
+
+if TYPE_CHECKING:
+    import moderngl
 
 DEBIAN_PACKAGES = "libegl1 libgl1-mesa-dri libgles2 libgl1"
 MINIMUM_VERSION = 330
@@ -25,6 +26,8 @@ def offscreen_context() -> moderngl.Context:
 
     Use it on one thread only. Raises MissingPart, naming Debian's packages, where EGL can't give OpenGL 3.3.
     """
+    import moderngl
+
     try:
         with interrupts_held():
             return moderngl.create_context(require=MINIMUM_VERSION, standalone=True, **EGL)

@@ -5,20 +5,23 @@ A fault that repeats does not flood them, a message can't forge a line, and who 
 
 from __future__ import annotations
 
+import copy
 import json
 import logging
 import os
+import queue
+import select
 import sys
+import time
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from io import UnsupportedOperation
+from logging.handlers import QueueHandler, QueueListener
 from typing import Any, TextIO
 
 from runtime.clock import NS_PER_S, Clock, MonotonicClock
 from runtime.config import ServiceSettings
 from runtime.errors import one_line
 from runtime.support.crash import written
-from runtime.support.log_writer import LogWriter
 
 # What sd-daemon(3) puts before a line so that journald files it under its level.
 PRIORITY = {
@@ -28,10 +31,11 @@ PRIORITY = {
     logging.ERROR: "<3>",
     logging.CRITICAL: "<2>",
 }
-ROOTS = ("phasestack", "runtime")  # named for what they tell, or after their module
+ROOTS = ("phasestack", "runtime")  # named for what they report, or after their module
 BURST = 5
 REMEMBERED = 1000
 QUIET_NS = 30 * NS_PER_S
+QUEUED_MAX = 4096  # lines that wait for a reader
 CLOSE_S = 1.0  # so long the last lines are waited for
 LINE_MAX = 4000  # characters
 
@@ -48,8 +52,7 @@ class TextFormat(logging.Formatter):
         if record.exc_info and record.exc_info[1]:
             text += f": {written(record.exc_info[1])}"  # a traceback is for whoever mends it, not for the log
         if self._journald:
-            prefix = PRIORITY.get(record.levelno, "<6>")
-            return prefix + text
+            return PRIORITY.get(record.levelno, "<6>") + text
         when = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
         return f"{when} {record.levelname.lower():7} {text}"
 
@@ -62,7 +65,7 @@ class JsonFormat(logging.Formatter):
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
             "logger": record.name,
-            "message": record.getMessage(),
+            "message": one_line(record.getMessage(), most=LINE_MAX),
         }
         if record.exc_info and record.exc_info[1]:
             line["exception"] = written(record.exc_info[1])
@@ -99,59 +102,71 @@ class RateLimit(logging.Filter):
         return True
 
 
-class Handler(logging.Handler):
-    """Formats where it is logged; a thread of its own writes."""
+class _Lines(logging.Handler):
+    """Writes lines to a descriptor, and waits for who reads it: used on the listener's thread."""
 
-    def __init__(self, stream: TextIO) -> None:
+    def __init__(self, descriptor: int, owner: QueuedLines) -> None:
         super().__init__()
-        self._memory: TextIO | None = None
-        self._writer: LogWriter | None = None
-        try:
-            descriptor = stream.fileno()
-        except (UnsupportedOperation, AttributeError):
-            self._memory = stream  # in memory: writing never waits
-            return
-        except ValueError:  # closed
-            descriptor = -1
-        self._writer = LogWriter(descriptor, told=self._told)
+        self._descriptor, self._owner, self._missed = descriptor, owner, 0  # lines whose loss is not reported yet
 
-    @property
-    def lost(self) -> int:
-        """Lines that could not be written."""
-        return self._writer.lost if self._writer is not None else 0
+    def createLock(self) -> None:
+        """None: one thread uses it, and who shuts logging down must not wait until it is through."""
+        self.lock = None
 
     def emit(self, record: logging.LogRecord) -> None:
-        if self._memory is not None:
-            self._memory.write(self._line(record).decode())
-        elif self._writer is not None and record.exc_info:
-            # An exception is written down whole in a file: not by whom it befell, whose time it would be.
-            self._writer.put(lambda: self._line(record))
-        elif self._writer is not None:
-            self._writer.put(self._line(record))
+        if not self._written(record):
+            self._owner.lost += 1
+        if (missed := self._owner.lost - self._missed) and self._owner.queue.empty():
+            text = f"{missed} log lines were lost: they could not be written"
+            if self._written(logging.LogRecord("phasestack.log", logging.WARNING, "", 0, text, (), None)):
+                self._missed += missed
 
-    def _line(self, record: logging.LogRecord) -> bytes:
+    def _written(self, record: logging.LogRecord) -> bool:
+        data = self.format(record).encode("utf-8", "backslashreplace") + b"\n"
         try:
-            line = self.format(record)
-        except Exception as error:
-            line = self.format(_record(logging.ERROR, f"a log line could not be made: {record.msg!r} ({error})"))
-        return line.encode("utf-8", "backslashreplace") + b"\n"
+            while data:
+                select.select((), (self._descriptor,), ())  # it may have been made not to block
+                data = data[os.write(self._descriptor, data[: select.PIPE_BUF]) :]
+        except OSError:  # nobody reads any more, or the disk is full
+            return False
+        return True
+
+
+class QueuedLines(QueueHandler):
+    """Puts records into a bounded queue, whose listener formats and writes them. Where it is full, lines are lost."""
+
+    def __init__(self, descriptor: int, form: logging.Formatter) -> None:
+        self.queue: queue.Queue[Any] = queue.Queue(QUEUED_MAX)
+        super().__init__(self.queue)
+        self.lost = 0
+        self._lines = _Lines(descriptor, self)
+        self._lines.setFormatter(form)
+        self._listener = QueueListener(self.queue, self._lines)
+        self._listener.start()
+
+    def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
+        """Its message in words now; its exception is put down by the listener, whose time it may take."""
+        prepared = copy.copy(record)
+        prepared.msg, prepared.args = record.getMessage(), None
+        return prepared
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        try:
+            self.queue.put_nowait(record)
+        except queue.Full:
+            self.lost += 1
 
     def flush(self) -> None:
         """Wait a moment for what is not written yet."""
-        if self._writer is not None:
-            self._writer.flush(CLOSE_S)
+        deadline_s = time.monotonic() + CLOSE_S
+        while self.queue.unfinished_tasks and time.monotonic() < deadline_s:
+            time.sleep(0.005)
 
     def close(self) -> None:
-        if self._writer is not None:
-            self._writer.close(CLOSE_S)
+        self.flush()
+        if not self.queue.unfinished_tasks:  # else its thread waits for a reader, for as long as the process lives
+            self._listener.stop()
         super().close()
-
-    def _told(self, count: int) -> bytes:
-        return self._line(_record(logging.WARNING, f"{count} log lines were lost: they could not be written"))
-
-
-def _record(level: int, message: str) -> logging.LogRecord:
-    return logging.LogRecord("phasestack.log", level, "", 0, message, (), None)
 
 
 def configure(
@@ -161,12 +176,22 @@ def configure(
     clock: Clock | None = None,
     environment: Mapping[str, str] = os.environ,
 ) -> None:
-    """Send every log line of ours to a stream (stderr), in the configured form. Calling it again replaces."""
-    for old in _handlers():
-        old.close()
-    handler = Handler(stream or sys.stderr)
+    """Send every log line of ours to a stream (stderr), in the configured form. Calling it again replaces.
+
+    What is written to memory is written at once.
+    """
+    for old in logging.getLogger(ROOTS[0]).handlers[:]:
+        if isinstance(old, QueuedLines):
+            old.close()
+    target = stream or sys.stderr
     journald = "JOURNAL_STREAM" in environment
-    handler.setFormatter(JsonFormat() if settings.log_format == "json" else TextFormat(journald=journald))
+    form = JsonFormat() if settings.log_format == "json" else TextFormat(journald=journald)
+    handler: logging.Handler
+    try:
+        handler = QueuedLines(os.dup(target.fileno()), form)  # whatever becomes of the number
+    except (OSError, ValueError):  # it is in memory, or closed
+        handler = logging.StreamHandler(target)
+        handler.setFormatter(form)
     handler.addFilter(RateLimit(clock or MonotonicClock()))
     for name in ROOTS:
         root = logging.getLogger(name)
@@ -177,14 +202,10 @@ def configure(
 
 def lost() -> int:
     """Lines that could not be written since the logs were configured."""
-    return sum(handler.lost for handler in _handlers())
+    return sum(handler.lost for handler in logging.getLogger(ROOTS[0]).handlers if isinstance(handler, QueuedLines))
 
 
 def flush() -> None:
     """Wait a moment for what is not written yet: before the process ends without Python's own clean-up."""
-    for handler in _handlers():
+    for handler in logging.getLogger(ROOTS[0]).handlers:
         handler.flush()
-
-
-def _handlers() -> list[Handler]:
-    return [handler for handler in logging.getLogger(ROOTS[0]).handlers if isinstance(handler, Handler)]

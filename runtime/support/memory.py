@@ -34,7 +34,7 @@ def give_back_later() -> None:
 
 
 @contextlib.contextmanager
-def settled() -> Iterator[None]:
+def gc_frozen() -> Iterator[None]:
     """Within: what there is already is not looked through for garbage.
 
     Looking through all of what the libraries have made stops every Python thread for several refreshes.

@@ -22,18 +22,13 @@ def number(low: float, high: float, unit: str = "", *, help: str) -> Any:
     return typer.Option(help=f"{help} ({low:g} to {high:g})", callback=_checked(low, high, unit))
 
 
-def number_argument(low: float, high: float, unit: str = "", *, help: str) -> Any:
-    """As `number`, for an argument."""
-    return typer.Argument(help=f"{help} ({low:g} to {high:g})", callback=_checked(low, high, unit))
-
-
 def place(*, help: str) -> Any:
     """An option that is where an eye is: three coordinates, metres, no farther than the settings allow."""
     return typer.Option(help=help, metavar="X Y Z", callback=_checked(-EYE_MOST_M, EYE_MOST_M, "m"))
 
 
 @contextmanager
-def told_by_option(command: str, **given: Any) -> Iterator[None]:
+def blame_option(command: str, **given: Any) -> Iterator[None]:
     """An InputError about a setting that the command line gave names the option: `scene`, `model`; None: not given."""
     try:
         yield

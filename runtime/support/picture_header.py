@@ -71,7 +71,7 @@ def check_size(
 ) -> None:
     """Raises InputError for more pixels than the limit, with both figures. name: of a picture within `source`."""
     if max(width_px, height_px) > SIDE_MAX_PX or width_px * height_px > limits.pixels:
-        problem = f"has {width_px} x {height_px} pixels; at most {limits.pixels:,} (limits.pixels)"
+        problem = f"has {width_px} x {height_px} pixels; at most {limits.pixels:,}"
         raise InputError(source, field, f"{name} {problem}".strip())
 
 

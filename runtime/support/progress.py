@@ -6,12 +6,11 @@ listener raises ends the work: so a signal is heard within one step.
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from typing import TextIO
+from typing import Any, TextIO
 
 NOW_AND_THEN_S = 30.0  # between two lines where nobody watches
 
@@ -64,56 +63,50 @@ class NowAndThen:
 
     def __init__(self, stream: TextIO, *, every_s: float = NOW_AND_THEN_S) -> None:
         self._stream, self._every_s = stream, every_s
-        self._begin_s = self._told_s = time.monotonic()
+        self._begin_s = self._last_s = time.monotonic()
 
     def __call__(self, text: str) -> None:
         now_s = time.monotonic()
-        if now_s - self._told_s < self._every_s:
+        if now_s - self._last_s < self._every_s:
             return
-        self._told_s = now_s
+        self._last_s = now_s
         minutes, seconds = divmod(round(now_s - self._begin_s), 60)
         with suppress(OSError, ValueError):
             self._stream.write(f"{minutes}:{seconds:02} {text}\n")
             self._stream.flush()
 
 
-class TerminalLine:
-    """A listener that shows a task which takes long on one line of a terminal, and takes the line away at its end.
+class ShownProgress:
+    """A listener that shows a task which takes long: on a terminal with rich, elsewhere by a line now and then."""
 
-    Where the stream is no terminal it tells now and then.
-    """
-
-    def __init__(
-        self, stream: TextIO, *, after_s: float = 1.0, every_s: float = 0.25, now_and_then_s: float = NOW_AND_THEN_S
-    ) -> None:
-        self._stream, self._after_s, self._every_s = stream, after_s, every_s
-        self._now_and_then_s = now_and_then_s
+    def __init__(self, stream: TextIO, *, after_s: float = 1.0, now_and_then_s: float = NOW_AND_THEN_S) -> None:
+        self._stream, self._after_s, self._now_and_then_s = stream, after_s, now_and_then_s
         self._lines = NowAndThen(stream, every_s=now_and_then_s)
-        self._told: tuple[str, int, int | None] = ("", 0, None)
-        self._ended: threading.Event | None = None  # of the task under way
+        self._begun_s: float | None = None
+        self._shown: Any = None
 
     def __call__(self, what: str, done: int, total: int | None) -> None:
-        self._told = (what, done, total)
         if not what:
-            if self._ended is not None:
-                self._ended.set()
-                self._ended = None
-        elif not self._stream.isatty():
-            if done == 0 and total is None:
-                self._lines = NowAndThen(self._stream, every_s=self._now_and_then_s)
-            self._lines(what + (f": {done} of {total}" if total else f": {done}" if done else ""))
-        elif self._ended is None and done == 0:
-            self._ended = threading.Event()
-            threading.Thread(target=self._show, args=(self._ended,), name="progress", daemon=True).start()
-
-    def _show(self, ended: threading.Event) -> None:
-        if ended.wait(self._after_s):
+            self._begun_s = None
+            if self._shown is not None:
+                self._shown.stop()
+                self._shown = None
             return
-        with suppress(OSError, ValueError):
-            while not ended.wait(self._every_s):
-                what, done, total = self._told
-                count = f" {done} of {total}" if total else f" {done}" if done else ""
-                self._stream.write(f"\r\x1b[K{what}{count}")
-                self._stream.flush()
-            self._stream.write("\r\x1b[K")
-            self._stream.flush()
+        if self._begun_s is None:
+            self._begun_s = time.monotonic()
+            self._lines = NowAndThen(self._stream, every_s=self._now_and_then_s)
+        if not self._stream.isatty():
+            self._lines(what + (f": {done} of {total}" if total else f": {done}" if done else ""))
+        elif time.monotonic() - self._begun_s >= self._after_s:
+            self._show(what, done, total)
+
+    def _show(self, what: str, done: int, total: int | None) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+        if self._shown is None:
+            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+            self._shown = Progress(*columns, console=Console(file=self._stream), transient=True)
+            self._shown.add_task(what)
+            self._shown.start()
+        self._shown.update(0, description=what, completed=done, total=total)

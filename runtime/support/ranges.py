@@ -6,7 +6,6 @@ import math
 
 EYE_MOST_M = 50.0  # a coordinate of an eye, either way
 FOV_RANGE_DEG = (0.1, 179.0)  # least and most of a picture's horizontal field of view
-BUDGET_MOST_MS = 10_000.0  # for one frame
 RECORD_MOST_S = 604_800.0  # a week
 SCALE = (1e-6, 1e6)  # least and most of a frame's unit by another's: micrometres in metres, and the other way
 # What a value may have been given in, by its own unit: factor and name.

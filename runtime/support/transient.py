@@ -26,11 +26,11 @@ WORDS = (
 )
 
 
-class MayPass(TransientError):
+class RetryableError(TransientError):
     """The machine lacked something: start again. Its text is that of what went wrong."""
 
 
-def may_pass(error: BaseException | None) -> bool:
+def is_retryable(error: BaseException | None) -> bool:
     """Whether anything in an exception's chain is the machine's trouble of the moment, and not its input.
 
     Readers turn what the system refuses into an InputError that names the file; the system's own error is still its

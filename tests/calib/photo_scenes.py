@@ -2,14 +2,64 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import cv2
 import numpy as np
 
-from calib.board import marks
+from calib.board import board, marks
 from calib.detect_marks import SeenMarks
-from calib.placed import PlacedPanel, stack_from_pixels
-from calib.simulator import Lens, by_hand, phone
+from calib.placed import PlacedPanel, corner_pixels, in_frame_of, stack_from_pixels, through
+from calib.registration import Registration, homographies
+from calib.simulator import Exposure, Lens, Scene, by_hand, camera_rays, phone, photograph, smaller
 from runtime.optics.stack import PanelStack
+
+PHONE_MEGAPIXELS = 12.0
+HALF_WIDTH_95 = 1.959964
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What a registration is off by, in the frame of the reference panel."""
+
+    pixels: np.ndarray  # (K,) distance over an even grid of points of every panel but the reference
+    gap_m: np.ndarray  # (N-1,)
+    inside_95: Any  # (M,) which of the stated 95% intervals hold the truth: gaps, then corners' coordinates
+
+
+def errors_of(found: Registration, truth: tuple[PlacedPanel, ...]) -> Errors:
+    """Compare with the true panels, in any frame."""
+    stack, reference = found.stack, found.bundle.reference
+    true = in_frame_of(truth, reference=reference, reference_x_m=stack.x_m[reference])
+    matrices, corners = homographies(true, stack, found.eye_m), corner_pixels(stack)
+    moving = [index for index in range(stack.count) if index != reference]
+    off = np.stack([through(found.homographies[i], corners) - through(matrices[i], corners) for i in moving])
+    gap_m = np.diff(found.true_x_m) - np.diff([panel.axis_x_m for panel in true])
+    inside = np.concatenate([
+        np.abs(gap_m) <= HALF_WIDTH_95 * found.gap_sigma_m,
+        (np.abs(off) <= HALF_WIDTH_95 * found.corner_sigma_px[moving]).ravel(),
+    ])  # fmt: skip
+    pixels = [error_over_panel_px(found.homographies[i], matrices[i], stack) for i in moving]
+    return Errors(np.concatenate(pixels), gap_m, inside)
+
+
+def error_over_panel_px(found: np.ndarray, truth: np.ndarray, stack: PanelStack) -> np.ndarray:
+    """(K,) distance between two homographies at an even grid of a panel's points, pixels."""
+    u, v = np.meshgrid(np.linspace(0, stack.width_px, 17), np.linspace(0, stack.height_px, 10))
+    points = np.column_stack([u.ravel(), v.ravel()])
+    return np.linalg.norm(through(found, points) - through(truth, points), axis=1)
+
+
+def simulated_photographs(
+    stack: PanelStack, truth: tuple[PlacedPanel, ...], *, count: int, megapixels: float, random: np.random.Generator
+) -> list[np.ndarray]:
+    """`count` photographs (h, w) by hand of the boards on a stack, with one phone of many."""
+    layers = np.stack([board(stack, index) for index in range(stack.count)])
+    lens = smaller(phone(random=random), float(np.sqrt(megapixels / PHONE_MEGAPIXELS)))
+    scene, rays = Scene(stack, truth, layers), camera_rays(lens)
+    poses = by_hand(count, stack, random=random)
+    return [photograph(scene, lens, pose, Exposure(), random=random, rays=rays) for pose in poses]
 
 
 def points_of(

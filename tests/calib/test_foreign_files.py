@@ -9,22 +9,17 @@ from typing import Any
 
 import pytest
 
-from calib.capture_run import read_marks
 from calib.config_file import read_document
 from calib.grey import read_series
 from calib.pairs import PairsFile, read_pairs
-from calib.photo_run import read_photograph
+from calib.photographs import read_photograph
+from calib.service_files import gather
 from calib.setup_run import read_progress
-from calib.setup_service import gather
 from calib.store import save
-from calib.vernier import read_settings
-from calib.viewpoints import grid
-from runtime.config import Settings
 from runtime.errors import InputError
 from runtime.panels.lut import measured_curve
 
 READERS = {
-    "marks": lambda path: read_marks(path, grid()),
     "configuration": read_document,
     "grey series": read_series,
     "pairs": read_pairs,
@@ -33,7 +28,6 @@ READERS = {
     "progress of setup": read_progress,
     "configuration of the service": lambda path: gather(path, path.parent / "out"),
     "calibration that is kept": lambda path: save(path, "new"),
-    "verniers": lambda path: read_settings(path, Settings().stack.stack()),
     "lut": measured_curve,
 }
 

@@ -12,9 +12,9 @@ import pytest
 from typer.testing import CliRunner
 
 from calib.commands import app
-from calib.grey_chart import GREYS, Unusable, grey_chart, histograms, measure, patches
+from calib.grey_chart import Unusable, grey_chart, histograms, measure
 from calib.placed import ideal_panel
-from calib.simulator import Exposure, Scene, camera_from_stack, phone, photograph, smaller
+from calib.simulator import Exposure, Scene, camera_from_stack, camera_rays, phone, photograph, smaller
 from runtime.config import StackGeometry
 from runtime.errors import InputError
 from runtime.panels.lut import measured_curve
@@ -37,8 +37,9 @@ def photographs(curve: Callable[..., Any], *, count: int = 2, **changes: float) 
     lens = smaller(phone(random=random), 0.7)
     exposure = Exposure(**({"dark": 0.004, "gain": 0.85, "samples": 3} | changes))
     places = np.array([[0.75, 0.0, 0.0], [0.8, 0.1, 0.05], [0.8, -0.1, 0.0]])[:count]
+    rays = camera_rays(lens)
     return [
-        photograph(scene, lens, camera_from_stack(place, towards_m=np.zeros(3)), exposure, random=random)
+        photograph(scene, lens, camera_from_stack(place, towards_m=np.zeros(3)), exposure, random=random, rays=rays)
         for place in places
     ]
 
@@ -46,20 +47,6 @@ def photographs(curve: Callable[..., Any], *, count: int = 2, **changes: float) 
 @pytest.fixture(scope="module")
 def pictures() -> list[np.ndarray]:
     return photographs(phase_of)
-
-
-def test_every_grey_has_many_patches_all_over_the_panel() -> None:
-    for grey in GREYS:
-        mine = [patch for patch in patches(STACK, PANEL) if patch.grey == grey]
-        assert len(mine) >= 5
-        assert np.ptp([patch.left_px for patch in mine]) > STACK.width_px / 3
-
-
-def test_mixed_patches_hold_their_share_of_white_pixels() -> None:
-    chart = grey_chart(STACK, PANEL)
-    for patch in patches(STACK, PANEL):
-        area = chart[patch.top_px : patch.top_px + patch.side_px, patch.left_px : patch.left_px + patch.side_px]
-        assert area.mean() / 255 == pytest.approx(patch.share if patch.grey < 0 else patch.grey / 255)
 
 
 def test_two_photographs_tell_a_panels_curve_without_knowing_the_cameras(
@@ -70,7 +57,7 @@ def test_two_photographs_tell_a_panels_curve_without_knowing_the_cameras(
     for number, picture in enumerate(pictures):
         cv2.imwrite(str(folder / f"{number}.png"), picture)
     result = run.invoke(
-        app, ["panels", "grey", "--photos", str(folder), "--panel", str(PANEL), "--out", str(tmp_path / "lut.csv")]
+        app, ["grey", "--photos", str(folder), "--panel", str(PANEL), "--out", str(tmp_path / "lut.csv")]
     )
     assert result.exception is None
     lut = measured_curve(tmp_path / "lut.csv")[:, 1].astype(float)
@@ -100,16 +87,16 @@ def test_another_panels_chart_is_told(pictures: list[np.ndarray]) -> None:
 @pytest.mark.parametrize(
     "options",
     [
-        ["grey", "--out", "l.csv", "--photos", "none", "--panel", "1"],
-        ["grey", "--out", "l.csv", "--photos", "none"],
-        ["grey", "--out", "l.csv", "--photos", "none", "--typed"],
-        ["grey-chart", "--panel", "3", "--out", "c.png"],
-        ["grey-chart", "--panel", "1"],
+        ["--out", "l.csv", "--photos", "none", "--panel", "1"],
+        ["--out", "l.csv", "--photos", "none", "--series", "none"],
+        ["--photos", ".", "--panel", "1"],
+        ["--panel", "3", "--out", "c.png"],
+        ["--panel", "1"],
     ],
 )
 def test_wrong_requests_are_refused_and_leave_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert isinstance(run.invoke(app, ["panels", *options]).exception, InputError)
+    assert isinstance(run.invoke(app, ["grey", *options]).exception, InputError)
     assert list(tmp_path.iterdir()) == []

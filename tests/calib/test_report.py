@@ -47,22 +47,12 @@ def test_the_page_holds_numbers_and_pictures_and_needs_nothing_else(tmp_path: Pa
     assert told["points"] == 27
     assert told["rejected"] == 1
     page = (out / "index.html").read_text()
-    assert page.count("data:image/png;base64,") == 3
+    assert page.count("data:image/png;base64,") == 2
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
     for text in ("residual, RMS", "robust", "condition", "expected error at the eye", "line 7", "rejected"):
         assert text in page
-    for name in ("residuals.png", "geometry.png", "eye-error.png"):
+    for name in ("residuals.png", "geometry.png"):
         assert read_image(out / name).std() > 5
-
-
-def test_its_numbers_are_those_of_the_solution(
-    tmp_path: Path, calibration: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray
-) -> None:
-    told = report(str(calibration), "--out", str(tmp_path / "r"))
-    assert 2 < told["rms_mm"] < 8
-    assert told["axis_rms_mm"] == pytest.approx(told["axis_rms_mm"])
-    assert np.hypot.reduce(told["axis_rms_mm"]) == pytest.approx(told["rms_mm"])
-    assert told["eye_error_mm"] < told["eye_error_p95_mm"] < 10
 
 
 def test_the_published_prototype_is_reported_without_its_points(tmp_path: Path) -> None:
@@ -74,19 +64,7 @@ def test_the_published_prototype_is_reported_without_its_points(tmp_path: Path) 
     assert told["eye_error_mm"] is None
     page = (tmp_path / "r" / "index.html").read_text()
     assert "far from 1" in page
-    assert "--pairs" in page
-
-
-def test_the_points_can_be_given(
-    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
-) -> None:
-    path = tmp_path / "plain.toml"
-    from runtime.eyes.demo_geometry import demo_stack_from_sensor
-
-    path.write_text(f"stack_from_sensor = {demo_stack_from_sensor().tolist()}\n")
-    pairs = write_pairs(measured(sigma_m=0.002), known_m)
-    told = report(str(path), "--out", str(tmp_path / "r"), "--pairs", str(pairs))
-    assert told["rms_mm"] == pytest.approx(0.002e3 * np.sqrt(3), rel=0.2)
+    assert "holds no pairs" in page
 
 
 def test_what_a_file_says_is_not_taken_for_markup(tmp_path: Path) -> None:
@@ -112,11 +90,3 @@ def test_spoiled_points_are_refused_and_nothing_is_written(tmp_path: Path, data:
     with pytest.raises(InputError, match="data"):
         report(str(path), "--out", str(tmp_path / "r"))
     assert not (tmp_path / "r").exists()
-
-
-def test_the_methods_table_is_written_with_its_plots(tmp_path: Path) -> None:
-    result = run.invoke(app, ["methods", "--out", str(tmp_path / "m"), "--seeds", "2", "--pairs-max", "100", "--json"])
-    assert result.exit_code == 0, result.output
-    told = json.loads((tmp_path / "m" / "methods.json").read_text())
-    assert [case["sigma_m"] for case in told["cases"]["clean"]] == [0.0, 0.001, 0.003, 0.01, 0.03]
-    assert (tmp_path / "m" / "index.html").read_text().count("data:image/png;base64,") == 6

@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import json
 import os
+import pty
 import shutil
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
+from calib.hardware import SimulatedHardware
 from calib.keys import Key
-from calib.message import message_layers
-from calib.misregistration import corrected
-from calib.placed import ideal_panel, true_from_ideal_seen
-from calib.registration import through
+from calib.placed import ideal_panel, in_frame_of, through, true_from_ideal_seen
 from calib.setup_run import progress_path, read_progress, walk_through
 from calib.setup_steps import STEPS, Setup, geometry, identify
-from calib.setup_world import SimulatedWorld
-from calib.viewpoints import IPD_M, eyes_at, grid, viewing_place_m
+from calib.viewpoints import grid
 from runtime.config import Settings, load_settings
 from runtime.errors import InputError
 from runtime.eyes.calibration import load_calibration
@@ -36,28 +36,32 @@ STACK = Settings().stack.stack()
 UP, DOWN, RIGHT, LEFT = "\x1b[A", "\x1b[B", "\x1b[C", "\x1b[D"
 
 
-def answers_of(world: SimulatedWorld) -> str:
+def simulated(seed: int) -> SimulatedHardware:
+    return SimulatedHardware(lambda: None, STACK, say=lambda text: None, seed=seed)
+
+
+def answers_of(hardware: SimulatedHardware) -> str:
     """The keys of a person who looks at a simulated display's cards, rear to front."""
     keys, shown, taken = "", 0, []
-    for panel in range(len(world.order)):
-        wanted = world.order.index(panel)
+    for panel in range(len(hardware.order)):
+        wanted = hardware.order.index(panel)
         while shown != wanted:
             keys += "n"
-            shown = (shown + 1) % len(world.order)
+            shown = (shown + 1) % len(hardware.order)
             while shown in taken:
-                shown = (shown + 1) % len(world.order)
-        rotation_deg, mirror = world.mounted[wanted]
+                shown = (shown + 1) % len(hardware.order)
+        rotation_deg, mirror = hardware.mounted[wanted]
         keys += "\n" + (DOWN if rotation_deg else UP) + ("n" if mirror != "none" else "\n")
         taken.append(wanted)
-        while len(taken) < len(world.order) and shown in taken:
-            shown = (shown + 1) % len(world.order)
+        while len(taken) < len(hardware.order) and shown in taken:
+            shown = (shown + 1) % len(hardware.order)
     return keys
 
 
 def every_key(seed: int) -> str:
-    world = SimulatedWorld(STACK, seed=seed)
+    hardware = simulated(seed)
     steps = [
-        "\n" + answers_of(world),
+        "\n" + answers_of(hardware),
         "\n" + DOWN + RIGHT + LEFT + "\n",
         "\n",
         "\n" + "\n" * len(STACK.x_m),
@@ -77,16 +81,18 @@ def setup_command(folder: Path, keys: str, *options: str) -> subprocess.Complete
 
 
 @pytest.fixture(scope="module")
-def set_up(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str], SimulatedWorld]:
+def set_up(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[Path, subprocess.CompletedProcess[str], SimulatedHardware]:
     folder = tmp_path_factory.mktemp("setup")
     done = setup_command(folder, every_key(5), "--simulate", "--seed", "5")
-    return folder, done, SimulatedWorld(STACK, seed=5)
+    return folder, done, simulated(5)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_keys_alone_lead_from_nothing_to_a_configuration_that_is_valid(
-    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedWorld],
+    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedHardware],
 ) -> None:
     folder, done, _ = set_up
     assert done.returncode == 0, done.stdout + done.stderr
@@ -97,25 +103,25 @@ def test_keys_alone_lead_from_nothing_to_a_configuration_that_is_valid(
     told = json.loads((folder / "out" / "setup.json").read_text())
     assert told["finished"]
     assert set(told["done"]) == {step.name for step in STEPS}
-    assert "eyes see" in (folder / "out" / "index.html").read_text()
+    assert "error of the eyes&#39; places" in (folder / "out" / "index.html").read_text()
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_every_panel_is_bound_to_its_monitor_as_it_is_mounted(
-    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedWorld],
+    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedHardware],
 ) -> None:
-    folder, _, world = set_up
+    folder, _, hardware = set_up
     for index, panel in enumerate(load_settings(folder / "new.toml").output.panels):
-        monitor = world.order.index(index)
+        monitor = hardware.order.index(index)
         assert panel.edid_serial == f"S{monitor}"
-        assert (panel.rotation_deg, panel.mirror) == world.mounted[monitor]
+        assert (panel.rotation_deg, panel.mirror) == hardware.mounted[monitor]
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_the_sensor_is_found_where_it_stands(
-    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedWorld],
+    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedHardware],
 ) -> None:
     folder, _, _ = set_up
     settings = load_settings(folder / "new.toml")
@@ -123,6 +129,19 @@ def test_the_sensor_is_found_where_it_stands(
     eyes = np.array([viewpoint.midpoint_m for viewpoint in grid()])
     sensor = np.column_stack([eyes, np.ones(27)]) @ np.linalg.inv(demo_stack_from_sensor()).T
     assert np.linalg.norm((sensor @ found.T)[:, :3] - eyes, axis=1).mean() < 0.002
+
+
+def corrected(layers: np.ndarray, true_from_ideal: list[np.ndarray]) -> np.ndarray:
+    """The layers as the presentation shader shows them on registered panels: bicubic, black beyond the edges."""
+    half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+    height, width = layers.shape[1:3]
+    shown = [
+        layer
+        if np.array_equal(matrix, np.eye(3))
+        else cv2.warpPerspective(layer, np.linalg.inv(half) @ matrix @ half, (width, height), flags=cv2.INTER_CUBIC)
+        for layer, matrix in zip(layers, true_from_ideal, strict=True)
+    ]
+    return np.stack(shown)
 
 
 class TrueStackView(CarriedView):
@@ -139,30 +158,30 @@ class TrueStackView(CarriedView):
             yield places[:, 0].reshape(u.shape), places[:, 1].reshape(v.shape)
 
 
-def sent_through(layers: np.ndarray, settings: Settings, world: SimulatedWorld, *, curves: bool) -> np.ndarray:
+def sent_through(layers: np.ndarray, settings: Settings, hardware: SimulatedHardware, *, curves: bool) -> np.ndarray:
     """(N, h, w, 3) codes of the phases that the simulated panels turn to for layers, by their configured curves."""
     found = np.empty_like(layers)
     for index, panel in enumerate(settings.output.panels):
         greys = np.rint(255 * (lut.measured_curve(Path(panel.lut)) if curves else lut.identity()))[:, 0] / 255
-        found[index] = np.rint(255 * world.phase_of(index, greys)).astype(np.uint8)[layers[index]]
+        found[index] = np.rint(255 * hardware.phase_of(index, greys)).astype(np.uint8)[layers[index]]
     return found
 
 
 def carried_db(
-    light: Path, settings: Settings, panels: Any, *, registered: bool, world: SimulatedWorld | None = None,
+    light: Path, settings: Settings, panels: Any, *, registered: bool, hardware: SimulatedHardware | None = None,
     curves: bool = True,
 ) -> float:  # fmt: skip
     """Displayed dB (docs/contracts.md) of what a run left of a refresh's light, on panels that stand where they do.
 
-    world: whose panels turn to what their monitors make of a grey; none: they follow exactly.
+    hardware: whose panels turn to what their monitors make of a grey; none: they follow exactly.
     """
     told = json.loads((light / "light.json").read_text())
     stack = replace(settings.stack.stack(), tilt=None)
     layers = np.stack([read_image(light / f"layer-{index}.png") for index in range(stack.count)])
     if registered:
         layers = corrected(layers, [np.array(panel.homography) for panel in settings.output.panels])
-    if world is not None:
-        layers = sent_through(layers, settings, world, curves=curves)
+    if hardware is not None:
+        layers = sent_through(layers, settings, hardware, curves=curves)
     errors = []
     for side, name in enumerate(("left", "right")):
         drawn = read_image(light / f"drawn-{name}.png")
@@ -178,10 +197,10 @@ def carried_db(
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_a_run_of_it_shows_the_eyes_within_a_decibel_of_a_perfect_stack(
-    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedWorld], tmp_path: Path
+    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedHardware], tmp_path: Path
 ) -> None:
     """The run's own light, sent through the registration to the panels where they truly are."""
-    folder, _, world = set_up
+    folder, _, hardware = set_up
     command = [sys.executable, "-m", "runtime.cli", "run", "--config", str(folder / "new.toml"), "--replay", "demo",
                "--headless", "--max-speed", "--frames", "31", "--keep-light", "15",
                "--out", str(tmp_path / "run")]  # fmt: skip
@@ -193,16 +212,16 @@ def test_a_run_of_it_shows_the_eyes_within_a_decibel_of_a_perfect_stack(
     ideal = tuple(ideal_panel(settings.stack.stack(), index) for index in range(3))
     perfect = carried_db(light, settings, ideal, registered=False)
     assert perfect > 28.0
-    true = world.true_panels()
-    assert perfect - carried_db(light, settings, true, registered=True, world=world) < 1.0
-    assert perfect - carried_db(light, settings, true, registered=False, world=world) > 5.0
-    assert perfect - carried_db(light, settings, true, registered=True, world=world, curves=False) > 5.0
+    true = in_frame_of(hardware.true_panels, reference=1, reference_x_m=0.0)
+    assert perfect - carried_db(light, settings, true, registered=True, hardware=hardware) < 1.0
+    assert perfect - carried_db(light, settings, true, registered=False, hardware=hardware) > 5.0
+    assert perfect - carried_db(light, settings, true, registered=True, hardware=hardware, curves=False) > 5.0
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_what_the_service_reads_is_gathered_and_stands_by_itself(
-    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedWorld], tmp_path: Path
+    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedHardware], tmp_path: Path
 ) -> None:
     folder, _, _ = set_up
     there = shutil.copytree(folder / "out" / "service", tmp_path / "etc")
@@ -218,12 +237,9 @@ class Scripted:
 
     def __init__(self, tmp_path: Path, keys: list[Key]) -> None:
         self.said: list[str] = []
-        self.world = SimulatedWorld(STACK, seed=1)
-        self.world.listen(self.said.append)
         pressed = iter(keys)
-        self.setup = Setup(
-            tmp_path / "c.toml", tmp_path / "out", self.world, lambda: next(pressed, Key.QUIT), self.said.append
-        )
+        self.hardware = SimulatedHardware(lambda: next(pressed, Key.QUIT), STACK, say=self.said.append, seed=1)
+        self.setup = Setup(tmp_path / "c.toml", tmp_path / "out", self.hardware, self.said.append)
 
 
 def test_a_step_that_is_done_is_where_it_goes_on_after(tmp_path: Path) -> None:
@@ -259,20 +275,10 @@ def test_sizes_are_set_with_arrows_and_measured_distances_stay(tmp_path: Path) -
     assert load_settings(config).stack.x_m == pytest.approx((-0.0587, 0.0, 0.0587))
 
 
-def test_who_knows_the_distance_of_their_eyes_says_so_and_may_take_it_back(tmp_path: Path) -> None:
-    down = [Key.DOWN] * 5
-    geometry(Scripted(tmp_path, [*down, Key.RIGHT, Key.RIGHT, Key.ACCEPT]).setup)
-    assert load_settings(tmp_path / "c.toml").calibration.ipd_m == pytest.approx(IPD_M + 0.0005)
-    geometry(Scripted(tmp_path, [*down, Key.ACCEPT]).setup)
-    assert load_settings(tmp_path / "c.toml").calibration.ipd_m == pytest.approx(IPD_M + 0.0005)
-    geometry(Scripted(tmp_path, [*down, *[Key.LEFT] * 40, Key.ACCEPT]).setup)
-    assert load_settings(tmp_path / "c.toml").calibration.ipd_m == 0.0
-
-
 def test_panels_already_known_keep_their_registration_when_they_are_identified_again(tmp_path: Path) -> None:
-    world = SimulatedWorld(STACK, seed=1)
+    hardware = simulated(1)
     meanings = {"\n": Key.ACCEPT, "n": Key.NEXT, UP: Key.UP, DOWN: Key.DOWN}
-    keys, rest = [], answers_of(world)
+    keys, rest = [], answers_of(hardware)
     while rest:
         piece = rest[:3] if rest.startswith("\x1b") else rest[:1]
         keys, rest = [*keys, meanings[piece]], rest[len(piece) :]
@@ -290,11 +296,36 @@ def test_progress_that_is_not_ours_is_refused(tmp_path: Path) -> None:
         read_progress(progress_path(tmp_path / "c.toml"))
 
 
-def test_words_stand_on_one_panel_and_the_others_are_clear() -> None:
-    layers = message_layers(STACK, ["Step 1 of 5: ä long line " * 6, "Enter: do it"])
-    assert not layers[0, ..., :3].any()
-    assert not layers[2, ..., :3].any()
-    assert 0.002 < (layers[1, ..., 0] > 128).mean() < 0.2
+def processor_s(process: int) -> float:
+    """Processor time that a process has used."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def test_a_simulated_card_is_shown_in_the_terminal_and_waiting_for_a_key_is_no_work(tmp_path: Path) -> None:
+    terminal, other_end = pty.openpty()
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "TERM": "xterm-256color"}
+    command = [sys.executable, "-m", "runtime.cli", "setup", "--simulate"]
+    with subprocess.Popen(
+        command, stdin=other_end, stdout=other_end, stderr=other_end, cwd=tmp_path,
+        env=environment | {"COLORTERM": "truecolor"},
+    ) as running:  # fmt: skip
+        try:
+            shown = b""
+            for wanted, key in ((b"Step 1 of 7", b"\n"), (b"simulated: it is panel", b"")):
+                while wanted not in shown:
+                    shown += os.read(terminal, 65536)
+                os.write(terminal, key)
+            assert shown.count("▀".encode()) > 1000
+            before = processor_s(running.pid)
+            time.sleep(4)
+            assert processor_s(running.pid) - before < 0.8
+            os.write(terminal, b"qq")
+            assert running.wait(timeout=60) == 0
+        finally:
+            running.kill()
+            os.close(other_end)
+            os.close(terminal)
 
 
 def test_nothing_is_asked_of_a_terminal_that_is_closed(tmp_path: Path) -> None:
@@ -302,14 +333,3 @@ def test_nothing_is_asked_of_a_terminal_that_is_closed(tmp_path: Path) -> None:
     assert done.returncode == 0
     assert "not done: identify" in done.stdout
     assert list(tmp_path.iterdir()) == []
-
-
-def test_photographs_and_a_device_are_one_or_the_other(tmp_path: Path) -> None:
-    done = setup_command(tmp_path, "", "--photos", "a", "--device", "0")
-    assert done.returncode == 2
-    assert done.stderr.startswith("phasestack: setup: --photos")
-
-
-def test_viewing_place_is_before_the_display() -> None:
-    eyes = eyes_at(viewing_place_m(Settings().calibration))
-    assert eyes[0, 1] < 0 < eyes[1, 1]

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from calib.board import board
-from calib.message import message_layers
-from calib.photo_trial import simulated_photographs
+from calib.display import message_layers
 from calib.placed import misplaced
 from calib.setup_steps import STEPS
 from runtime.config import load_settings
 from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import write_png
+from tests.calib.photo_scenes import simulated_photographs
 from tests.panels import xserver
 from tests.panels.xserver import HEIGHT_PX, WIDTH_PX
 from tests.waiting import eventually

@@ -49,15 +49,6 @@ def test_the_least_squares_residual_is_never_above_the_seeds(seed: int, sigma_m:
     assert residual["least-squares"] <= residual["inverse"] * (1 + 1e-12)
 
 
-@given(st.integers(0, 1000), st.floats(0.001, 0.05))
-def test_the_seeds_scale_lies_between_the_two_optima(seed: int, sigma_m: float) -> None:
-    points = cloud(seed)
-    sensor = points + np.random.default_rng(seed + 1).normal(scale=sigma_m, size=points.shape)
-    low, middle, high = (float(fit(sensor, points, rule=rule).scale) for rule in ("least-squares", "seed", "inverse"))
-    assert low <= middle <= high
-    assert middle == pytest.approx(np.sqrt(low * high), rel=1e-12)
-
-
 def test_least_squares_is_the_minimum_of_the_seeds_objective() -> None:
     """Against a general minimiser that knows nothing of SVD (EyeReal supplement, (20))."""
     points = cloud(3)
@@ -74,13 +65,6 @@ def test_least_squares_is_the_minimum_of_the_seeds_objective() -> None:
     assert ((found.points(sensor) - points) ** 2).sum() == pytest.approx(best.fun, rel=1e-6)
 
 
-def test_inverse_is_least_squares_the_other_way_round() -> None:
-    points = cloud(5)
-    sensor = 0.5 * points + np.random.default_rng(0).normal(scale=0.02, size=points.shape)
-    there, back = fit(sensor, points, rule="inverse"), fit(points, sensor, rule="least-squares")
-    np.testing.assert_allclose(there.matrix @ back.matrix, np.eye(4), atol=1e-12)
-
-
 def test_noise_on_the_sensors_side_shrinks_least_squares_and_not_inverse() -> None:
     random = np.random.default_rng(0)
     points = np.broadcast_to(cloud(1), (2000, 27, 3))
@@ -90,33 +74,12 @@ def test_noise_on_the_sensors_side_shrinks_least_squares_and_not_inverse() -> No
     assert true == pytest.approx(1.0, abs=0.02)
 
 
-def test_a_known_scale_is_kept() -> None:
-    points = cloud(2)
-    assert fit(points * 1.1, points, rule=0.9).scale == pytest.approx(0.9, rel=1e-15)
-
-
 @pytest.mark.parametrize("rule", RULES)
 def test_scipys_rotation_is_the_same(rule: str) -> None:
     points = cloud(7)
     sensor = Rotation.from_rotvec([1, 2, 3]).apply(points) + np.random.default_rng(0).normal(scale=0.01, size=(27, 3))
     reference, _ = Rotation.align_vectors(points - points.mean(0), sensor - sensor.mean(0))
     np.testing.assert_allclose(fit(sensor, points, rule=rule).rotation, reference.as_matrix(), atol=1e-12)
-
-
-def test_mirrored_points_never_give_a_mirrored_rotation() -> None:
-    points = cloud(4)
-    for axis in np.eye(3):
-        assert np.linalg.det(fit(points * (1 - 2 * axis), points, rule="inverse").rotation) == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize("rule", RULES)
-def test_weights_count_like_repetitions(rule: str) -> None:
-    points, random = cloud(6, 10), np.random.default_rng(0)
-    sensor = points + random.normal(scale=0.01, size=points.shape)
-    weights = random.integers(0, 4, 10).astype(float)
-    repeated = np.repeat(np.arange(10), weights.astype(int))
-    once = fit(sensor[repeated], points[repeated], rule=rule)
-    np.testing.assert_allclose(fit(sensor, points, rule=rule, weights=weights).matrix, once.matrix, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -111,14 +111,6 @@ def test_the_polish_saves_digits_that_the_covariance_alone_loses() -> None:
     assert polished < 1e-4 * plain
 
 
-@pytest.mark.parametrize("axis", np.vstack([np.eye(3), [[0.6, 0.8, 0.0], [-0.5, 0.5, 0.7]]]).tolist())
-def test_half_turns_are_no_special_case(axis: list[float]) -> None:
-    stack = scene()[1]
-    turn = Rotation.from_rotvec(np.pi * np.array(axis) / np.linalg.norm(axis))
-    found = fit(turn.inv().apply(stack), stack, rule="inverse")
-    np.testing.assert_allclose(found.rotation, turn.as_matrix(), atol=8 * DIGITS)
-
-
 def test_a_mirrored_cloud_gets_the_same_best_rotation_as_with_50_digits() -> None:
     sensor, stack = scene()
     sensor = sensor * [1, 1, -1]

@@ -66,16 +66,6 @@ def test_every_method_can_be_asked_for(
     assert load_calibration(tmp_path / "c.toml").method == method
 
 
-def test_the_error_figures_are_told(
-    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
-) -> None:
-    told = solve(write_pairs(measured(sigma_m=0.003), known_m), tmp_path / "c.toml")
-    assert 0 < told["rms_mm"] < told["max_mm"] < 20
-    assert told["leave_one_out_mm"] > told["rms_mm"]
-    assert len(told["axis_rms_mm"]) == 3
-    assert 1 < told["condition"] < 3
-
-
 def test_the_sensors_serial_travels_from_the_pairs_to_the_runtimes_check(
     tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
 ) -> None:
@@ -95,22 +85,6 @@ def test_outliers_are_named(
     assert told["method"] == "robust"
     assert told["outliers"] == ["line 6", "line 22"]
     assert any("line 6, line 22: rejected" in warning for warning in told["warnings"])
-
-
-def test_one_pair_beyond_the_seeds_five_centimetres_is_named(
-    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
-) -> None:
-    sensor = measured(sigma_m=0.001)
-    sensor[3] += [0.0, 0.09, 0.0]
-    told = solve(write_pairs(sensor, known_m), tmp_path / "c.toml", "--method", "inverse")
-    assert any("line 5: residual beyond 50 mm" in warning for warning in told["warnings"])
-
-
-def test_units_that_together_make_a_scale_that_no_calibration_has_are_refused(
-    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
-) -> None:
-    units = ("--sensor-unit", "1e6", "--stack-unit", "1e-6")
-    assert "stack_from_sensor: has scale 1e-12" in refusal(write_pairs(measured(), known_m), tmp_path, *units)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -137,24 +111,6 @@ def test_three_pairs_and_more_are_enough(
     np.testing.assert_allclose(
         load_calibration(tmp_path / "c.toml").stack_from_sensor, demo_stack_from_sensor(), atol=1e-9
     )
-
-
-def test_coincident_points_are_refused(tmp_path: Path, known_m: np.ndarray, write_pairs: Callable[..., Path]) -> None:
-    assert "coincide" in refusal(write_pairs(np.ones((27, 3)), known_m), tmp_path)
-
-
-def test_viewpoints_all_but_in_one_place_are_refused(
-    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
-) -> None:
-    close = known_m.mean(0) + 1e-3 * (known_m - known_m.mean(0))
-    assert "do not determine" in refusal(write_pairs(measured(close), close), tmp_path)
-
-
-def test_collinear_points_are_refused(
-    tmp_path: Path, measured: Callable[..., np.ndarray], write_pairs: Callable[..., Path]
-) -> None:
-    line = np.outer(np.linspace(0.3, 0.9, 9), [1.0, 0.1, 0.2])
-    assert "on one line" in refusal(write_pairs(measured(line), line), tmp_path)
 
 
 @pytest.mark.parametrize("aspect", [1e-2, 1e-3, 1e-5])
@@ -192,24 +148,20 @@ def test_mirrored_data_are_refused(
     assert "mirror" in refusal(write_pairs(measured(sigma_m=sigma_m) * mirror, known_m), tmp_path)
 
 
-@pytest.mark.parametrize(("scale", "option"), [(1000.0, "--stack-unit"), (0.001, "--sensor-unit")])
-def test_millimetres_on_one_side_are_refused_and_can_be_declared(
+@pytest.mark.parametrize(("scale", "side"), [(1000.0, "stack"), (0.001, "sensor")])
+def test_millimetres_on_one_side_are_refused(
     tmp_path: Path,
     measured: Callable[..., np.ndarray],
     known_m: np.ndarray,
     write_pairs: Callable[..., Path],
     scale: float,
-    option: str,
+    side: str,
 ) -> None:
     mixed = (measured(scale=scale), known_m) if scale < 1 else (measured(), known_m * 1000)
     path = write_pairs(*mixed)
     message = refusal(path, tmp_path)
     assert "units are mixed" in message
-    assert option in message
-    solve(path, tmp_path / "c.toml", option, "0.001")
-    np.testing.assert_allclose(
-        load_calibration(tmp_path / "c.toml").stack_from_sensor, demo_stack_from_sensor(), atol=1e-9
-    )
+    assert f"{side} is in millimetres" in message
 
 
 def test_repeated_rows_are_left_out_and_named(
@@ -219,14 +171,6 @@ def test_repeated_rows_are_left_out_and_named(
     told = solve(write_pairs(measured(sigma_m=0.001)[twice], known_m[twice]), tmp_path / "c.toml")
     assert told["pairs"] == 27
     assert any("line 29: repeats" in warning for warning in told["warnings"])
-
-
-def test_nan_rows_are_refused_with_their_line(
-    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
-) -> None:
-    sensor = measured()
-    sensor[7, 1] = np.nan
-    assert "line 9, sensor_y: is not finite" in refusal(write_pairs(sensor, known_m), tmp_path)
 
 
 def test_pairs_that_do_not_fit_are_refused_with_a_hint(
@@ -239,44 +183,12 @@ def test_pairs_that_do_not_fit_are_refused_with_a_hint(
     assert "robust" in message
 
 
-def test_pairs_that_do_not_belong_together_are_refused(
-    tmp_path: Path, known_m: np.ndarray, write_pairs: Callable[..., Path]
-) -> None:
-    shuffled = np.random.default_rng(3).permutation(known_m)
-    refusal(write_pairs(shuffled, known_m), tmp_path)
-
-
-def test_an_unknown_method_is_refused(
+def test_past_versions_are_kept(
     tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
 ) -> None:
-    assert "--method" in refusal(write_pairs(measured(), known_m), tmp_path, "--method", "magic")
-
-
-def test_past_versions_are_kept_and_come_back(
-    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
-) -> None:
-    out = tmp_path / "c.toml"
-    texts = []
+    out, texts = tmp_path / "c.toml", []
     for seed in range(3):
         solve(write_pairs(measured(sigma_m=0.002, seed=seed), known_m), out)
         texts.append(out.read_text())
-    for expected in (texts[1], texts[0]):
-        replaced = out.read_text()
-        assert run.invoke(app, ["solve", "--out", str(out), "--rollback"]).exit_code == 0
-        assert out.read_text() == expected
-        assert (tmp_path / "c.undone.toml").read_text() == replaced
-    result = run.invoke(app, ["solve", "--out", str(out), "--rollback"])
-    assert isinstance(result.exception, InputError)
-    assert out.read_text() == texts[0]
-
-
-def test_a_broken_past_version_is_not_put_back(
-    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
-) -> None:
-    out = tmp_path / "c.toml"
-    for seed in range(2):
-        solve(write_pairs(measured(sigma_m=0.002, seed=seed), known_m), out)
-    good = out.read_text()
-    (tmp_path / "c.1.toml").write_text("broken")
-    assert isinstance(run.invoke(app, ["solve", "--out", str(out), "--rollback"]).exception, InputError)
-    assert out.read_text() == good
+    kept = [(tmp_path / name).read_text() for name in ("c.1.toml", "c.2.toml", "c.toml")]
+    assert kept == texts

@@ -1,4 +1,4 @@
-"""Charts and verniers on real windows of a real X server, with keys that are really pressed."""
+"""A chart on real windows of a real X server, with keys that are really pressed."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.charts import eye_chart
-from calib.vernier import nominal, read_settings
-from calib.viewpoints import grid
+from calib.grey_chart import grey_chart
 from runtime.optics.stack import PanelStack
 from tests.panels import xserver
 from tests.panels.xserver import HEIGHT_PX, WIDTH_PX
@@ -33,7 +31,7 @@ height_px = {HEIGHT_PX}
 [output]
 kind = "windows"
 """ + "".join(f'[[output.panels]]\nconnector = "DUMMY{index}"\n' for index in range(3))
-RETURN, RIGHT, Q = 0xFF0D, 0xFF53, 0x71  # X key symbols
+Q = 0x71  # X key symbol
 
 
 @pytest.fixture(scope="module")
@@ -87,35 +85,10 @@ def shows(screen: xserver.XServer, monitor: int, expected: np.ndarray) -> bool:
     return eventually(lambda: np.array_equal(screen.panel(monitor)[..., 0], expected), within_s=30)
 
 
-def test_charts_are_shown_one_after_the_other(screen: xserver.XServer, phasestack: Any) -> None:
-    viewpoint = grid()[4]
-    running = phasestack("charts", "--show", "--kind", "seed", "--viewpoint", viewpoint.name)
-    charts = [
-        eye_chart(viewpoint, STACK, side=side, index=index, ipd_m=0.06) for index in range(2) for side in range(2)
-    ]
-    assert shows(screen, 0, charts[0])
-    assert not screen.panel(1).any()
-    assert not screen.panel(2).any()
-    press(screen, RETURN)
-    assert shows(screen, 0, charts[1])
-    running.stdin.write(b"n")
-    running.stdin.flush()
-    assert shows(screen, 1, charts[2])
+def test_a_chart_is_shown_until_a_key_is_pressed_on_a_panel(screen: xserver.XServer, phasestack: Any) -> None:
+    running = phasestack("grey", "--panel", "1", "--show")
+    assert shows(screen, 1, grey_chart(STACK, 1))
     assert not screen.panel(0).any()
+    assert not screen.panel(2).any()
     press(screen, Q)
     assert running.wait(timeout=60) == 0
-
-
-def test_a_vernier_is_nudged_with_the_keyboard_and_kept(
-    screen: xserver.XServer, phasestack: Any, tmp_path: Path
-) -> None:
-    out = tmp_path / "vernier.csv"
-    running = phasestack("panels", "vernier", "--eye", "0.5", "0", "0", "--out", str(out))
-    assert eventually(lambda: screen.panel(0).any() and screen.panel(1).any(), within_s=30)
-    press(screen, RIGHT)
-    press(screen, RETURN)
-    assert eventually(out.exists)
-    running.stdin.close()
-    assert running.wait(timeout=60) == 0
-    asked, (taken,) = nominal((0.5, 0.0, 0.0), STACK, reference=1)[0], read_settings(out, STACK)
-    assert taken.panel_px == pytest.approx((asked.panel_px[0] + 1.0, asked.panel_px[1]))

@@ -110,13 +110,6 @@ def test_half_a_pair_is_named(tmp_path: Path, context: Any, stack: PanelStack) -
         read_folder(tmp_path, LEGO)
 
 
-def test_a_half_that_is_there_twice_is_named(tmp_path: Path) -> None:
-    for x, half in ((6.0, 0), (6.0, 1), (7.0, 1)):
-        (tmp_path / f"pair3_x{x}_y{half}_z2.0_{half}.jpg").write_bytes(b"")
-    with pytest.raises(InputError, match=r"pair3_x7.0_y1_z2.0_1.jpg: pair3: _1 is there twice"):
-        read_folder(tmp_path, LEGO)
-
-
 def test_newer_data_name_the_eyes_left_and_right(tmp_path: Path, context: Any, stack: PanelStack) -> None:
     write_pair(tmp_path, context, stack)
     for half, side in (("1", "left"), ("0", "right")):
@@ -128,21 +121,6 @@ def test_newer_data_name_the_eyes_left_and_right(tmp_path: Path, context: Any, s
     assert pair.eyes_m[0, 1] < pair.eyes_m[1, 1]
 
 
-@pytest.mark.parametrize(
-    ("names", "said"),
-    [
-        (("y-0.3_z2.0_right", "y0.2_z2.0_left"), "_left stands to the right of _right with preset lego_bulldozer"),
-        (("y-0.3_z2.0_left",), "has no _right beside it"),
-        (("y-0.3_z2.0_left", "y0.2_z2.0_right", "y0.2_z2.0_1"), "has _1 beside _left and _right"),
-    ],
-)
-def test_names_of_sides_that_make_no_pair_are_told(tmp_path: Path, names: tuple[str, ...], said: str) -> None:
-    for name in names:
-        (tmp_path / f"pair0_x6.0_{name}.jpg").write_bytes(b"")
-    with pytest.raises(InputError, match=f"pair0: {said}"):
-        read_folder(tmp_path, LEGO)
-
-
 def test_a_folder_without_pairs_and_a_truncated_picture_are_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds no pair0"):
         read_folder(tmp_path, LEGO)
@@ -150,13 +128,6 @@ def test_a_folder_without_pairs_and_a_truncated_picture_are_told(tmp_path: Path)
         (tmp_path / f"pair0_x6.0_y{y}_z2.0_{half}.jpg").write_bytes(b"\xff\xd8\xff broken")
     with pytest.raises(InputError, match="not an image"):
         EyeRealSource(read_folder(tmp_path, LEGO), fov_deg=40, background=(1, 1, 1), name="lego")
-
-
-def test_an_eye_behind_the_display_is_told(tmp_path: Path) -> None:
-    for half, y in ((0, 0.2), (1, -0.2)):
-        (tmp_path / f"pair0_x-6.0_y{y}_z2.0_{half}.jpg").write_bytes(b"")
-    with pytest.raises(InputError, match="behind the display"):
-        read_folder(tmp_path, LEGO)
 
 
 def test_a_folder_of_any_name_is_read_as_the_preset_that_its_eyes_fit(

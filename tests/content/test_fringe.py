@@ -18,25 +18,11 @@ def test_a_box_has_twelve_edges_and_two_diagonals_a_face_none_of_which_is_an_out
     assert len(silhouette(edges, np.array([10.0, 20.0, 30.0]))[0]) == 6
 
 
-def test_a_card_s_outline_is_its_border_from_both_sides() -> None:
-    edges = edges_of(shapes.card(1.0, 1.0))
-    for x in (5.0, -5.0):
-        assert len(silhouette(edges, np.array([x, 0.3, 0.2]))[0]) == 4
-
-
 def test_a_sphere_s_outline_is_a_closed_ring() -> None:
     ball = shapes.sphere(1.0)
     ends, _ = silhouette(edges_of(ball), np.array([4.0, 1.0, 0.5]))
     places = np.unique(np.rint(ball.positions_m[ends].reshape(-1, 3) * 1e4).astype(int), axis=0, return_counts=True)[1]
     assert (places == 2).all()
-
-
-def test_edges_that_reach_behind_the_eye_are_left_out() -> None:
-    card = shapes.card(1.0, 1.0)
-    ends, apex = silhouette(edges_of(card), np.array([5.0, 0.0, 0.0]))
-    clip = np.column_stack([card.positions_m.astype(float), np.array([1.0, 1.0, 1.0, -1.0])])
-    corners, vertices, kept = ramps(clip, ends, apex, width_px=10, height_px=10)
-    assert len(corners) == len(vertices) == kept.sum() < 4
 
 
 def test_the_ramp_is_one_pixel_wide_and_lies_outside() -> None:

@@ -34,22 +34,6 @@ def drawn(context: Any, stack: PanelStack, scene: str = "sparse", time_ns: int =
     return picture
 
 
-def test_a_scene_that_is_not_placed_is_the_source_itself(context: Any, stack: PanelStack) -> None:
-    source = open_content(ContentSettings(scene="sparse"), stack, context)
-    assert not isinstance(source, PlacedSource)
-    source.close()
-
-
-def test_a_placed_scene_can_be_left_in_a_texture(context: Any, stack: PanelStack) -> None:
-    source = open_content(ContentSettings(scene="sparse", offset_m=(0.0, 0.05, 0.0)), stack, context)
-    view = panel_view(EYE, stack.panel(1))
-    assert isinstance(source, PlacedSource) and source.draws_in is context
-    left = source.draw(view, time_ns=0)
-    assert left is not None
-    assert (left.pixels().copy() == source.render(view, time_ns=0)).all()
-    source.close()
-
-
 def test_an_offset_moves_it_to_where_the_projection_says(context: Any, stack: PanelStack) -> None:
     offset = np.array([0.03, 0.08, -0.05])
     there = middle_of(drawn(context, stack, offset_m=tuple(offset)))
@@ -115,7 +99,7 @@ def test_a_picture_turned_edge_on_is_the_background_and_no_error(tmp_path: Path,
     write_png(tmp_path / "a.png", np.zeros((10, 10, 3), np.uint8))
     source = open_content(ContentSettings(scene=str(tmp_path / "a.png")), stack, context)
     turned = PlacedSource(source, Placing(rotation_deg=(0, 0, 90)))
-    assert (turned.render(panel_view((0.6, 0, 0), stack.panel(1)), time_ns=0) == (255, 255, 255, 0)).all()
+    assert (turned.render(panel_view((0.6, 0, 0), stack.panel(1)), time_ns=0) == (31, 31, 31, 0)).all()
 
 
 @pytest.mark.parametrize(
@@ -129,11 +113,5 @@ def test_a_picture_turned_edge_on_is_the_background_and_no_error(tmp_path: Path,
 def test_placing_that_leaves_nothing_to_be_seen_is_told_with_its_field(
     context: Any, stack: PanelStack, settings: dict[str, Any], field: str
 ) -> None:
-    with pytest.raises(InputError, match=rf"^content: {field}: leaves nothing of `sparse` to be seen: it stands at"):
+    with pytest.raises(InputError, match=rf"^content: {field}: leaves nothing of `sparse` to be seen: "):
         open_content(ContentSettings(scene="sparse", **settings), stack, context)
-
-
-def test_what_is_seen_at_some_turn_of_the_table_is_shown(tmp_path: Path, context: Any, stack: PanelStack) -> None:
-    write_png(tmp_path / "a.png", np.zeros((10, 10, 3), np.uint8))
-    settings = ContentSettings(scene=str(tmp_path / "a.png"), rotation_deg=(0, 0, 90), turntable_per_min=1)
-    open_content(settings, stack, context).close()

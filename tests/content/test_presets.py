@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from runtime.content.presets import axes_matrix, preset, preset_file, preset_names, rotation_matrix
+from runtime.content.presets import axes_matrix, preset, preset_file, preset_names
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 
@@ -50,10 +48,6 @@ PLACES = {
     "street": ("+x", "+z", -1, None),
 }  # fmt: skip
 SHIFTS = {"matrixcity": (0, 1.5, 0), "room_floor": (0, 0.35, 0.15)}
-LEFT_IS_0 = {
-    "lego_entity", "matrixcity", "metal_materials", "desk_bookshelf", "orchids", "china_art_museum", "traffic",
-    "ficus", "shoe_rack",
-}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", PLACES)
@@ -69,7 +63,6 @@ def test_the_published_reading_puts_the_panels_where_that_code_does_in_the_scene
     for x_m, along in zip(chosen.stack(stack).x_m, wanted, strict=True):
         place = (chosen.scene_from_stack @ [x_m, 0.0, 0.0, 1.0])[:3]
         assert place == pytest.approx(axes[:, 0] * along + SHIFTS.get(name, (0, 0, 0)), abs=1e-9)
-    assert chosen.left_index == (None if name == "minecraft" else 0 if name in LEFT_IS_0 else 1)
 
 
 # Where that code's own get_screen_coords_world puts the middle panel's middle, in training (data/dataset.py, which
@@ -132,15 +125,6 @@ def test_lego_s_panels_stand_at_minus_6_0_and_6_cm_there_and_3_cm_apart_in_the_s
     assert preset("lego_bulldozer").stack(stack).x_m == pytest.approx((-0.03, 0.0, 0.03))
 
 
-@pytest.mark.parametrize("name", PUBLISHED)
-@pytest.mark.parametrize("reading", ["seed", "published-code", "published-training"])
-def test_scene_from_stack_is_a_similarity_without_mirroring(name: str, reading: str) -> None:
-    chosen = preset(name, reading)  # type: ignore[arg-type]
-    linear = chosen.scene_from_stack[:3, :3]
-    assert linear @ linear.T == pytest.approx(np.eye(3) * chosen.scale_per_m**2, rel=1e-9, abs=1e-9)
-    assert np.linalg.det(linear) == pytest.approx(chosen.scale_per_m**3)
-
-
 def test_the_seed_s_pose_takes_the_scene_into_the_light_field_frame() -> None:
     table = preset_file().scene["traffic"]
     chosen = preset("traffic")
@@ -150,27 +134,6 @@ def test_the_seed_s_pose_takes_the_scene_into_the_light_field_frame() -> None:
     assert chosen.scene_from_stack @ np.append(in_stack, 1.0) == pytest.approx(np.append(point, 1.0))
 
 
-@pytest.mark.parametrize("order", ["xyz", "zyx", "XYZ", "ZYX", "YXZ"])
-def test_the_order_of_rotations_is_scipy_s(order: str) -> None:
-    angles = (216.0, -1.0, -28.0)
-    in_order = [angles["xyz".index(letter)] for letter in order.lower()]
-    assert rotation_matrix(angles, order) == pytest.approx(
-        Rotation.from_euler(order, in_order, degrees=True).as_matrix()
-    )
-
-
-def test_axes_are_out_right_and_up() -> None:
-    assert axes_matrix(out="+x", up="+z") == pytest.approx(np.eye(3))
-    assert axes_matrix(out="+z", up="+y") == pytest.approx(np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0.0]]))
-
-
 def test_an_unknown_preset_is_one_line_that_lists_them() -> None:
     with pytest.raises(InputError, match=r"^content: scene: no preset `lego`; there are .*lego_bulldozer"):
         preset("lego")
-
-
-def test_a_broken_data_file_names_the_field(tmp_path: Path) -> None:
-    file = tmp_path / "presets.toml"
-    file.write_text('rotation_order = "xyz"\n[scene.a]\ntitle = "A"\nscale_per_cm = -1.0\n')
-    with pytest.raises(InputError, match=r"presets.toml: scene.a.scale_per_cm"):
-        preset_file(file)

@@ -15,8 +15,8 @@ from runtime.daemon.build import Run, RunOptions, build_run
 from runtime.errors import PanelLost
 from runtime.frame.presenter import Presenter
 from runtime.records import EyePoints, PanelFrame, PresentReport, RefreshAccount, SensorFrame, State
-from runtime.sensor.base import Capabilities, SensorDriver
-from runtime.sensor.registry import register_driver
+from runtime.sensor import registry
+from runtime.sensor.base import Capabilities, Sensor
 
 SMALL: dict[str, Any] = {
     "stack": {"width_px": 192, "height_px": 108},
@@ -45,7 +45,7 @@ class Plan:
         self.clock_jump_ns = 0
 
 
-class FragileDriver(SensorDriver):
+class FragileDriver(Sensor):
     """Two eyes that sway, a hundred times a second, until its plan says otherwise."""
 
     name = "fragile"
@@ -80,12 +80,12 @@ class FragileDriver(SensorDriver):
 class Rig:
     """A run and the means to break it. Use as a context manager."""
 
-    def __init__(self, *, supervisor: Any = None, recorder: Any = None, **changes: dict[str, Any]) -> None:
+    def __init__(self, *, host: Any = None, recorder: Any = None, **changes: dict[str, Any]) -> None:
         self.plan = Plan()
-        register_driver("fragile", lambda settings, clock, latency_ms: FragileDriver(self.plan, clock))
+        registry._FACTORIES["fragile"] = lambda settings, clock, latency_ms, limits: FragileDriver(self.plan, clock)
         tables = {name: {**SMALL.get(name, {}), **changes.get(name, {})} for name in {**SMALL, **changes}}
         self.settings = Settings.model_validate(tables)
-        self.supervisor, self.recorder = supervisor, recorder
+        self.host, self.recorder = host, recorder
         self._cleanup = ExitStack()
         self.accounts: list[RefreshAccount] = []
 
@@ -95,7 +95,7 @@ class Rig:
                 self.settings,
                 RunOptions(),
                 self._cleanup,
-                supervisor=self.supervisor,
+                host=self.host,
                 on_account=self.accounts.append,
                 recorder=self.recorder,
             )
@@ -206,12 +206,12 @@ class BreakablePredictor:
         self._predictor, self.name, self.provider = predictor, predictor.name, predictor.provider
         self.answer: Callable[..., Any] | None = None
 
-    def predict(self, images: Any, eyes_m: Any, **how: Any) -> Any:
-        return (self.answer or self._predictor.predict)(images, eyes_m, **how)
+    def solve(self, job: Any) -> Any:
+        return (self.answer or self._predictor.solve)(job)
 
-    def well(self, images: Any, eyes_m: Any, **how: Any) -> Any:
+    def well(self, job: Any) -> Any:
         """What it would have answered."""
-        return self._predictor.predict(images, eyes_m, **how)
+        return self._predictor.solve(job)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._predictor, name)

@@ -75,7 +75,7 @@ def test_it_shows_a_scene_takes_another_and_stops_in_order(daemon: Any, x: XServ
     assert status["skew_ms"]["p50"] >= 0
     demo = x[0].panel(1)
     for scene in ("texture", "demo", "texture"):  # drawn in the content's context, whichever windows there are
-        assert ask([daemon.socket], {"command": "scene", "value": scene}) == {"ok": True}
+        assert ask([daemon.socket], {"command": "scene", "value": scene})["ok"]
     assert eventually(lambda: daemon.status()["scene"] == "texture")
     assert eventually(lambda: np.mean(x[0].panel(1).astype(float) != demo) > 0.5)
     assert state(daemon) in ("tracking", "holding", "flat")

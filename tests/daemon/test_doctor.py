@@ -11,7 +11,6 @@ import typer
 from typer.testing import CliRunner
 
 from runtime.clock import NS_PER_S, SimulatedClock
-from runtime.commands import doctor_checks
 from runtime.commands.doctor import doctor
 from runtime.daemon.server import StatusServer
 
@@ -93,21 +92,3 @@ def test_a_running_daemon_is_asked_how_it_is(tmp_path: Path, account: Any, secon
     assert checks["service"]["state"] == state
     assert checks["sensor"]["state"] == "skip"  # it has the device: opening it here would fail, or disturb
     assert code == 1
-
-
-def test_a_check_that_breaks_is_a_failed_row(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def broken(_settings: Any) -> None:
-        raise RuntimeError("boom")
-
-    monkeypatch.setitem(doctor_checks.CHECKS, "opengl", broken)
-    code, checks = examined(tmp_path)
-    assert code == 1
-    assert "boom" in checks["opengl"]["detail"]
-    assert checks["model"]["state"] == "ok"
-
-
-def test_people_get_a_table(tmp_path: Path) -> None:
-    app = typer.Typer()
-    app.command()(doctor)
-    result = CliRunner().invoke(app, [], env={"COLUMNS": "160"})
-    assert "what to do" in result.stdout

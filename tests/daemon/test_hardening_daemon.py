@@ -104,13 +104,6 @@ def test_a_log_reader_that_dies_is_survived_and_the_lost_lines_are_told_in_the_s
     daemon.ends()
 
 
-def test_full_devices_for_output_and_log_are_survived(started: Callable[..., Any]) -> None:
-    with open("/dev/full", "wb") as full:  # noqa: PTH123
-        daemon = started(stdout=full, stderr=full)
-        assert daemon.goes_on()
-        daemon.ends()
-
-
 def test_closed_standard_descriptors_are_survived(started: Callable[..., Any]) -> None:
     def close() -> None:
         os.close(1)

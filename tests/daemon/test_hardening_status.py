@@ -5,14 +5,12 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from runtime.commands.status import describe
 from runtime.daemon.supervise import snapshot
-from runtime.errors import SensorLost
 from runtime.support.artifacts import to_json
 from tests.daemon.rig import Rig
 
@@ -43,16 +41,6 @@ def test_a_run_that_tracks_says_rates_of_now_eyes_and_how_sure_and_the_sensors_r
     assert "paused" not in text and "rejected" not in text and "log " not in text
 
 
-@pytest.mark.parametrize(("name", "words"), [("paused", "frozen until"), ("flat_asked", "asked for, until")])
-def test_what_an_operator_asked_for_is_told(rig: Rig, name: str, words: str) -> None:
-    rig.refresh_until("tracking")
-    setattr(rig.presenter, name, True)
-    rig.refreshes(3)
-    answer, text = told_by(rig)
-    assert answer[name] is True
-    assert words in text
-
-
 def test_eyes_that_are_refused_are_counted_by_reason(rig: Rig) -> None:
     rig.refresh_until("tracking")
     rig.plan.eyes_m = np.array([[-0.7, -0.031, 0.0], [-0.7, 0.031, 0.0]])  # behind the display
@@ -62,24 +50,6 @@ def test_eyes_that_are_refused_are_counted_by_reason(rig: Rig) -> None:
     assert refused
     for why, count in refused.items():
         assert re.search(rf"^rejected .*{count} {re.escape(why)}", text, re.MULTILINE)
-
-
-def test_a_sensor_that_is_gone_has_no_rate(rig: Rig) -> None:
-    rig.refresh_until("tracking")
-    rig.plan.fault = SensorLost("unplugged")
-    rig.refresh_until("degraded: sensor")
-    answer, text = told_by(rig)
-    assert answer["sensor_hz"] is None
-    assert "samples/s" not in text
-    assert "unplugged" in text
-
-
-def test_a_stand_in_is_called_one() -> None:
-    with Rig(content={"scene": "lego_bulldozer"}) as rig:
-        rig.refreshes(3)
-        answer, text = told_by(rig)
-    assert "stand-in" in answer["content"]
-    assert re.search(r"^content +lego_bulldozer \(stand-in", text, re.MULTILINE)
 
 
 def test_what_was_not_measured_is_no_figure_anywhere(rig: Rig) -> None:
@@ -99,9 +69,3 @@ def test_nothing_that_came_through_the_socket_breaks_a_line() -> None:
     lines = list(describe({"state": "tracking\nup 3 h", "scene": "\x1b[2Ja\u202eb", "refused": "x" * 10000}))
     assert all(line.isprintable() for line in lines)
     assert all(len(line) <= 2000 for line in lines)
-
-
-def test_the_manual_names_what_the_status_tells() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "operation.md").read_text()
-    for name in ("turn_age_s", "log_lines_lost", "loading", "refused"):
-        assert f"`{name}`" in text

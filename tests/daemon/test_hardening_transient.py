@@ -4,27 +4,22 @@ from __future__ import annotations
 
 import errno
 import os
-import resource
 import subprocess
 import sys
-import urllib.request
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from runtime.clock import MonotonicClock
-from runtime.config import Overrides, SensorSettings, Settings
+from runtime.config import SensorSettings, Settings
 from runtime.daemon import supervise
 from runtime.daemon.build import RunOptions
-from runtime.daemon.metrics import CLIENTS_MAX, LOOPBACK, Metrics
 from runtime.errors import InputError, SensorLost, TransientError
 from runtime.sensor.base import Capabilities
 from runtime.sensor.worker import SensorState, SensorWorker
-from runtime.support.transient import PASSING, may_pass
-from tests.daemon.test_metrics import free_port, scraped
+from runtime.support.transient import PASSING, is_retryable
 from tests.waiting import eventually
 
 ROOT = Path(__file__).parents[2]
@@ -43,13 +38,8 @@ def read_by_a_reader(number: int) -> InputError:
 
 @pytest.mark.parametrize("number", sorted(PASSING))
 def test_what_the_machine_lacks_passes_however_it_was_told(number: int) -> None:
-    assert may_pass(OSError(number, "x"))
-    assert may_pass(read_by_a_reader(number))
-
-
-@pytest.mark.parametrize("number", [errno.ENOENT, errno.EACCES, errno.EISDIR, errno.EADDRINUSE, errno.ELOOP])
-def test_what_is_wrong_for_good_does_not(number: int) -> None:
-    assert not may_pass(read_by_a_reader(number))
+    assert is_retryable(OSError(number, "x"))
+    assert is_retryable(read_by_a_reader(number))
 
 
 def test_memory_and_threads_pass_and_so_do_libraries_words_for_them() -> None:
@@ -60,11 +50,11 @@ def test_memory_and_threads_pass_and_so_do_libraries_words_for_them() -> None:
         ImportError("libcuda.so: cannot open shared object file: Too many open files"),
         ImportError("onnxruntime_pybind11_state.so: failed to map segment from shared object"),
     ):
-        assert may_pass(error)
+        assert is_retryable(error)
 
 
 def test_a_users_words_prove_nothing() -> None:
-    assert not may_pass(InputError("too many open files.toml", "std::bad_alloc", "no space left on device"))
+    assert not is_retryable(InputError("too many open files.toml", "std::bad_alloc", "no space left on device"))
 
 
 @pytest.mark.parametrize("error", [MemoryError(), OSError(errno.EMFILE, "x"), read_by_a_reader(errno.EIO)])
@@ -91,15 +81,8 @@ def raising(error: Exception) -> Callable[..., Any]:
     return drive
 
 
-def lived() -> None:
-    overrides = Overrides(replay="demo", headless=True)
-    supervise.run_daemon(None, overrides, frames=1, max_speed=True, out=None, scale=0.1, quiet=True)
-
-
-def test_a_configuration_on_a_failing_disk_may_be_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(supervise, "load_settings", raising(read_by_a_reader(errno.EIO)))
-    with pytest.raises(TransientError):
-        lived()
+def lived(read_settings: Callable[[], Settings] = Settings) -> None:
+    supervise.run_daemon(read_settings, RunOptions(max_speed=True, frames=1, scale=0.1), progress=False)
 
 
 @pytest.mark.parametrize("limit", [8, 10, 12, 14, 18, 24])
@@ -122,7 +105,7 @@ def test_without_descriptors_the_exit_code_is_never_that_of_bad_configuration(tm
 class Refusing:
     """A sensor that the system has no descriptor for, so often as it is told."""
 
-    name, serial, overtaken, missed, refused = "refusing", "", 0, 0, {}
+    name, serial, skipped, missed, refused = "refusing", "", 0, 0, {}
     capabilities = Capabilities(eye_points=True)
 
     def __init__(self, errors: list[Exception]) -> None:
@@ -153,98 +136,3 @@ def test_a_sensor_that_can_not_be_reopened_for_want_of_descriptors_is_tried_agai
             assert isinstance(worker.error, InputError)
     finally:
         worker.stop()
-
-
-# The metrics' port
-
-
-@pytest.fixture
-def metrics() -> Iterator[Metrics]:
-    made = Metrics()
-    yield made
-    made.close()
-
-
-def test_a_thousand_connections_take_a_bounded_number_of_descriptors_and_scrapes_are_answered(metrics: Metrics) -> None:
-    port = free_port()
-    metrics.serve(port)
-    code = (
-        "import resource, socket, sys, time\n"
-        "soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)\n"
-        "resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 2000), hard))\n"
-        "held = []\n"
-        "for _ in range(1000):\n"
-        "    client = socket.socket(); client.settimeout(30)\n"
-        f"    client.connect(('{LOOPBACK}', {port})); client.sendall(b'GET /me'); held.append(client)\n"
-        "    time.sleep(0.003)\n"  # Linux drops what comes faster than it is let in, and tries again a second later
-        "print('held', flush=True); sys.stdin.read()"
-    )
-    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    assert hard >= 1100
-    before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
-    crowd = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    try:
-        assert crowd.stdout.readline() == b"held\n"
-        assert len(os.listdir("/proc/self/fd")) <= before + CLIENTS_MAX + 4  # noqa: PTH208
-        for _ in range(5):
-            assert 'phasestack_state{phasestack_state="starting"}' in scraped(port)
-    finally:
-        crowd.kill()
-        crowd.communicate()
-
-
-def test_a_port_that_is_taken_costs_the_figures_and_not_the_display(
-    metrics: Metrics, caplog: pytest.LogCaptureFixture
-) -> None:
-    port = free_port()
-    metrics.serve(port)
-    with ExitStack() as cleanup:
-        assert supervise._metrics(port, cleanup) is None
-        assert supervise._metrics(0, cleanup) is None
-
-
-def test_what_was_not_measured_has_no_figure(metrics: Metrics) -> None:
-    port = free_port()
-    metrics.serve(port)
-    told = scraped(port)
-    figures = {name: value for name, value in told.items() if value and not name.endswith("_created")}
-    assert figures == {'phasestack_state{phasestack_state="starting"}': 1.0}
-
-
-@pytest.mark.parametrize(
-    ("request_bytes", "status"),
-    [
-        (b"GET /metrics HTTP/1.1\r\n\r\n", b"200"),
-        (b"HEAD /metrics HTTP/1.0\r\nHost: x\r\n\r\n", b"200"),
-        (b"GET /etc/passwd HTTP/1.1\r\n\r\n", b"404"),
-        (b"POST /metrics HTTP/1.1\r\nContent-Length: 4\r\n\r\nabcd", b"405"),
-        (b"nonsense\n\n", b"405"),
-        (b"GET /" + b"x" * 20000, b"503"),
-    ],
-)
-def test_whatever_is_asked_gets_one_short_answer(metrics: Metrics, request_bytes: bytes, status: bytes) -> None:
-    import socket
-
-    port = free_port()
-    metrics.serve(port)
-    with socket.create_connection((LOOPBACK, port), timeout=20) as client:
-        client.sendall(request_bytes)
-        answer = b""
-        try:
-            while data := client.recv(65536):
-                answer += data
-        except ConnectionResetError:
-            pass  # what it had sent was not all read
-    assert answer.split()[1] == status
-    assert (b"phasestack_" in answer.partition(b"\r\n\r\n")[2]) == request_bytes.startswith(b"GET /metrics")
-
-
-def test_it_is_what_prometheus_expects(metrics: Metrics) -> None:
-    from prometheus_client.parser import text_string_to_metric_families
-
-    port = free_port()
-    metrics.serve(port)
-    with urllib.request.urlopen(f"http://{LOOPBACK}:{port}/metrics", timeout=20) as answer:
-        assert answer.headers["Content-Type"].startswith("text/plain")
-        names = {family.name for family in text_string_to_metric_families(answer.read().decode())}
-    assert "phasestack_stage_milliseconds" in names

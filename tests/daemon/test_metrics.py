@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import urllib.request
+from contextlib import ExitStack
 from typing import Any
 
 import pytest
 
+from runtime.daemon import supervise
 from runtime.daemon.metrics import LOOPBACK, Metrics
-from runtime.errors import InputError
 from runtime.records import RefreshAccount, State
 
 
@@ -21,6 +23,10 @@ def account(**changes: Any) -> Any:
         "stage_ms": {"render": 3.0, "inference": 12.5},
     }  # fmt: skip
     return RefreshAccount(**(values | changes))
+
+
+def refreshed(metrics: Metrics, told: Any, *, faults: Any = None, missed_blanks: int = 0) -> None:
+    metrics.refresh(told, faults=faults or {}, missed_blanks=missed_blanks)
 
 
 def free_port() -> int:
@@ -45,12 +51,10 @@ def scraped(port: int) -> dict[str, float]:
 def test_refreshes_solutions_stages_faults_and_state_are_told(metrics: Metrics) -> None:
     port = free_port()
     metrics.serve(port)
-    metrics.refresh(account())
-    metrics.refresh(account(inference="reused", present_ns=1_078_000_000, photon_ns=1_086_000_000))
-    metrics.refresh(account(presented=False, state=State.DEGRADED, inference="skipped", solution_age_ms=None))
-    metrics.fault("sensor")
-    metrics.missed_blanks(2)
-    metrics.missed_blanks(0)
+    refreshed(metrics, account())
+    refreshed(metrics, account(inference="reused", present_ns=1_078_000_000, photon_ns=1_086_000_000), missed_blanks=2)
+    last = account(presented=False, state=State.DEGRADED, inference="skipped", solution_age_ms=None)
+    refreshed(metrics, last, faults={"sensor": 1}, missed_blanks=2)
     told = scraped(port)
     assert told['phasestack_refreshes_total{result="presented"}'] == 2
     assert told['phasestack_refreshes_total{result="dropped"}'] == 1
@@ -71,38 +75,28 @@ def test_nothing_is_told_that_was_not_measured(metrics: Metrics) -> None:
     """No gauge stands at 0.0 for a quality that nobody looked at, and no rate is a mean since the start."""
     port = free_port()
     metrics.serve(port)
-    metrics.refresh(account(solution_age_ms=None, eye_sigma_mm=None, capture_ns=0))
+    refreshed(metrics, account(solution_age_ms=None, eye_sigma_mm=None, capture_ns=0))
     told = scraped(port)
     for name in ("solution_age_milliseconds", "eye_sigma_millimetres", "photon_latency_milliseconds"):
         assert told[f"phasestack_{name}_count"] == 0
     assert not [name for name in told if "psnr" in name or "fps" in name or "per_second" in name]
 
 
-def test_a_refresh_that_reached_no_panel_parts_two_intervals(metrics: Metrics) -> None:
+def test_who_asks_for_nothing_takes_no_descriptors_and_scrapes_are_answered(metrics: Metrics) -> None:
     port = free_port()
     metrics.serve(port)
-    for number, presented in enumerate([True, False, True, True]):
-        metrics.refresh(account(presented=presented, present_ns=1_000_000_000 + number * 16_000_000))
-    assert scraped(port)["phasestack_interval_milliseconds_count"] == 1
+    before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
+    crowd = [socket.create_connection((LOOPBACK, port), timeout=20) for _ in range(3)]
+    crowd[0].sendall(b"GET /me")
+    assert 'phasestack_state{phasestack_state="starting"}' in scraped(port)
+    assert len(os.listdir("/proc/self/fd")) <= before + len(crowd) + 2  # noqa: PTH208
+    for client in crowd:
+        client.close()
 
 
-def test_it_listens_on_loopback_only(metrics: Metrics) -> None:
-    metrics.serve(free_port())
-    assert metrics.address[0] == LOOPBACK
-
-
-def test_a_port_that_is_taken_is_named(metrics: Metrics) -> None:
-    with socket.socket() as other:
-        other.bind((LOOPBACK, 0))
-        other.listen()
-        with pytest.raises(InputError, match="service: metrics_port"):
-            metrics.serve(other.getsockname()[1])
-
-
-def test_after_closing_nobody_listens(metrics: Metrics) -> None:
+def test_a_port_that_is_taken_costs_the_figures_and_not_the_display(metrics: Metrics) -> None:
     port = free_port()
     metrics.serve(port)
-    metrics.close()
-    metrics.close()
-    with socket.socket() as probe:
-        assert probe.connect_ex((LOOPBACK, port)) != 0
+    with ExitStack() as cleanup:
+        assert supervise._metrics(port, cleanup) is None
+        assert supervise._metrics(0, cleanup) is None

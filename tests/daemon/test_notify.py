@@ -66,15 +66,6 @@ def test_ready_is_said_once(supervisor: Supervisor, notifier_of: Callable[..., N
     assert supervisor.heard() == ["READY=1"]
 
 
-def test_a_status_is_said_when_it_changes_and_on_one_line(
-    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
-) -> None:
-    notifier = notifier_of()
-    for text in ("tracking", "tracking", "degraded:\n sensor"):
-        notifier.status(text)
-    assert supervisor.heard() == ["STATUS=tracking", "STATUS=degraded: sensor"]
-
-
 def test_the_start_can_be_extended_until_it_is_over(
     supervisor: Supervisor, notifier_of: Callable[..., Notifier]
 ) -> None:
@@ -126,17 +117,6 @@ def test_a_watchdog_that_is_not_ours_is_not_fed(
     assert supervisor.heard() == []
 
 
-def test_reloading_and_stopping_are_announced(supervisor: Supervisor, notifier_of: Callable[..., Notifier]) -> None:
-    notifier = notifier_of(SimulatedClock(5_000_000))
-    notifier.ready()
-    notifier.reloading()
-    notifier.reloaded()
-    notifier.stopping("SIGTERM")
-    assert supervisor.heard()[1:] == [
-        "RELOADING=1\nMONOTONIC_USEC=5000", "READY=1", "STOPPING=1\nSTATUS=stopping: SIGTERM",
-    ]  # fmt: skip
-
-
 def test_a_reload_before_the_first_frame_does_not_make_it_ready(
     supervisor: Supervisor, notifier_of: Callable[..., Notifier]
 ) -> None:
@@ -158,15 +138,4 @@ def test_a_supervisor_that_does_not_listen_blocks_nobody(
     assert 0 < len(heard) < 5000  # what did not fit was left out, and nobody waited
     assert set(heard) == {"WATCHDOG=1"}
     notifier.close()
-    notifier.close()
-
-
-def test_without_a_supervisor_everything_is_silent(
-    monkeypatch: pytest.MonkeyPatch, notifier_of: Callable[..., Notifier]
-) -> None:
-    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    notifier = notifier_of()
-    assert not notifier.supervised
-    notifier.ready()
-    notifier.stopping("end")
     notifier.close()

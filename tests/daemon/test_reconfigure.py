@@ -76,7 +76,7 @@ class Bench:
         self.settings = settings()
         self.stack = self.settings.stack.stack()
         self.context = offscreen_context()
-        maker = SolverMaker(self.settings, self.stack, load_calibration(None), on_start=lambda _: True)
+        maker = SolverMaker(self.settings, self.stack, load_calibration(None))
         self.parts: RunningSolver = maker(context=self.context, simulated=True)
         state = self.parts.run.state
         self.first_content, self.first_model = Lent(state.content), Lent(state.predictor)
@@ -115,38 +115,6 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
 
 
 SCENE, MODEL = {"content": {"scene": "sparse"}}, {"model": {"name": "balanced"}}
-
-
-def test_a_scene_is_taken_over_and_the_one_before_is_closed(bench: Bench) -> None:
-    before = bench.state
-    change = bench.change(settings(**SCENE))
-    assert not change.finished
-    bench.advance(change)
-    assert change.problem == ""
-    assert bench.state.content.info.name == "sparse"
-    assert bench.state.settings.content.scene == "sparse"
-    assert bench.state.predictor is before.predictor
-    assert (bench.first_content.closed, bench.contents[0].closed, bench.first_model.closed) == (1, 0, 0)
-    bench.solve()
-
-
-def test_a_model_is_taken_over_and_the_one_before_is_closed(bench: Bench) -> None:
-    before = bench.state
-    change = bench.change(settings(**MODEL))
-    bench.advance(change)
-    assert bench.state.predictor.name == "balanced"
-    assert bench.state.content is before.content
-    assert (bench.first_model.closed, bench.models[0].closed) == (1, 0)
-    bench.solve()
-
-
-def test_settings_alone_load_nothing_and_are_taken_over_at_the_next_step(bench: Bench) -> None:
-    before = bench.state
-    change = bench.change(settings(tracker={"hold_s": 2.0}))
-    assert change.advance(bench.parts) is True
-    assert bench.state.settings.tracker.hold_s == 2.0
-    assert (bench.state.content, bench.state.predictor) == (before.content, before.predictor)
-    assert (bench.models, bench.contents) == ([], [])
 
 
 def test_all_of_a_change_is_one_new_state(bench: Bench, tmp_path: Path) -> None:
@@ -188,29 +156,12 @@ def test_where_a_part_can_t_be_had_everything_stays_and_what_was_loaded_is_close
     bench.solve()
 
 
-def test_a_model_that_can_t_be_had_leaves_the_scene_as_it_was_and_closes_the_new_one(bench: Bench) -> None:
-    before = bench.state
-    change = bench.change(settings(**SCENE, model={"name": "nothing.onnx"}))
-    bench.advance(change)
-    assert "nothing.onnx" in change.problem
-    assert bench.state is before
-    assert all(content.closed == 1 for content in bench.contents)
-    bench.solve()
-
-
 def test_a_bad_calibration_is_refused_before_anything_is_loaded(bench: Bench, tmp_path: Path) -> None:
     path = Path(tmp_path / "bad.toml")
     path.write_text("stack_from_sensor = 3\n")
     with pytest.raises(InputError, match="stack_from_sensor"):
         bench.change(settings(**SCENE, calibration={"file": str(path)}))
     assert (bench.models, bench.contents) == ([], [])
-
-
-def test_another_calibration_is_part_of_the_new_state(bench: Bench, tmp_path: Path) -> None:
-    path = tmp_path / "calibration.toml"
-    path.write_text("stack_from_sensor = [[1.0,0.0,0.0,0.5],[0.0,1.0,0.0,0.0],[0.0,0.0,1.0,0.0],[0.0,0.0,0.0,1.0]]\n")
-    bench.advance(bench.change(settings(calibration={"file": str(path)})))
-    assert bench.state.calibration.stack_from_sensor[0, 3] == 0.5
 
 
 @pytest.mark.parametrize("when", ["at once", "when the scene is there", "when all is there"])
@@ -234,23 +185,9 @@ def test_what_is_no_longer_wanted_is_closed_and_changes_nothing(bench: Bench, wh
     bench.solve()
 
 
-def test_the_same_scene_is_read_again_where_that_is_asked_for(bench: Bench) -> None:
-    bench.advance(bench.change(settings(), reload_content=True))
-    assert bench.state.content is bench.contents[0]
-    assert bench.first_content.closed == 1
-
-
 def test_what_is_decided_anew_for_every_solution_loads_no_model(bench: Bench) -> None:
     before = bench.state
     change = bench.change(settings(model={"eye_sigma_mm": 2.0}))
     assert change.advance(bench.parts) is True
     assert bench.state.predictor is before.predictor
     assert bench.models == []
-
-
-def test_after_a_change_the_next_step_solves_with_it(bench: Bench) -> None:
-    first = bench.solve()
-    bench.advance(bench.change(settings(**SCENE)))
-    second = bench.solve()
-    assert second.number > first.number
-    assert not np.array_equal(first.layers, second.layers)

@@ -27,36 +27,11 @@ def well(eyes: str = "predicted", **changes: Any) -> Conditions:
     return Conditions(**{"eyes": eyes, "missing": {}, "presented": True, **changes})
 
 
-def test_eyes_decide_where_nothing_is_missing() -> None:
-    assert judge(well("exact"))[0] is State.TRACKING
-    assert judge(well("predicted"))[0] is State.TRACKING
-    assert judge(well("rested"))[0] is State.TRACKING
-    assert judge(well("held"))[0] is State.HOLDING
-    assert judge(well("none"))[0] is State.FLAT
-
-
-def test_flat_can_be_asked_for_while_eyes_are_seen() -> None:
-    assert judge(well(flat_wanted=True)) == (State.FLAT, "asked for")
-
-
-def test_a_paused_picture_and_an_alignment_at_its_limit_are_told_beside_the_state() -> None:
-    assert judge(well(paused=True)) == (State.TRACKING, "eyes seen; the picture is paused")
-    state, reason = judge(well("held", limited="the eyes are 3 m away"))
-    assert state is State.HOLDING
-    assert "alignment at its limit until the next solution: the eyes are 3 m away" in reason
-
-
 def test_what_is_missing_is_named_with_its_reason() -> None:
     machine = StateMachine(now_ns=0)
     change = machine.update(well(missing={"panel": "DUMMY1 was disconnected", "sensor": "unplugged"}), now_ns=1)
     assert machine.name == change.after == "degraded: sensor, panel"
     assert change.reason == "sensor: unplugged; panel: DUMMY1 was disconnected"
-
-
-def test_until_the_first_frame_it_is_starting_and_says_what_it_waits_for() -> None:
-    state, reason = judge(well(presented=False, missing={"panel": "no X server"}))
-    assert state is State.STARTING
-    assert "panel: no X server" in reason
 
 
 def test_a_transition_is_told_once_and_again_when_what_is_missing_changes() -> None:

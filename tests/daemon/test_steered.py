@@ -11,9 +11,6 @@ import numpy as np
 import pytest
 
 from runtime.daemon.commands import parse
-from runtime.daemon.notify import may_restart
-from runtime.daemon.supervise import RestartAsked
-from runtime.errors import TransientError
 from tests.daemon.test_changes import Served
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -27,15 +24,15 @@ def layers_of(served: Served) -> np.ndarray:
 def test_a_scene_is_moved_at_once_and_put_back(tmp_path: Path) -> None:
     with Served(tmp_path, content={"scene": "sparse"}) as served:
         before = layers_of(served)
-        assert served.asked("place", {"offset_m": [0.0, 0.1, 0.0], "scale": 1.5}) == {"ok": True}
+        assert served.asked("place", {"offset_m": [0.0, 0.1, 0.0], "scale": 1.5})["ok"]
         assert served.status()["placing"]["scale"] == 1.5
         moved = layers_of(served)
         assert (moved != before).mean() > 0.01
-        assert served.asked("place", {"turntable_per_min": 6.0}) == {"ok": True}
+        assert served.asked("place", {"turntable_per_min": 6.0})["ok"]
         assert served.status()["placing"] == {
             "scale": 1.5, "offset_m": [0.0, 0.1, 0.0], "rotation_deg": [0.0, 0.0, 0.0], "turntable_per_min": 6.0,
         }  # fmt: skip
-        assert served.asked("place", None) == {"ok": True}
+        assert served.asked("place", None)["ok"]
         assert served.status()["placing"]["scale"] == 1.0 and not served.run.parts.content.info.moving
 
 
@@ -67,49 +64,12 @@ def test_a_place_that_is_none_is_told(tmp_path: Path, value: object, told: str) 
         assert served.asked("place", value)["error"].startswith(told)
 
 
-def test_another_scene_stands_as_configured(tmp_path: Path) -> None:
-    with Served(tmp_path, content={"scene": "sparse", "scale": 1.25}) as served:
-        assert served.asked("place", {"scale": 2.0})["ok"]
-        assert served.asked("scene", "thin")["ok"]
-        assert served.status()["placing"]["scale"] == 1.25
-
-
 def test_another_model_is_taken_and_one_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with Served(tmp_path) as served:
-        assert served.asked("model", "sart") == {"ok": True}
+        assert served.asked("model", "sart")["ok"]
         assert served.run.parts.run.state.predictor.name.startswith("sart")
         assert "nobody" in (answer := served.asked("model", "nobody"))["error"] and not answer["ok"]
         assert served.run.parts.run.state.settings.model.name == "sart"
-
-
-def test_a_stand_in_is_told_to_who_asks_for_the_scene(tmp_path: Path) -> None:
-    with Served(tmp_path) as served:
-        answer = served.asked("scene", "street")
-        assert answer["ok"] and "stand-in `demo`" in answer["note"]
-        assert "stand-in `demo`" in served.status()["content"]
-        assert "stand-in `demo`" in served.run.summary()["scene"]
-
-
-def test_a_restart_is_refused_where_nothing_would_start_it_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with Served(tmp_path) as served:
-        assert "Restart=" in served.asked("restart")["error"]
-        assert served.daemon.stop_reason() == ""
-        monkeypatch.setenv("NOTIFY_SOCKET", "/run/somewhere")
-        monkeypatch.setenv("PHASESTACK_UNIT_RESTARTS", "1")
-        assert served.asked("restart") == {"ok": True}
-        assert served.daemon.stop_reason() == "restart asked for"
-    assert issubclass(RestartAsked, TransientError)  # exit 75, which Restart=on-failure answers
-
-
-def test_both_units_say_that_they_restart_and_do() -> None:
-    for name in ("phasestack.service", "phasestack-user.service"):
-        text = (ROOT / "systemd" / name).read_text()
-        assert "Environment=PHASESTACK_UNIT_RESTARTS=1\n" in text and "Restart=on-failure\n" in text
-        assert "RestartPreventExitStatus=2\n" in text
-    assert may_restart({"NOTIFY_SOCKET": "x", "PHASESTACK_UNIT_RESTARTS": "1"})
-    assert not may_restart({"PHASESTACK_UNIT_RESTARTS": "1"}) and not may_restart({"NOTIFY_SOCKET": "x"})
 
 
 @pytest.mark.parametrize("arguments", [[], ["--reset", "--scale", "2"]])
@@ -126,11 +86,11 @@ def test_a_playlist_of_the_operators_is_written_shown_and_gone_through(
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
     shows = [{"scene": "thin", "seconds": 500}, {"scene": "grey", "seconds": 700}]
     with Served(tmp_path) as served:
-        assert served.asked("playlist", shows) == {"ok": True}
+        assert served.asked("playlist", shows)["ok"]
         told = served.status()
         assert told["scene"] == str(tmp_path / "state" / "playlist.toml")
         assert told["playlist"]["entries"] == shows and told["playlist"]["index"] == 0
-        assert served.asked("next") == {"ok": True}
+        assert served.asked("next")["ok"]
         assert served.status()["playlist"]["index"] == 1 and "grey (2 of 2)" in served.status()["content"]
         answer = served.asked("playlist", [{"scene": 'no"such\n.glb', "seconds": 5}])
         assert not answer["ok"] and "show[0]" in answer["error"]
@@ -147,6 +107,7 @@ def test_the_library_is_offered_with_the_scenes(tmp_path: Path) -> None:
     for name in ("b.glb", "a.ply", "film_sbs.mp4", "list.toml", "notes.txt", ".hidden.glb"):
         (library / name).touch()
     (library / "lego").mkdir()
+    (library / os.fsdecode(b"\xff.glb")).touch()  # no setting can hold such a name
     with Served(tmp_path, content={"library": str(library)}) as served:
         offered = [Path(name).name for name in about(served.run)["scenes"] if name.startswith(str(library))]
         assert offered == ["a.ply", "b.glb", "film_sbs.mp4", "lego", "list.toml"]

@@ -1,4 +1,4 @@
-"""The units, rules and scripts that make phasestack a service, checked by systemd's own tools."""
+"""Units, rules, installer, image and locks: checked by systemd's own tools; bounded; no other file than was meant."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import re
 import shutil
 import stat
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -20,12 +21,16 @@ UNITS = ROOT / "systemd"
 SYSTEM = ("phasestack.service", "phasestack-x.service", "phasestack-page.service")
 EXPOSURE_MAX = {"phasestack.service": 1.8, "phasestack-x.service": 7.0, "phasestack-page.service": 1.2}
 
+LOCKS = ROOT / "requirements"
+DAEMONS = ("phasestack.service", "phasestack-user.service")
+
 with_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze here")
 
 
-def run(*command: str, **environment: str) -> subprocess.CompletedProcess[str]:
+def run(*command: str, mask: int = -1, **environment: str) -> subprocess.CompletedProcess[str]:
+    surroundings = {**os.environ, **environment}
     return subprocess.run(
-        command, capture_output=True, text=True, timeout=60, env={**os.environ, **environment}, check=False
+        command, capture_output=True, text=True, timeout=900, env=surroundings, umask=mask, check=False
     )
 
 
@@ -56,16 +61,10 @@ def test_systemd_finds_nothing_wrong_with_the_user_unit(tmp_path: Path) -> None:
 
 @with_systemd
 @pytest.mark.parametrize("unit", SYSTEM)
-def test_exposure_stays_below_what_the_manual_states(unit: str) -> None:
-    threshold = EXPOSURE_MAX[unit]
-    result = run(
-        "systemd-analyze", "security", "--offline=yes", f"--threshold={round(threshold * 10)}", str(UNITS / unit)
-    )
+def test_exposure_stays_low(unit: str) -> None:
+    threshold = f"--threshold={round(EXPOSURE_MAX[unit] * 10)}"
+    result = run("systemd-analyze", "security", "--offline=yes", threshold, str(UNITS / unit))
     assert result.returncode == 0, result.stdout.splitlines()[-1]
-    stated = re.search(rf"`{unit}`[^\n]*?(\d\.\d)", (ROOT / "docs" / "operation.md").read_text())
-    measured = re.search(r"exposure level for \S+ (\d+\.\d)", result.stdout)
-    assert stated and measured
-    assert float(measured[1]) <= float(stated[1]) + 0.3  # each systemd weighs a little differently
 
 
 def keys(unit: str) -> dict[str, list[str]]:
@@ -138,8 +137,8 @@ def test_sysusers_and_tmpfiles_make_the_user_and_its_folders(tmp_path: Path) -> 
     assert stat.S_IMODE((tmp_path / "var/lib/phasestack").stat().st_mode) == 0o750
 
 
-def install(root: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    return run("sh", str(UNITS / "install.sh"), DESTDIR=str(root), APP="no", **environment)
+def install(root: Path, *, mask: int = -1, **environment: str) -> subprocess.CompletedProcess[str]:
+    return run("sh", str(UNITS / "install.sh"), mask=mask, **({"DESTDIR": str(root), "APP": "no"} | environment))
 
 
 def files(root: Path) -> set[str]:
@@ -177,26 +176,10 @@ def test_installing_again_keeps_the_operators_configuration(tmp_path: Path) -> N
     assert mine.read_text() == "# mine\n"
 
 
-def test_every_program_that_a_unit_starts_is_installed(tmp_path: Path) -> None:
-    install(tmp_path)
-    for unit in SYSTEM:
-        for key, values in keys(unit).items():
-            for value in values if key.startswith("Exec") else ():
-                program = value.split()[0]
-                assert program == "/usr/bin/Xorg" or (tmp_path / program.lstrip("/")).exists()
-
-
 def test_the_installer_refuses_an_old_or_missing_python(tmp_path: Path) -> None:
     result = install(tmp_path, PYTHON="no-such-python")
     assert result.returncode == 2
     assert "no-such-python" in result.stderr
-
-
-@pytest.mark.skipif(shutil.which("shellcheck") is None, reason="no shellcheck here")
-@pytest.mark.parametrize("script", ["install.sh", "uninstall.sh", "x-authority"])
-def test_the_shell_scripts_are_clean(script: str) -> None:
-    result = run("shellcheck", str(UNITS / script))
-    assert result.returncode == 0, result.stdout
 
 
 @pytest.mark.skipif(shutil.which("xauth") is None or shutil.which("mcookie") is None, reason="no xauth or mcookie here")
@@ -209,3 +192,80 @@ def test_the_authority_file_is_fresh_each_time_and_the_groups_alone(tmp_path: Pa
         cookies.append(run("xauth", "-f", str(file), "list").stdout.split()[-1])
     assert re.fullmatch("[0-9a-f]{32}", cookies[0])
     assert cookies[0] != cookies[1]
+
+
+@pytest.mark.parametrize("unit", DAEMONS)
+def test_what_the_daemon_may_take_of_the_machine_is_bounded(unit: str) -> None:
+    found = keys(unit)
+    assert 0 < int(found["MemoryMax"][0].removesuffix("%")) < 100
+    assert 64 <= int(found["TasksMax"][0]) <= 4096
+    assert int(found["CPUWeight"][0]) > 100  # the default: the picture goes first
+
+
+@pytest.mark.parametrize("script", ["install.sh", "uninstall.sh"])
+def test_an_argument_that_nobody_knows_is_refused_and_nothing_is_touched(tmp_path: Path, script: str) -> None:
+    done = subprocess.run(
+        ["sh", str(UNITS / script), "--hlep"],
+        env={**os.environ, "DESTDIR": str(tmp_path), "APP": "no"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert "--hlep" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def others_may_read(path: Path) -> bool:
+    mode = path.stat().st_mode
+    return bool(mode & stat.S_IROTH) and (not path.is_dir() or bool(mode & stat.S_IXOTH))
+
+
+def test_under_a_narrow_mask_the_services_user_can_read_what_is_installed(tmp_path: Path) -> None:
+    root = tmp_path / "tree"
+    root.mkdir(mode=0o755)
+    done = install(root, mask=0o077)
+    assert done.returncode == 0, done.stderr
+    assert [path for path in root.rglob("*") if not others_may_read(path)] == []
+
+
+# The locks
+
+
+def packages(lock: str) -> dict[str, tuple[str, list[str]]]:
+    """Name to version and hashes."""
+    text = "\n".join(line for line in (LOCKS / lock).read_text().splitlines() if not line.startswith("#"))
+    found = {}
+    for entry in re.split(r"\n(?=\S)", text.replace("\\\n", " ")):
+        name, _, rest = entry.strip().partition("==")
+        if name:
+            version, *options = rest.split()
+            found[name.lower().replace("_", "-")] = (version, options)
+    return found
+
+
+def test_all_locks_mean_the_same_files() -> None:
+    runtime, test = packages("runtime.lock") | packages("page.lock"), packages("test.lock")
+    assert {name: test.get(name) for name in runtime} == runtime
+
+
+def test_everything_that_is_declared_is_locked() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    test = packages("test.lock") | {"torch": ("2.13.0", [])}
+    for requirement in (
+        *project["dependencies"],
+        *(one for all_ in project["optional-dependencies"].values() for one in all_),
+    ):
+        name = re.match(r"[A-Za-z0-9._-]+", requirement)[0].lower().replace("_", "-")
+        if name != "phasestack":
+            assert name in test, requirement
+
+
+@pytest.mark.parametrize(("lock", "least"), [("runtime.lock", 40), ("page.lock", 6), ("test.lock", 40)])
+def test_every_pin_has_the_hashes_of_its_files(lock: str, least: int) -> None:
+    found = packages(lock)
+    assert len(found) > least
+    for name, (version, options) in found.items():
+        assert re.fullmatch(r"[0-9][0-9A-Za-z.]*", version), name
+        assert options and all(re.fullmatch(r"--hash=sha256:[0-9a-f]{64}", option) for option in options), name
+        assert len(set(options)) == len(options)

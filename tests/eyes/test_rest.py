@@ -6,6 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from runtime.clock import NS_PER_S
 from runtime.eyes.rest import RestWatch
@@ -25,7 +27,7 @@ def watched(
 ) -> list[tuple[float, np.ndarray, np.ndarray | None]]:
     """(time, true eyes, place) after each sample of a head that moves aside as it is told."""
     random = np.random.default_rng(seed)
-    watch = RestWatch(most_m=MOST_M)
+    watch = RestWatch(max_drift_m=MOST_M)
     told = []
     for number in range(int(seconds * rate_hz)):
         time_s = number / rate_hz
@@ -77,14 +79,34 @@ def test_slow_drift_is_bounded(noise_mm: float) -> None:
     assert max(off) < 2 * MOST_M + 3 * noise_mm / 1000
 
 
-def test_what_is_lost_or_nonsense_is_no_rest() -> None:
-    watch = RestWatch(most_m=MOST_M)
+def test_what_is_lost_is_no_rest() -> None:
+    watch = RestWatch(max_drift_m=MOST_M)
     for number in range(60):
         watch.update(EYES, capture_ns=number * NS_PER_S // 30)
-    assert watch.place is not None
-    watch.update(np.full((2, 3), np.nan), capture_ns=2 * NS_PER_S)
     assert watch.place is not None
     watch.update(EYES, capture_ns=10 * NS_PER_S)  # after a gap
     assert watch.place is None
     watch.update(EYES, capture_ns=NS_PER_S)  # a clock that was set back
+    assert watch.place is None
+
+
+def test_a_head_that_leans_in_on_the_axis_is_seen_to_leave() -> None:
+    watch = RestWatch(max_drift_m=MOST_M)
+    for number in range(90):
+        closer = np.array([0.2 * max(0.0, number / 30 - 2), 0.0, 0.0])
+        watch.update(EYES * [1, 1, 0] - closer, capture_ns=number * NS_PER_S // 30)
+        assert watch.place is None or closer[0] < 0.015
+
+
+def test_what_scatters_more_than_any_sensor_s_noise_never_rests() -> None:
+    assert all(place is None for _, _, place in watched(20, noise_m=0.02))
+
+
+@given(x_m=st.floats(-0.01, 0.01), y_m=st.floats(-0.001, 0.001))
+def test_whatever_it_rested_at_it_can_be_left(x_m: float, y_m: float) -> None:
+    watch = RestWatch(max_drift_m=MOST_M)
+    for number in range(90):
+        watch.update(np.tile([x_m, y_m, 0.0], (2, 1)), capture_ns=number * NS_PER_S // 30)
+    for number in range(90, 93):
+        watch.update(EYES, capture_ns=number * NS_PER_S // 30)
     assert watch.place is None

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from runtime.config import TrackerSettings
-from runtime.eyes.motions import observe, true_eyes
-from runtime.eyes.tracker import Tracker
+from runtime.eyes.motions import true_eyes
+from runtime.eyes.plausibility import NOT_NEWER
+from runtime.eyes.tracker import DECAY_S, ELSEWHERE, UNCERTAIN, Tracker, sideways_sigma_m
 from runtime.records import EyePoints
 
 MS = 1_000_000
@@ -24,21 +25,23 @@ HOLD_MS = round(1000 * TrackerSettings().hold_s)
 
 
 def points(
-    eyes: NDArray[np.float64] | list[list[float]] = STILL, *, confidence: float = 1.0, completed: str = ""
+    eyes: NDArray[np.float64] | list[list[float]] = STILL,
+    *,
+    confidence: float = 1.0,
+    completed: str = "",
+    covariance_m2: NDArray[np.float64] | None = None,
 ) -> EyePoints:
-    return EyePoints(np.asarray(eyes, dtype=float), SURE * confidence, completed)
+    return EyePoints(np.asarray(eyes, dtype=float), SURE * confidence, completed, covariance_m2)
 
 
 def moving(k: float, speed: tuple[float, float, float] = (0.0, 0.3, 0.0)) -> NDArray[np.float64]:
     return STILL + np.array(speed) * (k * PERIOD / 1e9)
 
 
-def fed(
-    count: int = 30, motion: Callable[..., Any] = lambda k: STILL, settings: TrackerSettings | None = None
-) -> tuple[Tracker, int]:
-    tracker = Tracker(settings)
+def fed(count: int = 30, motion: Callable[..., Any] = lambda k: STILL, **noise: Any) -> tuple[Tracker, int]:
+    tracker = Tracker()
     for k in range(count):
-        tracker.update(points(motion(k)), capture_ns=10**9 + k * PERIOD)
+        tracker.update(points(motion(k), **noise), capture_ns=10**9 + k * PERIOD)
     return tracker, 10**9 + (count - 1) * PERIOD
 
 
@@ -67,8 +70,8 @@ def test_a_prediction_goes_on_with_the_heads_motion() -> None:
 
 def test_it_never_predicts_further_than_the_horizon() -> None:
     tracker, last = fed(count=60, motion=moving)
-    limit = tracker.at(last + 120 * MS).eyes_m
-    np.testing.assert_array_equal(tracker.at(last + 180 * MS).eyes_m, limit)
+    limit = tracker.at(last + 200 * MS).eyes_m
+    np.testing.assert_array_equal(tracker.at(last + 280 * MS).eyes_m, limit)
 
 
 def test_a_lost_face_is_held_coming_to_rest_then_nobody() -> None:
@@ -102,37 +105,6 @@ def test_every_answer_is_for_the_instant_asked_and_eyes_are_there_unless_none(ms
 # --- what it does not believe
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [
-        points(STILL * np.nan),
-        points([[0.6, np.inf, 0], [0.6, 0.03, 0]]),
-        points(STILL + np.array([[0, 0, 0], [0, 0.03, 0]])),  # 92 mm apart
-        points([[0.6, -0.01, 0.03], [0.6, 0.01, 0.03]]),  # 20 mm apart
-        points(STILL + np.array([0.2, 0, 0])),  # 20 cm away at once
-        points(confidence=0.1),
-        points(confidence=np.nan),
-        points([[1e200, -0.031, 0.03], [1e200, 0.031, 0.03]]),
-    ],
-    ids=["nan", "infinite", "too wide", "too narrow", "too far", "a blink", "no confidence", "absurd"],
-)
-def test_a_single_bad_sample_changes_nothing(bad: EyePoints) -> None:
-    tracker, last = fed()
-    before = tracker.at(last + 80 * MS)
-    tracker.update(bad, capture_ns=last + PERIOD)
-    after = tracker.at(last + 80 * MS)
-    assert after.label == "predicted"
-    np.testing.assert_array_equal(after.eyes_m, before.eyes_m)
-
-
-def test_what_is_twice_elsewhere_is_believed() -> None:
-    tracker, last = fed()
-    there = STILL + np.array([0.2, 0.1, 0.0])
-    for k in (1, 2):
-        tracker.update(points(there), capture_ns=last + k * PERIOD)
-    np.testing.assert_allclose(tracker.at(last + 2 * PERIOD + 70 * MS).eyes_m, there, atol=0.003)
-
-
 def test_duplicates_and_late_samples_are_passed_over() -> None:
     tracker, last = fed()
     before = tracker.at(last + 50 * MS).eyes_m
@@ -147,11 +119,85 @@ def test_a_clock_that_was_set_back_begins_anew() -> None:
     assert tracker.at(last - 5 * 10**9).label == "exact"
 
 
-def test_an_unbroken_stream_of_nonsense_ends_in_nobody_not_in_nonsense() -> None:
+@pytest.mark.parametrize(
+    ("bad", "why"),
+    [
+        (points(STILL * np.nan), "not a number"),
+        (points([[0.6, np.inf, 0], [0.6, 0.03, 0]]), "not a number"),
+        (points(STILL + np.array([[0, 0, 0], [0, 0.03, 0]])), "too far apart for a person"),
+        (points([[0.6, -0.01, 0.03], [0.6, 0.01, 0.03]]), "too close together for a person"),
+        (points([[1e200, -0.031, 0.03], [1e200, 0.031, 0.03]]), "too distant for a viewer"),
+        (points(STILL * [-1, 1, 1]), "not in front of the panels"),
+        (points(STILL[::-1]), "left and right exchanged"),
+        (points(STILL + np.array([0.2, 0, 0])), ELSEWHERE),
+        (points(confidence=0.1), UNCERTAIN),
+        (points(confidence=np.nan), UNCERTAIN),
+    ],
+)
+def test_a_single_bad_sample_changes_nothing_and_is_refused_with_its_reason(bad: EyePoints, why: str) -> None:
     tracker, last = fed()
-    for k in range(1, 60):
-        tracker.update(points(STILL * np.nan), capture_ns=last + k * PERIOD)
-    assert tracker.at(last + 60 * PERIOD).label == "none"
+    before = tracker.at(last + 80 * MS)
+    assert tracker.update(bad, capture_ns=last + PERIOD) == why
+    np.testing.assert_array_equal(tracker.at(last + 80 * MS).eyes_m, before.eyes_m)
+    assert tracker.update(points(), capture_ns=last + PERIOD) == NOT_NEWER
+
+
+def test_a_hasty_head_is_believed_at_its_second_sample_and_another_person_once_the_viewer_is_gone() -> None:
+    tracker, last = fed()
+    hasty, far = STILL + np.array([0.0, 0.017, 0.0]), STILL + np.array([0.0, 0.4, 0.0])
+    told = [tracker.update(points(hasty), capture_ns=last + k * PERIOD) for k in (1, 2)]
+    assert told[-1] == ""
+    tracker, last = fed()
+    told = [tracker.update(points(far), capture_ns=last + k * PERIOD) for k in range(1, 17)]
+    assert told == [ELSEWHERE] * 15 + [""]
+    np.testing.assert_allclose(tracker.at(last + 16 * PERIOD + 20 * MS).eyes_m, far, atol=1e-9)  # and at once
+
+
+# --- how sure
+
+
+def drawn(covariance_m2: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Errors (n, 3) of the middle 45 ms ahead, and sigma as told (n,), of a leaning head with such noise."""
+    random, tracker, off, told = np.random.default_rng(2), Tracker(), [], []
+    for k in range(600):
+        time_s = k * PERIOD / 1e9
+        eyes = true_eyes("lean", np.array([time_s, 30.0]))[0] + random.multivariate_normal(np.zeros(3), covariance_m2)
+        assert tracker.update(points(eyes, covariance_m2=covariance_m2), capture_ns=k * PERIOD) == "" or k < 3
+        answer = tracker.at(k * PERIOD + 45 * MS)
+        off.append((answer.eyes_m - true_eyes("lean", np.array([time_s + 0.045, 30.0]))[0]).mean(0))
+        told.append(answer.sigma_m)
+    return np.array(off)[60:], np.array(told)[60:]
+
+
+def test_right_up_and_depth_are_believed_by_their_own_noise_and_sigma_is_what_it_does_to_the_picture() -> None:
+    fine = np.diag([0.002, 0.0001, 0.0001]) ** 2
+    off, told = drawn(fine)
+    coarse, _ = drawn(np.eye(3) * 0.002**2)
+    assert np.sqrt((off[:, 1:] ** 2).mean()) < 0.35 * np.sqrt((coarse[:, 1:] ** 2).mean())
+    eye_m = np.array([0.6, 0.0, 0.0])
+    true = sideways_sigma_m(off.T @ off / len(off), eye_m, panel_m=(0.5184, 0.2916))
+    assert 0.5 * true < np.sqrt((told**2).mean()) < 2.0 * true
+
+
+@pytest.mark.parametrize("covariance_m2", [np.full((3, 3), np.nan), np.zeros((3, 3)), -np.eye(3)])
+def test_a_covariance_that_is_none_breaks_nothing(covariance_m2: NDArray[np.float64]) -> None:
+    tracker, last = fed(covariance_m2=covariance_m2)
+    np.testing.assert_allclose(tracker.at(last + 50 * MS).eyes_m, STILL, atol=1e-6)
+
+
+def test_sigma_grows_while_the_head_is_not_seen() -> None:
+    tracker, last = fed(count=60, motion=moving)
+    sigmas = [tracker.at(last + ms * MS).sigma_m for ms in (10, 60, 120, 250, 400)]
+    assert sigmas == sorted(sigmas) and sigmas[-1] > 0.02  # it may have turned round, at 0.3 m/s
+
+
+def test_depth_counts_by_its_lever() -> None:
+    depth = np.diag([0.001**2, 0.0, 0.0])
+    eye_m = np.array([0.75, 0.0, 0.0])
+    random = np.random.default_rng(0)
+    foot = np.stack([random.uniform(-0.5184, 0.5184, 100_000), random.uniform(-0.2916, 0.2916, 100_000)], 1) / 2
+    expected = np.sqrt(((foot / 0.75 * 0.001) ** 2).mean())
+    assert sideways_sigma_m(depth, eye_m, panel_m=(0.5184, 0.2916)) == pytest.approx(expected, rel=0.01)
 
 
 # --- loss and return
@@ -173,7 +219,7 @@ def test_eyes_that_return_are_followed_within_two_samples_and_without_a_jump(los
         shown.append((ns, tracker.at(ns + ahead)))
     y = np.array([a.eyes_m[0, 1] for _, a in shown])
     assert np.abs(np.diff(y)).max() < 0.045  # of 80 mm: no frame shows more than about half of the way at once
-    arrived = next(ns for ns, a in shown if abs(a.eyes_m[0, 1] - elsewhere[0, 1]) < 0.004)
+    arrived = next(ns for ns, a in shown if abs(a.eyes_m[0, 1] - elsewhere[0, 1]) < 0.015)
     assert arrived - back_ns <= 2 * PERIOD + PERIOD // 3
 
 
@@ -199,8 +245,8 @@ def test_a_turning_and_tilting_head_is_followed_without_refusing_samples() -> No
         half *= 0.031 / np.linalg.norm(half)
         return np.array([STILL.mean(0) - half, STILL.mean(0) + half])
 
-    tracker, last = fed(count=120, motion=turned)
-    assert tracker.outliers == 0
+    tracker, last = Tracker(), 10**9 + 119 * PERIOD
+    assert not any([tracker.update(points(turned(k)), capture_ns=10**9 + k * PERIOD) for k in range(120)])
     assert np.linalg.norm(tracker.at(last + 60 * MS).eyes_m - turned(119 + 60 * MS / PERIOD), axis=1).max() < 0.012
 
 
@@ -213,65 +259,12 @@ def test_an_eye_that_was_filled_in_pulls_less() -> None:
     assert 0 < pull("left") < 0.6 * pull("")
 
 
-# --- properties
-
-
-def test_it_is_deterministic() -> None:
-    runs = []
-    for _ in range(2):
-        tracker = Tracker()
-        for o in observe("walk", seconds=5, rate_hz=30):
-            tracker.update(o.points, capture_ns=o.capture_ns)
-            runs.append(tracker.at(o.capture_ns + 60 * MS).eyes_m)
-    half = len(runs) // 2
-    assert all(np.array_equal(a, b) for a, b in zip(runs[:half], runs[half:]) if a is not None)
-
-
-def test_it_turns_and_shifts_with_the_frame() -> None:
-    turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
-    shift = np.array([0.1, -0.2, 0.3])
-    here, there = Tracker(), Tracker()
-    for o in observe("lean", seconds=4, rate_hz=30, outliers=0.05):
-        there.update(o.points and points(o.points.eyes_m @ turn.T + shift), capture_ns=o.capture_ns)
-        here.update(o.points, capture_ns=o.capture_ns)
-        one, other = here.at(o.capture_ns + 50 * MS).eyes_m, there.at(o.capture_ns + 50 * MS).eyes_m
-        assert (one is None) == (other is None)
-        if one is not None:
-            np.testing.assert_allclose(one @ turn.T + shift, other, atol=1e-9)
-
-
-def test_five_percent_outliers_hardly_move_it() -> None:
-    def p95(outliers: Any) -> Any:
-        tracker, errors = Tracker(), []
-        for o in observe("lean", seconds=20, rate_hz=60, outliers=outliers, dropout_every_s=0):
-            tracker.update(o.points, capture_ns=o.capture_ns)
-            truth = true_eyes("lean", np.array([o.capture_ns / 1e9]))[0]
-            errors.append(np.linalg.norm(tracker.at(o.capture_ns).eyes_m - truth, axis=1).max())
-        return np.percentile(errors[30:], 95)
-
-    assert p95(0.05) < 1.15 * p95(0.0)
-
-
-def test_only_one_model_is_a_plain_kalman_filter_and_works() -> None:
-    tracker, last = fed(count=60, motion=moving, settings=TrackerSettings(acceleration=(0.1,)))
-    np.testing.assert_allclose(tracker.at(last).eyes_m, moving(59), atol=1e-3)
-
-
-def test_every_refused_sample_is_counted() -> None:
-    tracker, last = fed(motion=moving)
-    for k in range(1, 4):
-        tracker.update(points(STILL * 1.4), capture_ns=last + k * PERIOD)  # eyes 87 mm apart are no person's
-    assert tracker.outliers == 3
-
-
 @pytest.mark.parametrize("since_ms", [40, 60, 90, 119])
 def test_lost_eyes_go_on_until_the_loss_and_then_come_to_rest_with_the_time_constant(since_ms: int) -> None:
-    settings = TrackerSettings()
     tracker, last = fed(60, moving)
-    speed = (tracker.at(last + 10 * MS).eyes_m - tracker.at(last).eyes_m) / 0.010
     tracker.update(None, capture_ns=last + PERIOD)
     held = tracker.at(last + since_ms * MS)
-    known, rest = PERIOD / 1e9, settings.decay_s
-    gone = known + rest * (1 - np.exp(-(since_ms / 1e3 - known) / rest))
+    known = PERIOD / 1e9
+    gone = known + DECAY_S * (1 - np.exp(-(since_ms / 1e3 - known) / DECAY_S))
     assert held.label == "held"
-    np.testing.assert_allclose(held.eyes_m - tracker.at(last).eyes_m, speed * gone, atol=1e-9)
+    np.testing.assert_allclose(held.eyes_m, moving(59 + gone * 1e9 / PERIOD), atol=1e-3)

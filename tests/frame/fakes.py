@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from runtime.frame.pacing import Pacer
 from runtime.frame.presenter import Presenter, Refresh
 from runtime.frame.run_state import RunCell
 from runtime.frame.samples import Samples
-from runtime.frame.solver import Step
+from runtime.frame.solver import SolverStep
 from runtime.frame.solver_host import News, SolverHost, Task
 from runtime.frame.viewer import Viewer
 from runtime.optics.stack import PanelStack
@@ -137,12 +136,12 @@ class FakePanels(PanelSink):
 class FakeParts:
     """`SolverParts` whose steps are a test's own function."""
 
-    def __init__(self, step: Callable[[SolveRequest], Step], stage_ms: dict[str, float] | None = None) -> None:
+    def __init__(self, step: Callable[[SolveRequest], SolverStep], stage_ms: dict[str, float] | None = None) -> None:
         self.behave, self.stage_ms = step, stage_ms or {}
         self.asked: list[SolveRequest] = []
         self.closed: list[bool] = []  # with `abandoned`, each time
 
-    def step(self, request: SolveRequest) -> Step:
+    def step(self, request: SolveRequest) -> SolverStep:
         self.asked.append(request)
         return self.behave(request)
 
@@ -171,7 +170,7 @@ class Stage:
     """A presenter on a test clock, among fakes; a sensor of `sensor_hz` sees the eyes where `eyes` says."""
 
     def __init__(self, *, sensor_hz: float = 60.0, **tables: dict[str, Any]) -> None:
-        defaults: dict[str, Any] = {"tracker": {"hold_s": 0.5, "blend_s": 0.3}, "plan": {"reuse": False}}
+        defaults: dict[str, Any] = {"tracker": {"hold_s": 0.5, "blend_s": 0.3}, "plan": {"enabled": False}}
         merged = {name: {**defaults.get(name, {}), **tables.get(name, {})} for name in {**defaults, **tables}}
         self.settings = Settings.model_validate(merged)
         self.clock = SimulatedClock(NS_PER_S)
@@ -223,8 +222,3 @@ class Named:
 
     def __init__(self, name: str) -> None:
         self.name = name
-
-
-def renumbered(solved: Solution, number: int) -> Solution:
-    """The same layers as another solution."""
-    return replace(solved, number=number)

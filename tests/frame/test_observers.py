@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from runtime.frame.observers import Observers
+from runtime.frame.presenter import Observers
 from tests.frame.fakes import Stage, Watching
 
 
@@ -17,19 +17,3 @@ def test_each_is_told_everything_in_order() -> None:
         both.sampled(sample)
     assert first.refreshes == second.refreshes == refreshes
     assert first.samples == second.samples == stage.watching.samples != []
-
-
-def test_who_comes_first_is_told_first() -> None:
-    told: list[str] = []
-
-    class Named(Watching):
-        def __init__(self, name: str) -> None:
-            super().__init__()
-            self.name = name
-
-        def refreshed(self, refresh: object) -> None:
-            told.append(self.name)
-
-    (refresh,) = Stage().refresh(1)
-    Observers(Named("account"), Named("black box")).refreshed(refresh)
-    assert told == ["account", "black box"]

@@ -10,13 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runtime.clock import NS_PER_MS
-from runtime.frame.policy import Decision, Flatness, FramePolicy, Made, wants_flat
+from runtime.frame.policy import Decision, Flatness, FramePolicy, SolutionKey
 from runtime.plan.savings import Plan
-from runtime.records import EyesEstimate, SolveRequest
+from runtime.records import SolveRequest
 from tests.frame.fakes import EYES, aside
 
-STILL = Plan(reuse=True, focus=False, eyes=(True, True), dead_band_m=None)
-NONE_LEFT_OUT = Plan(reuse=False, focus=False, eyes=(True, True), dead_band_m=None)
+STILL = Plan((True, True))
 
 
 def wish(eyes_m: Any = EYES, *, flat: bool = False, paused: bool = False) -> SolveRequest:
@@ -29,8 +28,8 @@ class Told:
     def __init__(self, *, plan: Plan | None = STILL) -> None:
         self.policy, self.plan = FramePolicy(), plan
         self.version = self.revision = 0
-        self.solved: Made | None = None
-        self.flat: Made | None = None
+        self.solved: SolutionKey | None = None
+        self.flat: SolutionKey | None = None
 
     def asked(self, request: SolveRequest) -> Decision:
         decision = self.policy.next_job(
@@ -42,9 +41,9 @@ class Told:
             flat=self.flat,
         )
         if decision.kind == "solve":
-            self.solved = Made(self.version, self.revision, decision.eyes_m)
+            self.solved = SolutionKey(self.version, self.revision, decision.eyes_m)
         if decision.kind == "flat":
-            self.flat = Made(self.version, self.revision, None, self.policy.episode)
+            self.flat = SolutionKey(self.version, self.revision, None, self.policy.episode)
         return decision
 
     def kinds(self, *requests: SolveRequest) -> list[str]:
@@ -66,41 +65,12 @@ def test_eyes_that_are_where_they_were_are_solved_for_once_and_any_others_anew()
     ]  # fmt: skip
 
 
-def test_a_fixed_dead_band_lets_eyes_move_within_it_from_where_they_were_solved_for() -> None:
-    told = Told(plan=Plan(True, False, (True, True), dead_band_m=0.002))
-    told.kinds(wish(), wish())
-    steps = [told.asked(wish(aside(k * 0.0009))).kind for k in range(1, 7)]
-    assert steps == ["nothing", "nothing", "solve", "nothing", "nothing", "solve"]  # drift does not add up
-
-
-def test_without_a_plan_for_it_the_band_counts_for_nothing() -> None:
-    told = Told(plan=Plan(False, False, (True, True), dead_band_m=0.002))
-    told.kinds(wish(), wish())
-    assert told.asked(wish(aside(0.0001))).kind == "solve"
-
-
 @pytest.mark.parametrize("what", ["version", "revision"])
 def test_other_settings_and_other_content_are_solved_for_though_the_head_rests(what: str) -> None:
     told = Told()
     told.kinds(wish(), wish())
     setattr(told, what, 1)
     assert told.kinds(wish(), wish()) == ["solve", "nothing"]
-
-
-def test_an_eye_that_can_t_see_gives_way_to_the_other() -> None:
-    told = Told(plan=Plan(True, False, (False, True), None))
-    told.asked(wish())
-    assert np.array_equal(told.asked(wish()).eyes_m, EYES[[1, 1]])
-    moved = EYES.copy()
-    moved[0] += 0.1  # the eye that does not count
-    assert told.asked(wish(moved)).kind == "nothing"
-
-
-def test_nobody_is_solved_for_where_nobody_is_seen() -> None:
-    told = Told()
-    told.kinds(wish(), wish())
-    told.version = 1
-    assert told.asked(wish(None)).kind == "nothing"
 
 
 def test_paused_makes_nothing_new_whatever_changes_but_the_first_picture() -> None:
@@ -155,27 +125,11 @@ def test_what_is_asked_for_again_and_again_is_there_soon_and_then_nothing_is_don
         assert told.solved.revision == told.revision
 
 
-def eyes(label: str) -> EyesEstimate:
-    return EyesEstimate(0, 0, None if label == "none" else EYES, label)
-
-
-def test_the_flat_picture_is_made_before_it_is_needed() -> None:
-    assert wants_flat(eyes("held"), flat_asked=False, flatness=0.0)
-    assert wants_flat(eyes("none"), flat_asked=False, flatness=0.0)
-    assert wants_flat(eyes("predicted"), flat_asked=True, flatness=0.0)
-    assert wants_flat(eyes("predicted"), flat_asked=False, flatness=0.3)
-    assert not any(wants_flat(eyes(label), flat_asked=False, flatness=0.0) for label in ("exact", "rested"))
-
-
 def test_the_picture_goes_over_to_the_flat_one_evenly_and_back() -> None:
     flatness = Flatness(0.0)
     values = [flatness.toward(1.0, blend_s=0.1, now_ns=k * 20 * NS_PER_MS) for k in range(8)]
     assert values == pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.0, 1.0])
     assert flatness.toward(0.0, blend_s=0.1, now_ns=190 * NS_PER_MS) == pytest.approx(0.5)
-
-
-def test_without_a_blend_it_goes_over_at_once() -> None:
-    assert Flatness(0.0).toward(1.0, blend_s=0.0, now_ns=5) == 1.0
 
 
 @given(st.lists(st.tuples(st.sampled_from([0.0, 1.0]), st.integers(0, 500 * NS_PER_MS)), max_size=30))

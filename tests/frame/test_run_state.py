@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import threading
 from typing import Any
 
@@ -29,21 +28,6 @@ def test_a_change_is_another_value_with_another_version_and_the_one_before_is_ha
     assert cell.state.content is content
     assert cell.state.predictor is before.predictor
     assert cell.state.version == before.version + 1
-
-
-def test_what_a_reader_holds_does_not_change(cell: RunCell) -> None:
-    held = cell.state
-    cell.replace(settings=Settings())
-    assert held.version == 0
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        held.content = Part()
-
-
-def test_a_part_that_there_is_not_changes_nothing(cell: RunCell) -> None:
-    before = cell.state
-    with pytest.raises(TypeError):
-        cell.replace(colour="red")
-    assert cell.state is before
 
 
 def test_changes_from_many_threads_are_all_made_and_each_part_is_handed_back_once(cell: RunCell) -> None:

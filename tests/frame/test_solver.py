@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 
 from runtime.clock import NS_PER_S
-from runtime.config import ContentSettings, Settings
+from runtime.config import ContentSettings, Settings, changed
 from runtime.content.base import ContentSource
 from runtime.content.registry import open_content
 from runtime.errors import ContentFailure, ModelFailure
 from runtime.eyes.calibration import load_calibration
 from runtime.frame.run_state import RunCell
-from runtime.frame.solver import Solver
+from runtime.frame.solver import Solver, SolverStep
 from runtime.model.predictor import Predictor
 from runtime.plan.drawing import drawn_for
-from runtime.plan.predictors import planned_predictor
 from runtime.records import SolveRequest
 from tests.frame.conftest import SMALL
 from tests.frame.fakes import EYES, aside
@@ -51,27 +50,13 @@ def test_the_flat_picture_is_for_eyes_anywhere_and_the_same_on_every_pixel_s_way
 def test_a_solution_is_what_the_model_makes_of_what_the_content_shows_these_eyes(solver: Solver, cell: RunCell) -> None:
     state = cell.state
     solution = solver.step(wish(time_ns=77)).solution
-    images = drawn_for(state.predictor, state.content, EYES, time_ns=77)
-    layers = state.predictor.predict(images, EYES, eye_sigma_mm=solution.eye_sigma_mm).layers
+    job = drawn_for(state.predictor, state.content, EYES, time_ns=77, trimmed=True, eye_sigma_mm=solution.eye_sigma_mm)
+    layers = state.predictor.solve(job).layers
     assert np.array_equal(solution.layers, layers)
     assert np.array_equal(solution.solved_for_m, EYES)
     assert solution.solved_for_ns == 77
     assert solution.seeing == (True, True)
     assert solution.layers.std() > 5
-
-
-def test_its_stages_are_told_and_together_they_are_its_time(solver: Solver) -> None:
-    stages = solver.step(wish()).solution.stage_ms
-    assert {"render", "inference", "finish"} <= set(stages) <= {"render", "prepare", "inference", "finish"}
-    assert all(value >= 0.0 for value in stages.values())
-    assert stages["render"] > 0 and stages["inference"] > 0
-
-
-def test_solutions_and_flat_pictures_are_numbered_together_and_upwards(solver: Solver) -> None:
-    made = [solver.step(wish(aside(k / 100), flat=k == 2)) for k in range(4)]
-    numbers = [(step.solution or step.flat).number for step in made]
-    assert numbers == sorted(set(numbers))
-    assert numbers[0] == 2  # the flat picture was the first
 
 
 def test_a_solver_that_is_made_anew_gives_no_number_a_second_time(solver: Solver, cell: RunCell) -> None:
@@ -94,7 +79,7 @@ def test_a_solution_that_is_held_never_changes_whatever_is_solved_after_it(solve
 
 def test_the_same_eyes_and_content_are_not_solved_for_twice(solver: Solver) -> None:
     assert solver.step(wish()).solution is not None
-    assert solver.step(wish(time_ns=NS_PER_S)).idle
+    assert solver.step(wish(time_ns=NS_PER_S)) == SolverStep()
     assert solver.step(wish(aside(0.001))).solution is not None
 
 
@@ -104,7 +89,7 @@ def test_another_state_is_solved_for_with_its_own_parts(solver: Solver, cell: Ru
     cell.replace(content=other)
     second = solver.step(wish()).solution
     assert not np.array_equal(first.layers, second.layers)
-    assert solver.step(wish()).idle
+    assert solver.step(wish()) == SolverStep()
     other.close()
 
 
@@ -123,22 +108,25 @@ def test_the_less_sure_the_eyes_the_more_the_solution_is_made_to_hold(solver: So
     assert sigmas[3] > 2.0
 
 
+def test_after_its_budget_no_further_step_begins_but_on_a_simulated_clock(cell: RunCell, solver: Solver) -> None:
+    whole = solver.step(wish()).solution.layers.copy()
+    cell.replace(settings=changed(cell.state.settings, "model", {"budget_ms": 1e-3}, source="a test"))
+    limited, simulated = (Solver(cell, SMALL, timed=timed) for timed in (True, False))
+    for made in (limited, simulated):
+        made.step(wish(None, flat=True))
+    assert not np.array_equal(limited.step(wish()).solution.layers, whole)
+    assert np.array_equal(simulated.step(wish()).solution.layers, whole)
+
+
 OFF_M = np.array([[0.123, 0.43, 0.0], [0.078, 0.47, 0.0]])  # the right eye is 80.6 degrees off the axis
 
 
 def test_an_eye_that_can_t_see_the_display_gives_way_to_the_other(solver: Solver, cell: RunCell) -> None:
-    planned = planned_predictor(cell.state.settings, SMALL)
-    cell.replace(predictor=planned)
     solution = solver.step(wish(OFF_M)).solution
     assert solution.seeing == (True, False)
     assert np.array_equal(solution.solved_for_m, OFF_M[[0, 0]])
     assert "the right eye" in [item.what for item in solver.plan_items()]
     assert solver.step(wish()).solution.seeing == (True, True)
-    planned.close()
-
-
-def test_one_eye_is_served_without_the_saving_of_windows_too(solver: Solver) -> None:
-    assert solver.step(wish(OFF_M)).missing == {}
 
 
 def test_the_flat_picture_is_drawn_from_the_middle_of_the_last_eyes(solver: Solver, cell: RunCell) -> None:
@@ -176,7 +164,7 @@ def test_a_model_that_fails_is_named_and_tried_again(
     solver: Solver, predictor: Predictor, monkeypatch: pytest.MonkeyPatch, fault: Exception
 ) -> None:
     with monkeypatch.context() as patch:
-        broken(predictor, "predict", fault, patch)
+        broken(predictor, "solve", fault, patch)
         assert solver.step(wish()).missing == {"model": str(fault) or "MemoryError"}
     assert solver.step(wish()).missing == {}
 
@@ -204,8 +192,3 @@ def test_a_fault_that_is_over_is_told_no_more_though_nothing_is_to_be_made(
         broken(content, "revision", ContentFailure("busy"), patch)
         assert solver.step(wish()).missing == {"content": "busy"}
     assert solver.step(wish()).missing == {}
-
-
-def test_the_plan_is_told_while_another_thread_solves(solver: Solver) -> None:
-    solver.step(wish())
-    assert "render and inference" in [item.what for item in solver.plan_items()]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from runtime.clock import NS_PER_MS, NS_PER_S
-from runtime.frame.stats import WINDOW, Ring, RunStats
+from runtime.frame.stats import Ring, RunStats
 from runtime.records import RefreshAccount, State
 
 PERIOD_NS = NS_PER_S // 50
@@ -88,22 +88,6 @@ def test_rates_now_are_of_the_last_second_and_those_of_the_run_are_not() -> None
     assert stats.summary(stale_inputs=0)["fps"] < 15
 
 
-def test_faults_are_counted_by_part() -> None:
-    stats = told([])
-    for part in ("model", "panel", "model"):
-        stats.fault(part)
-    assert stats.summary(stale_inputs=0)["faults"] == {"model": 2, "panel": 1}
-
-
-def test_memory_is_bounded_and_quantiles_are_of_the_newest() -> None:
-    ring = Ring(4)
-    assert ring.quantiles(("p50",)) is None
-    for value in range(100):
-        ring.add(float(value))
-    assert ring.quantiles(("p50", "max")) == {"p50": 97.5, "max": 99.0}
-    assert WINDOW >= 60 * 60  # a minute of refreshes
-
-
 @pytest.mark.parametrize("count", [1, 2, 3, 64, 1000])
 def test_quantiles_are_those_of_numpy(count: int) -> None:
     ring, values = Ring(), np.random.default_rng(1).normal(size=count)
@@ -111,28 +95,6 @@ def test_quantiles_are_those_of_numpy(count: int) -> None:
         ring.add(value)
     known = {f"p{share}": round(float(np.percentile(values, share)), 4) for share in (5, 50, 95, 99)}
     assert ring.quantiles((*known, "max")) == {**known, "max": round(float(values.max()), 4)}
-
-
-def test_quantiles_that_are_asked_for_often_may_be_without_the_newest_values_but_not_without_many() -> None:
-    ring = Ring(640)
-    for value in range(640):
-        ring.add(float(value))
-    asked = ring.quantiles(("max",))
-    for value in range(640, 650):
-        ring.add(float(value))
-    assert ring.quantiles(("max",), nearly=True) == asked == {"max": 639.0}
-    assert ring.quantiles(("p50",), nearly=True) == {"p50": 329.5}  # not asked for before
-    ring.add(650.0)  # more than a sixty-fourth
-    assert ring.quantiles(("max",), nearly=True) == {"max": 650.0}
-    ring.add(651.0)
-    assert ring.quantiles(("max",)) == {"max": 651.0}  # who wants to know it exactly does
-
-
-def test_the_first_values_are_told_at_once() -> None:
-    ring = Ring()
-    for value in range(3):
-        ring.add(float(value))
-        assert ring.quantiles(("max",), nearly=True) == {"max": float(value)}
 
 
 def test_the_capture_to_light_is_of_the_light_as_it_was_presented() -> None:

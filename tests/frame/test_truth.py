@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from runtime.clock import NS_PER_MS, NS_PER_S
-from runtime.frame.truth import GAP_NS, KEPT, UNKNOWN, TrueEyes
+from runtime.frame.truth import GAP_NS, UNKNOWN, TrueEyes
 
 
 def eyes(y_m: float) -> np.ndarray:
@@ -22,14 +22,7 @@ def truth() -> TrueEyes:
     return made
 
 
-def test_a_recording_that_knows_no_truth_answers_none() -> None:
-    truth = TrueEyes()
-    assert not truth.known
-    assert truth.at(5) is None
-
-
 def test_at_a_sample_it_is_the_sample_s_and_between_two_it_lies_between(truth: TrueEyes) -> None:
-    assert truth.known
     assert np.array_equal(truth.at(50 * NS_PER_MS), eyes(0.005))
     assert truth.at(53 * NS_PER_MS) == pytest.approx(eyes(0.0053))
     assert np.array_equal(truth.at(100 * NS_PER_MS), eyes(0.010))  # the newest
@@ -59,16 +52,3 @@ def test_nothing_is_made_up_for_a_gap(truth: TrueEyes) -> None:
     truth.add(newest_ns + GAP_NS + 1, eyes(0.5))
     assert truth.at(newest_ns + GAP_NS // 2) is None
     assert np.array_equal(truth.at(newest_ns + GAP_NS + 1), eyes(0.5))
-
-
-def test_samples_that_come_out_of_order_are_no_truth(truth: TrueEyes) -> None:
-    truth.add(20 * NS_PER_MS, eyes(9.0))
-    assert np.array_equal(truth.at(20 * NS_PER_MS), eyes(0.002))
-
-
-def test_it_remembers_so_much_and_no_more() -> None:
-    truth = TrueEyes()
-    for k in range(3 * KEPT):
-        truth.add(k * NS_PER_MS, eyes(k / 1e6))
-    assert truth.at(0) is None
-    assert truth.at((3 * KEPT - 2) * NS_PER_MS) is not None

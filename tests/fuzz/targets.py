@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import struct
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -99,6 +98,7 @@ def _configs() -> list[bytes]:
 
     table = json.loads(Settings().model_dump_json())
     table["sensor"].pop("fixed_eyes_m")
+    table["content"].pop("background")
     return [
         tomlkit.dumps(table).encode(),
         b"[model]\nname = 'fast'\n",
@@ -151,25 +151,18 @@ def _pair(data: bytes, folder: Path) -> object:
 def _tables() -> list[bytes]:
     """What calibration reads besides pairs: the first line tells which reader it is for."""
     greys = "\n".join(f"{grey},{0.1 + grey**2}" for grey in (0, 64, 128, 192, 255))
-    verniers = "reference,panel,eye_x,eye_y,eye_z,reference_u,reference_v,panel_u,panel_v\n1,0,0.5,0,0,9,9,8,8\n"
     return [
         b"grey,luminance\n" + greys.encode(),
         b"grey,red,green,blue\n0,1,1,1\n0.5,2,2,2\n0.7,3,3,3\n1,4,4,4\n",
         b"phase,grey\n0,0\n0.4,0.5\n1,1\n",
         b"phase,red,green,blue\n0,0,0,0\n1,1,1,1\n",
-        b"seconds,viewpoint\n0.9,R40-phi70-theta80\n2,R50-phi80-theta90\n",
-        verniers.encode(),
         b'{"done": {"geometry": {"width_m": 0.5}}}',
     ]
 
 
 def _table(data: bytes, folder: Path) -> object:
-    from calib.capture_run import read_marks
     from calib.grey import fit_series, read_series
     from calib.setup_run import read_progress
-    from calib.vernier import read_settings
-    from calib.viewpoints import grid
-    from runtime.config import StackGeometry
     from runtime.panels.lut import measured_curve
 
     path = _at(folder, "a.csv", data)
@@ -177,10 +170,6 @@ def _table(data: bytes, folder: Path) -> object:
         return read_progress(path)
     if data[:1] == b"p":
         return measured_curve(path)
-    if data[:1] == b"s":
-        return read_marks(path, grid())
-    if data[:1] == b"r":
-        return read_settings(path, StackGeometry().stack())
     return fit_series(read_series(path), path)
 
 
@@ -355,16 +344,17 @@ def _clouds() -> list[bytes]:
 
 
 def _cloud(data: bytes, folder: Path) -> object:
+    from runtime.content.ply import read_header
     from runtime.content.points import load_points
 
-    return load_points(_at(folder, "a.ply", data), limits=LIMITS)
+    return load_points(read_header(_at(folder, "a.ply", data), LIMITS))
 
 
 def _playlists() -> list[bytes]:
     text = (
         "repeat = false\n[[show]]\nscene = 'demo'\nseconds = 2\nscale = 1.5\noffset_m = [0.0, 0.01, 0.0]\n"
         "[[show]]\nscene = 'a.png'\nseconds = 0.5\nlayout = 'side-by-side'\n"
-        "[[show]]\nscene = 'lego_bulldozer'\nfile = 'a.ply'\nseconds = 86400\nup = '+y'\nout = '-x'\n"
+        "[[show]]\nscene = 'lego_bulldozer'\nfile = 'a.ply'\nseconds = 86400\naxes = '+y -x'\n"
     )
     return [text.encode(), json.dumps({"show": [{"scene": "flat", "seconds": 3}]}).encode()]
 
@@ -422,49 +412,12 @@ def _splats() -> list[bytes]:
 
 def _splat(data: bytes, folder: Path) -> object:
     from runtime.content.gaussians import load_gaussians
+    from runtime.content.ply import read_header
 
-    return load_gaussians(_at(folder, "a.ply", data), limits=LIMITS)
+    return load_gaussians(read_header(_at(folder, "a.ply", data), LIMITS))
 
 
 # Other programs
-
-
-def _handovers() -> list[bytes]:
-    """What a client says on the socket, and what it writes into the slots' headers."""
-    return [struct.pack("<QQQQQQ", 1, 1, 1, 2, 2, 2) + b"hello\n", struct.pack("<QQQQQQ", 5, 4, 9, 0, 0, 0)]
-
-
-def _handover(data: bytes, folder: Path) -> object:
-    import socket
-
-    from runtime.content.base import View
-    from runtime.content.external import HEADER_BYTES, ExternalSource
-    from runtime.optics.views import raster_from_stack
-
-    path = folder / "s"
-    source = ExternalSource(ContentSettings(scene="external", external=str(path)), stack=STACK)
-    try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
-            client.settimeout(5)
-            client.connect(str(path))
-            source.revision(time_ns=0)
-            for turn in range(3):
-                for side, y in enumerate((-0.03, 0.03)):
-                    eye = np.array([0.6, y, 0.0])
-                    plane = STACK.panel(1)
-                    view = View(eye, side, raster_from_stack(eye, plane), plane.width_px, plane.height_px)
-                    with contextlib.suppress(PhasestackError):
-                        source.render(view, time_ns=turn)
-                for slot in range(2):
-                    numbers = data[24 * slot : 24 * slot + 24]
-                    start = HEADER_BYTES + slot * source._slot_bytes
-                    source._memory[start : start + len(numbers)] = numbers
-                with contextlib.suppress(OSError):
-                    client.send(data[48:] or b"x", socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
-                source.revision(time_ns=turn)
-    finally:
-        source.close()
-    return source.rejected
 
 
 def _requests() -> list[bytes]:
@@ -535,7 +488,6 @@ TARGETS: dict[str, Target] = {
     "splat": Target(_splats, _splat),
     "playlist": Target(_playlists, _playlist),
     "stream": Target(_videos, _stream),
-    "external": Target(_handovers, _handover),
     "socket": Target(_requests, _request),
     "edid": Target(_edids, _edid),
     "json": Target(lambda: [*_panels(), b'{"a": [1, 2.5, null, "x\\u00e9"]}'], _json),

@@ -85,15 +85,15 @@ def pause(presenter: Presenter) -> None:
 def break_model(presenter: Presenter) -> None:
     """From now on the model raises."""
 
-    def predict(*_: Any, **__: Any) -> Any:
+    def solve(*_: Any, **__: Any) -> Any:
         raise ModelFailure("a golden run's model is broken")
 
-    vars(presenter.run_cell.state.predictor)["predict"] = predict
+    vars(presenter.run_cell.state.predictor)["solve"] = solve
 
 
 def mend_model(presenter: Presenter) -> None:
     """The model answers again."""
-    del vars(presenter.run_cell.state.predictor)["predict"]
+    del vars(presenter.run_cell.state.predictor)["solve"]
 
 
 # Each panel mounted another way: none shows its layer as it is.

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from runtime.config import Settings
-from runtime.daemon.build import Run, RunOptions
+from runtime.daemon.build import Host, Run, RunOptions
 from runtime.daemon.drive import drive
 from runtime.frame.presenter import Presenter, Refresh
 from runtime.optics.alignment import scale_and_shift, shown_layers
-from runtime.records import U8, RefreshAccount, SensorFrame
+from runtime.records import U8, SensorFrame
 from tests.golden.cases import Case
 
 DIGITS = 7  # of what is stored: a tenth of a micrometre, a tenth of the least tolerance
@@ -75,22 +75,19 @@ class Collector:
             self.light[account.frame] = shown_layers(frame)[..., :3].copy()
 
 
-class Operator:
+class Operator(Host):
     """The run's supervisor: does what the case says, when it says."""
 
-    def __init__(self, case: Case) -> None:
-        self._actions, self._refresh = case.actions, 0
+    def __init__(self, case: Case, runs: list[Run]) -> None:
+        self._actions, self._refresh, self._runs = case.actions, 0, runs
 
-    def stop_reason(self) -> str:
-        return ""
+    def watches(self, run: Run) -> None:
+        self._runs.append(run)
 
     def carry_out_commands(self, presenter: Presenter) -> None:
         if action := self._actions.get(self._refresh):
             action(presenter)
         self._refresh += 1
-
-    def refreshed(self, presenter: Presenter, account: RefreshAccount) -> None:
-        return
 
 
 def play(case: Case, out: Path) -> Played:
@@ -100,13 +97,8 @@ def play(case: Case, out: Path) -> Played:
     runs: list[Run] = []
     summary = drive(
         settings,
-        RunOptions(max_speed=True, measure=True),
-        out=out,
-        frames=None,
-        total=None,
-        progress=False,
-        supervisor=Operator(case),
-        on_built=runs.append,
+        RunOptions(max_speed=True, measure=True, out=out),
+        host=Operator(case, runs),
         recorder=collector,
     )
     lines = [json.loads(line) for line in (out / "frames.jsonl").read_text(encoding="utf-8").splitlines()]

@@ -43,7 +43,7 @@ def test_doubt_is_how_far_the_outer_panels_move_for_an_eye_that_is_off() -> None
         there, back = relative_scale_shift(frame.middle_m, from_x_m=x_m, to_x_m=frame.x_m)
         return raster_from_plane @ np.append((at[:2] * here + shift) * there + back, 1.0)
 
-    columns, rows, own = frame.doubt(STACK, eye_sigma_mm=2.0)
+    columns, rows, own = frame.eye_sigma_px(STACK, eye_sigma_mm=2.0)
     aside = on(frame.middle_m + np.array([0, 2e-3, 0]), STACK.x_m[2]) - on(frame.middle_m, STACK.x_m[2])
     above = on(frame.middle_m + np.array([0, 0, 2e-3]), STACK.x_m[2]) - on(frame.middle_m, STACK.x_m[2])
     assert abs(aside[0]) == pytest.approx(columns, rel=1e-4) and abs(above[0]) < 1e-6
@@ -206,7 +206,9 @@ def test_where_the_origin_lies_along_x_changes_nothing() -> None:
     assert there.x_m == pytest.approx(here.x_m + 0.2)
     assert (there.cells, there.rows) == (here.cells, here.rows)
     np.testing.assert_allclose(there.plane_from_raster, here.plane_from_raster, atol=1e-12)
-    np.testing.assert_allclose(there.doubt(moved, eye_sigma_mm=2.0), here.doubt(STACK, eye_sigma_mm=2.0), rtol=1e-6)
+    np.testing.assert_allclose(
+        there.eye_sigma_px(moved, eye_sigma_mm=2.0), here.eye_sigma_px(STACK, eye_sigma_mm=2.0), rtol=1e-6
+    )
 
 
 def test_a_raster_that_opencv_can_not_sample_is_refused() -> None:

@@ -8,8 +8,9 @@ import pytest
 
 from runtime.config import ModelSettings
 from runtime.model.channels import is_grey
+from runtime.model.job import Job
 from runtime.model.predictor import load_predictor
-from runtime.model.unrolled import UnrolledPredictor
+from runtime.model.trim import Savings, Scene, trim
 from runtime.optics.stack import PanelStack
 from runtime.records import U8
 
@@ -39,12 +40,11 @@ def test_one_pixel_of_colour_is_colour(channel: int) -> None:
 def test_one_channel_gives_the_layers_of_three(name: str) -> None:
     """To a few last digits: OpenCV rounds a sixteenth of a code differently where it resizes three channels."""
     predictor = load_predictor(name, STACK, ModelSettings(name=name))
-    assert isinstance(predictor, UnrolledPredictor)
-    pictures = grey_pictures()
-    three = predictor.predict(pictures, EYES).layers.copy()
-    predictor.one_channel = True
-    one = predictor.predict(pictures, EYES).layers
-    assert predictor.channels == 1
+    job = Job(grey_pictures(), EYES)
+    three = predictor.solve(job).layers.copy()
+    trimmed, savings = trim(job, Scene(STACK))
+    assert savings == Savings(1.0, 1)
+    one = predictor.solve(trimmed).layers
     assert (one[..., 3] == 255).all()
     assert (one[..., 0] == one[..., 1]).all()
     difference = np.abs(one.astype(np.int16) - three)
@@ -54,23 +54,15 @@ def test_one_channel_gives_the_layers_of_three(name: str) -> None:
 
 def test_pictures_that_turn_grey_and_back_leave_nothing_behind() -> None:
     predictor = load_predictor("balanced", STACK, ModelSettings())
-    assert isinstance(predictor, UnrolledPredictor)
-    predictor.one_channel = True
     grey, coloured = grey_pictures(), grey_pictures(1)
     for side in coloured:
         side[0][60:90, 100:140, 2] = 10
-    first = predictor.predict(coloured, EYES).layers.copy()
-    assert predictor.channels == 3
-    predictor.predict(grey, EYES)
-    assert predictor.channels == 1
-    assert (predictor.predict(coloured, EYES).layers == first).all()
+    first = predictor.solve(Job(coloured, EYES)).layers.copy()
+    predictor.solve(Job(grey, EYES, channels=1))
+    assert (predictor.solve(Job(coloured, EYES)).layers == first).all()
 
 
 def test_colour_in_one_eye_alone_is_kept() -> None:
-    predictor = load_predictor("fast", STACK, ModelSettings(name="fast"))
-    assert isinstance(predictor, UnrolledPredictor)
-    predictor.one_channel = True
     pictures = grey_pictures()
     pictures[1][0][100:140, 200:260, 0] = 250
-    predictor.predict(pictures, EYES)
-    assert predictor.channels == 3
+    assert trim(Job(pictures, EYES), Scene(STACK))[1].channels == 3

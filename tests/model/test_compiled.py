@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,13 +15,13 @@ from hypothesis import strategies as st
 import runtime.model.pyramid_level
 from runtime.config import ModelSettings
 from runtime.evaluation.displayed import displayed, expected_db
-from runtime.model import loops
+from runtime.model import compiled
 from runtime.model.compiled import passes, sampling, warp
 from runtime.model.compiled.fade import fade_codes
 from runtime.model.compiled.level import CompiledLevel, warm_up
-from runtime.model.compiled.unseen import make_up_rows
+from runtime.model.compiled.unseen import extrapolate_rows
+from runtime.model.cpu import CpuBackend
 from runtime.model.fade import Softening
-from runtime.model.opencv_surround import OpenCvBackend
 from runtime.model.predictor import SHIPPED, load_predictor
 from runtime.model.pyramid_level import CENTRE, EYES, FRONT, OUTER, REAR, PyramidLevel
 from runtime.model.rows import RowPool
@@ -65,8 +64,8 @@ def filled(kind: type[PyramidLevel], rows: RowPool, stack: PanelStack, *, boxes:
     level = kind(stack, reduction=1, rows=rows, channels=channels)
     level.crop(BOXES[boxes], stack)
     noise = np.random.default_rng(5)
-    for image in (*(level.outer[n] for n in OUTER), *level.wanted):
-        most = 2 * FULL if any(image is wanted for wanted in level.wanted) else FULL
+    for image in (*(level.outer[n] for n in OUTER), *level.target):
+        most = 2 * FULL if any(image is wanted for wanted in level.target) else FULL
         coarse = noise.integers(0, most, (image.shape[0] // 4 + 2, image.shape[1] // 4 + 2, *image.shape[2:]))
         fine = coarse.repeat(4, 0).repeat(4, 1)[: image.shape[0], : image.shape[1]]
         image[...] = (fine + np.roll(fine, 2, 0) + np.roll(fine, 2, 1)) // 3
@@ -132,9 +131,9 @@ def test_the_eyes_see_no_less_however_unsure_they_are(name: str, sigma_mm: float
     """What is blurred before it is sampled here is blurred after it there: not the same codes, but the same quality."""
     pair, found = eyes(0.6, 0.05, 0.03), []
     pictures = tuple(card_scene(eye) for eye in pair)
-    for compiled in (False, True):
+    for level in (PyramidLevel, CompiledLevel):
         predictor = load_predictor(name, CARDS, ModelSettings(threads=1))
-        predictor.surround_with(OpenCvBackend(compiled=compiled))
+        predictor.set_backend(CpuBackend(level=level))
         made = solve_still(*pictures, eyes_m=pair, fov_deg=FOV_DEG, predictor=predictor, eye_sigma_mm=sigma_mm).layers
         views = displayed(made, pictures, CARDS, eyes_m=pair, fov_deg=FOV_DEG, similarity=False)
         how: Any = {"eyes_m": pair, "fov_deg": FOV_DEG, "sigmas_mm": (sigma_mm,)}
@@ -243,14 +242,14 @@ def test_nothing_is_written_beside_the_images(rows: RowPool) -> None:
 
 def test_what_was_compiled_at_the_start_serves_every_case(rows: RowPool) -> None:
     warm_up()
-    compiled = (passes.correct, passes.blur, passes.close_centre, passes.show, warp.warp, make_up_rows, fade_codes)
+    kernels = (passes.correct, passes.blur, passes.close_centre, passes.show, warp.warp, extrapolate_rows, fade_codes)
     for boxes in BOXES:
         for channels in (1, 3):
             level = filled(CompiledLevel, rows, STACK, boxes=boxes, channels=channels)
             for sigma_mm in (0.0, 30.0):
                 fading = Softening(np.ones(level.size[0], np.float32), np.ones(level.size[1], np.float32))
                 solved(level, POSES["rolled"], sigma_mm=sigma_mm, fading=fading)
-    assert [len(function.signatures) for function in compiled] == [1] * len(compiled)
+    assert [len(function.signatures) for function in kernels] == [1] * len(kernels)
 
 
 @pytest.mark.parametrize(("right", "down"), [(0.0, 0.0), (0.1, -0.05), (-0.12, 0.0), (0.0, 0.1)])
@@ -302,40 +301,14 @@ def test_what_is_not_level_is_told(matrix: list[list[float]]) -> None:
     assert not warp.is_level(np.array(matrix), rows=slice(0, 80), columns=slice(0, 120), size=(160, 120))
 
 
-def test_without_numba_opencv_does_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    imported = builtins.__import__
-
-    def missing(name: str, *rest: Any, **names: Any) -> Any:
-        if name == "numba":
-            raise ImportError("No module named 'numba'")
-        return imported(name, *rest, **names)
-
-    monkeypatch.setattr(builtins, "__import__", missing)
-    found = loops.inner_loops.__wrapped__()
-    assert found.level is PyramidLevel and not found.compiled and "numba" in found.why
-
-
-def test_a_compiler_that_fails_is_told_and_opencv_does_it(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def broken() -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("runtime.model.compiled.level.warm_up", broken)
-    found = loops.inner_loops.__wrapped__()
-    assert found.level is PyramidLevel and not found.compiled
-    assert "No space left on device" in caplog.text and "No space left on device" in found.why
-
-
 def test_compiled_code_is_kept_by_what_it_follows_from(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    folder = loops._kept()
+    folder = compiled._kept()
     assert folder is not None and folder.parent == tmp_path / "phasestack" / "compiled"
     assert folder.stat().st_mode & 0o77 == 0
-    monkeypatch.setattr(loops, "SOURCES", loops.SOURCES[:1])
-    assert loops._kept() not in (None, folder)
     monkeypatch.setenv("XDG_CACHE_HOME", "/proc")
-    assert loops._kept() is None
+    elsewhere = compiled._kept()
+    assert elsewhere is not None and elsewhere.name == folder.name and not elsewhere.is_relative_to("/proc")
 
 
 def test_shown_codes_are_whole(rows: RowPool) -> None:

@@ -9,8 +9,8 @@ from runtime.config import ModelSettings
 from runtime.model import fade
 from runtime.model.compiled import fade as compiled
 from runtime.model.fade import Fade
+from runtime.model.job import Job, Part
 from runtime.model.predictor import load_predictor
-from runtime.model.unrolled import UnrolledPredictor
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 
@@ -49,12 +49,11 @@ def test_compiled_and_plain_fades_are_the_same(rows: int) -> None:
 
 def test_outer_panels_stay_even_beside_what_is_kept() -> None:
     predictor = load_predictor("balanced", STACK, ModelSettings())
-    assert isinstance(predictor, UnrolledPredictor)
     pictures = [[np.full((270, 480, 4), 128, np.uint8)] for _ in EYES]
     for side, shift in enumerate((3, -3)):
         pictures[side][0][100:160, 220 + shift : 260 + shift, :3] = (250, 60, 20)
-    predictor.fade = Fade(PixelRect(150, 60, 330, 200), over_px=(60.0, 0.0))
-    outer = predictor.predict(pictures, EYES).layers[[0, 2], ..., :3].astype(np.int16)
+    part = Part(PixelRect(24, 0, 456, 270), PixelRect(150, 60, 330, 200), (60.0, 0.0))
+    outer = predictor.solve(Job(pictures, EYES, part=part)).layers[[0, 2], ..., :3].astype(np.int16)
     assert np.abs(outer - 128).max() > 20
     assert np.abs(outer[:, :, :120] - 128).max() <= 1
     assert np.abs(outer[:, :, 360:] - 128).max() <= 1

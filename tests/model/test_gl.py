@@ -1,45 +1,46 @@
-"""The backend in OpenGL does what the one in OpenCV does: code for code where both sample exactly, and by the eye."""
+"""OpenGL does what the processor does: code for code where both sample exactly, and by the eye."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-import runtime.model.opencv_surround
+import runtime.model.cpu
 import runtime.model.pyramid_level
-from model_export.stills import random_still
-from runtime.config import ModelSettings, Settings
+from runtime.config import ModelSettings
 from runtime.errors import ContextLost, InputError, MissingPart
 from runtime.evaluation.displayed import displayed, expected_db
 from runtime.model import still
 from runtime.model.backends import choose
-from runtime.model.fade import Fade
+from runtime.model.contract import Step
+from runtime.model.cpu import CpuBackend
 from runtime.model.gl.backend import GlBackend
 from runtime.model.gl.programs import Account
-from runtime.model.loops import Loops
-from runtime.model.opencv_surround import OpenCvBackend
+from runtime.model.job import Job, Part
 from runtime.model.predictor import SHIPPED, Predictor, load_predictor
 from runtime.model.pyramid_level import PyramidLevel
 from runtime.model.still import solve_still
+from runtime.model.trim import Savings, Scene, trim
 from runtime.model.unrolled import UnrolledPredictor
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, Tilt
-from runtime.plan.predictors import planned_predictor
 from runtime.records import F64, U8
 from runtime.support.gl import offscreen_context
 from tests.model.exact import exact_resample
 from tests.model.scenes import FOV_DEG, card_scene, eyes
+from tests.model_export.stills import random_still
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 240, 135)
 TILT = Tilt(((0.001, 0.012, -0.006), (0.0, 0.0, 0.0), (-0.002, 0.004, 0.015)), (1.0, 0.1, -0.05))
 WITHIN_ONE = 0.999  # of all codes
 REFINED_WITHIN_ONE = 0.997  # where corrections go on from panels in 8 bits, of which a sixteenth decides a whole code
 UNSURE_MM = 24.0  # pixels are eight times those of 1920x1080: as many of them as 3 mm are there
-LEAST_DB = -0.05  # of displayed quality, against OpenCV
+LEAST_DB = -0.05  # of displayed quality, against the processor
+PART = Part(PixelRect(40, 24, 200, 135), PixelRect(60, 34, 190, 130), (40.0, 10.0))
 HALF_TURN = np.radians(30)
 POSES = {
     "straight": eyes(0.6),
@@ -71,24 +72,24 @@ def gl(made: tuple[Any, GlBackend]) -> Iterator[GlBackend]:
 
 @pytest.fixture
 def exactly(monkeypatch: pytest.MonkeyPatch) -> None:
-    """OpenCV's steps sample by the definition: its own sampling is off by up to a twelfth of a pixel."""
-    for module in (runtime.model.opencv_surround, runtime.model.pyramid_level):
+    """The processor's steps sample by the definition: its own sampling is off by up to a twelfth of a pixel."""
+    for module in (runtime.model.cpu, runtime.model.pyramid_level):
         monkeypatch.setattr(module, "resample", exact_resample)
-    monkeypatch.setattr(runtime.model.opencv_surround, "inner_loops", lambda: Loops(PyramidLevel, ""))
+    monkeypatch.setattr(runtime.model.cpu, "CompiledLevel", PyramidLevel)
 
 
 def both(name: str, stack: PanelStack, gl: GlBackend) -> tuple[UnrolledPredictor, UnrolledPredictor]:
-    """The model surrounded by OpenCV, and by OpenGL."""
-    opencv = load_predictor(name, stack, ModelSettings(threads=1))
-    assert isinstance(opencv, UnrolledPredictor)
-    return opencv, UnrolledPredictor(opencv.session, stack, surroundings=gl)
+    """The model on the processor, and by OpenGL."""
+    cpu = load_predictor(name, stack, ModelSettings(threads=1))
+    assert isinstance(cpu, UnrolledPredictor)
+    return cpu, UnrolledPredictor(cpu.session, stack, backend=gl)
 
 
 def sloped(predictors: tuple[UnrolledPredictor, UnrolledPredictor], floor: float) -> tuple[UnrolledPredictor, ...]:
     """Both, with rays that weigh by the slope of sin² and by so much at least; they share a session."""
     session = predictors[0].session
     session.contract = session.contract.model_copy(update={"slope_floor": floor})
-    predictors[0].surround_with(OpenCvBackend())  # made anew: with this contract
+    predictors[0].set_backend(CpuBackend())  # made anew: with this contract
     return predictors
 
 
@@ -105,12 +106,13 @@ def layers_of(
     sigma_mm: float = 1.0,
     fov_deg: float = FOV_DEG,
     refined: bool = False,
+    changed: Callable[[Job], Job] = lambda job: job,
 ) -> U8:
-    """refined: by what the rays lack of the layers in 8 bits, which differ where a sixteenth of a code decides."""
-    how: Any = {"eyes_m": pair, "fov_deg": fov_deg, "eye_sigma_mm": sigma_mm}
+    """refined: along the pictures' own rays too, which the processor does for both."""
+    how: Any = {"eyes_m": pair, "fov_deg": fov_deg, "eye_sigma_mm": sigma_mm, "changed": changed}
     with pytest.MonkeyPatch.context() as patch:
         if not refined:
-            patch.setattr(UnrolledPredictor, "refines", False)
+            patch.setattr(UnrolledPredictor, "refining", ())
         layers: U8 = solve_still(*pictures, predictor=predictor, **how).layers.copy()
     return layers
 
@@ -124,48 +126,19 @@ def within_one(first: U8, second: U8) -> float:
 @pytest.mark.parametrize("pose", POSES)
 @pytest.mark.parametrize("name", SHIPPED)
 def test_codes_are_those_of_exact_sampling(name: str, pose: str, sigma_mm: float, gl: GlBackend) -> None:
-    opencv, opengl = both(name, STACK, gl)
+    cpu, opengl = both(name, STACK, gl)
     pictures, pair = cards(POSES[pose], STACK), POSES[pose]
-    wanted, found = (layers_of(p, pictures, pair, sigma_mm=sigma_mm) for p in (opencv, opengl))
+    wanted, found = (layers_of(p, pictures, pair, sigma_mm=sigma_mm) for p in (cpu, opengl))
     assert within_one(wanted, found) >= WITHIN_ONE
     assert (found[..., 3] == 255).all()
 
 
 @pytest.mark.usefixtures("exactly")
-@pytest.mark.parametrize("sigma_mm", [0.0, 3.0, UNSURE_MM])
-@pytest.mark.parametrize("pose", ["straight", "beside and above", "above each other"])
-def test_codes_of_pictures_that_changed_a_little_are_those_of_exact_sampling(
-    pose: str, sigma_mm: float, gl: GlBackend, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Both backends go on from their own panels, for the same pictures."""
-    opencv, opengl = both("best", STACK, gl)
-    given: list[list[list[U8]]] = []
-    for name in ("predict", "refine"):
-        solve = getattr(opencv, name)
-
-        def noted(images: list[list[U8]], *rest: Any, solve: Any = solve, **how: Any) -> Any:
-            given.append([[image.copy() for image in pair] for pair in images])
-            return solve(images, *rest, **how)
-
-        monkeypatch.setattr(opencv, name, noted)
-    pair = POSES[pose]
-    wanted = layers_of(opencv, cards(pair, STACK), pair, sigma_mm=sigma_mm, refined=True)
-    before = opengl.predict(given[0], pair, eye_sigma_mm=sigma_mm).layers.copy()
-    found = opengl.refine(given[1], pair, eye_sigma_mm=sigma_mm).layers
-    assert within_one(wanted, found) >= REFINED_WITHIN_ONE > within_one(before, found)
-
-
-@pytest.mark.usefixtures("exactly")
-@pytest.mark.parametrize(
-    ("sigma_mm", "at_once"), [(0.0, False), (0.0, True), (3.0, False), (3.0, True), (8.0, False), (UNSURE_MM, False)]
-)
+@pytest.mark.parametrize("sigma_mm", [0.0, 8.0, UNSURE_MM])
 @pytest.mark.parametrize("pose", ["straight", "near", "rolled by 20 degrees", "above each other"])
 @pytest.mark.parametrize("name", ["balanced", "best"])
-def test_codes_where_rays_weigh_by_the_slope(
-    name: str, pose: str, sigma_mm: float, at_once: bool, gl: GlBackend, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Sure eyes in two passes and in one; unsure ones by whole images (8 mm, `best`) and by packed ones."""
-    monkeypatch.setattr(gl, "at_once", at_once)
+def test_codes_where_rays_weigh_by_the_slope(name: str, pose: str, sigma_mm: float, gl: GlBackend) -> None:
+    """Unsure eyes by whole images (8 mm, `best`) and by packed ones."""
     pictures, pair = cards(POSES[pose], STACK), POSES[pose]
     predictors = both(name, STACK, gl)
     (even,) = sloped(predictors[:1], 1.0)
@@ -180,9 +153,10 @@ def test_codes_where_rays_weigh_by_the_slope(
 def test_a_grey_part_of_larger_panels_where_rays_weigh_by_the_slope(sigma_mm: float, gl: GlBackend) -> None:
     pair, layers = eyes(0.6), []
     for predictor in sloped(both("balanced", STACK, gl), 0.25):
-        predictor.one_channel = True
-        predictor.fade = Fade(PixelRect(30, 15, 200, 120), over_px=(40.0, 10.0), bottom=False)
-        layers.append(layers_of(predictor, cards(pair, STACK, grey=True), pair, sigma_mm=sigma_mm))
+        grey = cards(pair, STACK, grey=True)
+        layers.append(
+            layers_of(predictor, grey, pair, sigma_mm=sigma_mm, changed=lambda job: replace(job, part=PART, channels=1))
+        )
     assert within_one(*layers) >= WITHIN_ONE
 
 
@@ -213,17 +187,9 @@ def test_codes_on_tilted_panels(pose: str, sigma_mm: float, gl: GlBackend, monke
     wanted, found = (layers_of(p, pictures, pair, sigma_mm=sigma_mm) for p in both("balanced", stack, gl))
     assert within_one(wanted, found) >= WITHIN_ONE
     # The tilt is felt; by pictures that are driven for beside their edge too: else outer panels are even there.
-    monkeypatch.setattr(still, "make_up", lambda *_, **__: None)
+    monkeypatch.setattr(still, "extrapolate_border", lambda *_, **__: None)
     flat, tilted = (both("balanced", panels, gl)[1] for panels in (STACK, stack))
     assert within_one(*(layers_of(p, pictures, pair, sigma_mm=sigma_mm) for p in (flat, tilted))) < 0.9
-
-
-def test_corrections_in_one_pass_on_tilted_panels(gl: GlBackend, monkeypatch: pytest.MonkeyPatch) -> None:
-    stack, pair, found = replace(STACK, tilt=TILT), eyes(0.6), []
-    for at_once in (False, True):
-        monkeypatch.setattr(gl, "at_once", at_once)
-        found.append(layers_of(both("fast", stack, gl)[1], cards(pair, stack), pair, sigma_mm=0.0))
-    assert (found[0] == found[1]).all()
 
 
 @pytest.mark.usefixtures("exactly")
@@ -231,37 +197,18 @@ def test_corrections_in_one_pass_on_tilted_panels(gl: GlBackend, monkeypatch: py
 def test_grey_pictures_in_one_channel(sigma_mm: float, gl: GlBackend) -> None:
     pair, layers = eyes(0.6), []
     for predictor in both("balanced", STACK, gl):
-        predictor.one_channel = True
-        layers.append(layers_of(predictor, cards(pair, STACK, grey=True), pair, sigma_mm=sigma_mm))
-        assert predictor.channels == 1
+        grey = cards(pair, STACK, grey=True)
+        layers.append(layers_of(predictor, grey, pair, sigma_mm=sigma_mm, changed=lambda job: replace(job, channels=1)))
     assert within_one(*layers) >= WITHIN_ONE
-
-
-@pytest.mark.parametrize("slope_floor", [1.0, 0.25])
-def test_corrections_in_one_pass_are_those_in_two(
-    slope_floor: float, gl: GlBackend, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pair, found, passes = eyes(0.6), [], []
-    for at_once in (False, True):
-        monkeypatch.setattr(gl, "at_once", at_once)
-        _, predictor = sloped(both("balanced", STACK, gl), slope_floor)
-        predictor.fade = Fade(PixelRect(30, 15, 200, 120), over_px=(40.0, 10.0))
-        gl.passes.account = account = Account()
-        found.append(layers_of(predictor, cards(pair, STACK), pair, sigma_mm=0.0))
-        passes.append([one.name for one in account.passes])
-    assert (found[0] == found[1]).all()
-    corrections = sum(step.kind != "chain" for step in predictor.session.contract.steps)
-    assert passes[0].count("residual") == passes[0].count("correct") == corrections
-    assert passes[1].count("correct_at_once") == corrections
-    assert "residual" not in passes[1]
 
 
 @pytest.mark.usefixtures("exactly")
 def test_a_part_of_larger_panels_ends_gently(gl: GlBackend) -> None:
-    pair, layers = eyes(0.6), []
-    for predictor in both("balanced", STACK, gl):
-        predictor.fade = Fade(PixelRect(30, 15, 200, 120), over_px=(40.0, 10.0), bottom=False)
-        layers.append(layers_of(predictor, cards(pair, STACK), pair))
+    pair = eyes(0.6)
+    layers = [
+        layers_of(predictor, cards(pair, STACK), pair, changed=lambda job: replace(job, part=PART))
+        for predictor in both("balanced", STACK, gl)
+    ]
     assert within_one(*layers) >= WITHIN_ONE
 
 
@@ -274,12 +221,19 @@ def test_windows_of_the_plan(gl: GlBackend) -> None:
         picture[110:150, 220 + shift : 260 + shift] = np.random.default_rng(0).integers(0, 200, (40, 40, 3))
     layers = []
     for backend in (None, gl):
-        predictor: Any = planned_predictor(Settings(), stack)
+        predictor = load_predictor("balanced", stack, ModelSettings(threads=1))
         if backend is not None:
-            predictor.surround_with(backend)
-        layers.append(layers_of(predictor, (pictures[0], pictures[1]), eyes(0.6)))
-        assert 0 < predictor.active_fraction < 1
-        assert predictor.backend == ("opencv" if backend is None else "gl")
+            predictor.set_backend(backend)
+        found: list[Savings] = []
+
+        def trimmed(job: Job, found: list[Savings] = found) -> Job:
+            job, savings = trim(job, Scene(stack))
+            found.append(savings)
+            return job
+
+        layers.append(layers_of(predictor, (pictures[0], pictures[1]), eyes(0.6), changed=trimmed))
+        assert 0 < found[0].solved_share < 1
+        assert predictor.backend == ("cpu" if backend is None else "gl")
     assert within_one(*layers) >= WITHIN_ONE
 
 
@@ -307,7 +261,7 @@ def test_codes_for_eyes_that_are_less_and_more_unsure(name: str, spread_px: floa
 
 @pytest.mark.parametrize("sigma_mm", [1.0, UNSURE_MM])
 @pytest.mark.parametrize("pose", ["straight", "rolled by 20 degrees", "turned by 30 degrees"])
-def test_the_eyes_see_no_less_than_with_opencv(pose: str, sigma_mm: float, gl: GlBackend) -> None:
+def test_the_eyes_see_no_less_than_on_the_processor(pose: str, sigma_mm: float, gl: GlBackend) -> None:
     pair = POSES[pose]
     pictures, shown = cards(pair, STACK), []
     for predictor in both("balanced", STACK, gl):
@@ -315,7 +269,7 @@ def test_the_eyes_see_no_less_than_with_opencv(pose: str, sigma_mm: float, gl: G
         look = displayed(layers, pictures, STACK, eyes_m=pair, fov_deg=FOV_DEG, similarity=False)
         expected = expected_db(look, layers, STACK, eyes_m=pair, fov_deg=FOV_DEG)
         shown.append([look.quality.psnr_db, *(value for value in expected.values() if value is not None)])
-    assert len(shown[0]) == 3
+    assert len(shown[0]) == 4
     assert (np.array(shown[1]) - shown[0] >= LEAST_DB).all()
 
 
@@ -324,18 +278,18 @@ def test_the_eyes_see_no_less_than_with_opencv(pose: str, sigma_mm: float, gl: G
 def test_at_1920x1080(name: str, gl: GlBackend, monkeypatch: pytest.MonkeyPatch) -> None:
     stack, pair = replace(STACK, width_px=1920, height_px=1080), eyes(0.6)
     pictures = cards(pair, stack)
-    opencv, opengl = both(name, stack, gl)
+    cpu, opengl = both(name, stack, gl)
     found = layers_of(opengl, pictures, pair)
     shown_db = [
         displayed(layers, pictures, stack, eyes_m=pair, fov_deg=FOV_DEG, similarity=False).quality.psnr_db
-        for layers in (layers_of(predictor, pictures, pair, refined=True) for predictor in (opencv, opengl))
+        for layers in (layers_of(predictor, pictures, pair, refined=True) for predictor in (cpu, opengl))
     ]
     assert abs(shown_db[1] - shown_db[0]) <= 0.05
-    for module in (runtime.model.opencv_surround, runtime.model.pyramid_level):
+    for module in (runtime.model.cpu, runtime.model.pyramid_level):
         monkeypatch.setattr(module, "resample", exact_resample)
-    monkeypatch.setattr(runtime.model.opencv_surround, "inner_loops", lambda: Loops(PyramidLevel, ""))
-    opencv.surround_with(OpenCvBackend(compiled=False))
-    assert within_one(layers_of(opencv, pictures, pair), found) >= WITHIN_ONE
+    monkeypatch.setattr(runtime.model.cpu, "CompiledLevel", PyramidLevel)
+    cpu.set_backend(CpuBackend())
+    assert within_one(layers_of(cpu, pictures, pair), found) >= WITHIN_ONE
 
 
 def test_a_panel_wider_than_the_driver_allows_is_refused(gl: GlBackend) -> None:
@@ -359,17 +313,17 @@ def test_only_the_network_s_raster_and_the_layers_cross(gl: GlBackend) -> None:
 def test_automatic_takes_the_faster_one_and_says_what_was_measured(gl: GlBackend) -> None:
     choice = choose("auto", load_predictor("fast", STACK), lambda: gl.passes.context)
     assert choice.why.startswith("measured at ")
-    opencv_ms, gl_ms = (float(part.split(" ms")[0].split()[-1]) for part in choice.why.split(", "))
-    assert choice.backend.name == ("gl" if gl_ms < opencv_ms else "opencv")
+    cpu_ms, gl_ms = (float(part.split(" ms")[0].split()[-1]) for part in choice.why.split(", "))
+    assert choice.backend.name == ("gl" if gl_ms < cpu_ms else "cpu")
 
 
-def test_without_opengl_automatic_is_opencv_and_gl_is_refused() -> None:
+def test_without_opengl_automatic_is_the_processor_and_gl_is_refused() -> None:
     def nothing() -> Any:
         raise MissingPart("no OpenGL without a screen")
 
     predictor = load_predictor("fast", STACK)
     choice = choose("auto", predictor, nothing)
-    assert choice.backend.name == "opencv"
+    assert choice.backend.name == "cpu"
     assert "no OpenGL" in choice.why
     with pytest.raises(MissingPart):
         choose("gl", predictor, nothing)
@@ -377,19 +331,19 @@ def test_without_opengl_automatic_is_opencv_and_gl_is_refused() -> None:
 
 def test_a_model_that_has_one_backend_keeps_it() -> None:
     predictor = load_predictor("sart", STACK)
-    assert choose("gl", predictor, offscreen_context).backend.name == predictor.backend == "opencv"
+    assert choose("gl", predictor, offscreen_context).backend.name == predictor.backend == "cpu"
 
 
 def test_a_lost_context_is_told_and_another_takes_over(gl: GlBackend) -> None:
     pair, lost = eyes(0.6), offscreen_context()
     predictor = load_predictor("fast", STACK)
-    predictor.surround_with(GlBackend(lost, STACK))
+    predictor.set_backend(GlBackend(lost, STACK))
     before = layers_of(predictor, cards(pair, STACK), pair)
     lost.release()
     with pytest.raises(ContextLost):
         layers_of(predictor, cards(pair, STACK), pair)
     with gl.passes.context:
-        predictor.surround_with(gl)
+        predictor.set_backend(gl)
         assert (layers_of(predictor, cards(pair, STACK), pair) == before).all()
 
 
@@ -398,10 +352,34 @@ def test_nothing_grows_while_a_viewer_walks(gl: GlBackend) -> None:
     places = [eyes(0.5 + 0.01 * step, 0.02 * step, roll_deg=2.0 * step) for step in range(8)]
     for pair in places:
         layers_of(opengl, cards(pair, STACK), pair, sigma_mm=3.0)
-    held = len(opengl._made._textures)  # type: ignore[union-attr]
+    held = [len(state._textures) for state in opengl._states.values()]  # type: ignore[attr-defined]
     targets = len(gl.passes._targets)
     for pair in reversed(places):
         layers_of(opengl, cards(pair, STACK), pair, sigma_mm=3.0)
-    assert (len(opengl._made._textures), len(gl.passes._targets)) == (held, targets)  # type: ignore[union-attr]
+    assert [len(state._textures) for state in opengl._states.values()] == held  # type: ignore[attr-defined]
+    assert len(gl.passes._targets) == targets
     opengl.close()
     assert len(gl.passes._targets) < targets
+
+
+JOINT = tuple(Step(kind="joint", size=1.45, momentum=0.4, places=places) for places in ("middle", "rising", "falling"))
+JOBS: dict[str, Callable[[Job], Job]] = {
+    "whole": lambda job: job,
+    "a part": lambda job: replace(job, part=PART),
+    "grey": lambda job: replace(job, channels=1),
+}
+
+
+@pytest.mark.parametrize("tilt", [None, TILT], ids=["even", "tilted"])
+@pytest.mark.parametrize("job", JOBS)
+@pytest.mark.parametrize("sigma_mm", [0.0, UNSURE_MM])
+def test_joint_steps_are_those_of_the_processor(sigma_mm: float, job: str, tilt: Tilt | None, gl: GlBackend) -> None:
+    stack, pair = replace(STACK, tilt=tilt), eyes(0.6)
+    predictors = both("fast", stack, gl)
+    session = predictors[0].session
+    session.contract = session.contract.model_copy(update={"steps": (*session.contract.steps[:1], *JOINT)})
+    pictures = cards(pair, stack, grey=job == "grey")
+    found = [layers_of(p, pictures, pair, sigma_mm=sigma_mm, changed=JOBS[job]) for p in predictors]
+    assert within_one(*found) >= 0.93  # what begins a twelfth of a pixel apart stays apart by a little
+    shown = [displayed(layers, pictures, stack, eyes_m=pair, fov_deg=FOV_DEG, similarity=False) for layers in found]
+    assert abs(shown[0].quality.psnr_db - shown[1].quality.psnr_db) <= 0.05

@@ -1,4 +1,4 @@
-"""Windows of the plan and a budget's coarser levels, put together in textures: code for code as on the processor."""
+"""Windows of the plan, put together in textures: code for code as on the processor."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-import runtime.model.opencv_surround
+import runtime.model.cpu
 import runtime.model.pyramid_level
-from runtime.config import Settings
+from runtime.config import ModelSettings
 from runtime.content.procedural import ProceduralSource
 from runtime.errors import ContextLost
 from runtime.model.assembly import ArrayAssembly, Placed, Rest, Shared, Uniform
 from runtime.model.gl.assembly import GlAssembly
 from runtime.model.gl.backend import GlBackend
 from runtime.model.gl.programs import Account
-from runtime.model.loops import Loops
-from runtime.model.predictor import Predictor
+from runtime.model.job import Job
+from runtime.model.predictor import Predictor, load_predictor
 from runtime.model.pyramid_level import NEUTRAL
+from runtime.model.trim import Scene, trim
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import drawn_for, raster_views
-from runtime.plan.reduced import ladder_predictor
 from runtime.records import F64, U8
 from runtime.support.gl import offscreen_context
 from runtime.support.gl_sharing import LayerPool, LayerTextures, ShareGroup
@@ -36,7 +36,6 @@ STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 240, 135)
 WITHIN_ONE = 0.999  # of all codes
 WALK = [eyes(0.6), eyes(0.6, 0.1, 0.02), eyes(0.7, -0.2), eyes(0.6, 0.1, roll_deg=15)]
 NETWORK = ["network down"] * 2 + ["answer up"] * 2
-SETTINGS = Settings.model_validate({"model": {"threads": 1}})
 
 
 @pytest.fixture(scope="module")
@@ -66,11 +65,9 @@ def pool(made: tuple[Any, ShareGroup, GlBackend], gl: GlBackend) -> LayerPool:
 @pytest.fixture
 def exactly(monkeypatch: pytest.MonkeyPatch) -> None:
     """OpenCV's steps sample by the definition."""
-    for module in (runtime.model.opencv_surround, runtime.model.pyramid_level):
+    for module in (runtime.model.cpu, runtime.model.pyramid_level):
         monkeypatch.setattr(module, "resample", exact_resample)
-    monkeypatch.setattr(
-        runtime.model.opencv_surround, "inner_loops", lambda: Loops(runtime.model.pyramid_level.PyramidLevel, "")
-    )
+    monkeypatch.setattr(runtime.model.cpu, "CompiledLevel", runtime.model.pyramid_level.PyramidLevel)
 
 
 def noise(width_px: int, height_px: int, *, count: int | None = None, seed: int = 0) -> U8:
@@ -93,19 +90,19 @@ def assert_alike(found: LayerTextures, wanted: U8, *, exact: bool) -> None:
         assert (second[..., 3] == 255).all()
 
 
-def drawn(predictor: Predictor, content: ProceduralSource, eyes_m: F64, *, aim: bool = True) -> Any:
-    """What is made of the content's pictures: drawn where it lies, or looked through for where they differ."""
+def drawn(predictor: Predictor, content: ProceduralSource, eyes_m: F64, *, aim: bool = True) -> Job:
+    """What is asked for: drawn where the content lies, or looked through for where the pictures differ."""
     if aim:
-        return predictor.predict(drawn_for(predictor, content, eyes_m, time_ns=0), eyes_m).made
-    views = raster_views(eyes_m, STACK.panel(1))
-    return predictor.predict([[content.render(view, time_ns=0).copy()] for view in views], eyes_m).made
+        return drawn_for(predictor, content, eyes_m, time_ns=0, trimmed=True)
+    pictures = [[content.render(view, time_ns=0).copy()] for view in raster_views(eyes_m, STACK.panel(1))]
+    return trim(Job(pictures, eyes_m), Scene(STACK))[0]
 
 
-def both(gl: GlBackend, scale: float = 1.0) -> tuple[Any, Any]:
-    """A level of the ladder surrounded by OpenCV, and by OpenGL."""
-    opencv, opengl = (ladder_predictor("fast", scale, STACK, SETTINGS) for _ in range(2))
-    opengl.surround_with(gl)
-    return opencv, opengl
+def both(gl: GlBackend) -> tuple[Predictor, Predictor]:
+    """A model on the processor, and by OpenGL."""
+    cpu, opengl = (load_predictor("fast", STACK, ModelSettings(threads=1)) for _ in range(2))
+    opengl.set_backend(gl)
+    return cpu, opengl
 
 
 def crossed(account: Account) -> list[str]:
@@ -137,23 +134,13 @@ def test_a_window_among_the_rest_is_put_there_as_the_processor_does_it(gl: GlBac
     textures.close()
 
 
-@pytest.mark.parametrize("size", [(120, 68), (180, 101), (97, 41), (240, 135)])
-def test_fewer_pixels_are_enlarged_within_one_code(size: tuple[int, int], gl: GlBackend, pool: LayerPool) -> None:
-    small = noise(*size, count=3)
-    textures = GlAssembly(gl.passes, pool, STACK)
-    wanted, found = ArrayAssembly(STACK).enlarged(small), textures.enlarged(written(pool, small))
-    assert isinstance(found, LayerTextures)
-    assert within_one(wanted, found.pixels()) == 1.0
-
-
 def test_arrays_are_put_together_on_the_processor(gl: GlBackend, pool: LayerPool) -> None:
     textures, box = GlAssembly(gl.passes, pool, STACK), PixelRect(40, 30, 104, 94)
     window = Placed(noise(64, 64, count=3), box, box)
     assert isinstance(textures.assembled(Uniform((1, 2, 3)), window), np.ndarray)
-    assert isinstance(textures.enlarged(noise(120, 68, count=3)), np.ndarray)
-    turned, picture = noise(135, 240, count=3), noise(240, 135)
-    assert (textures.turned(turned) == turned.transpose(0, 2, 1, 3)).all()
-    assert (textures.turned_picture(picture, 0) == picture.transpose(1, 0, 2)).all()
+    layers, picture = noise(135, 240, count=3), noise(240, 135)
+    assert (textures.transposed(layers) == layers.transpose(0, 2, 1, 3)).all()
+    assert (textures.transposed_picture(picture, 0) == picture.transpose(1, 0, 2)).all()
     assert gl.assembly(STACK).assembled(Uniform((1, 2, 3)), None).shape == (3, 135, 240, 4)
     assert isinstance(GlBackend(gl.context, STACK).assembly(STACK), ArrayAssembly)  # nobody shows its textures
 
@@ -162,13 +149,14 @@ def test_arrays_are_put_together_on_the_processor(gl: GlBackend, pool: LayerPool
 @pytest.mark.parametrize("aim", [True, False], ids=["drawn in the window", "found in the pictures"])
 def test_windows_of_the_plan_stay_in_textures(aim: bool, gl: GlBackend) -> None:
     content = ProceduralSource("sparse", stack=STACK, context=gl.context, background=(0.5, 0.6, 0.7))
-    opencv, opengl = both(gl)
+    cpu, opengl = both(gl)
     for eyes_m in WALK:
-        wanted = drawn(opencv, content, eyes_m, aim=aim).copy()
+        wanted = cpu.solve(drawn(cpu, content, eyes_m, aim=aim)).layers.copy()
         gl.passes.account = account = Account()
-        found = drawn(opengl, content, eyes_m, aim=aim)
+        job = drawn(opengl, content, eyes_m, aim=aim)
+        found = opengl.solve(job).made
         gl.passes.account = None
-        assert 0 < opencv.active_fraction == opengl.active_fraction < 0.6
+        assert 0 < job.solved_share(STACK) < 0.6
         assert isinstance(found, LayerTextures)
         assert within_one(wanted, found.pixels()) >= WITHIN_ONE
         # A picture that both eyes see besides goes up once, as every picture does that is no texture.
@@ -178,10 +166,11 @@ def test_windows_of_the_plan_stay_in_textures(aim: bool, gl: GlBackend) -> None:
 
 def test_pictures_that_are_alike_are_shown_from_textures(gl: GlBackend) -> None:
     picture = noise(STACK.width_px, STACK.height_px)
-    opencv, opengl = both(gl)
+    cpu, opengl = both(gl)
     gl.passes.account = account = Account()
-    wanted, found = (predictor.predict([[picture], [picture]], eyes(0.6)) for predictor in (opencv, opengl))
-    assert opengl.active_fraction == 0.0
+    job, savings = trim(Job([[picture], [picture]], eyes(0.6)), Scene(STACK))
+    wanted, found = (predictor.solve(job) for predictor in (cpu, opengl))
+    assert savings.solved_share == 0.0
     assert isinstance(found.made, LayerTextures)
     assert_alike(found.made, wanted.layers, exact=False)
     assert (found.layers[0, ..., :3] == NEUTRAL).all()
@@ -189,35 +178,18 @@ def test_pictures_that_are_alike_are_shown_from_textures(gl: GlBackend) -> None:
 
 
 @pytest.mark.usefixtures("exactly")
-@pytest.mark.parametrize("scale", [0.75, 0.5])
-@pytest.mark.parametrize("scene", ["demo", "sparse"])
-def test_coarser_levels_stay_in_textures(scene: str, scale: float, gl: GlBackend) -> None:
-    content = ProceduralSource(scene, stack=STACK, context=gl.context)
-    opencv, opengl = both(gl, scale)
-    for eyes_m in WALK[:2]:
-        wanted = drawn(opencv, content, eyes_m)
-        gl.passes.account = account = Account()
-        found = drawn(opengl, content, eyes_m)
-        gl.passes.account = None
-        assert isinstance(found, LayerTextures)
-        assert found.shape == (3, 135, 240, 4)
-        assert within_one(wanted, found.pixels()) >= WITHIN_ONE
-        assert crossed(account) == NETWORK
-    content.close()
-
-
-@pytest.mark.usefixtures("exactly")
 @pytest.mark.parametrize("scene", ["demo", "sparse"])
 def test_solutions_for_eyes_above_each_other_stay_in_textures(scene: str, gl: GlBackend) -> None:
     content = ProceduralSource(scene, stack=STACK, context=gl.context)
-    opencv, opengl = both(gl)
+    cpu, opengl = both(gl)
     for head in (0.0, 0.05, -0.05):
         eyes_m = np.array([[0.6, head, -0.031], [0.6, head, 0.031]])[:: -1 if head < 0 else 1]
-        wanted = drawn(opencv, content, eyes_m)
+        wanted = cpu.solve(drawn(cpu, content, eyes_m)).layers
         gl.passes.account = account = Account()
-        found = drawn(opengl, content, eyes_m)
+        job = drawn(opengl, content, eyes_m)
+        found = opengl.solve(job).made
         gl.passes.account = None
-        assert (opengl.active_fraction < 0.6) == (scene == "sparse")
+        assert (job.solved_share(STACK) < 0.6) == (scene == "sparse")
         assert isinstance(found, LayerTextures)
         assert within_one(wanted, found.pixels()) >= WITHIN_ONE
         assert crossed(account) == NETWORK
@@ -226,13 +198,13 @@ def test_solutions_for_eyes_above_each_other_stay_in_textures(scene: str, gl: Gl
 
 def test_textures_do_not_grow_while_a_viewer_walks(gl: GlBackend) -> None:
     content = ProceduralSource("sparse", stack=STACK, context=gl.context)
-    _, opengl = both(gl, 0.75)
+    _, opengl = both(gl)
     assert gl._pool is not None
     counts = []
     for _ in range(3):
         held = []  # as the newest solution and the one on the panels are
         for eyes_m in WALK:
-            held = [*held[-1:], drawn(opengl, content, eyes_m)]
+            held = [*held[-1:], opengl.solve(drawn(opengl, content, eyes_m)).made]
         counts.append((gl._pool.count, len(gl.passes._targets)))
     assert counts[1] == counts[2]
     opengl.close()
@@ -242,13 +214,14 @@ def test_textures_do_not_grow_while_a_viewer_walks(gl: GlBackend) -> None:
 def test_a_context_that_is_lost_is_told(pool: LayerPool, gl: GlBackend) -> None:
     lost = offscreen_context()
     backend = GlBackend(lost, STACK, group=ShareGroup())
-    predictor = ladder_predictor("fast", 1.0, STACK, SETTINGS)
-    predictor.surround_with(backend)
+    predictor = load_predictor("fast", STACK, ModelSettings(threads=1))
+    predictor.set_backend(backend)
     picture = noise(STACK.width_px, STACK.height_px)
-    predictor.predict([[picture], [picture]], eyes(0.6))
+    job = Job([[picture], [picture]], eyes(0.6))
+    predictor.solve(job)
     lost.release()
     with pytest.raises(ContextLost):
-        predictor.predict([[picture], [picture]], eyes(0.6))
+        predictor.solve(job)
     gl.context.__enter__()
-    predictor.surround_with(gl)
-    assert predictor.predict([[picture], [picture]], eyes(0.6)).layers.std() > 1
+    predictor.set_backend(gl)
+    assert predictor.solve(job).layers.std() > 1

@@ -7,6 +7,7 @@ import pytest
 
 from runtime.config import ModelSettings
 from runtime.errors import EyesNotServed, ModelFailure
+from runtime.model.job import Job
 from runtime.model.predictor import load_predictor
 from runtime.model.pyramid_level import NEUTRAL
 from runtime.model.sart import SartPredictor
@@ -79,7 +80,7 @@ def test_equal_pictures_on_the_centre_panel_leave_the_outer_panels_even() -> Non
     predictor = load_predictor("balanced", STACK, ModelSettings(threads=1))
     picture = np.full((270, 480, 4), 255, np.uint8)
     picture[..., :3] = np.random.default_rng(0).integers(0, 255, (270, 480, 3))
-    layers = predictor.predict([[picture], [picture]], eyes(0.6)).layers
+    layers = predictor.solve(Job([[picture], [picture]], eyes(0.6))).layers
     assert np.abs(layers[[0, 2], ..., :3].astype(int) - 128).max() <= 1
 
 
@@ -124,7 +125,7 @@ def test_eyes_behind_each_other_are_a_model_failure_that_a_viewer_may_leave_agai
     predictor = load_predictor("fast", STACK)
     grey = np.full((270, 480, 4), 128, np.uint8)
     with pytest.raises(EyesNotServed, match="not beside each other") as caught:
-        predictor.predict([[grey], [grey]], np.array([[0.6, 0.0, 0.0], [0.66, 0.0, 0.0]]))
+        predictor.solve(Job([[grey], [grey]], np.array([[0.6, 0.0, 0.0], [0.66, 0.0, 0.0]])))
     assert isinstance(caught.value, ModelFailure)
 
 
@@ -133,7 +134,7 @@ def test_a_doubt_that_is_no_number_is_a_model_failure() -> None:
     grey = np.full((270, 480, 4), 128, np.uint8)
     for sigma_mm in (np.nan, np.inf):
         with pytest.raises(ModelFailure):
-            predictor.predict([[grey], [grey]], eyes(0.6), eye_sigma_mm=sigma_mm)
+            predictor.solve(Job([[grey], [grey]], eyes(0.6), eye_sigma_mm=sigma_mm))
 
 
 def test_one_eye_that_stands_for_both_drives_no_outer_panel() -> None:

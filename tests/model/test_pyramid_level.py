@@ -41,7 +41,7 @@ def level_of(rows: RowPool, *, reduction: int = 1, channels: int = 3, outer: int
 def want(level: PyramidLevel, left: int, right: int) -> None:
     """Both eyes' pictures, each of one phase sum."""
     width, height = level.size
-    level.wanted = [np.full((height, width, 3), value, np.int16) for value in (left, right)]
+    level.target = [np.full((height, width, 3), value, np.int16) for value in (left, right)]
 
 
 def crossing_px(eye_m: np.ndarray, x_m: float) -> np.ndarray:

@@ -67,11 +67,11 @@ def test_a_workspace_keeps_its_buffers_while_the_eyes_see_the_same_and_the_netwo
     boxes = (PixelRect(0, 0, 96, 48), PixelRect(8, 8, 88, 40), PixelRect(16, 8, 96, 40))
     workspace.crop(boxes, stack)
     whole = workspace.levels[1]
-    wanted, outer = whole.wanted, whole.outer
+    wanted, outer = whole.target, whole.outer
     assert [image.shape for image in (outer[0], wanted[0], outer[2])] == [(48, 96, 3), (32, 80, 3), (32, 80, 3)]
     assert workspace.levels[2].size == (40, 16)
     workspace.crop(boxes, stack)
-    assert whole.wanted is wanted and whole.outer is outer
+    assert whole.target is wanted and whole.outer is outer
     workspace.crop((boxes[0],) * 3, stack)
     assert workspace.levels[2].size == (48, 24)
     near, far = (chain_frame(eyes(distance_m), stack, cell_px=4, reduction=2) for distance_m in (0.4, 1.5))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from runtime.model.job import Job
 from runtime.model.sart import ITERATIONS, SartPredictor
 from runtime.optics.malus import intensity_from_phase
 from runtime.optics.stack import PanelStack
@@ -28,7 +29,7 @@ def even(code: int) -> np.ndarray:
 def solved(count: int, left: int, right: int, *, iterations: int = ITERATIONS) -> np.ndarray:
     """(N, 3) codes in the panels' middle for eyes that want one grey each."""
     predictor = SartPredictor(stack_of(count), iterations=iterations)
-    layers = predictor.predict([[even(left)], [even(right)]], PAIR).layers
+    layers = predictor.solve(Job([[even(left)], [even(right)]], PAIR)).layers
     inner = layers[(slice(None), *INNER, slice(3))].reshape(count, -1, 3)
     assert (np.ptp(inner, axis=1) <= 1).all()
     return inner[:, 0]
@@ -62,7 +63,7 @@ def test_the_sum_is_on_the_second_branch_from_black_two_panels_to_white_one() ->
 
 
 def test_layers_are_rgba_of_8_bits_without_transparency() -> None:
-    layers = SartPredictor(stack_of(3), iterations=1).predict([[even(9)], [even(9)]], PAIR).layers
+    layers = SartPredictor(stack_of(3), iterations=1).solve(Job([[even(9)], [even(9)]], PAIR)).layers
     assert layers.dtype == np.uint8 and layers.shape == (3, 48, 96, 4)
     assert (layers[..., 3] == 255).all()
 
@@ -71,7 +72,7 @@ def test_panels_end_at_their_range_and_do_not_come_round() -> None:
     """A bar that is black for one eye and white for the other asks the outer panels for more than they have."""
     left, right = even(128), even(128)
     left[:, 40:56, :3], right[:, 40:56, :3] = 0, 255
-    layers = SartPredictor(stack_of(3), iterations=60).predict([[left], [right]], PAIR).layers[..., :3].astype(int)
+    layers = SartPredictor(stack_of(3), iterations=60).solve(Job([[left], [right]], PAIR)).layers[..., :3].astype(int)
     assert layers.min() == 0
     assert np.abs(np.diff(layers, axis=2)).max() < 100, "a code that comes round jumps by the whole range"
 

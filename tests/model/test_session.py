@@ -16,9 +16,9 @@ from runtime.errors import InputError, MissingPart
 from runtime.model import predictor, session
 from runtime.model.contract import METADATA_KEY
 from runtime.model.onnx_bytes import digest, has_external_data
-from runtime.model.onnx_runtime import onnxruntime
 from runtime.model.predictor import SHIPPED, load_predictor, model_path
 from runtime.model.session import ModelSession
+from runtime.support.onnx_runtime import onnxruntime
 from tests.model.scenes import STACK
 
 

@@ -11,11 +11,9 @@ from hypothesis import strategies as st
 
 from runtime.config import ModelSettings
 from runtime.evaluation.displayed import displayed
-from runtime.model import still, unseen
-from runtime.model.loops import Loops, inner_loops
+from runtime.model import still
 from runtime.model.predictor import SHIPPED, load_predictor
-from runtime.model.pyramid_level import PyramidLevel
-from runtime.model.unseen import Shown, is_whole, make_up, shown_of
+from runtime.model.unseen import Shown, extrapolate_border, is_whole, shown_of
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_raster, image_from_stack
 from runtime.records import U8
@@ -83,22 +81,12 @@ CASES = {
 }
 
 
-@pytest.fixture(params=["compiled", "plain"])
-def loops(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    if request.param == "plain":
-        monkeypatch.setattr(unseen, "inner_loops", lambda: Loops(PyramidLevel, "plain"))
-    else:
-        assert inner_loops().compiled
-    return str(request.param)
-
-
-@pytest.mark.usefixtures("loops")
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_shown_stays_and_beside_it_both_eyes_see_the_same(case: str) -> None:
     shown = CASES[case]
     images = [noise(1), noise(2)]
     before = [image.copy() for image in images]
-    make_up(images, shown, rows=WHOLE[0], columns=WHOLE[1])
+    extrapolate_border(images, shown, rows=WHOLE[0], columns=WHOLE[1])
     masks = [_inside(one, 0, 96) for one in shown]
     for image, was, mask in zip(images, before, masks, strict=True):
         assert (image[mask] == was[mask]).all()
@@ -112,26 +100,14 @@ def test_what_is_shown_stays_and_beside_it_both_eyes_see_the_same(case: str) -> 
         assert all((image == was).all() for image, was in zip(images, before, strict=True))
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_compiled_and_plain_are_the_same(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_lies_beside_a_window_is_left_alone() -> None:
     rows, columns = slice(3, 51), slice(4, 92)
-    shown = [
-        Shown(
-            *(np.where(one.any, np.clip(run, 4, 92), 0)[rows] for run in one)  # of a window
-        )
-        for one in CASES[case]
-    ]
-    found = []
-    for plain in (False, True):
-        images = [noise(1), noise(2)]
-        if plain:
-            monkeypatch.setattr(unseen, "inner_loops", lambda: Loops(PyramidLevel, "plain"))
-        make_up(images, shown, rows=rows, columns=columns)
-        found.append(np.stack(images))
-    assert (found[0] == found[1]).all()
+    shown = [Shown(*(np.where(one.any, np.clip(run, 4, 92), 0)[rows] for run in one)) for one in CASES["both end"]]
+    images = [noise(1), noise(2)]
+    extrapolate_border(images, shown, rows=rows, columns=columns)
     beside = np.ones((54, 96), bool)
     beside[rows, columns] = False
-    assert (found[0][0][beside] == noise(1)[beside]).all()
+    assert (images[0][beside] == noise(1)[beside]).all()
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -146,7 +122,7 @@ def test_eyes_whose_pictures_end_within_the_panels_see_more(name: str, monkeypat
     found = []
     for made_up in (True, False):
         if not made_up:
-            monkeypatch.setattr(still, "make_up", lambda *_, **__: None)
+            monkeypatch.setattr(still, "extrapolate_border", lambda *_, **__: None)
         predictor = load_predictor(name, stack, ModelSettings(threads=1))
         layers = still.solve_still(*pictures, eyes_m=pair, fov_deg=fov_deg, predictor=predictor).layers
         predictor.close()

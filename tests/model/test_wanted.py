@@ -9,6 +9,7 @@ from runtime.model import wanted
 from runtime.model.compiled import wanted as compiled
 from runtime.model.resample import buffer
 from runtime.model.rows import RowPool
+from runtime.model.transfer import phase_codes
 from runtime.optics.rect import PixelRect
 from runtime.records import I16
 
@@ -37,10 +38,10 @@ def test_compiled_phase_sums_are_those_of_opencv(
     noise = np.random.default_rng(3).integers(0, 256, (2, 36, 64, 4)).astype(np.uint8)
     if channels == 1:
         noise[..., 1:] = noise[..., :1]
-    pictures = wanted.Pictures(list(noise), BOXES[box], channels, emphasis, 2)
+    pictures = wanted.Pictures(list(noise), BOXES[box], channels, emphasis, phase_codes(2))
     rows, found = RowPool(threads, width_px=64), []
     rows.split = lambda _, work: [work(index, threads) for index in range(threads)]  # type: ignore[method-assign,assignment,misc]
-    for fill in (wanted.fill_wanted, compiled.fill_wanted):
+    for fill in (wanted.fill_targets, compiled.fill_targets):
         pairs = [images(BOXES[box], reduction=reduction, channels=channels) for reduction in reductions]
         fill(pictures, pairs, rows=rows)
         found.append([image.copy() for pair in pairs for image in pair])

@@ -13,7 +13,7 @@ import pytest
 torch = pytest.importorskip("torch")
 from model_export.checkpoint import load_eyereal, load_spectral  # noqa: E402
 from model_export.export import ExportRequest, eyereal_model, spectral_model  # noqa: E402
-from model_export.eyereal import OFFSET, EyeRealNet  # noqa: E402
+from model_export.eyereal import EyeRealNet  # noqa: E402
 from model_export.recipe import read_recipe  # noqa: E402
 from runtime.content.eyereal import Pair, read_folder  # noqa: E402
 from runtime.content.presets import preset  # noqa: E402
@@ -66,14 +66,6 @@ def test_it_has_the_keys_of_the_official_code() -> None:
         "subnets.up1.conv.1.running_mean",
         "subnets.out_conv.0.bias",
     } <= keys
-
-
-@pytest.mark.parametrize("size", [(64, 64), (67, 101), (33, 35)])
-def test_any_size_from_32_up_comes_out_as_it_went_in(size: tuple[int, int]) -> None:
-    with torch.no_grad():
-        out = EyeRealNet(4).eval()(torch.rand(1, 18, *size))
-    assert out.shape == (1, 9, *size)
-    assert out.min() >= -OFFSET and out.max() <= 1 - OFFSET
 
 
 def test_a_published_checkpoint_is_imported_with_every_weight(published: Path) -> None:
@@ -148,12 +140,6 @@ def test_a_corrupt_file_is_refused(tmp_path: Path, content: bytes) -> None:
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"corrupt\.pth"):
         load_eyereal(path)
-
-
-def test_a_truncated_checkpoint_is_refused(published: Path) -> None:
-    published.write_bytes(published.read_bytes()[:-4000])
-    with pytest.raises(InputError, match=r"published\.pth"):
-        load_eyereal(published)
 
 
 def test_a_checkpoint_of_the_old_tar_format_is_one_line(tmp_path: Path) -> None:
@@ -261,7 +247,7 @@ def test_an_export_says_what_it_was_trained_for_only_where_that_is_known(officia
 
     size = {"width_px": 64, "height_px": 40}
     checkpoint = ExportRequest("eyereal", tmp_path / "a.onnx", checkpoint=official, **size)
-    random = ExportRequest("eyereal", tmp_path / "a.onnx", random_init=1, base_width=4, **size)
+    random = ExportRequest("eyereal", tmp_path / "a.onnx", random_init=1, **size)
     assert trained_for(eyereal_model(checkpoint)[0]) is None
     assert trained_for(eyereal_model(random)[0]) is None
     assert trained_for(spectral_model(ExportRequest("fast", tmp_path / "a.onnx", random_init=1))[0]) is None

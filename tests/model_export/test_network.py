@@ -10,9 +10,9 @@ import pytest
 torch = pytest.importorskip("torch")
 from model_export.network import BOX, FULL, SpectralSolver  # noqa: E402
 from runtime.model.chain import chain_modes  # noqa: E402
-from runtime.model.onnx_runtime import onnxruntime  # noqa: E402
 from runtime.model.predictor import SHIPPED, model_path  # noqa: E402
 from runtime.records import F64  # noqa: E402
+from runtime.support.onnx_runtime import onnxruntime  # noqa: E402
 
 MODES = ("waves", "shifted_waves", "spectrum", "modes_in")
 K = 4  # columns

@@ -18,9 +18,10 @@ from model_export.data import TrainingPair, endless_pairs  # noqa: E402
 from model_export.recipe import Recipe, read_recipe  # noqa: E402
 from model_export.scene import Plane, draw  # noqa: E402
 from model_export.sight import displayed_mse, sight_of  # noqa: E402
-from model_export.train import TrainRequest, held_out_pairs, pair_loss, run_training  # noqa: E402
+from model_export.train import TrainRequest, pair_loss, run_training  # noqa: E402
 from runtime.config import ModelSettings  # noqa: E402
 from runtime.errors import InputError  # noqa: E402
+from runtime.model.job import Job  # noqa: E402
 from runtime.model.predictor import load_predictor  # noqa: E402
 from runtime.model.resample import target_from_source  # noqa: E402
 from runtime.optics.retina import sample_bilinear  # noqa: E402
@@ -97,7 +98,7 @@ def test_the_raster_s_own_sight_is_what_eyes_see_of_panels_that_are_drawn_on_it(
     alone = {"steps": session.contract.steps[:1], "emphasis": 0.0}
     session.contract = session.contract.model_copy(update=alone)
     rgba = [[cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA)] for picture in pair.images]
-    layers = predictor.predict(rgba, pair.eyes_m, eye_sigma_mm=4.0).layers[..., :3].astype(np.float64) / 255
+    layers = predictor.solve(Job(rgba, pair.eyes_m, eye_sigma_mm=4.0)).layers[..., :3].astype(np.float64) / 255
     predictor.close()
     errors = []
     for eye, picture in zip(pair.eyes_m, pair.images, strict=True):
@@ -267,8 +268,3 @@ def test_half_a_pair_is_refused_before_anything_is_written(tmp_path: Path, tiny:
     with pytest.raises(InputError, match="pair0"):
         trained(tmp_path / "out", tiny, data=(folder,))
     assert not (tmp_path / "out").exists()
-
-
-def test_held_out_pairs_are_the_same_every_time() -> None:
-    a, b = (held_out_pairs(1, **SMALL)[0] for _ in range(2))
-    assert np.array_equal(a.images[0], b.images[0])

@@ -88,7 +88,7 @@ def test_a_stack_that_is_turned_tilts_the_other_way_about() -> None:
     eye, (y, z) = np.array([0.5, 0.03, 0.01]), (0.1, 0.02)
     turned_eye = np.array([eye[0], -eye[2], -eye[1]])
     whole = layer_from_seen(TILTED, 2, eye) @ [y, z, 1.0]
-    found = layer_from_seen(TILTED.turned(), 2, turned_eye) @ [-z, -y, 1.0]
+    found = layer_from_seen(TILTED.transposed(), 2, turned_eye) @ [-z, -y, 1.0]
     np.testing.assert_allclose(found[:2] / found[2], [-whole[1] / whole[2], -whole[0] / whole[2]], atol=1e-12)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import stat
 import subprocess
 import sys
@@ -105,6 +106,7 @@ def test_a_get_does_nothing(page: Page, loop: Loop, path: str) -> None:
 def test_with_the_token_it_tells_what_the_daemon_tells(page: Page, loop: Loop) -> None:
     assert eventually(lambda: page.look_up("status").get("secret") == "of the daemon")
     assert eventually(lambda: page.look_up("pictures").get("frame") == 7)
+    assert eventually(lambda: page.look_up("about").get("pictured") == ["demo"]), "what is asked for a picture has one"
     assert page.look_up("other") == {"ok": False, "error": "there is no such thing to look up"}
 
 
@@ -131,11 +133,6 @@ def test_another_sites_request_is_refused_though_the_browser_gives_the_cookie(pa
     assert loop.told == []
     code, _, _ = page.ask("POST", "/do", body=body, Cookie=cookie, Origin=page.origin)
     assert code == 200 and loop.told == [("pause", None)]
-
-
-def test_an_origin_that_is_no_address_is_refused(page: Page, loop: Loop) -> None:
-    code, _, answer = page.ask("POST", "/do", body='{"command": "pause"}', Origin="http://[", **page.bearer)
-    assert (code, json.loads(answer)["error"], loop.told) == (403, "from another site", [])
 
 
 @pytest.mark.parametrize("path", ["/login", "/do"])
@@ -166,12 +163,12 @@ def test_a_name_that_leads_here_and_is_not_this_machines_is_refused(page: Page, 
 
 def test_wishes_reach_the_daemon_and_its_refusals_the_page(page: Page, loop: Loop) -> None:
     assert page.tell("scene", "grey") == (200, {"ok": True})
-    assert page.tell("budget", 20) == (200, {"ok": True})
+    assert page.tell("place", {"scale": 2.0}) == (200, {"ok": True})
     code, answer = page.tell("scene", "missing")
     assert (code, answer["error"]) == (409, "nobody knows 'missing'")
-    code, answer = page.tell("budget", "much")
-    assert (code, answer["error"]) == (409, "value: budget wants milliseconds")
-    assert loop.told == [("scene", "grey"), ("budget", 20.0), ("scene", "missing")]
+    code, answer = page.tell("place", "much")
+    assert (code, answer["error"]) == (409, "value: place wants an object of settings, or null for the configured ones")
+    assert loop.told == [("scene", "grey"), ("place", {"scale": 2.0}), ("scene", "missing")]
 
 
 @pytest.mark.parametrize(
@@ -223,13 +220,6 @@ def test_a_token_file_that_is_none_is_refused(tmp_path: Path, text: str, mode: i
         token_of(path)
 
 
-def test_a_link_in_the_tokens_place_is_not_followed(tmp_path: Path) -> None:
-    (tmp_path / "aim").write_text("a" * 40)
-    (tmp_path / "token").symlink_to(tmp_path / "aim")
-    with pytest.raises(InputError, match="cannot be read"):
-        token_of(tmp_path / "token")
-
-
 @pytest.mark.parametrize(
     ("options", "field"), [(["--host", "192.0.2.1"], "--host"), (["--config", "/nowhere.toml"], "nowhere.toml")]
 )
@@ -263,42 +253,28 @@ def test_built_in_scenes_have_a_picture_and_others_the_one_that_was_seen(
     assert kept.jpeg("other") is None
 
 
-def test_pictures_are_kept_by_the_status_that_is_asked_for_anyway(
-    folder: Path, loop: Loop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[str] = []
-
-    def status() -> dict[str, Any]:
-        asked.append("status")
-        return {"state": "tracking", "scene": "/srv/robot.glb"}
-
-    loop.server.publish(status)
-    loop.server.lookups["pictures"] = lambda: {"frame": 7, "jpegs": {"seen-left": "/9j/"}}
-    monkeypatch.setattr(thumbnails, "SETTLED_S", 0.0)
-    kept = Thumbnails(tmp_path)
-    daemon = Daemon(lambda: (folder / "s.sock",), kept)
-    assert daemon.look_up("pictures")["frame"] == 7
-    assert asked == []
-    assert daemon.look_up("status")["scene"] == "/srv/robot.glb"
-    assert asked == ["status"] and kept.jpeg("/srv/robot.glb") == b"\xff\xd8\xff"
-
-
 def test_a_picture_is_given_with_the_token_alone(page: Page, loop: Loop) -> None:
     code, headers, body = page.ask("GET", "/thumbnail?scene=demo", **page.bearer)
     assert (code, headers["content-type"]) == (200, "image/jpeg") and body.startswith(b"\xff\xd8")
     assert page.ask("GET", "/thumbnail?scene=never-seen", **page.bearer)[0] == 404
 
 
-@pytest.mark.parametrize(
-    ("value", "problem"),
-    [
-        (None, "playlist wants a list of 1 to 64"),
-        ([], "playlist wants a list of 1 to 64"),
-        ([{"scene": "demo"}], "value[0]: playlist wants a scene and its seconds"),
-        ([{"scene": "demo", "seconds": "1"}], "value[0].seconds: playlist wants a number"),
-        ([{"scene": "demo", "seconds": 1, "file": "/etc"}], "value[0]: playlist wants a scene and its seconds"),
-    ],
-)
-def test_a_playlist_that_is_none_is_told(page: Page, loop: Loop, value: Any, problem: str) -> None:
-    code, answer = page.tell("playlist", value)
-    assert code == 409 and problem in answer["error"] and loop.told == []
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")
+def test_a_token_file_of_another_user_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "token"
+    token_of(path)
+    os.chown(path, 12345, -1)
+    with pytest.raises(InputError, match="belongs to another user"):
+        token_of(path)
+
+
+def test_a_name_that_is_not_utf_8_takes_nothing_else_away(page: Page, loop: Loop) -> None:
+    loop.server.lookups["log"] = lambda: {"lines": [{"text": "\udcff.glb"}], "states": []}
+    assert eventually(lambda: page.look_up("log").get("lines") == [{"text": "\udcff.glb"}])
+
+
+def test_a_link_in_the_tokens_place_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "aim").write_text("a" * 40)
+    (tmp_path / "token").symlink_to(tmp_path / "aim")
+    with pytest.raises(InputError, match="cannot be read"):
+        token_of(tmp_path / "token")

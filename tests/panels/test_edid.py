@@ -16,17 +16,9 @@ def test_maker_model_and_serial_are_read() -> None:
     assert (edid.maker, edid.name, edid.serial, edid.product) == ("EIZ", "CG2700X", "A1B2-0003", 0x2B7A)
 
 
-def test_without_a_serial_text_the_number_serves() -> None:
-    assert parse(block(serial_number=4711)).serial == "4711"
-
-
 def test_numbers_that_mean_none_are_none() -> None:
     assert parse(block(serial_number=0)).serial == ""
     assert parse(block(serial_number=0x01010101)).serial == ""
-
-
-def test_extensions_after_the_base_block_do_no_harm() -> None:
-    assert parse(block(serial_text="X") + bytes(128)).serial == "X"
 
 
 @given(st.binary(max_size=300))

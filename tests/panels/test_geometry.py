@@ -28,11 +28,6 @@ def test_a_panel_turned_a_quarter_counter_clockwise_has_its_top_edge_on_the_view
     assert apply(matrix, 0, 1080) == (1080, 1920)
 
 
-def test_a_panel_upside_down_has_its_corners_exchanged() -> None:
-    matrix = panel_from_screen(screen_width_px=1920, screen_height_px=1080, rotation_deg=180, mirror="none")
-    assert apply(matrix, 0, 0) == (1920, 1080)
-
-
 def test_mirroring_is_the_viewers_left_and_right_even_on_a_turned_panel() -> None:
     matrix = panel_from_screen(screen_width_px=1920, screen_height_px=1080, rotation_deg=90, mirror="horizontal")
     assert apply(matrix, 0, 0) == (1080, 1920)

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,38 +50,6 @@ def test_the_doctor_fails_monitors_of_another_mode_and_passes_them_where_rescali
     state, detail = panels_row(tmp_path, "")
     assert state == "fail" and "shows 320x180, the stack is 1920x1080" in detail
     assert panels_row(tmp_path, "allow_rescaling = true")[0] == "ok"
-
-
-OPEN = """
-from runtime.clock import MonotonicClock
-from runtime.config import OutputSettings, PanelSettings
-from runtime.errors import PanelLost
-from runtime.optics.stack import PanelStack
-from runtime.panels.registry import open_panels
-from runtime.support.gl import offscreen_context
-
-panels = tuple(PanelSettings(connector=f"DUMMY{n}") for n in range(3))
-settings = OutputSettings(kind="windows", panels=panels, allow_rescaling=%s)
-try:
-    open_panels(settings, PanelStack(0.5, 0.28125, (-0.06, 0, 0.06), 640, 360), MonotonicClock(), offscreen_context())
-except PanelLost as error:
-    print(error)
-else:
-    print("open")
-"""
-
-
-@pytest.mark.parametrize(
-    ("allowed", "said"),
-    [(False, "panel 0: DUMMY0 shows 320x180, the stack is 640x360: phases would be rescaled"), (True, "open")],
-)
-def test_windows_on_monitors_of_another_mode_are_refused_unless_rescaling_is_allowed(
-    screen: XServer, allowed: bool, said: str
-) -> None:
-    environment = os.environ | {"DISPLAY": screen.name}
-    command = [sys.executable, "-c", OPEN % allowed]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
-    assert done.stdout.startswith(said), done.stderr
 
 
 def written(folder: Path, more: str) -> Path:

@@ -56,11 +56,6 @@ def test_a_panel_that_names_nothing_is_a_mistake_that_no_waiting_mends() -> None
         bind([PanelSettings()], [LEFT])
 
 
-def test_an_index_beyond_the_last_monitor_is_missing() -> None:
-    with pytest.raises(PanelLost, match="no monitor with index 3"):
-        bind([PanelSettings(index=3)], [LEFT, MIDDLE, RIGHT])
-
-
 def test_a_mode_of_another_shape_is_refused_and_a_smaller_one_of_the_same_is_not() -> None:
     check_shape(0, PanelSettings(), LEFT, width_px=960, height_px=540)
     with pytest.raises(PanelLost, match="panel 1: DP-1 shows 1080x1920"):

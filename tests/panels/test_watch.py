@@ -14,11 +14,10 @@ from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
 from runtime.config import OutputSettings, PanelSettings
 from runtime.errors import PanelLost
 from runtime.panels import xlib
-from runtime.panels.display import Window, glfw
+from runtime.panels.display import glfw
 from runtime.panels.registry import open_panels
 from runtime.panels.watch import PlacementWatch
 from runtime.panels.window import WindowPanels
-from runtime.panels.xlib import OutputState, WindowState
 from tests.panels.edids import block
 from tests.panels.test_windows import BY_CONNECTOR, STACK, frame, picture, presents, shows
 from tests.panels.xserver import XServer
@@ -163,30 +162,6 @@ def test_another_monitor_at_the_same_connector_is_noticed(x: XServer, opened: Ca
 def test_where_nothing_happens_nothing_is_lost(opened: Callable[..., Any], kind: str) -> None:
     sink = opened(*BY_CONNECTOR, kind=kind)
     assert lost(sink, within_s=2.5) == ""
-
-
-def test_every_window_and_monitor_is_asked_about_once_a_second_one_a_refresh(opened: Callable[..., Any]) -> None:
-    sink = opened(*BY_CONNECTOR)
-    clock = SimulatedClock(5 * NS_PER_S)
-    asked = []
-
-    class Listening:
-        def window_state(self, window: Window) -> WindowState:
-            asked.append(clock.now_ns())
-            return sink._display.window_state(window)
-
-        def output_state(self, connector: str) -> OutputState:
-            asked.append(clock.now_ns())
-            return sink._display.output_state(connector)
-
-    watch = PlacementWatch(Listening(), sink.monitors, sink._places(), clock)
-    asked.clear()
-    for refresh in range(4 * 60):
-        clock.sleep_until_ns(5 * NS_PER_S + refresh * NS_PER_S // 60)
-        assert watch.look() == ""
-    assert len(asked) == len(set(asked))  # never two in one refresh
-    assert 3 * 6 - 3 <= len(asked) <= 3 * 6  # three windows, three monitors; nothing in the first second
-    assert min(asked) >= 6 * NS_PER_S
 
 
 def test_a_refused_request_makes_it_look_at_everything_at_once(x: XServer, opened: Callable[..., Any]) -> None:

@@ -77,17 +77,6 @@ def shows(x: XServer, monitor: int, expected: np.ndarray) -> bool:
 
 
 @pytest.mark.parametrize("kind", ["windows", "span"])
-def test_every_panel_shows_its_own_layer_of_the_same_frame_at_its_place(
-    x: XServer, opened: Callable[..., Any], kind: str
-) -> None:
-    sink = opened(*BY_CONNECTOR, kind=kind)
-    for number in range(5):
-        assert sink.present(frame(number)).number == number
-        for index, monitor in enumerate((2, 0, 1)):
-            assert shows(x, monitor, picture(number, index))
-
-
-@pytest.mark.parametrize("kind", ["windows", "span"])
 def test_a_panel_mounted_upside_down_and_one_mirrored_are_sent_what_sets_it_right(
     x: XServer, opened: Callable[..., Any], kind: str
 ) -> None:
@@ -188,16 +177,6 @@ def test_the_aligned_picture_is_on_all_panels_in_the_same_frame(
         assert (difference() <= 1).mean() >= 0.999
 
 
-def test_a_solution_that_is_shown_again_is_not_uploaded_again(
-    opened: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sink = opened(*BY_CONNECTOR)
-    sink.present(moved(0))
-    monkeypatch.setattr(sink._textures, "upload", lambda frame: pytest.fail("uploaded again"))
-    for number in range(1, 5):
-        assert sink.present(moved(number)).number == number
-
-
 def test_the_pacer_is_told_when_the_blank_was_and_how_often_one_comes(opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
     assert sink.period_ns == pytest.approx(1e9 / 60, rel=1e-3)
@@ -226,16 +205,6 @@ def test_a_fault_while_drawing_leaves_the_new_frame_on_no_panel(
     for index, monitor in enumerate((2, 0, 1)):
         assert not np.array_equal(x.panel(monitor), picture(1, index)[..., :3])
     assert eventually(lambda: presents(sink, 2))
-
-
-def test_skew_and_rate_are_reported(opened: Callable[..., Any]) -> None:
-    sink = opened(*BY_CONNECTOR)
-    reports = [sink.present(frame(number)) for number in range(20)]
-    times = [report.present_ns for report in reports]
-    assert times == sorted(times)
-    interval_ms = np.median(np.diff(times)) / 1e6
-    skew_ms = np.median([report.skew_ms for report in reports])
-    assert 0 < skew_ms < interval_ms
 
 
 def test_an_unchanged_frame_stays_and_is_drawn_anew_where_the_windows_were_lost(
@@ -312,12 +281,3 @@ def test_the_death_of_the_x_server_ends_the_process_at_once_with_a_reason(tmp_pa
     assert process.returncode == SERVER_DIED
     assert "the X server died" in errors
     assert "Traceback" not in errors
-
-
-def test_the_cursor_is_hidden_and_windows_stay_when_focus_goes(opened: Callable[..., Any]) -> None:
-    sink = opened(*BY_CONNECTOR)
-    for surface in sink._surfaces:
-        handle = surface.window.handle
-        assert glfw.get_input_mode(handle, glfw.CURSOR) == glfw.CURSOR_HIDDEN
-        assert not glfw.get_window_attrib(handle, glfw.AUTO_ICONIFY)
-        assert not glfw.get_window_attrib(handle, glfw.ICONIFIED)

@@ -1,4 +1,4 @@
-"""The focused model against the whole one: the same picture for less work. Real scenes, the shipped model."""
+"""A trimmed job against the whole one: the same picture for less work. Real scenes, the shipped models."""
 
 from __future__ import annotations
 
@@ -9,26 +9,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runtime.config import Settings
+from runtime.config import ModelSettings
 from runtime.content.base import View
 from runtime.content.procedural import ProceduralSource
-from runtime.content.scenes import Scene, scene
+from runtime.content.scenes import Scene as Things
+from runtime.content.scenes import scene
+from runtime.evaluation.displayed import displayed
+from runtime.model.job import Job
 from runtime.model.predictor import Predictor, load_predictor
+from runtime.model.trim import Scene, trim
 from runtime.optics.retina import seen_by
-from runtime.optics.stack import PanelStack
+from runtime.optics.stack import PanelStack, Tilt
 from runtime.optics.views import image_from_stack
-from runtime.plan import measure
-from runtime.plan.drawing import raster_views
-from runtime.plan.focus import FocusedPredictor
-from runtime.plan.measure import displayed_psnr
-from runtime.plan.predictors import focused, planned_predictor
-from runtime.plan.reduced import ladder_predictor
-from runtime.plan.savings import selected_eyes
+from runtime.plan.drawing import drawn_for, raster_views, retina_pictures
+from runtime.plan.savings import make_plan, selected_eyes
+from runtime.records import F64, U8
 from runtime.support.gl import offscreen_context
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 960, 540)
 EYES = np.array([[0.6, -0.031, 0.05], [0.6, 0.031, 0.05]])
-SETTINGS = Settings()
 
 
 @pytest.fixture(scope="module")
@@ -43,163 +42,155 @@ def context(gl: Any) -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def whole() -> Predictor:
-    return load_predictor("fast", STACK, SETTINGS.model)
+def fast() -> Predictor:
+    return load_predictor("fast", STACK)
 
 
-def part_of(whole: Predictor) -> FocusedPredictor:
-    made = focused(whole, SETTINGS.model.model_copy(update={"name": "fast"}))
-    assert made is not None
-    return made
-
-
-def draw(source: ProceduralSource, predictor: Predictor, eyes: np.ndarray, *, time_ns: int, aim: bool = True) -> Any:
-    """One frame's layers. aim: the predictor is told where the content lies; else it finds that in the pictures."""
+def trimmed(source: ProceduralSource, predictor: Predictor, eyes: F64 = EYES, *, aim: bool = True, **how: Any) -> Job:
+    """aim: the content tells where it lies; else that is found in the pictures."""
     if aim:
-        return measure.draw(source, predictor, eyes, time_ns=time_ns)
-    images: list[list[Any]] = [[], []]
-    for raster in predictor.rasters(eyes):
-        for view in raster_views(eyes, raster):
-            images[view.side].append(source.render(view, time_ns=time_ns).copy())
-    return predictor.predict(images, eyes).layers
+        return drawn_for(predictor, source, eyes, time_ns=0, trimmed=True, **how)
+    pictures = [[source.render(view, time_ns=0).copy()] for view in raster_views(eyes, STACK.panel(1))]
+    return trim(Job(pictures, eyes), Scene(STACK, **how))[0]
 
 
-def psnr(layers: np.ndarray, source: ProceduralSource, eyes: np.ndarray = EYES) -> float:
-    return displayed_psnr(layers.copy(), source, eyes, STACK, fov_deg=40, time_ns=0)
+def psnr(layers: U8, source: ProceduralSource, eyes: F64 = EYES, stack: PanelStack = STACK) -> float:
+    targets = retina_pictures(source, eyes, stack, fov_deg=40, time_ns=0)
+    return displayed(layers, targets, stack, eyes_m=eyes, fov_deg=40, similarity=False).quality.psnr_db
+
+
+def compared(
+    predictor: Predictor, source: ProceduralSource, eyes: F64 = EYES, **how: Any
+) -> tuple[float, float, float]:
+    """PSNR of the whole and of what is left of it, and how much of the panels that is."""
+    whole = psnr(predictor.solve(drawn_for(predictor, source, eyes, time_ns=0)).layers, source, eyes, predictor.stack)
+    job = trimmed(source, predictor, eyes, **how)
+    part = psnr(predictor.solve(job).layers, source, eyes, predictor.stack)
+    return whole, part, job.solved_share(predictor.stack)
 
 
 @pytest.mark.parametrize("aim", [True, False], ids=["drawn in the window", "found in the pictures"])
-def test_a_sparse_object_looks_the_same_from_a_small_window(context: Any, whole: Predictor, aim: bool) -> None:
-    source = ProceduralSource("sparse", stack=STACK, context=context)
-    part = part_of(whole)
-    without = psnr(draw(source, whole, EYES, time_ns=0), source)
-    with_window = psnr(draw(source, part, EYES, time_ns=0, aim=aim), source)
-    assert part.active_fraction < 0.2
-    assert with_window > without - 0.1
+def test_a_sparse_object_looks_the_same_from_a_small_window(context: Any, fast: Predictor, aim: bool) -> None:
+    whole, part, share = compared(fast, ProceduralSource("sparse", stack=STACK, context=context), aim=aim)
+    assert share < 0.2
+    assert part > whole - 0.1
 
 
-def test_a_flat_scene_is_filled_in_closed_form(context: Any, whole: Predictor) -> None:
-    source = ProceduralSource("flat", stack=STACK, context=context)
-    part = part_of(whole)
-    layers = draw(source, part, EYES, time_ns=0, aim=False)
-    assert part.active_fraction == 0.0
-    assert psnr(layers, source) > psnr(draw(source, whole, EYES, time_ns=0), source) - 0.1
+def test_a_flat_scene_is_filled_in_closed_form(context: Any, fast: Predictor) -> None:
+    whole, part, share = compared(fast, ProceduralSource("flat", stack=STACK, context=context), aim=False)
+    assert share == 0.0
+    assert part > whole - 0.1
 
 
-def test_a_full_picture_goes_through_the_whole_model_unchanged(context: Any, whole: Predictor) -> None:
-    source = ProceduralSource("texture", stack=STACK, context=context)
-    part = part_of(whole)
-    focused_layers = draw(source, part, EYES, time_ns=0).copy()
-    assert part.active_fraction == 1.0
-    assert (focused_layers == draw(source, whole, EYES, time_ns=0)).all()
+def test_of_a_full_picture_nothing_is_left_out(context: Any, fast: Predictor) -> None:
+    job = trimmed(ProceduralSource("texture", stack=STACK, context=context), fast)
+    assert job.part is None and job.channels == 3
 
 
-def test_nothing_remains_of_an_earlier_window(context: Any, whole: Predictor) -> None:
-    """Frames of one moving viewer, drawn by one predictor, equal those of fresh ones."""
-    source = ProceduralSource("sparse", stack=STACK, context=context)
-    part = part_of(whole)
+def test_nothing_remains_of_an_earlier_window(context: Any, fast: Predictor) -> None:
+    """Frames of one moving viewer, solved by one predictor, equal those of fresh ones."""
+    source, before = ProceduralSource("sparse", stack=STACK, context=context), None
     for step in (0.0, 0.05, -0.1, 0.2):
         eyes = EYES + np.array([0.0, step, step / 4])
         for aim in (True, False):
-            layers = draw(source, part, eyes, time_ns=0, aim=aim).copy()
-            fresh = part_of(whole)
-            fresh.window = part.window  # a kept window may be larger than a new one's
-            again = draw(source, fresh, eyes, time_ns=0, aim=aim)
-            assert (layers[..., :3] == again[..., :3]).mean() > 0.9999
+            job = trimmed(source, fast, eyes, aim=aim, before=before)
+            before, layers = job.part, fast.solve(job).layers.copy()
+            fresh = load_predictor("fast", STACK)
+            assert (layers[..., :3] == fresh.solve(job).layers[..., :3]).all()
+            fresh.close()
+
+
+def test_a_window_that_still_holds_the_difference_is_kept(context: Any, fast: Predictor) -> None:
+    source = ProceduralSource("sparse", stack=STACK, context=context)
+    first = trimmed(source, fast).part
+    second = trimmed(source, fast, EYES + np.array([0.0, 0.002, 0.0]), before=first).part
+    assert first is not None and second is not None and first.box == second.box
 
 
 @pytest.mark.parametrize("name", ["fast", "balanced", "best"])
 def test_there_is_no_seam(context: Any, name: str) -> None:
     """On mid-grey, where the eye is most sensitive, the background errs no more than the whole model's does."""
     source = ProceduralSource("sparse", stack=STACK, context=context, background=(0.5, 0.6, 0.7))
-    settings = SETTINGS.model.model_copy(update={"name": name})
-    entire = load_predictor(name, STACK, settings)
-    part = focused(entire, settings)
-    assert part is not None
+    predictor = load_predictor(name, STACK)
     worst, mean, quality = [], [], []
-    for predictor in (entire, part):
-        layers = draw(source, predictor, EYES, time_ns=0).copy()
+    for job in (drawn_for(predictor, source, EYES, time_ns=0), trimmed(source, predictor)):
+        layers = predictor.solve(job).layers.copy()
         quality.append(psnr(layers, source))
         errors = []
         for side, eye in enumerate(EYES):
             projection = image_from_stack(eye, width_px=960, height_px=540, fov_deg=40)
-            wanted = source.render(View(eye, side, projection, 960, 540), time_ns=0)
+            target = source.render(View(eye, side, projection, 960, 540), time_ns=0)
             retina = seen_by(eye, layers, STACK, fov_deg=40)
-            background = (wanted[..., 3] == 0) & retina.mask
-            errors.append(np.abs(retina.image - wanted[..., :3] / 255.0)[background])
+            background = (target[..., 3] == 0) & retina.mask
+            errors.append(np.abs(retina.image - target[..., :3] / 255.0)[background])
         error = np.concatenate(errors)
         worst.append(error.max())
         mean.append(np.sqrt((error**2).mean()))
-    assert part.active_fraction < 0.25
+    assert job.solved_share(STACK) < 0.25
     assert worst[1] < 1.1 * worst[0]
     assert mean[1] < 1.2 * mean[0]
     assert quality[1] > quality[0] - 0.1
 
 
+@pytest.mark.parametrize("tilted", [False, True], ids=["even panels", "tilted panels"])
 @pytest.mark.parametrize("turn", [[0.0, 0.0, 0.0], [0.0, 0.0, 0.02]], ids=["level", "tilted head"])
 @pytest.mark.parametrize("at", [(-0.06, 0.02), (0.19, -0.06)], ids=["inside", "at the panel's edge"])
 def test_a_window_costs_nothing_wherever_the_object_is(
-    context: Any, at: tuple[float, float], turn: list[float]
+    context: Any, at: tuple[float, float], turn: list[float], tilted: bool
 ) -> None:
+    tilt = Tilt(((0.0, 0.005, -0.004), (0.0, 0.0, 0.0), (0.0, -0.004, 0.005)), (0.6, 0.0, 0.0))
+    stack = replace(STACK, tilt=tilt) if tilted else STACK
     thing = replace(scene("sparse").things[0], centre_m=(-0.02, *at))
-    source = ProceduralSource(Scene("other", (thing,)), stack=STACK, context=context, background=(0.3, 0.5, 0.4))
+    source = ProceduralSource(Things("other", (thing,)), stack=stack, context=context, background=(0.3, 0.5, 0.4))
     eyes = EYES + np.array([turn, np.zeros(3)])
-    entire = load_predictor("balanced", STACK, SETTINGS.model)
-    part = focused(entire, SETTINGS.model)
-    assert part is not None
-    with_window = psnr(draw(source, part, eyes, time_ns=0), source, eyes)
-    assert part.active_fraction < 0.5
-    assert with_window > psnr(draw(source, entire, eyes, time_ns=0), source, eyes) - 0.1
+    whole, part, share = compared(load_predictor("balanced", stack), source, eyes)
+    assert share < 0.5
+    assert part > whole - 0.1
 
 
-def test_still_pictures_are_warped_as_the_model_asks() -> None:
-    settings = SETTINGS.model.model_copy(update={"name": "best"})
-    entire = load_predictor("best", STACK, settings)
-    part = focused(entire, settings)
-    assert part is not None
-    assert part.interpolation == entire.interpolation == "cubic"
-    assert part.pre_emphasis == entire.pre_emphasis
-    assert part.windows(EYES) == entire.windows(EYES)
-
-
-def test_one_eye_alone_costs_no_inference(context: Any, whole: Predictor) -> None:
-    from runtime.plan.savings import make_plan
+def test_one_eye_alone_costs_no_inference(context: Any, fast: Predictor) -> None:
+    from runtime.config import Settings
 
     source = ProceduralSource("demo", stack=STACK, context=context)
     aside = np.array([[0.12, 0.42, 0.0], [0.07, 0.50, 0.0]])
-    plan = make_plan(source.info, STACK, SETTINGS, eyes_m=aside)
+    plan = make_plan(source.info, Settings(), eyes_m=aside)
     assert plan.eyes == (True, False)
-    part = part_of(whole)
     eyes = selected_eyes(aside, plan.eyes)
-    layers = draw(source, part, eyes, time_ns=0, aim=False)
-    assert part.active_fraction == 0.0
-    assert psnr(layers, source, eyes) > 25
-
-
-def test_fewer_pixels_are_enlarged_to_the_panels(context: Any) -> None:
-    source = ProceduralSource("demo", stack=STACK, context=context)
-    full = ladder_predictor("fast", 1.0, STACK, SETTINGS)
-    half = ladder_predictor("fast", 0.5, STACK, SETTINGS)
-    layers = draw(source, half, EYES, time_ns=0)
-    assert layers.shape == (3, 540, 960, 4)
-    assert 20 < psnr(layers, source) < psnr(draw(source, full, EYES, time_ns=0), source)
+    job = trimmed(source, fast, eyes, aim=False)
+    assert job.solved_share(STACK) == 0.0
+    assert psnr(fast.solve(job).layers, source, eyes) > 25
 
 
 def test_grey_windows_are_solved_in_one_channel(context: Any) -> None:
     source = ProceduralSource(
-        Scene("grey", scene("sparse").things, grey=True), stack=STACK, context=context, background=(0.5, 0.5, 0.5)
+        Things("grey", scene("sparse").things, grey=True), stack=STACK, context=context, background=(0.5, 0.5, 0.5)
     )
-    planned = planned_predictor(SETTINGS, STACK)
-    never = Settings.model_validate({"plan": {"one_channel": False}})
-    three = planned_predictor(never, STACK)
-    layers = draw(source, planned, EYES, time_ns=0).astype(np.int16)
-    assert planned.channels == 1
-    difference = np.abs(layers - draw(source, three, EYES, time_ns=0))
-    assert three.channels == 3
+    predictor = load_predictor("balanced", STACK)
+    job = trimmed(source, predictor)
+    assert job.channels == 1 and job.solved_share(STACK) < 0.3
+    layers = predictor.solve(job).layers.astype(np.int16)
+    difference = np.abs(layers - predictor.solve(replace(job, channels=3)).layers)
     assert difference.max() <= 2
     assert (difference > 0).mean() < 0.001
 
 
-def test_models_that_can_t_be_cut_are_left_whole() -> None:
+def test_models_that_can_t_be_cut_are_left_whole(context: Any) -> None:
     stack = replace(STACK, width_px=192, height_px=108)
-    assert focused(load_predictor("sart", stack, SETTINGS.model), SETTINGS.model) is None
+    sart = load_predictor("sart", stack, ModelSettings())
+    assert trimmed(ProceduralSource("sparse", stack=stack, context=context), sart).part is None
+
+
+def test_after_the_deadline_no_further_step_begins(context: Any, fast: Predictor) -> None:
+    """What there is by then is shown: less than all, more than nothing."""
+    source = ProceduralSource("texture", stack=STACK, context=context)
+    job = drawn_for(fast, source, EYES, time_ns=0)
+    layers, steps = [], []
+    for at in (0, 1 << 62, None):
+        solved = fast.solve(replace(job, deadline_ns=at))
+        layers.append(solved.layers.copy())
+        steps.append(solved.steps)
+    assert steps[0] == 1 < steps[1] == steps[2]
+    shown = [psnr(one, source) for one in layers]
+    assert shown[0] < shown[1] - 0.5
+    assert shown[1] == shown[2]
+    assert shown[0] > 20

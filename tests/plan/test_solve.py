@@ -62,11 +62,6 @@ def test_grey_pictures_are_solved_in_one_channel(tmp_path: Path) -> None:
         "inference beside the active window",
         "two of three colour channels",
     }
-    (item,) = solved(tmp_path, "[plan]\nfocus = false\n")["plan"]
-    assert item["what"] == "two of three colour channels"
-    assert abs(item["costs_db"]) < 0.02
-    (item,) = solved(tmp_path, "[plan]\none_channel = false\n")["plan"]
-    assert item["what"] == "inference beside the active window"
 
 
 def test_pictures_that_differ_everywhere_leave_nothing_out(tmp_path: Path) -> None:
@@ -74,4 +69,5 @@ def test_pictures_that_differ_everywhere_leave_nothing_out(tmp_path: Path) -> No
     random = np.random.default_rng(0)
     for name in ("left", "right"):
         write_png(tmp_path / f"{name}.png", random.integers(0, 256, (270, 480, 3), np.uint8))
-    assert solved(tmp_path)["plan"] == []
+    result = solved(tmp_path)
+    assert result["plan"] == [] and result["steps"] == 5

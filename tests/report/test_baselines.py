@@ -8,13 +8,9 @@ import pytest
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
-from runtime.report.baselines import as_codes, bilinear_rows, conjugate_gradients, eye_operator, mean_of_targets
-from runtime.report.eyesight import as_intensity, judged
-from runtime.report.filters import filtered_layers
-from runtime.report.pairs import Painter
+from runtime.report.baselines import as_codes, conjugate_gradients, eye_operator, mean_of_targets
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 48, 28)
-WIDE = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
 EYES = np.array([[0.6, -0.031, 0.05], [0.6, 0.032, 0.05]])
 VIEW = {"width_px": 48, "height_px": 28, "fov_deg": 40.0}
 
@@ -51,13 +47,6 @@ def test_the_transpose_is_exact() -> None:
     assert there == pytest.approx(back, rel=1e-4, abs=1e-2)
 
 
-def test_bilinear_weights_add_up_to_one() -> None:
-    rng = np.random.default_rng(3)
-    u = rng.uniform(0.5, 47.5, 100).astype(np.float32)
-    v = rng.uniform(0.5, 27.5, 100).astype(np.float32)
-    np.testing.assert_allclose(bilinear_rows(u, v, width_px=48, height_px=28).sum(axis=1), 1.0, atol=1e-6)
-
-
 def test_more_iterations_show_a_better_picture_and_beat_the_mean() -> None:
     wanted = scene()
     operators = [eye_operator(eye, STACK, **VIEW) for eye in EYES]
@@ -82,45 +71,3 @@ def test_where_the_wish_does_not_fit_the_box_cg_is_never_worse_than_its_start() 
         layers = conjugate_gradients(operators, wanted, stack, iterations=iterations)
         assert layers.min() >= 0 and layers.max() <= 1
         assert left_over(layers) <= start * 1.0001
-
-
-def test_channels_are_solved_apart() -> None:
-    wanted = scene(4)
-    operators = [eye_operator(eye, STACK, **VIEW) for eye in EYES]
-    together = conjugate_gradients(operators, wanted, STACK, iterations=3)
-    red = conjugate_gradients(operators, [w[..., :1] for w in wanted], STACK, iterations=3)
-    np.testing.assert_allclose(together[..., :1], red, atol=1e-5)
-
-
-def test_an_eye_whose_rays_all_miss_a_panel_is_refused() -> None:
-    far = PanelStack(0.5, 0.3, (-1.0, 0.0, 1.0), 32, 16)
-    with pytest.raises(ValueError, match="no ray"):
-        eye_operator([1.01, 30.0, 0.0], far, **VIEW)
-
-
-def test_the_closed_form_filter_is_far_better_than_the_mean_and_gains_by_repetition() -> None:
-    with Painter("demo", WIDE) as painter:
-        pair = painter.pair("demo", EYES, WIDE, off_mm=())
-    wanted = [as_intensity(image) for image in pair.images]
-    plain = judged(pair, as_codes(mean_of_targets(EYES, wanted, WIDE, fov_deg=40.0))).quality.psnr_db
-    once, thrice = (
-        judged(pair, as_codes(filtered_layers(EYES, wanted, WIDE, fov_deg=40.0, steps=steps))).quality.psnr_db
-        for steps in (1, 3)
-    )
-    assert once > plain + 2
-    assert thrice > once
-
-
-def test_the_filter_asks_nothing_of_a_picture_that_is_already_there() -> None:
-    """What three panels at one half show is wanted: nothing is left to add."""
-    wanted = [np.full((28, 48, 3), 0.5, np.float32)] * 2
-    layers = filtered_layers(EYES, wanted, STACK, fov_deg=40.0, steps=2)
-    np.testing.assert_allclose(layers, 0.5, atol=1e-5)
-
-
-def test_a_stronger_tikhonov_weight_drives_the_panels_less() -> None:
-    wanted = scene(6)
-    spread = [
-        float(np.std(filtered_layers(EYES, wanted, STACK, fov_deg=40.0, epsilon=epsilon))) for epsilon in (0.01, 1, 100)
-    ]
-    assert spread == sorted(spread, reverse=True)

@@ -85,15 +85,6 @@ def test_a_folder_without_cases_is_refused(tmp_path: Path, folder: str) -> None:
         read_pairs(tmp_path / folder)
 
 
-def test_eyes_are_an_ipd_apart_level_and_face_the_display() -> None:
-    eyes = eyes_at(distance_m=0.8, angle_deg=-50.0, height_m=0.2, ipd_m=0.065)
-    assert np.linalg.norm(eyes[1] - eyes[0]) == pytest.approx(0.065)
-    assert np.linalg.norm(eyes.mean(axis=0)) == pytest.approx(0.8)
-    assert eyes[0, 2] == eyes[1, 2] == pytest.approx(0.2)
-    assert (eyes[1] - eyes[0]) @ eyes.mean(axis=0) == pytest.approx(0.0, abs=1e-12)
-    assert eyes_at(distance_m=0.8)[1, 1] > 0, "the right eye is at the viewer's right"
-
-
 def test_places_beside_an_eye_lie_in_its_image_plane() -> None:
     eye = np.array([0.6, 0.2, 0.1])
     places = np.array(beside(eye, 4.0))

@@ -1,11 +1,8 @@
-"""`phasestack stability`: enough cases, all of them pass, and a case can fail: impostors do."""
+"""`phasestack stability`: enough cases, all of them pass, and a case can fail."""
 
 from __future__ import annotations
 
 import json
-import math
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +13,7 @@ from typer.testing import CliRunner
 
 from runtime.commands.stability import stability
 from runtime.errors import InputError
-from runtime.report.stability import controls, poses, solve, suite
-from runtime.report.stability.controls import Control
-from runtime.report.stability.limits import load_limits, recorded
-from runtime.report.stability.page import heat_map, row, spare_digits, stability_page
+from runtime.report.stability import poses, solve, suite
 from runtime.report.stability.trial import Answer, Case, Trial, refusal, settle
 
 FIELDS = {"name", "stage", "condition", "forward_error", "backward_error", "behaviour", "tolerance", "passed"}
@@ -42,7 +36,7 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, Path]:
 def test_there_are_at_least_120_cases_over_six_stages_and_all_pass(record: tuple[dict, Path]) -> None:
     cases = record[0]["cases"]
     assert len(cases) >= 120
-    assert {case["stage"] for case in cases} == STAGES | {"controls"}
+    assert {case["stage"] for case in cases} == STAGES
     assert [case["name"] for case in cases if not case["passed"]] == []
     assert len({(case["stage"], case["name"]) for case in cases}) == len(cases), "a name is used twice"
 
@@ -55,14 +49,6 @@ def test_the_long_cases_pass_too(tmp_path: Path) -> None:
     assert len(cases) > 500
     assert [case["name"] for case in cases if not case["passed"]] == []
     assert done.exit_code == 0
-
-
-def test_every_case_states_what_the_design_asks_for(record: tuple[dict, Path]) -> None:
-    for case in record[0]["cases"]:
-        assert case.keys() >= FIELDS
-        assert case["behaviour"] in {"answers", "warns", "refuses"}
-        if case["behaviour"] != "refuses":
-            assert case["forward_error"] <= case["tolerance"]
 
 
 def test_json_plots_and_page_lie_in_the_folder(record: tuple[dict, Path]) -> None:
@@ -78,25 +64,6 @@ STAGES = {
     "eye pose", "RPU", "phase", "Jones optics", "retina", "solve", "network", "tracker", "calibration",
     "unsure eyes",
 }  # fmt: skip
-
-
-def test_every_stage_has_its_impostors_and_they_fail_most_of_its_cases(record: tuple[dict, Path]) -> None:
-    """Seen in the issue: an operator of zeros, grey layers, the mean of the targets, a tracker that repeats itself, one
-    eye alone: each passed all there was."""
-    found = {case["name"]: case for case in record[0]["cases"] if case["stage"] == "controls"}
-    assert {name.partition(":")[0] for name in found} == STAGES
-    for name in (
-        "solve: an operator of zeros", "solve: grey layers", "solve: one eye alone", "solve: mean of targets",
-        "network: mean of targets", "network: grey layers", "network: eyes always straight ahead",
-        "tracker: repeats its first sample", "calibration: no shift", "retina: grey, and 30 dB",
-    ):  # fmt: skip
-        assert found[name]["forward_error"] <= 0.5, found[name]["note"]
-
-
-def test_the_code_itself_in_an_impostors_place_fails_the_control() -> None:
-    """A control measures something: what is right passes its stage, and so is no impostor."""
-    done, count = controls.passed(Control(poses.STAGE, "itself", poses.trials), {})
-    assert done == count > 20
 
 
 @pytest.mark.parametrize("defect", ["operator off by a tenth of a pixel", "eyes exchanged"])
@@ -121,7 +88,7 @@ def test_a_failing_case_makes_the_command_exit_with_1(tmp_path: Path, monkeypatc
         return pose
 
     code = poses.Poses(pose=bent)
-    monkeypatch.setattr(suite, "every_trial", lambda fits, check, full, limits: poses.trials(code))
+    monkeypatch.setattr(suite, "every_trial", lambda fits, check, full: poses.trials(code))
     done = command("--out", str(tmp_path))
     assert done.exit_code == 1
     assert "FAILS eye pose" in done.output
@@ -135,7 +102,7 @@ def test_a_case_that_crashes_fails_by_its_name_and_the_others_go_on(
     def crashes() -> Answer:
         raise ZeroDivisionError("somewhere deep inside")
 
-    def trials(fits: object, check: object, full: bool, limits: object) -> list[Trial]:
+    def trials(fits: object, check: object, full: bool) -> list[Trial]:
         good = Trial("solve", "a good one", lambda: Answer(0.0, 1.0), measure="of the wanted")
         bad = Trial("solve", "a bad one", crashes, measure="of the wanted", recorded=True)
         return [bad, good]
@@ -147,22 +114,6 @@ def test_a_case_that_crashes_fails_by_its_name_and_the_others_go_on(
     cases = {case["name"]: case for case in json.loads((tmp_path / "stability.json").read_text())["cases"]}
     assert cases["a good one"]["passed"] and not cases["a bad one"]["passed"]
     assert "a bad one" in (tmp_path / "index.html").read_text()
-
-
-def test_a_stage_whose_cases_cannot_be_made_is_one_failed_case(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object, **__: object) -> list[Trial]:
-        raise KeyError("no such preset")
-
-    for name in ("networks", "solve", "controls", "calibration"):
-        monkeypatch.setattr(getattr(suite, name), "trials", broken)
-    for name in ("retina", "tracking", "uncertainty"):  # others that go on, but the quick ones show it
-        monkeypatch.setattr(getattr(suite, name), "trials", lambda *_, **__: [])
-    limits: dict[str, float] = {}
-    cases = suite.run(list(suite.every_trial({}, lambda *_: None, full=False, limits=limits)), limits=limits)
-    failed = {case.stage: case for case in cases if case.name == "its cases"}
-    assert failed.keys() == {"network", "solve", "controls", "calibration"}
-    assert all(not case.passed and "KeyError" in case.note for case in failed.values())
-    assert sum(case.stage == "eye pose" and case.passed for case in cases) > 20
 
 
 def held(forward: float, limit: float | None, *, tolerance: float = 1.0, floor: float = 0.0) -> Case:
@@ -179,34 +130,8 @@ def test_a_case_is_held_to_what_was_recorded_and_five_per_cent() -> None:
     assert not without.passed and "no limit is recorded" in without.note
 
 
-def test_a_record_holds_what_is_held_to_one_and_keeps_what_was_not_run() -> None:
-    trials = [
-        Trial("stage", "held", lambda: Answer(0.12345678, 1.0), recorded=True),
-        Trial("stage", "crashed", lambda: Answer(math.nan, 1.0), recorded=True),
-        Trial("stage", "free", lambda: Answer(0.5, 1.0)),
-    ]
-    text = recorded(trials, [settle(trial) for trial in trials], {"stage: long": 3.0})
-    assert json.loads(text) == {"stage: held": 0.1235, "stage: long": 3.0}
-
-
-def test_a_broken_record_is_one_line(tmp_path: Path) -> None:
-    for content in ("not JSON", "[1]", '{"a": "b"}'):
-        (tmp_path / "limits.json").write_text(content)
-        with pytest.raises(InputError, match=r"limits\.json: is no record"):
-            load_limits(tmp_path / "limits.json")
-
-
 def answer(forward: float, tolerance: float = 1e-9, *, warned: bool = False) -> Trial:
     return Trial("stage", "name", lambda: Answer(forward, tolerance, warned=warned))
-
-
-def test_an_error_within_its_tolerance_passes_and_one_beyond_fails() -> None:
-    assert settle(answer(1e-10)).passed
-    assert not settle(answer(1e-8)).passed
-
-
-def test_nan_fails() -> None:
-    assert not settle(answer(math.nan)).passed
 
 
 def test_an_unexpected_warning_fails_and_an_expected_one_passes() -> None:
@@ -229,26 +154,9 @@ def test_only_the_codes_own_errors_count_as_a_refusal() -> None:
     assert not settle(Trial("stage", "name", refuses)).passed, "it refused where it must answer"
 
 
-def test_spare_digits_count_decades_below_the_tolerance() -> None:
-    assert spare_digits(settle(answer(1e-12))) == pytest.approx(3.0)
-    assert spare_digits(settle(answer(1e-6))) == pytest.approx(-3.0)
-
-
-def test_a_page_of_failures_says_so_first() -> None:
-    cases: list[Case] = [settle(answer(1e-8)), settle(answer(1e-12))]
-    page = stability_page(cases, machine={"seed": "0"}, seconds=1.0, command="phasestack stability")
-    assert page.lead.startswith("1 of 2")
-    assert "FAILS" in row(cases[0])[1]
-    assert heat_map(cases).png.startswith(b"\x89PNG")
-
-
-def test_without_mpmath_the_command_says_what_to_install() -> None:
-    code = (
-        "import sys; sys.modules['mpmath'] = None\n"
-        "from runtime.commands.stability import stability\n"
-        "from runtime.errors import MissingPart\n"
-        "try: stability(out=None, full=False, as_json=False, record=None)\n"
-        "except MissingPart as error: print(error)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "pip install phasestack[test]" in done.stdout
+def test_every_case_states_what_the_design_asks_for(record: tuple[dict, Path]) -> None:
+    for case in record[0]["cases"]:
+        assert case.keys() >= FIELDS
+        assert case["behaviour"] in {"answers", "warns", "refuses"}
+        if case["behaviour"] != "refuses":
+            assert case["forward_error"] <= case["tolerance"]

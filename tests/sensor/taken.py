@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from runtime.records import SensorFrame
-from runtime.sensor.base import SteppedDriver
+from runtime.sensor.base import SteppedSensor
 
 
-def taken_until(driver: SteppedDriver, time_ns: int) -> list[SensorFrame]:
+def taken_until(driver: SteppedSensor, time_ns: int) -> list[SensorFrame]:
     """All samples that have arrived by a time of the run's clock, oldest first, each once."""
     frames = []
     while (following := driver.peek()) is not None and driver.available_ns(following) <= time_ns:

@@ -32,9 +32,3 @@ def test_drift_between_the_clocks_is_followed() -> None:
         device_ns = round(k * 33 * MS * (1 + 1e-4))
         error = clock.host_ns(device_ns, arrival_ns=k * 33 * MS) - k * 33 * MS
     assert abs(error) < 2 * MS
-
-
-def test_a_restarted_device_begins_anew() -> None:
-    clock = DeviceClock()
-    clock.host_ns(10**15, arrival_ns=10**9)
-    assert clock.host_ns(5, arrival_ns=2 * 10**9) == 2 * 10**9

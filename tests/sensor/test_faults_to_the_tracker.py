@@ -12,6 +12,7 @@ import pytest
 
 from runtime.clock import MonotonicClock
 from runtime.config import SensorSettings
+from runtime.eyes.calibration import load_calibration
 from runtime.eyes.tracker import Tracker
 from runtime.sensor.eye_packets import EyePacket, encode
 from runtime.sensor.usb_eyes import UsbEyesDriver
@@ -65,13 +66,14 @@ def test_eyes_stay_where_they_are_through_a_fault_and_after_it(fault: Callable[.
     worker = SensorWorker(lambda: UsbEyesDriver(SETTINGS, clock, backend=bus), SETTINGS, clock)
     worker.start()
     tracker, labels, last = Tracker(), [], 0
-    truth = packet(1).points.eyes_m
+    calibration = load_calibration(None)
+    truth = calibration.apply(packet(1).points).eyes_m
     end = time.monotonic() + 5
     while last < 90 and time.monotonic() < end:
         frame = worker.newest()
         if frame is not None:
             last = frame.sequence if frame.sequence > 40 or last < 40 else last
-            tracker.update(frame.eyes, capture_ns=frame.capture_ns)
+            tracker.update(calibration.apply(frame.eyes), capture_ns=frame.capture_ns)
         answer = tracker.at(clock.now_ns() + 20_000_000)
         if answer.eyes_m is not None:
             assert np.abs(answer.eyes_m - truth).max() < 0.005

@@ -16,7 +16,6 @@ from runtime.config import SensorSettings
 from runtime.errors import EndOfRecording, InputError, MissingPart, SensorLost
 from runtime.sensor.openni2 import OpenNI2Driver
 from runtime.sensor.openni2_library import find_library
-from runtime.sensor.worker import SensorWorker
 from tests.sensor.oni_file import write_oni
 
 try:
@@ -88,19 +87,6 @@ def test_it_can_be_closed_twice_and_opened_again(oni: Any) -> None:
         driver.close()
     with pytest.raises(SensorLost):
         driver.read_newest(0.1)
-
-
-def test_it_runs_in_the_sensors_thread(oni: Any) -> None:
-    settings = SensorSettings(driver="openni2", source=str(oni), loop=True)
-    clock = MonotonicClock()
-    worker = SensorWorker(lambda: OpenNI2Driver(settings, clock), settings, clock)
-    worker.start()
-    received, end = 0, clock.now_ns() + 5 * 10**9
-    while received < 5 and clock.now_ns() < end:
-        received += worker.newest() is not None
-        clock.sleep_until_ns(clock.now_ns() + 10**7)
-    worker.stop()
-    assert received == 5
 
 
 @pytest.mark.parametrize("content", [b"", b"not an oni file", b"NI10" + bytes(60)], ids=range(3))

@@ -125,12 +125,3 @@ def test_images_of_a_sensor_that_has_none_are_not_claimed(tmp_path: Path) -> Non
     answer = CliRunner().invoke(app, ["--images", "--seconds", "0.5", "--out", str(tmp_path / "a.mcap")])
     assert answer.exit_code == 0 and "no pictures (this sensor delivers none)" in answer.stdout
     assert "whoever was there" not in answer.stdout
-
-
-def test_a_fast_sensor_is_recorded_whole(tmp_path: Path) -> None:
-    from runtime.evaluation.motion_recording import write_motion
-
-    write_motion(tmp_path / "fast.mcap", "walk", rate_hz=240, seconds=1.5)
-    source = settings(source=str(tmp_path / "fast.mcap"))
-    summary = record_to(tmp_path / "b.mcap", source, images=False, seconds=5, quiet=True)
-    assert summary["samples"] == 360 and summary["overtaken"] == 0

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from runtime.errors import SensorLost
-from runtime.sensor.known_devices import KNOWN_DEVICES, known_device
-from runtime.sensor.usb_devices import UDEV_RULE, find_device, find_devices, reset_device, usb_report
+from runtime.sensor.usb_devices import UDEV_RULE, find_device, usb_report
 from tests.sensor.fake_usb import KINECT_V2, FakeDevice, FakeUsb
 
 
@@ -14,10 +13,6 @@ def test_a_kinect_v2_on_usb_2_is_told_so() -> None:
     (row,) = usb_report(FakeUsb(FakeDevice(KINECT_V2, "K2", speed=3)))
     assert row["name"].startswith("Microsoft Kinect v2") and row["serial"] == "K2"
     assert any("USB 3" in problem for problem in row["problems"])
-
-
-def test_a_kinect_v2_on_usb_3_has_no_problem() -> None:
-    assert usb_report(FakeUsb(FakeDevice(KINECT_V2, speed=4)))[0]["problems"] == []
 
 
 def test_a_missing_permission_names_the_udev_rule() -> None:
@@ -30,14 +25,6 @@ def test_a_camera_without_a_driver_says_so() -> None:
     assert row["driver"] == "" and any("no driver" in problem for problem in row["problems"])
 
 
-def test_what_is_no_depth_camera_is_left_alone() -> None:
-    assert find_devices(FakeUsb(FakeDevice((0x046D, 0xC52B)))) == []
-
-
-def test_the_real_bus_can_be_listed() -> None:
-    assert isinstance(usb_report(), list)
-
-
 def test_a_device_is_found_by_its_serial_and_never_guessed() -> None:
     bus = FakeUsb(FakeDevice(serial="A1", address=5), FakeDevice(serial="B2", address=6))
     choice = {"driver": "usb-eyes", "backend": bus}
@@ -47,14 +34,3 @@ def test_a_device_is_found_by_its_serial_and_never_guessed() -> None:
         find_device(source="", serial="", **choice)
     with pytest.raises(SensorLost, match="C3"):
         find_device(source="C3", serial="", **choice)
-
-
-def test_a_device_that_hangs_is_reset() -> None:
-    device = FakeDevice()
-    reset_device(find_devices(FakeUsb(device))[0])
-    assert device.resets == 1
-
-
-def test_the_table_names_each_device_once() -> None:
-    ids = [(d.vendor_id, d.product_id) for d in KNOWN_DEVICES]
-    assert len(ids) == len(set(ids)) and known_device(*KINECT_V2) in KNOWN_DEVICES

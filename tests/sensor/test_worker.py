@@ -15,7 +15,7 @@ from runtime.clock import MonotonicClock
 from runtime.config import SensorSettings
 from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout
 from runtime.records import SensorFrame
-from runtime.sensor.base import Capabilities, SensorDriver
+from runtime.sensor.base import Capabilities, Sensor
 from runtime.sensor.worker import SensorWorker
 from tests.waiting import eventually
 
@@ -23,7 +23,7 @@ SETTINGS = SensorSettings(timeout_s=0.05, reopen_backoff_s=0.02, reopen_backoff_
 FRAME_S = 1 / 60
 
 
-class Scripted(SensorDriver):
+class Scripted(Sensor):
     """A driver whose `read_newest` asks the test what to do."""
 
     name = "scripted"
@@ -103,13 +103,6 @@ def test_a_driver_that_may_pause_is_neither_stalled_nor_reopened(
     worker, log = started(raiser(SensorTimeout("nothing")))
     time.sleep(0.5)
     assert worker.state == "opening" and log == ["open"] and worker.reopened == 0
-
-
-def test_a_sample_is_handed_out_once(started: Callable[..., Any]) -> None:
-    gate = threading.Semaphore(1)
-    worker, _ = started(lambda: gate.acquire(timeout=0.04) or (_ for _ in ()).throw(SensorTimeout("none")))
-    assert eventually(lambda: worker.newest() is not None)
-    assert worker.newest() is None
 
 
 def test_a_lost_device_is_closed_and_reopened_by_its_serial(started: Callable[..., Any]) -> None:
@@ -233,3 +226,26 @@ def test_a_device_that_always_hangs_does_not_fill_memory_with_threads(
         time.sleep(0.01)
     assert worker.state == "hung" and threading.active_count() <= before + 4
     release.set()
+
+
+@pytest.mark.parametrize("ahead_s", [0.3, 1e6, -1e5])
+def test_stamps_that_are_not_of_this_machine_s_clock_are_dated_anew_and_said(ahead_s: float, caplog: Any) -> None:
+    clock, frames = MonotonicClock(), []
+
+    class Astray(Scripted):
+        def read_newest(self, timeout_s: float) -> SensorFrame:
+            time.sleep(FRAME_S)
+            self._count += 1
+            return SensorFrame(self._count, clock.now_ns() + round(ahead_s * 1e9))
+
+    worker = SensorWorker(lambda: Astray(None, []), SETTINGS, clock)
+    worker.start()
+    try:
+        while len(frames) < 10:
+            for frame in worker.take():
+                frames.append(frame.capture_ns)
+                assert abs(clock.now_ns() - frame.capture_ns) < 1_000_000_000
+    finally:
+        worker.stop()
+    assert (np.diff(frames) > 0).all()
+    assert "dated by their arrival" in caplog.text and caplog.text.count("dated by") == 1

@@ -61,13 +61,6 @@ def test_a_folder_that_does_not_fit_is_told_by_the_name_that_was_given(tmp_path:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_replaces_another_whole(tmp_path: Path) -> None:
-    for data in (b"one", b"another"):
-        write_bytes(tmp_path / "new" / "a", data)
-        assert (tmp_path / "new" / "a").read_bytes() == data
-    assert len(list((tmp_path / "new").iterdir())) == 1
-
-
 @pytest.mark.parametrize(("in_the_way", "told"), [("b/c/x", "b/c: is a folder"), ("b", "b: is no folder")])
 def test_what_is_in_the_way_of_one_file_keeps_all_others_from_being_replaced(
     tmp_path: Path, in_the_way: str, told: str
@@ -108,3 +101,10 @@ def test_another_threads_lines_are_not_held_back(capfd: pytest.CaptureFixture[st
     done.set()
     other.join()
     assert (held.text, capfd.readouterr().err) == ("", "told at once\n")
+
+
+def test_a_file_replaces_another_whole(tmp_path: Path) -> None:
+    for data in (b"one", b"another"):
+        write_bytes(tmp_path / "new" / "a", data)
+        assert (tmp_path / "new" / "a").read_bytes() == data
+    assert len(list((tmp_path / "new").iterdir())) == 1

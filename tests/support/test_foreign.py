@@ -6,7 +6,6 @@ import json
 import os
 import socket
 import time
-import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -60,31 +59,12 @@ def test_a_file_is_read_up_to_its_limit_and_refused_beyond_with_both_figures(tmp
     assert "has 1000 bytes; at most 999 bytes" in refused(foreign.read_bytes, tmp_path / "a", most_bytes=999)
 
 
-def test_a_small_file_takes_little_memory_whatever_its_limit(tmp_path: Path) -> None:
-    (tmp_path / "a").write_bytes(b"x" * 1000)
-    tracemalloc.start()
-    try:
-        foreign.read_bytes(tmp_path / "a", most_bytes=1 << 30)
-        assert tracemalloc.get_traced_memory()[1] < 1 << 20
-    finally:
-        tracemalloc.stop()
-
-
 def test_whether_something_is_there_is_asked_of_names_that_can_be(tmp_path: Path) -> None:
     assert foreign.is_there(tmp_path, folder=True) and foreign.is_there(tmp_path)
     assert not foreign.is_there(tmp_path / "gone") and not foreign.is_there(tmp_path / "gone", folder=True)
     for name in ("x" * 5000, "a\0b", "/".join(["d" * 200] * 40), "y" * 300):
         with pytest.raises(InputError):
             foreign.is_there(tmp_path / name)
-
-
-def test_no_descriptor_is_left_open(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "fifo")
-    (tmp_path / "big").write_bytes(b"x" * 100)
-    before = len(list(Path("/proc/self/fd").iterdir()))
-    for name in ("fifo", "big", "gone"):
-        refused(foreign.read_bytes, tmp_path / name, most_bytes=10)
-    assert len(list(Path("/proc/self/fd").iterdir())) == before
 
 
 @pytest.mark.parametrize("path", ["a\0b", "x" * 5000, "y" * 300, "é" * 200, "/".join(["z" * 200] * 30)])
@@ -135,24 +115,11 @@ def test_json_that_nests_deep_is_refused_in_no_time(opening: str, times: int) ->
     assert time.monotonic() - start < HANG_S
 
 
-@pytest.mark.parametrize("text", ['"' + '\\"' * 500_000, '"' * 500_001, "\\" * 500_000, '"' + "\\" * 500_000])
-def test_strings_that_never_end_take_no_longer(text: str) -> None:
-    start = time.monotonic()
-    refused(parsed_json, text, source="a")
-    assert time.monotonic() - start < HANG_S
-
-
 @pytest.mark.parametrize(
     "text", ["NaN", "[Infinity]", '{"a": -Infinity}', "", "{", "9" * 5000 + "x", b"\xff", "\ud800"]
 )
 def test_what_is_no_json_is_refused(text: str | bytes) -> None:
     refused(parsed_json, text, source="a")
-
-
-def test_numbers_of_any_length_take_no_time() -> None:
-    start = time.monotonic()
-    assert parsed_json("9" * 1_000_000, source="a") == float("inf")
-    assert time.monotonic() - start < HANG_S
 
 
 @pytest.mark.parametrize(
@@ -163,19 +130,9 @@ def test_what_is_no_whole_number_in_its_range_is_refused_briefly(value: object) 
     assert line.startswith("a: n: is ") and len(line) < 200
 
 
-@pytest.mark.parametrize("value", [0, 5, 5.0, 1 << 62])
-def test_whole_numbers_are_taken(value: float) -> None:
-    assert whole(value, least=0, most=1 << 62) == value
-
-
 @pytest.mark.parametrize("text", ["²", "٣", "", "-", "1_0", "0x1", "1.0", "9" * 5000, "-1", " ", "½"])
 def test_digits_are_ascii_ones_and_not_too_many(text: str) -> None:
     assert len(refused(whole_from_text, text, least=0, most=10**15, source="a", field="n")) < 200
-
-
-@pytest.mark.parametrize(("text", "number"), [("7", 7), (" +12 ", 12), ("-3", -3), ("007", 7)])
-def test_digits_are_read(text: str, number: int) -> None:
-    assert whole_from_text(text, least=-9, most=99, source="a", field="n") == number
 
 
 @pytest.mark.parametrize("value", [float("inf"), float("nan"), "1", None, True, 1e300, 10**400, -2])
@@ -183,13 +140,8 @@ def test_what_is_no_number_in_its_range_is_refused(value: object) -> None:
     refused(real, value, least=-1, most=1e6, source="a", field="n")
 
 
-@given(st.text())
-def test_a_shown_value_is_printable_and_short(text: str) -> None:
-    shown = foreign.shown(text)
-    assert shown.isprintable() and len(shown) <= 43
-
-
-@given(st.text(), st.text(), st.text())
-def test_any_refusal_is_one_line(source: str, field: str, problem: str) -> None:
-    line = str(InputError(source, field, problem))
-    assert line.isprintable() and len(line) < 1000
+@pytest.mark.parametrize("text", ['"' + '\\"' * 500_000, '"' * 500_001, "\\" * 500_000, '"' + "\\" * 500_000])
+def test_strings_that_never_end_take_no_longer(text: str) -> None:
+    start = time.monotonic()
+    refused(parsed_json, text, source="a")
+    assert time.monotonic() - start < HANG_S

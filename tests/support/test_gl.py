@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 from typing import Any
 
+import moderngl
 import pytest
 
 from runtime.errors import MissingPart
@@ -21,7 +22,7 @@ def test_without_a_context_packages_are_named_and_a_limit_that_may_be_the_cause(
     def refused(**_: Any) -> None:
         raise Exception("eglInitialize failed (0x3001)")  # as glcontext raises it
 
-    monkeypatch.setattr(gl.moderngl, "create_context", refused)
+    monkeypatch.setattr(moderngl, "create_context", refused)
     monkeypatch.setattr(gl.resource, "getrlimit", lambda kind: (most, most))
     with pytest.raises(MissingPart, match=told):
         gl.offscreen_context()

@@ -1,1 +1,31 @@
-"""Compiled inner loops of what surrounds the network on the processor (numba)."""
+"""Kernels compiled by numba. The first import of one on a machine compiles it, which takes seconds and is kept."""
+
+from __future__ import annotations
+
+import logging
+import os
+from contextlib import suppress
+from importlib import metadata, resources
+from pathlib import Path
+
+import numba
+
+from runtime.support.cache import digest, user_cache
+
+log = logging.getLogger("phasestack.model")
+
+
+def _kept() -> Path | None:
+    """The folder for compiled code, named by what it follows from; None where none can be written."""
+    sources = sorted(Path(str(resources.files("runtime.model") / "compiled")).glob("*.py"))
+    folder = user_cache("compiled") / digest(sources, metadata.version("numba"))
+    with suppress(OSError):
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if os.access(folder, os.W_OK):
+        return folder
+    log.warning("compiled kernels can't be kept in %s: every start compiles them anew", folder)
+    return None
+
+
+KEPT_IN = _kept()
+numba.config.CACHE_DIR = str(KEPT_IN or "")  # type: ignore[attr-defined]

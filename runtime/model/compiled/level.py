@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from math import ceil, log, sqrt
 
 import numpy as np
@@ -17,8 +18,7 @@ from runtime.model.compiled.enlarge import enlarge
 from runtime.model.compiled.fade import fade_codes
 from runtime.model.compiled.passes import STRIP_ROWS, blur, close_centre, correct, show
 from runtime.model.compiled.sampling import SLACK, Samplings, numbers_of, samplings, work_row, work_tiles
-from runtime.model.compiled.sight import add_at_raster, lack_at_rays
-from runtime.model.compiled.unseen import make_up_rows
+from runtime.model.compiled.unseen import extrapolate_rows
 from runtime.model.compiled.warp import warped
 from runtime.model.pyramid_level import (
     CENTRE,
@@ -30,7 +30,7 @@ from runtime.model.pyramid_level import (
     START,
     Fading,
     PyramidLevel,
-    pixels_in_line,
+    reprojection,
 )
 from runtime.model.resample import buffer
 from runtime.model.rows import RowPool
@@ -141,7 +141,7 @@ class CompiledLevel(PyramidLevel):
         constants, floor = self._constants(), np.float32(self.slope_floor)
         panels = [numbers_of(self._in_the_mean(n)) for n in OUTER]
         widths = [self.rasters[n].width_px * self._channels for n in OUTER]
-        wanted = [numbers_of(image) for image in self.wanted]
+        wanted = [numbers_of(image) for image in self.target]
 
         def close(first: int, last: int, work: _Work) -> None:
             place = _pixels(layers[CENTRE]), boxes[CENTRE].v0, boxes[CENTRE].u0
@@ -153,7 +153,14 @@ class CompiledLevel(PyramidLevel):
             self._copy(self.outer[n], layers[n], boxes[n])
 
     def _copy(self, panel: I16, layer: U8, box: PixelRect) -> None:
-        numbers, pixels, bits = numbers_of(panel), _pixels(layer), SUBCODE.bit_length() - 1
+        self._copy_numbers(numbers_of(panel), layer, box)
+
+    def show_panels(self, panels: I16, layers: U8, boxes: Sequence[PixelRect]) -> None:
+        for numbers, layer, box in zip(panels, layers, boxes, strict=True):
+            self._copy_numbers(numbers, layer, box)
+
+    def _copy_numbers(self, numbers: I16, layer: U8, box: PixelRect) -> None:
+        pixels, bits = _pixels(layer), SUBCODE.bit_length() - 1
 
         def copy(first: int, last: int, _: _Work) -> None:
             show(numbers, pixels, box.v0, box.u0, box.width_px, first, last, self._channels, bits)
@@ -177,7 +184,7 @@ class CompiledLevel(PyramidLevel):
             2 * OUTER.index(panel),
             unsure,
             numbers_of(self._spare),
-            *(numbers_of(image) for image in self.wanted),
+            *(numbers_of(image) for image in self.target),
             self._seen_at,
             self._back_at[panel],
             *(np.float32(value) for value in (size, self.slope_floor, *limits)),
@@ -224,10 +231,8 @@ class CompiledLevel(PyramidLevel):
         return self._seen_at
 
     def _lay(self, eyes_m: F64) -> None:
-        seen = [pixels_in_line(self._stack, self.rasters, eye_m, of=n, on=CENTRE) for n in OUTER for eye_m in eyes_m]
-        back = {
-            n: [pixels_in_line(self._stack, self.rasters, eye_m, of=CENTRE, on=n) for eye_m in eyes_m] for n in OUTER
-        }
+        seen = [reprojection(self._stack, self.rasters, eye_m, of=n, on=CENTRE) for n in OUTER for eye_m in eyes_m]
+        back = {n: [reprojection(self._stack, self.rasters, eye_m, of=CENTRE, on=n) for eye_m in eyes_m] for n in OUTER}
         scales = [m[k, k] for m in (*seen, *back[REAR], *back[FRONT]) for k in (0, 1)]
         if min(scales) <= 0 or max(scales) > SCALE_MOST:
             return
@@ -251,6 +256,7 @@ class CompiledLevel(PyramidLevel):
         return self._channels, np.float32(START), np.float32(FULL), np.float32(SUBCODE)
 
 
+@cache
 def warm_up() -> None:
     """Compile every pass, or load what was compiled before."""
     stack, eyes_m = PanelStack(0.5, 0.25, (-0.06, 0.0, 0.06), 64, 32), np.array([[0.6, -0.03, 0.0], [0.6, 0.03, 0.0]])
@@ -270,9 +276,7 @@ def warm_up() -> None:
         warped(layers[0], same, out=layers[1], rows=whole[0], columns=whole[1], linear=linear)
     fade_codes(np.zeros((2, 6), np.int16), np.zeros((1, 2), np.float32), START, 3)
     every = np.zeros(32, np.int64), np.full(32, 64)
-    make_up_rows(_pixels(layers[0]), _pixels(layers[1]), *every, *every, 0, 0, 64)
-    lack = lack_at_rays(layers, layers[0], np.stack([same] * 3), least=0.0, most=1.0)
-    add_at_raster(layers[1], lack, same, gain=1.0, rows=whole[0], columns=whole[1])
+    extrapolate_rows(_pixels(layers[0]), _pixels(layers[1]), *every, *every, 0, 0, 64)
     rows.close()
 
 

@@ -306,14 +306,18 @@ def _pixel(red, green, blue):  # pragma: no cover
 @njit(**PASS)
 def show(panel, layer, v0, u0, width, first, last, channels, bits):  # pragma: no cover
     """An outer panel's rows first to last, (rows, numbers) int16 of so many bits beyond 8, into a layer as above."""
+    half = np.int32(1 << (bits - 1))
     for v in range(first, last):
         line, row, begin = U(v), U(v + v0), U(u0)
         if channels == 3:
             for u in range(width):
                 at = U(3) * U(u)
-                red, green = np.int32(panel[line, at]) >> bits, np.int32(panel[line, at + U(1)]) >> bits
-                layer[row, U(u) + begin] = _pixel(red, green, np.int32(panel[line, at + U(2)]) >> bits)
+                red, green = (
+                    (np.int32(panel[line, at]) + half) >> bits,
+                    (np.int32(panel[line, at + U(1)]) + half) >> bits,
+                )
+                layer[row, U(u) + begin] = _pixel(red, green, (np.int32(panel[line, at + U(2)]) + half) >> bits)
         else:
             for u in range(width):
-                code = np.int32(panel[line, U(u)]) >> bits
+                code = (np.int32(panel[line, U(u)]) + half) >> bits
                 layer[row, U(u) + begin] = _pixel(code, code, code)

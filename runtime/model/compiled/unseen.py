@@ -8,9 +8,9 @@ from runtime.model.compiled.sampling import PASS
 
 
 @njit(**PASS)
-def make_up_rows(left, right, left_first, left_last, right_first, right_last, v0, start, stop):  # pragma: no cover
-    """As `runtime.model.unseen.make_up`, of rows from v0 on that a picture shows a part of: RGBA (rows, pixels) uint32,
-    of which pixels start to stop are drawn."""
+def extrapolate_rows(left, right, left_first, left_last, right_first, right_last, v0, start, stop):  # pragma: no cover
+    """As `runtime.model.unseen.extrapolate_border`, of rows from v0 on that a picture shows a part of: RGBA (rows,
+    pixels) uint32, of which pixels start to stop are drawn."""
     for row in range(left_first.shape[0]):
         a, b, c, d = left_first[row], left_last[row], right_first[row], right_last[row]
         if b <= a and d <= c:

@@ -69,15 +69,15 @@ def want(
                     halved[line, U(u)] = table[pairs[U(u) * U(2 * CHANNELS)]]
 
 
-def fill_wanted(pictures: Pictures, pairs: Sequence[Sequence[I16]], *, rows: RowPool) -> None:
-    """As `runtime.model.wanted.fill_wanted`; other sizes than every pixel and every second are left to it."""
+def fill_targets(pictures: Pictures, pairs: Sequence[Sequence[I16]], *, rows: RowPool) -> None:
+    """As `runtime.model.wanted.fill_targets`; other sizes than every pixel and every second are left to it."""
     height, width = pictures.box.height_px, pictures.box.width_px
     full, *rest = pairs
     fits = full[0].shape[:2] == (height, width) and all(
         (2 * half[0].shape[0], 2 * half[0].shape[1]) == (height, width) for half in rest
     )
     if not fits or len(rest) > 1:
-        plain.fill_wanted(pictures, pairs, rows=rows)
+        plain.fill_targets(pictures, pairs, rows=rows)
         return
     halves = rest[0] if rest else [np.empty((0, 0), np.int16) for _ in full]
     sources = [np.ascontiguousarray(array).reshape(array.shape[0], -1) for array in pictures.arrays]

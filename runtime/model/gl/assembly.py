@@ -28,7 +28,7 @@ class GlAssembly:
         """pool: where layers are left, and where those come from that are put together."""
         self._passes, self._pool, self._stack = passes, pool, stack
         self._arrays = ArrayAssembly(stack)
-        self._turned: dict[int, DrawnPicture] = {}  # an eye
+        self._transposed: dict[int, DrawnPicture] = {}  # an eye
         self._textures: dict[str, Any] = {}  # made when they are first needed, on the thread that draws
 
     def assembled(self, rest: Rest, window: Placed | None) -> Layers:
@@ -55,38 +55,26 @@ class GlAssembly:
             wait_until_drawn()
         return left
 
-    def enlarged(self, layers: Layers) -> Layers:
-        if not isinstance(layers, LayerTextures):
-            return self._arrays.enlarged(layers)
-        with self._passes.drawing():
-            small, left = _images(layers), self._left()
-            size, large = small["rear"].size, left.textures[0].size
-            scale = (size[0] / large[0], size[1] / large[1])
-            images = tuple(_images(left).values())
-            self._passes.draw("enlarge", images, small, {"size": size, "layer_from_panel": scale})
-            wait_until_drawn()
-        return left
-
-    def turned_picture(self, picture: U8 | DrawnPicture, side: int) -> U8 | DrawnPicture:
+    def transposed_picture(self, picture: U8 | DrawnPicture, side: int) -> U8 | DrawnPicture:
         if not isinstance(picture, DrawnPicture):
-            return self._arrays.turned_picture(picture, side)
+            return self._arrays.transposed_picture(picture, side)
         width, height = self._stack.height_px, self._stack.width_px
         with self._passes.drawing():
-            if side not in self._turned:
-                texture = self._textures[f"turned {side}"] = self._passes.context.texture((width, height), 4)
+            if side not in self._transposed:
+                texture = self._textures[f"transposed {side}"] = self._passes.context.texture((width, height), 4)
                 target = self._passes.target((Image(texture, width, height),))
-                self._turned[side] = DrawnPicture(texture, target, np.empty((height, width, 4), np.uint8))
-            turned = self._turned[side]
-            self._turn(picture.texture, turned.texture)
-        return replace(turned, grey=picture.grey)
+                self._transposed[side] = DrawnPicture(texture, target, np.empty((height, width, 4), np.uint8))
+            transposed = self._transposed[side]
+            self._transpose(picture.texture, transposed.texture)
+        return replace(transposed, grey=picture.grey)
 
-    def turned(self, layers: Layers) -> Layers:
+    def transposed(self, layers: Layers) -> Layers:
         if not isinstance(layers, LayerTextures):
-            return self._arrays.turned(layers)
+            return self._arrays.transposed(layers)
         with self._passes.drawing():
             left = self._left()
-            for texture, turned in zip(layers.textures, left.textures, strict=True):
-                self._turn(texture, turned)
+            for texture, transposed in zip(layers.textures, left.textures, strict=True):
+                self._transpose(texture, transposed)
             wait_until_drawn()
         return left
 
@@ -94,10 +82,12 @@ class GlAssembly:
         with suppress(Exception):  # of a context that is lost there is nothing to release
             for texture in self._textures.values():
                 self._passes.forget(texture)
-        self._textures, self._turned = {}, {}
+        self._textures, self._transposed = {}, {}
 
-    def _turn(self, texture: Any, turned: Any) -> None:
-        self._passes.draw("turn", (Image(turned, *turned.size),), {"image": Image(texture, *texture.size)}, {})
+    def _transpose(self, texture: Any, transposed: Any) -> None:
+        self._passes.draw(
+            "transpose", (Image(transposed, *transposed.size),), {"image": Image(texture, *texture.size)}, {}
+        )
 
     def _left(self) -> LayerTextures:
         return left_in(self._pool, self._passes, self._stack)

@@ -10,7 +10,7 @@ from runtime.model.contract import Contract
 from runtime.model.fade import fade_codes
 from runtime.model.gl.assembly import GlAssembly
 from runtime.model.gl.programs import Passes
-from runtime.model.gl.surround import GlSurround, check_size
+from runtime.model.gl.state import GlState, check_size
 from runtime.optics.stack import PanelStack
 from runtime.support.gl import describe
 from runtime.support.gl_sharing import LayerPool, ShareGroup
@@ -28,13 +28,12 @@ class GlBackend:
         the stack is too large for the driver."""
         check_size(context, stack)
         self.context = context
-        self.at_once = False  # corrections in one pass: found by trying (`backends`)
         self.passes = Passes(context)
         self._pool = None if group is None else LayerPool(context, group)
         self.renderer = describe(context)["renderer"]
 
-    def surround(self, contract: Contract, stack: PanelStack, *, threads: int) -> GlSurround:
-        return GlSurround(self.passes, contract, stack, at_once=self.at_once, pool=self._pool)
+    def state(self, contract: Contract, stack: PanelStack, *, threads: int) -> GlState:
+        return GlState(self.passes, contract, stack, pool=self._pool)
 
     def assembly(self, stack: PanelStack) -> Assembly:
         return ArrayAssembly(stack) if self._pool is None else GlAssembly(self.passes, self._pool, stack)

@@ -28,6 +28,8 @@ function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
 
+// What is solved for an instant after this light has no age yet.
+const age = (value) => (typeof value === "number" ? Math.max(0, value) : value);
 const number = (value, digits = 1) => (value === null || value === undefined ? "–" : Number(value).toFixed(digits));
 const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], { hour12: false });
 
@@ -36,7 +38,7 @@ const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], { hou
 const PLOTS = [
   ["refreshes/s", (s) => s.fps_now, 1],
   ["solutions/s", (s) => s.solutions_per_s_now, 1],
-  ["solution's age, ms", (s) => s.solution_age_now_ms, 1],
+  ["solution's age, ms", (s) => age(s.solution_age_now_ms), 1],
   ["capture to light, ms", (s) => s.photon_now_ms, 1],
   ["eyes known to, mm", (s) => s.eye_sigma_now_mm, 2],
   ["presenting (median), ms", (s) => s.stage_ms?.present?.p50, 2],
@@ -121,7 +123,7 @@ function drawEyes(status) {
   view($("side"), status, 2, about.stack.height_m, sector(...about.viewing_up_deg));
 }
 
-// Figures, budget, faults.
+// Figures, what is left out, faults.
 
 function figures(status) {
   const rows = {
@@ -131,9 +133,9 @@ function figures(status) {
     "up for": `${Math.floor(status.uptime_s / 3600)} h ${Math.floor((status.uptime_s % 3600) / 60)} min`,
     refreshes: `${status.presented} presented, ${status.dropped} dropped, ${status.missed_blanks} blanks missed`,
     solutions: `${status.inferences}`,
-    sensor: `${number(status.sensor_hz)} samples/s, ${status.stale_inputs} overtaken`,
+    sensor: `${number(status.sensor_hz)} samples/s, ${status.stale_inputs} skipped`,
     "capture to light": status.photon_ms ? `${number(status.photon_ms.p50)} ms (p50), ${number(status.photon_ms.p99)} (p99)` : "–",
-    "solution's age": status.solution_age_ms ? `${number(status.solution_age_ms.p50)} ms (p50), ${number(status.solution_age_ms.p99)} (p99)` : "–",
+    "solution's age": status.solution_age_ms ? `${number(age(status.solution_age_ms.p50))} ms (p50), ${number(age(status.solution_age_ms.p99))} (p99)` : "–",
     stages: Object.entries(status.stage_ms ?? {}).filter(([, v]) => v).map(([k, v]) => `${k} ${number(v.p50, 2)}`).join(", ") + " ms (p50)",
     "black box": status.blackbox ? `${number(status.blackbox.kept_s, 0)} s kept, ${number(status.blackbox.kept_mib)} MiB; last file: ${status.blackbox.last_file ?? "none"}` : "–",
   };
@@ -149,11 +151,7 @@ function figures(status) {
   });
 }
 
-function budget(status) {
-  const b = status.budget;
-  const held = b?.held === true ? ", held" : b?.held === false ? ", not held" : "";
-  const text = !b ? "none set" : b.budget_ms > 0 ? `${b.budget_ms} ms: ${b.level}${held}` : `none set: ${b.level}`;
-  setText($("budget-told"), b?.measuring ? `${text}; measuring ${b.measuring}` : text);
+function leftOut(status) {
   const key = JSON.stringify(status.plan);
   if ($("plan").dataset.key !== key) {
     $("plan").dataset.key = key;
@@ -184,7 +182,7 @@ function entries(list, items, made) {
 
 // Pictures.
 
-const NAMED = (name) => name.startsWith("layer-") ? `layer ${Number(name.slice(6)) + 1} from the rear` :
+const NAMED = (name) => name.startsWith("layer-") ? `panel ${name.slice(6)}${name === "layer-0" ? " (rear)" : ""}` :
   name === "seen-left" ? "seen by the left eye" : "seen by the right eye";
 
 function pictures(answer) {
@@ -215,9 +213,9 @@ function pictures(answer) {
 
 const short = (name) => name.split("/").filter(Boolean).pop() ?? name;
 
-function picker(names) {
+function picker(names, pictured) {
   const box = $("picker");
-  const key = JSON.stringify(names);
+  const key = JSON.stringify([names, [...pictured]]);
   if (box.dataset.key === key) return;
   box.dataset.key = key;
   box.replaceChildren(...names.map((name) => {
@@ -225,19 +223,18 @@ function picker(names) {
     button.type = "button";
     button.setAttribute("aria-pressed", "false");
     button.title = name;
-    const image = document.createElement("img");
-    image.alt = "";
-    image.loading = "lazy";
-    image.src = `/thumbnail?scene=${encodeURIComponent(name)}`;
-    image.addEventListener("error", () => {
-      const none = html("span", "not seen yet");
-      none.className = "none";
-      image.replaceWith(none);
-    });
+    const image = pictured.has(name) ? document.createElement("img") : html("span", "not seen yet");
+    if (pictured.has(name)) {
+      image.alt = "";
+      image.loading = "lazy";
+      image.src = `/thumbnail?scene=${encodeURIComponent(name)}`;
+    } else {
+      image.className = "none";
+    }
     button.append(image, html("span", short(name)));
     button.addEventListener("click", async () => {
       delete $("scene").dataset.touched;
-      await tell(button, "scene", name);
+      await tell(button, "scene", name, $("scene-told"));
     });
     return button;
   }));
@@ -299,11 +296,11 @@ $("list-clear").addEventListener("click", () => {
 $("list-form").addEventListener("submit", async (event) => {
   event.preventDefault();
   if (!own.length) {
-    $("told").dataset.kind = "bad";
-    setText($("told"), "playlist: add a scene first");
+    $("list-answer").dataset.kind = "bad";
+    setText($("list-answer"), "playlist: add a scene first");
     return;
   }
-  if (await tell($("list-show"), "playlist", own)) own = [];
+  if (await tell($("list-show"), "playlist", own, $("list-answer"))) own = [];
 });
 
 // Where the scene stands: sent as it is changed.
@@ -349,19 +346,6 @@ for (const [id, name, part, units] of PLACE) {
 $("place-form").addEventListener("submit", (event) => event.preventDefault());
 $("place-reset").addEventListener("click", () => tell($("place-reset"), "place", null, $("placed")));
 
-// A restart darkens the display: it is asked for twice.
-
-let armed = 0;
-$("restart").addEventListener("click", async () => {
-  if (Date.now() - armed > 5000) {
-    armed = Date.now();
-    setText($("told"), "restart: the display goes dark for some seconds; press again to do it");
-    return;
-  }
-  armed = 0;
-  await tell($("restart"), "restart");
-});
-
 // Asking.
 
 async function lookUp(name) {
@@ -405,11 +389,10 @@ function show(status) {
   scenes(status);
   playlist(status.playlist);
   placing(status.placing);
-  if (document.activeElement !== $("budget") && !$("budget").dataset.touched) $("budget").value = status.budget?.budget_ms ?? 0;
   plot(status);
   drawEyes(status);
   figures(status);
-  budget(status);
+  leftOut(status);
 }
 
 async function every(ms, work) {
@@ -454,9 +437,7 @@ every(ABOUT_MS, async () => {
       return option;
     }));
   }
-  $("restart").disabled = !answer.may_restart;
-  $("restart-told").hidden = answer.may_restart;
-  picker(answer.scenes ?? []);
+  picker(answer.scenes ?? [], new Set(answer.pictured ?? []));
 });
 
 // Telling.
@@ -490,21 +471,16 @@ async function tell(button, command, value = null, where = $("told")) {
 }
 
 for (const button of document.querySelectorAll("[data-command]")) {
-  button.addEventListener("click", () => tell(button, button.dataset.command));
+  button.addEventListener("click", () => tell(button, button.dataset.command, null, $(button.dataset.command === "next" ? "list-answer" : "told")));
 }
-for (const id of ["scene", "model", "budget"]) $(id).addEventListener("input", () => ($(id).dataset.touched = "yes"));
+for (const id of ["scene", "model"]) $(id).addEventListener("input", () => ($(id).dataset.touched = "yes"));
 $("scene-form").addEventListener("submit", async (event) => {
   event.preventDefault();
-  await tell(event.submitter ?? event.target.querySelector("button"), "scene", $("scene").value.trim());
+  await tell(event.submitter ?? event.target.querySelector("button"), "scene", $("scene").value.trim(), $("scene-told"));
   delete $("scene").dataset.touched;
 });
 $("model-form").addEventListener("submit", async (event) => {
   event.preventDefault();
-  await tell(event.submitter ?? event.target.querySelector("button"), "model", $("model").value.trim());
+  await tell(event.submitter ?? event.target.querySelector("button"), "model", $("model").value.trim(), $("model-told"));
   delete $("model").dataset.touched;
-});
-$("budget-form").addEventListener("submit", async (event) => {
-  event.preventDefault();
-  await tell(event.submitter ?? event.target.querySelector("button"), "budget", Number($("budget").value));
-  delete $("budget").dataset.touched;
 });

@@ -12,7 +12,7 @@ try:
     from mpmath import mp as mp
     from mpmath import mpf as mpf
 except ImportError:
-    raise MissingPart("mpmath is needed for the references: pip install phasestack[test]") from None
+    raise MissingPart("mpmath is needed for the references: pip install mpmath") from None
 
 mp.dps = 50
 Vector = tuple[Any, Any, Any]  # of mpf

@@ -1,8 +1,8 @@
 """What each case came to when it was last recorded: no worse than that by more than 5% is what it is held to.
 
-Cases of what a model or a filter makes of a hard problem have no closed form for how good it can be: a tolerance that
-lets everything pass would also let an impostor pass (`controls`). `phasestack stability --full --record FILE` writes
-the file anew; whoever changes a model or the tracker does, and says in the commit what became worse.
+Cases of what a model or a filter makes of a hard problem have no closed form for how good it can be.
+`phasestack stability --full --record FILE` writes the file anew; whoever changes a model or the tracker does, and says
+in the commit what became worse.
 """
 
 from __future__ import annotations

@@ -14,9 +14,10 @@ from runtime.config import ModelSettings
 from runtime.model.chain import chain_modes
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.model.still import solve_still
+from runtime.optics.carried import intensities
+from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
-from runtime.report.eyesight import as_intensity, seen_rays
 from runtime.report.pairs import eyes_at
 from runtime.report.stability import exact
 from runtime.report.stability.retina import EDGE_PX, traced
@@ -44,7 +45,7 @@ def ready(model: str, stack: PanelStack) -> Predictor:
 
 
 def predicted(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack) -> U8:
-    """(N, h, w, 3) layers, copied out of the predictor: the code under trial, for which `controls` puts impostors."""
+    """(N, h, w, 3) layers, copied out of the predictor."""
     done = solve_still(images[0], images[1], eyes_m=eyes_m, fov_deg=FOV_DEG, predictor=ready(model, stack))
     return np.array(done.layers[..., :3])
 
@@ -54,8 +55,8 @@ def squared_error(layers: U8, images: Sequence[U8], eyes_m: F64, stack: PanelSta
     total, count = 0.0, 0
     for eye, image in zip(eyes_m, images, strict=True):
         size = {"width_px": image.shape[1], "height_px": image.shape[0]}
-        seen, mask = seen_rays(eye, layers, stack, **size, fov_deg=FOV_DEG, step=1)
-        difference = (seen - as_intensity(image))[mask]
+        seen = seen_by(eye, layers, stack, **size, fov_deg=FOV_DEG)
+        difference = (seen.image - intensities(image))[seen.mask]
         total, count = total + float(np.square(difference, dtype=np.float64).sum()), count + difference.size
     if not count:
         raise ValueError("no ray crosses every panel")
@@ -125,7 +126,8 @@ def scored(predict: Predict, model: str) -> Answer:
     height, width = images[0].shape[:2]
     random, error, counted = np.random.default_rng(11), 0.0, 0
     for eye in eyes:
-        seen, mask = seen_rays(eye, layers, STACK, width_px=width, height_px=height, fov_deg=FOV_DEG, step=1)
+        retina = seen_by(eye, layers, STACK, width_px=width, height_px=height, fov_deg=FOV_DEG)
+        seen, mask = retina.image, retina.mask
         place = exact.vector(eye)
         for row, column in zip(random.integers(0, height, RAYS), random.integers(0, width, RAYS), strict=True):
             channel = int(row + column) % 3

@@ -24,7 +24,7 @@ INTENSITIES = {
 
 @dataclass(frozen=True, slots=True)
 class Malus:
-    """The code under trial; `controls` puts impostors in its place."""
+    """The code under trial; tests put a wrong one in its place."""
 
     intensity: Callable[..., Any] = intensity_from_phase
     phase: Callable[..., Any] = phase_from_intensity

@@ -23,7 +23,7 @@ STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 1920, 1080)
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """The code under trial; `controls` puts impostors in its place."""
+    """The code under trial; tests put a wrong one in its place."""
 
     pose: Callable[..., Any] = stack_from_eye
     projection: Callable[..., Any] = image_from_stack

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from runtime.optics.light import squared_error
 from runtime.optics.quality import psnr_db, quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
@@ -26,7 +27,7 @@ EDGE_PX = 1e-4  # a ray so near to where it begins to count may count or not
 
 @dataclass(frozen=True, slots=True)
 class Eyesight:
-    """The code under trial; `controls` puts impostors in its place."""
+    """The code under trial; tests put a wrong one in its place."""
 
     seen: Callable[..., Any] = seen_by
     quality: Callable[..., Any] = quality
@@ -124,6 +125,50 @@ def displayed(code: Eyesight, eyes: Sequence[Sequence[float]], kind: str) -> Ans
     return Answer(exact.distance(found.psnr_db, truth_db), 0.002, note=note)
 
 
+def light(eyes: Sequence[Sequence[float]], true: Sequence[Sequence[float]], kind: str) -> Answer:
+    """Mean squared error of the light of nine rays a pixel, for eyes that are elsewhere than solved for, ray by ray."""
+    layers, rays = layers_of(kind, THREE), 3
+    targets = [np.random.default_rng(3).random((SIZE[1], SIZE[0], 3), dtype=np.float32) for _ in eyes]
+    total, count, doubtful = exact.mpf(0), 0, 0
+    for nominal, place, target in zip(map(exact.vector, eyes), map(exact.vector, true), targets, strict=True):
+        for row in range(SIZE[1]):
+            for column in range(SIZE[0]):
+                seen, inside, edge = lit(nominal, place, layers, column, row, rays)
+                doubtful += min(abs(inside), edge) < EDGE_PX
+                if inside > 0:
+                    wanted = [exact.mpf(float(value)) for value in target[row, column]]
+                    total += sum((a - b) ** 2 for a, b in zip(seen, wanted, strict=True))
+                    count += 3
+    found = squared_error(
+        layers, targets, THREE, solved_for_m=np.array(eyes), eyes_m=np.array(true), fov_deg=FOV_DEG, rays=rays
+    )
+    # A ray on the border between two pixels may take either: a ninth of a pixel's intensity.
+    tolerance = 64 * EPS32 + doubtful / rays**2 / max(count, 1)
+    return Answer(exact.distance(found, total / count), tolerance, note=f"{count} values, {doubtful} on a border")
+
+
+def lit(nominal: Any, true: Any, layers: U8, column: int, row: int, rays: int) -> tuple[list[Any], float, float]:
+    """The mean intensities of a pixel's rays, how far inside they cross, and how near to a border between pixels."""
+    sums, inside, edge = [exact.mpf(0)] * 3, math.inf, math.inf
+    for ray in range(rays * rays):
+        u, v = (exact.mpf(at) + (exact.mpf(part) + exact.mpf("0.5")) / rays
+                for at, part in ((column, ray % rays), (row, ray // rays)))  # fmt: skip
+        direction = exact.ray(nominal, u, v, width_px=SIZE[0], height_px=SIZE[1], fov_deg=FOV_DEG)
+        through = exact.combine(exact.hit(nominal, direction, THREE.x_m[1]), -1, true)
+        phases = [0, 0, 0]
+        for layer, x_m in zip(layers, THREE.x_m, strict=True):
+            place = exact.hit(true, through, x_m)
+            x, y = exact.panel_position(place, width_m=THREE.width_m, height_m=THREE.height_m, size=SIZE)
+            half = exact.mpf("0.5")
+            inside = min(inside, *map(float, (x - half, SIZE[0] - half - x, y - half, SIZE[1] - half - y)))
+            if inside <= 0:
+                return sums, inside, edge
+            edge = min(edge, *(float(abs(p - exact.mp.nint(p))) for p in (x, y)))
+            phases = [p + int(value) for p, value in zip(phases, layer[int(y), int(x)], strict=True)]
+        sums = [s + exact.mp.sin(exact.mp.pi / 2 * p / 255) ** 2 for s, p in zip(sums, phases, strict=True)]
+    return [s / rays**2 for s in sums], inside, edge
+
+
 def decibels(code: Eyesight, squared: float) -> Answer:
     """-10·log10 of a mean squared error, down to where nothing is left of it."""
     truth = -10 * exact.mp.log10(exact.mpf(squared))
@@ -151,6 +196,13 @@ def trials(code: Eyesight = Eyesight()) -> Iterator[Trial]:
     eyes = [[0.7, -0.03, 0.05], [0.7, 0.03, 0.05]]
     for kind in ("nearly right", "all wrong"):
         yield Trial(STAGE, f"PSNR, {kind}", partial(displayed, code, eyes, kind), measure="dB")
+    for name, moved_m, kind in (
+        ("at", 0.0, "checkerboard"),
+        ("2 mm beside", 0.002, "noise"),
+        ("beside", 0.05, "noise"),
+    ):
+        true = [[x, y + moved_m, z] for x, y, z in eyes]
+        yield Trial(STAGE, f"light {name} the eyes, {kind}", partial(light, eyes, true, kind), measure="squared error")
     for squared in (1.0, 0.5, 1e-3, 1e-6, 1e-10):
         yield Trial(STAGE, f"PSNR of a squared error of {squared:g}", partial(decibels, code, squared), measure="dB")
     layers = layers_of("noise", THREE)

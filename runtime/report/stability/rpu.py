@@ -32,7 +32,7 @@ PROBES = [(a, b) for a in (0.1, 0.5, 0.9) for b in (0.2, 0.8)]  # places on a pa
 
 @dataclass(frozen=True, slots=True)
 class Rpu:
-    """The code under trial; `controls` puts impostors in its place."""
+    """The code under trial; tests put a wrong one in its place."""
 
     panel_from_image: Callable[..., F64] = panel_from_image
     image_from_raster: Callable[..., F64] = image_from_raster

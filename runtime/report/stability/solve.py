@@ -166,7 +166,7 @@ def _optimum(gap_m: float, ipd_m: float, distance_m: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Solvers:
-    """The code under trial; `controls` puts impostors in its place."""
+    """The code under trial; tests put a wrong one in its place."""
 
     make_operator: Callable[..., Any] = eye_operator
     methods: tuple[tuple[str, Method], ...] = ()

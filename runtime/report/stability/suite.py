@@ -7,7 +7,6 @@ from functools import partial
 
 from runtime.report.stability import (
     calibration,
-    controls,
     networks,
     phases,
     poses,
@@ -25,7 +24,7 @@ from runtime.report.stability.trial import Answer, Case, Trial, settle
 SOLVERS = (*networks.MODELS, "sart")
 
 
-def every_trial(fits: Mapping[str, Fit], check: Check, *, full: bool, limits: Mapping[str, float]) -> Iterator[Trial]:
+def every_trial(fits: Mapping[str, Fit], check: Check, *, full: bool) -> Iterator[Trial]:
     """What there is to try. `fits` are the calibration's solvers by rule, `check` the check of eyes before a network.
 
     A stage whose cases can't be made is one case, which fails.
@@ -41,7 +40,6 @@ def every_trial(fits: Mapping[str, Fit], check: Check, *, full: bool, limits: Ma
         uncertainty.STAGE: uncertainty.trials,
         tracking.STAGE: partial(tracking.trials, full=full),
         calibration.STAGE: partial(calibration.trials, fits),
-        controls.STAGE: partial(controls.trials, limits, fits),
     }
     for stage, make in stages.items():
         try:

@@ -12,6 +12,7 @@ import numpy as np
 
 from runtime.config import ModelSettings
 from runtime.model.chain import chain_modes
+from runtime.model.job import Job
 from runtime.model.predictor import load_predictor
 from runtime.model.transfer import FULL
 from runtime.model.unrolled import UnrolledPredictor
@@ -135,11 +136,11 @@ def layers_of(model: str, sigma_mm: float, separation_m: float = 0.062) -> U8:
     random = np.random.default_rng(3)
     images = [[random.integers(0, 256, (108, 192, 4), dtype=np.uint8)] for _ in range(2)]
     eyes = np.array([[0.6, -separation_m / 2, 0.0], [0.6, separation_m / 2, 0.0]])
-    return loaded(model).predict(images, eyes, eye_sigma_mm=sigma_mm).layers[..., :3].copy()
+    return loaded(model).solve(Job(images, eyes, eye_sigma_mm=sigma_mm)).layers[..., :3].copy()
 
 
 def trials(answer: AnswerOf = answer_of, layers: LayersOf = layers_of) -> Iterator[Trial]:
-    """What there is to try; `controls` puts impostors in the network's place."""
+    """What there is to try."""
     for model in MODELS:
         for columns in (0.0, 0.01, 0.13, 1.0, 6.0, 100.0):
             yield Trial(

@@ -1,0 +1,118 @@
+"""The panels while a display is set up: layers, or words, until other ones come; and a person who looks at them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from textwrap import wrap
+
+import cv2
+import numpy as np
+import typer
+
+from calib.keys import Key, TerminalKeys, WindowKeys
+from runtime.clock import NS_PER_MS, MonotonicClock
+from runtime.config import Settings
+from runtime.optics.stack import PanelStack
+from runtime.panels.registry import open_panels, panel_settings
+from runtime.records import U8, PanelFrame
+from runtime.support.gl import offscreen_context
+
+POLL_NS = 50 * NS_PER_MS
+IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+MAX_CHARACTERS = 44  # of a line: longer ones would be too small to read from where viewers stand
+MARGIN = 0.1  # of the width on either side: the rims of panels before and behind take light away
+LETTERS = 0.055  # of the height
+
+
+class PanelDisplay:
+    """All panels, showing one set of layers until given another."""
+
+    def __init__(
+        self, settings: Settings, stack: PanelStack, *, registered: bool = False, grey_curve: bool = True
+    ) -> None:
+        """registered, grey_curve: as configured; False: the bare panels, for what measures them.
+
+        Raises InputError, MissingPart, PanelLost.
+        """
+        changes: dict[str, object] = {} if registered else {"homography": IDENTITY}
+        if not grey_curve:
+            changes |= {"lut": "", "gamma": 1.0}
+        panels = tuple(panel.model_copy(update=changes) for panel in panel_settings(settings.output, stack.count))
+        output = settings.output.model_copy(update={"panels": panels})
+        self._sink = open_panels(output, stack, MonotonicClock(), offscreen_context())
+        self._layers: U8 | None = None
+        self._number = 0
+        self.keys = WindowKeys(self._sink)
+        if settings.output.kind == "offscreen":
+            typer.echo("warning: output.kind is offscreen: nobody sees what is shown", err=True)
+
+    def show(self, layers: U8) -> None:
+        """(N, H, W, 4) layers on all panels. Raises PanelLost."""
+        self._layers = layers
+        self._number += 1
+        self._sink.present(PanelFrame(self._number, layers, self._number))
+
+    def again(self) -> None:
+        """The same once more: it takes in the windows' events and keeps them alive. Raises PanelLost."""
+        if self._layers is not None:
+            self.show(self._layers)
+
+    def close(self) -> None:
+        """Close the panels. May be called twice."""
+        self._sink.close()
+
+
+def show_pages(display: PanelDisplay, titles: Sequence[str], draw: Callable[[int], U8]) -> None:
+    """Page after page, as keys say, until the last one is accepted, or q.
+
+    draw: the (N, H, W, 4) layers of a page by its number. Closes the display. Raises PanelLost.
+    """
+    keys, clock, number, shown = TerminalKeys(), MonotonicClock(), 0, -1
+    try:
+        while number < len(titles):
+            if number != shown:
+                shown = number
+                display.show(draw(number))
+                typer.echo(f"{titles[number]}  (Enter, n: next, p: previous, q: stop)", err=True)
+            key = keys.poll() or display.keys.poll()
+            if key is Key.QUIT:
+                return
+            if key in (Key.ACCEPT, Key.NEXT, Key.RIGHT):
+                number += 1
+            elif key in (Key.PREVIOUS, Key.LEFT):
+                number = max(0, number - 1)
+            elif key is None:
+                clock.sleep_until_ns(clock.now_ns() + POLL_NS)
+                display.again()
+    finally:
+        display.close()
+        keys.close()
+
+
+def blank_layers(stack: PanelStack) -> U8:
+    """(N, H, W, 4) layers that turn no light."""
+    layers = np.zeros((stack.count, stack.height_px, stack.width_px, 4), np.uint8)
+    layers[..., 3] = 255
+    return layers
+
+
+def alone(picture: U8, stack: PanelStack, *, index: int) -> U8:
+    """(N, H, W, 4) layers in which one panel shows a grey (H, W) picture and the others turn no light."""
+    layers = blank_layers(stack)
+    layers[index, ..., :3] = picture[..., None]
+    return layers
+
+
+def message_layers(stack: PanelStack, lines: Sequence[str]) -> U8:
+    """(N, H, W, 4) layers with lines of text on the middle panel, read from the front; the first one larger."""
+    page = np.zeros((stack.height_px, stack.width_px), np.uint8)
+    plain = [part for line in lines for part in wrap(line.encode("ascii", "replace").decode(), MAX_CHARACTERS)]
+    room = stack.height_px / max(len(plain) + 2, 9)
+    for number, line in enumerate(plain):
+        (long, tall), _ = cv2.getTextSize(line, FONT, 1.0, 2)
+        height = LETTERS * stack.height_px * (1.4 if number == 0 else 1.0)
+        scale = min(height / tall, (1 - 2 * MARGIN) * stack.width_px / max(long, 1), 0.55 * room / tall)
+        place = (round(MARGIN * stack.width_px), round(room * (number + 1.5)))
+        cv2.putText(page, line, place, FONT, scale, 255, max(1, round(2 * scale)), cv2.LINE_AA)
+    return alone(page, stack, index=stack.count // 2)

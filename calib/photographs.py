@@ -1,0 +1,47 @@
+"""A folder of photographs that a person took."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from runtime.errors import InputError
+from runtime.records import U8
+from runtime.support import foreign
+from runtime.support.picture_header import is_cut_off, picture_size
+
+MAX_BYTES = 512 << 20
+MAX_PIXELS = 250_000_000  # phones have up to 200 million
+MAX_PHOTOGRAPHS = 100
+SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
+
+
+def photograph_files(folder: Path) -> list[Path]:
+    """The photographs of a folder, by name. Raises InputError."""
+    if not foreign.is_there(folder, folder=True):
+        raise InputError(folder, "", "is not a folder of photographs")
+    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    if not found:
+        raise InputError(folder, "", "holds no photograph (" + ", ".join(sorted(SUFFIXES)) + ")")
+    if len(found) > MAX_PHOTOGRAPHS:
+        raise InputError(folder, "", f"holds {len(found)} pictures: at most {MAX_PHOTOGRAPHS}")
+    return found
+
+
+def read_photograph(path: Path) -> U8:
+    """(h, w) grey, as the camera saw it: a note to turn it is not heeded. Raises InputError."""
+    data = foreign.read_bytes(path, most_bytes=MAX_BYTES)
+    try:
+        width, height = picture_size(data)
+    except ValueError:
+        width = height = 0
+    if width * height > MAX_PIXELS:
+        raise InputError(path, "", f"has {width} x {height} pixels; at most {MAX_PIXELS:,}")
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    readable = width > 0 and not is_cut_off(data)
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if readable else None
+    if picture is None:
+        raise InputError(path, "", "is not a photograph that can be decoded (JPEG or PNG; export HEIC as JPEG)")
+    return np.asarray(picture)

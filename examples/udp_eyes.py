@@ -1,0 +1,87 @@
+"""A sensor of one's own: eyes as JSON datagrams. One file on Python's path, one line of TOML.
+
+    [sensor]
+    driver = "udp_eyes:UdpEyes"
+    options = { port = 4711 }
+
+    PYTHONPATH=examples phasestack run --config udp.toml --headless --out out/udp
+
+A datagram is `{"n": 1, "t_ns": 0, "left": [x, y, z], "right": [x, y, z]}`: counted, with the sender's own time, metres
+in the sensor's frame (x to its right, y down, z away from it); `left` is the viewer's.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, Field
+
+from phasestack import Capabilities, DeviceClock, EyePoints, Sensor, SensorFrame, SensorLost, SensorTimeout
+
+
+class UdpOptions(BaseModel):
+    """What [sensor.options] may hold."""
+
+    port: int = Field(ge=1, le=65535)
+    noise_mm: tuple[float, float, float] = (0.5, 0.5, 2.0)  # right, down, away: standard deviations
+
+
+class UdpEyes(Sensor):
+    """Receives on the loopback interface."""
+
+    Options = UdpOptions
+    name = "udp-eyes"
+    capabilities = Capabilities(eye_points=True)
+
+    def __init__(self, options: UdpOptions, *, clock: Any) -> None:
+        # Only keep settings here: whatever can fail belongs into `open`.
+        self._port, self._clock = options.port, clock
+        self._covariance_m2 = np.diag(np.square(options.noise_mm)) * 1e-6
+        self._socket: socket.socket | None = None
+        self._times, self._last = DeviceClock(), 0
+
+    def open(self) -> None:
+        self.close()
+        channel = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            channel.bind(("127.0.0.1", self._port))
+        except OSError as error:
+            channel.close()  # what was acquired is released when the rest fails
+            raise SensorLost(f"port {self._port}: {error.strerror}") from None
+        self._socket, self._times, self._last = channel, DeviceClock(), 0
+
+    def read_newest(self, timeout_s: float) -> SensorFrame:
+        newest = self._receive(timeout_s)
+        if newest is None:
+            raise SensorTimeout(f"no datagram for {timeout_s:g} s")
+        while (later := self._receive(0.0)) is not None:
+            newest, self.skipped = later, self.skipped + 1
+        try:
+            message = json.loads(newest)
+            eyes_m = np.array([message["left"], message["right"]], dtype=np.float64).reshape(2, 3)
+            number, device_ns = int(message["n"]), int(message["t_ns"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise SensorLost(f"not an eye message: {error!r}") from None
+        self.missed += max(number - self._last - 1, 0) if self._last else 0
+        self._last = number
+        capture_ns = self._times.host_ns(device_ns, arrival_ns=self._clock.now_ns())
+        return SensorFrame(number, capture_ns, EyePoints(eyes_m, np.ones(2), covariance_m2=self._covariance_m2))
+
+    def _receive(self, timeout_s: float) -> bytes | None:
+        if self._socket is None:
+            raise SensorLost("not open")
+        self._socket.settimeout(max(timeout_s, 1e-4))
+        try:
+            return self._socket.recv(4096)
+        except TimeoutError:
+            return None
+        except OSError as error:
+            raise SensorLost(str(error)) from None
+
+    def close(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None

@@ -1,0 +1,31 @@
+"""What a program may import, and what is promised to it (docs/contracts.md, From Python)."""
+
+from __future__ import annotations
+
+from phasestack.eyes import find_eyes
+from phasestack.pair import Result, solve
+from runtime.content.base import ContentSource
+from runtime.errors import SensorLost, SensorTimeout
+from runtime.evaluation.solved import PairQuality as Quality
+from runtime.eyes.pupils import Pupils
+from runtime.optics.stack import PanelStack as Stack
+from runtime.records import EyePoints, SensorFrame
+from runtime.sensor.base import Capabilities, Sensor
+from runtime.sensor.device_clock import DeviceClock
+
+__all__ = [
+    "Capabilities",
+    "ContentSource",
+    "DeviceClock",
+    "EyePoints",
+    "Pupils",
+    "Quality",
+    "Result",
+    "Sensor",
+    "SensorFrame",
+    "SensorLost",
+    "SensorTimeout",
+    "Stack",
+    "find_eyes",
+    "solve",
+]

@@ -1,0 +1,41 @@
+"""Pictures as programs have them: arrays of codes or of intensities."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from runtime.evaluation.displayed import Picture
+from runtime.records import U8
+
+LEAST_PX = 16
+
+
+def as_picture(name: str, given: ArrayLike) -> Picture:
+    """(h, w, 3) uint8, or intensities in [0, 1] as float32; where it is transparent, white shows through.
+
+    Raises ValueError, naming the argument.
+    """
+    picture: Any = np.asarray(given)
+    if picture.ndim != 3 or picture.shape[2] not in (3, 4) or min(picture.shape[:2]) < LEAST_PX:
+        raise ValueError(f"{name}: has the shape {picture.shape}, not (h, w, 3|4) with {LEAST_PX} pixels at least")
+    if picture.dtype != np.uint8:
+        if not np.issubdtype(picture.dtype, np.floating):
+            raise ValueError(f"{name}: is of {picture.dtype}, neither uint8 nor floating point")
+        if not (np.isfinite(picture).all() and picture.min() >= 0 and picture.max() <= 1):
+            raise ValueError(f"{name}: holds values that are not within 0 and 1")
+        picture = picture.astype(np.float32)
+    if picture.shape[2] == 3:
+        return np.ascontiguousarray(picture)
+    full = 255 if picture.dtype == np.uint8 else 1
+    alpha = picture[..., 3:].astype(np.float32) / full
+    mixed = picture[..., :3] * alpha + full * (1 - alpha)
+    return np.ascontiguousarray((np.rint(mixed) if full == 255 else mixed).astype(picture.dtype))
+
+
+def as_codes(picture: Picture) -> U8:
+    """The nearest 8-bit codes."""
+    codes: Any = picture if picture.dtype == np.uint8 else np.rint(picture * 255).astype(np.uint8)
+    return np.asarray(codes, np.uint8)

@@ -1,0 +1,191 @@
+"""The three networks that see a face, and the square crops of a picture that they look at.
+
+Pixels are continuous, the centre of a picture's first pixel is (0.5, 0.5). *Left* is the viewer's own left, which is
+on the right of an unmirrored picture; it comes first. `docs/sensors.md` says where the models are from.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from runtime.records import F32, F64, U8
+from runtime.support.onnx_runtime import onnxruntime
+
+MODELS = Path(str(files("runtime.eyes") / "models"))
+STRIDES = (8, 16, 32)  # pixels a cell of YuNet's three grids
+OVERLAP_MAX = 0.3  # of two boxes of YuNet's, intersection over union: more is one face twice
+CROP_BLUR = 0.45  # standard deviation, in the crop's pixels, that keeps a shrunk picture from aliasing
+
+
+def load_network(name: str) -> Any:
+    """An onnxruntime session on one thread, which the display's loop never waits for. name: a file in `models`.
+
+    It has run once, as the first run is several times as slow as the others.
+    """
+    ort = onnxruntime()
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    session = ort.InferenceSession(str(MODELS / name), options, providers=["CPUExecutionProvider"])
+    (port,) = session.get_inputs()
+    shape = (1, 3, 256, 320) if name == "yunet.onnx" else port.shape
+    session.run(None, {port.name: np.zeros(shape, np.float32)})
+    return session
+
+
+def transformed(matrix: F64, points: F64) -> F64:
+    """(n, 2) points by an affine (2, 3) matrix."""
+    result: F64 = points @ matrix[:, :2].T + matrix[:, 2]
+    return result
+
+
+def inverse(matrix: F64) -> F64:
+    """Of an affine (2, 3) matrix."""
+    return np.asarray(cv2.invertAffineTransform(matrix), np.float64)
+
+
+def resampled(picture: U8, size: tuple[int, int], crop_from_picture: F64) -> U8:
+    """A picture warped by an affine (2, 3) matrix of continuous pixels, without aliasing; edges are repeated."""
+    ratio = 1 / np.sqrt(abs(np.linalg.det(crop_from_picture[:, :2])))  # picture's pixels a crop's
+    corners = np.array([[0, 0], [size[0], 0], [0, size[1]], [size[0], size[1]]], np.float64)
+    seen = transformed(inverse(crop_from_picture), corners)
+    height, width = picture.shape[:2]
+    margin = 2 + 2 * ratio
+    x0, y0 = np.clip(np.floor(seen.min(axis=0) - margin), 0, [width - 1, height - 1]).astype(int)
+    x1, y1 = np.clip(np.ceil(seen.max(axis=0) + margin), [x0 + 1, y0 + 1], [width, height]).astype(int)
+    part = picture[y0:y1, x0:x1]
+    if ratio > 1.3:
+        part = np.asarray(cv2.GaussianBlur(part, (0, 0), CROP_BLUR * np.sqrt(ratio * ratio - 1)), np.uint8)
+    warp = crop_from_picture.copy()
+    warp[:, 2] += warp[:, :2] @ [x0 + 0.5, y0 + 0.5] - 0.5  # continuous pixels to array indices
+    return np.asarray(cv2.warpAffine(part, warp, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
+
+@dataclass(frozen=True, slots=True)
+class Square:
+    """A square of a picture, turned with the face in it."""
+
+    centre: F64  # (2,) px
+    side: float  # px
+    angle: float  # radians, of its lower edge, clockwise on the screen
+
+    def picture_from_crop(self, size: int, *, mirrored: bool = False) -> F64:
+        """(2, 3): continuous pixels of a crop of `size` pixels to those of the picture."""
+        c, s = np.cos(self.angle) * self.side / size, np.sin(self.angle) * self.side / size
+        matrix = np.array([[-c if mirrored else c, -s], [-s if mirrored else s, c]])
+        return np.column_stack([matrix, self.centre - matrix @ [size / 2, size / 2]])
+
+    def crop(self, picture: U8, size: int, *, mirrored: bool = False) -> tuple[F32, F64]:
+        """(1, size, size, 3) values 0 to 1, and `picture_from_crop`."""
+        matrix = self.picture_from_crop(size, mirrored=mirrored)
+        pixels = resampled(picture, (size, size), inverse(matrix))
+        return np.divide(pixels[None], 255, dtype=np.float32), matrix
+
+
+@dataclass(frozen=True, slots=True)
+class FoundFace:
+    """A face as YuNet sees it."""
+
+    score: float  # 0 to 1
+    box: F64  # (4,) x, y, width, height, px
+    points: F64  # (5, 2) px: right eye, left eye, nose, right and left corner of the mouth
+
+    @property
+    def size(self) -> float:
+        """Side of a square as large as the box, px."""
+        return float(np.sqrt(self.box[2] * self.box[3]))
+
+    def square(self) -> Square:
+        """What the mesh looks at."""
+        eyes, mouth = self.points[:2].mean(axis=0), self.points[3:].mean(axis=0)
+        line = self.points[1] - self.points[0]
+        size = max(np.linalg.norm(line), 0.95 * np.linalg.norm(mouth - eyes))
+        return Square(eyes + 0.45 * (mouth - eyes), float(4.4 * size), float(np.arctan2(line[1], line[0])))
+
+
+class FaceNetwork:
+    """YuNet: faces anywhere in a picture."""
+
+    def __init__(self) -> None:
+        self._session = load_network("yunet.onnx")
+
+    def find(self, picture: U8, *, longest_px: int, score_min: float) -> list[FoundFace]:
+        """Faces in an (h, w, 3) RGB picture that is looked at `longest_px` wide or high, surest first."""
+        height, width = picture.shape[:2]
+        scale = min(1.0, longest_px / max(height, width))
+        small = picture
+        if scale < 1:
+            size = (max(1, round(width * scale)), max(1, round(height * scale)))
+            small = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+        rows, columns = small.shape[:2]
+        padded = np.zeros((1, 3, -(-rows // 32) * 32, -(-columns // 32) * 32), np.float32)
+        padded[0, :, :rows, :columns] = small[:, :, ::-1].transpose(2, 0, 1)
+        found = self._decoded(self._session.run(None, {"input": padded}), padded.shape[3], score_min)
+        ratio = np.array([width / columns, height / rows])
+        return [FoundFace(one.score, one.box * np.tile(ratio, 2), (one.points + 0.5) * ratio) for one in found]
+
+    @staticmethod
+    def _decoded(outputs: list[F32], width: int, score_min: float) -> list[FoundFace]:
+        """The grids' cells that hold a face; of those that overlap, the surest."""
+        faces = []
+        for level, stride in enumerate(STRIDES):
+            classes, objects, boxes, points = (outputs[kind * len(STRIDES) + level][0] for kind in range(4))
+            scores = np.sqrt(np.clip(classes[:, 0], 0, 1) * np.clip(objects[:, 0], 0, 1))
+            for cell in np.flatnonzero(scores > score_min):
+                corner = np.array([cell % (width // stride), cell // (width // stride)])
+                size = np.exp(boxes[cell, 2:].astype(np.float64)) * stride
+                box = np.concatenate([(corner + boxes[cell, :2]) * stride - size / 2, size])
+                five = (corner + points[cell].reshape(5, 2).astype(np.float64)) * stride
+                faces.append(FoundFace(float(scores[cell]), box, five))
+        kept: list[FoundFace] = []
+        for face in sorted(faces, key=lambda one: -one.score):
+            if all(_overlap(face.box, other.box) < OVERLAP_MAX for other in kept):
+                kept.append(face)
+        return kept
+
+
+def _overlap(a: F64, b: F64) -> float:
+    """Intersection over union of two boxes."""
+    sides = np.minimum(a[:2] + a[2:], b[:2] + b[2:]) - np.maximum(a[:2], b[:2])
+    shared = float(np.prod(np.maximum(sides, 0)))
+    return shared / float(a[2] * a[3] + b[2] * b[3] - shared)
+
+
+class MeshNetwork:
+    """468 points of a face that lies in a square of the picture. Numbers of points are MediaPipe's."""
+
+    SIZE = 192
+
+    def __init__(self) -> None:
+        self._session = load_network("face_mesh.onnx")
+
+    def points(self, picture: U8, square: Square) -> tuple[F64, float]:
+        """(468, 3) px: x, y, and z as far as x is long, away from the camera; and how surely this is a face."""
+        crop, matrix = square.crop(picture, self.SIZE)
+        mesh, presence = self._session.run(None, {"input_1": crop})
+        points = mesh.reshape(468, 3).astype(np.float64)
+        certainty = 1 / (1 + np.exp(-float(presence.ravel()[0])))
+        return np.column_stack([transformed(matrix, points[:, :2]), points[:, 2] * square.side / self.SIZE]), certainty
+
+
+class IrisNetwork:
+    """The iris in a square around an eye. It knows the eye on the left of a picture; the other one is mirrored."""
+
+    SIZE = 64
+
+    def __init__(self) -> None:
+        self._session = load_network("iris.onnx")
+
+    def points(self, picture: U8, square: Square, *, is_left: bool) -> tuple[F64, F64]:
+        """(5, 2) px: the iris' centre and four places on its edge; (16, 2) the lids' edges, lower one first."""
+        crop, matrix = square.crop(picture, self.SIZE, mirrored=is_left)
+        names = ["output_iris", "output_eyes_contours_and_brows"]
+        iris, lids = self._session.run(names, {"input_1": crop})
+        iris, lids = (one.reshape(-1, 3)[:, :2].astype(np.float64) for one in (iris, lids))
+        return transformed(matrix, iris), transformed(matrix, lids[:16])

@@ -1,0 +1,497 @@
+"""A step that moves all panels by what the eyes see wrong, on panels whose pixels are even boxes.
+
+The mathematics, which a shader writes the same way (all values from 0 to 1, one colour channel at a time):
+
+1. *Rays.* One ray for every pixel p of the centre panel, for each eye and each place e that the eye may be at (sure
+   eyes: one; unsure ones: sigma to the right and up, and to the left and down, in turn with the other diagonal). A box
+   as wide as a pixel sees on another panel the mean of the two by two pixels that it overlaps, weighted by how much:
+   that is a bilinear sample at the ray's middle. S_n(e): panel n's pixels from the centre panel's, as e sees them
+   in line: a scale and a shift, or nearly so where panels are tilted.
+2. *See.* s = x_0(S_0 p) + x_1(S_1 p) + x_2(S_2 p), I = sin²(pi/2·s), c = sin(pi·s) (the slope of I, but for pi/2).
+3. *Compare.* G_e(p) = c·(I - T_e(p)), W_e(p) = c²; both 0 where the ray leaves a panel; G also fades towards the edges
+   of a part of larger panels.
+4. *Bring back.* For every pixel q of panel n, with S_n(e)^-1 and bilinear samples: N = sum over e of G_e, and
+   D = sum over e of W_e, at least `floor` times the number of rays.
+5. *Move.* With y_n what the rays saw: new x_n = clip(y_n - w·N / (3·pi/2·D), 0, 1), and new y_n = new x_n +
+   b·(new x_n - x_n).
+
+D is the separable majoriser of tomography (SQS; Erdogan and Fessler 1999) for three panels. Rays see the panels ahead
+of where they are by b times their last change (Nesterov). Without clipping a mode of eigenvalue l (0 to 1) is damped
+while w·l < 2·(1 + b) / (1 + 2·b): 1.5 for b = 0.5; larger first steps are safe only where few follow.
+
+Rows of G and W live in a ring that stays in a core's cache: panels' rows follow as soon as the rays that cross them are
+there, and write where the step before last lay.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from runtime.model.compiled.sampling import OPTIONS, PASS, PIECE, TILE, U, _everywhere, _loaded
+from runtime.records import F32, F64
+from runtime.support.threads import at_once
+
+CENTRE = 1
+FULL = 4080.0  # a panel's whole range in sixteenths of a code
+INTENSITY = 64.0  # of a target's code, in 16 bits
+SLOPED = 16384.0  # of a ring's G and W
+MARGIN = 2 * PIECE  # numbers behind an image that whole pieces may read
+RUN = 192  # numbers of a row whose height in an image counts as a line
+NEAR_PX = 0.5  # a ray counts that crosses every panel so far inside its edge
+_VECTOR = ir.VectorType(ir.FloatType(), PIECE)
+
+
+@intrinsic
+def _add_piece(typing, row, source, step, weight, slope, before, at, out, start):
+    """out[start + k] = before[at + k] + what lies between row[source + k] and row[source + k + step], `PIECE` numbers
+    at once."""
+    signature = types.void(
+        row, types.uint64, types.uint64, types.float32, types.float32, before, types.uint64, out, types.uint64
+    )
+
+    def generate(context, builder, signature, arguments):
+        row, source, step, weight, slope, before, at, out, start = arguments
+        kinds, fast = signature.args, ["contract"]
+        pixels = builder.select(
+            builder.icmp_unsigned("==", step, ir.Constant(ir.IntType(64), 3)),
+            ir.Constant(_VECTOR, [float(k // 3) for k in range(PIECE)]),
+            ir.Constant(_VECTOR, [float(k) for k in range(PIECE)]),
+        )
+        here = _loaded(context, builder, kinds[0], row, source)
+        beside = _loaded(context, builder, kinds[0], row, builder.add(source, step))
+        grown = builder.fmul(pixels, _everywhere(builder, slope), flags=fast)
+        share = builder.fadd(grown, _everywhere(builder, weight), flags=fast)
+        between = builder.fmul(builder.fsub(beside, here, flags=fast), share, flags=fast)
+        sums = builder.fadd(_loaded(context, builder, kinds[5], before, at), here, flags=fast)
+        place = builder.gep(context.make_array(kinds[7])(context, builder, out).data, [start])
+        result = builder.fadd(sums, between, flags=fast)
+        builder.store(result, builder.bitcast(place, ir.PointerType(_VECTOR)), align=4)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+class Layout(NamedTuple):
+    """How the tiles of a row lie in images: kept from row to row, as it changes only where panels are tilted."""
+
+    keys: Any  # (images, tiles, 3) float64: scale, shift and bend that it was laid for
+    spans: Any  # (images, tiles, 3) int32: first pixel within the image, first beyond, pieces
+    starts: Any  # (images, tiles, pieces) int32, numbers in the tile
+    sources: Any  # (images, tiles, pieces) int32, numbers in the image
+    weights: Any  # (images, tiles, pieces, 2) float32, of the right neighbour at a piece's first pixel, and its growth
+
+
+@njit(**OPTIONS)
+def _lay(scale, bend, shift, pixels, width, near, channels, n, tile, layout):  # pragma: no cover
+    """Where pixels 0 to `pixels` of a tile lie in a row of `width`, centres at integers: pixel k at shift + scale·k +
+    bend·k·(k - pixels + 1)."""
+    layout.keys[n, tile, 0], layout.keys[n, tile, 1], layout.keys[n, tile, 2] = scale, shift, bend
+    low, high, ends = near - 0.5, width - 0.5 - near, pixels - 1
+    longest, count, k, first = PIECE // channels, 0, 0, 0
+    grows = scale - 1.0 if abs(scale - 1.0) > 1e-6 else 1e-6
+    runs = 1.0 / grows  # pixels until the source is one further beside, but for a parabola's slight bend
+    while k < pixels and shift + k * (scale + bend * (k - ends)) < low:
+        k += 1
+    first = k
+    while k < pixels:
+        x = shift + k * (scale + bend * (k - ends))
+        if x > high:
+            break
+        left = min(max(int(x), 0), max(width - 2, 0))
+        share = min(max(x - left, 0.0), 1.0)
+        length = longest
+        length = min(length, int(((1.0 if grows > 0.0 else 0.0) - share) * runs) + 1)
+        layout.starts[n, tile, count], layout.sources[n, tile, count] = k * channels, left * channels
+        local = scale + bend * (2 * k + length - 1 - ends)
+        layout.weights[n, tile, count, 0], layout.weights[n, tile, count, 1] = share, local - 1.0
+        count, k = count + 1, k + length
+    last = min(k, pixels)
+    while last > first and shift + (last - 1) * (scale + bend * (last - 1 - ends)) > high:
+        last -= 1
+    layout.spans[n, tile, 0], layout.spans[n, tile, 1], layout.spans[n, tile, 2] = first, last, count
+
+
+@njit(**OPTIONS)
+def _sample(
+    before, image, ring, height, width, near, matrix, v, tile, pixels, channels, n, layout, row, out
+):  # pragma: no cover
+    """out = before + bilinear samples of an image (ring rows, numbers), whose row r is at r % ring, for the pixels of a
+    tile of row v; the pixels that lie within it. matrix (3, 3): the image's pixels from the tile's raster's, centres at
+    halves; along a tile a parabola stands for it."""
+    a, ends, y = tile * (TILE // channels) + 0.5, max(pixels - 1, 1), v + 0.5
+    weight = 1.0 / (matrix[2, 0] * a + matrix[2, 1] * y + matrix[2, 2])
+    xa = (matrix[0, 0] * a + matrix[0, 1] * y + matrix[0, 2]) * weight - 0.5
+    ya = (matrix[1, 0] * a + matrix[1, 1] * y + matrix[1, 2]) * weight - 0.5
+    a += 0.5 * ends
+    weight = 1.0 / (matrix[2, 0] * a + matrix[2, 1] * y + matrix[2, 2])
+    xm = (matrix[0, 0] * a + matrix[0, 1] * y + matrix[0, 2]) * weight - 0.5
+    ym = (matrix[1, 0] * a + matrix[1, 1] * y + matrix[1, 2]) * weight - 0.5
+    a += 0.5 * ends
+    weight = 1.0 / (matrix[2, 0] * a + matrix[2, 1] * y + matrix[2, 2])
+    xb = (matrix[0, 0] * a + matrix[0, 1] * y + matrix[0, 2]) * weight - 0.5
+    yb = (matrix[1, 0] * a + matrix[1, 1] * y + matrix[1, 2]) * weight - 0.5
+    scale, bend = (xb - xa) / ends, 2.0 * (xa + xb - 2.0 * xm) / (ends * ends)
+    low, high = near - 0.5, height - 0.5 - near
+    if min(ya, yb) < low or max(ya, yb) > high or not scale > 0.05:
+        return 0, 0
+    if abs(bend) * ends < 1e-7:
+        bend = 0.0
+    if layout.keys[n, tile, 0] != scale or layout.keys[n, tile, 1] != xa or layout.keys[n, tile, 2] != bend:
+        _lay(scale, bend, xa, pixels, width, near, channels, n, tile, layout)
+    first, last, count = layout.spans[n, tile, 0], layout.spans[n, tile, 1], layout.spans[n, tile, 2]
+    if count == 0:
+        return 0, 0
+    source = layout.sources[n, tile, 0]
+    numbers = layout.sources[n, tile, count - 1] + PIECE + channels - source
+    if ya == yb and ym == ya:
+        top = min(int(max(ya, 0.0)), max(height - 2, 0))
+        upper, lower, down = U(top % ring), U(min(top + 1, height - 1) % ring), np.float32(max(ya - top, 0.0))
+        begin = U(source)
+        for k in range((numbers + PIECE - 1) // PIECE * PIECE):
+            x0, x1 = np.float32(image[upper, U(k) + begin]), np.float32(image[lower, U(k) + begin])
+            row[U(k)] = x0 + (x1 - x0) * down
+    else:
+        # Rows are blended run by run: a run ends where the row above changes.
+        fall, sag = (yb - ya) / ends, 2.0 * (ya + yb - 2.0 * ym) / (ends * ends)
+        at, none, one = 0, np.float32(0), np.float32(1)
+        while at < numbers:
+            k = first + at / (channels * scale)
+            here = min(max(ya + k * (fall + sag * (k - ends)), 0.0), height - 1.0)
+            slope = (fall + sag * (2.0 * k - ends)) / (channels * scale)
+            top = min(int(here), max(height - 2, 0))
+            length = min(numbers - at, RUN)
+            if slope > 1e-9:
+                length = min(length, int((top + 1 - here) / slope) + 1)
+            elif slope < -1e-9:
+                length = min(length, int((top - here) / slope) + 1)
+            upper, lower = U(top % ring), U(min(top + 1, height - 1) % ring)
+            weight, grows, begin, to = np.float32(here - top), np.float32(slope), U(at + source), U(at)
+            for k in range((length + PIECE - 1) // PIECE * PIECE):  # the next run writes over what is too much
+                x0, x1 = np.float32(image[upper, U(k) + begin]), np.float32(image[lower, U(k) + begin])
+                row[U(k) + to] = x0 + (x1 - x0) * min(max(weight + grows * np.float32(k), none), one)
+            at += length
+    for piece in range(count):
+        start = U(layout.starts[n, tile, U(piece)])
+        _add_piece(
+            row,
+            U(layout.sources[n, tile, U(piece)] - source),
+            U(channels),
+            layout.weights[n, tile, U(piece), 0],
+            layout.weights[n, tile, U(piece), 1],
+            before,
+            start,
+            out,
+            start,
+        )
+    return first, last
+
+
+@njit(**OPTIONS)
+def _sum_where(
+    before, image, ring, height, width, matrix, v, tile, pixels, channels, n, layout, row, out
+):  # pragma: no cover
+    """As `_sample`, and `before` alone for the pixels that lie beside the image."""
+    none = 0.0
+    first, last = _sample(
+        before, image, ring, height, width, none, matrix, v, tile, pixels, channels, n, layout, row, out
+    )
+    for k in range(first * channels):
+        out[U(k)] = before[U(k)]
+    for k in range(last * channels, pixels * channels):
+        out[U(k)] = before[U(k)]
+
+
+@njit(**PASS)
+def move_rows(
+    panels,
+    moved,
+    last_step,
+    sizes,
+    targets,
+    seen,
+    back,
+    same_centre,
+    needs,
+    fade_columns,
+    fade_rows,
+    step,
+    momentum,
+    floor,
+    channels,
+    first_row,
+    end_row,
+    rows_of,
+    ring,
+    seen_layout,
+    back_layout,
+    row,
+    tiles,
+):  # pragma: no cover
+    """One step of the panels' rows that follow the centre panel's rays first_row to end_row.
+
+    panels: (3, rows, numbers) int16, what the eyes see; moved: the same, written; last_step: (3, rows, numbers) int16,
+    without momentum, read and written. sizes (3, 2): rows and pixels. targets: (2, rows, numbers) int16. seen, back:
+    (rays, 3, 3, 3) panels' pixels from the centre's and the other way, of a weight of about 1. needs: (3, rows, 2)
+    first and last of the centre's rows that a panel's row is seen through. rows_of: (3, 2) each panel's rows.
+    ring: (rays, 2, rows, numbers) int16; row, tiles: to work in.
+    """
+    rays, size_of_tile = seen.shape[0], TILE // channels
+    height, width = sizes[3, 0], sizes[3, 1]
+    ring_rows = ring.shape[2]
+    none, one, half, near = np.float32(0), np.float32(1), np.float32(0.5), 0.5
+    turns, pi = np.float32(1 / (2 * FULL)), np.float32(np.pi)
+    code, sloped = np.float32(1 / (255 * INTENSITY)), np.float32(SLOPED)
+    full, least = np.float32(FULL), np.float32(floor * rays * SLOPED)
+    size, speed = np.float32(step * FULL / (3 * np.pi / 2)), np.float32(momentum)
+    at0, at1, at2 = rows_of[0, 0], rows_of[1, 0], rows_of[2, 0]
+    for r in range(first_row, end_row):
+        for e in range(rays):
+            for tile in range((width + size_of_tile - 1) // size_of_tile):
+                begin = tile * size_of_tile
+                pixels = min(size_of_tile, width - begin)
+                first, last = 0, pixels
+                sums, other = tiles[1], tiles[2]
+                low, high = _sample(
+                    tiles[0],
+                    panels[0],
+                    sizes[0, 0],
+                    sizes[0, 0],
+                    sizes[0, 1],
+                    near,
+                    seen[e, 0],
+                    r,
+                    tile,
+                    pixels,
+                    channels,
+                    3 * e,
+                    seen_layout,
+                    row,
+                    sums,
+                )
+                first, last = max(first, low), min(last, high)
+                low, high = _sample(
+                    sums,
+                    panels[2],
+                    sizes[2, 0],
+                    sizes[2, 0],
+                    sizes[2, 1],
+                    near,
+                    seen[e, 2],
+                    r,
+                    tile,
+                    pixels,
+                    channels,
+                    3 * e + 2,
+                    seen_layout,
+                    row,
+                    other,
+                )
+                first, last = max(first, low), min(last, high)
+                offset = U(begin * channels)
+                if same_centre:
+                    for k in range(pixels * channels):
+                        sums[U(k)] = other[U(k)] + np.float32(panels[CENTRE, U(r), U(k) + offset])
+                else:
+                    low, high = _sample(
+                        other,
+                        panels[1],
+                        sizes[1, 0],
+                        sizes[1, 0],
+                        sizes[1, 1],
+                        near,
+                        seen[e, 1],
+                        r,
+                        tile,
+                        pixels,
+                        channels,
+                        3 * e + 1,
+                        seen_layout,
+                        row,
+                        sums,
+                    )
+                    first, last = max(first, low), min(last, high)
+                line, side, fade = U(r % ring_rows), U(e % 2), fade_rows[U(r)]
+                for k in range(pixels * channels):
+                    half_turn = sums[U(k)] * turns
+                    x = (half_turn - np.floor(half_turn + half)) * pi
+                    y = x * x
+                    sine = np.float32(1 / 362880) * y - np.float32(1 / 5040)
+                    sine = (((sine * y + np.float32(1 / 120)) * y - np.float32(1 / 6)) * y + one) * x
+                    cosine = np.float32(-1 / 3628800) * y + np.float32(1 / 40320)
+                    cosine = (((cosine * y - np.float32(1 / 720)) * y + np.float32(1 / 24)) * y - half) * y + one
+                    slope = np.float32(2) * sine * cosine
+                    error = sine * sine - np.float32(targets[side, U(r), U(k) + offset]) * code
+                    slope_by_fade = slope * sloped
+                    error *= fade * fade_columns[U(k) + offset]
+                    ring[U(e), U(0), line, U(k) + offset] = np.int16(np.int32(np.rint(slope_by_fade * error)))
+                    ring[U(e), U(1), line, U(k) + offset] = np.int16(np.int32(slope_by_fade * slope))
+                for k in range(first * channels):
+                    ring[U(e), U(0), line, U(k) + offset] = 0
+                    ring[U(e), U(1), line, U(k) + offset] = 0
+                for k in range(last * channels, pixels * channels):
+                    ring[U(e), U(0), line, U(k) + offset] = 0
+                    ring[U(e), U(1), line, U(k) + offset] = 0
+        for n in range(3):
+            q = at0 if n == 0 else at1 if n == 1 else at2
+            while q < rows_of[n, 1] and needs[n, q, 1] <= r:
+                for tile in range((sizes[n, 1] + size_of_tile - 1) // size_of_tile):
+                    begin = tile * size_of_tile
+                    pixels = min(size_of_tile, sizes[n, 1] - begin)
+                    offset, line = U(begin * channels), U(q)
+                    total, weight = tiles[3], tiles[4]
+                    if n == CENTRE and same_centre:
+                        here = U(q % ring_rows)
+                        for k in range(pixels * channels):
+                            total[U(k)] = np.float32(ring[U(0), U(0), here, U(k) + offset])
+                            weight[U(k)] = np.float32(ring[U(0), U(1), here, U(k) + offset])
+                        for e in range(1, rays):
+                            for k in range(pixels * channels):
+                                total[U(k)] += np.float32(ring[U(e), U(0), here, U(k) + offset])
+                                weight[U(k)] += np.float32(ring[U(e), U(1), here, U(k) + offset])
+                    else:
+                        for k in range(pixels * channels):
+                            total[U(k)] = none
+                            weight[U(k)] = none
+                        for e in range(rays):  # an even number
+                            a, b = (3, 5) if e % 2 == 0 else (5, 3)
+                            place = back[e, n]
+                            index = 3 * e + n
+                            _sum_where(
+                                tiles[a],
+                                ring[e, 0],
+                                ring_rows,
+                                height,
+                                width,
+                                place,
+                                q,
+                                tile,
+                                pixels,
+                                channels,
+                                index,
+                                back_layout,
+                                row,
+                                tiles[b],
+                            )
+                            a, b = (4, 6) if e % 2 == 0 else (6, 4)
+                            _sum_where(
+                                tiles[a],
+                                ring[e, 1],
+                                ring_rows,
+                                height,
+                                width,
+                                place,
+                                q,
+                                tile,
+                                pixels,
+                                channels,
+                                index,
+                                back_layout,
+                                row,
+                                tiles[b],
+                            )
+                    for k in range(pixels * channels):
+                        change = size * total[U(k)] / max(weight[U(k)], least)
+                        now = min(max(np.float32(panels[U(n), line, U(k) + offset]) - change, none), full)
+                        before = np.float32(last_step[U(n), line, U(k) + offset])
+                        ahead = now + speed * (now - before)
+                        last_step[U(n), line, U(k) + offset] = np.int16(np.int32(now + half))
+                        moved[U(n), line, U(k) + offset] = np.int16(np.int32(np.floor(ahead + half)))
+                q += 1
+            if n == 0:
+                at0 = q
+            elif n == 1:
+                at1 = q
+            else:
+                at2 = q
+
+
+class Rays(NamedTuple):
+    """Where one step looks: from each eye, and each place that it may be at."""
+
+    seen: F64  # (rays, 3, 3, 3) panels' pixels from the centre panel's; left and right eyes in turn
+    back: F64  # (rays, 3, 3, 3) the centre panel's pixels from theirs
+    needs: NDArray[np.int32]  # (3, rows, 2) the centre panel's rows that a panel's row is seen through
+
+
+def rays_of(seen: F64, sizes: NDArray[np.int64]) -> Rays:
+    """seen: (rays, 3, 3, 3), last entries about 1; sizes (3, 2): rows and columns of the panels."""
+    back: F64 = np.linalg.inv(seen).astype(np.float64)
+    back /= back[..., 2:, 2:]
+    needs = np.zeros((3, sizes[:3, 0].max(), 2), np.int32)
+    for n, (height, width) in enumerate(sizes[:3]):
+        q = np.arange(height) + 0.5
+        ends = []
+        for matrix in back[:, n]:
+            for u in (0.0, float(width)):
+                y, w = (row[0] * u + row[1] * q + row[2] for row in matrix[1:])
+                ends.append(np.floor(y / w - 0.5))
+        most = sizes[3, 0] - 1
+        needs[n, :height, 0] = np.clip(np.min(ends, axis=0), 0, most)
+        needs[n, :height, 1] = np.maximum.accumulate(np.clip(np.max(ends, axis=0) + 1, 0, most))
+    return Rays(np.ascontiguousarray(seen), back, needs)
+
+
+class JointState:
+    """The panels between steps, and what steps work in."""
+
+    def __init__(self, sizes: NDArray[np.int64], *, channels: int, threads: int) -> None:
+        self.sizes, self.channels, self.threads = np.asarray(sizes, np.int64), channels, threads
+        rows, columns = self.sizes.max(axis=0)
+        shape = (3, rows + 1, columns * channels + MARGIN)
+        self.panels, self._moved, self.last = (np.zeros(shape, np.int16) for _ in range(3))
+        self.targets = np.zeros((2, rows + 1, columns * channels + MARGIN), np.int16)
+        self._columns = columns
+
+    def start(self) -> None:
+        """Begin at `panels`: without momentum."""
+        self.last[...] = self.panels
+
+    def step(
+        self, rays: Rays, *, size: float, momentum: float, floor: float, fade: tuple[F32, F32] | None = None
+    ) -> None:
+        height = int(self.sizes[3, 0])
+        count, threads = len(rays.seen), self.threads
+        ring_rows = int((rays.needs[..., 1] - rays.needs[..., 0]).max()) + 2
+        tiles_a_row = -(-self._columns // (TILE // self.channels))
+        same = bool(np.array_equal(rays.seen[:, CENTRE], np.broadcast_to(np.eye(3), (count, 3, 3))))
+        numbers = self._columns * self.channels + MARGIN
+        columns, rows = fade if fade is not None else (np.ones(numbers, np.float32), np.ones(height, np.float32))
+        scale = float(np.abs(np.concatenate([rays.seen, rays.back])[..., 0, 0]).max())
+
+        def layout() -> Layout:
+            spans = (3 * count, tiles_a_row)
+            pieces = (*spans, TILE // self.channels)
+            return Layout(
+                np.full((*spans, 3), np.nan), np.zeros((*spans, 3), np.int32), np.zeros(pieces, np.int32),
+                np.zeros(pieces, np.int32), np.zeros((*pieces, 2), np.float32),
+            )  # fmt: skip
+
+        def share(index: int) -> None:
+            first, end = height * index // threads, height * (index + 1) // threads
+            of = np.zeros((3, 2), np.int64)
+            begin = first
+            for n in range(3):
+                last = rays.needs[n, : self.sizes[n, 0], 1]
+                of[n] = (
+                    np.searchsorted(last, [first, end])
+                    if index + 1 < threads
+                    else (np.searchsorted(last, first), len(last))
+                )
+                if of[n, 0] < of[n, 1]:
+                    begin = min(begin, int(rays.needs[n, of[n, 0] : of[n, 1], 0].min()))
+            move_rows(
+                self.panels, self._moved, self.last, self.sizes, self.targets, rays.seen, rays.back, same, rays.needs,
+                columns, rows, size, momentum, floor, self.channels, begin, end, of,
+                np.zeros((count, 2, ring_rows, numbers), np.int16), layout(), layout(),
+                np.zeros(int(TILE * max(1.0, scale) * 1.2) + 4 * PIECE, np.float32),
+                np.zeros((7, TILE + 4 * PIECE), np.float32),
+            )  # fmt: skip
+
+        at_once(share, range(threads))
+        self.panels, self._moved = self._moved, self.panels

@@ -1,0 +1,457 @@
+"""The steps around the network as passes of fragment shaders, and the images that live from frame to frame.
+
+Images are signed 16-bit sixteenths of a code, as OpenCV's are: one number a pixel where there is one channel, else
+four, of which one is unused (three can't be drawn into). Where the eyes are unsure three are packed into 32 bits.
+What the eyes want is held as 8-bit codes. Only the network's raster, its answer and, where they are asked for, the
+layers cross the bus.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from math import ceil
+from typing import Any
+
+import cv2
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.errors import InputError, ModelFailure
+from runtime.model.chain import ColumnLaw
+from runtime.model.contract import Contract, Step
+from runtime.model.fade import CORRECTED_SHARE
+from runtime.model.gl.assembly import left_in
+from runtime.model.gl.joint import RAYS, GlJoint
+from runtime.model.gl.programs import Image, Passes
+from runtime.model.job import Picture
+from runtime.model.pyramid_level import CENTRE, FRONT, NEUTRAL, OUTER, REAR, START, reprojection, spreads
+from runtime.model.steps import Problem, reductions
+from runtime.model.transfer import phase_codes
+from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.records import F64, I16, U8, Layers
+from runtime.support.gl import DrawnPicture, finish
+from runtime.support.gl_sharing import LayerPool, wait_until_drawn
+
+EYES = ("left", "right")
+NAMES = {REAR: "rear", FRONT: "front"}
+KERNEL = 64  # entries of the blur's uniform
+SURE = (0.0, 0.0)  # a spread, pixels
+PACKED_SPREAD_PX = 0.5  # images are packed where blurs of so much, on every pixel, hide what that rounds
+
+Spread = dict[int, tuple[float, float]]
+
+
+class GlState:
+    """A `SolverState`. Used on the thread of its context, which is current whenever a frame begins."""
+
+    def __init__(
+        self,
+        passes: Passes,
+        contract: Contract,
+        stack: PanelStack,
+        *,
+        pool: LayerPool | None = None,
+    ) -> None:
+        """passes: of a context that others may use too. pool: where solutions are left; None: they are read back.
+        Raises InputError where a panel is too large for the driver."""
+        check_size(passes.context, stack)
+        self._passes, self._contract, self._stack = passes, contract, stack
+        self._textures: dict[tuple[Any, ...], Any] = {}
+        table = phase_codes(contract.branch).reshape(256, -1)[:, 0].astype(np.int16)
+        self._table = Image(self._texture("table", 256, 1, 1, data=table), 256, 1)
+        self._pool = pool
+        self._layers: U8 | None = None  # where they are read back
+        self._read: dict[tuple[int, ...], tuple[I16, I16]] = {}
+        self._closed = False
+        self._outer: dict[tuple[int, int], str] = {}  # which of two images a panel is in
+
+    @contextmanager
+    def begin(self, pictures: Sequence[Picture], problem: Problem) -> Iterator[None]:
+        with self._passes.drawing():
+            self._problem = problem
+            self._grey = problem.channels == 1
+            needed = reductions(self._contract) | {self._contract.reduction}
+            self._rasters = {reduction: problem.rasters(reduction) for reduction in needed}
+            self._spread: dict[int, Spread] = {
+                reduction: spreads(
+                    rasters,
+                    problem.eyes_m,
+                    eye_sigma_mm=problem.eye_sigma_mm,
+                    least_px=self._contract.least_spread_px,
+                )
+                for reduction, rasters in self._rasters.items()
+            }
+            self._stepped: GlJoint | None = None
+            joint = any(step.kind == "joint" for step in self._contract.steps)
+            self._packed = not (self._grey or joint) and all(
+                n in self._spread[1] and min(self._spread[1][n]) >= PACKED_SPREAD_PX for n in OUTER
+            )
+            sloped = self._contract.slope_floor < 1
+            self._defines = tuple(name for name, on in (("PACKED", self._packed), ("SLOPED", sloped)) if on)
+            self._outer = {}
+            self._want(self._taken(pictures), tuple(self._rasters))
+            yield
+
+    def network_pictures(self) -> tuple[I16, I16]:
+        problem, frame, reduction = self._problem, self._problem.frame, self._contract.reduction
+        seen = tuple(self._grown(f"network {side}", frame.width_px, frame.rows) for side in EYES)
+        matrices = [problem.reduced_from_frame(side) for side in range(2)]
+        self._draw(
+            "network",
+            seen,
+            self._wanted(reduction),
+            {
+                "size": problem.reduced_size,
+                "left_from_raster": _mat3(matrices[0]),
+                "right_from_raster": _mat3(matrices[1]),
+                **_columns(frame.columns),
+            },
+        )
+        return self._read_back(seen)
+
+    def set_panel(self, reduction: int, panel: int, codes: I16, *, shown: bool) -> None:
+        rows, columns = codes.shape[:2]
+        answer = self._grown(f"answer {panel}", columns, rows, components=self._problem.channels)
+        answer.texture.write(np.ascontiguousarray(codes), viewport=(0, 0, columns, rows), alignment=1)
+        self._passes.crossed("answer up", answer, bytes_px=2 * self._problem.channels, to_gpu=True)
+        matrix = self._problem.answer_from_raster(panel, self._rasters[reduction][panel])
+        place = {"size": answer.size, "image_from_panel": _mat3(matrix), **_columns(self._problem.answer_columns)}
+        self._draw("resample", (self._spare(reduction, panel),), {"image": answer}, {**place, "shown": shown})
+        self._swap(reduction, panel)
+
+    def project(self, reduction: int, panels: Sequence[int]) -> None:
+        for n in panels:
+            if n in (spread := self._spread[reduction]):
+                half, mean = self._image(reduction, n, "half"), self._image(reduction, n, "mean")
+                self._blur({"image": self._panel(reduction, n)}, (half,), spread[n])
+                self._blur({"image": half}, (mean,), spread[n], down=True)
+
+    def correct(self, reduction: int, panel: int, *, size: float, shown: bool) -> None:
+        places: dict[str, Any] = {
+            f"centre_from_{eye}": _mat3(
+                reprojection(self._problem.stack, self._rasters[reduction], eye_m, of=CENTRE, on=panel)
+            )
+            for eye, eye_m in zip(EYES, self._problem.eyes_m, strict=True)
+        }
+        places["size"] = _size(self._rasters[reduction][CENTRE])
+        result, outer = (self._spare(reduction, panel),), {"panel": self._panel(reduction, panel)}
+        how = {"eighths": round(size * 8), "shown": shown}
+        if spread := self._spread[reduction]:
+            outer["mean"] = self._mean(reduction, panel)
+            half = self._joined(reduction, panel, outer, places, spread.get(panel, SURE))
+            kernel = {**_kernel(spread.get(panel, SURE), down=True), "size": half.size}
+            self._draw("correct_unsure", result, {**outer, "half_blurred": half}, {**how, **kernel})
+        else:
+            images, seen = self._seen(reduction)
+            lacks = {eye: self._image(reduction, CENTRE, f"lacks {eye}") for eye in EYES}
+            self._draw("residual", tuple(lacks.values()), images, seen)
+            self._draw("correct", result, {**lacks, **outer, **self._weighing(reduction)}, {**places, **how})
+        self._swap(reduction, panel)
+
+    def start_joint(self) -> None:
+        centre = self._image(1, CENTRE, "begun")
+        images = {**self._wanted(1), **{NAMES[n]: self._panel(1, n) for n in OUTER}}
+        self._draw("centre", (centre,), images, self._through(1))
+        self._stepped = GlJoint(self._passes, self._joint_image)
+        self._stepped.start({REAR: self._panel(1, REAR), CENTRE: centre, FRONT: self._panel(1, FRONT)})
+
+    def joint(self, step: Step) -> None:
+        assert self._stepped is not None
+        targets = {eye: self._image(1, CENTRE, f"wanted {eye}", dtype="f1") for eye in EYES}
+        how = {"size": step.size, "momentum": step.momentum, "floor": step.floor}
+        self._stepped.step(self._problem.rays(step.places), targets, **how, ends=self._fade(1))
+
+    def upsample(self, coarser_reduction: int, reduction: int, *, shown: bool) -> None:
+        for n in OUTER:
+            coarse = self._panel(coarser_reduction, n)
+            fine = self._rasters[reduction][n]
+            scale = (coarse.width_px / fine.width_px, coarse.height_px / fine.height_px)
+            how = {"size": coarse.size, "image_from_panel": scale, "shown": shown}
+            self._draw("finer", (self._spare(reduction, n),), {"image": coarse}, how)
+            self._swap(reduction, n)
+
+    def finish(self) -> Layers:
+        width, height = self._stack.width_px, self._stack.height_px
+        if self._pool is not None:
+            left = left_in(self._pool, self._passes, self._stack)
+            self._draw_layers(tuple(Image(texture, width, height) for texture in left.textures))
+            wait_until_drawn()
+            return left
+        images = tuple(
+            Image(self._texture(("layer", n), width, height, 4, dtype="f1"), width, height) for n in range(3)
+        )
+        self._draw_layers(images)
+        finish()
+        if self._layers is None:
+            self._layers = np.empty((3, height, width, 4), np.uint8)
+        for image, layer in zip(images, self._layers, strict=True):
+            self._passes.target((image,)).read_into(layer, components=4)
+            self._passes.crossed("layer down", image, bytes_px=4, to_gpu=False)
+        return self._layers
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            with suppress(Exception):  # of a context that is lost there is nothing to release
+                for texture in self._textures.values():
+                    self._passes.forget(texture)
+            self._textures = {}
+
+    def _draw_layers(self, images: tuple[Image, ...]) -> None:
+        """The solution: one image a panel, RGBA in 8 bits."""
+        boxes = self._problem.boxes
+        if self._stepped is not None:
+            panels = {NAMES[n] if n != CENTRE else "centre": image for n, image in self._stepped.panels.items()}
+            sizes = {f"{name}_size": image.size for name, image in panels.items()}
+            names = ((CENTRE, "centre"), *NAMES.items())
+            places = {f"{name}_origin": (boxes[n].u0, boxes[n].v0) for n, name in names}
+            self._draw("show", images, panels, {**sizes, **places})
+            return
+        outer = {NAMES[n]: self._panel(1, n) for n in OUTER} | {f"{NAMES[n]}_mean": self._mean(1, n) for n in OUTER}
+        where: dict[str, Any] = {
+            f"{name}_origin": (boxes[n].u0, boxes[n].v0) for n, name in ((CENTRE, "centre"), *NAMES.items())
+        }
+        where["centre_size"] = _size(self._rasters[1][CENTRE])
+        self._draw(
+            "close",
+            images,
+            {**self._wanted(1), **outer},
+            {**self._through(1), **where, "neutral": NEUTRAL},
+        )
+
+    def _taken(self, pictures: Sequence[Picture]) -> list[Image]:
+        """The pictures where they were drawn, or their box, uploaded."""
+        box = self._problem.boxes[CENTRE]
+        taken = []
+        self._origin = (0, 0)
+        for eye, picture in zip(EYES, pictures, strict=True):
+            if isinstance(picture, DrawnPicture):
+                self._origin = (box.u0, box.v0)
+                taken.append(Image(picture.texture, box.width_px, box.height_px))
+                continue
+            texture = self._texture(("picture", eye), self._stack.width_px, self._stack.height_px, 4, dtype="f1")
+            image = Image(texture, box.width_px, box.height_px)
+            texture.write(np.ascontiguousarray(picture[box.slices]), viewport=(0, 0, *image.size))
+            self._passes.crossed("picture up", image, bytes_px=4, to_gpu=True)
+            taken.append(image)
+        return taken
+
+    def _want(self, pictures: Sequence[Image], coarser_by: Sequence[int]) -> None:
+        """Both eyes' phase sums on some rasters."""
+        box = self._problem.boxes[CENTRE]
+        for reduction in coarser_by:
+            width, height = _size(self._rasters[reduction][CENTRE])
+            wanted = self._wanted(reduction)
+            self._draw(
+                "wanted",
+                (wanted["wanted_left"], wanted["wanted_right"]),
+                {"left": pictures[0], "right": pictures[1]},
+                {
+                    "origin": self._origin,
+                    "box": (box.width_px, box.height_px),
+                    "reduction": (box.width_px / width, box.height_px / height),
+                    "emphasis": self._contract.emphasis,
+                },
+            )
+
+    def _joined(
+        self,
+        reduction: int,
+        panel: int,
+        outer: dict[str, Image],
+        places: dict[str, Any],
+        spread: tuple[float, float],
+    ) -> Image:
+        """What a correction for unsure eyes blurs, blurred across.
+
+        The mean B of what is lacked, less twice the noise p - B m of a panel p with mean m = B p, is
+        B(lacks + 2 (m - p)) + 2 (m - p): one blur for two, of numbers that are small.
+        """
+        lacks, moving, half = (
+            tuple(self._image(reduction, CENTRE, f"{name} {eye}") for eye in EYES)
+            for name in ("lacks", "moving", "half")
+        )
+        images, seen = self._seen(reduction)
+        self._draw("residual_unsure", (*lacks, *moving), images, {**seen, "of_front": panel == REAR})
+        self._blur({"first": moving[0], "second": moving[1]}, half, spread, name="blur_both", twice=True)
+        joined, blurred = (self._image(reduction, panel, name) for name in ("joined", "half"))
+        lacked = dict(zip((*EYES, *(f"half_blurred_{eye}" for eye in EYES)), (*lacks, *half), strict=True))
+        lacked |= self._weighing(reduction)
+        self._draw("back", (joined,), {**lacked, **outer}, {**places, **_kernel(spread, twice=True, down=True)})
+        self._blur({"image": joined}, (blurred,), spread)
+        return blurred
+
+    def _seen(self, reduction: int) -> tuple[dict[str, Image], dict[str, Any]]:
+        """What the eyes want and see at the centre panel's pixels."""
+        return {**self._wanted(reduction), **self._means(reduction)}, {
+            **self._through(reduction),
+            **self._fade(reduction),
+        }
+
+    def _through(self, reduction: int) -> dict[str, Any]:
+        """How the eyes see the outer panels through the centre panel's pixels."""
+        rasters = self._rasters[reduction]
+        found: dict[str, Any] = {}
+        for n, name in NAMES.items():
+            found[f"{name}_size"] = _size(rasters[n])
+            for eye, eye_m in zip(EYES, self._problem.eyes_m, strict=True):
+                found[f"{name}_from_{eye}"] = _mat3(reprojection(self._problem.stack, rasters, eye_m, of=n, on=CENTRE))
+        return found
+
+    def _fade(self, reduction: int) -> dict[str, Any]:
+        fade = self._problem.fade
+        if fade is None:
+            return {"over": (0.0, 0.0, 0.0, 0.0)}
+        along, down = (float(over_px * CORRECTED_SHARE) for over_px in fade.over_px)
+        raster = self._rasters[reduction][CENTRE]
+        matrix = self._problem.centre_from(raster.plane_from_raster())
+        return {
+            "kept_box": tuple(map(float, (fade.kept.u0, fade.kept.v0, fade.kept.u1, fade.kept.v1))),
+            "over": (along * fade.left, down * fade.top, along * fade.right, down * fade.bottom),
+            "centre_from_here": _as_scale_shift(matrix),
+        }
+
+    def _blur(
+        self,
+        images: dict[str, Image],
+        outputs: tuple[Image, ...],
+        spread: tuple[float, float],
+        *,
+        name: str = "blur",
+        down: bool = False,
+        twice: bool = False,
+    ) -> None:
+        kernel = _kernel(spread, down=down, twice=twice)
+        self._draw(name, outputs, images, {**kernel, "size": outputs[0].size})
+
+    def _draw(
+        self, name: str, outputs: tuple[Image, ...], inputs: dict[str, Image], uniforms: Mapping[str, Any]
+    ) -> None:
+        always = {"even": START, "grey": self._grey, "slope_floor": self._contract.slope_floor}
+        self._passes.draw(name, outputs, inputs, {**uniforms, **always}, defines=self._defines)
+
+    def _wanted(self, reduction: int) -> dict[str, Image]:
+        """What the eyes want, with the table that makes phase sums of it."""
+        images = {f"wanted_{eye}": self._image(reduction, CENTRE, f"wanted {eye}", dtype="f1") for eye in EYES}
+        return {**images, "table": self._table}
+
+    def _weighing(self, reduction: int) -> dict[str, Image]:
+        """What rays are weighed by, where they are."""
+        return self._wanted(reduction) if self._contract.slope_floor < 1 else {}
+
+    def _mean(self, reduction: int, panel: int) -> Image:
+        """An outer panel as eyes that are unsure see it."""
+        if panel in self._spread[reduction]:
+            return self._image(reduction, panel, "mean")
+        return self._panel(reduction, panel)
+
+    def _means(self, reduction: int) -> dict[str, Image]:
+        return {NAMES[n]: self._mean(reduction, n) for n in OUTER}
+
+    def _panel(self, reduction: int, panel: int) -> Image:
+        return self._image(reduction, panel, self._outer.get((reduction, panel), "outer"))
+
+    def _spare(self, reduction: int, panel: int) -> Image:
+        """Where a panel is drawn that is made from itself."""
+        return self._image(reduction, panel, _other(self._outer.get((reduction, panel), "outer")))
+
+    def _swap(self, reduction: int, panel: int) -> None:
+        self._outer[reduction, panel] = _other(self._outer.get((reduction, panel), "outer"))
+
+    def _image(self, reduction: int, panel: int, name: str, *, dtype: str | None = None) -> Image:
+        """The box's part of an image as large as a whole panel: boxes follow the viewer, textures don't."""
+        width, height = -(-self._stack.width_px // reduction), -(-self._stack.height_px // reduction)
+        dtype = dtype or ("u4" if self._packed else "i2")
+        components = 1 if self._grey or dtype == "u4" else 4
+        texture = self._texture((name, reduction, panel), width, height, components, dtype=dtype)
+        return Image(texture, *_size(self._rasters[reduction][panel]))
+
+    def _joint_image(self, panel: int, name: str, dtype: str) -> Image:
+        """Rays go through the centre panel's pixels."""
+        return self._image(1, CENTRE if panel == RAYS else panel, name, dtype=dtype)
+
+    def _grown(self, name: str, width_px: int, height_px: int, *, components: int | None = None) -> Image:
+        """An image of the network's raster, whose size follows the viewer; its texture only grows."""
+        components = components or (1 if self._grey else 4)
+        held = self._textures.get(key := (name, components, "i2"))
+        if held is None or held.width < width_px or held.height < height_px:
+            width, height = (max(width_px, held.width), max(height_px, held.height)) if held else (width_px, height_px)
+            check_raster(self._passes.context, width, height)
+            if held is not None:
+                self._passes.forget(self._textures.pop(key))
+            held = self._texture(name, width, height, components)
+        return Image(held, width_px, height_px)
+
+    def _texture(
+        self, key: Any, width: int, height: int, components: int, *, dtype: str = "i2", data: NDArray[Any] | None = None
+    ) -> Any:
+        key = (key, components, dtype)
+        if key not in self._textures:
+            made = self._passes.context.texture((width, height), components, data, dtype=dtype, alignment=1)
+            made.filter = (moderngl.NEAREST, moderngl.NEAREST)
+            made.repeat_x = made.repeat_y = False
+            self._textures[key] = made
+        return self._textures[key]
+
+    def _read_back(self, seen: Sequence[Image]) -> tuple[I16, I16]:
+        """The one thing that crosses to the processor: the network's raster."""
+        finish()
+        channels, (width, height) = self._problem.channels, seen[0].size
+        tail = () if channels == 1 else (channels,)
+        if (key := (height, width, channels)) not in self._read:
+            self._read = {key: (np.empty((height, width, *tail), np.int16), np.empty((height, width, *tail), np.int16))}
+        for index, (image, array) in enumerate(zip(seen, self._read[key], strict=True)):
+            self._passes.target(seen).read_into(
+                array, viewport=(0, 0, width, height), components=channels, attachment=index, alignment=1, dtype="i2"
+            )
+            self._passes.crossed("network down", image, bytes_px=2 * channels, to_gpu=False)
+        return self._read[key]
+
+
+def check_size(context: moderngl.Context, stack: PanelStack) -> None:
+    """Raises InputError where a panel is wider or higher than the driver allows."""
+    most = int(context.info["GL_MAX_TEXTURE_SIZE"])
+    most_wide, most_high = (min(most, int(value)) for value in context.info["GL_MAX_VIEWPORT_DIMS"])
+    for name, value, limit in (("width_px", stack.width_px, most_wide), ("height_px", stack.height_px, most_high)):
+        if value > limit:
+            raise InputError("stack", name, f'{value}: this OpenGL driver allows {limit}; set model.backend = "cpu"')
+
+
+def check_raster(context: moderngl.Context, width_px: int, height_px: int) -> None:
+    """Raises ModelFailure where the network's raster is larger than the driver allows."""
+    most = int(context.info["GL_MAX_TEXTURE_SIZE"])
+    if max(width_px, height_px) > most:
+        raise ModelFailure(f"OpenGL: the network's raster is {width_px}x{height_px}, the driver allows {most}")
+
+
+def _other(name: str) -> str:
+    return "outer" if name == "spare" else "spare"
+
+
+def _kernel(spread: tuple[float, float], *, down: bool = False, twice: bool = False) -> dict[str, Any]:
+    """The mean over where the eyes may be, as pixels move by it, along one direction."""
+    u, v = (s * np.sqrt(2.0) if twice else s for s in spread)
+    reach, weights = ceil(3 * max(u, v)), [1.0]
+    if reach:
+        weights = cv2.getGaussianKernel(2 * reach + 1, v if down else u)[reach:, 0].tolist()
+    padded = tuple(weights) + (0.0,) * (KERNEL - len(weights))
+    return {"kernel": padded, "reach": reach, "along": (0, 1) if down else (1, 0)}
+
+
+def _size(raster: PlaneRaster) -> tuple[int, int]:
+    return raster.width_px, raster.height_px
+
+
+def _columns(law: ColumnLaw) -> dict[str, float]:
+    return {"bend": law.bend, "middle": law.middle}
+
+
+def _mat3(matrix: F64) -> tuple[float, ...]:
+    """Column by column, as OpenGL has it."""
+    return tuple(matrix.T.ravel().tolist())
+
+
+def _as_scale_shift(matrix: F64) -> tuple[float, float, float, float]:
+    return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])

@@ -1,0 +1,224 @@
+"""The unrolled solver's steps, their order stated once, and what a device has to do for them.
+
+A backend (`cpu`, `gl`) does single steps, and knows neither their order nor when a panel is rounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from time import perf_counter_ns
+from typing import Protocol
+
+import numpy as np
+
+from runtime.model.assembly import Assembly
+from runtime.model.chain import ChainFrame, ColumnLaw
+from runtime.model.contract import Contract, Places, Step
+from runtime.model.fade import Fade, FadeCodes
+from runtime.model.job import Picture
+from runtime.model.pyramid_level import CENTRE, FRONT, OUTER, REAR, coarser, reprojection
+from runtime.optics.rect import PixelRect
+from runtime.optics.stack import PanelStack, PlaneRaster
+from runtime.optics.tilt import coarse_layer_from_seen
+from runtime.optics.views import stack_from_eye
+from runtime.records import F64, I16, Layers
+from runtime.support.threads import at_once
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """What one solution is for."""
+
+    contract: Contract
+    stack: PanelStack
+    boxes: tuple[PixelRect, ...]  # per panel, what the eyes look through
+    eyes_m: F64  # (2, 3) left and right, frame `stack`
+    frame: ChainFrame  # the network's raster
+    eye_sigma_mm: float  # standard deviation of where light enters the eyes, an axis
+    channels: int  # 1 or 3
+    fade: Fade | None  # how the panels end, where they are a part of larger ones
+
+    def rasters(self, reduction: int) -> tuple[PlaneRaster, ...]:
+        """The panels' pixels within their boxes, so much coarser."""
+        return tuple(coarser(box.cut(self.stack.panel(n)), reduction) for n, box in enumerate(self.boxes))
+
+    @property
+    def reduced_size(self) -> tuple[int, int]:
+        """(width, height) of the centre panel's pixels that the network's pictures are taken from."""
+        reduction, box = self.contract.reduction, self.boxes[CENTRE]
+        return max(1, box.width_px // reduction), max(1, box.height_px // reduction)
+
+    def reduced_from_frame(self, side: int) -> F64:
+        """3x3: those pixels from the network's raster (`ChainFrame.columns`), as one eye sees them in line."""
+        width, height = self.reduced_size
+        centre = self.boxes[CENTRE].cut(self.stack.panel(CENTRE))
+        reduced_from_full = np.diag([width / centre.width_px, height / centre.height_px, 1.0])
+        reduced_from_plane = reduced_from_full @ centre.raster_from_plane()
+        return reduced_from_plane @ self.frame.plane_from_frame(self.eyes_m[side], x_m=self.stack.x_m[CENTRE])
+
+    def answer_from_raster(self, panel: int, raster: PlaneRaster) -> F64:
+        """3x3: the network's answer's pixels (`answer_columns`) from an outer panel's, in line as seen from between the
+        eyes."""
+        seen_from_layer = np.linalg.inv(coarse_layer_from_seen(self.stack, panel, self.frame.middle_m))
+        matrix = self.frame.frame_from_plane(x_m=raster.x_m) @ seen_from_layer @ raster.plane_from_raster()
+        # The answer begins one parallax before the first column.
+        shifted = np.array([[1.0, 0.0, self.frame.cell_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) @ matrix
+        return np.asarray(shifted / shifted[2, 2], np.float64)
+
+    @property
+    def answer_columns(self) -> ColumnLaw:
+        """Of the network's answer."""
+        law = self.frame.columns
+        return ColumnLaw(law.bend, law.middle + self.frame.cell_px)
+
+    def faded(self, panels: Answer, *, start: int, fade_codes: FadeCodes) -> Answer:
+        """The network's answer that ends, at `start`, within a part of the panels; in place. fade_codes: the
+        backend's."""
+        if self.fade is None:
+            return panels
+        frame, first = self.frame, next(iter(panels.values()))
+        plane_from_wave = frame.plane_from_frame(frame.middle_m, x_m=self.stack.x_m[CENTRE])
+        plane_from_wave = plane_from_wave @ np.array([[1.0, 0.0, -frame.cell_px], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        rows, columns = first.shape[:2]
+        weights = self.fade.wave_weights(
+            self.centre_from(plane_from_wave), rows=rows, columns=columns, law=self.answer_columns
+        )
+        ends, channels = weights[..., 0], first.size // (rows * columns)
+        at_once(lambda panel: fade_codes(panel.reshape(rows, -1), ends, start, channels), list(panels.values()))
+        return panels
+
+    def rays(self, places: Places) -> F64:
+        """(rays, 3, 3, 3): each panel's pixels from the centre panel's, as left and right eyes in turn see them in line
+        from where a joint step takes them to be."""
+        sides = PLACES[places] if self.eye_sigma_mm > 0 else PLACES["middle"]
+        right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
+        rasters = self.rasters(1)
+        found = []
+        for across, down in sides:
+            moved_m = self.eye_sigma_mm / 1e3 * (across * right + down * up)
+            for eye_m in self.eyes_m + moved_m:
+                seen = [reprojection(self.stack, rasters, eye_m, of=n, on=CENTRE) for n in OUTER]
+                found.append([seen[0], np.eye(3), seen[1]])
+        return np.array(found)
+
+    def centre_from(self, plane_from_raster: F64) -> F64:
+        """3x3: the centre panel's pixels from a raster's on its plane."""
+        return self.stack.panel(CENTRE).raster_from_plane() @ plane_from_raster
+
+
+PLACES: Mapping[Places, Sequence[tuple[float, float]]] = {  # right and up, standard deviations
+    "middle": ((0.0, 0.0),),
+    "rising": ((1.0, 1.0), (-1.0, -1.0)),
+    "falling": ((1.0, -1.0), (-1.0, 1.0)),
+}
+Answer = Mapping[int, I16]  # per outer panel, (rows, columns[, 3]) on the network's raster, sixteenths of a code
+Network = Callable[[tuple[I16, I16]], Answer]
+
+
+class SolverState(Protocol):
+    """The panels of one size on one device, and what changes them. Lives from frame to frame; one thread uses it."""
+
+    def begin(self, pictures: Sequence[Picture], problem: Problem) -> AbstractContextManager[None]:
+        """Take two pictures (h, w, 4) of the centre panel's pixels: cut to its box, the target phase sums of both eyes,
+        on every raster that the steps need. The steps are done within what it answers."""
+
+    def network_pictures(self) -> tuple[I16, I16]:
+        """Each eye's residual while the outer panels are even, on the network's raster: (rows, columns[, 3])."""
+
+    def set_panel(self, reduction: int, panel: int, codes: I16, *, shown: bool) -> None:
+        """An outer panel as the network has it; shown: rounded to what 8 bits can show."""
+
+    def project(self, reduction: int, panels: Sequence[int]) -> None:
+        """See outer panels anew through the centre panel's pixels."""
+
+    def correct(self, reduction: int, panel: int, *, size: float, shown: bool) -> None:
+        """Change one outer panel by both eyes' residuals along the rays through each of its pixels, when the centre
+        panel is the best one for the outer panels."""
+
+    def start_joint(self) -> None:
+        """Joint steps go on from the outer panels on every pixel, and from the centre panel that suits them."""
+
+    def joint(self, step: Step) -> None:
+        """Change all panels by what both eyes see wrong (`compiled.joint`)."""
+
+    def upsample(self, coarser_reduction: int, reduction: int, *, shown: bool) -> None:
+        """Take the outer panels over from a coarser raster."""
+
+    def finish(self) -> Layers:
+        """(N, h, w, 4): the centre panel closed on every pixel, all of them in 8-bit codes, even beside the boxes;
+        an array is the state's own until the next frame."""
+
+    def close(self) -> None:
+        """Release threads and textures. May be called twice."""
+
+
+class SolverBackend(Protocol):
+    """A device that does what surrounds the network."""
+
+    name: str  # as `model.backend` calls it
+    context: object  # of OpenGL, whose textures it reads; None: it reads arrays
+
+    @property
+    def fade_codes(self) -> FadeCodes:
+        """What ends the network's answer, which is an array, within a part of the panels (`fade.fade_codes`)."""
+
+    def state(self, contract: Contract, stack: PanelStack, *, threads: int) -> SolverState:
+        """For a model and stacks of this one's size. Raises InputError where that does not fit."""
+
+    def assembly(self, stack: PanelStack) -> Assembly:
+        """For a model that solves a part of a stack; made on any thread."""
+
+    def close(self) -> None:
+        """Release what its states shared, once they are closed. May be called twice."""
+
+
+def run_steps(
+    steps: Sequence[Step], state: SolverState, network: Network, *, deadline_ns: int | None = None
+) -> tuple[Layers, int]:
+    """The layers of the problem that was begun, every step in its order, but for those after the deadline; and how many
+    were done.
+
+    The first steps may work on coarser rasters. An outer panel is rounded to what 8 bits show where it is changed
+    last, so that the centre panel, closed at the end, answers to what the eyes will really see.
+    """
+    last = {n: _last_change(steps, n) for n in OUTER}
+    reduction, done = steps[0].reduction, 0
+    for index, step in enumerate(steps):
+        if index and deadline_ns is not None and perf_counter_ns() >= deadline_ns:
+            break
+        done += 1
+        if step.reduction != reduction:
+            state.upsample(reduction, step.reduction, shown=False)
+            reduction = step.reduction
+            state.project(reduction, OUTER)
+        if step.kind == "joint":
+            if steps[index - 1].kind != "joint":
+                state.start_joint()
+            state.joint(step)
+            continue
+        shown = {n: index == last[n] for n in OUTER}
+        changed: tuple[int, ...] = OUTER
+        if step.kind == "chain":
+            for n, codes in network(state.network_pictures()).items():
+                state.set_panel(reduction, n, codes, shown=shown[n])
+        else:
+            changed = (FRONT if step.kind == "front" else REAR,)
+            state.correct(reduction, changed[0], size=step.size, shown=shown[changed[0]])
+        state.project(reduction, changed)
+    if reduction != 1:
+        state.upsample(reduction, 1, shown=True)
+        state.project(1, OUTER)
+    return state.finish(), done
+
+
+def reductions(contract: Contract) -> frozenset[int]:
+    """Those of the rasters that a model's steps work on, and the panels' own."""
+    return frozenset({1} | {step.reduction for step in contract.steps})
+
+
+def _last_change(steps: Sequence[Step], panel: int) -> int:
+    """The last step that changes an outer panel on every pixel; none if all are coarser."""
+    kinds = {"chain", "front" if panel == FRONT else "rear"}
+    return max((index for index, step in enumerate(steps) if step.kind in kinds and step.reduction == 1), default=-1)

@@ -1,0 +1,32 @@
+"""Classes of a user's own, named by a dotted path: `mypackage.tunnel:Tunnel` is the class `Tunnel` of that module."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from typing import Any
+
+from runtime.errors import InputError, one_line
+
+PLUGIN = re.compile(r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", re.ASCII)
+
+
+def is_plugin(name: str) -> bool:
+    """True for `module:Class`."""
+    return PLUGIN.fullmatch(name) is not None
+
+
+def plugin_class(name: str, base: type, *, field: str) -> Any:
+    """The class that `name` stands for. Raises InputError: no such module or class, or one that is no `base`.
+
+    field: the setting that names it.
+    """
+    module, _, attribute = name.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), attribute, None)
+    except Exception as error:  # whatever a module does when it is imported
+        problem = one_line(f"{type(error).__name__}: {error}")
+        raise InputError(field, "", f"`{module}` cannot be imported from Python's path ({problem})") from error
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise InputError(field, "", f"`{name}` is no class that derives from phasestack.{base.__name__}")
+    return found

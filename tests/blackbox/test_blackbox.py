@@ -1,0 +1,209 @@
+"""A black box beside a run: bounded, written at a fault, an error, or when asked; a recording that can be replayed."""
+
+from __future__ import annotations
+
+import json
+import logging
+import stat
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+
+from runtime.blackbox import recorder as recording
+from runtime.blackbox.recorder import Recorder
+from runtime.clock import NS_PER_S
+from runtime.config import Settings
+from runtime.daemon.build import RunOptions, build_run
+from runtime.errors import SensorLost
+from runtime.eyes.calibration import load_calibration
+from runtime.records import RefreshAccount
+from runtime.sensor.recording import Recording, recording_to
+from runtime.sensor.replay import demo_recording_path
+from tests.daemon.rig import Rig
+
+SMALL: dict[str, Any] = {"stack": {"width_px": 192, "height_px": 108}, "model": {"name": "fast", "threads": 1}}
+
+
+@dataclass(frozen=True)
+class Read:
+    """A message as a reader has it."""
+
+    topic: str
+    schema: dict[str, Any]
+    value: dict[str, Any]
+
+
+def read(path: Path) -> list[Read]:
+    """Every message of a file, by the mcap library."""
+    from mcap.reader import make_reader
+
+    with path.open("rb") as file:
+        return [
+            Read(channel.topic, json.loads(schema.data), json.loads(message.data))
+            for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages()
+            if schema is not None
+        ]
+
+
+def run_of(source: Path, *, recorder: Recorder | None = None) -> list[RefreshAccount]:
+    """Every refresh of a recording on the simulated clock."""
+    settings = Settings.model_validate({**SMALL, "sensor": {"driver": "replay", "source": str(source)}})
+    accounts: list[RefreshAccount] = []
+    with ExitStack() as cleanup:
+        run = build_run(settings, RunOptions(max_speed=True), cleanup, on_account=accounts.append, recorder=recorder)
+        run.presenter.run()
+        if recorder is not None:
+            recorder.save("asked")
+            recorder.close()
+    return accounts
+
+
+@pytest.fixture(autouse=True)
+def logged(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "phasestack")
+
+
+@pytest.fixture(scope="module")
+def stalled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Four seconds of the demo recording, of which one and a half are missing."""
+    path = tmp_path_factory.mktemp("stalled") / "stalled.mcap"
+    demo = Recording(demo_recording_path())
+    with recording_to(path, demo.header) as writer:
+        for sample in demo.samples():
+            second = (sample.capture_ns - demo.first.capture_ns) / NS_PER_S
+            if second < 4.0 and not 1.0 < second < 2.5:
+                writer.write(sample)
+    yield path
+
+
+def the_file(folder: Path) -> Path:
+    (found,) = folder.glob("blackbox-*.mcap")
+    return found
+
+
+def test_it_holds_every_refresh_sample_and_state_and_a_replay_gives_the_same_states(
+    stalled: Path, tmp_path: Path
+) -> None:
+    recorder = Recorder(tmp_path, minutes=2.0)
+    accounts = run_of(stalled, recorder=recorder)
+    path = the_file(tmp_path)
+    messages = read(path)
+    count = Counter(message.topic for message in messages)
+    assert (count["/refresh"], count["/eyes"]) == (len(accounts), 76)  # 30 samples a second, less those missing
+    passed = [state for state, _ in groupby(m.value["state"] for m in messages if m.topic == "/state")]
+    assert passed == ["flat", "tracking", "holding", "flat", "tracking"]
+    for message in messages:
+        jsonschema.validate(message.value, message.schema)
+    again = run_of(path)
+    assert [account.state for account in again] == [account.state for account in accounts]
+    for before, after in zip(accounts, again, strict=True):
+        if before.eyes_m is not None:
+            np.testing.assert_allclose(after.eyes_m, before.eyes_m, atol=1e-6)
+
+
+def test_it_keeps_no_more_than_its_minutes_and_its_bytes(tmp_path: Path, monkeypatch: Any) -> None:
+    recorder = Recorder(tmp_path, minutes=1.0 / 60)
+    with Rig(recorder=recorder) as rig:
+        rig.refresh_until("tracking")
+        rig.refreshes_for(1.5)
+        assert 0.5 < recorder.describe()["kept_s"] <= 1.0
+        monkeypatch.setattr(recording, "BYTES_MAX", 20_000)
+        rig.refreshes(3)
+        assert recorder.describe()["kept_mib"] * (1 << 20) <= 20_000 * 1.1
+        recorder.close()
+
+
+def test_a_fault_writes_what_was_before_it_and_what_followed_for_its_owner_alone(
+    tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(recording, "AFTER_FAULT_NS", NS_PER_S // 2)
+    recorder = Recorder(tmp_path, minutes=2.0)
+    with Rig(recorder=recorder) as rig:
+        rig.refresh_until("tracking")
+        rig.plan.fault = SensorLost("unplugged")
+        rig.refresh_until("degraded: sensor")
+        rig.plan.fault = None
+        rig.refresh_until("tracking")
+        rig.refresh_until(lambda: bool(list(tmp_path.glob("blackbox-*.mcap"))))
+        recorder.close()
+    path = the_file(tmp_path)
+    assert path.stem.endswith("-fault-sensor") and stat.S_IMODE(path.stat().st_mode) == 0o600
+    messages = read(path)
+    passed = [state for state, _ in groupby(m.value["state"] for m in messages if m.topic == "/state")]
+    assert passed[-3:] == ["tracking", "degraded", "tracking"]
+    reason = [m.value for m in messages if m.topic == "/state" and m.value["state"] == "degraded"][-1]
+    assert reason["missing"] == ["sensor"] and "unplugged" in reason["reason"]
+    assert any("degraded: sensor" in m.value["message"] for m in messages if m.topic == "/log")
+    assert len(list(tmp_path.iterdir())) == 1  # nothing half-written beside it
+
+
+def test_it_is_written_when_asked_and_the_samples_in_it_are_a_recording(tmp_path: Path) -> None:
+    answers: list[tuple[str, Path | None]] = []
+    recorder = Recorder(tmp_path, minutes=2.0)
+    with Rig(recorder=recorder) as rig:
+        rig.refresh_until("tracking")
+        recorder.save("asked", lambda problem, path: answers.append((problem, path)))
+        rig.refresh_until(lambda: bool(answers))
+        recorder.close()
+        sent_m = rig.plan.eyes_m
+    problem, path = answers[0]
+    assert problem == "" and path is not None and path.parent == tmp_path
+    points = list(Recording(path).samples())[-1].eyes
+    assert points is not None
+    # This sensor's points are in the stack's frame; the recording's are in a sensor's, as the calibration has it.
+    np.testing.assert_allclose(load_calibration(None).apply(points).eyes_m, sent_m, atol=0.01)
+
+
+def test_where_nothing_is_kept_asking_is_refused(tmp_path: Path) -> None:
+    answers: list[str] = []
+    Recorder(tmp_path, minutes=0.0).save("asked", lambda problem, _: answers.append(problem))
+    assert "blackbox_minutes" in answers[0]
+
+
+def test_an_error_that_ends_the_run_leaves_its_black_box(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, minutes=2.0)
+    with Rig(recorder=recorder) as rig:
+        rig.refresh_until("tracking")
+        recorder.close(crashed="ValueError: a bug")
+    messages = read(the_file(tmp_path))
+    assert any("ValueError: a bug" in m.value["message"] for m in messages if m.topic == "/log")
+
+
+def test_a_folder_that_cant_be_written_is_reported_to_who_asks(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    answers: list[str] = []
+    recorder = Recorder(tmp_path / "file", minutes=2.0)
+    with Rig(recorder=recorder) as rig:
+        rig.refresh_until("tracking")
+        recorder.save("asked", lambda problem, _: answers.append(problem))
+        rig.refresh_until(lambda: bool(answers))
+        recorder.close()
+    assert "cannot be written" in answers[0]
+
+
+def test_a_flood_of_one_kind_keeps_its_first_and_last_and_takes_no_other_kinds_place(tmp_path: Path) -> None:
+    earlier = tmp_path / "blackbox-20200101T000000Z-fault-sensor.mcap"
+    earlier.write_bytes(b"an earlier run's")
+    (tmp_path / "mine.mcap").write_bytes(b"kept")
+    recorder = Recorder(tmp_path, minutes=2.0)
+    first = tmp_path / "blackbox-20200102T000000Z-fault-model.mcap"
+    for number in range(100):
+        path = first.with_name(f"blackbox-20200102T00{number:04}Z-fault-model.mcap") if number else first
+        path.write_bytes(b"new")
+        recorder._make_room("fault-model", path)
+    assert {path.name for path in tmp_path.iterdir()} == {earlier.name, "mine.mcap", first.name, path.name}
+    for number in range(50):  # of other runs
+        file = tmp_path / f"blackbox-20200103T00{number:04}Z-fault-panel.mcap"
+        file.write_bytes(b"new")
+        Recorder(tmp_path, minutes=2.0)._make_room("fault-panel", file)
+    kept = [path.name for path in sorted(tmp_path.glob("blackbox-*.mcap"))]
+    assert len(kept) == recording.FILES_MAX and kept[:3] == [earlier.name, first.name, path.name]
+    assert kept[3].startswith("blackbox-20200103T000000Z") and kept[-1] == file.name

@@ -1,0 +1,194 @@
+"""`calibrate panels` on simulated photographs: from pictures to the configuration."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from calib.board import PER_PANEL, board, marks
+from calib.commands import app
+from calib.detect_marks import find_marks
+from calib.photographs import read_photograph
+from calib.placed import PlacedPanel, in_frame_of, misplaced, true_from_ideal_seen
+from calib.viewpoints import viewing_place_m
+from runtime.config import Settings, StackGeometry, load_settings
+from runtime.errors import InputError
+from runtime.optics.stack import PanelStack
+from runtime.support.artifacts import read_image
+from tests.calib.photo_scenes import error_over_panel_px, simulated_photographs
+
+run = CliRunner()
+STACK = StackGeometry().stack()
+EYE = viewing_place_m(Settings().calibration)
+CONFIG = '# kept\n[[output.panels]]\nconnector = "A"\n[[output.panels]]\nconnector = "B"\n[[output.panels]]\n'
+
+
+def panels(*options: str) -> dict:
+    result = run.invoke(app, ["panels", *options, "--json"])
+    if result.exception is not None:
+        raise result.exception
+    return json.loads(result.stdout)
+
+
+@pytest.fixture(scope="module")
+def truth() -> tuple[PlacedPanel, PlacedPanel, PlacedPanel]:
+    return misplaced(STACK, shift_m=0.002, turn_deg=1.0, gap_m=0.002, random=np.random.default_rng(2))
+
+
+@pytest.fixture(scope="module")
+def pictures(truth: tuple[PlacedPanel, PlacedPanel, PlacedPanel]) -> list[np.ndarray]:
+    return simulated_photographs(STACK, truth, count=7, megapixels=6.0, random=np.random.default_rng(3))
+
+
+@pytest.fixture
+def photos(tmp_path: Path, pictures: list[np.ndarray]) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for number, picture in enumerate(pictures):
+        cv2.imwrite(str(folder / f"{number + 1}.png"), picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return folder
+
+
+def replaced(photos: Path, number: int, picture: np.ndarray) -> None:
+    cv2.imwrite(str(photos / f"{number}.png"), picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+
+
+def blurred(picture: np.ndarray) -> np.ndarray:
+    return cv2.GaussianBlur(picture, (0, 0), 4.0)
+
+
+def half_covered(picture: np.ndarray) -> np.ndarray:
+    covered = picture.copy()
+    covered[:, : round(picture.shape[1] * 0.55)] = 40
+    return covered
+
+
+@pytest.mark.parametrize(
+    "stack",
+    [
+        STACK,
+        PanelStack(0.5, 0.28, (-0.03, 0.03), 3840, 2160),
+        PanelStack(0.3, 0.2, (-0.04, 0.0, 0.02, 0.05), 1280, 800),
+    ],
+)
+def test_a_camera_square_to_a_bare_panel_reads_every_mark_where_it_was_drawn(stack: PanelStack) -> None:
+    for index in range(stack.count):
+        picture = cv2.copyMakeBorder(board(stack, index), 40, 40, 40, 40, cv2.BORDER_CONSTANT)
+        seen = find_marks(cv2.GaussianBlur(picture, (0, 0), 0.8), stack, name="")
+        assert seen.marks[index] == sum(seen.marks) == PER_PANEL
+        # Pixel centres lie at halves on a panel and at whole numbers in a picture.
+        assert np.abs(seen.image_px - 40 + 0.5 - seen.panel_px).max() < 0.1
+
+
+def test_panels_too_small_or_too_many_for_boards_are_refused() -> None:
+    with pytest.raises(InputError, match="at least"):
+        marks(PanelStack(0.3, 0.2, (0.0, 0.1), 150, 100))
+    with pytest.raises(InputError, match="5 panels at most"):
+        marks(PanelStack(0.3, 0.2, tuple(0.01 * n for n in range(6)), 1920, 1080))
+
+
+def test_photographs_register_the_panels_in_the_configuration(
+    tmp_path: Path, photos: Path, truth: tuple[PlacedPanel, PlacedPanel, PlacedPanel]
+) -> None:
+    config = tmp_path / "c.toml"
+    config.write_text(CONFIG)
+    told = panels(
+        "--photos", str(photos), "--out", str(tmp_path / "r"), "--config", str(config), "--write",
+    )  # fmt: skip
+    settings = load_settings(config)
+    assert config.read_text().startswith("# kept")
+    assert [panel.connector for panel in settings.output.panels] == ["A", "B", ""]
+    stack = settings.stack.stack()
+    true = in_frame_of(truth, reference=1, reference_x_m=0.0)
+    assert np.abs(np.diff(stack.x_m) - np.diff([panel.axis_x_m for panel in true])).max() < 0.2e-3
+    for index, panel in enumerate(settings.output.panels):
+        expected = true_from_ideal_seen(true[index], EYE, stack, index)
+        error = error_over_panel_px(np.array(panel.homography), expected, STACK)
+        assert np.sqrt((error**2).mean()) < 0.1
+        assert error.max() < 0.3
+    assert Path(told["kept_version"]).read_text() == CONFIG
+    assert json.loads((tmp_path / "r" / "registration.json").read_text())["used"] == 7
+    assert load_settings(tmp_path / "r" / "panels.toml").stack.x_m == settings.stack.x_m
+
+
+@pytest.mark.parametrize(
+    ("spoil", "why"),
+    [
+        (blurred, "blurred"),
+        (half_covered, "is covered or cut off: of panel"),
+        (lambda picture: picture[:, ::-1], "is mirrored"),
+        (lambda picture: np.full_like(picture, 30), "shows no mark"),
+    ],
+)
+def test_photographs_that_cannot_be_used_are_named_and_nothing_is_written(
+    tmp_path: Path, photos: Path, pictures: list[np.ndarray], spoil: Callable[..., Any], why: str
+) -> None:
+    config = tmp_path / "c.toml"
+    config.write_text(CONFIG)
+    for number in (1, 3, 5):
+        replaced(photos, number, np.ascontiguousarray(spoil(pictures[number - 1])))
+    with pytest.raises(InputError) as refused:
+        panels("--photos", str(photos), "--out", str(tmp_path / "r"), "--config", str(config), "--write")
+    text = str(refused.value)
+    assert "4 of 7 photographs can be used" in text
+    for number in (1, 3, 5):
+        assert f"{number}.png" in text
+    assert why in text
+    assert "\n" not in text
+    assert config.read_text() == CONFIG
+    assert not (tmp_path / "r").exists()
+
+
+def test_a_bad_photograph_among_good_ones_is_left_out_and_named(
+    tmp_path: Path, photos: Path, pictures: list[np.ndarray]
+) -> None:
+    replaced(photos, 2, blurred(pictures[1]))
+    told = panels("--photos", str(photos), "--out", str(tmp_path / "r"))
+    assert told["used"] == 6
+    assert any(note.startswith("2.png") and note.endswith("left out") for note in told["notes"])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        [],
+        ["--photos", "."],
+        ["--out", "r", "--photos", "none"],
+        ["--out", "r", "--photos", "."],
+        ["--out", "r", "--photos", ".", "--write"],
+    ],
+)
+def test_wrong_requests_are_refused_and_leave_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError):
+        panels(*options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_photograph_of_too_many_pixels_is_refused_by_its_header(tmp_path: Path) -> None:
+    small = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes()
+    header = b"IHDR" + (30_000).to_bytes(4, "big") * 2 + small[24:29]
+    (tmp_path / "a.png").write_bytes(small[:12] + header + zlib.crc32(header).to_bytes(4, "big") + small[33:])
+    with pytest.raises(InputError, match=r"30000 x 30000 pixels; at most 250,000,000"):
+        read_photograph(tmp_path / "a.png")
+
+
+def test_a_file_that_is_no_picture_is_named(tmp_path: Path, photos: Path) -> None:
+    (photos / "8.jpg").write_bytes(b"not a picture")
+    with pytest.raises(InputError, match=r"8\.jpg: is not a photograph"):
+        panels("--photos", str(photos), "--out", str(tmp_path / "r"))
+
+
+def test_boards_are_written_one_for_each_panel(tmp_path: Path) -> None:
+    told = panels("--out", str(tmp_path / "b"))
+    assert np.array_equal(read_image(tmp_path / "b" / told["files"][2])[..., 0], board(STACK, 2))

@@ -1,0 +1,113 @@
+"""`phasestack eyes`: pictures, films and recordings to pupils and overlays; what is wrong is told in one line."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from runtime.errors import InputError
+from runtime.eyes.benchmark import measure, told
+from runtime.sensor.recording import recording_to
+from runtime.sensor.recording_format import RecordingHeader
+from runtime.support.artifacts import read_image, write_png
+from tests.eyes.scene import camera, eileen, frame, grace, scene
+
+CAMERA = camera(640, 480, 65.0)
+
+
+def eyes(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "runtime.cli", "eyes", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+def places(count: int) -> list[np.ndarray]:
+    return [np.array([0.004 * number, 0.0, 0.6]) for number in range(count)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A portrait, a picture of nobody, a film and a recording of a head that moves."""
+    folder = tmp_path_factory.mktemp("pictures")
+    write_png(folder / "eileen.png", eileen().picture)
+    write_png(folder / "nobody.png", np.full((90, 120, 3), 77, np.uint8))
+    film = cv2.VideoWriter(str(folder / "film.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 30, (640, 480))
+    header = RecordingHeader("openni2", "1", colour=True, depth=True, truth=False)
+    with recording_to(folder / "record.mcap", header) as recording:
+        for number, place in enumerate(places(5)):
+            colour, depth, _ = scene(place, intrinsics=CAMERA)
+            film.write(np.ascontiguousarray(colour[..., ::-1]))
+            recording.write(frame(colour, depth, CAMERA, number=number + 1))
+    film.release()
+    return folder
+
+
+def test_pictures_films_and_recordings_in_the_order_given(folder: Path, tmp_path: Path) -> None:
+    names = ["eileen.png", "nobody.png", "film.mp4", "record.mcap"]
+    done = eyes(*(folder / name for name in names), "--out", tmp_path / "out", "--json")
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(done.stdout)["pictures"]
+    assert [Path(row["file"]).name for row in rows] == [*names[:2], *["film.mp4"] * 5, *["record.mcap"] * 5]
+    portrait, nobody, *frames = rows
+    assert np.abs(np.array(portrait["eyes_px"]) - eileen().pupils).max() < 1.5
+    assert portrait["seen"] == "found" and 0 < portrait["sigma_px"] < 1 and portrait["ms"] > 0
+    assert nobody["eyes_px"] is None and nobody["sigma_px"] is None and nobody["reason"] == "no face"
+    assert [row["seen"] for row in frames] == ["found", *["followed"] * 4] * 2
+    for row, place in zip(rows[-5:], places(5)):
+        assert np.abs(np.mean(row["eyes_m"], axis=0) - place).max() < 0.006
+        assert len(row["sigma_mm"]) == 3
+    left = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert left == ["000-eileen.png", "001-nobody.png", "002-film.mp4", "003-record.mp4"]
+    assert {path.stat().st_mode & 0o777 for path in (tmp_path / "out").iterdir()} == {0o600}
+    overlay = read_image(tmp_path / "out" / "000-eileen.png").astype(int)
+    assert ((overlay[..., 1] - overlay[..., 0] > 120) & (overlay[..., 1] - overlay[..., 2] > 120)).sum() > 50  # green
+
+
+def test_pictures_in_sequence_are_followed(folder: Path) -> None:
+    done = eyes(folder / "eileen.png", folder / "eileen.png", "--sequence", "--rate-hz", "60", "--json")
+    assert [row["seen"] for row in json.loads(done.stdout)["pictures"]] == ["found", "followed"]
+
+
+def test_what_can_not_be_read_is_told_in_one_line_and_leaves_nothing(folder: Path, tmp_path: Path) -> None:
+    for name in ("text.png", "text.mp4", "text.mcap", "missing.png", "missing.mp4"):
+        if name.startswith("text"):
+            (tmp_path / name).write_text("no picture")
+        done = eyes(folder / "eileen.png", tmp_path / name, "--out", tmp_path / "out")
+        assert done.returncode == 2 and done.stdout == "", name
+        assert name in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
+        assert not (tmp_path / "out").exists()
+
+
+def test_without_a_file_the_sensor_is_looked_at(tmp_path: Path) -> None:
+    done = eyes("--json")
+    row, *_ = json.loads(done.stdout)["pictures"]
+    assert done.returncode == 0 and row["eyes_px"] is None and len(row["eyes_m"]) == 2
+    assert row["reason"] == "this sensor delivers eyes and no pictures"
+    live = eyes()  # the built-in recording ends after ten seconds
+    assert live.returncode == 0 and "left eye" in live.stdout
+
+
+def test_the_benchmark_measures_detection_error_sigma_jitter_and_time(tmp_path: Path) -> None:
+    for portrait, name in ((eileen(), "eileen.png"), (grace(), "grace.png")):
+        write_png(tmp_path / name, portrait.picture)
+    rows = [
+        {"file": f"{name}.png", "left": portrait.pupils[0].tolist(), "right": portrait.pupils[1].tolist()}
+        for portrait, name in ((eileen(), "eileen"), (grace(), "grace"))
+    ]
+    (tmp_path / "truth.json").write_text(json.dumps(rows))
+    measured = measure(tmp_path)
+    for camera_row in measured["cameras"]:
+        assert camera_row["right"] == 1 and camera_row["mean_mm"] < 1.2 and camera_row["within_2_sigma"] > 0.7
+    steady = measured["steady"]
+    assert steady["lost"] == 0 and max(steady["right_mm"], steady["up_mm"]) < 0.07 and abs(steady["lag_frames"]) < 0.1
+    assert measured["processor_ms"]["followed"]["p50"] < measured["processor_ms"]["found"]["p50"]
+    assert told(measured).count("\n") >= 8
+    rows[1]["left"] = "here"
+    (tmp_path / "truth.json").write_text(json.dumps(rows))
+    with pytest.raises(InputError, match=r"truth\.json: 1: must have"):
+        measure(tmp_path)

@@ -1,0 +1,115 @@
+"""How far away the eyes are, from depth that has faults, or from no depth at all."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from runtime.config import Settings
+from runtime.eyes.detect import EyeFinder, covariance
+from runtime.records import SensorFrame
+from tests.eyes.scene import IPD_M, camera, frame, scene
+
+CAMERA = camera(640, 480, 65.0)
+PLACE = np.array([0.04, 0.02, 0.7])
+
+
+def test_eyes_are_found_in_space_to_some_millimetres_at_every_place() -> None:
+    for place in ((0.0, 0.0, 0.4), (0.1, 0.05, 0.6), (-0.25, -0.1, 0.9), (0.3, 0.1, 1.4)):
+        colour, depth, (truth,) = scene(np.array(place), intrinsics=CAMERA)
+        finder = EyeFinder()
+        for number in (1, 2, 3):
+            found = finder.find(frame(colour, depth, CAMERA, number=number))
+        assert found is not None and np.abs(found.eyes_m - truth).max() < 0.005
+        assert found.eyes_m[0, 0] > found.eyes_m[1, 0]  # the left one is on the right of an unmirrored picture
+
+
+def test_depth_of_another_size_is_registered_by_scale() -> None:
+    colour, depth, (truth,) = scene(PLACE, intrinsics=CAMERA, depth_size=(320, 240))
+    assert np.abs(EyeFinder().find(frame(colour, depth, CAMERA)).eyes_m - truth).max() < 0.005
+
+
+def with_settings(**sections: dict) -> Settings:
+    return Settings.model_validate(sections)
+
+
+def faulty(depth: np.ndarray, seed: int, *, holes: float, flying: float, noise_mm: float) -> np.ndarray:
+    random = np.random.default_rng(seed)
+    noisy = np.clip(depth + random.normal(0, noise_mm, depth.shape), 1, 60_000).astype(np.uint16)
+    noisy[random.random(depth.shape) < holes] = 0
+    is_flying = random.random(depth.shape) < flying
+    noisy[is_flying] = (noisy[is_flying] + random.uniform(100, 1500, is_flying.sum())).astype(np.uint16)
+    return noisy
+
+
+def test_noise_holes_and_flying_pixels_neither_pull_the_eyes_nor_shake_them_and_sigma_is_true() -> None:
+    colour, depth, (truth,) = scene(PLACE, intrinsics=CAMERA)
+    finder, errors, sigmas = EyeFinder(), [], []
+    for number in range(30):
+        bad = faulty(depth, number, holes=0.4, flying=0.15, noise_mm=5)
+        found = finder.find(frame(colour, bad, CAMERA, number=number))
+        errors.append(found.eyes_m.mean(axis=0)[2] - truth[:, 2].mean())
+        sigmas.append(np.sqrt(found.covariance_m2[2, 2]))
+    assert np.abs(errors[5:]).max() < 0.005
+    assert np.std(errors[10:]) < 0.0012  # a quarter of one pixel's noise
+    assert np.abs(errors).max() < 3 * max(sigmas) and np.mean(np.abs(errors)) > 0.1 * np.mean(sigmas)
+
+
+@pytest.mark.parametrize("glasses_mm", [0, 60, 400], ids=["holes", "the lens", "what it mirrors"])
+def test_what_glasses_do_to_depth_does_not_reach_the_eyes(glasses_mm: int) -> None:
+    colour, depth, (truth,) = scene(PLACE, intrinsics=CAMERA)
+    for u, v in truth[:, :2] / truth[:, 2:] * CAMERA.fx_px + [CAMERA.cx_px, CAMERA.cy_px]:
+        around = np.s_[int(v) - 9 : int(v) + 9, int(u) - 11 : int(u) + 11]
+        depth[around] = depth[around] + glasses_mm if glasses_mm else 0
+    found = EyeFinder().find(frame(colour, depth, CAMERA))
+    assert np.abs(found.eyes_m[:, 2].mean() - truth[0, 2]) < 0.012
+    assert np.sqrt(found.covariance_m2[2, 2]) > 0.003  # nobody measured at the eyes themselves
+
+
+def test_depth_that_stops_is_bridged_by_this_viewers_eye_distance() -> None:
+    finder, sigmas = EyeFinder(), []
+    for number in range(30):
+        colour, depth, (truth,) = scene(PLACE + np.array([0, 0, 0.004 * number]), intrinsics=CAMERA)
+        found = finder.find(frame(colour, depth * (number < 10), CAMERA, number=number))
+        assert np.abs(found.eyes_m[:, 2] - truth[:, 2]).max() < 0.009
+        sigmas.append(np.sqrt(found.covariance_m2[2, 2]))
+    assert sigmas[-1] > sigmas[9]
+
+
+@pytest.mark.parametrize("depth_mm", [0, 90, 9000], ids=["nothing", "too near", "the wall"])
+def test_depth_that_makes_no_person_of_a_face_gives_no_eyes_and_says_so(depth_mm: int) -> None:
+    colour, depth, _ = scene(PLACE, intrinsics=CAMERA)
+    finder = EyeFinder()
+    assert finder.find(frame(colour, np.full_like(depth, depth_mm), CAMERA)) is None
+    assert finder.reason == "no depth of a person's size on the face"
+
+
+def test_a_camera_without_depth_knows_the_distance_as_well_as_people_s_eyes_are_alike() -> None:
+    colour, _, (truth,) = scene(PLACE, intrinsics=CAMERA)
+    learnt, known = EyeFinder(), EyeFinder(with_settings(calibration={"ipd_m": IPD_M}))
+    for number in range(20):
+        eyes = [finder.find(frame(colour, None, CAMERA, number=number)) for finder in (learnt, known)]
+    sigmas = [np.sqrt(found.covariance_m2[2, 2]) for found in eyes]
+    errors = [abs(found.eyes_m[:, 2].mean() - PLACE[2]) for found in eyes]
+    assert errors[0] < 2.5 * sigmas[0] and 0.01 < sigmas[0] < 0.05
+    assert errors[1] < 2.5 * sigmas[1] and sigmas[1] < 0.02
+    seen = eyes[0].eyes_m / eyes[0].eyes_m[:, 2:]
+    np.testing.assert_allclose(seen, truth / truth[:, 2:], atol=0.003)  # sideways nothing is lost
+
+
+def test_sigma_is_told_along_the_line_of_sight_and_across_it() -> None:
+    place, line = np.array([0.3, 0.0, 0.4]), np.array([0.06, 0.0, 0.01])
+    told = covariance(place, line, 0.001, 0.002, 0.004)
+    sight, sideways = np.array([0.6, 0.0, 0.8]), np.array([0.8, 0.0, -0.6])
+    for axis, sigma in ((sight, 0.004), (sideways, 0.001), (np.array([0.0, 1.0, 0.0]), 0.002)):
+        assert np.sqrt(axis @ told @ axis) == pytest.approx(sigma)
+
+
+def test_what_is_no_viewer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    colour, depth, _ = scene(intrinsics=CAMERA)
+    finder = EyeFinder()
+    assert finder.find(frame(colour, depth, CAMERA)) is None and finder.reason == "no face"
+    assert finder.find(SensorFrame(1, 1)) is None and "no colour" in finder.reason
+    colour, depth, _ = scene(np.array([0.0, 0.0, 2.5]), intrinsics=camera(), wall_m=6.0)
+    monkeypatch.setattr("runtime.eyes.detect.RANGE_MAX_M", 2.0)
+    assert finder.find(frame(colour, depth, camera())) is None and "beyond 2 m" in finder.reason

@@ -1,1 +1,0 @@
-"""Mutants of the code, and whether a test notices them."""

@@ -1,0 +1,224 @@
+"""Logging never holds up who logs, loses nothing silently, and can't be made to say what it was not told."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import os
+import re
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from runtime.clock import NS_PER_S, SimulatedClock
+from runtime.config import ServiceSettings
+from runtime.support import logs
+from runtime.support.logs import BURST, QUEUED_MAX, ROOTS, configure
+
+ROOT = Path(__file__).parents[2]
+log = logging.getLogger("phasestack.test")
+
+
+@pytest.fixture(autouse=True)
+def restored() -> Any:
+    loggers = [logging.getLogger(name) for name in ROOTS]
+    before = [(logger.handlers[:], logger.level, logger.propagate) for logger in loggers]
+    yield
+    for logger, (handlers, level, propagate) in zip(loggers, before, strict=True):
+        logger.handlers[:], logger.level, logger.propagate = handlers, level, propagate
+
+
+def logged(settings: Any = None, clock: Any = None, environment: Any = None) -> Any:
+    stream = io.StringIO()
+    configure(
+        settings or ServiceSettings(), stream=stream, clock=clock or SimulatedClock(), environment=environment or {}
+    )
+    return stream
+
+
+class Pipe:
+    """A reader that reads when it is told to."""
+
+    def __init__(self) -> None:
+        self.out, self._in = os.pipe()
+        self.stream = open(self._in, "w", encoding="utf-8")  # noqa: SIM115, PTH123
+        self.text = ""
+        self._stop = threading.Event()
+
+    def read_until(self, pattern: str, *, within_s: float = 60.0) -> re.Match[str]:
+        deadline_s = time.monotonic() + within_s
+        os.set_blocking(self.out, False)
+        while not (found := re.search(pattern, self.text)):
+            assert time.monotonic() < deadline_s, self.text[-500:]
+            try:
+                self.text += os.read(self.out, 1 << 20).decode()
+            except BlockingIOError:
+                time.sleep(0.005)
+        return found
+
+    def close(self) -> None:
+        self.stream.close()
+        os.close(self.out)
+
+
+@pytest.fixture
+def pipe() -> Iterator[Pipe]:
+    made = Pipe()
+    yield made
+    logs.flush()
+    made.close()
+
+
+def configured(stream: Any, clock: SimulatedClock | None = None, **settings: str) -> None:
+    configure(ServiceSettings(**settings), stream=stream, clock=clock or SimulatedClock(), environment={})
+
+
+def say(text: str) -> None:
+    """Past the rate limit."""
+    log.info("%s", text, extra={"always": True})
+
+
+def test_a_reader_that_never_reads_holds_up_nobody_and_what_was_lost_is_told_when_it_reads(pipe: Pipe) -> None:
+    configured(pipe.stream)
+    count = 2 * QUEUED_MAX
+    longest_s = 0.0
+    for number in range(count):
+        begin_s = time.monotonic()
+        say(f"line {number} " + "x" * 100)
+        longest_s = max(longest_s, time.monotonic() - begin_s)
+    assert longest_s < 2.0  # without the thread the first full pipe would hold it for ever
+    assert logs.lost() > 0
+    lost = int(pipe.read_until(r"(\d+) log lines were lost")[1])
+    assert lost == logs.lost()
+    assert len(re.findall(r"line \d+ x", pipe.text)) + lost == count
+    say("and on")
+    pipe.read_until("and on")
+
+
+def test_a_reader_that_is_gone_is_survived_and_counted() -> None:
+    out, descriptor = os.pipe()
+    with open(descriptor, "w", encoding="utf-8") as stream:  # noqa: PTH123
+        configured(stream)
+        os.close(out)
+        say("nobody hears this")
+        logs.flush()
+        assert logs.lost() == 1
+
+
+def test_a_process_whose_log_nobody_reads_ends_all_the_same() -> None:
+    """Python's own clean-up waits for no thread that is stuck in a full pipe."""
+    code = (
+        "import logging; from runtime.config import ServiceSettings; from runtime.support.logs import configure;"
+        "configure(ServiceSettings(), environment={});"
+        "[logging.getLogger('phasestack').info('%s', 'x' * 1000, extra={'always': True}) for _ in range(1000)];"
+        "print('done')"
+    )
+    out, descriptor = os.pipe()
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=descriptor, timeout=60, check=False
+        )
+    finally:
+        os.close(out)
+        os.close(descriptor)
+    assert (done.returncode, done.stdout) == (0, b"done\n")
+
+
+def test_the_last_lines_before_the_end_are_written() -> None:
+    code = (
+        "import logging; from runtime.config import ServiceSettings; from runtime.support.logs import configure;"
+        "configure(ServiceSettings(), environment={});"
+        "[logging.getLogger('phasestack').info('%d', n, extra={'always': True}) for n in range(500)]"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert [int(line.split()[-1]) for line in done.stderr.splitlines()] == list(range(500))
+
+
+FORGERIES = [
+    "lego\n12:00:00 error   state: tracking -> stopping (forged)",
+    "lego\r12:00:00 error   forged",
+    "lego\x1b[2K\x1b[1Aforged",
+    "lego\u2028forged",
+    "lego\x85forged",
+    "lego\u202edegrof",
+    "lego\0forged",
+    "lego\udcffforged",
+]
+
+
+@pytest.mark.parametrize("text", FORGERIES)
+@pytest.mark.parametrize("form", ["text", "json"])
+def test_a_message_can_not_forge_a_line(text: str, form: str) -> None:
+    stream = io.StringIO()
+    configured(stream, log_format=form)
+    log.info("asked for: scene %s", text)
+    log.error(text)
+    lines = stream.getvalue().removesuffix("\n").split("\n")
+    assert len(lines) == 2
+    assert all(line.isprintable() for line in lines)
+    assert all("lego" in line for line in lines)
+
+
+def test_transitions_of_state_are_never_rate_limited() -> None:
+    stream = io.StringIO()
+    configured(stream)
+    for number in range(10 * BURST):
+        log.info("state: %s -> %s (%s)", "tracking", "holding", number, extra={"always": True})
+        log.info("chatter %d", number)
+    lines = stream.getvalue().splitlines()
+    assert sum("state:" in line for line in lines) == 10 * BURST
+    assert sum("chatter" in line for line in lines) == BURST
+
+
+def test_people_read_time_level_and_message() -> None:
+    stream = logged()
+    log.warning("sensor lost: %s", "openni2")
+    assert stream.getvalue().split(" ", 1)[1] == "warning sensor lost: openni2\n"
+
+
+def test_journald_gets_a_priority_and_no_time() -> None:
+    stream = logged(environment={"JOURNAL_STREAM": "8:1"})
+    log.error("first")
+    assert stream.getvalue() == "<3>first\n"
+
+
+def test_a_traceback_is_in_a_file_that_the_line_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LOGS_DIRECTORY", str(tmp_path))
+    stream = logged()
+    try:
+        raise ValueError("boom")
+    except ValueError:
+        log.exception("failed")
+    assert stream.getvalue().count("\n") == 1 and "Traceback" not in stream.getvalue()
+    (file,) = tmp_path.iterdir()
+    assert str(file) in stream.getvalue() and "Traceback" in file.read_text() and file.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_traceback_stays_inside_its_json_line() -> None:
+    stream = logged(ServiceSettings(log_format="json"))
+    try:
+        raise ValueError("boom")
+    except ValueError:
+        log.exception("failed")
+    assert stream.getvalue().count("\n") == 1
+    assert "ValueError: boom" in json.loads(stream.getvalue())["exception"]
+
+
+def test_a_message_that_repeats_is_cut_off_and_counted_and_others_still_pass() -> None:
+    clock = SimulatedClock()
+    stream = logged(clock=clock)
+    for number in range(100):
+        log.warning("model failed, %d", number)
+    log.warning("something else")
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == BURST + 1
+    clock.advance_ns(60 * NS_PER_S)
+    log.warning("model failed, %d", 100)
+    assert f"({100 - BURST} more like this were not shown)" in stream.getvalue().splitlines()[-1]
