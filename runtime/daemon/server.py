@@ -150,10 +150,10 @@ class StatusServer:
         """One client, as many requests as it likes."""
         task = asyncio.current_task()
         assert task is not None
-        self._clients.add(task)
         writer.transport.set_write_buffer_limits(high=0)  # `drain` waits until all of an answer is on its way
         try:
             self._make_room()
+            self._clients.add(task)
             while line := await self._request(task, reader):
                 await self._reply(line, writer)
         except _Refusal as error:
@@ -170,11 +170,12 @@ class StatusServer:
 
     def _make_room(self) -> None:
         """Send away who has waited longest for a whole request; raises _Refusal where all are being answered."""
-        if len(self._clients) > CLIENTS_MAX:
+        if len(self._clients) >= CLIENTS_MAX:
             longest = next(iter(self._reading), None)
             if longest is None:
                 raise _Refusal("too many clients")
             self._reading.pop(longest)
+            self._clients.discard(longest)  # at once: many may come before it runs again
             longest.cancel("too many clients")
 
     async def _request(self, task: asyncio.Task[None], reader: StreamReader) -> bytes:
