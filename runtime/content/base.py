@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from runtime.support.gl import DrawnPicture
 
 
+Colour = tuple[float, float, float]  # 0-1
+WHITE: Colour = (1.0, 1.0, 1.0)
+
+
 @dataclass(frozen=True, slots=True)
 class View:
     """One eye and the raster that it should be drawn for."""
@@ -30,9 +34,7 @@ class View:
     pixels_from_stack: F64  # (3, 4) projection; third coordinate: positive before the eye, metres
     width_px: int
     height_px: int
-    display_from_view: F64 | None = (
-        None  # 3x3 rotation out of a frame that was placed; the lamp stands in the display's
-    )
+    display_from_view: F64 | None = None  # 3x3 turn out of a frame that was placed: the lamp stands in the display's
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +46,7 @@ class ContentInfo:
     stand_in: bool = False  # what was named is not here, and this is shown in its place; `name` says so
     grey: bool = False
     depth_range_m: tuple[float, float] | None = None  # nearest to farthest along +x of `stack`: (rear, front)
-    background: tuple[float, float, float] | None = (1.0, 1.0, 1.0)  # uniform colour behind it, 0-1; None: none
+    background: Colour | None = WHITE  # uniform, behind it; None: none
     flat_x_m: float | None = None  # all of it lies in this plane of `stack` and looks alike to both eyes
 
 

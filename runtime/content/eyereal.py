@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.base import WHITE, ContentInfo, ContentSource, View
 from runtime.content.images import WarpedPicture, image_from_view, rgba_from_rgb
 from runtime.content.placing import SceneFile
 from runtime.content.presets import Preset, Reading, preset, preset_names
-from runtime.content.scenes import WHITE
 from runtime.errors import ContentFailure, InputError
 from runtime.optics.views import image_from_stack
 from runtime.records import F64, U8

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runtime.content.shapes import I32, Shape
 from runtime.records import F32, F64
@@ -77,30 +76,29 @@ def silhouette(edges: Edges, eye: F64) -> tuple[I32, I32]:
     return edges.ends[chosen, which], edges.apex[chosen, which]
 
 
-def ramps(clip: F64, ends: I32, apex: I32, *, width_px: int, height_px: int) -> tuple[F32, I32, NDArray[np.bool_]]:
+def ramps(clip: F64, ends: I32, apex: I32, *, width_px: int, height_px: int) -> tuple[F32, I32]:
     """Two triangles along each outline edge, from the edge (coverage 1) to a pixel outside it (coverage 0).
 
     clip: (v, 4) clip coordinates of the shape's vertices.
-    Returns (k, 6, 5) clip coordinates and coverage, (k, 6) the vertex whose colour each corner has, and the
-    (n,) mask of the edges that were kept: those wholly before the eye and long enough to have a direction.
+    Returns (k, 6, 5) clip coordinates and coverage, and (k, 6) the vertex whose colour each corner has, of the edges
+    that lie wholly before the eye and are long enough to have a direction.
     """
     scale = np.array([width_px / 2, height_px / 2])
     points = clip[np.column_stack([ends, apex])]
-    before: NDArray[np.bool_] = np.asarray((points[..., 3] > 1e-6).all(1))
-    points = points[before]
+    before = (points[..., 3] > 1e-6).all(1)
+    points, ends = points[before], ends[before]
     pixels = points[..., :2] / points[..., 3:] * scale
     along = pixels[:, 1] - pixels[:, 0]
     length = np.hypot(along[:, 0], along[:, 1])
     long_enough = length > 1e-3
-    points, pixels, along = points[long_enough], pixels[long_enough], along[long_enough] / length[long_enough, None]
+    points, pixels, ends = points[long_enough], pixels[long_enough], ends[long_enough]
+    along = along[long_enough] / length[long_enough, None]
     outward = np.column_stack([-along[:, 1], along[:, 0]])
     inside = ((pixels[:, 2] - pixels[:, 0]) * outward).sum(1)
     outward *= np.where(inside > 0, -RAMP_PX, RAMP_PX)[:, None]
     corners = np.repeat(points[:, :2], 2, axis=1)
     coverage = np.tile([1.0, 0.0, 1.0, 0.0], (len(points), 1))
     corners[:, 1::2, :2] += (outward / scale)[:, None] * corners[:, 1::2, 3:]
-    kept = before.copy()
-    kept[before] = long_enough
     quad = [0, 1, 2, 2, 1, 3]
     packed = np.concatenate([corners, coverage[..., None]], axis=2)[:, quad]
-    return packed.astype(np.float32), ends[kept][:, [0, 0, 1, 1, 0, 1]], kept
+    return packed.astype(np.float32), ends[:, [0, 0, 1, 1, 0, 1]]

@@ -41,14 +41,6 @@ Table = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class GltfScene:
-    """Parts in their own frames, and the rig that places them."""
-
-    parts: tuple[Part, ...]
-    rig: Rig
-
-
-@dataclass(frozen=True, slots=True)
 class _Look:
     """What a material comes to."""
 
@@ -59,8 +51,11 @@ class _Look:
     uv_from_uv: F64 | None = None  # 3x3
 
 
-def load_gltf(path: Path, data: bytes, *, limits: LimitSettings, animation: str = "") -> GltfScene:
-    """Read a whole file. animation: which one plays, by name or number. Raises InputError."""
+def load_gltf(path: Path, data: bytes, *, limits: LimitSettings, animation: str = "") -> tuple[list[Part], Rig]:
+    """Parts in their own frames, and the rig that places them. animation: which one plays, by name or number.
+
+    Raises InputError.
+    """
     text, binary = data, b""
     if path.suffix.lower() == ".glb" or data[:4] == b"glTF":
         text, binary = _chunks(path, data)
@@ -110,7 +105,7 @@ class _Reader:
         self._looks: dict[int, _Look] = {}
         self._pictures: dict[tuple[int, float], U8] = {}
 
-    def scene(self, animation: str) -> GltfScene:
+    def scene(self, animation: str) -> tuple[list[Part], Rig]:
         for name in self._table.get("extensionsRequired", []):
             if name not in UNDERSTOOD:
                 raise InputError(self._path, "extensionsRequired", f"{foreign.shown(name)} is not understood")
@@ -135,7 +130,7 @@ class _Reader:
                 placed.append((part, _bound(binding, number, table.get("weights"), skin)))
             self._within(len(placed), self._limits.instances, "nodes")
         rig = Rig(tuple(nodes), tuple(order), tuple(binding for _, binding in placed), channels)
-        return GltfScene(tuple(part for part, _ in placed), rig)
+        return [part for part, _ in placed], rig
 
     def _within(self, count: int, most: int, field: str) -> None:
         foreign.within(count, most, source=self._path, field=field)
@@ -335,6 +330,8 @@ class _Reader:
 
     def _picture(self, index: int, cutoff: float) -> U8:
         """RGBA whose alpha is cut at a half, wherever the material cuts it; 0: nowhere."""
+        from PIL import Image
+
         if (index, cutoff) not in self._pictures:
             item = self._at("images", index)
             coded = self._bytes_of(item, "texture")
@@ -342,7 +339,8 @@ class _Reader:
                 coded = self._view(item["bufferView"])[0]
             name = f"images[{index}]"
             check_picture(coded, source=self._path, field="texture", name=name, limits=self._limits)
-            rgba = decoded_picture(coded)
+            with Image.open(io.BytesIO(coded)) as image:
+                rgba = texture_of(image)
             rgba[..., 3] = np.clip(rgba[..., 3] * (0.5 / max(cutoff, 1e-3)), 0, 255) if cutoff else 255
             self._pictures[index, cutoff] = rgba
         return self._pictures[index, cutoff]
@@ -437,11 +435,8 @@ def smooth_normals(positions: F32, triangles: I32) -> F32:
     return found
 
 
-def decoded_picture(coded: bytes) -> U8:
-    """(h, w, 4) RGBA, no larger than a texture may be."""
-    from PIL import Image
-
-    with Image.open(io.BytesIO(coded)) as image:
-        if max(image.size) > LARGEST_TEXTURE_PX:
-            image.thumbnail((LARGEST_TEXTURE_PX, LARGEST_TEXTURE_PX))
-        return np.array(image.convert("RGBA"))
+def texture_of(image: Any) -> U8:
+    """(h, w, 4) RGBA of a Pillow image, no larger than a texture may be."""
+    if max(image.size) > LARGEST_TEXTURE_PX:
+        image.thumbnail((LARGEST_TEXTURE_PX, LARGEST_TEXTURE_PX))
+    return np.array(image.convert("RGBA"))

@@ -15,18 +15,16 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.config import LimitSettings
 from runtime.content import camera
-from runtime.content.base import ContentInfo, DrawingSource, View
-from runtime.content.gltf import LARGEST_TEXTURE_PX, GltfScene, file_of, load_gltf
+from runtime.content.base import ContentInfo
+from runtime.content.gltf import file_of, load_gltf, texture_of
 from runtime.content.placing import SceneFile
 from runtime.content.ply import read_header
 from runtime.content.rig import Pose, Rig, deformed
 from runtime.content.shapes import Shape
-from runtime.content.triangles import Part, ReadyPart, TrianglePainter, ready
+from runtime.content.triangles import DrawnPart, Part, TriangleSource
 from runtime.errors import InputError, MissingPart, one_line
-from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64, U8
 from runtime.support import foreign, progress
-from runtime.support.gl import DrawnPicture
 from runtime.support.picture_header import check_picture
 
 log = logging.getLogger("phasestack.content")
@@ -41,7 +39,6 @@ LARGEST_COORDINATE = 1e15  # products of three still fit in float32's range
 class MeshData:
     """A loaded file, in its own coordinates."""
 
-    name: str
     parts: tuple[Part, ...]  # in the scene's frame; where there is a rig, each in its own
     low: F64  # (3,) corner of the box that holds it, however it moves
     high: F64
@@ -54,11 +51,16 @@ def prepare(file: SceneFile) -> Callable[[Any], MeshSource]:
     parts = []
     for number, part in enumerate(data.parts):
         progress.tell(f"{file.path.name}: outlines", number, len(data.parts))
-        parts.append(ready(part))
+        parts.append(DrawnPart(part))
     matrix = file.placed(data.low, data.high)
-    return lambda context: MeshSource(
-        data, stack_from_scene=matrix, context=context, background=file.background, parts=parts
+    x_m = camera.box_corners(data.low, data.high) @ matrix[0, :3] + matrix[0, 3]
+    info = ContentInfo(
+        name=file.path.stem,
+        moving=data.rig is not None,
+        depth_range_m=(float(x_m.min()), float(x_m.max())),
+        background=file.background,
     )
+    return lambda context: MeshSource(parts, matrix, context=context, info=info, rig=data.rig)
 
 
 def load_mesh(path: Path, *, limits: LimitSettings | None = None, animation: str = "") -> MeshData:
@@ -70,7 +72,7 @@ def load_mesh(path: Path, *, limits: LimitSettings | None = None, animation: str
     progress.tell(f"reading {path.name}", 0)
     data = foreign.read_bytes(path, most_bytes=round(limits.file_mib * foreign.MIB))
     if path.suffix.lower() in GLTF:
-        return _of_gltf(path, load_gltf(path, data, limits=limits, animation=animation))
+        return _of_gltf(path, *load_gltf(path, data, limits=limits, animation=animation))
     if importlib.util.find_spec("trimesh") is None:
         raise MissingPart("meshes need trimesh: pip install trimesh")
     _check_counts(path, data, limits)
@@ -106,31 +108,25 @@ def _boxed(path: Path, parts: Sequence[Part], points: Sequence[F32], rig: Rig | 
     low, high = corners.min(0), corners.max(0)
     if not (np.abs(corners) <= LARGEST_COORDINATE).all():  # nor NaN
         raise InputError(path, "nodes", f"place vertices beyond {LARGEST_COORDINATE:g}")
-    return MeshData(path.stem, tuple(parts), low, high, rig)
+    return MeshData(tuple(parts), low, high, rig)
 
 
-def _of_gltf(path: Path, scene: GltfScene) -> MeshData:
+def _of_gltf(path: Path, parts: Sequence[Part], rig: Rig) -> MeshData:
     """Parts that stand still are carried into the scene's frame once; those of a rig that moves stay in their own."""
-    _check(path, scene.parts)
-    rig = scene.rig
-    points = []
+    _check(path, parts)
+    shapes: list[Shape] = []  # in the scene's frame, at all times that are looked at
     for number, time_s in enumerate(rig.times_s()):
         progress.tell(f"{path.name}: places", number)
         pose = rig.pose(time_s)
         with np.errstate(all="ignore"):  # what overflows is refused by its box
-            points += [shape.positions_m for shape in _shapes(scene.parts, rig, pose)]
+            shapes += [_carried(*placed) for placed in zip(posed(parts, rig, pose), pose.scene_from_part, strict=True)]
+    points = [shape.positions_m for shape in shapes]
     if rig.moves:
-        return _boxed(path, scene.parts, points, rig)
-    still = [replace(part, shape=shape) for part, shape in zip(scene.parts, _shapes(scene.parts, rig, rig.pose(0.0)))]
-    return _boxed(path, still, points)
+        return _boxed(path, parts, points, rig)
+    return _boxed(path, [replace(part, shape=shape) for part, shape in zip(parts, shapes, strict=True)], points)
 
 
-def _shapes(parts: Sequence[Part], rig: Rig, pose: Pose) -> list[Shape]:
-    """Every part's shape in the scene's frame."""
-    return [_carried(*placed) for placed in zip(_posed(parts, rig, pose), pose.scene_from_part, strict=True)]
-
-
-def _posed(parts: Sequence[Part], rig: Rig, pose: Pose) -> list[Shape]:
+def posed(parts: Sequence[Part], rig: Rig, pose: Pose) -> list[Shape]:
     """Every part's shape in its own frame, deformed."""
     shapes = []
     for part, binding, weights, bones in zip(parts, rig.bindings, pose.morph_weights, pose.bones, strict=True):
@@ -263,60 +259,33 @@ def _material(material: Any, pictures: dict[int, U8]) -> tuple[U8 | None, tuple[
     if image is None:
         return None, UNCOLOURED if factor is None else (red, green, blue)
     if id(image) not in pictures:
-        if max(image.size) > LARGEST_TEXTURE_PX:
-            image.thumbnail((LARGEST_TEXTURE_PX, LARGEST_TEXTURE_PX))
-        pictures[id(image)] = np.asarray(image.convert("RGBA"))
+        pictures[id(image)] = texture_of(image)
     return pictures[id(image)], (red, green, blue) if red or green or blue else (1.0, 1.0, 1.0)
 
 
-class MeshSource(DrawingSource):
+class MeshSource(TriangleSource):
     """A loaded mesh at its place in the stack frame, and moving where its file says so."""
 
     def __init__(
-        self,
-        data: MeshData,
-        *,
-        stack_from_scene: F64,
-        context: Any,
-        background: tuple[float, float, float],
-        parts: Sequence[ReadyPart] | None = None,
+        self, parts: Sequence[DrawnPart], stack_from_scene: F64, *, context: Any, info: ContentInfo, rig: Rig | None
     ) -> None:
-        """parts: those of `data`, where they were made ready on another thread."""
-        self.draws_in = context
-        self._painter = TrianglePainter(parts or data.parts, context=context, background=background)
-        self._data, self._rig = data, data.rig
-        self._stack_from_scene = stack_from_scene
-        self._placed = [stack_from_scene] * len(data.parts)
+        self._stack_from_scene, self._rig = stack_from_scene, rig
+        self._at_rest = [part.part for part in parts]
         self._posed_for: float | None = None
-        box = camera.box_corners(data.low, data.high)
-        x = box @ stack_from_scene[0, :3] + stack_from_scene[0, 3]
-        self.info = ContentInfo(
-            name=data.name,
-            moving=data.rig is not None,
-            depth_range_m=(float(x.min()), float(x.max())),
-            background=background,
-        )
+        super().__init__(parts, [stack_from_scene] * len(parts), context=context, info=info)
 
-    def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
-        return self._painter.paint(view, self._places(time_ns))
-
-    def extent(self, view: View, *, time_ns: int) -> PixelRect:
-        return self._painter.extent(view, self._places(time_ns))
-
-    def close(self) -> None:
-        self._painter.close()
-
-    def _places(self, time_ns: int) -> list[F64]:
-        """4x4 stack_from_part of every part; deforms those that bend."""
+    def places(self, time_ns: int) -> Sequence[F64]:
+        """Deforms the parts that bend, too."""
         if self._rig is None:
-            return self._placed
+            return self.stack_from_parts
         period_ns = round(self._rig.duration_s * NS_PER_S)
         time_s = time_ns % period_ns / NS_PER_S if period_ns else 0.0
         if time_s != self._posed_for:
             pose = self._rig.pose(time_s)
-            for index, shape in enumerate(_posed(self._data.parts, self._rig, pose)):
-                if self._rig.bindings[index].deforms:
-                    self._painter.deform(index, shape)
-            self._placed = [self._stack_from_scene @ matrix for matrix in pose.scene_from_part]
+            shapes = posed(self._at_rest, self._rig, pose)
+            for part, binding, shape in zip(self.parts, self._rig.bindings, shapes, strict=True):
+                if binding.deforms:
+                    part.deform(shape)
+            self.stack_from_parts = [self._stack_from_scene @ matrix for matrix in pose.scene_from_part]
             self._posed_for = time_s
-        return self._placed
+        return self.stack_from_parts

@@ -121,12 +121,13 @@ def _from_path(file: SceneFile) -> Opener:
 
 def _built_in(name: str, settings: ContentSettings, stack: PanelStack, *, stands_for: str = "") -> Opener:
     """stands_for: the preset in whose place it is shown: the paper's scenes are not shipped."""
-    from runtime.content.procedural import ProceduralSource, ready_scene
+    from runtime.content.procedural import ProceduralSource, parts_of
 
-    made = ready_scene(name)
+    scene = SCENES[name]()
+    parts = parts_of(scene)
 
     def make(context: Any) -> ContentSource:
-        source = ProceduralSource(made, stack=stack, context=context, background=settings.background)
+        source = ProceduralSource(scene, stack=stack, context=context, background=settings.background, parts=parts)
         if stands_for:
             shown = f"{stands_for} (stand-in `{name}`: content.file is empty)"
             source.info = replace(source.info, name=shown, stand_in=True)

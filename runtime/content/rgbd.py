@@ -16,17 +16,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from runtime.content.base import ContentInfo, DrawingSource, View
+from runtime.content.base import ContentInfo
 from runtime.content.images import rgba_from_rgb
 from runtime.content.pictures import open_frames, screen
 from runtime.content.placing import SceneFile
 from runtime.content.shapes import I32, Shape
-from runtime.content.triangles import Part, TrianglePainter
+from runtime.content.triangles import DrawnPart, Part, TriangleSource
 from runtime.errors import InputError
-from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
-from runtime.support.gl import DrawnPicture
 
 COLUMNS = 320  # of the surface where it is smooth: as fine as depth cameras see, and quick without a graphics card
 FINEST_COLUMNS = 1600  # of the surface beside an edge
@@ -173,30 +171,13 @@ def _edge_to_edge(index: Any, count: int) -> F64:
     return np.where(index == 0, 0.0, np.where(index == count - 1, float(count), place))
 
 
-def prepare(file: SceneFile) -> Callable[[Any], RgbdSource]:
+def prepare(file: SceneFile) -> Callable[[Any], TriangleSource]:
     """Read it; the answer uploads it. Raises InputError where it holds no depth."""
     colour, depth = split_rgbd(open_frames(file.path, file.settings, limits=file.limits).frame(0), file.path)
-    parts = surfaces(colour, depth, stack=file.stack, depth_m=file.settings.depth_m)
-    return lambda context: RgbdSource(parts, file=file, context=context)
-
-
-class RgbdSource(DrawingSource):
-    """A picture with depth between two planes of the stack frame."""
-
-    def __init__(self, parts: list[Part], *, file: SceneFile, context: Any) -> None:
-        # Outlines of a torn surface run through its inside: no ramps there.
-        self.draws_in = context
-        self._painter = TrianglePainter(parts, context=context, background=file.background, samples=SAMPLES)
-        self._places = [np.eye(4)] * len(parts)
-        x_m = parts[0].shape.positions_m[:, 0]
-        low, high = float(x_m.min()), float(x_m.max())
-        self.info = ContentInfo(name=file.path.stem, depth_range_m=(low, high), background=file.background)
-
-    def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
-        return self._painter.paint(view, self._places)
-
-    def extent(self, view: View, *, time_ns: int) -> PixelRect:
-        return self._painter.extent(view, self._places)
-
-    def close(self) -> None:
-        self._painter.close()
+    # Outlines of a torn surface run through its inside: samples there, no ramps.
+    found = surfaces(colour, depth, stack=file.stack, depth_m=file.settings.depth_m)
+    parts = [DrawnPart(part, outlined=False) for part in found]
+    x_m = parts[0].positions[:, 0]
+    info = ContentInfo(file.path.stem, depth_range_m=(float(x_m.min()), float(x_m.max())), background=file.background)
+    places = [np.eye(4)] * len(parts)
+    return lambda context: TriangleSource(parts, places, context=context, info=info, samples=SAMPLES)

@@ -8,12 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from runtime.content import shapes
+from runtime.content.base import WHITE, Colour
 from runtime.content.shapes import Shape
 from runtime.errors import InputError
 from runtime.records import F64
-
-Colour = tuple[float, float, float]
-WHITE: Colour = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,10 +13,10 @@ import moderngl
 import numpy as np
 
 from runtime.content import camera
-from runtime.content.base import View
+from runtime.content.base import WHITE, ContentInfo, DrawingSource, View
 from runtime.content.canvas import Canvas
-from runtime.content.fringe import Edges, edges_of, ramps, silhouette
-from runtime.content.shapes import Shape
+from runtime.content.fringe import edges_of, ramps, silhouette
+from runtime.content.shapes import I32, Shape
 from runtime.optics.rect import PixelRect, union
 from runtime.records import F32, F64, U8
 from runtime.support.gl import DrawnPicture, linked_program
@@ -111,215 +111,183 @@ class Part:
         return tuple(name for name, wanted in switches.items() if wanted)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ReadyPart:
-    """A part with all that can be worked out without a GL context: the slow half of getting it on to the panels."""
+class DrawnPart:
+    """A part with all that drawing it takes. Made without a GL context, on any thread, which is the slow half; then
+    uploaded by the source that draws it."""
 
-    part: Part
-    features: tuple[str, ...]
-    attributes: F32  # (v, 8) normal, texture coordinates, colour
-    packed: F32  # (v, 11) position and attributes
-    edges: Edges | None  # for ramps along the outline; None: it has none
-    corners_m: F64  # (8, 3) of the box that holds it; frame of the part
+    def __init__(self, part: Part, *, outlined: bool = True) -> None:
+        """outlined: with what ramps along its outline need."""
+        mesh = part.shape
+        self.part, self.features = part, part.features
+        colours = np.ones_like(mesh.positions_m) if part.vertex_colours is None else part.vertex_colours
+        # (v, 11) position, normal, texture coordinates, colour
+        self.vertices = np.concatenate([mesh.positions_m, mesh.normals, mesh.uv, colours], axis=1, dtype=np.float32)
+        self.edges = edges_of(mesh) if outlined and len(mesh.triangles) <= OUTLINED_MAX else None
+        low, high = mesh.positions_m.min(0), mesh.positions_m.max(0)
+        if part.turning:
+            reach = float(np.linalg.norm(mesh.positions_m, axis=1).max())
+            low, high = np.full(3, -reach), np.full(3, reach)
+        self.corners_m = camera.box_corners(low, high)  # (8, 3) of the box that holds it; frame of the part
+        self.texture: Any = None
+
+    @property
+    def positions(self) -> F32:
+        """(v, 3) at present."""
+        return self.vertices[:, :3]
+
+    def upload(self, context: Any, surface_program: Any, outline_program: Any, texture: Any) -> None:
+        """Make its GL objects; programs and texture are the source's, and shared."""
+        self.surface_program, self.outline_program, self.texture = surface_program, outline_program, texture
+        self._buffer = context.buffer(self.vertices)
+        self._triangles = context.buffer(np.ascontiguousarray(self.part.shape.triangles, np.int32))
+        names = ("in_normal", "in_uv", "in_colour")
+        layout = _layout(surface_program, self._buffer, ("in_position", *names), (3, 3, 2, 3))
+        self.surface = context.vertex_array(surface_program, [layout], index_buffer=self._triangles)
+        size = max(len(self.edges.faces) if self.edges else 0, 1) * OUTLINE_BYTES
+        self._outline_buffer = context.buffer(reserve=size, dynamic=True)
+        layout = _layout(outline_program, self._outline_buffer, ("in_clip", "in_coverage", *names), (4, 1, 3, 2, 3))
+        self._outline = context.vertex_array(outline_program, [layout])
+
+    def deform(self, shape: Shape) -> None:
+        """Another shape: the same triangles, their vertices elsewhere."""
+        self.vertices[:, :3], self.vertices[:, 3:6] = shape.positions_m, shape.normals
+        self._buffer.write(self.vertices)
+        if self.edges is not None:
+            self.edges = self.edges.moved(shape)
+        self.corners_m = camera.box_corners(shape.positions_m.min(0), shape.positions_m.max(0))
+
+    def draw_outline(self, corners: F32, vertices: I32) -> None:
+        """Ramps (k, 6, 5) along its outline, each corner with the attributes of a vertex (k, 6)."""
+        packed = np.concatenate([corners.reshape(-1, 5), self.vertices[vertices.reshape(-1), 3:]], axis=1)
+        self._outline_buffer.write(packed)
+        self._outline.render(vertices=len(packed))
+
+    def release(self) -> None:
+        """Its GL objects, but for what is shared; a vertex array does not release its buffers."""
+        for held in (self.surface, self._buffer, self._triangles, self._outline, self._outline_buffer):
+            held.release()
 
 
-def ready(part: Part, *, outlined: bool = True) -> ReadyPart:
-    """Needs no GL: may run on any thread. outlined: with what ramps along its outline need."""
-    mesh = part.shape
-    attributes = _attributes(part)
-    low, high = mesh.positions_m.min(0), mesh.positions_m.max(0)
-    if part.turning:
-        reach = float(np.linalg.norm(mesh.positions_m, axis=1).max())
-        low, high = np.full(3, -reach), np.full(3, reach)
-    return ReadyPart(
-        part=part,
-        features=part.features,
-        attributes=attributes,
-        packed=np.concatenate([mesh.positions_m, attributes], axis=1, dtype=np.float32),
-        edges=edges_of(mesh) if outlined and len(mesh.triangles) <= OUTLINED_MAX else None,
-        corners_m=camera.box_corners(low, high),
-    )
+def corners_m(parts: Sequence[DrawnPart], stack_from_parts: Sequence[F64]) -> F64:
+    """(8n, 3) corners in the stack frame of the boxes that hold the parts."""
+    placed = zip(parts, stack_from_parts, strict=True)
+    return np.concatenate([part.corners_m @ matrix[:3, :3].T + matrix[:3, 3] for part, matrix in placed])
 
 
-@dataclass(slots=True)
-class _Uploaded:
-    part: Part
-    positions: F32  # (v, 3) at present
-    surface: Any
-    surface_buffers: tuple[Any, ...]  # vertices, triangles: a vertex array does not release them
-    outline: Any
-    outline_buffer: Any
-    edges: Edges | None
-    texture: Any
-    surface_program: Any
-    outline_program: Any
-    corners_m: F64  # (8, 3) of the box that holds it; frame of the part
-    attributes: F32  # (v, 8)
-
-
-class TrianglePainter:
-    """Uploads parts once and draws them through any view."""
+class TriangleSource(DrawingSource):
+    """Parts at their places, over a background."""
 
     def __init__(
         self,
-        parts: Sequence[Part | ReadyPart],
+        parts: Sequence[DrawnPart],
+        stack_from_parts: Sequence[F64],
         *,
         context: Any,
-        background: tuple[float, float, float],
+        info: ContentInfo,
         samples: int = 0,
     ) -> None:
-        """samples: per pixel, for outlines; 0: ramps along the outlines, which a software rasteriser draws faster."""
-        self._context = context
-        self._canvas = Canvas(context, samples=samples, background=background)
+        """stack_from_parts: 4x4 each, a similarity; samples: per pixel, for outlines; 0: ramps along the outlines,
+        which a software rasteriser draws faster."""
+        self.info = info
+        self.context = self.draws_in = context
+        self.parts, self.stack_from_parts = list(parts), list(stack_from_parts)
+        self._canvas = Canvas(context, samples=samples, background=info.background or WHITE)
         self._with_ramps = samples == 0
         self._programs: dict[tuple[str, ...], Any] = {}
         self._textures: dict[int, Any] = {}
-        self._parts = [
-            self._upload(part if isinstance(part, ReadyPart) else ready(part, outlined=samples == 0)) for part in parts
-        ]
+        for part in self.parts:
+            programs = self._program(part.features), self._program((*part.features, "OUTLINE"))
+            picture = part.part.picture
+            part.upload(context, *programs, None if picture is None else self._texture(picture))
 
-    def corners_m(self, stack_from_parts: Sequence[F64]) -> F64:
-        """(8n, 3) corners in the stack frame of the boxes that hold the parts."""
-        placed = zip(self._parts, stack_from_parts, strict=True)
-        return np.concatenate([item.corners_m @ matrix[:3, :3].T + matrix[:3, 3] for item, matrix in placed])
+    def places(self, time_ns: int) -> Sequence[F64]:
+        """4x4 stack_from_part of every part, which what moves works out anew."""
+        return self.stack_from_parts
 
-    def extent(self, view: View, stack_from_parts: Sequence[F64]) -> PixelRect:
-        """A box of the view's pixels that holds all that `paint` would draw."""
+    def extent(self, view: View, *, time_ns: int) -> PixelRect:
         size = {"width_px": view.width_px, "height_px": view.height_px}
         boxes = []
-        for item, matrix in zip(self._parts, stack_from_parts, strict=True):
-            vertices = item.positions
-            points = item.corners_m if len(vertices) > PROJECTED_MAX else vertices.astype(np.float64)
+        for part, matrix in zip(self.parts, self.places(time_ns), strict=True):
+            points = part.corners_m if len(part.vertices) > PROJECTED_MAX else part.positions.astype(np.float64)
             placed = points @ matrix[:3, :3].T + matrix[:3, 3]
             if camera.depth_bounds(view.pixels_from_stack, placed) is not None:
                 boxes.append(camera.covered_box(view.pixels_from_stack, placed, align_px=1, **size))
         return union(boxes)
 
-    def deform(self, index: int, shape: Shape) -> None:
-        """Another shape for a part: the same triangles, their vertices elsewhere."""
-        item = self._parts[index]
-        item.positions = shape.positions_m
-        item.attributes[:, :3] = shape.normals
-        item.surface_buffers[0].write(np.concatenate([shape.positions_m, item.attributes], axis=1, dtype=np.float32))
-        if item.edges is not None:
-            item.edges = item.edges.moved(shape)
-        item.corners_m = camera.box_corners(shape.positions_m.min(0), shape.positions_m.max(0))
-
-    def paint(self, view: View, stack_from_parts: Sequence[F64]) -> DrawnPicture:
-        """The parts at their places (4x4 each, a similarity), over the background."""
+    def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
+        """The same bytes for the same view and time."""
         size = {"width_px": view.width_px, "height_px": view.height_px}
-        corners = self.corners_m(stack_from_parts).reshape(-1, 8, 3)
+        places = self.places(time_ns)
+        corners = corners_m(self.parts, places).reshape(-1, 8, 3)
         bounds = camera.depth_bounds(view.pixels_from_stack, corners.reshape(-1, 3))
         boxes = [camera.covered_box(view.pixels_from_stack, part, **size) for part in corners]
         area = union(boxes) if bounds else PixelRect(0, 0, 0, 0)
         # Nearest first: what they hide need not be shaded.
         order = np.argsort(-corners[..., 0].mean(1), kind="stable")
-        placed = [(self._parts[index], stack_from_parts[index]) for index in order]
+        placed = [(self.parts[index], places[index]) for index in order]
 
-        def draw() -> None:
+        def paint() -> None:
             near_m, far_m = bounds or (0.0, 0.0)
             clip = camera.clip_from_stack(view.pixels_from_stack, near_m=near_m, far_m=far_m, **size)
-            self._context.enable_only(self._context.DEPTH_TEST)
-            for item, stack_from_part in placed:
-                self._describe(item.surface_program, item, stack_from_part, view)
-                item.surface_program["clip_from_part"].write(_gl(clip @ stack_from_part))
-                item.surface.render()
+            self.context.enable_only(self.context.DEPTH_TEST)
+            for part, stack_from_part in placed:
+                _set_look(part.surface_program, part, stack_from_part, view)
+                part.surface_program["clip_from_part"].write(_gl(clip @ stack_from_part))
+                part.surface.render()
             if self._with_ramps:
                 self._draw_outlines(placed, clip, view)
 
-        return self._canvas.draw(side=view.side, box=area, paint=draw, **size)
+        return self._canvas.draw(side=view.side, box=area, paint=paint, **size)
 
     def close(self) -> None:
-        """Release every GL object. May be called twice."""
         self._canvas.close()
-        for item in self._parts:
-            for held in (item.surface, *item.surface_buffers, item.outline, item.outline_buffer):
-                held.release()
-        for shared in (*self._textures.values(), *self._programs.values()):
-            shared.release()
-        self._parts, self._textures, self._programs = [], {}, {}
-
-    def _upload(self, prepared: ReadyPart) -> _Uploaded:
-        part, features, context = prepared.part, prepared.features, self._context
-        surface_program, outline_program = self._program(features), self._program((*features, "OUTLINE"))
-        triangles = context.buffer(np.ascontiguousarray(part.shape.triangles, np.int32))
-        vertices = context.buffer(prepared.packed)
-        names = ("in_normal", "in_uv", "in_colour")
-        surface = context.vertex_array(
-            surface_program,
-            [_layout(surface_program, vertices, ("in_position", *names), (3, 3, 2, 3))],
-            index_buffer=triangles,
-        )
-        edges = prepared.edges
-        buffer = context.buffer(reserve=max(len(edges.faces) if edges else 0, 1) * OUTLINE_BYTES, dynamic=True)
-        layout = _layout(outline_program, buffer, ("in_clip", "in_coverage", *names), (4, 1, 3, 2, 3))
-        return _Uploaded(
-            part=part,
-            positions=part.shape.positions_m,
-            surface=surface,
-            surface_buffers=(vertices, triangles),
-            outline=context.vertex_array(outline_program, [layout]),
-            outline_buffer=buffer,
-            edges=edges,
-            texture=None if part.picture is None else self._texture(part.picture),
-            surface_program=surface_program,
-            outline_program=outline_program,
-            corners_m=prepared.corners_m,
-            attributes=prepared.attributes,
-        )
+        for held in (*self.parts, *self._textures.values(), *self._programs.values()):
+            held.release()
+        self.parts, self._textures, self._programs = [], {}, {}
 
     def _program(self, features: tuple[str, ...]) -> Any:
         if features not in self._programs:
             head = "#version 330\n" + "".join(f"#define {name}\n" for name in features)
-            self._programs[features] = linked_program(self._context, vertex=head + VERTEX, fragment=head + FRAGMENT)
+            self._programs[features] = linked_program(self.context, vertex=head + VERTEX, fragment=head + FRAGMENT)
         return self._programs[features]
 
     def _texture(self, picture: U8) -> Any:
         if id(picture) not in self._textures:
             height, width = picture.shape[:2]
-            texture = self._context.texture((width, height), 4, np.ascontiguousarray(picture).tobytes())
+            texture = self.context.texture((width, height), 4, np.ascontiguousarray(picture).tobytes())
             texture.build_mipmaps()
-            texture.filter = (self._context.LINEAR_MIPMAP_NEAREST, self._context.LINEAR)
+            texture.filter = (self.context.LINEAR_MIPMAP_NEAREST, self.context.LINEAR)
             self._textures[id(picture)] = texture
         return self._textures[id(picture)]
 
-    def _describe(self, program: Any, item: _Uploaded, stack_from_part: F64, view: View) -> None:
-        linear = stack_from_part[:3, :3]
-        if view.display_from_view is not None:
-            linear = view.display_from_view @ linear
-        if "stack_from_part" in program:
-            program["stack_from_part"].write(_gl(np.linalg.pinv(linear).T * np.cbrt(abs(np.linalg.det(linear)))))
-        program["colour"] = item.part.colour
-        if item.texture is not None:
-            item.texture.use(0)
-
-    def _draw_outlines(self, placed: list[tuple[_Uploaded, F64]], clip_from_stack: F64, view: View) -> None:
-        context, framebuffer = self._context, self._context.fbo
+    def _draw_outlines(self, placed: list[tuple[DrawnPart, F64]], clip_from_stack: F64, view: View) -> None:
+        context, framebuffer = self.context, self.context.fbo
         context.enable_only(context.DEPTH_TEST | context.BLEND)
         context.blend_func = OVER
         framebuffer.depth_mask = False
-        for item, stack_from_part in reversed(placed):
-            if item.edges is None or not np.linalg.det(stack_from_part[:3, :3]):
+        for part, stack_from_part in reversed(placed):
+            if part.edges is None or not np.linalg.det(stack_from_part[:3, :3]):
                 continue  # nor where it was squashed: then it has no inside
             eye = np.linalg.solve(stack_from_part, np.append(view.eye_m, 1.0))[:3]
-            ends, apex = silhouette(item.edges, eye)
+            ends, apex = silhouette(part.edges, eye)
             clip_from_part = clip_from_stack @ stack_from_part
-            clip = item.positions @ clip_from_part[:, :3].T + clip_from_part[:, 3]
-            corners, vertices, _ = ramps(clip, ends, apex, width_px=view.width_px, height_px=view.height_px)
-            if not len(corners):
-                continue
-            packed = np.concatenate([corners.reshape(-1, 5), item.attributes[vertices.reshape(-1)]], axis=1)
-            item.outline_buffer.write(packed)
-            self._describe(item.outline_program, item, stack_from_part, view)
-            item.outline.render(vertices=len(packed))
+            clip = part.positions @ clip_from_part[:, :3].T + clip_from_part[:, 3]
+            corners, vertices = ramps(clip, ends, apex, width_px=view.width_px, height_px=view.height_px)
+            if len(corners):
+                _set_look(part.outline_program, part, stack_from_part, view)
+                part.draw_outline(corners, vertices)
         framebuffer.depth_mask = True
 
 
-def _attributes(part: Part) -> F32:
-    """(v, 8): normal, texture coordinates, colour."""
-    mesh = part.shape
-    colours = np.ones_like(mesh.positions_m) if part.vertex_colours is None else part.vertex_colours
-    return np.concatenate([mesh.normals, mesh.uv, colours], axis=1, dtype=np.float32)
+def _set_look(program: Any, part: DrawnPart, stack_from_part: F64, view: View) -> None:
+    linear = stack_from_part[:3, :3]
+    if view.display_from_view is not None:
+        linear = view.display_from_view @ linear
+    if "stack_from_part" in program:
+        program["stack_from_part"].write(_gl(np.linalg.pinv(linear).T * np.cbrt(abs(np.linalg.det(linear)))))
+    program["colour"] = part.part.colour
+    if part.texture is not None:
+        part.texture.use(0)
 
 
 def _gl(matrix: F64) -> F32:

@@ -294,9 +294,9 @@ def _box(kind: str, **visual: Any) -> bytes:
 def _mesh(suffix: str) -> Callable[[bytes, Path], object]:
     def read(data: bytes, folder: Path) -> object:
         from runtime.content.mesh import load_mesh
-        from runtime.content.triangles import ready
+        from runtime.content.triangles import DrawnPart
 
-        return [ready(part) for part in load_mesh(_at(folder, f"a{suffix}", data), limits=LIMITS).parts]
+        return [DrawnPart(part) for part in load_mesh(_at(folder, f"a{suffix}", data), limits=LIMITS).parts]
 
     return read
 
