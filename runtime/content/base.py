@@ -119,3 +119,40 @@ class DrawingSource(ContentSource):
 
     def render(self, view: View, *, time_ns: int) -> U8:
         return self.draw(view, time_ns=time_ns).pixels()
+
+
+class ForwardingSource(ContentSource):
+    """A source that shows another one."""
+
+    source: ContentSource  # that is shown at present
+
+    @abstractmethod
+    def asked(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
+        """Which one is asked, with which view, for which time."""
+
+    @property
+    def problem(self) -> str:
+        return self.source.problem
+
+    @property
+    def draws_in(self) -> object:  # type: ignore[override]
+        return self.source.draws_in
+
+    def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
+        source, view, time_ns = self.asked(view, time_ns)
+        return source.draw(view, time_ns=time_ns)
+
+    def render(self, view: View, *, time_ns: int) -> U8:
+        source, view, time_ns = self.asked(view, time_ns)
+        return source.render(view, time_ns=time_ns)
+
+    def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
+        source, view, time_ns = self.asked(view, time_ns)
+        return source.extent(view, time_ns=time_ns)
+
+    def is_empty(self, view: View, *, time_ns: int) -> bool:
+        source, view, time_ns = self.asked(view, time_ns)
+        return source.is_empty(view, time_ns=time_ns)
+
+    def close(self) -> None:
+        self.source.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -80,10 +81,9 @@ def read_folder(folder: Path, preset: Preset) -> tuple[Pair, ...]:
     for number, halves in sorted(found.items()):
         names = ("left", "right") if "left" in halves or "right" in halves else ("0", "1")
         path = next(iter(halves.values()))[0]
-        if missing := [name for name in names if name not in halves]:
-            raise InputError(path, f"pair{number}", f"has no _{missing[0]} beside it")
-        if surplus := [name for name in halves if name not in names]:
-            raise InputError(path, f"pair{number}", f"has _{surplus[0]} beside _left and _right")
+        if sorted(halves) != [*names]:
+            there = " and ".join(f"_{half}" for half in halves)
+            raise InputError(path, f"pair{number}", f"has {there}; _{names[0]} and _{names[1]} are needed")
         (first, first_eye), (second, second_eye) = (halves[name] for name in names)
         if first_eye[1] == second_eye[1]:
             raise InputError(first, f"pair{number}", "both eyes are at the same y: left can't be told from right")
@@ -143,33 +143,25 @@ class EyeRealSource(ContentSource):
     def __init__(
         self, pairs: tuple[Pair, ...], *, fov_deg: float, background: tuple[float, float, float], name: str
     ) -> None:
-        self._pairs = pairs
+        self._pairs, self._fov_deg, self._background = pairs, fov_deg, background
         self._eyes_m = np.stack([pair.eyes_m for pair in pairs])
-        self._fov_deg = fov_deg
-        self._background = background
-        self._loaded: dict[int, tuple[tuple[WarpedPicture, F64], tuple[WarpedPicture, F64]]] = {}
+        self._loaded = lru_cache(KEPT)(self._load)
         self._chosen = 0
-        self._load(0)
+        self._loaded(0)
         self.info = ContentInfo(name=name, background=background)
 
     def render(self, view: View, *, time_ns: int) -> U8:
         if view.side == 0:  # the right eye gets the same pair
             self._chosen = int(np.linalg.norm(self._eyes_m[:, 0] - view.eye_m, axis=1).argmin())
         try:
-            picture, projection = self._load(self._chosen)[view.side]
+            picture, projection = self._loaded(self._chosen)[view.side]
         except InputError as error:
             raise ContentFailure(str(error)) from None
         matrix = image_from_view(projection, view.pixels_from_stack, x_m=0.0)
         return picture.warped(matrix, width_px=view.width_px, height_px=view.height_px, side=view.side)
 
-    def _load(self, index: int) -> tuple[tuple[WarpedPicture, F64], tuple[WarpedPicture, F64]]:
-        if index not in self._loaded:
-            pair = self._pairs[index]
-            left, right = self._opened(pair, 0), self._opened(pair, 1)
-            while len(self._loaded) >= KEPT:
-                self._loaded.pop(next(iter(self._loaded)))
-            self._loaded[index] = (left, right)
-        return self._loaded[index]
+    def _load(self, index: int) -> list[tuple[WarpedPicture, F64]]:
+        return [self._opened(self._pairs[index], side) for side in (0, 1)]
 
     def _opened(self, pair: Pair, side: int) -> tuple[WarpedPicture, F64]:
         rgb = read_image(pair.paths[side])

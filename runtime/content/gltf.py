@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import io
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -100,10 +101,9 @@ class _Reader:
         """binary: a GLB's own buffer."""
         self._path, self._table, self._binary, self._limits = path, table, binary, limits
         self._elements = 0  # that were read of all accessors
-        self._buffers: dict[int, bytes] = {}
-        self._meshes: dict[int, list[tuple[Part, Binding]]] = {}
-        self._looks: dict[int, _Look] = {}
-        self._pictures: dict[tuple[int, float], U8] = {}
+        # What several things refer to is read once.
+        self._buffer, self._mesh = cache(self._buffer_of), cache(self._mesh_of)
+        self._look, self._picture = cache(self._look_of), cache(self._picture_of)
 
     def scene(self, animation: str) -> tuple[list[Part], Rig]:
         for name in self._table.get("extensionsRequired", []):
@@ -124,7 +124,7 @@ class _Reader:
             progress.tell(f"{self._path.name}: parts", count, len(standing))
             table = tables[number]
             skin = skins[_index(table["skin"])] if "skin" in table else None
-            for part, binding in self._mesh(_index(table["mesh"])):
+            for part, binding in self._mesh(table["mesh"]):
                 triangles += len(part.shape.triangles)
                 self._within(triangles, self._limits.triangles, "meshes")
                 placed.append((part, _bound(binding, number, table.get("weights"), skin)))
@@ -154,20 +154,21 @@ class _Reader:
         head, mark, coded = uri.partition("base64,")
         return base64.b64decode(coded) if mark else unquote(head).encode()
 
+    def _buffer_of(self, index: int) -> bytes:
+        item = self._at("buffers", index)
+        data = self._bytes_of(item, f"buffers[{index}].uri")
+        data = self._binary if data is None else data
+        if len(data) < item["byteLength"]:
+            problem = f"its {len(data)} bytes are fewer than the {item['byteLength']} promised"
+            raise InputError(self._path, f"buffers[{index}]", problem)
+        return data
+
     def _view(self, index: Any) -> tuple[bytes, int]:
         """What a buffer view holds, and its stride (0: none)."""
         view = self._at("bufferViews", index)
-        number = _index(view["buffer"])
-        if number not in self._buffers:
-            item = self._at("buffers", number)
-            data = self._bytes_of(item, f"buffers[{number}].uri")
-            data = self._binary if data is None else data
-            if len(data) < item["byteLength"]:
-                problem = f"its {len(data)} bytes are fewer than the {item['byteLength']} promised"
-                raise InputError(self._path, f"buffers[{number}]", problem)
-            self._buffers[number] = data
         start = _index(view.get("byteOffset", 0))
-        return self._buffers[number][start : start + _index(view["byteLength"])], _index(view.get("byteStride", 0))
+        data = self._buffer(view["buffer"])[start : start + _index(view["byteLength"])]
+        return data, _index(view.get("byteStride", 0))
 
     def _accessor(self, index: Any, *kinds: str) -> Numbers:
         """(count, width) numbers; integers that stand for fractions as such."""
@@ -231,13 +232,11 @@ class _Reader:
 
     # Meshes.
 
-    def _mesh(self, index: int) -> list[tuple[Part, Binding]]:
+    def _mesh_of(self, index: Any) -> list[tuple[Part, Binding]]:
         """The parts of a mesh, which all its instances share."""
-        if index not in self._meshes:
-            mesh = self._at("meshes", index)
-            made = [self._primitive(primitive, mesh.get("weights")) for primitive in mesh["primitives"]]
-            self._meshes[index] = [item for item in made if item is not None]
-        return self._meshes[index]
+        mesh = self._at("meshes", index)
+        made = [self._primitive(primitive, mesh.get("weights")) for primitive in mesh["primitives"]]
+        return [item for item in made if item is not None]
 
     def _primitive(self, primitive: Table, weights: ArrayLike | None) -> tuple[Part, Binding] | None:
         attributes, mode = primitive["attributes"], primitive.get("mode", TRIANGLES)
@@ -300,14 +299,8 @@ class _Reader:
 
     # Materials.
 
-    def _look(self, index: Any) -> _Look:
-        if index is None:
-            return _Look()
-        if index not in self._looks:
-            self._looks[index] = self._look_of(self._at("materials", index))
-        return self._looks[index]
-
-    def _look_of(self, material: Table) -> _Look:
+    def _look_of(self, index: Any) -> _Look:
+        material = {} if index is None else self._at("materials", index)
         extensions = material.get("extensions", {})
         shading = material.get("pbrMetallicRoughness", {})
         use, factor = shading.get("baseColorTexture"), shading.get("baseColorFactor")
@@ -328,22 +321,19 @@ class _Reader:
         moved = None if change is None else _uv_change(change)
         return replace(look, picture=picture, uv_set=_index(use.get("texCoord", 0)), uv_from_uv=moved)
 
-    def _picture(self, index: int, cutoff: float) -> U8:
+    def _picture_of(self, index: Any, cutoff: float) -> U8:
         """RGBA whose alpha is cut at a half, wherever the material cuts it; 0: nowhere."""
         from PIL import Image
 
-        if (index, cutoff) not in self._pictures:
-            item = self._at("images", index)
-            coded = self._bytes_of(item, "texture")
-            if coded is None:
-                coded = self._view(item["bufferView"])[0]
-            name = f"images[{index}]"
-            check_picture(coded, source=self._path, field="texture", name=name, limits=self._limits)
-            with Image.open(io.BytesIO(coded)) as image:
-                rgba = texture_of(image)
-            rgba[..., 3] = np.clip(rgba[..., 3] * (0.5 / max(cutoff, 1e-3)), 0, 255) if cutoff else 255
-            self._pictures[index, cutoff] = rgba
-        return self._pictures[index, cutoff]
+        item = self._at("images", index)
+        coded = self._bytes_of(item, "texture")
+        if coded is None:
+            coded = self._view(item["bufferView"])[0]
+        check_picture(coded, source=self._path, field="texture", name=f"images[{index}]", limits=self._limits)
+        with Image.open(io.BytesIO(coded)) as image:
+            rgba = texture_of(image)
+        rgba[..., 3] = np.clip(rgba[..., 3] * (0.5 / max(cutoff, 1e-3)), 0, 255) if cutoff else 255
+        return rgba
 
     # What moves.
 

@@ -25,14 +25,23 @@ def plane_metres(x_m: float) -> PlaneRaster:
     return PlaneRaster(x_m=x_m, left_m=0.0, top_m=0.0, pitch_u_m=1.0, pitch_v_m=1.0, width_px=1, height_px=1)
 
 
-def image_from_view(image_from_stack: F64, pixels_from_stack: F64, *, x_m: float) -> F64:
-    """3x3 picture pixels from a view's pixels by way of the plane x = x_m.
+def image_from_view(image_from_stack: F64, pixels_from_stack: F64, *, x_m: float) -> F64 | None:
+    """3x3 picture pixels from a view's pixels by way of the plane x = x_m; None where the view's eye lies in it.
 
     Where picture and view are of the same eye, every plane gives the same matrix; otherwise the plane is where
-    the picture hangs. Raises ValueError where the view's eye lies in that plane.
+    the picture hangs.
     """
     plane = plane_metres(x_m)
-    return image_from_raster(image_from_stack, plane) @ panel_from_image(pixels_from_stack, plane)
+    plane_from_view = plane_from_pixels(pixels_from_stack, plane)
+    return None if plane_from_view is None else image_from_raster(image_from_stack, plane) @ plane_from_view
+
+
+def plane_from_pixels(pixels_from_stack: F64, plane: PlaneRaster) -> F64 | None:
+    """3x3 a plane's pixels from a view's; None for an eye in the plane: it sees the picture edge-on."""
+    try:
+        return panel_from_image(pixels_from_stack, plane)
+    except ValueError:
+        return None
 
 
 def reduction(picture_from_view: F64, *, width_px: int, height_px: int) -> int:
@@ -53,17 +62,19 @@ class WarpedPicture:
         self._border = (*(round(value * 255) for value in background), 0)
         self._out: dict[tuple[int, int, int], U8] = {}
 
-    def warped(self, picture_from_view: F64, *, width_px: int, height_px: int, side: int) -> U8:
-        """(h, w, 4): the picture at each of the view's pixels; the background with alpha 0 beside it.
+    def warped(self, picture_from_view: F64 | None, *, width_px: int, height_px: int, side: int) -> U8:
+        """(h, w, 4): the picture at each of the view's pixels; the background with alpha 0 beside it, or alone (None).
 
         The array is kept and written again by the next call of the same size and side.
         """
-        level = reduction(picture_from_view, width_px=width_px, height_px=height_px)
-        picture, shrink = self._level(level)
         key = (width_px, height_px, side)
         if key not in self._out:
             self._out[key] = np.empty((height_px, width_px, 4), np.uint8)
         out = self._out[key]
+        if picture_from_view is None:
+            out[:] = self._border
+            return out
+        picture, shrink = self._level(reduction(picture_from_view, width_px=width_px, height_px=height_px))
         matrix = _MINUS_HALF @ np.diag([*shrink, 1.0]) @ picture_from_view @ _HALF
         cv2.warpPerspective(
             picture,

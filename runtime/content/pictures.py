@@ -16,10 +16,9 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings, LimitSettings
 from runtime.content.base import ContentInfo, ContentSource, View
-from runtime.content.images import WarpedPicture, rgba_from_rgb
+from runtime.content.images import WarpedPicture, plane_from_pixels, rgba_from_rgb
 from runtime.content.placing import SceneFile
 from runtime.errors import ContentFailure, InputError
-from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import U8
 from runtime.support import foreign, progress
@@ -133,48 +132,32 @@ class Frames(ABC):
         """Release files."""
 
 
-class Picture(Frames):
-    """One picture for ever."""
-
-    count, rate_hz = 1, 1.0
-
-    def __init__(self, rgb: U8) -> None:
-        self._rgb = rgb
-
-    def frame(self, index: int) -> U8:
-        return self._rgb
-
-
-class PictureFolder(Frames):
-    """The pictures of a folder in the order of their names, turned as their EXIF says."""
+class PictureFiles(Frames):
+    """One picture for ever, or those of a folder in the order of their names; turned as their EXIF says."""
 
     def __init__(self, paths: Sequence[Path], *, rate_hz: float, limits: LimitSettings) -> None:
-        self._paths = list(paths)
-        size_of_file(self._paths[0], limits=limits)  # before it is unpacked
-        self._shape = read_image(self._paths[0]).shape
-        for number, path in enumerate(self._paths[1:], start=1):
+        size_of_file(paths[0], limits=limits)  # before it is unpacked
+        self._paths, self._held = paths, (0, read_image(paths[0]))
+        self._size = self._held[1].shape[1::-1]
+        for number, path in enumerate(paths[1:], start=1):
             if number % TELL_EVERY == 0:
-                progress.tell(f"{path.parent.name}: pictures", number, len(self._paths))
-            _refuse_other_size(path, self._shape, limits)
-        self.count, self.rate_hz = len(self._paths), rate_hz
+                progress.tell(f"{path.parent.name}: pictures", number, len(paths))
+            size = size_of_file(path, limits=limits)  # by its header alone: a long sequence opens quickly
+            if size != self._size:
+                problem = "{} x {} pixels; the folder's first picture has {} x {}".format(*size, *self._size)
+                raise InputError(path, "size", problem)
+        self.count, self.rate_hz = len(paths), rate_hz
 
     def frame(self, index: int) -> U8:
-        try:
-            picture = read_image(self._paths[index])
-        except InputError as error:
-            raise ContentFailure(str(error)) from None
-        if picture.shape != self._shape:
+        if index != self._held[0]:
+            try:
+                self._held = index, read_image(self._paths[index])
+            except InputError as error:
+                raise ContentFailure(str(error)) from None
+        picture = self._held[1]
+        if picture.shape[1::-1] != self._size:
             raise ContentFailure(f"{self._paths[index]}: its size differs from the first picture's")
         return picture
-
-
-def _refuse_other_size(path: Path, shape: tuple[int, ...], limits: LimitSettings) -> None:
-    """Reads the header alone: a long sequence opens quickly. Raises InputError."""
-    width, height = size_of_file(path, limits=limits)
-    if (height, width) != shape[:2]:
-        raise InputError(
-            path, "size", f"{width} x {height} pixels; the folder's first picture has {shape[1]} x {shape[0]}"
-        )
 
 
 def _opened(path: Path) -> cv2.VideoCapture:
@@ -237,65 +220,42 @@ class Video(Frames):
 def open_frames(path: Path, settings: ContentSettings, *, limits: LimitSettings | None = None) -> Frames:
     """A picture, a video, or a folder of pictures. Raises InputError."""
     limits = limits or LimitSettings()
+    if path.suffix.lower() in VIDEOS and not path.is_dir():
+        return Video(path, limits=limits)
+    paths = [path]
     if path.is_dir():
         paths = sorted(item for item in path.iterdir() if item.suffix.lower() in PICTURES)
-        if not paths:
-            raise InputError(path, "", "the folder holds no pictures")
-        return PictureFolder(paths, rate_hz=settings.picture_rate_hz, limits=limits)
-    if path.suffix.lower() in VIDEOS:
-        return Video(path, limits=limits)
-    size_of_file(path, limits=limits)
-    return Picture(read_image(path))
+    if not paths:
+        raise InputError(path, "", "the folder holds no pictures")
+    return PictureFiles(paths, rate_hz=settings.picture_rate_hz, limits=limits)
 
 
 def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
     """Open a picture, a video or a folder of pictures. Raises InputError."""
     layout = layout_of(file.path, file.settings)
-    frames = open_frames(file.path, file.settings, limits=file.limits)
-    source = ScreenPictures(frames, layout=layout, file=file)
+    source = PicturesSource(open_frames(file.path, file.settings, limits=file.limits), layout=layout, file=file)
     return lambda context: source
 
 
-class ScreenPictures(ContentSource):
-    """Views of pictures or videos that hang in the plane of the display's centre."""
+class ScreenSource(ContentSource):
+    """Views of pictures that hang in the plane of the display's centre."""
 
-    def __init__(self, frames: Frames, *, layout: Layout, file: SceneFile) -> None:
-        """Raises InputError where the picture is too small for its layout."""
-        self._frames, self._layout, self._file = frames, layout, file
+    def __init__(self, *, layout: Layout, file: SceneFile) -> None:
+        self._layout, self._file = layout, file
         self._at = -1  # number of the picture whose views these are
         self._views: list[U8] = []
         self._screen: PlaneRaster | None = None
         self._shown: dict[int, WarpedPicture] = {}
-        if not frames.count:
-            return  # none yet: a live one
-        first = frames.frame(0)
-        try:
-            self._take(0, first)
-        except ValueError as error:
-            raise InputError(file.path, "layout", str(error)) from None
-        moving, mono = frames.count > 1, layout.kind == "mono"
-        self.info = ContentInfo(
-            name=file.path.stem,
-            moving=moving,
-            grey=not moving and _is_grey(first),
-            depth_range_m=(0.0, 0.0) if mono else None,
-            background=file.background,
-            flat_x_m=0.0 if mono else None,
-        )
 
-    def picture_at(self, time_ns: int) -> tuple[int, U8]:
-        """The number of the picture that the run's clock calls for, and it. Raises ContentFailure."""
-        number = self.revision(time_ns=time_ns)
-        return number, self._frames.frame(number)
-
-    def revision(self, *, time_ns: int) -> int:
-        return int(time_ns * self._frames.rate_hz / NS_PER_S) % self._frames.count
+    @abstractmethod
+    def picture(self, number: int) -> U8:
+        """The one of a `revision`. Raises ContentFailure."""
 
     def render(self, view: View, *, time_ns: int) -> U8:
-        number, picture = self.picture_at(time_ns)
+        number = self.revision(time_ns=time_ns)
         if number != self._at:
             try:
-                self._take(number, picture)
+                self._take(number, self.picture(number))
             except ValueError as error:
                 raise ContentFailure(f"{self.info.name}: {error}") from None
         assert self._screen is not None
@@ -304,11 +264,8 @@ class ScreenPictures(ContentSource):
             shown = self._views[which]
             shown = rgba_from_rgb(shown) if shown.shape[2] == 3 else shown
             self._shown[which] = WarpedPicture(shown, background=self._file.background)
-        matrix = panel_from_image(view.pixels_from_stack, self._screen)
+        matrix = plane_from_pixels(view.pixels_from_stack, self._screen)
         return self._shown[which].warped(matrix, width_px=view.width_px, height_px=view.height_px, side=view.side)
-
-    def close(self) -> None:
-        self._frames.close()
 
     def _take(self, number: int, picture: U8) -> None:
         """Raises ValueError where it is too small."""
@@ -325,6 +282,38 @@ class ScreenPictures(ContentSource):
         angle = np.arctan2(view.eye_m[1], view.eye_m[0])
         place = (angle / np.radians(self._file.settings.cone_deg) + 0.5) * (len(self._views) - 1)
         return int(np.clip(np.rint(place), 0, len(self._views) - 1))
+
+
+class PicturesSource(ScreenSource):
+    """Pictures or videos."""
+
+    def __init__(self, frames: Frames, *, layout: Layout, file: SceneFile) -> None:
+        """Raises InputError where the picture is too small for its layout."""
+        super().__init__(layout=layout, file=file)
+        self._frames = frames
+        first = frames.frame(0)
+        try:
+            self._take(0, first)
+        except ValueError as error:
+            raise InputError(file.path, "layout", str(error)) from None
+        moving, mono = frames.count > 1, layout.kind == "mono"
+        self.info = ContentInfo(
+            name=file.path.stem,
+            moving=moving,
+            grey=not moving and _is_grey(first),
+            depth_range_m=(0.0, 0.0) if mono else None,
+            background=file.background,
+            flat_x_m=0.0 if mono else None,
+        )
+
+    def picture(self, number: int) -> U8:
+        return self._frames.frame(number)
+
+    def revision(self, *, time_ns: int) -> int:
+        return int(time_ns * self._frames.rate_hz / NS_PER_S) % self._frames.count
+
+    def close(self) -> None:
+        self._frames.close()
 
 
 def _is_grey(rgb: U8) -> bool:

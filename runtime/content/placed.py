@@ -13,14 +13,12 @@ import numpy as np
 
 from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings
-from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.base import ContentInfo, ContentSource, ForwardingSource, View
 from runtime.content.presets import rotation_matrix
 from runtime.errors import InputError
-from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
-from runtime.records import F64, U8
-from runtime.support.gl import DrawnPicture
+from runtime.records import F64
 
 FIELDS = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # of ContentSettings
 NS_PER_MIN = 60 * NS_PER_S
@@ -52,10 +50,8 @@ class Placing:
 
     def rotation(self, time_ns: int) -> F64:
         """3x3 stack_from_scene turn."""
-        fixed = rotation_matrix(self.rotation_deg, "xyz")
-        if not self.turntable_per_min:
-            return fixed
-        return rotation_matrix((0.0, 0.0, 360.0 * self.turns_at(time_ns)), "xyz") @ fixed
+        turntable = rotation_matrix((0.0, 0.0, 360.0 * self.turns_at(time_ns)), "xyz")
+        return turntable @ rotation_matrix(self.rotation_deg, "xyz")
 
     def stack_from_scene(self, time_ns: int) -> F64:
         """4x4 similarity."""
@@ -82,18 +78,17 @@ def placed_source(source: ContentSource, placing: Placing, stack: PanelStack, *,
 
     Raises InputError, naming the field, where nothing of it would be seen; the source is closed only if it is new.
     """
-    new = not isinstance(source, PlacedSource)
-    inner = source.source if isinstance(source, PlacedSource) else source
+    inner = source
     if isinstance(source, PlacedSource):
-        placing = placing.after(source.placing, time_ns)
+        inner, placing = source.source, placing.after(source.placing, time_ns)
     if placing.stands_as_it_is:
         return inner
     result = PlacedSource(inner, placing)
     if _nothing_is_seen(result, stack, time_ns):
-        name = inner.info.name
-        if new:
+        refusal = _refusal(inner.info.name, placing, stack)
+        if inner is source:
             inner.close()
-        raise _refusal(name, placing, stack)
+        raise refusal
     return result
 
 
@@ -120,80 +115,35 @@ def _refusal(name: str, placing: Placing, stack: PanelStack) -> InputError:
     )
 
 
-class PlacedSource(ContentSource):
+class PlacedSource(ForwardingSource):
     """A source at another place."""
 
     def __init__(self, source: ContentSource, placing: Placing) -> None:
         """source: closed with this one."""
         self.source, self.placing = source, placing
-        self._infos: tuple[ContentInfo, ContentInfo] | None = None  # of the source, and as placed
-        self._blank: dict[tuple[int, int], U8] = {}
 
     @property
     def info(self) -> ContentInfo:  # type: ignore[override]
         """The source's own, as far as it still holds here."""
-        inner = self.source.info
-        if self._infos is None or self._infos[0] is not inner:
-            self._infos = inner, _moved(inner, self.placing)
-        return self._infos[1]
+        return _moved(self.source.info, self.placing)
 
-    @property
-    def problem(self) -> str:
-        return self.source.problem
-
-    @property
-    def draws_in(self) -> object:  # type: ignore[override]
-        return self.source.draws_in
-
-    def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
-        try:
-            return self.source.draw(self._seen_from_scene(view, time_ns), time_ns=time_ns)
-        except ValueError:  # `render` has the background then
-            return None
-
-    def render(self, view: View, *, time_ns: int) -> U8:
-        try:
-            return self.source.render(self._seen_from_scene(view, time_ns), time_ns=time_ns)
-        except ValueError:  # of the optics: a flat picture was turned until its plane goes through the eye
-            return self._background(view)
-
-    def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
-        return self.source.extent(self._seen_from_scene(view, time_ns), time_ns=time_ns)
+    def asked(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
+        """The same pixels for the same eye, in the scene's frame."""
+        matrix = self.placing.stack_from_scene(time_ns)
+        turn = matrix[:3, :3] / self.placing.scale
+        eye = turn.T @ (view.eye_m - matrix[:3, 3]) / self.placing.scale
+        lit = turn if view.display_from_view is None else view.display_from_view @ turn
+        pixels_from_scene = view.pixels_from_stack @ matrix
+        return self.source, View(eye, view.side, pixels_from_scene, view.width_px, view.height_px, lit), time_ns
 
     def revision(self, *, time_ns: int) -> int:
-        inner = self.source.revision(time_ns=time_ns)
-        return time_ns if self.placing.turntable_per_min else inner
-
-    def is_empty(self, view: View, *, time_ns: int) -> bool:
-        try:
-            return self.source.is_empty(self._seen_from_scene(view, time_ns), time_ns=time_ns)
-        except ValueError:
-            return True
+        return time_ns if self.placing.turntable_per_min else self.source.revision(time_ns=time_ns)
 
     def describe(self, *, time_ns: int) -> dict[str, Any] | None:
         return self.source.describe(time_ns=time_ns)
 
     def skip(self, *, time_ns: int) -> bool:
         return self.source.skip(time_ns=time_ns)
-
-    def close(self) -> None:
-        self.source.close()
-
-    def _seen_from_scene(self, view: View, time_ns: int) -> View:
-        """The same pixels for the same eye, in the scene's frame."""
-        matrix = self.placing.stack_from_scene(time_ns)
-        turn = matrix[:3, :3] / self.placing.scale
-        eye = turn.T @ (view.eye_m - matrix[:3, 3]) / self.placing.scale
-        lit = turn if view.display_from_view is None else view.display_from_view @ turn
-        return View(eye, view.side, view.pixels_from_stack @ matrix, view.width_px, view.height_px, lit)
-
-    def _background(self, view: View) -> U8:
-        size = (view.height_px, view.width_px)
-        if size not in self._blank:
-            colour = self.info.background or (1.0, 1.0, 1.0)
-            pixel = [*(round(255 * value) for value in colour), 0]
-            self._blank = {size: np.tile(np.array(pixel, np.uint8), (*size, 1))}
-        return self._blank[size]
 
 
 def _moved(info: ContentInfo, placing: Placing) -> ContentInfo:

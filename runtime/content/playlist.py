@@ -15,12 +15,9 @@ from pydantic import Field, field_validator
 
 from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings, Section, located, read_table, validated
-from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.base import ContentInfo, ContentSource, ForwardingSource, View
 from runtime.content.placed import FIELDS
 from runtime.errors import InputError
-from runtime.optics.rect import PixelRect
-from runtime.records import U8
-from runtime.support.gl import DrawnPicture
 from runtime.support.plausible import within
 
 ENTRIES_MAX = 64
@@ -77,16 +74,10 @@ def read_playlist(path: Path, settings: ContentSettings) -> Playlist:
     return Playlist(path, file.repeat, tuple(entries))
 
 
-class PlaylistSource(ContentSource):
+class PlaylistSource(ForwardingSource):
     """The scenes of a list, one after another, from the first time that it is asked for."""
 
-    def __init__(
-        self,
-        playlist: Playlist,
-        openers: list[Callable[[Any], ContentSource]],
-        *,
-        context: Any,
-    ) -> None:
+    def __init__(self, playlist: Playlist, openers: list[Callable[[Any], ContentSource]], *, context: Any) -> None:
         """Raises InputError where one of them can't be shown."""
         self._list = playlist
         self._ends_ns = list(accumulate(round(entry.seconds * NS_PER_S) for entry in playlist.entries))
@@ -106,17 +97,13 @@ class PlaylistSource(ContentSource):
     @property
     def info(self) -> ContentInfo:  # type: ignore[override]
         """Of the one at present, by the list's name."""
-        index, inner = self._number % len(self._sources), self._shown.info
+        index, inner = self._number % len(self._sources), self.source.info
         name = f"{self._list.path.stem}: {inner.name} ({index + 1} of {len(self._sources)})"
         return replace(inner, name=name, moving=True)
 
     @property
-    def _shown(self) -> ContentSource:
+    def source(self) -> ContentSource:  # type: ignore[override]
         return self._sources[self._number % len(self._sources)]
-
-    @property
-    def problem(self) -> str:
-        return self._shown.problem
 
     def describe(self, *, time_ns: int) -> dict[str, Any]:
         """For the status: the scenes and their seconds, which one is shown, and for how long still."""
@@ -134,25 +121,13 @@ class PlaylistSource(ContentSource):
         self._begin_ns = time_ns - rounds * self._ends_ns[-1] - self._ends_ns[within]
         return True
 
-    @property
-    def draws_in(self) -> object:  # type: ignore[override]
-        return self._shown.draws_in
-
-    def draw(self, view: View, *, time_ns: int) -> DrawnPicture | None:
-        source, since_ns = self._source(time_ns)
-        return source.draw(view, time_ns=since_ns)
-
-    def render(self, view: View, *, time_ns: int) -> U8:
-        source, since_ns = self._source(time_ns)
-        return source.render(view, time_ns=since_ns)
-
-    def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
-        source, since_ns = self._source(time_ns)
-        return source.extent(view, time_ns=since_ns)
+    def asked(self, view: View, time_ns: int) -> tuple[ContentSource, View, int]:
+        since_ns = self._turn_to(time_ns)
+        return self.source, view, since_ns
 
     def revision(self, *, time_ns: int) -> int:
-        source, since_ns = self._source(time_ns)
-        return (self._number << 64) + source.revision(time_ns=since_ns)
+        since_ns = self._turn_to(time_ns)
+        return (self._number << 64) + self.source.revision(time_ns=since_ns)
 
     def is_empty(self, view: View, *, time_ns: int) -> bool:
         return all(source.is_empty(view, time_ns=0) for source in self._sources)
@@ -161,12 +136,12 @@ class PlaylistSource(ContentSource):
         for source in self._sources:
             source.close()
 
-    def _source(self, time_ns: int) -> tuple[ContentSource, int]:
-        """The one at a time, and the time since it began."""
+    def _turn_to(self, time_ns: int) -> int:
+        """Show the one whose time it is; answers how long it has been shown."""
         if self._begin_ns is None:
             self._begin_ns = time_ns
         self._number, since_ns = self._at(time_ns)
-        return self._shown, since_ns
+        return since_ns
 
     def _at(self, time_ns: int) -> tuple[int, int]:
         """Which entry, counted over all rounds, and for how long."""

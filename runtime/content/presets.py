@@ -70,8 +70,6 @@ class Preset:
     """One scene in one reading."""
 
     name: str
-    reading: Reading
-    scale_per_m: float  # digital units per metre: 100 r_p2d
     gap_m: float  # between neighbouring panels
     width_m: float | None  # of the panels; None: the reading says nothing
     scene_from_stack: F64  # 4x4 similarity: digital coordinates of a point in metres of the stack frame
@@ -126,14 +124,7 @@ def preset(name: str, reading: Reading = "seed") -> Preset:
         shift = np.array(published.shift if reading == "published-code" or published.shift[0] else (0.0, 0.0, 0.0))
         scene_from_stack[:3, 3] = shift + axes[:, 0] * published.middle
         gap_m, width_m = published.thickness_cm * CM, published.width_cm * CM
-    return Preset(
-        name=name,
-        reading=reading,
-        scale_per_m=scale_per_m,
-        gap_m=gap_m,
-        width_m=width_m,
-        scene_from_stack=scene_from_stack,
-    )
+    return Preset(name, gap_m, width_m, scene_from_stack)
 
 
 def rotation_matrix(angles_deg: Triple, order: str) -> F64:

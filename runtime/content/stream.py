@@ -22,7 +22,7 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings, LimitSettings
 from runtime.content.base import ContentInfo, ContentSource
-from runtime.content.pictures import CONTAINERS, Frames, Layout, ScreenPictures, layout_of
+from runtime.content.pictures import CONTAINERS, Layout, ScreenSource, layout_of
 from runtime.content.placing import SceneFile
 from runtime.errors import ContentFailure, InputError, MissingPart, one_line
 from runtime.optics.stack import PanelStack
@@ -79,27 +79,8 @@ class Target:
         return usual | given
 
 
-class _Shared:
-    """What the decoding thread and the source share; the newest wins."""
-
-    def __init__(self) -> None:
-        self.ending = threading.Event()
-        self.first = threading.Event()
-        self.newest: tuple[int, U8] | None = None  # number, (h, w, 4) RGBA
-        self.arrived_ns = time.monotonic_ns()
-        self.problem = "waiting for its first picture"
-
-    def put(self, picture: U8) -> None:
-        self.newest = (1 if self.newest is None else self.newest[0] + 1, picture)
-        self.arrived_ns = time.monotonic_ns()
-        self.problem = ""
-        self.first.set()
-
-
-class Feed(Frames):
+class Feed:
     """A source that is being read, from when this is made until it is closed or forgotten."""
-
-    count, rate_hz = 0, 1.0
 
     def __init__(self, target: Target, settings: ContentSettings, limits: LimitSettings) -> None:
         """Raises MissingPart without PyAV."""
@@ -108,53 +89,50 @@ class Feed(Frames):
         except ImportError:
             raise MissingPart("live pictures need PyAV: pip install av") from None
         av.logging.set_level(av.logging.PANIC)
-        self.target, self.shared = target, _Shared()
-        reader = _Reader(target, settings, limits, self.shared)
-        threading.Thread(target=reader.run, name="stream", daemon=True).start()
+        self.reader = Reader(target, settings, limits)
+        threading.Thread(target=self.reader.run, name="stream", daemon=True).start()
         # A scene that was skipped while it was loaded is dropped, and its thread ends with it.
-        self._end = weakref.finalize(self, self.shared.ending.set)
-
-    def frame(self, index: int) -> U8:
-        """The newest, whichever is asked for."""
-        if self.shared.newest is None:
-            raise ContentFailure(f"{self.target.shown}: {self.shared.problem or 'waiting for its first picture'}")
-        return self.shared.newest[1]
-
-    def close(self) -> None:
-        self._end()
+        self.close = weakref.finalize(self, self.reader.ending.set)
 
 
-class _Reader:
-    """The decoding thread. Holds no Feed: who forgets that ends this."""
+class Reader:
+    """The decoding thread, and the newest picture that it has. Holds no Feed: who forgets that ends this."""
 
-    def __init__(self, target: Target, settings: ContentSettings, limits: LimitSettings, shared: _Shared) -> None:
-        self._target, self._limits, self._shared = target, limits, shared
+    def __init__(self, target: Target, settings: ContentSettings, limits: LimitSettings) -> None:
+        self.shown = target.shown
+        self.ending, self.first = threading.Event(), threading.Event()
+        self.newest: tuple[int, U8] | None = None  # number, (h, w, 4) RGBA
+        self.arrived_ns = time.monotonic_ns()
+        self.problem = "waiting for its first picture"
+        self._target, self._limits = target, limits
         self._options = dict(settings.stream_options)
         self._size: tuple[int, int] | None = None
         self._reported = ""
 
     def run(self) -> None:
         wait_s = AGAIN_S
-        while not self._shared.ending.is_set():
-            before = self._shared.newest
+        while not self.ending.is_set():
+            before = self.newest
             problem = self._played()
-            if self._shared.ending.is_set():
+            if self.ending.is_set():
                 return
-            came = self._shared.newest is not before
+            came = self.newest is not before
             if self._target.is_file and came and not problem:
                 continue
             wait_s = AGAIN_S if came else min(2 * wait_s, AGAIN_MAX_S)
             self._report(problem or "it has ended")
-            self._shared.ending.wait(wait_s)
+            self.ending.wait(wait_s)
 
     def _played(self) -> str:
         """Read it to its end; why it ended, empty for its own end."""
         import av
 
         try:
-            for picture in self._pictures():
-                self._shared.put(picture)
-                self._reported = ""
+            for picture in self.pictures():
+                self.newest = (1 if self.newest is None else self.newest[0] + 1, picture)
+                self.arrived_ns = time.monotonic_ns()
+                self.problem = self._reported = ""
+                self.first.set()
         except InputError as error:
             return error.problem
         except av.error.ExitError:  # a time limit has passed
@@ -162,11 +140,11 @@ class _Reader:
         except (OSError, ValueError, av.error.FFmpegError) as error:
             return one_line(getattr(error, "strerror", None) or type(error).__name__, most=120)
         except Exception as error:  # a decoder's own: the loop goes on
-            log.exception("%s: unexpected error", self._target.shown)
+            log.exception("%s: unexpected error", self.shown)
             return type(error).__name__
         return ""
 
-    def _pictures(self) -> Iterator[U8]:
+    def pictures(self) -> Iterator[U8]:
         """Every picture of a file when it is due; of all else the newest."""
         import av
         from av.video.reformatter import VideoReformatter
@@ -175,7 +153,7 @@ class _Reader:
         options = self._target.options(self._options)
         with closing(av.open(self._target.url, format=kind, options=options, timeout=(OPEN_S, READ_S))) as container:
             if not container.streams.video or container.streams.video[0].codec_context is None:
-                raise InputError(self._target.shown, "", "holds no pictures that can be decoded")
+                raise InputError(self.shown, "", "holds no pictures that can be decoded")
             stream = container.streams.video[0]
             self._check_size(stream.codec_context.width, stream.codec_context.height)
             # One for all pictures: made anew, with threads of its own, for each, it took longer than all the rest.
@@ -193,7 +171,7 @@ class _Reader:
             due_s += _step_s(before_s, frame.time)
             before_s = frame.time
             due_s = max(due_s, time.monotonic() - LONGEST_STEP_S)  # a machine that slept does not race
-            if self._shared.ending.wait(max(0.0, due_s - time.monotonic())):
+            if self.ending.wait(max(0.0, due_s - time.monotonic())):
                 return
             yield frame
 
@@ -201,7 +179,7 @@ class _Reader:
         """The newest frame of a stream, whenever there is one."""
         with closing(_Packets(container, stream)) as arrived:
             for packets, broken in arrived.batches():
-                if self._shared.ending.is_set():
+                if self.ending.is_set():
                     return
                 if broken:
                     stream.codec_context.flush_buffers()
@@ -215,19 +193,19 @@ class _Reader:
 
     def _check_size(self, width_px: int, height_px: int) -> None:
         """Raises InputError for too many pixels; reports a change."""
-        check_size(width_px, height_px, source=self._target.shown, limits=self._limits)
+        check_size(width_px, height_px, source=self.shown, limits=self._limits)
         if self._size not in (None, (width_px, height_px)) and width_px:
             now = f"{width_px} x {height_px}"
-            log.warning("%s: its pictures changed from %d x %d to %s pixels", self._target.shown, *self._size, now)
+            log.warning("%s: its pictures changed from %d x %d to %s pixels", self.shown, *self._size, now)
         if width_px:
             self._size = (width_px, height_px)
 
     def _report(self, problem: str) -> None:
-        self._shared.problem = f"{problem}; it is tried again"
+        self.problem = f"{problem}; it is tried again"
         if problem != self._reported:
             self._reported = problem
-            stays = "; the last picture stays" if self._shared.newest is not None else ""
-            log.warning("%s: %s%s", self._target.shown, problem, stays)
+            stays = "; the last picture stays" if self.newest is not None else ""
+            log.warning("%s: %s%s", self.shown, problem, stays)
 
 
 class _Packets:
@@ -302,52 +280,52 @@ def prepare(
     if layout.kind == "rgbd":
         raise InputError("content", "layout", "rgbd is not for live pictures")
     feed = Feed(target, settings, limits)
-    feed.shared.first.wait(FIRST_PICTURE_S)
+    feed.reader.first.wait(FIRST_PICTURE_S)
     file = SceneFile(target.path, settings, stack, limits)
     return lambda context: LiveSource(feed, layout=layout, file=file)
 
 
-class LiveSource(ScreenPictures):
+class LiveSource(ScreenSource):
     """The newest picture of a feed."""
 
-    _frames: Feed
-
     def __init__(self, feed: Feed, *, layout: Layout, file: SceneFile) -> None:
-        super().__init__(feed, layout=layout, file=file)
-        self._number = 0  # of the picture that is shown
+        super().__init__(layout=layout, file=file)
+        self._feed, self._reader = feed, feed.reader
+        self._number, self._newest = 0, np.empty((0, 0, 4), np.uint8)  # that is shown
         self._looked_ns: int | None = None
         self._stalled = False
-        self.info = ContentInfo(name=feed.target.shown, moving=True, background=file.background)
+        self.info = ContentInfo(name=feed.reader.shown, moving=True, background=file.background)
 
     @property
     def problem(self) -> str:
-        shared, shown = self._frames.shared, self._frames.target.shown
-        if shared.problem:
-            return f"{shown}: {shared.problem}"
+        if self._reader.problem:
+            return f"{self._reader.shown}: {self._reader.problem}"
         silent_s = self._silent_s()
-        return f"{shown}: no new picture for {silent_s:.0f} s" if silent_s > STALLED_S else ""
+        return f"{self._reader.shown}: no new picture for {silent_s:.0f} s" if silent_s > STALLED_S else ""
 
     def revision(self, *, time_ns: int) -> int:
-        self._look(time_ns)
-        return self._number
-
-    def picture_at(self, time_ns: int) -> tuple[int, U8]:
         # Both eyes of one frame see one picture: two would be depth that isn't there.
         if time_ns != self._looked_ns:
-            self._look(time_ns)
-        return self._number, self._picture if self._number else self._frames.frame(0)
+            self._looked_ns = time_ns
+            self._look()
+        return self._number
 
-    def _look(self, time_ns: int) -> None:
-        self._looked_ns = time_ns
-        if self._frames.shared.newest is not None:
-            self._number, self._picture = self._frames.shared.newest
+    def picture(self, number: int) -> U8:
+        if not number:
+            raise ContentFailure(f"{self._reader.shown}: {self._reader.problem}")
+        return self._newest
+
+    def close(self) -> None:
+        self._feed.close()
+
+    def _look(self) -> None:
+        if self._reader.newest is not None:
+            self._number, self._newest = self._reader.newest
         silent_s = self._silent_s()
         if (silent_s > STALLED_S) != self._stalled and self._number:  # once when it begins, once when it is over
             self._stalled = not self._stalled
-            what = (
-                f"no new picture for {silent_s:.0f} s; the last one stays" if self._stalled else "pictures come again"
-            )
-            log.warning("%s: %s", self._frames.target.shown, what)
+            stays = f"no new picture for {silent_s:.0f} s; the last one stays"
+            log.warning("%s: %s", self._reader.shown, stays if self._stalled else "pictures come again")
 
     def _silent_s(self) -> float:
-        return (time.monotonic_ns() - self._frames.shared.arrived_ns) / NS_PER_S
+        return (time.monotonic_ns() - self._reader.arrived_ns) / NS_PER_S

@@ -377,15 +377,14 @@ def _stream(data: bytes, folder: Path) -> object:
     """Decoded as a live film is, without its thread and its times."""
     import av
 
+    from runtime.content.stream import Reader
     from runtime.content.stream import Target as Live
-    from runtime.content.stream import _Reader, _Shared
 
-    shared = _Shared()
-    shared.ending = _Hurried()
-    live = Live(f"live:{_at(folder, 'a.mp4', data)}")
+    reader = Reader(Live(f"live:{_at(folder, 'a.mp4', data)}"), ContentSettings(), LIMITS)
+    reader.ending = _Hurried()
     av.logging.set_level(av.logging.PANIC)
     try:
-        return sum(1 for _ in islice(_Reader(live, ContentSettings(), LIMITS, shared)._pictures(), 5))
+        return sum(1 for _ in islice(reader.pictures(), 5))
     except (OSError, ValueError, av.error.FFmpegError) as error:  # which its loop tells and tries again
         raise PhasestackError(str(error)[:100].replace("\n", " ")) from None
 
