@@ -7,17 +7,16 @@ the parallax that a late picture lacks does not.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from runtime.optics.light import RAYS, squared_error
+from runtime.optics.light import RAYS, panels_from_centre, squared_error
 from runtime.optics.quality import Quality, psnr_db, quality
 from runtime.optics.retina import Rays, Retina, checked_eye, through_layers
 from runtime.optics.stack import PanelStack
-from runtime.optics.tilt import layer_from_seen, layer_pixels_from_seen
 from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8, U16
 
@@ -46,24 +45,10 @@ class CarriedView:
         toward_panels = self._rays.toward_panels()
         return through_layers(layers, lambda rows: self._positions(true, rows), toward_panels, self._stack)
 
-    def _positions(self, true_m: F64, rows: slice) -> Iterator[tuple[F64, F64]]:
+    def _positions(self, true_m: F64, rows: slice) -> Iterable[tuple[F64, F64]]:
         """On every panel: where the lines from the true eye through the centre panel's points cross it (section 3)."""
-        stack = self._stack
-        centre = stack.panel(stack.count // 2)
-        u, v = self._rays.on(centre, rows)
-        u_true = (true_m[1] - centre.left_m) / centre.pitch_u_m
-        v_true = (centre.top_m - true_m[2]) / centre.pitch_v_m
-        for index, x_m in enumerate(stack.x_m):
-            share = (x_m - true_m[0]) / (centre.x_m - true_m[0])
-            x, y = u * share + u_true * (1 - share), v * share + v_true * (1 - share)
-            if stack.tilt is not None:
-                h = layer_pixels_from_seen(stack.panel(index), layer_from_seen(stack, index, true_m))
-                weight = h[2, 0] * x + h[2, 1] * y + h[2, 2]
-                x, y = (
-                    (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / weight,
-                    (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / weight,
-                )
-            yield x, y
+        centre = self._stack.panel(self._stack.count // 2)
+        return [self._rays.on(centre, rows, moved=matrix) for matrix in panels_from_centre(true_m, self._stack)]
 
 
 def carried_quality(
@@ -85,7 +70,9 @@ def carried_quality(
     """
     seen, wanted, masks = [], [], []
     for nominal, true, picture in zip(np.asarray(solved_for_m), np.asarray(eyes_m), drawn, strict=True):
-        retina = _view(nominal, picture, stack, fov_deg=fov_deg, step=step).seen_from(true, layers)
+        height_px, width_px = picture.shape[:2]
+        view = CarriedView(nominal, stack, width_px=width_px, height_px=height_px, fov_deg=fov_deg, step=step)
+        retina = view.seen_from(true, layers)
         seen.append(retina.image)
         wanted.append(intensities(picture, step))
         masks.append(retina.mask)
@@ -150,8 +137,3 @@ def intensities(picture: U8 | U16 | F32, step: int = 1) -> F32:
     if picture.dtype != np.float32:
         part /= np.float32(255 if picture.dtype == np.uint8 else 65535)
     return part
-
-
-def _view(eye_m: F64, picture: U8 | U16 | F32, stack: PanelStack, *, fov_deg: float, step: int) -> CarriedView:
-    height_px, width_px = picture.shape[:2]
-    return CarriedView(eye_m, stack, width_px=width_px, height_px=height_px, fov_deg=fov_deg, step=step)

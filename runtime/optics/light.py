@@ -53,7 +53,7 @@ def squared_error(
         height, width = target.shape[:2]
         view = Rays.of_eye(checked_eye(nominal, stack), width_px=width, height_px=height, fov_deg=fov_deg)
         centre = panel_from_image(view.from_stack, stack.panel(stack.count // 2))
-        panels = _panels_from_centre(checked_eye(true, stack), stack)
+        panels = panels_from_centre(checked_eye(true, stack), stack)
         rows = range(0, height, step * -(-height // (4 * cores * step)))
         calls += [
             (codes, target, centre, panels, stack.tilt is not None, view.toward(), table, rays, step, first, last)
@@ -66,7 +66,7 @@ def squared_error(
     return float(total / counted)
 
 
-def _panels_from_centre(true_m: F64, stack: PanelStack) -> F64:
+def panels_from_centre(true_m: F64, stack: PanelStack) -> F64:
     """(N, 3, 3) where the lines from an eye through the centre panel's pixels cross each panel's layer."""
     centre = stack.panel(stack.count // 2)
     own_pixel = np.array(

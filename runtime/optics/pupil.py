@@ -9,16 +9,12 @@ PUPIL_DIAMETERS = 4.0  # a disc's standard deviation along an axis is a quarter 
 PUPIL_SIGMA_MM = 1.0  # where nobody tells: the pupil alone, 4 mm wide
 
 
-def combined_sigma_mm(*, pupil_mm: float, tracker_sigma_m: float) -> float:
-    """Standard deviation along an axis, millimetres, of where light enters an eye: pupil and tracker together.
-
-    pupil_mm: the pupil's diameter. tracker_sigma_m: metres, an axis, common to both eyes. Root sum of squares.
-    """
-    return math.hypot(pupil_mm / PUPIL_DIAMETERS, tracker_sigma_m * 1e3)
-
-
 def configured_sigma_mm(setting: Literal["auto"] | float, *, pupil_mm: float, tracker_sigma_m: float) -> float:
-    """What `model.eye_sigma_mm` comes to: a number as it stands, `auto` the pupil and the tracker together."""
+    """What `model.eye_sigma_mm` comes to: a number as it stands; `auto` the pupil and the tracker together.
+
+    Standard deviation along an axis, millimetres, of where light enters an eye. pupil_mm: the pupil's diameter;
+    tracker_sigma_m: metres, an axis, common to both eyes.
+    """
     if setting == "auto":
-        return combined_sigma_mm(pupil_mm=pupil_mm, tracker_sigma_m=tracker_sigma_m)
+        return math.hypot(pupil_mm / PUPIL_DIAMETERS, tracker_sigma_m * 1e3)
     return float(setting)

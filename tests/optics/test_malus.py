@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from random import Random
 
 import numpy as np
 import pytest
@@ -23,13 +22,6 @@ def test_what_an_eye_sees_is_the_jones_product_between_crossed_polarizers(values
     by_hand = reference.jones_intensity(angles, analyser=math.pi / 2)
     assert jones_intensity(angles) == pytest.approx(by_hand, abs=1e-14)
     assert float(intensity_from_phase(np.array(sum(values)))) == pytest.approx(by_hand, abs=1e-12)
-
-
-@given(panel_values, st.randoms(use_true_random=False))
-def test_the_order_of_the_panels_does_not_matter_to_a_single_ray(values: list[float], random: Random) -> None:
-    shuffled = list(values)
-    random.shuffle(shuffled)
-    assert jones_intensity(values) == pytest.approx(jones_intensity(shuffled), abs=1e-14)
 
 
 def test_crossed_polarizers_are_dark_without_a_rotation_and_bright_with_a_quarter_turn() -> None:
@@ -52,12 +44,6 @@ def test_each_branch_inverts_malus_law_within_its_own_range(branch: int, intensi
     phase = phase_from_intensity(np.array(intensity), branch)
     assert branch - 1 <= phase <= branch
     assert float(intensity_from_phase(phase)) == pytest.approx(intensity, abs=1e-15)
-
-
-@given(floats(0.0, 1.0))
-def test_the_branches_mirror_each_other(intensity: float) -> None:
-    value = np.array(intensity)
-    assert float(phase_from_intensity(value, 1) + phase_from_intensity(value, 2)) == pytest.approx(2.0, abs=1e-15)
 
 
 def test_intensities_outside_the_range_are_clipped_and_never_nan() -> None:
