@@ -1,0 +1,158 @@
+"""Around every command: whatever happens in it ends in an exit code and at most one line on stderr.
+
+0 done, 1 a check has failed, 2 bad usage or input, 70 an error of ours (its whole story is in a file that the line
+names), 75 what may pass, 130 Ctrl-C, 141 nobody reads what is printed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any
+
+INTERRUPTED, BAD_INPUT, OWN_ERROR, MAY_PASS, NOBODY_READS = 130, 2, 70, 75, 141
+
+
+def run_guarded(*, interrupts_leave: bool) -> None:
+    """Run the command that the arguments name; never returns. interrupts_leave: until now (`cli`); then they raise."""
+    output = _fill_standard_descriptors()
+    try:
+        from runtime.commands.app import app
+        from runtime.support.crash import watch_threads
+        from runtime.support.privacy import keep_quiet
+        from runtime.support.progress import ShownProgress, listening
+
+        if interrupts_leave:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        keep_quiet()
+        watch_threads()
+        with listening(ShownProgress(sys.stderr)):
+            code = _code_of(app, output)
+    except BaseException as error:
+        code = _ended(_reported, error, output)
+    code = _ended(_flushed, code, output)
+    if interrupts_leave:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt now would find the interpreter half taken down
+    if _has_hung_thread():  # taking down what a library's own thread still runs in would end in an abort
+        from runtime.support import logs
+
+        logs.flush()
+        os._exit(code)
+    sys.exit(code)
+
+
+def _ended(step: Callable[..., int], *arguments: object) -> int:
+    """The exit code of one of the last steps, which a second interrupt may fall into."""
+    try:
+        return step(*arguments)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+def _has_hung_thread() -> bool:
+    """Whether a solver's thread (`frame.solver_thread`) or a job (`support.background`) is in a call that hangs."""
+    return any(thread.name.startswith(("solver-", "job ")) for thread in threading.enumerate())
+
+
+def _code_of(app: Any, output: _Output) -> int:
+    from runtime.support.removed import removed_command
+
+    if gone := removed_command(sys.argv[1:]):
+        _say(f"phasestack: {gone[0]}: is gone: {gone[1]}")
+        return BAD_INPUT
+    try:
+        app()
+    except SystemExit as error:
+        if isinstance(error.__context__, BrokenPipeError):  # typer ends any of them so, a socket's too
+            return _reported(error.__context__, output)
+        if isinstance(error.code, str):
+            _say(error.code)
+            return 1
+        return error.code or 0
+    return 0
+
+
+def _reported(error: BaseException, output: _Output) -> int:
+    """The exit code of what a command was ended by, told in one line."""
+    from runtime.errors import PhasestackError, TransientError, one_line
+
+    if _is_interrupt(error):
+        return INTERRUPTED
+    if isinstance(error, OSError) and error is output.problem:
+        if isinstance(error, BrokenPipeError):
+            return NOBODY_READS
+        _say(f"phasestack: stdout: cannot be written ({error.strerror})")
+        return BAD_INPUT
+    if isinstance(error, PhasestackError):
+        _say(f"phasestack: {one_line(str(error), most=2000)}")
+        return MAY_PASS if isinstance(error, TransientError) else BAD_INPUT
+    if isinstance(error, MemoryError):
+        _say("phasestack: out of memory (this may pass: start again)")
+        return MAY_PASS
+    from runtime.support.crash import written
+
+    _say(f"phasestack: {written(error)}")
+    return OWN_ERROR
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """An interrupt, or what a library made of one that fell into its import."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+def _say(line: str) -> None:
+    with contextlib.suppress(OSError, ValueError):  # where nobody reads stderr either, the exit code has to do
+        print(line, file=sys.stderr, flush=True)
+
+
+class _Output(io.FileIO):
+    """Standard output that remembers why it could not be written: a full disk, or a reader that went away."""
+
+    problem: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data)
+        except OSError as error:
+            self.problem = error
+            raise
+
+
+def _flushed(code: int, output: _Output) -> int:
+    """The exit code once all that was printed is out: Python's own last flush would tell a failure in a traceback."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError) as error:
+            problem = output.problem if stream is sys.stdout else error
+            code = code or _reported(problem or error, output)
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, stream.fileno())
+            os.close(nowhere)
+    return code
+
+
+def _fill_standard_descriptors() -> _Output:
+    """Where stdin, stdout or stderr is closed, it leads nowhere: no file that is opened later takes its place.
+
+    Answers what is below the new `sys.stdout`.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(number, True)
+    os.close(number)
+    output = _Output(1, "wb", closefd=False)
+    sys.stdout = io.TextIOWrapper(
+        io.BufferedWriter(output),
+        encoding=getattr(sys.stdout, "encoding", "utf-8"),
+        errors="backslashreplace",
+        line_buffering=output.isatty(),
+    )
+    sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115, PTH123 - for the whole process
+    return output
