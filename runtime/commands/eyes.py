@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from runtime.support.options import number
+
+JSON_S = 2.0  # of a sensor that is looked at for one JSON object
 
 
 def eyes(
@@ -30,25 +32,35 @@ def eyes(
     """
     import json
 
+    from rich.live import Live
+
     from runtime.commands.eyes_looking import look_at_files, look_at_sensor
     from runtime.config import load_settings
 
     settings = load_settings(config)
+    rows: list[dict[str, Any]] = []
     if files:
-        pictures = look_at_files(files, settings, sequence=sequence, rate_hz=rate_hz, out=out)
+        rows = look_at_files(files, settings, sequence=sequence, rate_hz=rate_hz, out=out)
+    elif as_json:
+        look_at_sensor(settings, rows.append, out=out, seconds=JSON_S)
     else:
-        pictures = look_at_sensor(settings, out=out, seconds=2.0 if as_json else None)
+        with Live() as live:
+            look_at_sensor(settings, lambda row: live.update(_in_words(row)), out=out)
     if as_json:
-        typer.echo(json.dumps({"pictures": pictures}))
-    elif files:
-        for row in pictures:
-            where = row["file"] if row["frame"] is None else f"{row['file']}, frame {row['frame']}"
-            typer.echo(f"{where}: {_in_words(row)}")
+        typer.echo(json.dumps({"pictures": rows}))
+        return
+    for row in rows:
+        typer.echo(_in_words(row))
 
 
-def _in_words(row: dict[str, object]) -> str:
+def _in_words(row: dict[str, Any]) -> str:
+    where = row["file"] if row["frame"] is None else f"{row['file']}, frame {row['frame']}"
+    said = [row["reason"]] if row["reason"] else []
+    if row["eyes_m"] is not None:
+        left, right = (" ".join(f"{1e3 * x:.0f}" for x in eye) for eye in row["eyes_m"])
+        said.append(f"left eye {left} mm, right eye {right} mm, frame of the sensor")
     if row["eyes_px"] is None:
-        return f"nobody ({row['reason']}), {row['ms']:.1f} ms"
-    left, right = ([round(float(x), 1) for x in eye] for eye in row["eyes_px"])  # type: ignore[attr-defined]
-    said = f", {row['reason']}" if row["reason"] else ""
-    return f"left {left}, right {right}, sigma {row['sigma_px']:.2f} px, {row['seen']}, {row['ms']:.1f} ms{said}"
+        return ", ".join([f"{where}: {'the sensor sees eyes' if row['eyes_m'] else 'nobody'}", *said])
+    left, right = (" ".join(f"{x:.1f}" for x in eye) for eye in row["eyes_px"])
+    found = f"{where}: left {left} px, right {right} px, sigma {row['sigma_px']:.2f} px, {row['seen']}"
+    return ", ".join([found, f"{row['ms']:.1f} ms", *said])

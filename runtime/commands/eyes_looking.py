@@ -1,10 +1,10 @@
-"""What `phasestack eyes` does: pictures from files or the sensor through the finder, to rows, overlays, a table."""
+"""What `phasestack eyes` does: pictures from files or the sensor through the finder, to rows and overlays."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,14 @@ import cv2
 import numpy as np
 
 from runtime.clock import NS_PER_S, MonotonicClock
-from runtime.config import LimitSettings, Settings
+from runtime.config import Settings
 from runtime.errors import EndOfRecording, InputError, SensorTimeout
 from runtime.eyes.detect import EyeFinder
 from runtime.eyes.face_flow import RIGID
 from runtime.eyes.pupils import Pupils
 from runtime.records import U8, EyePoints, SensorFrame
+from runtime.sensor.recording import Recording
+from runtime.sensor.registry import open_sensor
 from runtime.support import foreign
 from runtime.support.artifacts import OutputFolder, png_bytes, read_image
 from runtime.support.library_lines import held_back
@@ -73,45 +75,33 @@ def look_at_files(
     files: list[Path], settings: Settings, *, sequence: bool, rate_hz: float, out: Path | None
 ) -> list[Row]:
     """Rows in the order of the files and their frames. Raises InputError, and then leaves nothing in `out`."""
-    watcher, rows = Watcher(settings), []
-    with ExitStack() as cleanup:
-        folder = cleanup.enter_context(OutputFolder(out)).staging if out is not None else None
-        for number, path in enumerate(files):
-            kind = path.suffix.lower()
-            overlay = None if folder is None else folder / f"{number:03d}-{path.stem}"
-            if kind not in (RECORDING, *FILMS):
-                if not sequence:
-                    watcher.forget()
-                picture = SensorFrame(number, round(number * NS_PER_S / rate_hz), colour=read_image(path))
-                rows.append(_looked(watcher, picture, str(path), None, overlay))
-                continue
-            watcher.forget()
-            source = _recorded(path, settings.limits) if kind == RECORDING else _filmed(path, rate_hz)
-            with Film(overlay, rate_hz) as film:
-                for index, frame in enumerate(source):
-                    row, pupils = watcher.look(frame, str(path), index)
+    watcher, rows, follows = Watcher(settings), [], False
+    with OutputFolder(out) if out is not None else nullcontext() as folder:
+        for place, path in enumerate(files):
+            is_still = path.suffix.lower() not in (RECORDING, *FILMS)
+            if not (sequence and is_still and follows):
+                watcher.forget()
+            follows = is_still
+            target = None if folder is None else folder.staging / f"{place:03d}-{path.stem}"
+            with _Overlays(target, is_still, rate_hz) as overlays:
+                for number, frame in enumerate(_frames(path, place, rate_hz)):
+                    row, pupils = watcher.look(frame, str(path), None if is_still else number)
                     rows.append(row)
-                    if frame.colour is not None:
-                        film.add(drawn(frame.colour, pupils, row))
-            watcher.forget()
+                    overlays.add(frame, pupils, row)
     return rows
 
 
-def _looked(watcher: Watcher, frame: SensorFrame, file: str, number: int | None, overlay: Path | None) -> Row:
-    row, pupils = watcher.look(frame, file, number)
-    if overlay is not None and frame.colour is not None:
-        path = overlay.with_name(f"{overlay.name}.png")
-        path.touch(PRIVATE)
-        path.write_bytes(png_bytes(drawn(frame.colour, pupils, row)))
-    return row
-
-
-def _recorded(path: Path, limits: LimitSettings) -> Iterator[SensorFrame]:
-    from runtime.sensor.recording import Recording
-
-    for frame in Recording(path, limits=limits).samples():
-        # What was found when it was recorded is not asked: the pictures are looked at anew.
-        yield frame if frame.colour is None else replace(frame, eyes=None)
+def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
+    """A file's pictures. place: of a still picture, in a sequence. Raises InputError."""
+    kind = path.suffix.lower()
+    if kind == RECORDING:
+        for frame in Recording(path).samples():
+            # What was found when it was recorded is not asked: the pictures are looked at anew.
+            yield frame if frame.colour is None else replace(frame, eyes=None)
+    elif kind in FILMS:
+        yield from _filmed(path, rate_hz)
+    else:
+        yield SensorFrame(place, round(place * NS_PER_S / rate_hz), colour=read_image(path))
 
 
 def _filmed(path: Path, rate_hz: float) -> Iterator[SensorFrame]:
@@ -135,30 +125,34 @@ def _filmed(path: Path, rate_hz: float) -> Iterator[SensorFrame]:
         raise InputError(path, "", "is not a film that can be decoded")
 
 
-class Film:
-    """Overlays as a film, begun with the first; without a place, nothing."""
+class _Overlays:
+    """A file's overlays, as a picture or a film that is its owner's alone; without a target, nothing."""
 
-    def __init__(self, overlay: Path | None, rate_hz: float) -> None:
-        self._path = None if overlay is None else overlay.with_name(f"{overlay.name}.mp4")
-        self._rate_hz = rate_hz
-        self._writer: Any = None
+    def __init__(self, target: Path | None, is_still: bool, rate_hz: float) -> None:
+        self._target, self._is_still, self._rate_hz = target, is_still, rate_hz
+        self._film: Any = None
 
-    def __enter__(self) -> Film:
+    def __enter__(self) -> _Overlays:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._writer is not None:
-            self._writer.release()
+        if self._film is not None:
+            self._film.release()
 
-    def add(self, picture: U8) -> None:
-        if self._path is None:
+    def add(self, frame: SensorFrame, pupils: Pupils | None, row: Row) -> None:
+        if self._target is None or frame.colour is None:
+            return
+        picture = drawn(frame.colour, pupils, row)
+        path = self._target.with_name(f"{self._target.name}.{'png' if self._is_still else 'mp4'}")
+        path.touch(PRIVATE)
+        if self._is_still:
+            path.write_bytes(png_bytes(picture))
             return
         height, width = picture.shape[0] // 2 * 2, picture.shape[1] // 2 * 2
-        if self._writer is None:
-            self._path.touch(PRIVATE)
+        if self._film is None:
             code = cv2.VideoWriter.fourcc(*"mp4v")
-            self._writer = cv2.VideoWriter(str(self._path), cv2.CAP_FFMPEG, code, self._rate_hz, (width, height))
-        self._writer.write(np.ascontiguousarray(picture[:height, :width, ::-1]))
+            self._film = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, self._rate_hz, (width, height))
+        self._film.write(np.ascontiguousarray(picture[:height, :width, ::-1]))
 
 
 def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
@@ -194,71 +188,22 @@ def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
     return canvas
 
 
-def look_at_sensor(settings: Settings, *, out: Path | None, seconds: float | None) -> list[Row]:
-    """What the configured sensor shows, live in the terminal until Ctrl-C; seconds: silent, and for so long.
+def look_at_sensor(
+    settings: Settings, tell: Callable[[Row], None], *, out: Path | None, seconds: float = np.inf
+) -> None:
+    """Tell of every frame of the configured sensor, for so long, until it ends or Ctrl-C comes.
 
-    The last overlay is left in `out`. Raises InputError, SensorLost.
+    The newest overlay is left in `out`. Raises InputError, SensorLost.
     """
-    from rich.live import Live
-
-    from runtime.sensor.registry import open_sensor
-
-    watcher, rows, newest = Watcher(settings), [], None
-    driver = open_sensor(settings.sensor, MonotonicClock(), limits=settings.limits)
-    with ExitStack() as cleanup:
-        folder = cleanup.enter_context(OutputFolder(out)).staging if out is not None else None
-        cleanup.enter_context(driver)
-        live = cleanup.enter_context(Live(transient=False)) if seconds is None else None
-        end = time.monotonic() + (seconds or np.inf)
+    watcher, driver = Watcher(settings), open_sensor(settings.sensor, MonotonicClock())
+    end = time.monotonic() + seconds
+    with OutputFolder(out) if out is not None else nullcontext() as folder, driver:
+        target = None if folder is None else folder.staging / settings.sensor.driver
+        overlays = _Overlays(target, True, settings.loop.rate_hz)
         with suppress(KeyboardInterrupt, EndOfRecording):
             while time.monotonic() < end:
-                try:
+                with suppress(SensorTimeout):
                     frame = driver.read_newest(settings.sensor.timeout_s)
-                except SensorTimeout:
-                    if live is not None:
-                        live.update(f"nothing from {settings.sensor.driver} for {settings.sensor.timeout_s:g} s")
-                    continue
-                row, pupils = watcher.look(frame, settings.sensor.driver, frame.sequence)
-                if frame.colour is not None:
-                    newest = frame.colour, pupils, row
-                if live is None:
-                    rows.append(row)
-                else:
-                    live.update(_table(row, frame))
-        if folder is not None and newest is not None:
-            path = folder / f"{settings.sensor.driver}.png"
-            path.touch(PRIVATE)
-            path.write_bytes(png_bytes(drawn(*newest)))
-    return rows
-
-
-def _table(row: Row, frame: SensorFrame) -> Any:
-    """A frame for the technician who wonders whether the camera sees him: figures, and the picture in letters."""
-    from rich.console import Group
-    from rich.table import Table
-
-    table = Table(show_header=False)
-    table.add_row("frame", str(row["frame"]))
-    table.add_row("viewer", str(row["seen"] or ("seen by the sensor" if row["eyes_m"] else "nobody")))
-    if row["reason"]:
-        table.add_row("", row["reason"])
-    if row["eyes_m"] is not None:
-        for side, eye in zip(("left eye", "right eye"), row["eyes_m"], strict=True):
-            table.add_row(side, " ".join(f"{1e3 * x:7.1f}" for x in eye) + " mm, frame of the sensor")
-    if row["sigma_mm"] is not None:
-        table.add_row("sigma", " ".join(f"{x:7.1f}" for x in row["sigma_mm"]) + " mm")
-    if frame.colour is None:
-        return table
-    table.add_row("time", f"{row['ms']:.1f} ms")
-    return Group(table, _in_letters(frame.colour, row["eyes_px"]))
-
-
-def _in_letters(picture: U8, eyes_px: list[list[float]] | None) -> str:
-    """The picture, mirrored as one sees oneself, in 64 x 20 letters from dark to light; the eyes are O."""
-    columns, lines, ramp = 64, 20, " .:-=+*#"
-    grey = cv2.resize(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (columns, lines), interpolation=cv2.INTER_AREA)
-    letters = [[ramp[value * len(ramp) // 256] for value in line] for line in grey.tolist()]
-    for x, y in eyes_px or ():
-        column, line = int(x * columns / picture.shape[1]), int(y * lines / picture.shape[0])
-        letters[min(max(line, 0), lines - 1)][min(max(column, 0), columns - 1)] = "O"
-    return "\n".join("".join(reversed(line)) for line in letters)
+                    row, pupils = watcher.look(frame, settings.sensor.driver, frame.sequence)
+                    overlays.add(frame, pupils, row)
+                    tell(row)

@@ -86,5 +86,7 @@ def test_without_a_file_the_sensor_is_looked_at(tmp_path: Path) -> None:
     row, *_ = json.loads(done.stdout)["pictures"]
     assert done.returncode == 0 and row["eyes_px"] is None and len(row["eyes_m"]) == 2
     assert row["reason"] == "this sensor delivers eyes and no pictures"
-    live = eyes()  # the built-in recording ends after ten seconds
+    config = tmp_path / "end.toml"
+    config.write_text("[sensor]\nstart_s = 9.0\n")  # the built-in recording ends after ten seconds
+    live = eyes("--config", config)
     assert live.returncode == 0 and "left eye" in live.stdout
