@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import json
-from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from runtime.errors import FatalError, InputError
 from runtime.support.options import number
 from runtime.support.ranges import RECORD_MOST_S
 
 if TYPE_CHECKING:
     from runtime.config import Settings
     from runtime.records import SensorFrame
-    from runtime.sensor.recording_format import RecordingHeader
     from runtime.sensor.worker import SensorWorker
 
 POLL_S = 0.004
 FIRST_SAMPLE_S = 15.0
 SUFFIX = ".mcap"
+OVER = ("ended", "failed")
 
 
 def record(
@@ -54,17 +56,22 @@ def record(
 
     Example: phasestack record --motion walk --seed 3 --rate-hz 60 --out walk.mcap
     """
-    refuse_target(out, force=force or motion is not None)
-    if motion is not None and not force and not _is_motion(out):  # which is made again from its seed; a viewer is not
-        refuse_target(out, force=False)
-    made = {"--seed": seed, "--rate-hz": rate_hz, "--noise-mm": noise_mm}
+    _refuse_target(out, motion=motion is not None, force=force)
+    made = {"seed": seed, "rate_hz": rate_hz, "noise_mm": noise_mm}
+    meaningless = {"config": config, "images": images or None} if motion is not None else made
+    for name, value in meaningless.items():
+        if value is not None:
+            what = "--motion" if motion is not None else "a sensor"
+            raise InputError("record", f"--{name.replace('_', '-')}", f"has no meaning with {what}")
     if motion is not None:
-        _refuse_with("--motion", {"--config": config, "--images": images or None})
-        summary = _record_motion(out, motion, seed=seed, rate_hz=rate_hz, noise_mm=noise_mm, seconds=seconds)
+        from runtime.evaluation.motion_recording import write_motion
+
+        given: dict[str, Any] = {**made, "seconds": seconds}
+        told = write_motion(out, motion, **{name: value for name, value in given.items() if value is not None})
+        summary = told | {"holds": ["eyes", "true eyes"], "stopped": "the motion is done"}
     else:
         from runtime.config import load_settings
 
-        _refuse_with("a sensor", made)
         summary = record_to(out, load_settings(config), images=images, seconds=seconds, quiet=as_json)
     if as_json:
         typer.echo(json.dumps(summary))
@@ -73,48 +80,27 @@ def record(
         typer.echo(f"{out}: {length}, {_contents(summary)} ({summary['stopped']})")
 
 
-def refuse_target(out: Path, *, force: bool, source: str = "record", field: str = "--out") -> None:
-    """Raises InputError for a name that is not a recording's, or one that is taken."""
-    from runtime.errors import InputError
+def _refuse_target(out: Path, *, motion: bool, force: bool) -> None:
+    """Raises InputError for a name that is not a recording's, or one that is taken.
+
+    A motion may replace a motion, which is made again from its seed; a viewer is not.
+    """
+    from runtime.sensor.recording import Recording
     from runtime.support.foreign import checked_path
 
-    checked_path(out, source=source, field=field)
+    checked_path(out, source="record", field="--out")
     if out.suffix.lower() != SUFFIX:
-        raise InputError(out, field, f"must end in {SUFFIX}: recordings are MCAP files")
+        raise InputError(out, "--out", f"must end in {SUFFIX}: recordings are MCAP files")
     if out.is_dir():
-        raise InputError(out, field, "is a folder")
-    if (out.exists() or out.is_symlink()) and not force:
-        raise InputError(out, "--out", "is there already: take another name, or --force to replace it")
-
-
-def _is_motion(out: Path) -> bool:
-    """Whether a recording there was made by --motion."""
-    from runtime.errors import InputError
-    from runtime.sensor.recording import Recording
-
+        raise InputError(out, "--out", "is a folder")
+    if force or not (out.exists() or out.is_symlink()):
+        return
     try:
-        return Recording(out).header.driver == "motion"
-    except InputError:
-        return False
-
-
-def _refuse_with(what: str, options: dict[str, Any]) -> None:
-    """Raises InputError for options that mean nothing with what is recorded."""
-    from runtime.errors import InputError
-
-    for name, value in options.items():
-        if value is not None:
-            raise InputError("record", name, f"has no meaning with {what}")
-
-
-def _record_motion(
-    out: Path, motion: str, *, seed: int | None, rate_hz: float | None, noise_mm: float | None, seconds: float | None
-) -> dict[str, Any]:
-    from runtime.evaluation.motion_recording import write_motion
-
-    how = {"seed": seed, "rate_hz": rate_hz, "noise_mm": noise_mm, "seconds": seconds}
-    given: dict[str, Any] = {name: value for name, value in how.items() if value is not None}
-    return write_motion(out, motion, **given) | {"holds": ["eyes", "true eyes"], "stopped": "the motion is done"}
+        if motion and Recording(out).header.driver == "motion":
+            return
+    except InputError:  # something else has the name
+        pass
+    raise InputError(out, "--out", "is there already: take another name, or --force to replace it")
 
 
 def _contents(summary: dict[str, Any]) -> str:
@@ -133,60 +119,65 @@ def _contents(summary: dict[str, Any]) -> str:
 
 def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | None, quiet: bool) -> dict[str, Any]:
     """Record until the time is up, a limit is reached, the source ends or Ctrl-C. Raises FatalError, InputError."""
-    from contextlib import ExitStack
     from dataclasses import replace
 
-    from runtime.clock import MonotonicClock
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    from runtime.clock import NS_PER_S, MonotonicClock
     from runtime.eyes.detect import EyeFinder
     from runtime.sensor.detecting import DetectingDriver
     from runtime.sensor.recording import RecordingLimits, recording_to
+    from runtime.sensor.recording_format import RecordingHeader
     from runtime.sensor.registry import open_sensor
     from runtime.sensor.worker import SensorWorker
 
     clock, s = MonotonicClock(), settings.sensor
     worker = SensorWorker(
-        lambda: DetectingDriver(
-            open_sensor(s, clock, limits=settings.limits),
-            lambda: EyeFinder(settings).find,
-            keep_images=images,
-        ),
-        s,
-        clock,
+        lambda: DetectingDriver(open_sensor(s, clock), lambda: EyeFinder(settings).find, keep_images=images), s, clock
     )
     limits = RecordingLimits(min(seconds or s.record_max_s, s.record_max_s), round(s.record_max_mib * (1 << 20)))
-    in_time = seconds is not None and seconds <= s.record_max_s
-    time_is_up = "the time is up" if in_time else "the limit sensor.record_max_s is reached"
-    count, first_ns, last_ns = 0, 0, 0
+    stopped = "the time is up" if limits.max_s == seconds else "the limit sensor.record_max_s is reached"
+    writer, first_ns, so_far_s = None, 0, 0.0
     holds: dict[str, None] = {}
-    pending: deque[SensorFrame] = deque()
+    columns = (TextColumn("recording"), BarColumn(), TextColumn("{task.fields[note]}"))
     with ExitStack() as cleanup:
+        shown = Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True)
+        task = cleanup.enter_context(shown).add_task("recording", total=seconds, note="")
         cleanup.callback(worker.stop)
         worker.start()
         try:
-            frame = _first(worker, clock.now_ns(), pending, driver=s.driver)
-            first_ns = last_ns = frame.capture_ns
-            writer = cleanup.enter_context(recording_to(out, _header(frame, s.driver, worker, images), limits=limits))
-            tell = cleanup.enter_context(_progress(quiet, seconds))
-            deadline_ns = frame.capture_ns + round((seconds or s.record_max_s) * 1e9)
-            while True:
-                frame = frame if images else replace(frame, colour=None, depth_mm=None)
-                if not writer.write(frame):
-                    is_long = frame.capture_ns - first_ns > limits.max_s * 1e9
-                    stopped = time_is_up if is_long else "the limit sensor.record_max_mib is reached"
+            for frame in _samples(worker, limits.max_s):
+                if writer is None:
+                    first_ns, has = frame.capture_ns, worker.capabilities
+                    pictures = has if images else None
+                    header = RecordingHeader(
+                        driver=s.driver,
+                        serial=worker.serial,
+                        colour=pictures is not None and pictures.colour,
+                        depth=pictures is not None and pictures.depth,
+                        truth=frame.true_eyes_m is not None,
+                    )
+                    writer = cleanup.enter_context(recording_to(out, header, limits=limits))
+                kept = frame if images else replace(frame, colour=None, depth_mm=None)
+                if not writer.write(kept):
+                    if frame.capture_ns - first_ns <= limits.max_s * NS_PER_S:
+                        stopped = "the limit sensor.record_max_mib is reached"
                     break
-                count, last_ns = writer.count, frame.capture_ns
-                tell(count, (last_ns - first_ns) / 1e9)
-                holds |= dict.fromkeys(_streams(frame))
-                following = _next(worker, deadline_ns, pending)
-                if following is None:
-                    stopped = worker.reason if worker.state in ("ended", "failed") else time_is_up
-                    break
-                frame = following
+                so_far_s = (frame.capture_ns - first_ns) / NS_PER_S
+                holds |= dict.fromkeys(_streams(kept))
+                shown.update(task, completed=so_far_s, note=f"{writer.count} samples, {so_far_s:.1f} s")
+            else:
+                if worker.state in OVER:
+                    stopped = worker.reason
         except KeyboardInterrupt:
-            stopped = "stopped by hand"
-            if count == 0:
+            if writer is None:
                 raise
-    told = {"file": str(out), "samples": count, "seconds": (last_ns - first_ns) / 1e9, "stopped": stopped}
+            stopped = "stopped by hand"
+        if writer is None:
+            why = worker.reason or "nothing came"
+            raise worker.error or FatalError(f"sensor {s.driver}: no sample ({worker.state}: {why})")
+    told = {"file": str(out), "samples": writer.count, "seconds": so_far_s, "stopped": stopped}
     return told | {"holds": list(holds), "images_asked": images, "skipped": worker.stale_inputs}
 
 
@@ -196,56 +187,18 @@ def _streams(frame: SensorFrame) -> list[str]:
     return [name for name, value in parts.items() if value is not None]
 
 
-def _header(frame: SensorFrame, driver: str, worker: SensorWorker, images: bool) -> RecordingHeader:
-    from runtime.sensor.recording_format import RecordingHeader
-
-    has = worker.capabilities
-    return RecordingHeader(
-        driver=driver,
-        serial=worker.serial,
-        colour=images and has is not None and has.colour,
-        depth=images and has is not None and has.depth,
-        truth=frame.true_eyes_m is not None,
-    )
-
-
-def _first(worker: SensorWorker, now_ns: int, pending: deque[SensorFrame], *, driver: str) -> SensorFrame:
-    """The first sample. Raises FatalError where the sensor gives none."""
-    from runtime.errors import FatalError
-
-    frame = _next(worker, now_ns + round(FIRST_SAMPLE_S * 1e9), pending)
-    if frame is None:
-        why = worker.reason or "nothing came"
-        raise worker.error or FatalError(f"sensor {driver}: no sample ({worker.state}: {why})")
-    return frame
-
-
-def _next(worker: SensorWorker, deadline_ns: int, pending: deque[SensorFrame]) -> SensorFrame | None:
-    """The next sample, or None at the deadline and where none will come. `pending`: those that arrived with it."""
+def _samples(worker: SensorWorker, limit_s: float) -> Iterator[SensorFrame]:
+    """Samples as they arrive, until the source is over or the time is up, which begins with the first sample."""
     import time
 
-    while not pending:
-        is_over = worker.state in ("ended", "failed")  # asked first: its last samples come before it says so
-        pending.extend(worker.take())
-        if not pending:
+    deadline_ns, begun = time.monotonic_ns() + round(FIRST_SAMPLE_S * 1e9), False
+    while True:
+        is_over = worker.state in OVER  # asked first: its last samples come before it says so
+        frames = worker.take()
+        if frames and not begun:
+            deadline_ns, begun = frames[0].capture_ns + round(limit_s * 1e9), True
+        yield from frames
+        if not frames:
             if is_over or time.monotonic_ns() >= deadline_ns:
-                return None
+                return
             time.sleep(POLL_S)
-    return pending.popleft()
-
-
-def _progress(quiet: bool, seconds: float | None) -> Any:
-    """A context manager whose value takes the count of samples and the seconds so far."""
-    from contextlib import contextmanager
-
-    @contextmanager
-    def shown() -> Any:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn
-
-        columns = (TextColumn("recording"), BarColumn(), TextColumn("{task.fields[note]}"))
-        with Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True) as progress:
-            task = progress.add_task("recording", total=seconds, note="")
-            yield lambda count, so_far: progress.update(task, completed=so_far, note=f"{count} samples, {so_far:.1f} s")
-
-    return shown()
