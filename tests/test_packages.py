@@ -63,7 +63,7 @@ def test_a_clean_environment_with_the_wheel_alone_runs_the_demo(packages: Path, 
     done(python, "-m", "pip", "install", "-q", "-r", ROOT / "requirements" / "runtime.lock", cwd=tmp_path)
     done(python, "-m", "pip", "install", "-q", "--no-deps", wheel, cwd=tmp_path)
     command = tmp_path / "clean" / "bin" / "phasestack"
-    done(command, "demo", "--frames", "12", "--scale", "0.1", "--out", "out", cwd=tmp_path)
+    done(command, "demo", "--frames", "12", "--out", "out", cwd=tmp_path)
     assert {path.name for path in (tmp_path / "out").iterdir()} >= DEMO_FILES
     where = done(python, "-c", "import runtime; print(runtime.__file__)", cwd=tmp_path)
     assert where.startswith(str(tmp_path))

@@ -8,14 +8,10 @@ from typing import Annotated
 
 import typer
 
-from runtime.support.options import number
-
 
 def demo(
     out: Annotated[Path, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = Path("out/demo"),
     frames: Annotated[int | None, typer.Option(min=1, help="refreshes; default: the whole recording")] = None,
-    scale: Annotated[float, number(0.05, 2.0, help="panel resolution, times 1920x1080")] = 1.0,
-    model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="the summary as one JSON object on stdout")] = False,
 ) -> None:
     """Replay a built-in recording of a moving head through the whole pipeline, on panels that need no screen.
@@ -23,18 +19,18 @@ def demo(
     Example: phasestack demo --out out/demo
     """
     from runtime.clock import NS_PER_S
-    from runtime.config import Settings, with_options
+    from runtime.config import Settings
     from runtime.daemon.build import RunOptions
     from runtime.daemon.drive import drive, print_summary
     from runtime.sensor.recording import Recording
     from runtime.sensor.replay import demo_recording_path
 
-    settings = with_options(Settings(), model=model)
+    settings = Settings()
     captures_ns = [sample.capture_ns for sample in Recording(demo_recording_path()).samples()]
     refreshes = round((captures_ns[-1] - captures_ns[0]) / NS_PER_S * settings.loop.rate_hz)
     summary = drive(
         settings,
-        RunOptions(max_speed=True, measure=True, scale=scale, frames=frames, out=out),
+        RunOptions(max_speed=True, measure=True, frames=frames, out=out),
         total=min(refreshes, frames or refreshes),
         progress=True,
     )

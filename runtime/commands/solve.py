@@ -32,7 +32,6 @@ def solve(
         typer.Option(help="what surrounds the network: cpu, gl, or auto: the faster one here, from --repeat 10 on"),
     ] = None,
     no_plan: Annotated[bool, typer.Option("--no-plan", help="leave nothing out, whatever the pictures allow")] = False,
-    config: Annotated[Path | None, typer.Option(help="configuration, for the model's settings")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="solve.json's object on stdout")] = False,
 ) -> None:
     """Solve the layers for two still pictures and two eyes, and measure what the eyes then see.
@@ -40,25 +39,20 @@ def solve(
     Example: phasestack solve --left l.png --right r.png --left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0 --fov 40
     --panels panels.json --out out/solve
     """
-    from runtime.commands.solving import SolveOptions, solve_pair
+    from runtime.commands.solving import solve_pair
 
     with blame_option("solve", model=model):
         result = solve_pair(
-            SolveOptions(
-                left,
-                right,
-                left_eye,
-                right_eye,
-                fov,
-                panels,
-                out,
-                model,
-                repeat,
-                eye_sigma_mm,
-                config,
-                backend,
-                no_plan,
-            )
+            (left, right),
+            (left_eye, right_eye),
+            panels,
+            out,
+            fov_deg=fov,
+            model=model,
+            repeat=repeat,
+            eye_sigma_mm=eye_sigma_mm,
+            backend=backend,
+            plan=not no_plan,
         )
     if as_json:
         typer.echo(json.dumps(result))

@@ -32,12 +32,11 @@ def pictures(folder: Path, *, grey: bool) -> None:
     write_json(folder / "panels.json", {"width_m": 0.5184, "height_m": 0.2916, "x_m": [-0.06, 0.0, 0.06]})
 
 
-def solved(folder: Path, config: str = "", model: str = "balanced") -> dict[str, Any]:
-    (folder / "config.toml").write_text(config, encoding="utf-8")
+def solved(folder: Path, *more: str, model: str = "balanced") -> dict[str, Any]:
     eyes = ["--left-eye", "0.6", "-0.031", "0", "--right-eye", "0.6", "0.031", "0"]
     files = ["--left", str(folder / "left.png"), "--right", str(folder / "right.png")]
-    where = ["--panels", str(folder / "panels.json"), "--config", str(folder / "config.toml")]
-    done = runner.invoke(app, [*files, *eyes, *where, "--model", model, "--out", str(folder / "out"), "--json"])
+    where = ["--panels", str(folder / "panels.json"), "--out", str(folder / "out"), "--json"]
+    done = runner.invoke(app, [*files, *eyes, *where, "--model", model, *more])
     assert done.exit_code == 0, done.output
     result: dict[str, Any] = json.loads(done.stdout)
     return result
@@ -51,7 +50,7 @@ def test_the_window_is_solved_alone_and_costs_no_quality(tmp_path: Path, model: 
     assert item["what"] == "inference beside the active window"
     assert item["costs_db"] < 0.1
     assert isinstance(item["saves_ms"], float)
-    plain = solved(tmp_path, "[plan]\nenabled = false\n", model=model)
+    plain = solved(tmp_path, "--no-plan", model=model)
     assert plain["plan"] == []
     assert planned["psnr_db"] - plain["psnr_db"] == pytest.approx(-item["costs_db"], abs=0.002)
 
