@@ -43,9 +43,7 @@ class ContentInfo:
 
     name: str
     moving: bool = False
-    stand_in: bool = False  # what was named is not here, and this is shown in its place; `name` says so
     grey: bool = False
-    depth_range_m: tuple[float, float] | None = None  # nearest to farthest along +x of `stack`: (rear, front)
     background: Colour | None = WHITE  # uniform, behind it; None: none
     flat_x_m: float | None = None  # all of it lies in this plane of `stack` and looks alike to both eyes
 

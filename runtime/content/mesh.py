@@ -14,7 +14,6 @@ import numpy as np
 
 from runtime.clock import NS_PER_S
 from runtime.config import LimitSettings
-from runtime.content import camera
 from runtime.content.base import ContentInfo
 from runtime.content.gltf import file_of, load_gltf, texture_of
 from runtime.content.placing import SceneFile
@@ -53,13 +52,7 @@ def prepare(file: SceneFile) -> Callable[[Any], MeshSource]:
         progress.tell(f"{file.path.name}: outlines", number, len(data.parts))
         parts.append(DrawnPart(part))
     matrix = file.placed(data.low, data.high)
-    x_m = camera.box_corners(data.low, data.high) @ matrix[0, :3] + matrix[0, 3]
-    info = ContentInfo(
-        name=file.path.stem,
-        moving=data.rig is not None,
-        depth_range_m=(float(x_m.min()), float(x_m.max())),
-        background=file.background,
-    )
+    info = ContentInfo(file.path.stem, moving=data.rig is not None, background=file.background)
     return lambda context: MeshSource(parts, matrix, context=context, info=info, rig=data.rig)
 
 

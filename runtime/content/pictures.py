@@ -301,7 +301,6 @@ class PicturesSource(ScreenSource):
             name=file.path.stem,
             moving=moving,
             grey=not moving and _is_grey(first),
-            depth_range_m=(0.0, 0.0) if mono else None,
             background=file.background,
             flat_x_m=0.0 if mono else None,
         )

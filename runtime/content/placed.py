@@ -148,15 +148,6 @@ class PlacedSource(ForwardingSource):
 
 def _moved(info: ContentInfo, placing: Placing) -> ContentInfo:
     still = not placing.turntable_per_min
-    upright = still and placing.rotation_deg[1:] == (0.0, 0.0)  # its planes stay parallel to the panels
-    out_m = placing.offset_m[0]
-    depth = None
-    if upright and info.depth_range_m is not None:
-        rear, front = (out_m + placing.scale * x for x in info.depth_range_m)
-        depth = (rear, front)
-    return replace(
-        info,
-        moving=info.moving or not still,
-        depth_range_m=depth,
-        flat_x_m=info.flat_x_m if upright and out_m == 0.0 else None,
-    )
+    # Where its planes stay parallel to the panels, and the middle one's is kept.
+    is_flat = still and placing.rotation_deg[1:] == (0.0, 0.0) and placing.offset_m[0] == 0.0
+    return replace(info, moving=info.moving or not still, flat_x_m=info.flat_x_m if is_flat else None)

@@ -136,11 +136,7 @@ class PointSource(DrawingSource):
         margin = self._disc_m / 2
         low, high = positions.min(0).astype(np.float64) - margin, positions.max(0).astype(np.float64) + margin
         self._corners_m = camera.box_corners(low, high)
-        self.info = ContentInfo(
-            name=name,
-            depth_range_m=(float(low[0]), float(high[0])),
-            background=background,
-        )
+        self.info = ContentInfo(name, background=background)
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         size = {"width_px": view.width_px, "height_px": view.height_px}

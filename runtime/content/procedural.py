@@ -11,7 +11,7 @@ from runtime.clock import NS_PER_S
 from runtime.content import shapes, textures
 from runtime.content.base import WHITE, Colour, ContentInfo
 from runtime.content.scenes import Scene, Thing, scene
-from runtime.content.triangles import DrawnPart, Part, TriangleSource, corners_m
+from runtime.content.triangles import DrawnPart, Part, TriangleSource
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
 
@@ -53,12 +53,10 @@ class ProceduralSource(TriangleSource):
         self._scale = stack.height_m / MODELLED_HEIGHT_M
         parts = parts or parts_of(self._scene)
         still = [self._placed(thing, 0.0) for thing in self._scene.things]
-        x_m = corners_m(parts, still)[:, 0]
         info = ContentInfo(
             name=self._scene.name,
             moving=self._scene.moving,
             grey=self._scene.grey,
-            depth_range_m=(float(x_m.min()), float(x_m.max())),
             background=background or WHITE,
             flat_x_m=0.0 if self._scene.flat else None,
         )

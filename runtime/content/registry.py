@@ -130,7 +130,7 @@ def _built_in(name: str, settings: ContentSettings, stack: PanelStack, *, stands
         source = ProceduralSource(scene, stack=stack, context=context, background=settings.background, parts=parts)
         if stands_for:
             shown = f"{stands_for} (stand-in `{name}`: content.file is empty)"
-            source.info = replace(source.info, name=shown, stand_in=True)
+            source.info = replace(source.info, name=shown)
         return source
 
     return make

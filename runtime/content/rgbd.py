@@ -177,7 +177,6 @@ def prepare(file: SceneFile) -> Callable[[Any], TriangleSource]:
     # Outlines of a torn surface run through its inside: samples there, no ramps.
     found = surfaces(colour, depth, stack=file.stack, depth_m=file.settings.depth_m)
     parts = [DrawnPart(part, outlined=False) for part in found]
-    x_m = parts[0].positions[:, 0]
-    info = ContentInfo(file.path.stem, depth_range_m=(float(x_m.min()), float(x_m.max())), background=file.background)
+    info = ContentInfo(file.path.stem, background=file.background)
     places = [np.eye(4)] * len(parts)
     return lambda context: TriangleSource(parts, places, context=context, info=info, samples=SAMPLES)

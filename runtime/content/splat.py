@@ -84,12 +84,7 @@ class SplatSource(DrawingSource):
             [(self._buffer, "2f 2f 4f", "in_place", "in_deviations", "in_colour")],
             index_buffer=self._quads,
         )
-        x = np.percentile(self._gaussians.centres[:, 0], [1, 99])
-        self.info = ContentInfo(
-            name=name,
-            depth_range_m=(float(x[0]), float(x[1])),
-            background=background,
-        )
+        self.info = ContentInfo(name, background=background)
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         """Every splat that the eye can see, farthest first."""

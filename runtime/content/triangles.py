@@ -168,12 +168,6 @@ class DrawnPart:
             held.release()
 
 
-def corners_m(parts: Sequence[DrawnPart], stack_from_parts: Sequence[F64]) -> F64:
-    """(8n, 3) corners in the stack frame of the boxes that hold the parts."""
-    placed = zip(parts, stack_from_parts, strict=True)
-    return np.concatenate([part.corners_m @ matrix[:3, :3].T + matrix[:3, 3] for part, matrix in placed])
-
-
 class TriangleSource(DrawingSource):
     """Parts at their places, over a background."""
 
@@ -217,14 +211,13 @@ class TriangleSource(DrawingSource):
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         """The same bytes for the same view and time."""
         size = {"width_px": view.width_px, "height_px": view.height_px}
-        places = self.places(time_ns)
-        corners = corners_m(self.parts, places).reshape(-1, 8, 3)
+        placed = list(zip(self.parts, self.places(time_ns), strict=True))
+        corners = np.stack([part.corners_m @ matrix[:3, :3].T + matrix[:3, 3] for part, matrix in placed])
         bounds = camera.depth_bounds(view.pixels_from_stack, corners.reshape(-1, 3))
         boxes = [camera.covered_box(view.pixels_from_stack, part, **size) for part in corners]
         area = union(boxes) if bounds else PixelRect(0, 0, 0, 0)
         # Nearest first: what they hide need not be shaded.
-        order = np.argsort(-corners[..., 0].mean(1), kind="stable")
-        placed = [(self.parts[index], places[index]) for index in order]
+        placed = [placed[index] for index in np.argsort(-corners[..., 0].mean(1), kind="stable")]
 
         def paint() -> None:
             near_m, far_m = bounds or (0.0, 0.0)

@@ -7,13 +7,15 @@ from typing import Any
 
 from runtime.config import Settings
 from runtime.content.base import ContentSource
-from runtime.content.loader import ContentLoader
+from runtime.content.registry import Opener, prepare_content
 from runtime.daemon.solver_parts import RunningSolver, ready_predictor
-from runtime.errors import PhasestackError
+from runtime.errors import InputError, PhasestackError
 from runtime.eyes.calibration import load_calibration
 from runtime.model.predictor import Predictor
 from runtime.optics.stack import PanelStack
+from runtime.support import progress
 from runtime.support.background import Job
+from runtime.support.crash import written
 from runtime.support.memory import give_back_later
 
 
@@ -31,39 +33,34 @@ class Reconfiguration:
         """
         self.settings = settings
         self._calibration = load_calibration(Path(settings.calibration.file) if settings.calibration.file else None)
-        self._loader: ContentLoader | None = None
+        self._loading: Job[Opener] | None = None
         self._source: ContentSource | None = None
         self._model: Job[Predictor] | None = None
         self._abandoned = False
+        self.progress = f"loading model {settings.model.name}"  # what is being made ready, for the status
         self.problem = ""  # one line, where it can't be done
         self.finished = False
         if reload_content or settings.content != old.content:
-            self._loader = ContentLoader(stack, limits=settings.limits)
-            self._loader.request(settings.content)
+            self.progress = f"loading {settings.content.scene}"
+            self._loading = Job(settings.content.scene, lambda: self._prepared(stack))
         if _model_part(settings) != _model_part(old):
             self._model = Job("model", lambda: ready_predictor(settings, stack), discard=lambda made: made.close())
-
-    @property
-    def progress(self) -> str:
-        """What is being made ready, for the status."""
-        if self._loader is not None:
-            return self._loader.progress or f"loading {self.settings.content.scene}"
-        return f"loading model {self.settings.model.name}"
 
     def advance(self, parts: Any) -> bool:
         """True once it was taken over, refused or abandoned. Uploads to GL: for the solver's thread."""
         assert isinstance(parts, RunningSolver)
-        if self._loader is not None:
-            loaded = self._loader.poll(parts.context)
-            if loaded is not None:
-                self._loader, self._source, self.problem = None, loaded.source, loaded.problem
+        if self._loading is not None and self._loading.done:
+            self.problem, opener = self._loading.problem, self._loading.take()
+            self._loading, self.progress = None, f"loading model {self.settings.model.name}"
+            if opener is not None and not self._abandoned:
+                self._open(opener, parts.context)
         if self._model is not None and self._model.done:
             self.problem = self.problem or self._model.problem
         if self.problem or self._abandoned:
             self._discard()
             self.finished = True
             return True
-        if self._loader is not None or (self._model is not None and not self._model.done):
+        if self._loading is not None or (self._model is not None and not self._model.done):
             return False
         try:
             self._commit(parts)
@@ -76,6 +73,26 @@ class Reconfiguration:
     def abandon(self) -> None:
         """It is no longer wanted; nothing of it stays."""
         self._abandoned = True
+
+    def _prepared(self, stack: PanelStack) -> Opener:
+        """Content, read on the job's thread, where what is said of it is heard; abandoned, it is given up."""
+
+        def tell(what: str, done: int, total: int | None) -> None:
+            if self._abandoned:
+                raise InputError("content", "scene", "is no longer wanted")
+            if what:
+                self.progress = f"{what}: {done} of {total}" if total else f"{what}: {done}" if done else what
+
+        with progress.listening(tell):
+            return prepare_content(self.settings.content, stack, limits=self.settings.limits)
+
+    def _open(self, opener: Opener, context: Any) -> None:
+        try:
+            self._source = opener(context)
+        except PhasestackError as error:
+            self.problem = str(error)
+        except Exception as error:  # a GL driver's or a library's own: the present scene goes on
+            self.problem = f"{self.settings.content.scene}: {written(error)}"
 
     def _commit(self, parts: RunningSolver) -> None:
         """Take over what is ready: one new state, and what it replaces is closed."""
@@ -103,7 +120,7 @@ class Reconfiguration:
             self._source.close()
         if self._model is not None:
             self._model.abandon()
-        self._loader = self._source = self._model = None
+        self._loading = self._source = self._model = None
         give_back_later()
 
 

@@ -79,13 +79,6 @@ def carried_quality(
     return quality(seen, wanted, masks, similarity=step == 1)
 
 
-def expected_psnr_db(
-    layers: U8, drawn: Sequence[U8 | U16 | F32], stack: PanelStack, *, sigma_mm: float, **how: Any
-) -> float:
-    """`expected_psnrs_db` of one standard deviation."""
-    return expected_psnrs_db(layers, drawn, stack, sigmas_mm=(sigma_mm,), **how)[sigma_mm]
-
-
 def expected_psnrs_db(
     layers: U8,
     drawn: Sequence[U8 | U16 | F32],

@@ -16,7 +16,7 @@ import pytest
 
 from runtime.clock import MonotonicClock
 from runtime.config import Settings, load_settings
-from runtime.content import loader
+from runtime.daemon import reconfigure
 from runtime.daemon import server as server_module
 from runtime.daemon.client import ask
 from runtime.daemon.notify import Notifier
@@ -86,14 +86,14 @@ def served(tmp_path: Path) -> Iterator[Served]:
 @pytest.fixture
 def gate(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
     """Content comes to be loaded when it is set."""
-    real, opened = loader.prepare_content, threading.Event()
+    real, opened = reconfigure.prepare_content, threading.Event()
 
     def prepare(settings: Any, stack: Any, **how: Any) -> Any:
         progress.tell(f"reading {settings.scene}", 1, 2)
         assert opened.wait(60.0)
         return real(settings, stack, **how)
 
-    monkeypatch.setattr(loader, "prepare_content", prepare)
+    monkeypatch.setattr(reconfigure, "prepare_content", prepare)
     yield opened
     opened.set()
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from runtime.config import Settings
-from runtime.content import loader
 from runtime.daemon import reconfigure
 from runtime.daemon.reconfigure import Reconfiguration
 from runtime.daemon.solver_parts import RunningSolver, SolverMaker, ready_predictor
@@ -54,7 +53,7 @@ class Bench:
         self.gate.set()
         self.models: list[Lent] = []
         self.contents: list[Lent] = []
-        prepare = loader.prepare_content
+        prepare = reconfigure.prepare_content
 
         def ready(chosen: Settings, stack: Any) -> Any:
             made = Lent(ready_predictor(chosen, stack))
@@ -72,7 +71,7 @@ class Bench:
             return make
 
         monkeypatch.setattr(reconfigure, "ready_predictor", ready)
-        monkeypatch.setattr(loader, "prepare_content", prepared)
+        monkeypatch.setattr(reconfigure, "prepare_content", prepared)
         self.settings = settings()
         self.stack = self.settings.stack.stack()
         self.context = offscreen_context()

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runtime.optics.carried import CarriedView, carried_quality, expected_psnr_db, expected_psnrs_db
+from runtime.optics.carried import CarriedView, carried_quality, expected_psnrs_db
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack, Tilt
@@ -118,7 +118,8 @@ def test_expected_psnr_is_five_points_of_the_eyes_common_place_of_rays_or_of_lig
             for error in traced_error(eye, eye + move, layers, picture, stack, fov_deg=30, rays=rays)
         ]
         total += weight * sum(errors) / len(errors)
-    told = expected_psnr_db(layers, pictures, stack, eyes_m=eyes, fov_deg=30, sigma_mm=sigma_mm, rays=rays)
+    how = {"eyes_m": eyes, "fov_deg": 30, "sigmas_mm": (sigma_mm,), "rays": rays}
+    told = expected_psnrs_db(layers, pictures, stack, **how)[sigma_mm]
     # Of light, a ray at the edge of two pixels may take either: with so few pixels that is felt.
     assert told == pytest.approx(-10 * math.log10(total), abs=5e-3 if rays else 2e-3)
 
@@ -143,7 +144,7 @@ def test_eyes_that_are_where_the_layers_were_solved_for_see_the_exact_quality() 
     told = carried_quality(layers, pictures, STACKS[0], solved_for_m=eyes, eyes_m=eyes, fov_deg=30)
     assert told.psnr_db == pytest.approx(expected.psnr_db, abs=1e-4)
     assert told.ssim == pytest.approx(expected.ssim, abs=1e-5)
-    sure = expected_psnr_db(layers, pictures, STACKS[0], eyes_m=eyes, fov_deg=30, sigma_mm=0.0)
+    sure = expected_psnrs_db(layers, pictures, STACKS[0], eyes_m=eyes, fov_deg=30, sigmas_mm=(0.0,))[0.0]
     assert sure == pytest.approx(expected.psnr_db, abs=1e-4)
 
 
