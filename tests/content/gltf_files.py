@@ -31,17 +31,23 @@ class Buffer:
         self.accessors.append({"bufferView": len(self.views) - 1, "count": len(array), **kind})
         return len(self.accessors) - 1
 
-    def write(self, path: Path, **tables: Any) -> Path:
+    def table(self, primitive: dict[str, Any], **tables: Any) -> dict[str, Any]:
+        """Of one mesh that one node has, unless `tables` say otherwise."""
         uri = "data:application/octet-stream;base64," + base64.b64encode(self.data).decode()
-        table = {
+        return {
             "asset": {"version": "2.0"},
             "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0}],
+            "meshes": [{"primitives": [primitive]}],
             "buffers": [{"uri": uri, "byteLength": len(self.data)}],
             "bufferViews": self.views,
             "accessors": self.accessors,
             **tables,
         }
-        path.write_text(json.dumps(table))
+
+    def write(self, path: Path, primitive: dict[str, Any], **tables: Any) -> Path:
+        path.write_text(json.dumps(self.table(primitive, **tables)))
         return path
 
 
@@ -58,13 +64,7 @@ def moving_square(path: Path, *, kind: str = "LINEAR") -> Path:
         keys = [[0, 0, 0], [-3, 0, 0], [0, 0, 0], [0, 0, 0], [3, 0, 0], [0, 0, 0]]
     sampler = {"input": b.add([0.0, 2.0]), "output": b.add(keys), "interpolation": kind}
     channel = {"sampler": 0, "target": {"node": 0, "path": "translation"}}
-    return b.write(
-        path,
-        scenes=[{"nodes": [0]}],
-        nodes=[{"mesh": 0}],
-        meshes=[{"primitives": [primitive]}],
-        animations=[{"name": "slide", "samplers": [sampler], "channels": [channel]}],
-    )
+    return b.write(path, primitive, animations=[{"name": "slide", "samplers": [sampler], "channels": [channel]}])
 
 
 def bending_bar(path: Path) -> Path:
@@ -89,13 +89,13 @@ def bending_bar(path: Path) -> Path:
     sampler = {"input": b.add([0.0, 1.0]), "output": b.add([[0, 0, 0, 1], [0, 0, half, half]])}
     return b.write(
         path,
+        primitive,
         scenes=[{"nodes": [0, 1]}],
         nodes=[
             {"mesh": 0, "skin": 0, "translation": [50, 50, 50]},  # which a skin leaves out
             {"children": [2]},
             {"translation": [0, 2, 0]},
         ],
-        meshes=[{"primitives": [primitive]}],
         skins=[{"joints": [1, 2], "inverseBindMatrices": bound}],
         animations=[{"samplers": [sampler], "channels": [{"sampler": 0, "target": {"node": 2, "path": "rotation"}}]}],
     )
@@ -111,10 +111,5 @@ def growing_square(path: Path) -> Path:
         "targets": [{"POSITION": b.add(rise)}],
     }
     sampler = {"input": b.add([0.0, 1.0]), "output": b.add([0.0, 1.0])}
-    return b.write(
-        path,
-        scenes=[{"nodes": [0]}],
-        nodes=[{"mesh": 0}],
-        meshes=[{"primitives": [primitive]}],
-        animations=[{"samplers": [sampler], "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}]}],
-    )
+    channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
+    return b.write(path, primitive, animations=[{"samplers": [sampler], "channels": [channel]}])

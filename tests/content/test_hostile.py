@@ -25,6 +25,7 @@ from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import read_image
 from runtime.support.progress import listening
+from tests.content.gltf_files import Buffer
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
 HANG_S = 30  # what took minutes, or for ever
@@ -160,22 +161,9 @@ def test_an_obj_of_too_many_triangles_is_refused(tmp_path: Path) -> None:
 
 def gltf(**changes: Any) -> dict[str, Any]:
     """A triangle, embedded."""
-    data = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes() + np.array([0, 1, 2], "<u4").tobytes()
-    uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
-    table: dict[str, Any] = {
-        "asset": {"version": "2.0"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
-        "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
-            {"bufferView": 1, "componentType": 5125, "count": 3, "type": "SCALAR"},
-        ],
-        "bufferViews": [{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 12}],
-        "buffers": [{"byteLength": 48, "uri": uri}],
-    }
-    return table | changes
+    b = Buffer()
+    attributes = {"POSITION": b.add([[0, 0, 0], [1, 0, 0], [0, 1, 0]])}
+    return b.table({"attributes": attributes, "indices": b.add([0, 1, 2], np.uint32)}, **changes)
 
 
 def glb(table: dict[str, Any], binary: bytes = b"") -> bytes:
@@ -218,6 +206,17 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
         gltf(bufferViews=[{"buffer": 0, "byteOffset": 40, "byteLength": 36}] * 2),
         "is damaged, or no glTF (ValueError",
     ),
+    "a buffer that is not there": (
+        gltf(buffers=[{"uri": "gone.bin", "byteLength": 9}]),
+        "buffers[0].uri: gone.bin is not there",
+    ),
+    "a short buffer": (
+        gltf(buffers=[{"uri": "data:base64,MTI=", "byteLength": 9}]),
+        "buffers[0]: its 2 bytes are fewer than the 9 promised",
+    ),
+    "a number for a list": (gltf(buffers=5), "is damaged, or no glTF (TypeError"),
+    "no numbers": (gltf(accessors=[]), "is damaged, or no glTF (IndexError"),
+    "nothing": (gltf(meshes=[], nodes=[], scenes=[]), "faces: there are none"),
     "a URI with NUL": (gltf(buffers=[{"byteLength": 48, "uri": "a%00b.bin"}]), "buffers[0].uri: the path holds a NUL"),
     "a long name": (gltf(buffers=[{"byteLength": 48, "uri": "a" * 300}]), "buffers[0].uri: a name in the path has 300"),
     "an address": (gltf(buffers=[{"byteLength": 48, "uri": "http://localhost/a.bin"}]), "only files beside this one"),
@@ -272,7 +271,12 @@ def test_json_that_nests_too_deep_is_refused(tmp_path: Path, suffix: str, text: 
 def test_what_lies_beside_an_obj_is_read_only_where_it_is_a_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo.png")
     (tmp_path / "a.obj").write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\n")
-    for line, told in (("map_Kd fifo.png", "is a FIFO"), ("map_Kd /etc/passwd", "absolute"), ("map_Kd a\0b", "NUL")):
+    for line, told in (
+        ("map_Kd gone.png", "texture: gone.png is not there"),
+        ("map_Kd fifo.png", "is a FIFO"),
+        ("map_Kd /etc/passwd", "absolute"),
+        ("map_Kd a\0b", "NUL"),
+    ):
         (tmp_path / "a.mtl").write_text(f"newmtl a\n{line}\n")
         assert told in refused(tmp_path / "a.obj")
 
