@@ -54,15 +54,14 @@ def transport_stream(pictures: int, **options: object) -> bytes:
     return held.getvalue()
 
 
-class Served:
-    """Sends to whoever connects, one at a time, until told to hang up."""
+class StreamServer:
+    """Sends bytes to whoever connects, one at a time, at a pace; holds or hangs up when it is told."""
 
-    def __init__(self) -> None:
-        self.hang_up = threading.Event()
-        self.connections = 0
+    def __init__(self, data: bytes) -> None:
+        self.data, self.connections = data, 0
+        self.hold, self.hang_up, self._closing = (threading.Event() for _ in range(3))
         self._listening = socket.create_server(("127.0.0.1", 0))
         self.url = f"tcp://127.0.0.1:{self._listening.getsockname()[1]}"
-        self._closing = threading.Event()
         threading.Thread(target=self._run, name="served", daemon=True).start()
 
     def close(self) -> None:
@@ -81,26 +80,12 @@ class Served:
                 self._send(client)
 
     def _send(self, client: socket.socket) -> None:
-        raise NotImplementedError
-
-
-class StreamServer(Served):
-    """Sends bytes at a pace, or holds."""
-
-    def __init__(self, data: bytes) -> None:
-        self.data, self.hold = data, threading.Event()
-        self.pace_s = 0.01
-        super().__init__()
-
-    def _send(self, client: socket.socket) -> None:
-        data, at, step = self.data, 0, 188 * 16
-        while at < len(data) and not self._closing.is_set() and not self.hang_up.is_set():
-            if self.hold.is_set():
-                self._closing.wait(0.02)
-                continue
-            client.sendall(data[at : at + step])
-            at += step
-            self._closing.wait(self.pace_s)
+        at, step = 0, 188 * 16
+        while at < len(self.data) and not self._closing.is_set() and not self.hang_up.is_set():
+            if not self.hold.is_set():
+                client.sendall(self.data[at : at + step])
+                at += step
+            self._closing.wait(0.01)
 
 
 @contextmanager

@@ -166,16 +166,6 @@ def gltf(**changes: Any) -> dict[str, Any]:
     return b.table({"attributes": attributes, "indices": b.add([0, 1, 2], np.uint32)}, **changes)
 
 
-def glb(table: dict[str, Any], binary: bytes = b"") -> bytes:
-    text = json.dumps(table).encode()
-    text += b" " * (-len(text) % 4)
-    binary += bytes(-len(binary) % 4)
-    chunks = struct.pack("<I", len(text)) + b"JSON" + text
-    if binary:
-        chunks += struct.pack("<I", len(binary)) + b"BIN\0" + binary
-    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
-
-
 def textured(material_texture: Any, textures: Any, images: Any) -> dict[str, Any]:
     table = gltf(images=images, textures=textures)
     table["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": material_texture}}}]
@@ -244,13 +234,12 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("name", GLTFS)
-@pytest.mark.parametrize("suffix", [".gltf", ".glb"])
-def test_a_gltf_is_refused_by_what_it_says_of_itself(tmp_path: Path, name: str, suffix: str) -> None:
+def test_a_gltf_is_refused_by_what_it_says_of_itself(tmp_path: Path, name: str) -> None:
     table, told = GLTFS[name]
     (tmp_path / "zero.bin").symlink_to("/dev/zero")
     os.mkfifo(tmp_path / "fifo.png")
-    path = tmp_path / f"a{suffix}"
-    path.write_bytes(glb(table) if suffix == ".glb" else json.dumps(table).encode())
+    path = tmp_path / "a.gltf"
+    path.write_text(json.dumps(table))
     start = time.monotonic()
     if told:
         assert told in refused(path)
