@@ -11,10 +11,11 @@ import re
 import threading
 import time
 import weakref
-from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
+from functools import partial
 from pathlib import Path
+from queue import Queue
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,7 @@ ANALYSED_US = "1000000"  # of a stream, before its first picture; FFmpeg would l
 FIRST_PICTURE_S = 3.0  # that is waited for, where it comes soon
 STALLED_S = 2.0  # without a new picture it is reported
 AGAIN_S, AGAIN_MAX_S = 0.5, 8.0  # between attempts; doubles
-LONGEST_STEP_S = 2.0  # between two pictures of a file; a longer one is a lie
+RATES_HZ = (0.5, 240.0)  # of a file; beyond, it lies
 USUAL_STEP_S = 1 / 30
 BEHIND = 8  # packets that wait, from which on all before the newest key picture are left out
 WAITING_MAX = 512  # packets; the oldest make way
@@ -164,16 +165,16 @@ class Reader:
                     yield np.asarray(reformatter.reformat(frame, format="rgba", threads=1).to_ndarray(), np.uint8)
 
     def _when_due(self, container: Any, stream: Any) -> Generator[Any, None, None]:
-        """A file's frames, each at its time."""
-        due_s, before_s = time.monotonic(), None
+        """A file's frames, at the pace that it says; a usual one where it says nonsense."""
+        rate_hz = float(stream.average_rate or 0)
+        step_s = 1 / rate_hz if RATES_HZ[0] <= rate_hz <= RATES_HZ[1] else USUAL_STEP_S
+        due_s = time.monotonic()
         for frame in container.decode(stream):
             self._check_size(frame.width, frame.height)
-            due_s += _step_s(before_s, frame.time)
-            before_s = frame.time
-            due_s = max(due_s, time.monotonic() - LONGEST_STEP_S)  # a machine that slept does not race
             if self.ending.wait(max(0.0, due_s - time.monotonic())):
                 return
             yield frame
+            due_s = max(due_s, time.monotonic() - step_s) + step_s  # a machine that slept does not race
 
     def _as_they_come(self, container: Any, stream: Any) -> Generator[Any, None, None]:
         """The newest frame of a stream, whenever there is one."""
@@ -213,13 +214,11 @@ class _Packets:
 
     def __init__(self, container: Any, stream: Any) -> None:
         """container: an open `av` container, which nobody else reads."""
-        self._source = container.demux(stream)
-        self._waiting: deque[Any] = deque(maxlen=WAITING_MAX)
+        self._waiting: Queue[Any] = Queue()  # packets, and at the end what ended them, an exception
         self._broken = False  # something was left out: what follows cannot be decoded on from what was before
-        self._ended, self._closing = False, False
-        self._problem: Exception | None = None
-        self._news = threading.Condition()
-        self._thread = threading.Thread(target=self._run, name="stream packets", daemon=True)
+        self._closing = False
+        run = partial(self._run, container.demux(stream))
+        self._thread = threading.Thread(target=run, name="stream packets", daemon=True)
         self._thread.start()
 
     def batches(self) -> Iterator[tuple[list[Any], bool]]:
@@ -227,48 +226,37 @@ class _Packets:
 
         Ends with the stream. Raises what reading it raised.
         """
-        while True:
-            with self._news:
-                self._news.wait_for(lambda: self._waiting or self._ended)
-                packets, broken = list(self._waiting), self._broken
-                self._waiting.clear()
-                self._broken = False
-            if not packets:
-                if self._problem is not None:
-                    raise self._problem
-                return
+        end: Exception | None = None
+        while end is None:
+            packets = [self._waiting.get()] + [self._waiting.get() for _ in range(self._waiting.qsize())]
+            broken, self._broken = self._broken, False
+            if isinstance(packets[-1], Exception):
+                end = packets.pop()
             if len(packets) >= BEHIND:
                 newest_key = max((place for place, packet in enumerate(packets) if packet.is_keyframe), default=0)
                 packets, broken = packets[newest_key:], broken or newest_key > 0
-            yield packets, broken
+            if packets:
+                yield packets, broken
+        if not isinstance(end, EOFError):
+            raise end
 
     def close(self) -> None:
         """No more is read. Waits for the read that is under way, which has a time limit of its own."""
         self._closing = True
         self._thread.join()
 
-    def _run(self) -> None:
+    def _run(self, packets: Iterator[Any]) -> None:
         try:
-            for packet in self._source:
+            for packet in packets:
                 if self._closing:
-                    break
-                with self._news:
-                    self._broken |= len(self._waiting) == WAITING_MAX
-                    self._waiting.append(packet)
-                    self._news.notify()
+                    return
+                self._waiting.put(packet)
+                if self._waiting.qsize() > WAITING_MAX:
+                    self._waiting.get()
+                    self._broken = True
+            self._waiting.put(EOFError())
         except Exception as error:  # raised again by who takes
-            self._problem = error
-        with self._news:
-            self._ended = True
-            self._news.notify()
-
-
-def _step_s(before_s: float | None, now_s: float | None) -> float:
-    """From one picture of a file to the next; a usual one where the file says nonsense."""
-    if before_s is None:
-        return 0.0
-    step_s = (now_s or 0.0) - before_s
-    return step_s if 0 < step_s <= LONGEST_STEP_S else USUAL_STEP_S
+            self._waiting.put(error)
 
 
 def prepare(

@@ -32,17 +32,16 @@ def film(
     pictures: int,
     first: int = 0,
     size: tuple[int, int] = (160, 48),
-    told_rate: int = RATE,
 ) -> None:
-    """A film of stereo pictures; told_rate: what the file says of its pictures a second."""
+    """A film of stereo pictures."""
     with av.open(file, "w", format=kind) as container:
-        stream = container.add_stream("mpeg2video" if kind == "mpegts" else "mpeg4", rate=told_rate)
+        stream = container.add_stream("mpeg2video" if kind == "mpegts" else "mpeg4", rate=RATE)
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
         stream.bit_rate = 4_000_000
         stream.gop_size = 5
         for number in range(pictures):
             frame = av.VideoFrame.from_ndarray(stereo_picture(first + number, *size), format="rgb24")
-            frame.pts, frame.time_base = number, Fraction(1, told_rate)
+            frame.pts, frame.time_base = number, Fraction(1, RATE)
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
 

@@ -20,8 +20,8 @@ from tests.optics import reference
 from tests.optics.strategies import floats
 
 SIZE = (17, 11)  # of the pictures, pixels
-STACKS = (
-    PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 32, 20),
+STACKS = (  # no line of sight lies in an edge between pixels, where the nearest one is anybody's choice
+    PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 33, 21),
     PanelStack(0.5, 0.3, (-0.05, 0.02), 24, 16),
     PanelStack(0.4, 0.4, (-0.07, -0.03, 0.01, 0.03), 20, 20),
 )
@@ -120,8 +120,7 @@ def test_expected_psnr_is_five_points_of_the_eyes_common_place_of_rays_or_of_lig
         total += weight * sum(errors) / len(errors)
     how = {"eyes_m": eyes, "fov_deg": 30, "sigmas_mm": (sigma_mm,), "rays": rays}
     told = expected_psnrs_db(layers, pictures, stack, **how)[sigma_mm]
-    # Of light, a ray at the edge of two pixels may take either: with so few pixels that is felt.
-    assert told == pytest.approx(-10 * math.log10(total), abs=5e-3 if rays else 2e-3)
+    assert told == pytest.approx(-10 * math.log10(total), abs=2e-3)
 
 
 def test_light_of_tilted_panels_takes_the_rays_that_a_retina_takes() -> None:
@@ -165,15 +164,16 @@ def test_what_is_compared_with_every_second_ray_only_has_no_similarity() -> None
     assert math.isfinite(told.psnr_db)
 
 
-@pytest.mark.parametrize("bad", [[0.06, 0.0, 0.0], [-1.0, 0.0, 0.0], [math.nan, 0.0, 0.0]])
-def test_a_true_eye_behind_a_panel_is_refused(bad: list[float]) -> None:
+@pytest.mark.parametrize(
+    ("place", "told"),
+    [
+        ([0.06, 0.0, 0.0], "in front of every panel"),
+        ([-1.0, 0.0, 0.0], "in front of every panel"),
+        ([math.nan, 0.0, 0.0], "in front of every panel"),
+        ([0.7, 50.0, 0.0], "crosses every panel"),
+    ],
+)
+def test_a_true_eye_that_sees_nothing_of_the_panels_is_refused(place: list[float], told: str) -> None:
     layers, pictures, eyes = case(STACKS[0], 5)
-    with pytest.raises(ValueError, match="in front of every panel"):
-        carried_quality(layers, pictures, STACKS[0], solved_for_m=eyes, eyes_m=[bad, bad], fov_deg=30)
-
-
-def test_eyes_that_see_nothing_of_the_panels_are_refused() -> None:
-    layers, pictures, eyes = case(STACKS[0], 6)
-    aside = eyes + np.array([0.0, 50.0, 0.0])
-    with pytest.raises(ValueError, match="crosses every panel"):
-        carried_quality(layers, pictures, STACKS[0], solved_for_m=eyes, eyes_m=aside, fov_deg=30)
+    with pytest.raises(ValueError, match=told):
+        carried_quality(layers, pictures, STACKS[0], solved_for_m=eyes, eyes_m=[place, place], fov_deg=30)

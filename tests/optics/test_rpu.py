@@ -97,14 +97,6 @@ def test_m_rpu_is_the_inverse_of_the_homography(eye: np.ndarray, stack: PanelSta
     np.testing.assert_allclose(product / scale, np.eye(3), atol=max(bound, 1e-9))
 
 
-@given(st.lists(floats(-100, 100), min_size=4, max_size=4))
-def test_collinear_corners_are_refused(positions: list[float]) -> None:
-    # Powers of two make the determinant exactly zero, whatever the positions.
-    corners = np.array([[p, 2 * p] for p in positions])
-    with pytest.raises(ValueError, match="collinear"):
-        image_from_panel_four_points(corners, width_px=10, height_px=10)
-
-
 @given(quadrilaterals(), st.integers(0, 3), st.integers(0, 3), floats(-1.0, 2.0), floats(1e-12, 1e12))
 def test_any_three_corners_on_a_line_or_two_at_one_place_are_refused(
     corners: np.ndarray, moved: int, steps: int, along: float, size: float
@@ -118,20 +110,10 @@ def test_any_three_corners_on_a_line_or_two_at_one_place_are_refused(
     flat[moved] = corners[first]
     with pytest.raises(ValueError, match="collinear"):
         image_from_panel_four_points(flat * size, width_px=640, height_px=480)
-    image_from_panel_four_points(corners * size, width_px=640, height_px=480)
-
-
-def test_corners_that_are_not_finite_are_refused() -> None:
+    flat[moved] = np.inf
     with pytest.raises(ValueError, match="collinear"):
-        image_from_panel_four_points([[0, 0], [np.inf, 0], [1, 1], [0, 1]], width_px=10, height_px=10)
-
-
-@given(floats(-1.0, 1.0), floats(-1.0, 1.0), floats(0.01, 0.1))
-def test_an_eye_in_a_panels_plane_is_refused(y: float, z: float, x: float) -> None:
-    stack = PanelStack(0.5, 0.3, (-x, 0.0, x), 1920, 1080)
-    projection = image_from_stack([x, y, z], **IMAGE)
-    with pytest.raises(ValueError, match="panel's plane"):
-        panel_from_image(projection, stack.panel(2))
+        image_from_panel_four_points(flat, width_px=640, height_px=480)
+    image_from_panel_four_points(corners * size, width_px=640, height_px=480)
 
 
 def test_an_eye_in_a_panels_plane_is_refused_in_any_units_of_the_image() -> None:
