@@ -58,7 +58,6 @@ REMOVED_COMMANDS: dict[str, str] = {
     "report --fresh": "take it out: nothing is kept; the page grows while it is measured",
     "bench robust": "`report --pairs DIR` measures pairs of your own",
     "bench passes": "nothing: it was a developer's count of OpenGL passes",
-    "bench eyes": "`eyes FILE ...` says how sure each pupil is; `run --keep-light` measures a recording with true eyes",
     "bench --backend": "`solve --backend gl --repeat 20` times a backend",
     "solve --config": "take it out: the defaults hold; --backend and --no-plan are options",
     "demo --model": "`run --replay demo --headless --max-speed --model NAME --out DIR`",

@@ -11,10 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
+from runtime.errors import InputError
+from runtime.eyes.benchmark import measure, told
 from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.support.artifacts import read_image, write_png
-from tests.eyes.scene import camera, eileen, frame, scene
+from tests.eyes.scene import camera, eileen, frame, grace, scene
 
 CAMERA = camera(640, 480, 65.0)
 
@@ -90,3 +92,24 @@ def test_without_a_file_the_sensor_is_looked_at(tmp_path: Path) -> None:
     config.write_text("[sensor]\nstart_s = 9.0\n")  # the built-in recording ends after ten seconds
     live = eyes("--config", config)
     assert live.returncode == 0 and "left eye" in live.stdout
+
+
+def test_the_benchmark_measures_detection_error_sigma_jitter_and_time(tmp_path: Path) -> None:
+    for portrait, name in ((eileen(), "eileen.png"), (grace(), "grace.png")):
+        write_png(tmp_path / name, portrait.picture)
+    rows = [
+        {"file": f"{name}.png", "left": portrait.pupils[0].tolist(), "right": portrait.pupils[1].tolist()}
+        for portrait, name in ((eileen(), "eileen"), (grace(), "grace"))
+    ]
+    (tmp_path / "truth.json").write_text(json.dumps(rows))
+    measured = measure(tmp_path)
+    for camera_row in measured["cameras"]:
+        assert camera_row["right"] == 1 and camera_row["mean_mm"] < 1.2 and camera_row["within_2_sigma"] > 0.7
+    steady = measured["steady"]
+    assert steady["lost"] == 0 and max(steady["right_mm"], steady["up_mm"]) < 0.07 and abs(steady["lag_frames"]) < 0.1
+    assert measured["processor_ms"]["followed"]["p50"] < measured["processor_ms"]["found"]["p50"]
+    assert told(measured).count("\n") >= 8
+    rows[1]["left"] = "here"
+    (tmp_path / "truth.json").write_text(json.dumps(rows))
+    with pytest.raises(InputError, match=r"truth\.json: 1: must have"):
+        measure(tmp_path)
