@@ -293,10 +293,7 @@ class ModelSettings(Section):
     eye_sigma_mm: Literal["auto"] | NonNegative = Field(
         "auto",
         description="standard deviation of where light enters an eye, millimetres an axis: a picture for two points "
-        "(0) or a forgiving one; auto: the pupil and the tracker's own covariance together",
-    )
-    pupil_mm: Annotated[float, within(0.0, 20.0, "mm")] = Field(
-        4.0, description="diameter of a pupil, millimetres, for eye_sigma_mm = auto"
+        "(0) or a forgiving one; auto: a pupil of 4 mm and the tracker's own covariance together",
     )
     budget_ms: NonNegative = Field(
         0.0, description="time for one solution, drawing included, after which no further step begins; 0: none"
@@ -425,7 +422,6 @@ class ServiceSettings(Section):
     group: str = Field("phasestack", description="group that may use the socket")
     metrics_port: Annotated[int, Field(ge=0, le=65535)] = Field(0, description="Prometheus on loopback; 0: off")
     log_format: Literal["text", "json"] = Field("text", description="log lines for people or for machines")
-    log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="least level that is logged")
     blackbox_minutes: Annotated[float, within(0.0, 60.0, "min")] = Field(
         2.0, description="what the black box keeps in memory, to be written at a fault or by `ctl blackbox`; 0: none"
     )

@@ -43,7 +43,6 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         ("[calibration]\nipd_m = 6.3", "calibration.ipd_m", "did you mean centimetres (0.063)?"),
         ("[calibration]\nviewing_m = [400, 600]", "calibration.viewing_m.0", "did you mean millimetres (0.4)?"),
         ("[content]\npicture_rate_hz = 1e-300", "content.picture_rate_hz", "may be 0.01 to 1000 Hz"),
-        ("[model]\npupil_mm = 4000", "model.pupil_mm", "may be 0 to 20 mm"),
         ("[tracker]\nhold_s = 500", "tracker.hold_s", "did you mean milliseconds (0.5)?"),
         ("[sensor]\nstart_s = 1e300", "sensor.start_s", "beyond"),
         ("[sensor]\nfixed_eyes_m = [[600, -31, 0], [600, 31, 0]]", "sensor.fixed_eyes_m.0.0", "millimetres (0.6)"),

@@ -90,9 +90,7 @@ class Solver:
     def _solve(self, state: RunState, request: SolveRequest, eyes_m: F64, *, revision: int) -> SolverStep:
         settings, watch = state.settings.model, Stopwatch()
         stages: dict[str, float] = {}
-        sigma_mm = configured_sigma_mm(
-            settings.eye_sigma_mm, pupil_mm=settings.pupil_mm, tracker_sigma_m=request.sigma_m
-        )
+        sigma_mm = configured_sigma_mm(settings.eye_sigma_mm, tracker_sigma_m=request.sigma_m)
         limited = self._timed and settings.budget_ms > 0
         deadline_ns = perf_counter_ns() + round(settings.budget_ms * NS_PER_MS) if limited else None
         try:

@@ -196,7 +196,7 @@ def configure(
     for name in ROOTS:
         root = logging.getLogger(name)
         root.handlers[:] = [handler]
-        root.setLevel(settings.log_level.upper())
+        root.setLevel(logging.INFO)
         root.propagate = False
 
 

@@ -16,15 +16,13 @@ from runtime.daemon.client import ask
 from tests.daemon.test_daemon import CONFIG, PHASESTACK
 from tests.waiting import eventually
 
-QUIET = CONFIG.replace('log_format = "json"', 'log_format = "json"\nlog_level = "debug"')
-
 
 class Daemon:
     """`phasestack run` with standard output and error of a test's choice."""
 
     def __init__(self, folder: Any, *, stdout: Any, stderr: Any, preexec_fn: Any = None) -> None:
         self.socket, config = folder / "status.sock", folder / "phasestack.toml"
-        config.write_text(QUIET.format(folder=folder))
+        config.write_text(CONFIG.format(folder=folder))
         self.process = subprocess.Popen(
             [*PHASESTACK, "run", "--config", str(config), "--replay", "demo", "--headless"],
             env={**os.environ, "OMP_NUM_THREADS": "1"},
