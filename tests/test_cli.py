@@ -64,17 +64,6 @@ def solve_arguments(folder: Path, **changes: object) -> list[str]:
     return arguments
 
 
-def test_solve_leaves_layers_and_what_the_eyes_see(pair: Path) -> None:
-    result = phasestack(*solve_arguments(pair), "--json")
-    assert result.returncode == 0, result.stderr
-    solved = json.loads(result.stdout)
-    assert solved == json.loads((pair / "out" / "solve.json").read_text())
-    names = {path.name for path in (pair / "out").iterdir()}
-    assert names >= {"layer-0.png", "layer-1.png", "layer-2.png", "seen-left.png", "seen-right.png", "solve.json"}
-    assert solved["psnr_db"] > 15
-    assert solved["total_ms"] >= solved["inference_ms"] > 0
-
-
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
@@ -103,7 +92,8 @@ def test_what_cannot_be_solved_is_one_line_and_exit_2(pair: Path, changes: dict[
 
 def test_eyes_in_line_with_the_displays_depth_are_served_by_sart(pair: Path) -> None:
     eyes: dict[str, object] = {"left_eye": (0.6, 0, 0), "right_eye": (0.66, 0, 0)}
-    assert phasestack(*solve_arguments(pair, **eyes, model="sart")).returncode == 0
+    app(solve_arguments(pair, **eyes, model="sart"), standalone_mode=False)
+    assert (pair / "out" / "solve.json").exists()
 
 
 def test_what_a_decoder_says_of_a_damaged_picture_stands_in_the_one_line(pair: Path) -> None:

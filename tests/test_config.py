@@ -5,19 +5,20 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from runtime.commands.app import app
 from runtime.config import Settings, load_settings, load_stack, with_options
 from runtime.daemon.names import check_names, scene_from_here, scene_names
 from runtime.errors import InputError
 from runtime.support import cache
 from runtime.support.artifacts import write_png
+from runtime.support.removed import REMOVED_COMMANDS, removed_command
+from tests.test_cli import phasestack, refusal
 
 
 def loaded(folder: Path, text: str) -> Settings:
@@ -111,11 +112,13 @@ def test_a_panels_file_takes_its_pixels_from_the_pictures_whatever_their_shape(t
         load_stack(file, width_px=600, height_px=800)
 
 
-def test_what_config_prints_is_a_configuration_and_says_where_paths_start(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "runtime.cli", "config"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    assert done.stdout.startswith("# Paths are relative to this file's folder.\n")
-    assert loaded(tmp_path, done.stdout) == Settings()
+def test_what_config_prints_is_a_configuration_and_says_where_paths_start(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    app(["config"], standalone_mode=False)
+    printed = capsys.readouterr().out
+    assert printed.startswith("# Paths are relative to this file's folder.\n")
+    assert loaded(tmp_path, printed) == Settings()
 
 
 def test_one_serial_on_two_monitors_is_told_apart_by_connector(tmp_path: Path) -> None:
@@ -152,20 +155,17 @@ def test_paths_are_relative_to_the_file_and_names_stay_names(tmp_path: Path, mon
     assert serial.sensor.source == "1d27/0601@1/5", "a device's URI is no path"
 
 
-def test_a_file_beside_the_configuration_is_found_from_any_folder(tmp_path: Path) -> None:
-    """The whole command, run elsewhere: today it looks for the file in the working directory."""
+def test_a_file_beside_the_configuration_is_found_from_any_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     from runtime.eyes.calibration import DEMO_FILE
 
     shutil.copy(DEMO_FILE, tmp_path / "calibration.toml")
     config = tmp_path / "phasestack.toml"
     config.write_text('[calibration]\nfile = "calibration.toml"\n')
-    done = checked(config, cwd="/")
-    assert (done.returncode, done.stdout) == (0, f"{config}: valid\n"), done.stderr
-
-
-def checked(config: Path, cwd: str | Path = ".") -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "runtime.cli", "config", "--check", str(config)]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=120)
+    monkeypatch.chdir("/")
+    app(["config", "--check", str(config)], standalone_mode=False)
+    assert capsys.readouterr().out == f"{config}: valid\n"
 
 
 @pytest.mark.parametrize(
@@ -193,12 +193,11 @@ def test_check_knows_every_name_and_looks_for_every_file(tmp_path: Path, text: s
     assert said in str(told.value)
 
 
-def test_check_exits_with_2_and_one_line(tmp_path: Path) -> None:
+def test_check_names_the_file(tmp_path: Path) -> None:
     config = tmp_path / "phasestack.toml"
     config.write_text('[model]\nname = "balancd"\n')
-    done = checked(config)
-    assert done.returncode == 2
-    assert done.stderr == f"phasestack: {config}: model.name: nobody knows 'balancd': did you mean balanced?\n"
+    told = refusal("config", "--check", config)
+    assert told == f"{config}: model.name: nobody knows 'balancd': did you mean balanced?"
 
 
 @pytest.mark.parametrize("given", [{"scene": "s" * 5000}, {"replay": "a\0b"}, {"model": "m" * 300}])
@@ -234,10 +233,9 @@ def test_every_wrong_field_of_a_file_is_told_in_one_line(tmp_path: Path) -> None
     assert any(part.startswith("loop.rate_hz: ") for part in parts) and "loop.zebra: is no setting" in parts
 
 
-@pytest.mark.parametrize("line", [["ctl", "budget", "16"], ["run", "--config", "a.toml", "--budget-ms=16"]])
-def test_a_command_or_option_that_is_gone_says_what_took_its_place(line: list[str]) -> None:
-    command = [sys.executable, "-m", "runtime.cli", *line]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+def test_a_command_or_option_that_is_gone_says_what_took_its_place() -> None:
+    assert removed_command(["ctl", "budget", "16"]) == ("ctl budget", REMOVED_COMMANDS["ctl budget"])
+    done = phasestack("run", "--config", "a.toml", "--budget-ms=16")
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.count("\n") == 1 and "is gone: " in done.stderr and "model.budget_ms" in done.stderr
 

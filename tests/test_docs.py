@@ -88,10 +88,3 @@ def test_every_page_can_be_reached_from_the_readme() -> None:
         places = ((page.parent / link).resolve() for link in links if link.endswith(".md") and ":" not in link)
         waiting += [place for place in places if place not in reached]
     assert [page.name for page in PAGES if page not in reached] == []
-
-
-def test_ci_runs_what_the_readme_tells_a_newcomer_to_run() -> None:
-    named = re.findall(r"^    (make \w+)", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
-    assert named[:2] == ["make demo", "make test"]
-    run = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
-    assert [command for command in named[:2] if not re.search(rf"^{command}\b", run, re.MULTILINE)] == []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import typer.main
 from runtime.commands.app import app
 from runtime.errors import InputError
 from tests.test_cli import refusal
+from tests.test_docs import walk
 
 HEADLESS = "run --headless --max-speed --frames 1 --scale 0.1 --out {out}"
 EYES = "--left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0 --fov 40"
@@ -67,15 +67,9 @@ def test_it_is_refused_in_one_line(folder: Path, command: str, told: str) -> Non
     assert not (folder / "out").exists()
 
 
-def commands(command: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    yield words, command
-    for name, child in getattr(command, "commands", {}).items():
-        yield from commands(child, (*words, name))
-
-
 def parameters(kind: str) -> list[tuple[tuple[str, ...], Any]]:
     """Every option and argument of a kind, with its command's words."""
-    found = commands(typer.main.get_command(app))
+    found = walk(typer.main.get_command(app))
     return [(words, one) for words, command in found for one in command.params
             if kind in str(one.type_descriptor.annotation)]  # fmt: skip
 
