@@ -94,7 +94,7 @@ def compare(
     before, after = benchmark.read(old), benchmark.read(new)
     changes = benchmark.compare(before, after)
     worse = [change for change in changes if change.worse]
-    busy = [f"{path}: {why}" for path, file in ((old, before), (new, after)) if (why := benchmark.too_busy(file))]
+    busy = [f"{path}: {why}" for path, file in ((old, before), (new, after)) if (why := file.too_busy())]
     if as_json:
         rows = [{"what": change.what, "worse": change.worse, "text": change.text} for change in changes]
         print(to_json({"worse": len(worse), "changes": rows, "times_compared": not busy, "too_busy": busy}))
@@ -102,7 +102,7 @@ def compare(
         console = Console(highlight=False, soft_wrap=True)
         for why in busy:
             console.print(f"times are not compared, the machine was too busy: {why}", style="yellow")
-        speed = after["yardstick_ms"] / before["yardstick_ms"]
+        speed = after.yardstick_ms / before.yardstick_ms
         console.print(f"machine: {speed:.2f} times the time of the yardstick; solutions are compared net of it")
         for change in sorted(changes, key=lambda change: not change.worse):
             verdict, style = ("worse ", "red") if change.worse else ("better", "green")

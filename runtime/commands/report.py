@@ -74,8 +74,7 @@ def _published(width_px: int, height_px: int) -> list[Method]:
     import model_export
     from model_export import yardstick
     from runtime.errors import FatalError, InputError
-    from runtime.report.frontier import check_models
-    from runtime.report.methods import Method
+    from runtime.report.methods import Method, check_models
     from runtime.report.worker import apart
     from runtime.support.cache import digest, user_cache
 

@@ -49,7 +49,7 @@ def stability(
         write_text(record, recorded(trials, cases, limits))
     seconds = time.perf_counter() - started
     failed = [case for case in cases if not case.passed]
-    machine = describe(seed=0, packages=("mpmath",))
+    machine = describe()
     result = {"cases": [asdict(case) for case in cases], "machine": machine, "seconds": round(seconds, 1)}
     if out is not None:
         command = "phasestack stability" + (" --full" if full else "")

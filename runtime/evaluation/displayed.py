@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
 
-from runtime.optics.carried import expected_psnrs_db, intensities, light_psnrs_db
+from runtime.optics.carried import expected_psnrs_db, intensities
 from runtime.optics.quality import Quality, quality
-from runtime.optics.retina import Retina, seen_by
+from runtime.optics.retina import Retina, as_codes, seen_by
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8, U16
+from runtime.support.artifacts import write_png
 
 Picture = U8 | U16 | F32  # (h, w, 3): code values, or intensities in [0, 1]
 SIGMAS_MM = (0.0, 1.0, 2.0)  # two points, a pupil alone, a pupil and a good tracker
@@ -26,6 +28,12 @@ class EyeViews:
     seen: tuple[Retina, ...]
     wanted: tuple[Picture, ...]
     quality: Quality  # exact, at the eyes that the layers were made (or aligned) for
+
+    def write(self, folder: Path) -> None:
+        """What each eye sees and should see, as pictures."""
+        for eye, retina, target in zip(("left", "right"), self.seen, self.wanted, strict=True):
+            write_png(folder / f"seen-{eye}.png", as_codes(retina.image))
+            write_png(folder / f"wanted-{eye}.png", as_codes(intensities(target)))
 
 
 def displayed(
@@ -62,40 +70,18 @@ def expected_db(
     fov_deg: float,
     sigmas_mm: Sequence[float] = SIGMAS_MM,
     step: int = 1,
+    rays: int = 0,
 ) -> dict[str, float | None]:
     """Expected PSNR (docs/contracts.md, Error) of layers, by the eyes' uncertainty in millimetres: "0", "1", "2".
 
-    step: only every so-manieth ray of every so-manieth row. None where such an error would take an eye to where it
-    sees nothing.
+    step: only every so-manieth ray of every so-manieth row; rays: of light, along and down a pixel, 0: one, bilinear.
+    None where such an error would take an eye to where it sees nothing.
     """
-    return _by_sigma(expected_psnrs_db, eye_views, layers, stack, sigmas_mm, eyes_m=eyes_m, fov_deg=fov_deg, step=step)
-
-
-def light_db(
-    eye_views: EyeViews,
-    layers: U8,
-    stack: PanelStack,
-    *,
-    eyes_m: F64,
-    fov_deg: float,
-    sigmas_mm: Sequence[float] = SIGMAS_MM,
-    step: int = 1,
-) -> dict[str, float | None]:
-    """What light leaves the panels' pixels (docs/contracts.md, Error): as `expected_db`. "1" is the one to quote."""
-    return _by_sigma(light_psnrs_db, eye_views, layers, stack, sigmas_mm, eyes_m=eyes_m, fov_deg=fov_deg, step=step)
-
-
-def _by_sigma(
-    measure: Callable[..., dict[float, float]],
-    eye_views: EyeViews,
-    layers: U8,
-    stack: PanelStack,
-    sigmas_mm: Sequence[float],
-    **how: Any,
-) -> dict[str, float | None]:
     values: dict[float, float | None] = dict.fromkeys(sigmas_mm)
     with contextlib.suppress(ValueError):
-        values |= measure(layers, eye_views.wanted, stack, sigmas_mm=sigmas_mm, **how)
+        values |= expected_psnrs_db(
+            layers, eye_views.wanted, stack, eyes_m=eyes_m, fov_deg=fov_deg, sigmas_mm=sigmas_mm, step=step, rays=rays
+        )
     return {f"{sigma_mm:g}": value for sigma_mm, value in values.items()}
 
 

@@ -12,32 +12,11 @@ from typing import Any, TextIO
 from runtime.errors import InputError
 from runtime.evaluation.contact_sheet import Moment, contact_sheet, headline
 from runtime.evaluation.displayed import EyeViews
-from runtime.optics.carried import intensities
-from runtime.optics.retina import as_codes
 from runtime.records import U8
 from runtime.support.artifacts import OutputFolder, to_json, write_json, write_png
 
 log = logging.getLogger("phasestack.output")
 
-# A line of frames.jsonl, in this order; what a caller knows beyond these comes after them.
-FIELDS = (
-    "frame",
-    "capture_ns",
-    "predicted_for_ns",
-    "present_ns",
-    "eyes_m",
-    "eyes_label",
-    "eye_sigma_mm",
-    "state",
-    "presented",
-    "solution",
-    "solved_for_m",
-    "solution_age_ms",
-    "true_eyes_m",
-    "inference",
-    "stage_ms",
-    "skew_ms",
-)
 WAITING = 64  # pieces of work that may wait for the disk
 
 
@@ -80,27 +59,15 @@ class RunOutput:
         self._attempt(lambda: self._folder.__exit__(kind, error, trace))
 
     def refresh(self, line: Mapping[str, Any]) -> None:
-        """One line of frames.jsonl: FIELDS, null where a run doesn't know one, and whatever else there is.
-
-        Arrays in it must not be written to afterwards.
-        """
-        told: dict[str, Any] = {name: line.get(name) for name in FIELDS}
-        told |= {name: value for name, value in line.items() if name not in FIELDS}
-        told["stage_ms"] = {stage: round(value, 4) for stage, value in (told["stage_ms"] or {}).items()}
-        for name in ("skew_ms", "solution_age_ms", "eye_sigma_mm"):
-            told[name] = None if told[name] is None else round(told[name], 4)
-        told["state"] = None if told["state"] is None else str(told["state"])
-        self._later(lambda: self._line(told))
+        """One line of frames.jsonl. Arrays in it must not be written to afterwards."""
+        self._later(lambda: self._line(line))
 
     def light(self, frame: int, *, layers: U8, drawn: tuple[U8, U8] | None, info: Mapping[str, Any]) -> None:
         """`light/<frame>/`: what the panels show at one refresh, and what the eyes that it was solved for should see.
 
-        layers: (N, h, w, 3 or 4), aligned; drawn: (h, w, 3) retina pictures, None where there
-        were none; info: `solved_for_m`, `eyes_m`,
-        `true_eyes_m` (2, 3), frame `stack`, None where not known, `fov` in degrees, and what else there is.
-        None of these arrays may be written to afterwards.
+        layers: (N, h, w, 3 or 4), aligned; drawn: (h, w, 3) retina pictures, None where there were none; info: what
+        light.json holds. None of these arrays may be written to afterwards.
         """
-        told = {name: info.get(name) for name in ("solved_for_m", "eyes_m", "true_eyes_m", "fov")} | dict(info)
 
         def write() -> None:
             folder = self._folder.staging / "light" / str(frame)
@@ -108,7 +75,7 @@ class RunOutput:
                 write_png(folder / f"layer-{n}.png", layer)
             for eye, picture in zip(("left", "right"), drawn or (), strict=False):
                 write_png(folder / f"drawn-{eye}.png", picture)
-            write_json(folder / "light.json", told)
+            write_json(folder / "light.json", info)
 
         self._later(write)
 
@@ -125,9 +92,7 @@ class RunOutput:
             for n, layer in enumerate(layers):
                 write_png(folder / f"layer-{n}.png", layer)
             if eye_views is not None:
-                for side, eye in enumerate(("left", "right")):
-                    write_png(folder / f"seen-{eye}.png", as_codes(eye_views.seen[side].image))
-                    write_png(folder / f"wanted-{eye}.png", as_codes(intensities(eye_views.wanted[side])))
+                eye_views.write(folder)
             if moment is None:
                 sheet = contact_sheet(layers, eye_views, headline=headline(None), lines=[in_one_line(summary)])
             else:
@@ -169,9 +134,9 @@ class RunOutput:
         log.warning("output: abandoned, nothing new is left in %s: %s", self._target, why, exc_info=trace)
         self._folder.discard()  # now: it may be what fills the disk
 
-    def _line(self, told: dict[str, Any]) -> None:
+    def _line(self, line: Mapping[str, Any]) -> None:
         assert self._lines is not None
-        self._lines.write(to_json(told) + "\n")
+        self._lines.write(to_json(line) + "\n")
 
     def _close_lines(self) -> None:
         if self._lines is not None:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from runtime.evaluation.contact_sheet import contact_sheet, headline
-from runtime.evaluation.displayed import EyeViews, Picture, displayed, expected_db, light_db
-from runtime.optics.carried import intensities
+from runtime.evaluation.displayed import EyeViews, Picture, displayed, expected_db
+from runtime.optics.light import RAYS
 from runtime.optics.retina import as_codes
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
@@ -56,24 +56,24 @@ class SolvedPair:
         """Layers, what each eye sees and should see, and a contact sheet with `lines` below its headline."""
         for n, layer in enumerate(self.layers):
             write_png(folder / f"layer-{n}.png", layer)
-        for name, seen, target in zip(("left", "right"), self.seen, self.eye_views.wanted, strict=True):
-            write_png(folder / f"seen-{name}.png", seen)
-            write_png(folder / f"wanted-{name}.png", as_codes(intensities(target)))
+        self.eye_views.write(folder)
         sheet = contact_sheet(self.layers, self.eye_views, headline=headline(self.quality.light_db["1"]), lines=lines)
         write_png(folder / "contact-sheet.png", sheet)
 
 
-def judged(layers: U8, pictures: Sequence[Picture], stack: PanelStack, *, eyes_m: F64, fov_deg: float) -> SolvedPair:
-    """What eyes (2, 3), frame `stack`, make of layers. Raises ValueError where they see nothing of the display."""
+def judged(
+    layers: U8, pictures: Sequence[Picture], stack: PanelStack, *, eyes_m: F64, fov_deg: float, step: int = 1
+) -> SolvedPair:
+    """What eyes (2, 3), frame `stack`, make of layers. Raises ValueError where they see nothing of the display.
+
+    step: what is expected of unsure eyes is measured on every so-manieth ray of every so-manieth row alone.
+    """
     views = displayed(layers, pictures, stack, eyes_m=eyes_m, fov_deg=fov_deg)
-    found = views.quality
-    quality = PairQuality(
-        light_db(views, layers, stack, eyes_m=eyes_m, fov_deg=fov_deg),
-        expected_db(views, layers, stack, eyes_m=eyes_m, fov_deg=fov_deg),
-        found.psnr_db,
-        found.ssim,
-        tuple(found.eye_psnr_db),
+    light, expected = (
+        expected_db(views, layers, stack, eyes_m=eyes_m, fov_deg=fov_deg, step=step, rays=rays) for rays in (RAYS, 0)
     )
+    at_eyes = views.quality
+    quality = PairQuality(light, expected, at_eyes.psnr_db, at_eyes.ssim, tuple(at_eyes.eye_psnr_db))
     return SolvedPair(layers, views, quality)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
+from itertools import islice
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -11,10 +12,10 @@ from typing import Any
 from runtime.config import StackGeometry
 from runtime.report import focal, moving
 from runtime.report.focal_page import focal_section
-from runtime.report.frontier import MethodResult, check_models, measure
+from runtime.report.frontier import QUOTED, MethodResult, measure
 from runtime.report.frontier_page import frontier_section
 from runtime.report.machine import describe
-from runtime.report.methods import Method, shipped_and_references
+from runtime.report.methods import Method, check_models, shipped_and_references
 from runtime.report.moving_page import moving_section
 from runtime.report.page import Page, Section, Tile
 from runtime.report.pairs import StillPair, procedural_pairs, read_pairs
@@ -23,7 +24,8 @@ from runtime.report.worker import apart
 REWRITTEN_EVERY_S = 10.0
 QUOTE = "light_db of eyes sure to 1 mm: what both eyes make of the panels' pixels"
 Progress = Callable[[str], None]
-Published = Callable[[int, int], list[Method]]  # the published network for panels so wide and high
+Published = Callable[[int, int], Sequence[Method]]  # the published network for panels so wide and high
+Batch = tuple[Sequence[Method], Iterable[StillPair]]
 
 
 class GrowingPage:
@@ -33,8 +35,7 @@ class GrowingPage:
         self._out, self._command, self._progress = out, command, progress
         self._sections: dict[str, Section] = {}
         self._written_s = float("-inf")
-        self.results: list[MethodResult] = []  # that the page's head tells of
-        self.record: dict[str, Any] = {"machine": describe(seed=0), "command": command, "quote": QUOTE}
+        self.record: dict[str, Any] = {"machine": describe(), "command": command, "quote": QUOTE, "complete": False}
 
     def doing(self, what: str) -> None:
         """What is measured now."""
@@ -50,6 +51,7 @@ class GrowingPage:
     def finished(self) -> None:
         """Nothing more will come."""
         del self.record["measuring"]
+        self.record["complete"] = True
         self.write()
 
     def write(self) -> None:
@@ -57,10 +59,20 @@ class GrowingPage:
         doing = self.record.get("measuring")
         notes = [f"Not finished: it grows while it is measured. The last that was known: {doing}."] if doing else []
         sections, machine = list(self._sections.values()), self.record["machine"]
+        tiles = _tiles(self.record.get("methods", []))
         lead = "Light, of eyes sure to 1 mm, is the figure to quote; higher is better."
-        page = Page("Error against run time", lead, sections, machine, self._command, _tiles(self.results), notes)
-        page.write(self._out, record="report.json", data=self.record | {"complete": doing is None})
+        page = Page("Error against run time", lead, sections, machine, self._command, tiles, notes)
+        page.write(self._out, record="report.json", data=self.record)
         self._written_s = monotonic()
+
+
+def _tiles(methods: Sequence[dict[str, Any]]) -> list[Tile]:
+    shown = [m for m in methods if m["kind"] == "network" and m["trained"] and QUOTED in m["light_db"]]
+    tiles = [Tile(f"{method['light_db'][QUOTED]:.1f} dB", f"light, {method['name']}") for method in shown]
+    ms = {method["name"]: method["ms_p50"] for method in methods}
+    if {"eyereal", "balanced"} <= ms.keys():
+        tiles.append(Tile(f"1/{ms['eyereal'] / ms['balanced']:.0f}", "of the published network's time, balanced"))
+    return tiles
 
 
 def whole_report(
@@ -85,54 +97,22 @@ def whole_report(
         stack = replace(stack, width_px=960, height_px=540)
     page = GrowingPage(out, command, progress)
     methods = shipped_and_references(models, quick=quick)
-    frontier: list[MethodResult] = []
     for size, own in _by_size(cases).items():
-        title = f"Error against run time: {len(own)} case file{'s' if len(own) > 1 else ''}, {size}"
-        frontier += _frontier(page, methods, own, title=title, name=f"cases-{size}", before=frontier, key="methods")
-    key = "methods_on_built_in_scenes" if frontier else "methods"
-    title = "Error against run time: built-in scenes"
-    scenes = _frontier(page, methods, procedural_pairs(stack), title=title, name="scenes", before=[], key=key)
-    page.doing("the published network")
-    if found := published(stack.width_px, stack.height_px):
-        first = next(iter(procedural_pairs(stack)))
-        for _, results in measure(found, [first]):
-            everything = [*scenes, *results]
-        page.record[key] = [result.record() for result in everything]
-        page.results = everything
-        page.put(
-            "scenes", lambda: frontier_section(everything, pairs=_names(scenes), title=title, name="scenes"), last=True
-        )
+        title = f"{len(own)} case file{'s' if len(own) > 1 else ''}, {size}"
+        _frontier(page, [(methods, own)], title=title, name=f"cases-{size}", key="methods")
+
+    def on_scenes() -> Iterable[Batch]:
+        yield methods, procedural_pairs(stack)
+        page.doing("the published network")
+        yield published(stack.width_px, stack.height_px), islice(procedural_pairs(stack), 1)
+
+    key = "methods_on_built_in_scenes" if cases else "methods"
+    _frontier(page, on_scenes(), title="built-in scenes", name="scenes", key=key)
     _moving(page, quick=quick)
     if with_focal:
         _focal(page)
     page.finished()
-    return page.record | {"complete": True}
-
-
-def _frontier(
-    page: GrowingPage,
-    methods: Sequence[Method],
-    pairs: Iterable[StillPair],
-    *,
-    title: str,
-    name: str,
-    before: Sequence[MethodResult],
-    key: str,
-) -> list[MethodResult]:
-    page.doing(f"{title}: drawing")
-    results: list[MethodResult] = []
-    for done, results in measure(methods, pairs):
-        page.doing(f"{title}: {done} is done")
-        page.record[key] = [result.record() for result in (*before, *results)]
-        if key == "methods":
-            page.results = results
-        page.put(name, lambda: frontier_section(results, pairs=_names(results), title=title, name=name))  # noqa: B023
-    page.put(name, lambda: frontier_section(results, pairs=_names(results), title=title, name=name), last=True)
-    return results
-
-
-def _names(results: Sequence[MethodResult]) -> str:
-    return "; ".join(pair.pair for pair in results[0].pairs)
+    return page.record
 
 
 def _by_size(cases: Sequence[StillPair]) -> dict[str, list[StillPair]]:
@@ -140,6 +120,24 @@ def _by_size(cases: Sequence[StillPair]) -> dict[str, list[StillPair]]:
     for pair in cases:
         groups.setdefault(f"{pair.stack.width_px}x{pair.stack.height_px}", []).append(pair)
     return groups
+
+
+def _frontier(page: GrowingPage, batches: Iterable[Batch], *, title: str, name: str, key: str) -> None:
+    """One section of pairs that share a resolution; `key`: of the record that its methods are added to."""
+    title = f"Error against run time: {title}"
+    page.doing(f"{title}: drawing")
+    before, results = page.record.get(key, []), dict[str, MethodResult]()
+
+    def section() -> Section:
+        return frontier_section(list(results.values()), title=title, name=name)
+
+    for methods, pairs in batches:
+        for done, result in measure(methods, pairs):
+            page.doing(f"{title}: {done} is done")
+            results[result.name] = result
+            page.record[key] = before + [one.record() for one in results.values()]
+            page.put(name, section)
+    page.put(name, section, last=True)
 
 
 def _moving(page: GrowingPage, *, quick: bool) -> None:
@@ -161,20 +159,7 @@ def _focal(page: GrowingPage) -> None:
         )
     page.record["focal"] = {
         "model": stack.model,
-        "pinhole_db": stack.pinhole_db,
-        "slices": [
-            {"plane_m": s.plane_m, "psnr_db": s.psnr_db, "contrast": s.contrast_shown, "contrast_true": s.contrast_true}
-            for s in stack.slices
-        ],
+        "slices": [{"plane_m": s.plane_m, "psnr_db": s.psnr_db} for s in stack.slices],
         "cards": [asdict(card) for card in stack.cards],
     }
     page.put("focal", lambda: focal_section(stack), last=True)
-
-
-def _tiles(results: Sequence[MethodResult]) -> list[Tile]:
-    by_name = {result.name: result for result in results}
-    tiles = [Tile(f"{r.quoted_db:.1f} dB", f"light, {r.name}") for r in results if r.kind == "network" and r.trained]
-    if {"eyereal", "balanced"} <= by_name.keys():
-        ratio = by_name["eyereal"].ms_p50 / by_name["balanced"].ms_p50
-        tiles.append(Tile(f"1/{ratio:.0f}", "of the published network's time, balanced"))
-    return tiles

@@ -19,10 +19,8 @@ from runtime.content.scenes import Scene, Thing
 from runtime.model.job import Job
 from runtime.model.predictor import load_predictor
 from runtime.optics.carried import intensities
-from runtime.optics.malus import intensity_from_phase
 from runtime.optics.quality import psnr_db
-from runtime.optics.retina import Mask, average, pupil_points, sample_bilinear
-from runtime.optics.rpu import panel_from_image
+from runtime.optics.retina import Rays, Retina, average, pupil_points, through_layers
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_camera, raster_from_stack, stack_from_eye
 from runtime.records import F32, F64, U8
@@ -44,10 +42,7 @@ class Slice:
     plane_m: float  # x of the place in focus, straight ahead
     shown: F32  # (h, w, 3) through the layers
     true: F32  # (h, w, 3) as the scene itself would look
-    mask: Mask
     psnr_db: float
-    contrast_shown: tuple[float, ...]  # of each card
-    contrast_true: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +61,6 @@ class FocalStack:
     model: str
     slices: tuple[Slice, ...]
     cards: tuple[Accommodation, ...]
-    pinhole_db: float
 
 
 def projection(eye_m: F64, point: F64, *, focus_m: float) -> F64:
@@ -82,19 +76,6 @@ def projection(eye_m: F64, point: F64, *, focus_m: float) -> F64:
     camera[1, 2] -= camera[1, 1] * point[1] / focus_m
     result: F64 = camera @ np.column_stack([rotation, -rotation @ place])
     return result
-
-
-def through_layers(matrix: F64, layers: U8, stack: PanelStack) -> tuple[F32, Mask]:
-    """(h, w, 3) what a projection's pinhole sees of the layers, and which rays cross every panel."""
-    u, v = np.arange(WIDTH_PX) + 0.5, (np.arange(HEIGHT_PX) + 0.5)[:, None]
-    total, mask = np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.float32), np.ones((HEIGHT_PX, WIDTH_PX), bool)
-    for index in range(stack.count):
-        h = panel_from_image(matrix, stack.panel(index))
-        weight = h[2, 0] * u + h[2, 1] * v + h[2, 2]
-        x, y = (((r[0] * u + r[1] * v + r[2]) / weight).astype(np.float32) for r in h[:2])
-        total += sample_bilinear(layers[index][..., :3], u=x, v=y)
-        mask &= (x > 0.5) & (x < stack.width_px - 0.5) & (y > 0.5) & (y < stack.height_px - 0.5)
-    return intensity_from_phase(total * np.float32(1 / 255)), mask
 
 
 def card_windows(eye_m: F64) -> list[tuple[slice, slice]]:
@@ -139,46 +120,34 @@ def focal_stack(
     predictor.close()
     eye, points = eyes[1], pupil_points(PUPIL_M)
     gaze = -stack_from_eye(eye)[:3, 2]
-    windows = card_windows(eye)
     slices: list[Slice] = []
     for index, plane_m in enumerate(PLANES_M):
         focus_m = float((np.array([plane_m, 0.0, 0.0]) - eye) @ gaze)
-        shown, masks, true = [], [], []
-        for point in points:
-            matrix = projection(eye, point, focus_m=focus_m)
-            image, mask = through_layers(matrix, layers, stack)
-            shown.append(image)
-            masks.append(mask)
-            drawn = painter.draw(eye, matrix, width_px=WIDTH_PX, height_px=HEIGHT_PX)
-            true.append(intensities(drawn))
-        seen, wanted, mask = average(shown), average(true), np.logical_and.reduce(masks)
-        error = float(np.square(seen[mask] - wanted[mask], dtype=np.float64).mean())
-        slices.append(
-            Slice(
-                plane_m,
-                seen,
-                wanted,
-                mask,
-                psnr_db(error),
-                tuple(contrast(seen, window) for window in windows),
-                tuple(contrast(wanted, window) for window in windows),
-            )
-        )
+        matrices = [projection(eye, point, focus_m=focus_m) for point in points]
+        retinas = [seen_through(matrix, layers, stack) for matrix in matrices]
+        drawn = [painter.draw(eye, matrix, width_px=WIDTH_PX, height_px=HEIGHT_PX) for matrix in matrices]
+        shown, true = average([r.image for r in retinas]), average([intensities(picture) for picture in drawn])
+        mask = np.logical_and.reduce([r.mask for r in retinas])
+        error = float(np.square(shown[mask] - true[mask], dtype=np.float64).mean())
+        slices.append(Slice(plane_m, shown, true, psnr_db(error)))
         progress(index + 1, len(PLANES_M))
-    matrix = projection(eye, np.zeros(2), focus_m=DISTANCE_M)
-    image, mask = through_layers(matrix, layers, stack)
-    sharp = intensities(painter.draw(eye, matrix, width_px=WIDTH_PX, height_px=HEIGHT_PX))
-    pinhole_db = psnr_db(float(np.square(image[mask] - sharp[mask], dtype=np.float64).mean()))
-    away = [float(np.linalg.norm(np.array([x, 0.0, 0.0]) - eye)) for x in PLANES_M]
+    away = [math.dist((x, 0.0, 0.0), eye) for x in PLANES_M]
     cards = tuple(
         Accommodation(
             math.dist(eye, (x, y, 0.0)),
-            sharpest(away, [s.contrast_shown[i] for s in slices]),
-            sharpest(away, [s.contrast_true[i] for s in slices]),
+            sharpest(away, [contrast(s.shown, window) for s in slices]),
+            sharpest(away, [contrast(s.true, window) for s in slices]),
         )
-        for i, (x, y) in enumerate(zip(CARDS_M, OFFSETS_M, strict=True))
+        for x, y, window in zip(CARDS_M, OFFSETS_M, card_windows(eye), strict=True)
     )
-    return FocalStack(model, tuple(slices), cards, pinhole_db)
+    return FocalStack(model, tuple(slices), cards)
+
+
+def seen_through(matrix: F64, layers: U8, stack: PanelStack) -> Retina:
+    """What a projection's pinhole sees of the layers, and which rays cross every panel."""
+    rays = Rays(matrix, np.arange(WIDTH_PX) + np.float64(0.5), (np.arange(HEIGHT_PX) + np.float64(0.5))[:, None])
+    panels = [stack.panel(index) for index in range(stack.count)]
+    return through_layers(layers, lambda rows: (rays.on(panel, rows) for panel in panels), rays.toward_panels(), stack)
 
 
 def cards_painter(stack: PanelStack) -> Painter:

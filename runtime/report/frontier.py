@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from runtime.errors import InputError
-from runtime.evaluation.displayed import displayed, expected_db, light_db
+from runtime.evaluation.solved import PairQuality, judged
 from runtime.evaluation.trials import timed
 from runtime.optics.carried import intensities
 from runtime.optics.light import squared_error
 from runtime.optics.quality import psnr_db
 from runtime.records import U8
-from runtime.report.methods import Kind, Method, opened
+from runtime.report.methods import Kind, Method
 from runtime.report.pairs import StillPair
 from runtime.report.worker import apart
 
@@ -36,7 +35,7 @@ class MethodRun:
     """One method on one pair, as the process that ran it saw it."""
 
     layers: U8
-    run_ms: list[float]  # whole predictions: two decoded images to N 8-bit layers
+    run_ms: tuple[float, ...]  # whole predictions: two decoded images to N 8-bit layers
     memory_mib: float  # the process's peak
     parameters: int
     precision: str
@@ -47,13 +46,9 @@ class PairResult:
     """One method on one pair."""
 
     pair: str
-    run_ms: list[float]
+    run_ms: tuple[float, ...]
     memory_mib: float
-    light_db: dict[str, float]  # by how sure the eyes are, millimetres: "0", "1", "2"
-    expected_db: dict[str, float]  # the same, one ray a pixel
-    psnr_db: float
-    ssim: float
-    eye_psnr_db: tuple[float, ...]
+    quality: PairQuality
     psnr_db_off_eye: dict[str, float]
 
 
@@ -68,11 +63,10 @@ class MethodResult:
     height_px: int
     ms_p50: float
     ms_p99: float
-    runs: int
     memory_mib: float
     parameters: int
-    light_db: dict[str, float]
-    expected_db: dict[str, float]
+    light_db: dict[str, float]  # by how sure the eyes are, millimetres: "0", "1", "2"
+    expected_db: dict[str, float]  # the same, one ray a pixel
     psnr_db: float
     ssim: float
     worst_eye_psnr_db: float  # least of all eyes and pairs
@@ -90,80 +84,73 @@ class MethodResult:
         return asdict(self)
 
 
+def measure(
+    methods: Sequence[Method], pairs: Iterable[StillPair], *, threads: int = 2
+) -> Iterator[tuple[str, MethodResult]]:
+    """Every method on every pair, pair by pair; one without training on the first alone. Pairs share a resolution.
+
+    Yields what was measured last, and its method's result so far. Raises FatalError where one fails.
+    """
+    found: dict[str, list[PairResult]] = {method.name: [] for method in methods}
+    for number, pair in enumerate(pairs):
+        for method in methods if number == 0 else [method for method in methods if method.trained]:
+            run = apart(run_method, method, replace(pair, off=()), threads)
+            found[method.name].append(pair_result(pair, run))
+            yield f"{method.name}, {pair.name}", _together(method, pair, run, found[method.name])
+
+
 def run_method(method: Method, pair: StillPair, threads: int) -> MethodRun:
     """Open, warm up, time, and note the peak of memory. Runs in a process of its own."""
     import cv2
 
+    from runtime.model.still import solve_still
+
     cv2.setNumThreads(threads)
-    ready = opened(method, pair, threads=threads)
+    predictor = method.opened(pair.stack, threads=threads)
     _forget_peak()
-    done = timed(lambda: ready.solve(pair), runs=FEWEST_RUNS, most=MOST_RUNS, enough_s=ENOUGH_S, slow_s=SLOW_S)
+    done = timed(
+        lambda: solve_still(*pair.images, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, predictor=predictor).layers,
+        runs=FEWEST_RUNS,
+        most=MOST_RUNS,
+        enough_s=ENOUGH_S,
+        slow_s=SLOW_S,
+    )
     layers, peak_mib = np.array(done.answer[..., :3]), _peak_mib()
-    return MethodRun(layers, list(done.times_ms), peak_mib, ready.parameters, ready.precision)
+    session = getattr(predictor, "session", None)
+    precision = "fp32" if session is None else str(session.contract.precision)
+    return MethodRun(layers, done.times_ms, peak_mib, predictor.parameters, precision)
 
 
 def _forget_peak() -> None:
-    try:
+    # Not on an older kernel: the peak then includes the start of the interpreter, which is less.
+    with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    except OSError:
-        return  # an older kernel: the peak then includes the start of the interpreter, which is less
 
 
 def _peak_mib() -> float:
-    for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1]) / 1024
-    return float("nan")
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    return int(status.partition("VmHWM:")[2].split()[0]) / 1024
 
 
-def measure(
-    methods: Sequence[Method], pairs: Iterable[StillPair], *, threads: int = 2
-) -> Iterator[tuple[str, list[MethodResult]]]:
-    """Every method on every pair, pair by pair; one without training on the first alone. Pairs share a resolution.
-
-    Yields what was measured last and the results so far, in the methods' order. Raises FatalError where one fails.
-    """
-    found: dict[str, MethodResult] = {}
-    for number, pair in enumerate(pairs):
-        for method in methods if number == 0 else [method for method in methods if method.trained]:
-            run = apart(run_method, method, replace(pair, off=()), threads)
-            so_far = found[method.name].pairs if method.name in found else []
-            found[method.name] = _together(method, pair, run, [*so_far, judged(pair, run)])
-            yield f"{method.name}, {pair.name}", list(found.values())
-
-
-def judged(pair: StillPair, run: MethodRun) -> PairResult:
+def pair_result(pair: StillPair, run: MethodRun) -> PairResult:
     """Displayed quality (docs/contracts.md, Error) at the eyes, expected of unsure ones, and at places beside them."""
-    layers, stack = run.layers, pair.stack
-    where: Any = {"eyes_m": pair.eyes_m, "fov_deg": pair.fov_deg}
-    eye_views = displayed(layers, pair.wanted, stack, **where)
-    where["step"] = max(1, math.isqrt(pair.images[0].shape[0] * pair.images[0].shape[1] // ENOUGH_PIXELS))
+    height_px, width_px = pair.images[0].shape[:2]
+    step = max(1, math.isqrt(height_px * width_px // ENOUGH_PIXELS))
+    at_eyes = judged(run.layers, pair.wanted, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, step=step)
     off: dict[str, list[float]] = {}
     for view in pair.off:
-        place, target = view.eye_m[None], [intensities(view.image)]
+        place = view.eye_m[None]
+        where: Any = {"solved_for_m": place, "eyes_m": place, "fov_deg": pair.fov_deg, "rays": 0, "step": OFF_STEP}
         with contextlib.suppress(ValueError):  # nothing is seen from there
-            error = squared_error(
-                layers, target, stack, solved_for_m=place, eyes_m=place, fov_deg=pair.fov_deg, rays=0, step=OFF_STEP
-            )
+            error = squared_error(run.layers, [intensities(view.image)], pair.stack, **where)
             off.setdefault(f"{view.mm:g}mm", []).append(psnr_db(error))
-    light, expected = (
-        {sigma: value for sigma, value in measured(eye_views, layers, stack, **where).items() if value is not None}
-        for measured in (light_db, expected_db)
-    )
-    exact = eye_views.quality
     beside = {name: float(np.mean(values)) for name, values in off.items()}
-    figures = (light, expected, exact.psnr_db, exact.ssim, exact.eye_psnr_db, beside)
-    return PairResult(pair.name, run.run_ms, run.memory_mib, *figures)
+    return PairResult(pair.name, run.run_ms, run.memory_mib, at_eyes.quality, beside)
 
 
 def _together(method: Method, pair: StillPair, run: MethodRun, pairs: list[PairResult]) -> MethodResult:
     all_ms = np.concatenate([one.run_ms for one in pairs])
-
-    def means(name: str) -> dict[str, float]:
-        tables = [getattr(one, name) for one in pairs]
-        keys = dict.fromkeys(key for table in tables for key in table)
-        return {key: float(np.mean([table[key] for table in tables if key in table])) for key in keys}
-
+    seen = [one.quality for one in pairs]
     return MethodResult(
         name=method.name,
         kind=method.kind,
@@ -172,18 +159,24 @@ def _together(method: Method, pair: StillPair, run: MethodRun, pairs: list[PairR
         height_px=pair.stack.height_px,
         ms_p50=float(np.median(all_ms)),
         ms_p99=float(np.percentile(all_ms, 99)),
-        runs=len(all_ms),
         memory_mib=max(one.memory_mib for one in pairs),
         parameters=run.parameters,
-        light_db=means("light_db"),
-        expected_db=means("expected_db"),
-        psnr_db=float(np.mean([one.psnr_db for one in pairs])),
-        ssim=float(np.mean([one.ssim for one in pairs])),
-        worst_eye_psnr_db=min(min(one.eye_psnr_db) for one in pairs),
-        psnr_db_off_eye=means("psnr_db_off_eye"),
+        light_db=_means([one.light_db for one in seen]),
+        expected_db=_means([one.expected_db for one in seen]),
+        psnr_db=float(np.mean([one.psnr_db for one in seen])),
+        ssim=float(np.mean([one.ssim for one in seen])),
+        worst_eye_psnr_db=min(min(one.eye_psnr_db) for one in seen),
+        psnr_db_off_eye=_means([one.psnr_db_off_eye for one in pairs]),
         trained=method.trained,
-        pairs=pairs,
+        pairs=list(pairs),
     )
+
+
+def _means(tables: Sequence[Any]) -> dict[str, float]:
+    """By key, over the tables that have a number there."""
+    keys = dict.fromkeys(key for table in tables for key in table)
+    found = {key: [table[key] for table in tables if table.get(key) is not None] for key in keys}
+    return {key: float(np.mean(values)) for key, values in found.items() if values}
 
 
 def pareto(results: Sequence[MethodResult]) -> list[MethodResult]:
@@ -193,14 +186,3 @@ def pareto(results: Sequence[MethodResult]) -> list[MethodResult]:
         if not front or result.quoted_db > front[-1].quoted_db:
             front.append(result)
     return front
-
-
-def check_models(names: Sequence[str]) -> None:
-    """Raises InputError for an ONNX file that isn't there or isn't ours, before anything is measured."""
-    from runtime.model.session import ModelSession
-
-    for name in names:
-        path = Path(name)
-        if not path.is_file():
-            raise InputError(path, "", "is not a file")
-        ModelSession(path, provider="cpu", threads=1)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from runtime.report.frontier import MethodResult, pareto
 from runtime.report.page import Figure, Section, Table
-from runtime.report.plots import COLOURS, drawing, label_points, png
+from runtime.report.plots import COLOURS, drawing, png
 
 KINDS = {"network": ("o", COLOURS[0]), "iterative": ("s", COLOURS[1])}
 
 
-def frontier_section(results: Sequence[MethodResult], *, pairs: str, title: str, name: str) -> Section:
+def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) -> Section:
     """The plot and the table of one resolution's methods, as far as they are measured."""
+    pairs = "; ".join(pair.pair for pair in results[0].pairs)
     text = [
         f"Every method on {pairs}, in one run. Light, the figure to quote: what both eyes make of the panels' pixels, "
         "which are even boxes, for eyes that are sure to 1 mm: a pupil. One ray a pixel, sampled bilinearly, is "
@@ -28,33 +30,27 @@ def frontier_section(results: Sequence[MethodResult], *, pairs: str, title: str,
 
 def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
     """A curve for each kind of method, more steps to the right; a line where there is a time and no picture."""
+    beside: Any = {"textcoords": "offset points", "fontsize": 8.5}
     with drawing(9.6, 5.0) as figure:
         axes = figure.add_subplot()
-        dots = sorted((result for result in results if result.trained), key=lambda r: r.ms_p50)
         for kind, (marker, colour) in KINDS.items():
-            if own := [r for r in dots if r.kind == kind]:
-                places = [r.ms_p50 for r in own], [r.quoted_db for r in own]
-                axes.plot(*places, marker=marker, markersize=7, color=colour, label=kind)
+            dots = sorted((r for r in results if r.trained and r.kind == kind), key=lambda r: r.ms_p50)
+            if dots:
+                places = [(r.ms_p50, r.quoted_db) for r in dots]
+                axes.plot(*zip(*places, strict=True), marker=marker, markersize=7, color=colour, label=kind)
+            for index, result in enumerate(dots):  # above and below the curve in turn, so that no name lies on another
+                above = {"xytext": (0, (9, -16)[index % 2]), "ha": "center"}
+                axes.annotate(result.name, (result.ms_p50, result.quoted_db), **above, **beside)
         for result in (result for result in results if not result.trained):
             axes.axvline(result.ms_p50, color=COLOURS[5], linestyle=":", linewidth=1.4)
-            axes.annotate(
-                f"{result.name} (time only)",
-                (result.ms_p50, 0.02),
-                xycoords=axes.get_xaxis_transform(),
-                xytext=(-3, 0),
-                textcoords="offset points",
-                rotation=90,
-                ha="right",
-                va="bottom",
-                fontsize=8.5,
-            )
+            place: Any = {"xycoords": axes.get_xaxis_transform(), "xytext": (-3, 0), "ha": "right", "rotation": 90}
+            axes.annotate(f"{result.name} (time only)", (result.ms_p50, 0.02), **place, **beside)
         axes.set(xscale="log", xlabel="median time of a whole solution, ms", ylabel="light, dB (a pupil)")
         axes.margins(x=0.1, y=0.15)
         axes.set_title("Light against run time: up and to the left is better")
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter("")
         axes.legend()
-        label_points(figure, axes, [(r.ms_p50, r.quoted_db, r.name) for r in dots])
     return Figure(name, png(figure), "Times hold for this machine and this hour: compare their ratios.")
 
 
@@ -63,16 +59,8 @@ def method_table(results: Sequence[MethodResult]) -> Table:
     ordered = sorted(results, key=lambda r: r.ms_p50)
     front = {result.name for result in pareto(results)}
     beside = list(dict.fromkeys(key for result in results for key in result.psnr_db_off_eye))
-    headings = ["method", "× fastest", "p50 ms", "p99 ms", "MiB", "parameters"]
-    headings += [
-        "light 1 mm dB",
-        "0 mm",
-        "2 mm",
-        "one ray dB",
-        "SSIM",
-        "worst eye",
-        *(f"{key} beside" for key in beside),
-    ]
+    headings = ["method", "× fastest", "p50 ms", "p99 ms", "MiB", "parameters", "light 1 mm dB", "0 mm", "2 mm"]
+    headings += ["one ray dB", "SSIM", "worst eye", *(f"{key} beside" for key in beside)]
     rows = []
     for r in ordered:
         seen = [r.light_db.get(key) for key in ("1", "0", "2")] + [r.psnr_db, r.ssim, r.worst_eye_psnr_db]

@@ -1,14 +1,17 @@
-"""The methods that the frontier compares, each as a function from a pair to layers. Picklable: they run elsewhere."""
+"""The methods that the frontier compares. Picklable: they run in processes of their own."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from runtime.records import U8
-from runtime.report.pairs import StillPair
+from runtime.errors import InputError
+
+if TYPE_CHECKING:
+    from runtime.model.predictor import Predictor
+    from runtime.optics.stack import PanelStack
 
 Kind = Literal["network", "iterative"]
 SHIPPED = ("balanced", "fast", "best")  # the default first: a report's first figure
@@ -25,34 +28,15 @@ class Method:
     iterations: int = 0  # of SART
     trained: bool = True  # where not, time and memory are the network's, its picture is nobody's
 
+    def opened(self, stack: PanelStack, *, threads: int) -> Predictor:
+        """Ready for pairs on a stack. Raises InputError, MissingPart."""
+        from runtime.config import ModelSettings
+        from runtime.model.predictor import load_predictor
+        from runtime.model.sart import SartPredictor
 
-@dataclass(frozen=True, slots=True)
-class Opened:
-    """A method made ready for a stack: what is done once and not timed."""
-
-    solve: Callable[[StillPair], U8]  # layers (N, h, w, 3 or 4), the solver's own until its next call
-    parameters: int
-    precision: str
-
-
-def opened(method: Method, pair: StillPair, *, threads: int) -> Opened:
-    """A method ready for pairs on this pair's stack. Raises InputError, MissingPart."""
-    from runtime.config import ModelSettings
-    from runtime.model.predictor import Predictor, load_predictor
-    from runtime.model.sart import SartPredictor
-    from runtime.model.still import solve_still
-
-    predictor: Predictor
-    if method.iterations:
-        predictor = SartPredictor(pair.stack, iterations=method.iterations)
-    else:
-        predictor = load_predictor(method.source, pair.stack, ModelSettings(threads=threads))
-    session = getattr(predictor, "session", None)
-    return Opened(
-        lambda p: solve_still(*p.images, eyes_m=p.eyes_m, fov_deg=p.fov_deg, predictor=predictor).layers,
-        predictor.parameters,
-        "fp32" if session is None else str(session.contract.precision),
-    )
+        if self.iterations:
+            return SartPredictor(stack, iterations=self.iterations)
+        return load_predictor(self.source, stack, ModelSettings(threads=threads))
 
 
 def shipped_and_references(models: Sequence[str] = (), *, quick: bool = False) -> list[Method]:
@@ -60,3 +44,14 @@ def shipped_and_references(models: Sequence[str] = (), *, quick: bool = False) -
     methods = [Method(name, "network", name) for name in SHIPPED]
     methods += [Method(Path(name).stem, "network", name) for name in models]
     return methods + [Method(f"SART-{n}", "iterative", "sart", n) for n in (SART[:-1] if quick else SART)]
+
+
+def check_models(names: Sequence[str]) -> None:
+    """Raises InputError for an ONNX file that isn't there or isn't ours, before anything is measured."""
+    from runtime.model.session import ModelSession
+
+    for name in names:
+        path = Path(name)
+        if not path.is_file():
+            raise InputError(path, "", "is not a file")
+        ModelSession(path, provider="cpu", threads=1)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ from runtime.daemon.build import RunOptions, build_run, scaled_stack
 from runtime.errors import FatalError
 from runtime.evaluation.motion_recording import write_motion
 from runtime.optics.carried import expected_psnrs_db, light_psnrs_db
-from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 
 MOTIONS = ("still", "lean", "walk", "stop-and-go")
@@ -55,12 +54,11 @@ class Moving:
 
 
 class Watched:
-    """Where a run's files would go: looks at each light as it comes, so that none is kept."""
+    """Where a run's files would go: keeps them in memory."""
 
-    def __init__(self, measure: Callable[[Light], Any]) -> None:
-        self._measure = measure
+    def __init__(self) -> None:
         self.lines: list[Mapping[str, Any]] = []  # of frames.jsonl
-        self.values: list[Any] = []  # what `measure` answered, light by light
+        self.lights: list[Light] = []  # of which all is known
         self.summary: Mapping[str, Any] = {}
 
     def refresh(self, line: Mapping[str, Any]) -> None:
@@ -68,17 +66,16 @@ class Watched:
 
     def light(self, frame: int, *, layers: U8, drawn: tuple[U8, U8] | None, info: Mapping[str, Any]) -> None:
         if drawn is not None and info["solved_for_m"] is not None and info["true_eyes_m"] is not None:
-            self.values.append(self._measure(Light(frame, layers, drawn, info["solved_for_m"], info["true_eyes_m"])))
+            self.lights.append(Light(frame, layers, drawn, info["solved_for_m"], info["true_eyes_m"]))
 
 
-def simulated_run(
-    settings: Settings, *, scale: float, keep_light: int, measure: Callable[[Light], Any], quality: bool = False
-) -> Watched:
-    """The daemon's own loop on a recording, on the simulated clock, to its end; `measure` is given every kept light.
+def simulated_run(settings: Settings, *, scale: float, keep_light: int, quality: bool = False) -> Watched:
+    """The daemon's own loop on a recording, on the simulated clock, to its end.
 
-    keep_light: refreshes from one to the next; quality: the summary has the run's own decibels. Raises FatalError.
+    keep_light: refreshes from one to the next, 0: none; quality: the summary has the run's own decibels.
+    Raises FatalError.
     """
-    watched = Watched(measure)
+    watched = Watched()
     with ExitStack() as cleanup:
         options = RunOptions(max_speed=True, measure=quality, scale=scale, keep_light=keep_light)
         run = build_run(settings, options, cleanup, output=watched)
@@ -102,36 +99,26 @@ def moving_run(motion: str, solver_ms: float, *, seconds: float = SECONDS, scale
         recording = Path(folder) / "motion.mcap"
         write_motion(recording, motion, seconds=seconds, seed=seed)
         settings = settings_for(recording, solver_ms=solver_ms)
-        look = partial(_carried, stack=scaled_stack(settings, scale), fov_deg=settings.content.fov_deg)
-        watched = simulated_run(settings, scale=scale, keep_light=EVERY, measure=look)
-    return _judged(watched, motion, solver_ms, rate_hz=settings.loop.rate_hz)
-
-
-def _carried(light: Light, *, stack: PanelStack, fov_deg: float) -> tuple[int, float, float]:
-    """The refresh, and what the true eyes see of it: light, and one ray a pixel. NaN where they see nothing."""
-    where: Any = {"eyes_m": light.solved_for_m, "seen_from_m": light.true_eyes_m, "sigmas_mm": (0.0,)}
-    where |= {"fov_deg": fov_deg, "step": STEP}
-    try:
-        seen = [way(light.layers, light.drawn, stack, **where)[0.0] for way in (light_psnrs_db, expected_psnrs_db)]
-    except ValueError:
-        return light.frame, float("nan"), float("nan")
-    return light.frame, seen[0], seen[1]
-
-
-def _judged(watched: Watched, motion: str, solver_ms: float, *, rate_hz: float) -> Moving:
-    first = SETTLED_S * rate_hz
-    seen = np.array([value[1:] for value in watched.values if value[0] >= first and np.isfinite(value[1])])
+        watched = simulated_run(settings, scale=scale, keep_light=EVERY)
+    first = SETTLED_S * settings.loop.rate_hz
+    where: Any = {"stack": scaled_stack(settings, scale), "fov_deg": settings.content.fov_deg}
+    where |= {"sigmas_mm": (0.0,), "step": STEP}
+    seen = []
+    for light in (light for light in watched.lights if light.frame >= first):
+        where |= {"eyes_m": light.solved_for_m, "seen_from_m": light.true_eyes_m}
+        with contextlib.suppress(ValueError):  # they see nothing
+            seen.append([way(light.layers, light.drawn, **where)[0.0] for way in (light_psnrs_db, expected_psnrs_db)])
     lines = [line for line in watched.lines if line["frame"] >= first and line["true_eyes_m"] is not None]
     tracked, behind = (
         [_apart_mm(line[place], line["true_eyes_m"]) for line in lines if line[place] is not None]
         for place in ("eyes_m", "solved_for_m")
     )
-    if not len(seen) or not tracked or not behind:
+    if not seen or not tracked or not behind:
         raise FatalError(f"the motion {motion} with a solver of {solver_ms:g} ms showed nothing")
-    light_db, one_ray_db = map(float, seen.mean(axis=0))
+    light_db, one_ray_db = map(float, np.mean(seen, axis=0))
     p50, p95 = map(float, np.percentile(tracked, (50, 95)))
     return Moving(motion, solver_ms, light_db, one_ray_db, len(seen), (p50, p95), float(np.median(behind)))
 
 
-def _apart_mm(found_m: Sequence[Any] | F64, truth_m: Sequence[Any] | F64) -> float:
-    return float(np.linalg.norm(np.asarray(found_m) - np.asarray(truth_m), axis=1).mean() * 1000)
+def _apart_mm(found_m: F64, truth_m: F64) -> float:
+    return float(np.linalg.norm(found_m - truth_m, axis=1).mean() * 1000)

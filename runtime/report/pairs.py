@@ -6,10 +6,11 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import BaseModel, Field
 
 from runtime.config import StackGeometry, read_table, validated
 from runtime.errors import InputError
@@ -17,13 +18,14 @@ from runtime.evaluation.displayed import Picture
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, stack_from_eye
 from runtime.records import F64, U8
-from runtime.support import foreign
 from runtime.support.artifacts import in_8_bits, read_picture
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
 
 if TYPE_CHECKING:
     from runtime.content.scenes import Scene
 
+Metres = Annotated[float, Field(strict=True, ge=-EYE_MOST_M, le=EYE_MOST_M)]
+Place = tuple[Metres, Metres, Metres]  # frame `stack`
 OFF_MM = (2, 4, 6)
 FOV_DEG = 40.0
 
@@ -55,6 +57,24 @@ class StillPair:
         return self.stored or self.images
 
 
+class OffEntry(BaseModel):
+    """What an eye should see from elsewhere, as a case file has it."""
+
+    mm: Annotated[float, Field(strict=True, ge=0, le=1000 * EYE_MOST_M)]
+    eye: Place
+    image: str
+
+
+class CaseFile(BaseModel):
+    """A case file (docs/contracts.md)."""
+
+    panels: dict[str, Any]
+    eyes: tuple[Place, Place]  # left, right
+    images: tuple[str, str]
+    fov: Annotated[float, Field(strict=True, ge=FOV_RANGE_DEG[0], le=FOV_RANGE_DEG[1])]
+    off: tuple[OffEntry, ...] = ()
+
+
 def read_pairs(folder: Path) -> list[StillPair]:
     """Every case file in a folder, by name. Other JSON files are passed over; a case with a mistake is not.
 
@@ -73,50 +93,23 @@ def read_pairs(folder: Path) -> list[StillPair]:
 
 
 def _case(path: Path, table: dict[str, Any]) -> StillPair:
-    names = table["images"]
-    if not (isinstance(names, list) and len(names) == 2 and all(isinstance(name, str) for name in names)):
-        raise InputError(path, "images", "must name the left and the right picture")
-    left, right = (read_picture(path.parent / name) for name in names)
+    case = validated(CaseFile, table, source=path)
+    left, right = (read_picture(path.parent / name) for name in case.images)
     if left.shape != right.shape:
         raise InputError(path, "images", f"differ in size: {left.shape[1::-1]} and {right.shape[1::-1]}")
-    if not isinstance(table["panels"], dict):
-        raise InputError(path, "panels", "must be a table")
     size = {"width_px": left.shape[1], "height_px": left.shape[0]}
-    stack = validated(StackGeometry, size | table["panels"], source=f"{path}: panels").stack()
-    eyes = np.array([_place(eye, path, "eyes") for eye in _items(table["eyes"], path, "eyes")])
-    if eyes.shape != (2, 3):
-        raise InputError(path, "eyes", "must be the left and the right eye")
+    stack = validated(StackGeometry, size | case.panels, source=f"{path}: panels").stack()
+    eyes = np.array(case.eyes)
     if not (eyes[:, 0] > max(stack.x_m)).all():
         raise InputError(path, "eyes", "must be before every panel")
-    fov_deg = foreign.real(table.get("fov"), least=FOV_RANGE_DEG[0], most=FOV_RANGE_DEG[1], source=path, field="fov")
-    off = tuple(_off_view(item, path, left.shape) for item in _items(table.get("off", []), path, "off"))
+    off = []
+    for view in case.off:
+        image = read_picture(path.parent / view.image)
+        if image.shape != left.shape:
+            raise InputError(path.parent / view.image, "", "differs in size from the pair")
+        off.append(OffView(view.mm, np.array(view.eye), image))
     images = (in_8_bits(left), in_8_bits(right))
-    return StillPair(path.stem, stack, eyes, images, fov_deg, off, (left, right))
-
-
-def _items(value: Any, path: Path, field: str) -> list[Any]:
-    if not isinstance(value, list):
-        raise InputError(path, field, "must be a list")
-    return value
-
-
-def _place(value: Any, path: Path, field: str) -> F64:
-    """(3,) metres: where an eye is."""
-    if not isinstance(value, list) or len(value) != 3:
-        raise InputError(path, field, "must be three finite numbers, metres")
-    return np.array([foreign.real(c, least=-EYE_MOST_M, most=EYE_MOST_M, source=path, field=field) for c in value])
-
-
-def _off_view(item: Any, path: Path, shape: tuple[int, ...]) -> OffView:
-    if not (isinstance(item, dict) and {"mm", "eye", "image"} <= item.keys()):
-        raise InputError(path, "off", "entries need mm, eye and image")
-    mm = foreign.real(item["mm"], least=0.0, most=EYE_MOST_M * 1000, source=path, field="off.mm")
-    if not isinstance(item["image"], str):
-        raise InputError(path, "off.image", "must be a file name")
-    image = read_picture(path.parent / item["image"])
-    if image.shape != shape:
-        raise InputError(path.parent / item["image"], "", "differs in size from the pair")
-    return OffView(mm, _place(item["eye"], path, "off.eye"), image)
+    return StillPair(path.stem, stack, eyes, images, case.fov, tuple(off), (left, right))
 
 
 def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0, ipd_m: float = 0.063) -> F64:

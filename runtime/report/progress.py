@@ -24,8 +24,7 @@ def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
         return
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(title, total=None)
         yield lambda done, of: progress.update(task, completed=done, total=of)
 
@@ -46,6 +45,5 @@ def status_line(title: str) -> Iterator[Callable[[str], None]]:
         yield lambda text: told(f"{title}: {text}")
         return
 
-    console = Console(stderr=True)
-    with console.status(title) as status:
+    with Console(stderr=True).status(title) as status:
         yield lambda text: status.update(f"{title}: {text}")

@@ -6,7 +6,6 @@ import json
 import math
 import struct
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,12 @@ import cv2
 import numpy as np
 import pytest
 
+from runtime.commands.solving import SolveOptions, solve_pair
 from runtime.errors import InputError
 from runtime.evaluation.displayed import displayed, on_panels_raster
 from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import in_8_bits, read_image, read_picture
 from tests.optics import reference
-from tests.test_cli import phasestack
 
 STACK = PanelStack(0.4, 0.3, (-0.06, 0.0, 0.06), 80, 60)
 EYES = np.array([[0.8, -0.03, 0.05], [0.8, 0.03, 0.05]])
@@ -85,27 +84,18 @@ def test_sizes_that_are_only_rounded_have_the_panels_aspect() -> None:
     assert on_panels_raster(np.zeros((768, 1360, 3), np.uint8), stack).shape == (768, 1360, 3)
 
 
-@pytest.fixture
-def solved(tmp_path: Path) -> Callable[..., Any]:
-    """Runs `solve` on two pictures' files; answers solve.json and the layers."""
-
-    def run(left: Path, right: Path, *more: str) -> tuple[dict, np.ndarray]:
-        panels = {"width_m": 0.4, "height_m": 0.3, "x_m": [-0.06, 0, 0.06], "width_px": 80, "height_px": 60}
-        (tmp_path / "panels.json").write_text(json.dumps(panels))
-        eyes = ("--left-eye", *map(str, EYES[0]), "--right-eye", *map(str, EYES[1]))
-        files = ("--left", left, "--right", right, "--panels", tmp_path / "panels.json", "--out", tmp_path / "out")
-        result = phasestack("solve", *files, *eyes, "--fov", str(FOV), *more)
-        assert result.returncode == 0, result.stderr
-        layers = np.stack([cv2.imread(str(tmp_path / "out" / f"layer-{n}.png"))[..., ::-1] for n in range(3)])
-        return json.loads((tmp_path / "out" / "solve.json").read_text()), layers
-
-    return run
+def solved(left: Path, right: Path) -> tuple[dict[str, Any], np.ndarray]:
+    """What `solve` leaves of two pictures' files: solve.json and the layers."""
+    out, panels = left.parent / "out", left.parent / "panels.json"
+    panels.write_text(json.dumps({"width_m": 0.4, "height_m": 0.3, "x_m": STACK.x_m, "width_px": 80, "height_px": 60}))
+    eyes = (tuple(EYES[0]), tuple(EYES[1]))
+    solve_pair(SolveOptions(left, right, *eyes, FOV, panels, out, "balanced", repeat=1, eye_sigma_mm=1.0, config=None))
+    layers = np.stack([cv2.imread(str(out / f"layer-{n}.png"))[..., ::-1] for n in range(3)])
+    return json.loads((out / "solve.json").read_text()), layers
 
 
 @pytest.mark.parametrize("size", [(48, 27), (27, 48)], ids=["wider than the panels", "portrait"])
-def test_solve_tells_what_the_eyes_see_of_pictures_of_another_aspect(
-    solved: Callable[..., Any], tmp_path: Path, size: tuple[int, int]
-) -> None:
+def test_solve_tells_what_the_eyes_see_of_pictures_of_another_aspect(tmp_path: Path, size: tuple[int, int]) -> None:
     width, height = size
     targets = []
     for name, shift in (("left", 0), ("right", 2)):
@@ -123,7 +113,7 @@ def test_solve_tells_what_the_eyes_see_of_pictures_of_another_aspect(
     assert told["eye_sigma_mm"] == 1
 
 
-def test_solve_scores_16_bit_pictures_with_all_their_bits(solved: Callable[..., Any], tmp_path: Path) -> None:
+def test_solve_scores_16_bit_pictures_with_all_their_bits(tmp_path: Path) -> None:
     targets = []
     for name in ("left", "right"):
         # Half a code above an 8-bit one: cut off to 8 bits, the target would be another by up to 255/256 of a code.
@@ -136,7 +126,7 @@ def test_solve_scores_16_bit_pictures_with_all_their_bits(solved: Callable[..., 
     assert abs(told["psnr_db"] - cut_off) > 0.05, "this test must be able to fail"
 
 
-def test_solve_composes_transparent_pictures_on_white(solved: Callable[..., Any], tmp_path: Path) -> None:
+def test_solve_composes_transparent_pictures_on_white(tmp_path: Path) -> None:
     targets = []
     for name in ("left", "right"):
         colour = (smooth(60, 80) * 255).astype(np.uint8)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from runtime.evaluation.motion_recording import write_motion
-from runtime.report.moving import Light, moving_run, settings_for, simulated_run
+from runtime.report.moving import moving_run, settings_for, simulated_run
 
 SCALE = 0.15
 
@@ -31,11 +31,10 @@ def test_a_runs_solver_takes_as_long_as_it_is_told_and_its_truth_is_the_recordin
     settings = settings_for(recording, solver_ms=200.0)
     solving = ("render", "prepare", "inference", "finish")
     assert sum(settings.loop.simulated_stage_ms[stage] for stage in solving) == pytest.approx(200.0)
-    lights: list[Light] = []
-    watched = simulated_run(settings, scale=SCALE, keep_light=10, measure=lights.append)
+    watched = simulated_run(settings, scale=SCALE, keep_light=10)
     assert watched.summary["solutions_per_s"] < 6
     told = {line["frame"]: line for line in watched.lines}
-    assert len(lights) > 5
-    for light in lights:
+    assert len(watched.lights) > 5
+    for light in watched.lights:
         np.testing.assert_array_equal(light.true_eyes_m, told[light.frame]["true_eyes_m"])
         np.testing.assert_array_equal(light.solved_for_m, told[light.frame]["solved_for_m"])

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
+from numpy.typing import ArrayLike
 from typer.testing import CliRunner
 
 from runtime.commands.stability import stability
@@ -67,28 +68,29 @@ STAGES = {
 
 
 @pytest.mark.parametrize("defect", ["operator off by a tenth of a pixel", "eyes exchanged"])
-def test_a_small_defect_of_the_operator_is_found_too(defect: str) -> None:
+def test_a_small_defect_of_the_operator_is_found_too(defect: str, monkeypatch: pytest.MonkeyPatch) -> None:
     real = solve.eye_operator
 
     def bent(eye: object, stack: object, **size: object) -> object:
         moved = np.asarray(eye) * [1, -1, 1] if defect == "eyes exchanged" else np.add(eye, [0, 0.01, 0])
         return real(moved, stack, **size)  # type: ignore[arg-type]
 
-    code = solve.Solvers(make_operator=bent)
-    trials = [trial for trial in solve.trials(code) if trial.name in ("spectrum, gap 0.06 m", "spectrum, gap 0.1 m")]
+    monkeypatch.setattr(solve, "eye_operator", bent)
+    trials = [trial for trial in solve.trials({}) if trial.name in ("spectrum, gap 0.06 m", "spectrum, gap 0.1 m")]
     assert len(trials) == 2 and not any(settle(trial).passed for trial in trials)
 
 
 def test_a_failing_case_makes_the_command_exit_with_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A pose that is wrong by a millionth: the command, on the poses alone, with one defect put into the optics."""
+    real = poses.stack_from_eye
 
-    def bent(eye: object) -> np.ndarray:
-        pose = poses.stack_from_eye(eye)  # type: ignore[arg-type]
+    def bent(eye: ArrayLike) -> np.ndarray:
+        pose = real(eye)
         pose[0, 0] += 1e-6
         return pose
 
-    code = poses.Poses(pose=bent)
-    monkeypatch.setattr(suite, "every_trial", lambda fits, check, full: poses.trials(code))
+    monkeypatch.setattr(poses, "stack_from_eye", bent)
+    monkeypatch.setattr(suite, "every_trial", lambda fits, check, full: poses.trials())
     done = command("--out", str(tmp_path))
     assert done.exit_code == 1
     assert "FAILS eye pose" in done.output
@@ -104,7 +106,7 @@ def test_a_case_that_crashes_fails_by_its_name_and_the_others_go_on(
 
     def trials(fits: object, check: object, full: bool) -> list[Trial]:
         good = Trial("solve", "a good one", lambda: Answer(0.0, 1.0), measure="of the wanted")
-        bad = Trial("solve", "a bad one", crashes, measure="of the wanted", recorded=True)
+        bad = Trial("solve", "a bad one", crashes, measure="of the wanted", floor=0.0)
         return [bad, good]
 
     monkeypatch.setattr(suite, "every_trial", trials)
@@ -117,7 +119,7 @@ def test_a_case_that_crashes_fails_by_its_name_and_the_others_go_on(
 
 
 def held(forward: float, limit: float | None, *, tolerance: float = 1.0, floor: float = 0.0) -> Case:
-    trial = Trial("stage", "name", lambda: Answer(forward, tolerance), recorded=True, floor=floor)
+    trial = Trial("stage", "name", lambda: Answer(forward, tolerance), floor=floor)
     return settle(trial, limit=limit)
 
 

@@ -6,7 +6,7 @@ From pairs that hardly determine it, and from noisy ones by every rule, against 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -53,18 +53,10 @@ def recovered(
     a relative error of the coordinates, rounding included, can turn the fit.
     """
     truth = rotation(quaternion)
-    stack_m = np.array(
-        [
-            [
-                float(
-                    exact.mpf(offset_m[i])
-                    + exact.mpf(scale) * sum(truth[i][j] * exact.mpf(float(p[j])) for j in range(3))
-                )
-                for i in range(3)
-            ]
-            for p in sensor_m
-        ]
-    )
+    rows = [
+        [exact.mpf(scale) * x for x in line] + [exact.mpf(shift)] for line, shift in zip(truth, offset_m, strict=True)
+    ]
+    stack_m = np.array([[float(x) for x in placed(rows, p)] for p in sensor_m])
     matrix = fit(sensor_m, stack_m)
     found = matrix[:3, :3]
     size = float(np.cbrt(np.linalg.det(found)))
@@ -77,14 +69,21 @@ def recovered(
     return Answer(fits, 16 * EPS64 * condition, condition, fits / condition)
 
 
+def placed(rows: Sequence[Sequence[Any]], point: F64) -> list[Any]:
+    """(3,) where a transform (3 or 4, 4) puts a point, exactly."""
+    x, y, z = exact.vector(point)
+    return [row[0] * x + row[1] * y + row[2] * z + row[3] for row in rows[:3]]
+
+
+def exactly(matrix: F64) -> list[list[Any]]:
+    """A matrix of exact numbers."""
+    return [[exact.mpf(float(value)) for value in row] for row in matrix]
+
+
 def carried_off(matrix: F64, sensor_m: F64, stack_m: F64) -> float:
     """How far a fit carries its own points from where they belong, of the largest coordinate."""
-    rows = [[exact.mpf(float(value)) for value in row] for row in matrix]
-    off = 0.0
-    for p, w in zip(sensor_m, stack_m, strict=True):
-        for i in range(3):
-            place = rows[i][3] + sum(rows[i][j] * exact.mpf(float(p[j])) for j in range(3))
-            off = max(off, exact.distance(w[i], place))
+    places = [placed(exactly(matrix), p) for p in sensor_m]
+    off = max(exact.distance(w[i], place[i]) for place, w in zip(places, stack_m, strict=True) for i in range(3))
     return off / float(np.abs(stack_m).max())
 
 
@@ -136,14 +135,8 @@ def noisy(
     found = fit(sensor_m, stack_m)
     if found.shape != (4, 4) or not np.array_equal(found[3], [0, 0, 0, 1]):
         return Answer(math.nan, 0.0, note="no transform")
-    error = 0.0
-    for p in sensor_m[good]:
-        for i in range(3):
-            ours, theirs = (
-                row[i][3] + sum(row[i][j] * exact.mpf(float(p[j])) for j in range(3))
-                for row in ([[exact.mpf(float(x)) for x in line] for line in found], truth)
-            )
-            error = max(error, float(abs(ours - theirs)))
+    places = [(placed(exactly(found), p), placed(truth, p)) for p in sensor_m[good]]
+    error = max(float(abs(ours - theirs)) for pair in places for ours, theirs in zip(*pair, strict=True))
     size = float(np.abs(stack_m).max())
     extents = [np.linalg.svd(p[good] - p[good].mean(0), compute_uv=False)[1] for p in (sensor_m, stack_m)]
     condition = max(

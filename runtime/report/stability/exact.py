@@ -7,6 +7,7 @@ from functools import lru_cache
 from typing import Any, TypedDict
 
 from runtime.errors import MissingPart
+from runtime.records import F64
 
 try:
     from mpmath import mp as mp
@@ -26,7 +27,7 @@ class Image(TypedDict):
     fov_deg: float
 
 
-def vector(values: Sequence[float]) -> Vector:
+def vector(values: Sequence[float] | F64) -> Vector:
     """Floats as exact numbers."""
     return (mpf(float(values[0])), mpf(float(values[1])), mpf(float(values[2])))
 
@@ -60,6 +61,7 @@ def axes(eye: Vector) -> tuple[Vector, Vector, Vector]:
     return right, cross(back, right), back
 
 
+@lru_cache(maxsize=256)
 def focal_px(width_px: int, fov_deg: float) -> Any:
     """Focal length of a picture of this width and horizontal field of view, pixels."""
     return mpf(width_px) / 2 / mp.tan(mp.radians(mpf(fov_deg)) / 2)

@@ -14,6 +14,7 @@ from runtime.config import ModelSettings
 from runtime.model.chain import chain_modes
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.model.still import solve_still
+from runtime.optics import quality
 from runtime.optics.carried import intensities
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
@@ -35,7 +36,6 @@ RAYS = 150  # of each eye, traced
 FLOOR = 0.0005  # an eighth of a code: what another processor's rounding may move
 
 Check = Callable[[tuple[float, ...], tuple[float, ...], PanelStack], object]  # left and right eye; raises
-Predict = Callable[[str, Sequence[U8], F64, PanelStack], U8]  # model, two pictures, eyes -> (N, h, w, 3) layers
 
 
 @lru_cache(maxsize=4)
@@ -54,10 +54,9 @@ def squared_error(layers: U8, images: Sequence[U8], eyes_m: F64, stack: PanelSta
     """Mean squared displayed error over both eyes. Raises ValueError where no ray counts."""
     total, count = 0.0, 0
     for eye, image in zip(eyes_m, images, strict=True):
-        size = {"width_px": image.shape[1], "height_px": image.shape[0]}
-        seen = seen_by(eye, layers, stack, **size, fov_deg=FOV_DEG)
-        difference = (seen.image - intensities(image))[seen.mask]
-        total, count = total + float(np.square(difference, dtype=np.float64).sum()), count + difference.size
+        seen = seen_by(eye, layers, stack, width_px=image.shape[1], height_px=image.shape[0], fov_deg=FOV_DEG)
+        squared, counted = quality.squared_error(seen.image, intensities(image), seen.mask)
+        total, count = total + squared, count + counted
     if not count:
         raise ValueError("no ray crosses every panel")
     return total / count
@@ -111,18 +110,18 @@ KINDS = (
 )  # fmt: skip
 
 
-def stressed(predict: Predict, model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack = STACK) -> Answer:
+def stressed(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack = STACK) -> Answer:
     """RMS displayed error; how much of it there must be is known for no picture: it is held to what was recorded."""
-    layers = predict(model, images, eyes_m, stack)
+    layers = predicted(model, images, eyes_m, stack)
     if layers.shape != (3, stack.height_px, stack.width_px, 3) or layers.dtype != np.uint8:
         return Answer(1.0, 0.0, note=f"layers of {layers.shape}, {layers.dtype}")
     return Answer(math.sqrt(squared_error(layers, images, eyes_m, stack)), 1.0)
 
 
-def scored(predict: Predict, model: str) -> Answer:
+def scored(model: str) -> Answer:
     """What the other cases take for seen of a model's layers, against rays traced to 50 digits."""
     images, eyes = pictures("coloured stripes, shifted by a third"), eyes_at(distance_m=0.6)
-    layers = predict(model, images, eyes, STACK)
+    layers = predicted(model, images, eyes, STACK)
     height, width = images[0].shape[:2]
     random, error, counted = np.random.default_rng(11), 0.0, 0
     for eye in eyes:
@@ -130,20 +129,19 @@ def scored(predict: Predict, model: str) -> Answer:
         seen, mask = retina.image, retina.mask
         place = exact.vector(eye)
         for row, column in zip(random.integers(0, height, RAYS), random.integers(0, width, RAYS), strict=True):
-            channel = int(row + column) % 3
-            truth, inside = traced(place, STACK, layers, int(column), int(row), channel, size=(width, height))
+            truth, inside = traced(place, STACK, layers, int(column), int(row), size=(width, height))
             if abs(inside) > EDGE_PX and bool(mask[row, column]) != (inside > 0):
                 return Answer(1.0, 0.0, note=f"ray {column}, {row} counts and should not, or the other way round")
             if inside > EDGE_PX and mask[row, column]:
-                error, counted = max(error, exact.distance(seen[row, column, channel], truth)), counted + 1
+                error, counted = max(error, *map(exact.distance, seen[row, column], truth)), counted + 1
     return Answer(error, 8 * EPS32 * width * STACK.count, note=f"{counted} rays")
 
 
-def repeatable(predict: Predict, model: str) -> Answer:
+def repeatable(model: str) -> Answer:
     """The same picture twice, with another in between: no state may be left behind."""
     eyes = eyes_at(distance_m=0.6)
     noise, flat = pictures("noise, another for each eye"), pictures("all white")
-    found = [predict(model, images, eyes, STACK).astype(int) for images in (noise, flat, noise)]
+    found = [predicted(model, images, eyes, STACK).astype(int) for images in (noise, flat, noise)]
     if np.array_equal(found[0], found[1]):
         return Answer(255.0, 0.0, note="white looks like noise")
     return Answer(float(np.abs(found[0] - found[2]).max()), 0.0)
@@ -215,7 +213,7 @@ def solver(model: str) -> Method:
     return solve
 
 
-def picture_trials(predict: Predict = predicted, *, full: bool = False) -> Iterator[Trial]:
+def picture_trials(*, full: bool = False) -> Iterator[Trial]:
     """Every case of what a model makes of two pictures; `full`: on every pose for each model, and on 4K panels."""
     for model in MODELS:
         for kind, (distance_m, angle_deg) in zip(KINDS, itertools.cycle(PLACES), strict=False):
@@ -223,15 +221,13 @@ def picture_trials(predict: Predict = predicted, *, full: bool = False) -> Itera
                 ("", eyes_at(distance_m=0.6)),
                 (f"{FROM}{distance_m:g} m, {angle_deg:g} degrees", eyes_at(distance_m=distance_m, angle_deg=angle_deg)),
             ):
-                run = partial(stressed, predict, model, pictures(kind), eyes)
-                yield Trial(STAGE, f"{model}: {kind}{place}", run, measure="intensity", recorded=True, floor=FLOOR)
-        run = partial(scored, predict, model)
+                run = partial(stressed, model, pictures(kind), eyes)
+                yield Trial(STAGE, f"{model}: {kind}{place}", run, measure="intensity", floor=FLOOR)
+        run = partial(scored, model)
         yield Trial(STAGE, f"{model}: what is seen of its layers", run, measure="intensity")
-        yield Trial(
-            STAGE, f"{model}: the same picture twice", partial(repeatable, predict, model), measure="grey levels"
-        )
+        yield Trial(STAGE, f"{model}: the same picture twice", partial(repeatable, model), measure="grey levels")
     for model in MODELS if full else ("balanced",):
-        yield from _poses(predict, model, full=full)
+        yield from _poses(model, full=full)
 
 
 def trials(check: Check, *, full: bool = False) -> Iterator[Trial]:
@@ -258,13 +254,13 @@ def trials(check: Check, *, full: bool = False) -> Iterator[Trial]:
     yield refusal(
         STAGE,
         "85 degrees aside: no ray crosses all panels",
-        partial(stressed, predicted, "balanced", smooth(STACK), aside),
+        partial(stressed, "balanced", smooth(STACK), aside),
     )
     for cells in (8, 112, 1024):
         yield Trial(STAGE, f"singular vectors of {cells} chain cells, float32", partial(modes, cells))
 
 
-def _poses(predict: Predict, model: str, *, full: bool) -> Iterator[Trial]:
+def _poses(model: str, *, full: bool) -> Iterator[Trial]:
     for name, eyes in (
         ("70 degrees aside", eyes_at(distance_m=0.8, angle_deg=70.0)),
         ("75 degrees aside", eyes_at(distance_m=2.0, angle_deg=75.0)),
@@ -277,13 +273,13 @@ def _poses(predict: Predict, model: str, *, full: bool) -> Iterator[Trial]:
         ("head turned by 60 degrees", np.array([[0.627, -0.016, 0.0], [0.573, 0.016, 0.0]])),
         ("left and right exchanged", eyes_at(distance_m=0.6)[::-1].copy()),
     ):
-        run = partial(stressed, predict, model, smooth(STACK), eyes)
-        yield Trial(STAGE, f"{model}: {name}", run, measure="intensity", recorded=True, floor=FLOOR)
+        run = partial(stressed, model, smooth(STACK), eyes)
+        yield Trial(STAGE, f"{model}: {name}", run, measure="intensity", floor=FLOOR)
     for gap_m in (1e-4, 1e-3, 0.5):
         stack = replace(STACK, x_m=(-gap_m, 0.0, gap_m))
-        run = partial(stressed, predict, model, smooth(stack), eyes_at(distance_m=0.6 + gap_m), stack)
-        yield Trial(STAGE, f"{model}: panels {gap_m:g} m apart", run, measure="intensity", recorded=True, floor=FLOOR)
+        run = partial(stressed, model, smooth(stack), eyes_at(distance_m=0.6 + gap_m), stack)
+        yield Trial(STAGE, f"{model}: panels {gap_m:g} m apart", run, measure="intensity", floor=FLOOR)
     for width, height in ((16, 16), (17, 31), (333, 77), *(((3840, 2160),) if full else ())):
         stack = replace(STACK, width_px=width, height_px=height)
-        run = partial(stressed, predict, model, smooth(stack), eyes_at(distance_m=0.6), stack)
-        yield Trial(STAGE, f"{model}: panels of {width}x{height}", run, measure="intensity", recorded=True, floor=FLOOR)
+        run = partial(stressed, model, smooth(stack), eyes_at(distance_m=0.6), stack)
+        yield Trial(STAGE, f"{model}: panels of {width}x{height}", run, measure="intensity", floor=FLOOR)

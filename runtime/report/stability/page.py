@@ -6,12 +6,15 @@ import math
 from collections.abc import Sequence
 
 from runtime.report.page import Figure, Page, Section, Table, Tile
-from runtime.report.plots import COLOURS, drawing, png
-from runtime.report.stability.solve import GEOMETRIES, problem_of
-from runtime.report.stability.trial import EPS64, Case
+from runtime.report.plots import drawing, png
+from runtime.report.stability.trial import Case
 
 COLUMNS = 30
-NO_ROUNDING = {"solve", "network"}  # stages whose errors are no matter of rounding
+SPARE = (  # digits at least, colour, name
+    (4.0, "#123f63", "over 4 digits"), (2.0, "#1c6f7d", "2 to 4"), (1.0, "#5aa98a", "1 to 2"),
+    (0.5, "#a9cfb0", "half to 1"), (-math.inf, "#f0c24b", "under half a digit"),
+)  # fmt: skip
+REFUSED, FAILS = "#d7dce6", "#c0322b"
 ABOUT = {
     "eye pose": "Where an eye is and how its head is turned: on and near the vertical axis, in, between and behind "
     "the panels, from 1e-200 to 1e200 m (EyeReal supplement, (10)-(14)).",
@@ -33,13 +36,14 @@ ABOUT = {
 }
 
 
-def spare_digits(case: Case) -> float:
-    """Decimal digits between the error and its tolerance; negative where it fails."""
+def colour_of(case: Case) -> str:
+    """By the decimal digits between the error and its tolerance."""
+    if not case.passed:
+        return FAILS
     if not math.isfinite(case.forward_error):
-        return math.nan
-    if case.forward_error == 0.0:
-        return math.inf
-    return math.log10(max(case.tolerance, 1e-18) / max(case.forward_error, 1e-18))
+        return REFUSED
+    spare = math.log10(max(case.tolerance, 1e-18) / max(case.forward_error, 1e-18)) if case.forward_error else math.inf
+    return next(colour for least, colour, _ in SPARE if spare >= least)
 
 
 def stages_of(cases: Sequence[Case]) -> list[str]:
@@ -54,63 +58,25 @@ def heat_map(cases: Sequence[Case]) -> Figure:
         own = [case for case in cases if case.stage == stage]
         rows += [(stage if not start else "", own[start : start + COLUMNS]) for start in range(0, len(own), COLUMNS)]
     with drawing(9.6, 0.9 + 0.29 * len(rows)) as figure:
-        from matplotlib.colors import BoundaryNorm, ListedColormap
         from matplotlib.patches import Patch, Rectangle
 
         axes = figure.add_subplot()
-        colours = ["#f0c24b", "#a9cfb0", "#5aa98a", "#1c6f7d", "#123f63"]
-        limits = [0, 0.5, 1, 2, 4, 20]
-        map_, norm = ListedColormap(colours), BoundaryNorm(limits, len(colours))
         for y, (_, own) in enumerate(rows):
             for x, case in enumerate(own):
-                spare = spare_digits(case)
-                face = "#d7dce6" if math.isnan(spare) else map_(norm(min(max(spare, 0), 19)))
-                if not case.passed:
-                    face = "#c0322b"
-                axes.add_patch(Rectangle((x, y), 0.9, 0.86, facecolor=face, linewidth=0))
-                if case.behaviour == "warns":
-                    axes.text(x + 0.45, y + 0.45, "!", ha="center", va="center", color="white", fontsize=8)
-                if not case.passed:
-                    axes.text(x + 0.45, y + 0.45, "×", ha="center", va="center", color="white", fontsize=9)
+                axes.add_patch(Rectangle((x, y), 0.9, 0.86, facecolor=colour_of(case), linewidth=0))
+                mark = "×" if not case.passed else "!" if case.behaviour == "warns" else ""
+                axes.text(x + 0.45, y + 0.45, mark, ha="center", va="center", color="white", fontsize=8.5)
         axes.set(xlim=(0, COLUMNS), ylim=(len(rows), 0), xticks=[])
         axes.set_yticks([y + 0.45 for y in range(len(rows))], [name for name, _ in rows])
         axes.grid(visible=False)
         axes.tick_params(length=0)
         for side in ("left", "bottom"):
             axes.spines[side].set_visible(False)
-        named = ["under half a digit to spare", "half to 1", "1 to 2", "2 to 4", "over 4 digits to spare"]
-        handles = [Patch(color=colour, label=name) for colour, name in zip(colours, named, strict=True)]
-        handles += [Patch(color="#d7dce6", label="refuses, as it must"), Patch(color="#c0322b", label="× fails")]
+        named = [*((colour, f"{name} to spare") for _, colour, name in SPARE), (REFUSED, "refuses, as it must")]
+        handles = [Patch(color=colour, label=name) for colour, name in (*named, (FAILS, "× fails"))]
         figure.legend(handles=handles, loc="outside lower left", ncols=4, fontsize=8.5)
     text = "Every case a square: how far its error stays below its tolerance. ! answers with a warning."
     return Figure("heat-map", png(figure), text)
-
-
-def condition_plot(cases: Sequence[Case]) -> Figure:
-    """Error against condition: a stable method stays along eps times the condition."""
-    with drawing(9.6, 4.6) as figure:
-        axes = figure.add_subplot()
-        span = [1.0, 1e13]
-        axes.plot(span, [EPS64 * c for c in span], color="#9aa3b5", linestyle="--", linewidth=1.2)
-        axes.text(1.5e9, 6e-8, "rounding of the input × condition", color="#5b6478", rotation=24, ha="center")
-        left_out = NO_ROUNDING
-        for colour, stage in zip(COLOURS, [s for s in stages_of(cases) if s not in left_out], strict=False):
-            own = [c for c in cases if c.stage == stage and math.isfinite(c.forward_error) and c.condition < 1e14]
-            points = [(c.condition, max(c.forward_error, 1e-18)) for c in own]
-            if points:
-                axes.scatter(*zip(*points, strict=True), s=20, color=colour, alpha=0.75, label=stage, linewidth=0)
-        axes.set(xscale="log", yscale="log", xlim=(0.7, 3e13), ylim=(5e-19, 1))
-        axes.set(
-            xlabel="condition of the problem",
-            ylabel="forward error",
-            title="Errors grow as the problems do, not faster",
-        )
-        axes.legend(ncols=4, loc="upper left", fontsize=8.5)
-    text = (
-        "A dot a case. Along the dashed line a method loses only what the rounding of its input must cost. Dots above "
-        "it at condition 1 are single precision and panels of 8 to 16 bits, whose tolerances are their own grey steps."
-    )
-    return Figure("error-against-condition", png(figure), text)
 
 
 def stiffness_plot(cases: Sequence[Case]) -> Figure:
@@ -121,7 +87,7 @@ def stiffness_plot(cases: Sequence[Case]) -> Figure:
         for name in dict.fromkeys(case.name.partition(",")[0] for case in own):
             points = sorted((c.condition, c.forward_error) for c in own if c.name.partition(",")[0] == name)
             axes.plot(*zip(*points, strict=True), marker="o", markersize=4, label=name)
-        bounds = sorted((problem.condition(), problem.optimum()) for problem in map(problem_of, GEOMETRIES))
+        bounds = sorted({(c.condition, c.forward_error - c.backward_error) for c in own})
         axes.plot(*zip(*bounds, strict=True), color="#9aa3b5", linestyle="--", linewidth=1.2, label="does not fit")
         axes.set(xscale="log", ylim=(0, 0.7), ylabel="part of the wanted left")
         axes.set(xlabel="condition of the two-eye operator for one cycle across the panels")
@@ -172,11 +138,7 @@ def stability_page(cases: Sequence[Case], *, machine: dict[str, str], seconds: f
             "digits or a closed form. The tolerance is stated before the case runs: a small multiple of the rounding "
             "of the input times the condition of the problem, or what was recorded of the case and 5%.",
         ],
-        [
-            heat_map(cases),
-            *([condition_plot(cases)] if set(stages) - NO_ROUNDING else []),
-            *([stiffness_plot(cases)] if "solve" in stages else []),
-        ],
+        [heat_map(cases), *([stiffness_plot(cases)] if "solve" in stages else [])],
         [] if not failed else [Table(headings, [row(c) for c in failed], "What fails", ["bad"] * len(failed))],
     )
     sections = [summary]

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -21,21 +19,10 @@ STAGE = "eye pose"
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 1920, 1080)
 
 
-@dataclass(frozen=True, slots=True)
-class Poses:
-    """The code under trial; tests put a wrong one in its place."""
-
-    pose: Callable[..., Any] = stack_from_eye
-    projection: Callable[..., Any] = image_from_stack
-    scale_shift: Callable[..., Any] = relative_scale_shift
-    retina: Callable[..., Any] = seen_by
-    panel_from_image: Callable[..., Any] = panel_from_image
-
-
-def pose(code: Poses, eye: Sequence[float]) -> Answer:
+def pose(eye: Sequence[float]) -> Answer:
     """The rotation against 50 digits. Its condition is how fast the head turns as the eye nears the axis."""
     truth = np.array(exact.axes(exact.vector(eye)), dtype=object).T
-    rotation = code.pose(eye)[:3, :3]
+    rotation = stack_from_eye(eye)[:3, :3]
     error = max(exact.distance(rotation[i, j], truth[i, j]) for i in range(3) for j in range(3))
     scale = max(map(abs, eye))
     ground = math.hypot(eye[0] / scale, eye[1] / scale)
@@ -43,10 +30,10 @@ def pose(code: Poses, eye: Sequence[float]) -> Answer:
     return Answer(error, 4 * EPS64, condition, backward_error=error / max(condition, 1.0))
 
 
-def gaze(code: Poses, eye: Sequence[float]) -> Answer:
+def gaze(eye: Sequence[float]) -> Answer:
     """The stack's origin in the middle of the picture, and a point aside of it where 50 digits put it."""
     view: exact.Image = {"width_px": 1920, "height_px": 1080, "fov_deg": 40.0}
-    projection = code.projection(eye, **view)
+    projection = image_from_stack(eye, **view)
     size, error = max(map(abs, eye)), 0.0
     for point in ((0.0, 0.0, 0.0), (0.125 * size, -0.25 * size, 0.0625 * size)):
         seen = projection @ [*point, 1.0]
@@ -55,9 +42,9 @@ def gaze(code: Poses, eye: Sequence[float]) -> Answer:
     return Answer(error / 1920, 8 * EPS64)
 
 
-def scale_shift(code: Poses, eye: Sequence[float], to_x_m: float) -> Answer:
+def scale_shift(eye: Sequence[float], to_x_m: float) -> Answer:
     """From the centre panel to another along an eye's ray."""
-    scale, shift = code.scale_shift(eye, from_x_m=0.0, to_x_m=to_x_m)
+    scale, shift = relative_scale_shift(eye, from_x_m=0.0, to_x_m=to_x_m)
     e = exact.vector(eye)
     point = (exact.mpf(0), exact.mpf(0.125), exact.mpf(-0.0625))
     truth = exact.hit(e, exact.combine(point, -1, e), to_x_m)
@@ -68,27 +55,27 @@ def scale_shift(code: Poses, eye: Sequence[float], to_x_m: float) -> Answer:
     return Answer(error, 8 * EPS64 * condition, condition)
 
 
-def trials(code: Poses = Poses()) -> Iterator[Trial]:
+def trials() -> Iterator[Trial]:
     """Every pose case."""
     for power in [*range(1, 13), 100, 300]:
         angle = 10.0**-power
         eye = [0.6 * math.sin(angle) * math.cos(0.7), 0.6 * math.sin(angle) * math.sin(0.7), 0.6 * math.cos(angle)]
-        yield Trial(STAGE, f"1e-{power} rad from the vertical axis", partial(pose, code, eye))
-    yield Trial(STAGE, "on the vertical axis, above", partial(pose, code, [0.0, 0.0, 0.6]))
-    yield Trial(STAGE, "on the vertical axis, below", partial(pose, code, [0.0, 0.0, -0.6]))
-    yield Trial(STAGE, "subnormal off the axis", partial(pose, code, [5e-324, 5e-324, 0.6]))
+        yield Trial(STAGE, f"1e-{power} rad from the vertical axis", partial(pose, eye))
+    yield Trial(STAGE, "on the vertical axis, above", partial(pose, [0.0, 0.0, 0.6]))
+    yield Trial(STAGE, "on the vertical axis, below", partial(pose, [0.0, 0.0, -0.6]))
+    yield Trial(STAGE, "subnormal off the axis", partial(pose, [5e-324, 5e-324, 0.6]))
     for distance_m in (1e-200, 1e-6, 1e-3, 1.0, 1e3, 1e6, 1e200):
         eye = [0.8 * distance_m, 0.36 * distance_m, 0.48 * distance_m]
-        yield Trial(STAGE, f"{distance_m:g} m away", partial(pose, code, eye))
+        yield Trial(STAGE, f"{distance_m:g} m away", partial(pose, eye))
     for distance_m in (1e-6, 1.0, 1e6):
         eye = [0.8 * distance_m, 0.36 * distance_m, 0.48 * distance_m]
-        yield Trial(STAGE, f"gaze from {distance_m:g} m", partial(gaze, code, eye), measure="of the width")
-        yield Trial(STAGE, f"panel to panel from {distance_m:g} m", partial(scale_shift, code, eye, -0.06))
-    yield Trial(STAGE, "panel to panel, 1e-9 m before it", partial(scale_shift, code, [0.06 + 1e-9, 0.2, 0.1], 0.06))
-    yield Trial(STAGE, "at the front panel's centre: a pose", partial(pose, code, [0.06, 0.0, 0.0]))
-    yield refusal(STAGE, "at the stack's origin: no gaze", partial(code.pose, [0.0, 0.0, 0.0]))
-    yield refusal(STAGE, "not a number", partial(code.pose, [math.nan, 0.0, 1.0]))
-    yield refusal(STAGE, "infinitely far", partial(code.pose, [math.inf, 0.0, 1.0]))
+        yield Trial(STAGE, f"gaze from {distance_m:g} m", partial(gaze, eye), measure="of the width")
+        yield Trial(STAGE, f"panel to panel from {distance_m:g} m", partial(scale_shift, eye, -0.06))
+    yield Trial(STAGE, "panel to panel, 1e-9 m before it", partial(scale_shift, [0.06 + 1e-9, 0.2, 0.1], 0.06))
+    yield Trial(STAGE, "at the front panel's centre: a pose", partial(pose, [0.06, 0.0, 0.0]))
+    yield refusal(STAGE, "at the stack's origin: no gaze", partial(stack_from_eye, [0.0, 0.0, 0.0]))
+    yield refusal(STAGE, "not a number", partial(stack_from_eye, [math.nan, 0.0, 1.0]))
+    yield refusal(STAGE, "infinitely far", partial(stack_from_eye, [math.inf, 0.0, 1.0]))
     layers = np.zeros((3, 1080, 1920, 3), np.uint8)
     for name, eye in (
         ("at the front panel's centre", [0.06, 0.0, 0.0]),
@@ -96,7 +83,7 @@ def trials(code: Poses = Poses()) -> Iterator[Trial]:
         ("between the panels", [0.03, 0.1, 0.0]),
         ("behind the panels", [-0.5, 0.0, 0.1]),
     ):
-        yield refusal(STAGE, f"{name}: a retina", partial(code.retina, eye, layers, STACK, fov_deg=40.0))
+        yield refusal(STAGE, f"{name}: a retina", partial(seen_by, eye, layers, STACK, fov_deg=40.0))
     for index, x in enumerate(STACK.x_m):
         if x:
             eye = [x, 0.3, 0.1]
@@ -104,10 +91,10 @@ def trials(code: Poses = Poses()) -> Iterator[Trial]:
             yield refusal(
                 STAGE,
                 f"in the plane of panel {index}: its RPU",
-                partial(code.panel_from_image, projection, STACK.panel(index)),
+                partial(panel_from_image, projection, STACK.panel(index)),
             )
     yield refusal(
         STAGE,
         "in a panel's plane: through it",
-        partial(code.scale_shift, [0.0, 0.1, 0.1], from_x_m=0.0, to_x_m=0.06),
+        partial(relative_scale_shift, [0.0, 0.1, 0.1], from_x_m=0.0, to_x_m=0.06),
     )

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -22,16 +21,8 @@ STAGE = "retina"
 SIZE = (32, 18)  # of the pictures and panels: every ray of a small picture is traced
 FOV_DEG = 40.0
 THREE = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), *SIZE)
+SMALL = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 16, 9)  # for nine rays a pixel
 EDGE_PX = 1e-4  # a ray so near to where it begins to count may count or not
-
-
-@dataclass(frozen=True, slots=True)
-class Eyesight:
-    """The code under trial; tests put a wrong one in its place."""
-
-    seen: Callable[..., Any] = seen_by
-    quality: Callable[..., Any] = quality
-    psnr: Callable[[float], float] = psnr_db
 
 
 def layers_of(kind: str, stack: PanelStack) -> U8:
@@ -46,17 +37,17 @@ def layers_of(kind: str, stack: PanelStack) -> U8:
 
 
 def traced(
-    eye: Any, stack: PanelStack, layers: U8, column: int, row: int, channel: int, size: tuple[int, int] = SIZE
-) -> tuple[Any, float]:
-    """The intensity that a ray of the picture sees, and by how many pixels it crosses the panels inside what counts.
+    eye: Any, stack: PanelStack, layers: U8, column: int, row: int, size: tuple[int, int] = SIZE
+) -> tuple[list[Any], float]:
+    """The intensities that a ray of the picture sees, and by how many pixels it crosses the panels inside what counts.
 
     Bilinear between a panel's pixel centres, summed, sin² of pi/2 of it. size: columns and rows of the picture.
     """
     u, v = exact.mpf(column) + exact.mpf("0.5"), exact.mpf(row) + exact.mpf("0.5")
     direction = exact.ray(eye, u, v, width_px=size[0], height_px=size[1], fov_deg=FOV_DEG)
     if direction[0] >= 0:
-        return exact.mpf(0), -math.inf
-    total, inside = exact.mpf(0), math.inf
+        return [], -math.inf
+    total, inside = [exact.mpf(0)] * 3, math.inf
     for layer, x_m in zip(layers, stack.x_m, strict=True):
         x, y = exact.panel_position(
             exact.hit(eye, direction, x_m), width_m=stack.width_m, height_m=stack.height_m,
@@ -72,37 +63,36 @@ def traced(
         for dy, wy in ((0, 1 - fy), (1, fy)):
             for dx, wx in ((0, 1 - fx), (1, fx)):
                 if wx and wy:
-                    total += wx * wy * int(layer[top + dy, left + dx, channel])
-    return exact.mp.sin(exact.mp.pi / 2 * total / 255) ** 2, inside
+                    values = layer[top + dy, left + dx]
+                    total = [t + wx * wy * int(value) for t, value in zip(total, values, strict=True)]
+    return [exact.mp.sin(exact.mp.pi / 2 * t / 255) ** 2 for t in total], inside
 
 
-def seen_rays(code: Eyesight, eye: Sequence[float], stack: PanelStack, kind: str) -> Answer:
+def seen_rays(eye: Sequence[float], stack: PanelStack, kind: str) -> Answer:
     """Every ray's intensity, and whether it counts."""
     layers = layers_of(kind, stack)
-    retina = code.seen(eye, layers, stack, fov_deg=FOV_DEG, width_px=SIZE[0], height_px=SIZE[1])
+    retina = seen_by(eye, layers, stack, fov_deg=FOV_DEG, width_px=SIZE[0], height_px=SIZE[1])
     if retina.image.shape != (SIZE[1], SIZE[0], 3):
         return Answer(1.0, 0.0, note=f"a picture of {retina.image.shape}")
     e, error, counted, wrong = exact.vector(eye), 0.0, 0, 0
-    for row in range(SIZE[1]):
-        for column in range(SIZE[0]):
-            channel = (row + column) % 3
-            truth, inside = traced(e, stack, layers, column, row, channel)
-            if abs(inside) > EDGE_PX and bool(retina.mask[row, column]) != (inside > 0):
-                wrong += 1
-            if inside > EDGE_PX and retina.mask[row, column]:
-                counted += 1
-                error = max(error, exact.distance(retina.image[row, column, channel], truth))
+    for row, column in np.ndindex(*retina.mask.shape):
+        truth, inside = traced(e, stack, layers, column, row)
+        if abs(inside) > EDGE_PX and bool(retina.mask[row, column]) != (inside > 0):
+            wrong += 1
+        if inside > EDGE_PX and retina.mask[row, column]:
+            counted += 1
+            error = max(error, *map(exact.distance, retina.image[row, column], truth))
     if wrong or not counted:
         return Answer(1.0, 0.0, note=f"{wrong} rays count that do not, or the other way round; {counted} compared")
     # Positions are single precision: half a rounding of the width, a grey step of the range a pixel and panel.
     return Answer(error, 8 * EPS32 * SIZE[0] * stack.count, float(stack.count), note=f"{counted} rays")
 
 
-def displayed(code: Eyesight, eyes: Sequence[Sequence[float]], kind: str) -> Answer:
+def displayed(eyes: Sequence[Sequence[float]], kind: str) -> Answer:
     """PSNR of one mean squared error over both eyes, all rays that count and all channels, in dB."""
     layers = layers_of("noise", THREE)
     random = np.random.default_rng(9)
-    seen = [code.seen(eye, layers, THREE, fov_deg=FOV_DEG) for eye in eyes]
+    seen = [seen_by(eye, layers, THREE, fov_deg=FOV_DEG) for eye in eyes]
     total, count = exact.mpf(0), 0
     wanted = []
     for eye, retina in zip(eyes, seen, strict=True):
@@ -112,35 +102,31 @@ def displayed(code: Eyesight, eyes: Sequence[Sequence[float]], kind: str) -> Ans
             target = random.random(retina.image.shape, dtype=np.float32)
         wanted.append(target)
         e = exact.vector(eye)
-        for row in range(SIZE[1]):
-            for column in range(SIZE[0]):
-                for channel in range(3):
-                    truth, inside = traced(e, THREE, layers, column, row, channel)
-                    if inside > 0:
-                        total += (truth - exact.mpf(float(target[row, column, channel]))) ** 2
-                        count += 1
+        for row, column in np.ndindex(*retina.mask.shape):
+            truth, inside = traced(e, THREE, layers, column, row)
+            if inside > 0:
+                total += sum((a - exact.mpf(float(b))) ** 2 for a, b in zip(truth, target[row, column], strict=True))
+                count += 3
     truth_db = -10 * exact.mp.log10(total / count)
-    found = code.quality([r.image for r in seen], wanted, [r.mask for r in seen])
+    found = quality([r.image for r in seen], wanted, [r.mask for r in seen])
     note = f"{float(truth_db):.3f} dB of {count} values"
     return Answer(exact.distance(found.psnr_db, truth_db), 0.002, note=note)
 
 
 def light(eyes: Sequence[Sequence[float]], true: Sequence[Sequence[float]], kind: str) -> Answer:
     """Mean squared error of the light of nine rays a pixel, for eyes that are elsewhere than solved for, ray by ray."""
-    layers, rays = layers_of(kind, THREE), 3
-    targets = [np.random.default_rng(3).random((SIZE[1], SIZE[0], 3), dtype=np.float32) for _ in eyes]
+    layers, rays = layers_of(kind, SMALL), 3
+    targets = [np.random.default_rng(3).random((SMALL.height_px, SMALL.width_px, 3), dtype=np.float32) for _ in eyes]
     total, count, doubtful = exact.mpf(0), 0, 0
     for nominal, place, target in zip(map(exact.vector, eyes), map(exact.vector, true), targets, strict=True):
-        for row in range(SIZE[1]):
-            for column in range(SIZE[0]):
-                seen, inside, edge = lit(nominal, place, layers, column, row, rays)
-                doubtful += min(abs(inside), edge) < EDGE_PX
-                if inside > 0:
-                    wanted = [exact.mpf(float(value)) for value in target[row, column]]
-                    total += sum((a - b) ** 2 for a, b in zip(seen, wanted, strict=True))
-                    count += 3
+        for row, column in np.ndindex(SMALL.height_px, SMALL.width_px):
+            seen, inside, edge = lit(nominal, place, layers, column, row, rays)
+            doubtful += min(abs(inside), edge) < EDGE_PX
+            if inside > 0:
+                total += sum((a - exact.mpf(float(b))) ** 2 for a, b in zip(seen, target[row, column], strict=True))
+                count += 3
     found = squared_error(
-        layers, targets, THREE, solved_for_m=np.array(eyes), eyes_m=np.array(true), fov_deg=FOV_DEG, rays=rays
+        layers, targets, SMALL, solved_for_m=np.array(eyes), eyes_m=np.array(true), fov_deg=FOV_DEG, rays=rays
     )
     # A ray on the border between two pixels may take either: a ninth of a pixel's intensity.
     tolerance = 64 * EPS32 + doubtful / rays**2 / max(count, 1)
@@ -149,18 +135,17 @@ def light(eyes: Sequence[Sequence[float]], true: Sequence[Sequence[float]], kind
 
 def lit(nominal: Any, true: Any, layers: U8, column: int, row: int, rays: int) -> tuple[list[Any], float, float]:
     """The mean intensities of a pixel's rays, how far inside they cross, and how near to a border between pixels."""
+    width, height, half = SMALL.width_px, SMALL.height_px, exact.mpf("0.5")
     sums, inside, edge = [exact.mpf(0)] * 3, math.inf, math.inf
     for ray in range(rays * rays):
-        u, v = (exact.mpf(at) + (exact.mpf(part) + exact.mpf("0.5")) / rays
-                for at, part in ((column, ray % rays), (row, ray // rays)))  # fmt: skip
-        direction = exact.ray(nominal, u, v, width_px=SIZE[0], height_px=SIZE[1], fov_deg=FOV_DEG)
-        through = exact.combine(exact.hit(nominal, direction, THREE.x_m[1]), -1, true)
+        u, v = column + (ray % rays + half) / rays, row + (ray // rays + half) / rays
+        direction = exact.ray(nominal, u, v, width_px=width, height_px=height, fov_deg=FOV_DEG)
+        through = exact.combine(exact.hit(nominal, direction, SMALL.x_m[1]), -1, true)
         phases = [0, 0, 0]
-        for layer, x_m in zip(layers, THREE.x_m, strict=True):
+        for layer, x_m in zip(layers, SMALL.x_m, strict=True):
             place = exact.hit(true, through, x_m)
-            x, y = exact.panel_position(place, width_m=THREE.width_m, height_m=THREE.height_m, size=SIZE)
-            half = exact.mpf("0.5")
-            inside = min(inside, *map(float, (x - half, SIZE[0] - half - x, y - half, SIZE[1] - half - y)))
+            x, y = exact.panel_position(place, width_m=SMALL.width_m, height_m=SMALL.height_m, size=(width, height))
+            inside = min(inside, *map(float, (x - half, width - half - x, y - half, height - half - y)))
             if inside <= 0:
                 return sums, inside, edge
             edge = min(edge, *(float(abs(p - exact.mp.nint(p))) for p in (x, y)))
@@ -169,13 +154,13 @@ def lit(nominal: Any, true: Any, layers: U8, column: int, row: int, rays: int) -
     return [s / rays**2 for s in sums], inside, edge
 
 
-def decibels(code: Eyesight, squared: float) -> Answer:
+def decibels(squared: float) -> Answer:
     """-10·log10 of a mean squared error, down to where nothing is left of it."""
     truth = -10 * exact.mp.log10(exact.mpf(squared))
-    return Answer(exact.distance(code.psnr(squared), truth), 16 * EPS64 * max(abs(float(truth)), 1.0))
+    return Answer(exact.distance(psnr_db(squared), truth), 16 * EPS64 * max(abs(float(truth)), 1.0))
 
 
-def trials(code: Eyesight = Eyesight()) -> Iterator[Trial]:
+def trials() -> Iterator[Trial]:
     """Every case of what eyes see."""
     two = PanelStack(0.5184, 0.2916, (-0.02, 0.03), *SIZE)
     four = PanelStack(0.3, 0.2, (-0.09, -0.02, 0.01, 0.06), 17, 31)
@@ -187,15 +172,15 @@ def trials(code: Eyesight = Eyesight()) -> Iterator[Trial]:
         ("4 m away", [4.0, -0.3, 0.2]),
     ):
         for kind in ("noise", "checkerboard"):
-            run = partial(seen_rays, code, eye, THREE, kind)
+            run = partial(seen_rays, eye, THREE, kind)
             yield Trial(STAGE, f"rays, {name}, {kind}", run, measure="intensity")
     for name, stack in (("two panels", two), ("four uneven panels of 17x31", four)):
-        run = partial(seen_rays, code, [0.6, 0.04, 0.03], stack, "noise")
+        run = partial(seen_rays, [0.6, 0.04, 0.03], stack, "noise")
         yield Trial(STAGE, f"rays, {name}", run, measure="intensity")
-    yield Trial(STAGE, "rays, all white", partial(seen_rays, code, [0.6, 0, 0], THREE, "white"), measure="intensity")
+    yield Trial(STAGE, "rays, all white", partial(seen_rays, [0.6, 0, 0], THREE, "white"), measure="intensity")
     eyes = [[0.7, -0.03, 0.05], [0.7, 0.03, 0.05]]
     for kind in ("nearly right", "all wrong"):
-        yield Trial(STAGE, f"PSNR, {kind}", partial(displayed, code, eyes, kind), measure="dB")
+        yield Trial(STAGE, f"PSNR, {kind}", partial(displayed, eyes, kind), measure="dB")
     for name, moved_m, kind in (
         ("at", 0.0, "checkerboard"),
         ("2 mm beside", 0.002, "noise"),
@@ -204,12 +189,12 @@ def trials(code: Eyesight = Eyesight()) -> Iterator[Trial]:
         true = [[x, y + moved_m, z] for x, y, z in eyes]
         yield Trial(STAGE, f"light {name} the eyes, {kind}", partial(light, eyes, true, kind), measure="squared error")
     for squared in (1.0, 0.5, 1e-3, 1e-6, 1e-10):
-        yield Trial(STAGE, f"PSNR of a squared error of {squared:g}", partial(decibels, code, squared), measure="dB")
+        yield Trial(STAGE, f"PSNR of a squared error of {squared:g}", partial(decibels, squared), measure="dB")
     layers = layers_of("noise", THREE)
 
     def nobody() -> object:
-        away = code.seen([0.07, 30.0, 0.0], layers, THREE, fov_deg=FOV_DEG)
-        return code.quality([away.image], [away.image], [away.mask])
+        away = seen_by([0.07, 30.0, 0.0], layers, THREE, fov_deg=FOV_DEG)
+        return quality([away.image], [away.image], [away.mask])
 
     yield refusal(STAGE, "PSNR where no ray crosses every panel", nobody)
-    yield refusal(STAGE, "an eye behind the panels", partial(code.seen, [-0.5, 0, 0], layers, THREE, fov_deg=FOV_DEG))
+    yield refusal(STAGE, "an eye behind the panels", partial(seen_by, [-0.5, 0, 0], layers, THREE, fov_deg=FOV_DEG))

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -28,16 +27,6 @@ STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 1920, 1080)
 SIZE = (1920, 1080)
 FOV_DEG = 40.0
 PROBES = [(a, b) for a in (0.1, 0.5, 0.9) for b in (0.2, 0.8)]  # places on a panel, as fractions of its size
-
-
-@dataclass(frozen=True, slots=True)
-class Rpu:
-    """The code under trial; tests put a wrong one in its place."""
-
-    panel_from_image: Callable[..., F64] = panel_from_image
-    image_from_raster: Callable[..., F64] = image_from_raster
-    four_points: Callable[..., F64] = image_from_panel_four_points
-    positions: Callable[..., Any] = panel_positions
 
 
 def at_angle(degrees: float, distance_m: float = 0.6) -> list[float]:
@@ -73,7 +62,7 @@ def mapped(m: F64, u: float, v: float) -> F64:
     return np.asarray(weighted[:2] / weighted[2])
 
 
-def followed(code: Rpu, eye: Sequence[float], *, index: int, stack: PanelStack = STACK) -> Answer:
+def followed(eye: Sequence[float], *, index: int, stack: PanelStack = STACK) -> Answer:
     """M_RPU of image pixels whose rays meet the panel, against ray tracing with 50 digits.
 
     Its condition is that of the mapping: how far a relative change of 1 of an image position, or of the eye's
@@ -82,7 +71,7 @@ def followed(code: Rpu, eye: Sequence[float], *, index: int, stack: PanelStack =
     view: exact.Image = {"width_px": stack.width_px, "height_px": stack.height_px, "fov_deg": FOV_DEG}
     projection = image_from_stack(eye, **view)
     raster = stack.panel(index)
-    m = code.panel_from_image(projection, raster)
+    m = panel_from_image(projection, raster)
     e = exact.vector(eye)
     error, condition = 0.0, 1.0
     for a, b in PROBES:
@@ -102,7 +91,7 @@ def followed(code: Rpu, eye: Sequence[float], *, index: int, stack: PanelStack =
     return Answer(relative, 64 * EPS64 * condition, condition, relative / condition, warned)
 
 
-def nearly_parallel(code: Rpu, angle_rad: float) -> Answer:
+def nearly_parallel(angle_rad: float) -> Answer:
     """A ray that makes a small angle with the panels: where it meets one is far away, and very sensitive."""
     eye = [0.5, 0.5, 0.0]
     e = exact.vector(eye)
@@ -112,17 +101,17 @@ def nearly_parallel(code: Rpu, angle_rad: float) -> Answer:
     u = float(exact.image_position(e, exact.combine(e, 1, direction), **view)[0])
     toward = exact.ray(e, exact.mpf(u), exact.mpf(540), **view)
     truth = exact.panel_position(exact.hit(e, toward, 0.06), width_m=0.5184, height_m=0.2916, size=SIZE)[0]
-    found = mapped(code.panel_from_image(image_from_stack(eye, **view), STACK.panel(2)), u, 540.0)[0]
+    found = mapped(panel_from_image(image_from_stack(eye, **view), STACK.panel(2)), u, 540.0)[0]
     relative = exact.distance(found, truth) / float(abs(truth))
     condition = 2 / angle_rad
     return Answer(relative, 16 * EPS64 * condition, condition, relative / condition)
 
 
-def single_precision(code: Rpu, width_px: int, height_px: int, degrees: float) -> Answer:
+def single_precision(width_px: int, height_px: int, degrees: float) -> Answer:
     """The float32 maps that retinas and warps sample with, in panel pixels."""
     stack = PanelStack(0.5184, 0.2916, STACK.x_m, width_px, height_px)
     eye = at_angle(degrees)
-    u, v = code.positions(eye, stack, index=2, width_px=width_px, height_px=height_px, fov_deg=FOV_DEG)
+    u, v = panel_positions(eye, stack, index=2, width_px=width_px, height_px=height_px, fov_deg=FOV_DEG)
     e, error, counted = exact.vector(eye), 0.0, 0
     for row in range(7, height_px, height_px // 5):
         for column in range(11, width_px, width_px // 7):
@@ -147,7 +136,7 @@ def seen_error(h: F64, e: Any, *, index: int = 2) -> float:
     return error / size
 
 
-def four_points(code: Rpu, degrees: float) -> Answer:
+def four_points(degrees: float) -> Answer:
     """The corrected closed form from the images of four corners: points between them, against rays of 50 digits."""
     e = exact.vector(at_angle(degrees))
     view: exact.Image = {"width_px": 1920, "height_px": 1080, "fov_deg": FOV_DEG}
@@ -157,7 +146,7 @@ def four_points(code: Rpu, degrees: float) -> Answer:
             for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))
         ]
     )
-    h = code.four_points(corners, width_px=1920, height_px=1080)
+    h = image_from_panel_four_points(corners, width_px=1920, height_px=1080)
     back = np.column_stack([panel_corners_px(STACK.panel(2)), np.ones(4)]) @ h.T
     backward = float(np.abs(back[:, :2] / back[:, 2:] - corners).max() / np.abs(corners).max())
     # Of the eight linear equations (44), each row scaled to its size, as rounding sees them.
@@ -168,12 +157,12 @@ def four_points(code: Rpu, degrees: float) -> Answer:
     return Answer(seen_error(h, e), 16 * EPS64 * condition, condition, backward)
 
 
-def round_trip(code: Rpu, degrees: float) -> Answer:
+def round_trip(degrees: float) -> Answer:
     """H against 50 digits, and H·M_RPU, which should be the identity: no worse than rounding times H's condition."""
     eye = at_angle(degrees)
     projection = image_from_stack(eye, width_px=1920, height_px=1080, fov_deg=FOV_DEG)
-    h = code.image_from_raster(projection, STACK.panel(2))
-    product = h @ code.panel_from_image(projection, STACK.panel(2))
+    h = image_from_raster(projection, STACK.panel(2))
+    product = h @ panel_from_image(projection, STACK.panel(2))
     # In fractions of the pictures: pixels would put the size of the picture into the condition.
     sizes = np.diag([*SIZE, 1.0])
     condition = float(np.linalg.cond(np.linalg.inv(sizes) @ h @ sizes))
@@ -182,44 +171,40 @@ def round_trip(code: Rpu, degrees: float) -> Answer:
     return Answer(error, 16 * EPS64 * condition, condition, error / condition)
 
 
-def trials(code: Rpu = Rpu()) -> Iterator[Trial]:
+def trials() -> Iterator[Trial]:
     """Every RPU case."""
     for degrees in (0.0, 45.0, 70.0, 80.0, 85.0):
         for index in (0, 2):
-            run = partial(followed, code, at_angle(degrees), index=index)
+            run = partial(followed, at_angle(degrees), index=index)
             yield Trial(STAGE, f"{degrees:g} degrees off axis, panel {index}", run, measure="of the width")
     for degrees in (89.0, 89.9, 89.99):
         # Far enough that the eye is still before the front panel; its near edge may be behind the image plane.
-        run = partial(followed, code, at_angle(degrees, 1000.0), index=2)
+        run = partial(followed, at_angle(degrees, 1000.0), index=2)
         yield Trial(STAGE, f"{degrees:g} degrees off axis at 1 km", run, measure="of the width")
     for power in (1, 3, 5, 7, 9, 11):
-        run = partial(followed, code, [0.06 + 10.0**-power, 0.4, 0.0], index=2)
+        run = partial(followed, [0.06 + 10.0**-power, 0.4, 0.0], index=2)
         yield Trial(STAGE, f"1e-{power} m before the front panel's plane", run, measure="of the width")
     for name, eye in (("3 cm before an edge", [0.09, 0.2, 0.0]), ("1 mm before a corner", [0.061, 0.25, 0.14])):
-        run = partial(followed, code, eye, index=2)
+        run = partial(followed, eye, index=2)
         yield Trial(STAGE, f"corners behind the eye, {name}", run, expected="warns", measure="of the width")
     for width_m in (1e-6, 1e-3, 1e3, 1e6):
         stack = PanelStack(width_m, width_m * 9 / 16, (-width_m / 9, 0.0, width_m / 9), 1920, 1080)
-        run = partial(followed, code, [1.2 * width_m, 0.3 * width_m, 0.2 * width_m], index=2, stack=stack)
+        run = partial(followed, [1.2 * width_m, 0.3 * width_m, 0.2 * width_m], index=2, stack=stack)
         yield Trial(STAGE, f"panels {width_m:g} m wide", run, measure="of the width")
     for power in range(1, 10, 2):
-        yield Trial(
-            STAGE, f"ray 1e-{power} rad from parallel to the panels", partial(nearly_parallel, code, 10.0**-power)
-        )
+        yield Trial(STAGE, f"ray 1e-{power} rad from parallel to the panels", partial(nearly_parallel, 10.0**-power))
     for width_px, height_px in ((64, 36), (1920, 1080), (3840, 2160)):
         for degrees in (0.0, 70.0):
-            run = partial(single_precision, code, width_px, height_px, degrees)
+            run = partial(single_precision, width_px, height_px, degrees)
             yield Trial(STAGE, f"float32 maps, {width_px}x{height_px}, {degrees:g} degrees", run, measure="px")
     for degrees in (0.0, 45.0, 70.0, 80.0):
-        yield Trial(STAGE, f"four-point closed form, {degrees:g} degrees", partial(four_points, code, degrees))
-        yield Trial(STAGE, f"H·M_RPU, {degrees:g} degrees", partial(round_trip, code, degrees))
-    flat = [[0.0, 0.0], [1.0, 2.0], [2.0, 4.0], [5.0, 10.0]]
-    yield refusal(STAGE, "four corners on one line", partial(code.four_points, flat, width_px=1920, height_px=1080))
+        yield Trial(STAGE, f"four-point closed form, {degrees:g} degrees", partial(four_points, degrees))
+        yield Trial(STAGE, f"H·M_RPU, {degrees:g} degrees", partial(round_trip, degrees))
     for name, corners in (
+        ("four corners on one line", [[0.0, 0.0], [1.0, 2.0], [2.0, 4.0], [5.0, 10.0]]),
         ("two corners at one place", [[0.0, 0.0], [0.0, 0.0], [9.0, 9.0], [0.0, 9.0]]),
         ("three corners on one line", [[0.0, 0.0], [5.0, 0.0], [9.0, 0.0], [0.0, 9.0]]),
         ("the first corner between its neighbours", [[4.5, 4.5], [9.0, 0.0], [9.0, 9.0], [0.0, 9.0]]),
+        ("a corner at NaN", [[0.0, 0.0], [math.nan, 0.0], [1.0, 1.0], [0.0, 1.0]]),
     ):
-        yield refusal(STAGE, name, partial(code.four_points, corners, width_px=1920, height_px=1080))
-    nowhere = [[0.0, 0.0], [math.nan, 0.0], [1.0, 1.0], [0.0, 1.0]]
-    yield refusal(STAGE, "a corner at NaN", partial(code.four_points, nowhere, width_px=1920, height_px=1080))
+        yield refusal(STAGE, name, partial(image_from_panel_four_points, corners, width_px=1920, height_px=1080))

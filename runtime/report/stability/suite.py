@@ -17,7 +17,6 @@ from runtime.report.stability import (
     uncertainty,
 )
 from runtime.report.stability.calibration import Fit
-from runtime.report.stability.limits import key_of
 from runtime.report.stability.networks import Check
 from runtime.report.stability.trial import Answer, Case, Trial, settle
 
@@ -29,13 +28,13 @@ def every_trial(fits: Mapping[str, Fit], check: Check, *, full: bool) -> Iterato
 
     A stage whose cases can't be made is one case, which fails.
     """
-    methods = (*solve.OURS, *((name, networks.solver(name)) for name in SOLVERS))
+    methods = {**solve.OURS, **{name: networks.solver(name) for name in SOLVERS}}
     stages: dict[str, Callable[[], Iterable[Trial]]] = {
         poses.STAGE: poses.trials,
         rpu.STAGE: rpu.trials,
         phases.PHASE: phases.trials,
         retina.STAGE: retina.trials,
-        solve.STAGE: partial(solve.trials, solve.Solvers(methods=methods)),
+        solve.STAGE: partial(solve.trials, methods),
         networks.STAGE: partial(networks.trials, check, full=full),
         uncertainty.STAGE: uncertainty.trials,
         tracking.STAGE: partial(tracking.trials, full=full),
@@ -61,6 +60,6 @@ def run(
     """Settle every trial, telling how far it is."""
     cases = []
     for index, trial in enumerate(trials):
-        cases.append(settle(trial, limit=limits.get(key_of(trial))))
+        cases.append(settle(trial, limit=limits.get(trial.key)))
         progress(index + 1, len(trials))
     return cases

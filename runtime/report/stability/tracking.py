@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -34,14 +34,6 @@ def kalman(places: F64, dt_s: float, *, haste: float, noise_m: float) -> tuple[A
         belief = imm.predicted(belief, dt_s, acceleration=(haste,), stay_s=1.0)
         belief = imm.corrected(belief, place, noise=noise)
     return belief.state[0, :3], belief.state[0, 3:6]
-
-
-@dataclass(frozen=True, slots=True)
-class Tracking:
-    """The code under trial; tests put a wrong one in its place."""
-
-    make: Callable[..., Any] = Tracker
-    filter: Callable[..., tuple[Any, Any]] = kalman
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,11 +72,11 @@ def exact_kalman(places: F64, dt_s: float, *, haste: float, variance: float) -> 
     return state[0], state[1]
 
 
-def filtered(code: Tracking, dt_s: float, *, haste: float, noise_m: float, steps: int = 200) -> Answer:
+def filtered(dt_s: float, *, haste: float, noise_m: float, steps: int = 200) -> Answer:
     """A plain Kalman filter (one model) over a noisy walk; its stiffness is the ratio of its two gains."""
     rng = np.random.default_rng(3)
     places = np.cumsum(rng.normal(0, 0.3 * min(dt_s, 1.0), (steps, 3)), axis=0) + rng.normal(0, noise_m, (steps, 3))
-    found, speed = code.filter(places, dt_s, haste=haste, noise_m=noise_m)
+    found, speed = kalman(places, dt_s, haste=haste, noise_m=noise_m)
     error = 0.0
     for axis in range(3):
         truth, truth_speed = exact_kalman(places[:, axis], dt_s, haste=haste, variance=noise_m**2)
@@ -95,9 +87,9 @@ def filtered(code: Tracking, dt_s: float, *, haste: float, noise_m: float, steps
     return Answer(error / span, 64 * EPS64 * max(stiff, steps), stiff)
 
 
-def still(code: Tracking, updates: int) -> Answer:
+def still(updates: int) -> Answer:
     """A head that does not move must not drift, wherever it came to rest."""
-    tracker = code.make()
+    tracker = Tracker()
     confidence = np.ones(2)
     came = Head(30 * FRAME_NS)
     for index in range(updates):
@@ -108,14 +100,12 @@ def still(code: Tracking, updates: int) -> Answer:
     return Answer(float(np.abs(found - came.eyes_m(30 * FRAME_NS)).max()), 1e-9, float(updates))
 
 
-def after(
-    code: Tracking, steps_ns: list[int], ask_ns: int, *, settings: TrackerSettings | None = None, lost: bool = False
-) -> Answer:
+def after(steps_ns: list[int], ask_ns: int, *, settings: TrackerSettings | None = None, lost: bool = False) -> Answer:
     """A head that moves evenly, sampled at odd intervals and asked for at an odd time: where it is then.
 
     lost: it was not seen for so long that nobody can know; then an answer is the mistake.
     """
-    tracker = code.make(settings) if settings else code.make()
+    tracker = Tracker(settings) if settings else Tracker()
     now, head = 0, Head(sum(map(abs, steps_ns)) + ask_ns)
     tracker.update(EyePoints(head.eyes_m(now), np.ones(2)), capture_ns=now)
     for step in steps_ns:
@@ -129,9 +119,9 @@ def after(
     return Answer(error, 1.0, note=f"label {estimate.label}")
 
 
-def nonsense(code: Tracking, eyes_m: F64, capture_ns: int) -> Answer:
+def nonsense(eyes_m: F64, capture_ns: int) -> Answer:
     """One bad sample among good ones of a moving head must change nothing, and the head is where it is."""
-    trackers = code.make(), code.make()
+    trackers = Tracker(), Tracker()
     head, ask_ns = Head(31 * FRAME_NS), 30 * FRAME_NS + FRAME_NS // 2
     for index in range(30):
         for tracker in trackers:
@@ -145,10 +135,10 @@ def nonsense(code: Tracking, eyes_m: F64, capture_ns: int) -> Answer:
     return Answer(float(np.abs(one - head.eyes_m(ask_ns)).max()), 0.02)
 
 
-def trials(code: Tracking = Tracking(), *, full: bool = False) -> Iterator[Trial]:
+def trials(*, full: bool = False) -> Iterator[Trial]:
     """Every case of the tracker; `full` adds the long one."""
     for updates in (10_000, *((1_000_000,) if full else ())):
-        yield Trial(STAGE, f"{updates} updates of a still head", partial(still, code, updates), measure="m")
+        yield Trial(STAGE, f"{updates} updates of a still head", partial(still, updates), measure="m")
     for name, dt_s, haste, noise_m in (
         ("as it is used", 1 / 30, 1.0, 0.003),
         ("1 kHz", 1e-3, 1.0, 0.003),
@@ -157,7 +147,7 @@ def trials(code: Tracking = Tracking(), *, full: bool = False) -> Iterator[Trial
         ("believes hardly any", 1 / 30, 1e-6, 0.03),
         ("microseconds apart", 1e-6, 1.0, 0.003),
     ):
-        run = partial(filtered, code, dt_s, haste=haste, noise_m=noise_m)
+        run = partial(filtered, dt_s, haste=haste, noise_m=noise_m)
         yield Trial(STAGE, f"Kalman filter, {name}", run, measure="of the walk")
     hour, usual = 3600 * NS_PER_S, [FRAME_NS] * 30
     for name, steps, ask in (
@@ -171,15 +161,15 @@ def trials(code: Tracking = Tracking(), *, full: bool = False) -> Iterator[Trial
         ("asked 60 ms ahead", usual, 60_000_000),
         ("asked an hour ahead", usual, hour),
     ):
-        run = partial(after, code, steps, ask, lost=ask == hour)
-        yield Trial(STAGE, name, run, measure="m", recorded=ask != hour, floor=FLOOR_M)
+        run = partial(after, steps, ask, lost=ask == hour)
+        yield Trial(STAGE, name, run, measure="m", floor=None if ask == hour else FLOOR_M)
     for name, values in (
         ("sensor noise 1 nm", {"noise_m": 1e-9}),
         ("sensor noise 1 m", {"noise_m": 1.0}),
     ):
         settings = TrackerSettings().model_copy(update=values)
-        run = partial(after, code, usual, 60_000_000, settings=settings)
-        yield Trial(STAGE, f"stiff gains: {name}", run, measure="m", recorded=True, floor=FLOOR_M)
+        run = partial(after, usual, 60_000_000, settings=settings)
+        yield Trial(STAGE, f"stiff gains: {name}", run, measure="m", floor=FLOOR_M)
     later = 30 * FRAME_NS + FRAME_NS // 4
     for name, eyes, when in (
         ("NaN", np.full((2, 3), np.nan), later),
@@ -188,5 +178,5 @@ def trials(code: Tracking = Tracking(), *, full: bool = False) -> Iterator[Trial
         ("1e300 m away", EYES_M + 1e300, later),
         ("late by a frame", EYES_M + 0.01, 29 * FRAME_NS),
     ):
-        run = partial(nonsense, code, eyes, when)
-        yield Trial(STAGE, f"one bad sample: {name}", run, measure="m", recorded=True, floor=FLOOR_M)
+        run = partial(nonsense, eyes, when)
+        yield Trial(STAGE, f"one bad sample: {name}", run, measure="m", floor=FLOOR_M)

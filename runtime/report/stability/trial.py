@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from runtime.errors import PhasestackError
@@ -36,8 +36,14 @@ class Trial:
     run: Callable[[], Answer | None]  # None: it answered where it must refuse
     expected: Behaviour = "answers"
     measure: str = "relative"  # unit of the forward error
-    recorded: bool = False  # held to what was recorded (`limits`), in addition to the tolerance that the answer states
-    floor: float = 0.0  # of a recorded limit: what another machine's rounding may add, in the measure
+    # Where the case is held to what was recorded (`limits`), in addition to the tolerance that the answer states: what
+    # another machine's rounding may add, in the measure.
+    floor: float | None = None
+
+    @property
+    def key(self) -> str:
+        """What the case is recorded by."""
+        return f"{self.stage}: {self.name}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +58,8 @@ class Case:
     behaviour: Behaviour
     tolerance: float
     passed: bool
-    expected: Behaviour
     measure: str
-    note: str = field(default="")
+    note: str = ""
 
 
 def refusal(stage: str, name: str, call: Callable[[], object]) -> Trial:
@@ -71,39 +76,38 @@ def settle(trial: Trial, *, limit: float | None = None) -> Case:
 
     limit: the forward error that was recorded of it; a trial that is held to one fails without it.
     """
-    nothing = float("nan")
     try:
         with warnings.catch_warnings():
             # numpy's complaints about inf and NaN are not how the runtime warns: what comes out is measured.
             warnings.simplefilter("ignore", RuntimeWarning)
             answer = trial.run()
     except (PhasestackError, ValueError) as error:
-        passed = trial.expected == "refuses"
-        return Case(
-            trial.name, trial.stage, float("inf"), nothing, nothing, "refuses", 0.0, passed, trial.expected,
-            trial.measure, str(error),
-        )  # fmt: skip
+        return _unanswered(trial, "refuses", str(error), passed=trial.expected == "refuses")
     except Exception as error:
-        note = f"{type(error).__name__}: {error}"
-        return Case(
-            trial.name, trial.stage, float("inf"), nothing, nothing, "refuses", 0.0, False, trial.expected,
-            trial.measure, note,
-        )  # fmt: skip
+        return _unanswered(trial, "refuses", f"{type(error).__name__}: {error}")
     if answer is None:
-        return Case(
-            trial.name, trial.stage, float("inf"), nothing, nothing, "answers", 0.0, False, trial.expected,
-            trial.measure, "it answered where no answer exists",
-        )  # fmt: skip
-    if trial.recorded:
+        return _unanswered(trial, "answers", "it answered where no answer exists")
+    if trial.floor is not None:
         answer = _held_to(answer, limit, trial.floor)
     behaviour: Behaviour = "warns" if answer.warned else "answers"
-    backward = answer.forward_error if answer.backward_error is None else answer.backward_error
-    # A NaN compares false with everything: it fails.
-    passed = behaviour == trial.expected and answer.forward_error <= answer.tolerance
     return Case(
-        trial.name, trial.stage, answer.condition, answer.forward_error, backward, behaviour, answer.tolerance,
-        passed, trial.expected, trial.measure, answer.note,
-    )  # fmt: skip
+        name=trial.name,
+        stage=trial.stage,
+        condition=answer.condition,
+        forward_error=answer.forward_error,
+        backward_error=answer.forward_error if answer.backward_error is None else answer.backward_error,
+        behaviour=behaviour,
+        tolerance=answer.tolerance,
+        # A NaN compares false with everything: it fails.
+        passed=behaviour == trial.expected and answer.forward_error <= answer.tolerance,
+        measure=trial.measure,
+        note=answer.note,
+    )
+
+
+def _unanswered(trial: Trial, behaviour: Behaviour, note: str, *, passed: bool = False) -> Case:
+    numbers = (float("inf"), float("nan"), float("nan"))
+    return Case(trial.name, trial.stage, *numbers, behaviour, 0.0, passed, trial.measure, note)
 
 
 def _held_to(answer: Answer, limit: float | None, floor: float) -> Answer:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache, partial
 from itertools import pairwise
 from typing import Any
@@ -53,11 +53,7 @@ def answer_of(model: str, need: F64, doubt: tuple[float, float, float]) -> F64:
     return np.stack([found[name].reshape(ROWS, -1) for name in ("rear", "front")]) / FULL
 
 
-Doubt = tuple[float, float, float]
-AnswerOf = Callable[[str, F64, Doubt], F64]  # model, need (rows, columns), doubt -> (2, rows, columns) rear and front
-
-
-def unsure(answer: AnswerOf, model: str, sigma_columns: float) -> Answer:
+def unsure(model: str, sigma_columns: float) -> Answer:
     """One wave, even along rows and within cells, against its own least squares.
 
     Even in every cell, the centre's parallax nothing: g = s/(s² + 8(1 - m²)cos(2ws)-terms + floor)·2·need per mode of
@@ -69,7 +65,7 @@ def unsure(answer: AnswerOf, model: str, sigma_columns: float) -> Answer:
     angle = np.pi * k / (cells + 1)
     along = np.repeat(np.sin(angle * np.arange(1, cells + 1)), 2 * cell) * 0.05
     need = np.tile(along, (ROWS, 1))
-    rear, front = answer(model, need, (sigma_columns, 0.0, 0.0))
+    rear, front = answer_of(model, need, (sigma_columns, 0.0, 0.0))
     s2 = (4 * np.sin(angle / 2)) ** 2
     m2 = np.exp(-((sigma_columns * angle / (2 * cell)) ** 2))
     noise = 8 * (1 - m2) + 8 * (1 - s2 / 8) * (m2 - m2 * m2)
@@ -82,49 +78,46 @@ def unsure(answer: AnswerOf, model: str, sigma_columns: float) -> Answer:
     )
 
 
-def small(answer: AnswerOf, model: str, rows_or_columns: str) -> Answer:
+def small(model: str, rows_or_columns: str) -> Answer:
     """One cell, or one chain's worth of difference: finite, in the box, nothing where nothing is wanted."""
     cell = loaded(model).session.contract.cell_px
     cells = 1 if rows_or_columns == "one cell" else 9
     need = np.zeros((ROWS, cells * 2 * cell))
     need[:, :: 2 * cell] = 0.2
-    panels = answer(model, need, (0.1, 0.1, 0.3))
-    even = answer(model, 0 * need, (0.1, 0.1, 0.3))
+    panels = answer_of(model, need, (0.1, 0.1, 0.3))
+    even = answer_of(model, 0 * need, (0.1, 0.1, 0.3))
     if np.abs(panels - even).max() < PANEL_CODE:
         return Answer(1.0, 0.0, note="what is wanted changes nothing")
     inside = float(max(panels.max() - 1, -panels.min(), 0.0))
     return Answer(max(inside, float(np.abs(even - 0.5).max())), 1 / FULL)
 
 
-def clipped(answer: AnswerOf, model: str) -> Answer:
+def clipped(model: str) -> Answer:
     """A difference that no panel can show: every value in the range, the way to it taken as far as it goes."""
     cell = loaded(model).session.contract.cell_px
     need = np.full((ROWS, 40 * 2 * cell), 0.5)
-    rear, front = answer(model, need, (0.0, 0.0, 0.0))
+    rear, front = answer_of(model, need, (0.0, 0.0, 0.0))
     outside = float(max(front.max() - 1, -front.min(), rear.max() - 1, -rear.min(), 0.0))
     reached = float(np.ptp(front))  # a ramp as long as the raster fills the range and stays
     return Answer(outside + max(0.98 - reached, 0.0), 1 / FULL, note=f"range used {reached:.3f}")
 
 
-def monotone(answer: AnswerOf, model: str) -> Answer:
+def monotone(model: str) -> Answer:
     """The surer the eyes, the stronger the drive: never more for more doubt, and next to none for nothing but doubt."""
     random = np.random.default_rng(5)
     cell = loaded(model).session.contract.cell_px
     need = random.uniform(-0.1, 0.1, (ROWS, 24 * 2 * cell))
     doubts = (0.0, 0.1, 0.3, 1.0, 5.0, 50.0)
-    drives = [float(np.square(answer(model, need, (doubt, doubt, 0.3)) - 0.5).mean()) for doubt in doubts]
+    drives = [float(np.square(answer_of(model, need, (doubt, doubt, 0.3)) - 0.5).mean()) for doubt in doubts]
     rises = max(b - a for a, b in pairwise(drives))
     left = max(drives[-1] - MOST_LEFT * drives[0], 0.0) if drives[0] > 0.0 else 1.0
     return Answer(max(rises, left, 0.0), 1e-6, note=" ".join(f"{drive:.2g}" for drive in drives))
 
 
-LayersOf = Callable[..., U8]  # model, sigma_mm, separation_m=0.062 -> (3, h, w, 3)
-
-
-def whole(layers: LayersOf, model: str, sigma_mm: float) -> Answer:
+def whole(model: str, sigma_mm: float) -> Answer:
     """A whole prediction of eyes that disagree everywhere: the outer panels nearer to even, the less is known."""
     driven, sure = (
-        float(np.abs(layers(model, sigma)[[0, 2]].astype(float) - 128).mean() / 255) for sigma in (sigma_mm, 0.0)
+        float(np.abs(layers_of(model, sigma)[[0, 2]].astype(float) - 128).mean() / 255) for sigma in (sigma_mm, 0.0)
     )
     most = sure * min((share for least_mm, share in DRIVEN_MOST if sigma_mm >= least_mm), default=1.0)
     note = f"outer panels {driven:.3f} from even, for two points {sure:.3f}"
@@ -139,29 +132,27 @@ def layers_of(model: str, sigma_mm: float, separation_m: float = 0.062) -> U8:
     return loaded(model).solve(Job(images, eyes, eye_sigma_mm=sigma_mm)).layers[..., :3].copy()
 
 
-def trials(answer: AnswerOf = answer_of, layers: LayersOf = layers_of) -> Iterator[Trial]:
+def trials() -> Iterator[Trial]:
     """What there is to try."""
     for model in MODELS:
         for columns in (0.0, 0.01, 0.13, 1.0, 6.0, 100.0):
             yield Trial(
                 STAGE,
                 f"{model}: a wave, doubt of {columns:g} columns",
-                partial(unsure, answer, model, columns),
+                partial(unsure, model, columns),
                 measure="phase",
             )
         for what in ("one cell", "one chain"):
-            yield Trial(STAGE, f"{model}: {what}", partial(small, answer, model, what), measure="phase")
-        yield Trial(STAGE, f"{model}: all clipped", partial(clipped, answer, model), measure="phase")
-        yield Trial(
-            STAGE, f"{model}: doubt from nothing to 50 columns", partial(monotone, answer, model), measure="phase²"
-        )
+            yield Trial(STAGE, f"{model}: {what}", partial(small, model, what), measure="phase")
+        yield Trial(STAGE, f"{model}: all clipped", partial(clipped, model), measure="phase")
+        yield Trial(STAGE, f"{model}: doubt from nothing to 50 columns", partial(monotone, model), measure="phase²")
     for sigma_mm in SIGMAS_MM:
         yield Trial(
             STAGE,
             f"balanced: eyes off by {sigma_mm:g} mm",
-            partial(whole, layers, "balanced", sigma_mm),
+            partial(whole, "balanced", sigma_mm),
             measure="phase",
         )
     for name, sigma_mm in (("NaN", math.nan), ("infinite", math.inf)):
-        yield refusal(STAGE, f"balanced: {name} doubt", partial(layers, "balanced", sigma_mm))
-    yield refusal(STAGE, "balanced: separation vanishes", partial(layers, "balanced", 1.0, 1e-15))
+        yield refusal(STAGE, f"balanced: {name} doubt", partial(layers_of, "balanced", sigma_mm))
+    yield refusal(STAGE, "balanced: separation vanishes", partial(layers_of, "balanced", 1.0, 1e-15))
