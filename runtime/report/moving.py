@@ -16,7 +16,7 @@ from runtime.config import Settings, validated
 from runtime.daemon.build import RunOptions, build_run, scaled_stack
 from runtime.errors import FatalError
 from runtime.evaluation.motion_recording import write_motion
-from runtime.optics.carried import expected_psnrs_db, light_psnrs_db
+from runtime.optics.carried import light_psnrs_db
 from runtime.records import F64, U8
 
 MOTIONS = ("still", "lean", "walk", "stop-and-go")
@@ -47,7 +47,6 @@ class Moving:
     motion: str
     solver_ms: float
     light_db: float  # at the true eyes; mean over lights
-    one_ray_db: float
     lights: int
     tracker_mm: tuple[float, float]  # p50 and p95 of how far the eyes were from where the tracker believed them
     behind_mm: float  # p50 of how far they were from where the layers had been solved for
@@ -106,7 +105,7 @@ def moving_run(motion: str, solver_ms: float, *, seconds: float = SECONDS, scale
     for light in (light for light in watched.lights if light.frame >= first):
         where |= {"eyes_m": light.solved_for_m, "seen_from_m": light.true_eyes_m}
         with contextlib.suppress(ValueError):  # they see nothing
-            seen.append([way(light.layers, light.drawn, **where)[0.0] for way in (light_psnrs_db, expected_psnrs_db)])
+            seen.append(light_psnrs_db(light.layers, light.drawn, **where)[0.0])
     lines = [line for line in watched.lines if line["frame"] >= first and line["true_eyes_m"] is not None]
     tracked, behind = (
         [_apart_mm(line[place], line["true_eyes_m"]) for line in lines if line[place] is not None]
@@ -114,9 +113,8 @@ def moving_run(motion: str, solver_ms: float, *, seconds: float = SECONDS, scale
     )
     if not seen or not tracked or not behind:
         raise FatalError(f"the motion {motion} with a solver of {solver_ms:g} ms showed nothing")
-    light_db, one_ray_db = map(float, np.mean(seen, axis=0))
     p50, p95 = map(float, np.percentile(tracked, (50, 95)))
-    return Moving(motion, solver_ms, light_db, one_ray_db, len(seen), (p50, p95), float(np.median(behind)))
+    return Moving(motion, solver_ms, float(np.mean(seen)), len(seen), (p50, p95), float(np.median(behind)))
 
 
 def _apart_mm(found_m: F64, truth_m: F64) -> float:

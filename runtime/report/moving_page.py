@@ -20,9 +20,9 @@ def moving_section(found: Sequence[Moving]) -> Section:
         "simulated clock: refreshes, solver and sensor take the times that are written here, which are configured, not "
         "measured; heads at 0.6 m, 30 samples a second, 3 mm of noise, outliers and dropouts.",
     ]
-    headings = ["motion", "solver ms", "light dB", "one ray dB", "tracker off p50 mm", "p95 mm", "since solved p50 mm"]
+    headings = ["motion", "solver ms", "light dB", "tracker off p50 mm", "p95 mm", "since solved p50 mm"]
     rows = [
-        [one.motion, f"{one.solver_ms:g}", f"{one.light_db:.1f}", f"{one.one_ray_db:.1f}"]
+        [one.motion, f"{one.solver_ms:g}", f"{one.light_db:.1f}"]
         + [f"{mm:.1f}" for mm in (*one.tracker_mm, one.behind_mm)]
         for one in found
     ]

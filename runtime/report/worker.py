@@ -20,15 +20,15 @@ T = TypeVar("T")
 def apart(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
     """Call an importable function in a fresh process: its memory and threads are its own.
 
-    Raises what the function raises of phasestack's own errors; FatalError where the process dies.
+    Raises FatalError with what the function raises of phasestack's own errors, and where the process dies.
     """
     call = pickle.dumps((function, args, kwargs))
     done = subprocess.run([sys.executable, "-m", "runtime.report.worker"], input=call, capture_output=True, check=False)
     if done.returncode != 0:
         last = (done.stderr.decode(errors="replace").strip().splitlines() or ["no message"])[-1]
         raise FatalError(f"{function.__name__}: the measuring process ended with {done.returncode}: {last}")
-    result: T | PhasestackError = pickle.loads(done.stdout)
-    if isinstance(result, PhasestackError):
+    result: T | FatalError = pickle.loads(done.stdout)
+    if isinstance(result, FatalError):
         raise result
     return result
 

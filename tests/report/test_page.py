@@ -49,7 +49,7 @@ def report_page() -> Page:
         method("SART-10", "iterative", 900, 40),
     ]
     moving = [
-        Moving(motion, solver_ms, 27.0 - solver_ms / 20, 28.0, 9, (3.0, 7.0), solver_ms / 4)
+        Moving(motion, solver_ms, 27.0 - solver_ms / 20, 9, (3.0, 7.0), solver_ms / 4)
         for motion in ("still", "lean")
         for solver_ms in (33.0, 150.0)
     ]

@@ -17,15 +17,9 @@ from runtime.report.methods import SHIPPED, Method
 from runtime.report.pairs import StillPair
 from tests.model_export.stills import filling_fov_deg, random_still
 
-SIZE = {"width_px": 96, "height_px": 54}
-
 
 def seen_as(pair: StillPair) -> dict[str, Any]:
     return {"eyes_m": pair.eyes_m, "fov_deg": pair.fov_deg, "similarity": False}
-
-
-def small(number: int) -> StillPair:
-    return random_still(3, number, **SIZE)
 
 
 def test_an_eyes_picture_is_the_panel_raster_seen_through_its_projection() -> None:
@@ -61,12 +55,6 @@ def test_what_lies_behind_the_eye_is_not_seen() -> None:
     wall = Plane(red, np.array([-2.0, 0.3, 0.5]), np.array([4.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0]))
     image = view((wall,), np.array([0.6, 0.0, 0.0]), width_px=64, height_px=36, fov_deg=90.0)
     assert (image[18, 50:, 0] > 200).all() and (image[18, :32] == 0).all()
-
-
-def test_a_pair_follows_from_seed_and_number_alone() -> None:
-    one, again, other = small(4), small(4), small(5)
-    assert np.array_equal(one.images, again.images) and np.array_equal(one.eyes_m, again.eyes_m)
-    assert not np.array_equal(one.images, other.images)
 
 
 @pytest.mark.slow

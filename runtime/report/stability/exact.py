@@ -7,6 +7,7 @@ from functools import lru_cache
 from typing import Any, TypedDict
 
 from runtime.errors import MissingPart
+from runtime.optics.stack import PanelStack
 from runtime.records import F64
 
 try:
@@ -89,11 +90,13 @@ def hit(eye: Vector, direction: Vector, x_m: float) -> Vector:
     return combine(eye, (mpf(x_m) - eye[0]) / direction[0], direction)
 
 
-def panel_position(point: Vector, *, width_m: float, height_m: float, size: tuple[int, int]) -> tuple[Any, Any]:
-    """A panel's pixel position (u, v) of a point in its plane."""
+def on_panel(eye: Vector, direction: Vector, stack: PanelStack, index: int) -> tuple[Any, Any]:
+    """Where a ray crosses a panel, pixels (u, v)."""
+    _, right, up = hit(eye, direction, stack.x_m[index])
+    half = mpf("0.5")
     return (
-        (point[1] / mpf(width_m) + mpf(1) / 2) * size[0],
-        (mpf(1) / 2 - point[2] / mpf(height_m)) * size[1],
+        (right / mpf(stack.width_m) + half) * stack.width_px,
+        (half - up / mpf(stack.height_m)) * stack.height_px,
     )
 
 

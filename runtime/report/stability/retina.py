@@ -48,11 +48,8 @@ def traced(
     if direction[0] >= 0:
         return [], -math.inf
     total, inside = [exact.mpf(0)] * 3, math.inf
-    for layer, x_m in zip(layers, stack.x_m, strict=True):
-        x, y = exact.panel_position(
-            exact.hit(eye, direction, x_m), width_m=stack.width_m, height_m=stack.height_m,
-            size=(stack.width_px, stack.height_px),
-        )  # fmt: skip
+    for index, layer in enumerate(layers):
+        x, y = exact.on_panel(eye, direction, stack, index)
         half = exact.mpf("0.5")
         margins = (x - half, stack.width_px - half - x, y - half, stack.height_px - half - y)
         inside = min(inside, *(float(margin) for margin in margins))
@@ -142,9 +139,8 @@ def lit(nominal: Any, true: Any, layers: U8, column: int, row: int, rays: int) -
         direction = exact.ray(nominal, u, v, width_px=width, height_px=height, fov_deg=FOV_DEG)
         through = exact.combine(exact.hit(nominal, direction, SMALL.x_m[1]), -1, true)
         phases = [0, 0, 0]
-        for layer, x_m in zip(layers, SMALL.x_m, strict=True):
-            place = exact.hit(true, through, x_m)
-            x, y = exact.panel_position(place, width_m=SMALL.width_m, height_m=SMALL.height_m, size=(width, height))
+        for index, layer in enumerate(layers):
+            x, y = exact.on_panel(true, through, SMALL, index)
             inside = min(inside, *map(float, (x - half, width - half - x, y - half, height - half - y)))
             if inside <= 0:
                 return sums, inside, edge

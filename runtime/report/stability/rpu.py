@@ -26,6 +26,7 @@ STAGE = "RPU"
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 1920, 1080)
 SIZE = (1920, 1080)
 FOV_DEG = 40.0
+VIEW: exact.Image = {"width_px": 1920, "height_px": 1080, "fov_deg": FOV_DEG}
 PROBES = [(a, b) for a in (0.1, 0.5, 0.9) for b in (0.2, 0.8)]  # places on a panel, as fractions of its size
 
 
@@ -45,15 +46,8 @@ def place(stack: PanelStack, index: int, a: float, b: float) -> Any:
 
 def traced(eye: Any, stack: PanelStack, index: int, u: float, v: float) -> tuple[Any, Any]:
     """Where the ray of an image position meets a panel, pixels, to 50 digits."""
-    direction = exact.ray(
-        eye, exact.mpf(u), exact.mpf(v), width_px=stack.width_px, height_px=stack.height_px, fov_deg=FOV_DEG
-    )
-    return exact.panel_position(
-        exact.hit(eye, direction, stack.x_m[index]),
-        width_m=stack.width_m,
-        height_m=stack.height_m,
-        size=(stack.width_px, stack.height_px),
-    )
+    size: Any = {"width_px": stack.width_px, "height_px": stack.height_px}
+    return exact.on_panel(eye, exact.ray(eye, exact.mpf(u), exact.mpf(v), **size, fov_deg=FOV_DEG), stack, index)
 
 
 def mapped(m: F64, u: float, v: float) -> F64:
@@ -96,11 +90,10 @@ def nearly_parallel(angle_rad: float) -> Answer:
     eye = [0.5, 0.5, 0.0]
     e = exact.vector(eye)
     direction = (-exact.mp.sin(angle_rad), -exact.mp.cos(angle_rad), exact.mpf(0))
-    wide = 100.0
-    view: exact.Image = {"width_px": 1920, "height_px": 1080, "fov_deg": wide}
+    view: exact.Image = {**VIEW, "fov_deg": 100.0}
     u = float(exact.image_position(e, exact.combine(e, 1, direction), **view)[0])
     toward = exact.ray(e, exact.mpf(u), exact.mpf(540), **view)
-    truth = exact.panel_position(exact.hit(e, toward, 0.06), width_m=0.5184, height_m=0.2916, size=SIZE)[0]
+    truth = exact.on_panel(e, toward, STACK, 2)[0]
     found = mapped(panel_from_image(image_from_stack(eye, **view), STACK.panel(2)), u, 540.0)[0]
     relative = exact.distance(found, truth) / float(abs(truth))
     condition = 2 / angle_rad
@@ -126,10 +119,9 @@ def single_precision(width_px: int, height_px: int, degrees: float) -> Answer:
 
 def seen_error(h: F64, e: Any, *, index: int = 2) -> float:
     """How far H puts points of a panel from where 50 digits see them, of the largest image coordinate."""
-    view: exact.Image = {"width_px": 1920, "height_px": 1080, "fov_deg": FOV_DEG}
     error, size = 0.0, 1.0
     for a, b in PROBES:
-        truth = exact.image_position(e, place(STACK, index, a, b), **view)
+        truth = exact.image_position(e, place(STACK, index, a, b), **VIEW)
         found = mapped(h, a * SIZE[0], b * SIZE[1])
         error = max(error, exact.distance(found[0], truth[0]), exact.distance(found[1], truth[1]))
         size = max(size, abs(float(truth[0])), abs(float(truth[1])))
@@ -139,13 +131,8 @@ def seen_error(h: F64, e: Any, *, index: int = 2) -> float:
 def four_points(degrees: float) -> Answer:
     """The corrected closed form from the images of four corners: points between them, against rays of 50 digits."""
     e = exact.vector(at_angle(degrees))
-    view: exact.Image = {"width_px": 1920, "height_px": 1080, "fov_deg": FOV_DEG}
-    corners = np.array(
-        [
-            [float(c) for c in exact.image_position(e, place(STACK, 2, a, b), **view)]
-            for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))
-        ]
-    )
+    places = [place(STACK, 2, a, b) for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    corners = np.array([[float(c) for c in exact.image_position(e, point, **VIEW)] for point in places])
     h = image_from_panel_four_points(corners, width_px=1920, height_px=1080)
     back = np.column_stack([panel_corners_px(STACK.panel(2)), np.ones(4)]) @ h.T
     backward = float(np.abs(back[:, :2] / back[:, 2:] - corners).max() / np.abs(corners).max())

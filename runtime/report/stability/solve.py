@@ -110,6 +110,7 @@ class Problem:
 def exact_operator(gap_m: float, ipd_m: float, distance_m: float) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
     """Each eye's rays that cross every panel, by 50 digits: (rays, N·h·w) bilinear weights, and their columns."""
     fov_deg = math.degrees(2 * math.atan(WIDTH_M / 2 / distance_m))
+    stack = PanelStack(WIDTH_M, HEIGHT_M, (-gap_m, 0.0, gap_m), WIDTH_PX, HEIGHT_PX)
     half, found = exact.mpf("0.5"), []
     for sign in (-1, 1):
         eye = exact.vector([distance_m, sign * ipd_m / 2, 0.0])
@@ -119,10 +120,8 @@ def exact_operator(gap_m: float, ipd_m: float, distance_m: float) -> tuple[tuple
             for u in range(WIDTH_PX):
                 ray = exact.ray(eye, u + half, v + half, width_px=WIDTH_PX, height_px=HEIGHT_PX, fov_deg=fov_deg)
                 weights: dict[int, float] = {}
-                for number, x_m in enumerate((-gap_m, 0.0, gap_m)):
-                    x, y = exact.panel_position(
-                        exact.hit(eye, ray, x_m), width_m=WIDTH_M, height_m=HEIGHT_M, size=(WIDTH_PX, HEIGHT_PX)
-                    )
+                for number in range(3):
+                    x, y = exact.on_panel(eye, ray, stack, number)
                     if not (half < x < WIDTH_PX - half and half < y < HEIGHT_PX - half):
                         break
                     left, top = int(exact.mp.floor(x - half)), int(exact.mp.floor(y - half))
