@@ -119,7 +119,7 @@ def _run(recording: Path) -> dict[str, float]:
     """What one run says of itself, and how far from the truth it had the eyes at its refreshes."""
     settings = settings_for(recording, solver_ms=SOLVER_MS)
     settings = settings.model_copy(update={"loop": settings.loop.model_copy(update={"evaluate_every": EVERY})})
-    watched = simulated_run(settings, scale=SCALE, keep_light=0, measure=bool, quality=True)
+    watched = simulated_run(settings, scale=SCALE, quality=True)
     tracked = [line for line in watched.lines if line["state"] == State.TRACKING]
     known = [line for line in tracked if line["true_eyes_m"] is not None]
     if not known or watched.summary["carried_db_true_eyes"] is None:

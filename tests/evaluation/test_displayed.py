@@ -10,8 +10,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from runtime.commands.solving import SolveOptions, solve_pair
+from runtime.commands.app import app
 from runtime.errors import InputError
 from runtime.evaluation.displayed import displayed, on_panels_raster
 from runtime.optics.stack import PanelStack
@@ -86,8 +87,10 @@ def solved(left: Path, right: Path) -> tuple[dict[str, Any], np.ndarray]:
     """What `solve` leaves of two pictures' files: solve.json and the layers."""
     out, panels = left.parent / "out", left.parent / "panels.json"
     panels.write_text(json.dumps({"width_m": 0.4, "height_m": 0.3, "x_m": STACK.x_m, "width_px": 80, "height_px": 60}))
-    eyes = (tuple(EYES[0]), tuple(EYES[1]))
-    solve_pair(SolveOptions(left, right, *eyes, FOV, panels, out, "balanced", repeat=1, eye_sigma_mm=1.0, config=None))
+    files = {"--left": left, "--right": right, "--panels": panels, "--out": out, "--fov": FOV}
+    options = ["--left-eye", *EYES[0], "--right-eye", *EYES[1], *(part for pair in files.items() for part in pair)]
+    done = CliRunner().invoke(app, ["solve", *map(str, options)])
+    assert done.exit_code == 0, done.output
     layers = np.stack([cv2.imread(str(out / f"layer-{n}.png"))[..., ::-1] for n in range(3)])
     return json.loads((out / "solve.json").read_text()), layers
 
