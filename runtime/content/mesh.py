@@ -18,7 +18,7 @@ from runtime.content.base import ContentInfo
 from runtime.content.gltf import file_of, load_gltf, texture_of
 from runtime.content.placing import SceneFile
 from runtime.content.ply import read_header
-from runtime.content.rig import Pose, Rig, deformed
+from runtime.content.rig import Binding, Node, Pose, Rig, deformed
 from runtime.content.shapes import Shape
 from runtime.content.triangles import DrawnPart, Part, TriangleSource
 from runtime.errors import InputError, MissingPart, one_line
@@ -38,10 +38,10 @@ LARGEST_COORDINATE = 1e15  # products of three still fit in float32's range
 class MeshData:
     """A loaded file, in its own coordinates."""
 
-    parts: tuple[Part, ...]  # in the scene's frame; where there is a rig, each in its own
-    low: F64  # (3,) corner of the box that holds it, however it moves
+    parts: tuple[Part, ...]  # each in its own frame
+    rig: Rig  # that places and moves them
+    low: F64  # (3,) corner of the box that holds it, however it moves; in the scene's frame
     high: F64
-    rig: Rig | None = None  # that moves it; None: it stands still
 
 
 def prepare(file: SceneFile) -> Callable[[Any], MeshSource]:
@@ -52,7 +52,7 @@ def prepare(file: SceneFile) -> Callable[[Any], MeshSource]:
         progress.tell(f"{file.path.name}: outlines", number, len(data.parts))
         parts.append(DrawnPart(part))
     matrix = file.placed(data.low, data.high)
-    info = ContentInfo(file.path.stem, moving=data.rig is not None, background=file.background)
+    info = ContentInfo(file.path.stem, moving=data.rig.moves, background=file.background)
     return lambda context: MeshSource(parts, matrix, context=context, info=info, rig=data.rig)
 
 
@@ -65,7 +65,7 @@ def load_mesh(path: Path, *, limits: LimitSettings | None = None, animation: str
     progress.tell(f"reading {path.name}", 0)
     data = foreign.read_bytes(path, most_bytes=round(limits.file_mib * foreign.MIB))
     if path.suffix.lower() in GLTF:
-        return _of_gltf(path, *load_gltf(path, data, limits=limits, animation=animation))
+        return _boxed(path, *load_gltf(path, data, limits=limits, animation=animation))
     if importlib.util.find_spec("trimesh") is None:
         raise MissingPart("meshes need trimesh: pip install trimesh")
     _check_counts(path, data, limits)
@@ -74,8 +74,7 @@ def load_mesh(path: Path, *, limits: LimitSettings | None = None, animation: str
         parts = [_part(mesh, path, pictures) for mesh in _loaded(path, data, limits)]
     triangles = sum(len(part.shape.triangles) for part in parts)
     foreign.within(triangles, limits.triangles, source=path, field="faces")
-    _check(path, parts)
-    return _boxed(path, parts, [part.shape.positions_m for part in parts])
+    return _boxed(path, parts, Rig((Node(),), (0,), (Binding(0),) * len(parts)))
 
 
 def _check(path: Path, parts: Sequence[Part]) -> None:
@@ -95,28 +94,20 @@ def _check(path: Path, parts: Sequence[Part]) -> None:
         raise InputError(path, "faces", "none has an area")
 
 
-def _boxed(path: Path, parts: Sequence[Part], points: Sequence[F32], rig: Rig | None = None) -> MeshData:
-    """points: (n, 3) each, that the box is to hold."""
-    corners = np.array([bound(array, axis=0) for array in points for bound in (np.min, np.max)], dtype=np.float64)
-    low, high = corners.min(0), corners.max(0)
-    if not (np.abs(corners) <= LARGEST_COORDINATE).all():  # nor NaN
-        raise InputError(path, "nodes", f"place vertices beyond {LARGEST_COORDINATE:g}")
-    return MeshData(tuple(parts), low, high, rig)
-
-
-def _of_gltf(path: Path, parts: Sequence[Part], rig: Rig) -> MeshData:
-    """Parts that stand still are carried into the scene's frame once; those of a rig that moves stay in their own."""
+def _boxed(path: Path, parts: Sequence[Part], rig: Rig) -> MeshData:
+    """With the box that holds all of it, however it moves."""
     _check(path, parts)
-    shapes: list[Shape] = []  # in the scene's frame, at all times that are looked at
+    corners = []
     for number, time_s in enumerate(rig.times_s()):
         progress.tell(f"{path.name}: places", number)
         pose = rig.pose(time_s)
         with np.errstate(all="ignore"):  # what overflows is refused by its box
-            shapes += [_carried(*placed) for placed in zip(posed(parts, rig, pose), pose.scene_from_part, strict=True)]
-    points = [shape.positions_m for shape in shapes]
-    if rig.moves:
-        return _boxed(path, parts, points, rig)
-    return _boxed(path, [replace(part, shape=shape) for part, shape in zip(parts, shapes, strict=True)], points)
+            for shape, matrix in zip(posed(parts, rig, pose), pose.scene_from_part, strict=True):
+                points = shape.positions_m @ matrix[:3, :3].T + matrix[:3, 3]
+                corners += [points.min(0), points.max(0)]
+    if not (np.abs(corners) <= LARGEST_COORDINATE).all():  # nor NaN
+        raise InputError(path, "nodes", f"place vertices beyond {LARGEST_COORDINATE:g}")
+    return MeshData(tuple(parts), rig, np.min(corners, axis=0), np.max(corners, axis=0))
 
 
 def posed(parts: Sequence[Part], rig: Rig, pose: Pose) -> list[Shape]:
@@ -129,20 +120,6 @@ def posed(parts: Sequence[Part], rig: Rig, pose: Pose) -> list[Shape]:
             shape = replace(shape, positions_m=positions, normals=normals)
         shapes.append(shape)
     return shapes
-
-
-def _carried(shape: Shape, matrix: F64) -> Shape:
-    """A shape through a 4x4 affine map, its normals still outwards."""
-    if (matrix == np.eye(4)).all():
-        return shape
-    linear = matrix[:3, :3]
-    positions = (shape.positions_m @ linear.T + matrix[:3, 3]).astype(np.float32)
-    normals = shape.normals @ np.linalg.pinv(linear)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0).astype(np.float32)
-    mirrored = np.linalg.det(linear) < 0
-    triangles = np.ascontiguousarray(shape.triangles[:, [0, 2, 1]]) if mirrored else shape.triangles
-    return Shape(positions, normals, shape.uv, triangles)
 
 
 def _check_counts(path: Path, data: bytes, limits: LimitSettings) -> None:
@@ -260,7 +237,7 @@ class MeshSource(TriangleSource):
     """A loaded mesh at its place in the stack frame, and moving where its file says so."""
 
     def __init__(
-        self, parts: Sequence[DrawnPart], stack_from_scene: F64, *, context: Any, info: ContentInfo, rig: Rig | None
+        self, parts: Sequence[DrawnPart], stack_from_scene: F64, *, context: Any, info: ContentInfo, rig: Rig
     ) -> None:
         self._stack_from_scene, self._rig = stack_from_scene, rig
         self._at_rest = [part.part for part in parts]
@@ -269,8 +246,6 @@ class MeshSource(TriangleSource):
 
     def places(self, time_ns: int) -> Sequence[F64]:
         """Deforms the parts that bend, too."""
-        if self._rig is None:
-            return self.stack_from_parts
         period_ns = round(self._rig.duration_s * NS_PER_S)
         time_s = time_ns % period_ns / NS_PER_S if period_ns else 0.0
         if time_s != self._posed_for:

@@ -118,7 +118,7 @@ class Rig:
     @property
     def moves(self) -> bool:
         """Something of it changes with time."""
-        return bool(self.channels) and self.duration_s > 0
+        return self.duration_s > 0
 
     @property
     def duration_s(self) -> float:
