@@ -6,7 +6,7 @@ import importlib.util
 import io
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from runtime.content.base import ContentInfo
 from runtime.content.gltf import file_of, load_gltf, texture_of
 from runtime.content.placing import SceneFile
 from runtime.content.ply import read_header
-from runtime.content.rig import Binding, Node, Pose, Rig, deformed
+from runtime.content.rig import Binding, Node, Rig
 from runtime.content.shapes import Shape
 from runtime.content.triangles import DrawnPart, Part, TriangleSource
 from runtime.errors import InputError, MissingPart, one_line
@@ -100,26 +100,13 @@ def _boxed(path: Path, parts: Sequence[Part], rig: Rig) -> MeshData:
     corners = []
     for number, time_s in enumerate(rig.times_s()):
         progress.tell(f"{path.name}: places", number)
-        pose = rig.pose(time_s)
         with np.errstate(all="ignore"):  # what overflows is refused by its box
-            for shape, matrix in zip(posed(parts, rig, pose), pose.scene_from_part, strict=True):
+            for shape, matrix in rig.posed([part.shape for part in parts], time_s):
                 points = shape.positions_m @ matrix[:3, :3].T + matrix[:3, 3]
                 corners += [points.min(0), points.max(0)]
     if not (np.abs(corners) <= LARGEST_COORDINATE).all():  # nor NaN
         raise InputError(path, "nodes", f"place vertices beyond {LARGEST_COORDINATE:g}")
     return MeshData(tuple(parts), rig, np.min(corners, axis=0), np.max(corners, axis=0))
-
-
-def posed(parts: Sequence[Part], rig: Rig, pose: Pose) -> list[Shape]:
-    """Every part's shape in its own frame, deformed."""
-    shapes = []
-    for part, binding, weights, bones in zip(parts, rig.bindings, pose.morph_weights, pose.bones, strict=True):
-        shape = part.shape
-        if binding.deforms:
-            positions, normals = deformed(shape.positions_m, shape.normals, binding, weights, bones)
-            shape = replace(shape, positions_m=positions, normals=normals)
-        shapes.append(shape)
-    return shapes
 
 
 def _check_counts(path: Path, data: bytes, limits: LimitSettings) -> None:
@@ -240,7 +227,7 @@ class MeshSource(TriangleSource):
         self, parts: Sequence[DrawnPart], stack_from_scene: F64, *, context: Any, info: ContentInfo, rig: Rig
     ) -> None:
         self._stack_from_scene, self._rig = stack_from_scene, rig
-        self._at_rest = [part.part for part in parts]
+        self._at_rest = [part.part.shape for part in parts]
         self._posed_for: float | None = None
         super().__init__(parts, [stack_from_scene] * len(parts), context=context, info=info)
 
@@ -249,11 +236,10 @@ class MeshSource(TriangleSource):
         period_ns = round(self._rig.duration_s * NS_PER_S)
         time_s = time_ns % period_ns / NS_PER_S if period_ns else 0.0
         if time_s != self._posed_for:
-            pose = self._rig.pose(time_s)
-            shapes = posed(self._at_rest, self._rig, pose)
-            for part, binding, shape in zip(self.parts, self._rig.bindings, shapes, strict=True):
-                if binding.deforms:
+            placed = self._rig.posed(self._at_rest, time_s)
+            for part, at_rest, (shape, _) in zip(self.parts, self._at_rest, placed, strict=True):
+                if shape is not at_rest:
                     part.deform(shape)
-            self.stack_from_parts = [self._stack_from_scene @ matrix for matrix in pose.scene_from_part]
+            self.stack_from_parts = [self._stack_from_scene @ matrix for _, matrix in placed]
             self._posed_for = time_s
         return self.stack_from_parts

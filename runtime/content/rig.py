@@ -5,13 +5,15 @@ The equations are glTF 2.0's (appendix C for the interpolations, 3.7.3 for skins
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from runtime.content.shapes import Shape
 from runtime.records import F32, F64
 
 Path = Literal["translation", "rotation", "scale", "weights"]
@@ -48,11 +50,6 @@ class Binding:
     weights: F32 | None = None  # (v, 4) sum 1
     morphs: F32 | None = None  # (m, v, 3) offsets of positions
     rest_weights: F64 | None = None  # (m,)
-
-    @property
-    def deforms(self) -> bool:
-        """Its vertices move against each other."""
-        return self.skin is not None or self.morphs is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,15 +95,6 @@ class Channel:
 
 
 @dataclass(frozen=True, slots=True)
-class Pose:
-    """A rig at one time."""
-
-    scene_from_part: tuple[F64, ...]  # (4, 4) each; a skinned part's vertices are in the scene's frame: identity
-    morph_weights: tuple[F64 | None, ...]  # (m,) each
-    bones: tuple[F64 | None, ...]  # (j, 4, 4) scene_from_mesh of each bone of each part's skin
-
-
-@dataclass(frozen=True, slots=True)
 class Rig:
     """Nodes, what hangs on them, and how they move."""
 
@@ -125,8 +113,11 @@ class Rig:
         """Of the animation, which then begins again."""
         return max((float(channel.times_s[-1]) for channel in self.channels), default=0.0)
 
-    def pose(self, time_s: float) -> Pose:
-        """At a time from 0 to the duration."""
+    def posed(self, shapes: Sequence[Shape], time_s: float) -> list[tuple[Shape, F64]]:
+        """Every part deformed, and 4x4 scene_from_part, at a time from 0 to the duration.
+
+        A skinned part's vertices come to be in the scene's frame.
+        """
         values: dict[tuple[int, str], F64] = {
             (channel.node, channel.path): channel.at(time_s) for channel in self.channels
         }
@@ -135,36 +126,39 @@ class Rig:
             node = self.nodes[number]
             local = _local(node, values, number)
             world[number] = local if node.parent < 0 else world[node.parent] @ local
-        identity = np.eye(4)
-        placed, weights, bones = [], [], []
-        for binding in self.bindings:
-            placed.append(identity if binding.skin is not None else world[binding.node])
-            given = values.get((binding.node, "weights"))
-            count = 0 if binding.morphs is None else len(binding.morphs)
-            weights.append(
-                None if not count else given if given is not None and len(given) == count else binding.rest_weights
-            )
-            bones.append(None if binding.skin is None else _bones(binding.skin, world))
-        return Pose(tuple(placed), tuple(weights), tuple(bones))
+        placed = []
+        for shape, binding in zip(shapes, self.bindings, strict=True):
+            if binding.morphs is not None:
+                shape = _morphed(shape, binding, values.get((binding.node, "weights")))
+            if binding.skin is not None:
+                shape = _bent(shape, binding, _bones(binding.skin, world))
+            placed.append((shape, np.eye(4) if binding.skin is not None else world[binding.node]))
+        return placed
 
     def times_s(self) -> list[float]:
         """Times over which its extent is looked at."""
         return [self.duration_s * step / TRIED for step in range(TRIED + 1)] if self.moves else [0.0]
 
 
-def deformed(positions: F32, normals: F32, binding: Binding, weights: F64 | None, bones: F64 | None) -> tuple[F32, F32]:
-    """(v, 3) positions and unit normals of a part in a pose: morphed, then carried by its bones."""
-    points = positions
-    if binding.morphs is not None and weights is not None:
-        points = points + np.tensordot(weights.astype(np.float32), binding.morphs, axes=1)
-    if bones is None or binding.joints is None or binding.weights is None:
-        return np.asarray(points, dtype=np.float32), normals
+def _morphed(shape: Shape, binding: Binding, weights: F64 | None) -> Shape:
+    """weights: (m,) of an animation; others than there are targets, or none: those at rest."""
+    assert binding.morphs is not None and binding.rest_weights is not None
+    if weights is None or len(weights) != len(binding.morphs):
+        weights = binding.rest_weights
+    points = shape.positions_m + np.tensordot(weights.astype(np.float32), binding.morphs, axes=1)
+    return replace(shape, positions_m=points)
+
+
+def _bent(shape: Shape, binding: Binding, bones: F64) -> Shape:
+    """Its vertices carried by bones (j, 4, 4)."""
+    assert binding.joints is not None and binding.weights is not None
     rows = bones[:, :3].reshape(-1, 12).astype(np.float32)
     blended = np.einsum("vk,vkr->vr", binding.weights, rows[binding.joints], optimize=True).reshape(-1, 3, 4)
-    moved = np.einsum("vij,vj->vi", blended[:, :, :3], points) + blended[:, :, 3]
-    turned = np.einsum("vij,vj->vi", blended[:, :, :3], normals)
+    moved = np.einsum("vij,vj->vi", blended[:, :, :3], shape.positions_m) + blended[:, :, 3]
+    turned = np.einsum("vij,vj->vi", blended[:, :, :3], shape.normals)
     length = np.linalg.norm(turned, axis=1, keepdims=True)
-    return moved, np.divide(turned, length, out=np.zeros_like(turned), where=length > 0)
+    normals = np.divide(turned, length, out=np.zeros_like(turned), where=length > 0)
+    return replace(shape, positions_m=moved, normals=normals)
 
 
 def slerp(first: F64, second: F64, share: float) -> F64:

@@ -16,7 +16,7 @@ from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings, LimitSettings
 from runtime.content.base import ContentSource
 from runtime.content.camera import project
-from runtime.content.mesh import load_mesh, posed
+from runtime.content.mesh import load_mesh
 from runtime.content.registry import open_content
 from runtime.content.rig import Channel, slerp
 from runtime.errors import InputError
@@ -79,7 +79,7 @@ def test_turns_are_interpolated_as_scipy_does() -> None:
 
 def test_bones_carry_their_vertices(tmp_path: Path) -> None:
     data = load_mesh(bending_bar(tmp_path / "a.gltf"))
-    rest, bent = (posed(data.parts, data.rig, data.rig.pose(time))[0].positions_m for time in (0.0, 1.0))
+    rest, bent = (data.rig.posed([data.parts[0].shape], time)[0][0].positions_m for time in (0.0, 1.0))
     assert np.abs(rest - data.parts[0].shape.positions_m).max() < 1e-6
     tip = np.abs(rest[:, 1] - 4) < 1e-6
     # Turned by 90 degrees about z at (0, 2, 0): (x, y) goes to (2 - y, 2 + x).
@@ -102,7 +102,7 @@ def test_a_bent_model_is_drawn_where_its_vertices_are(tmp_path: Path, context: A
 
 def test_a_morph_target_moves_its_vertices(tmp_path: Path) -> None:
     data = load_mesh(growing_square(tmp_path / "a.gltf"))
-    half = posed(data.parts, data.rig, data.rig.pose(0.5))[0].positions_m
+    half = data.rig.posed([data.parts[0].shape], 0.5)[0][0].positions_m
     assert half[:, 1].tolist() == [-1, -1, 2.5, 2.5]
     assert data.high[1] > 3.5  # the box holds what it grows to
 
@@ -118,9 +118,8 @@ def test_a_still_scene_is_as_the_mesh_library_reads_it(tmp_path: Path) -> None:
     scene.export(path)
     data = load_mesh(path)
     mine = []
-    for part, matrix in zip(data.parts, data.rig.pose(0.0).scene_from_part, strict=True):
-        points = part.shape.positions_m @ matrix[:3, :3].T + matrix[:3, 3]
-        corners = points[part.shape.triangles]
+    for shape, matrix in data.rig.posed([part.shape for part in data.parts], 0.0):
+        corners = (shape.positions_m @ matrix[:3, :3].T + matrix[:3, 3])[shape.triangles]
         mine.append(corners if np.linalg.det(matrix[:3, :3]) > 0 else corners[:, [0, 2, 1]])
     assert np.abs(faces_of(mine) - faces_of([mesh.triangles for mesh in trimesh.load_scene(path).dump()])).max() < 1e-4
 

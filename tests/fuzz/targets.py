@@ -252,7 +252,7 @@ def rigs() -> list[bytes]:
 def mesh(path: Path) -> object:
     """Loaded, its outlines looked for, and posed at a time that no key has."""
     data = load_mesh(path, limits=LIMITS)
-    return [DrawnPart(part) for part in data.parts], data.rig.pose(0.377)
+    return [DrawnPart(part) for part in data.parts], data.rig.posed([part.shape for part in data.parts], 0.377)
 
 
 def points(count: int, names: list[str], kind: str) -> list[bytes]:
