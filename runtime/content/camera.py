@@ -5,25 +5,27 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from runtime.content.base import View
 from runtime.optics.rect import PixelRect
 from runtime.records import F64
 
 NEAREST_M = 1e-3
 
 
-def clip_from_stack(pixels_from_stack: F64, *, width_px: int, height_px: int, near_m: float, far_m: float) -> F64:
-    """4x4 OpenGL clip matrix of a 3x4 pixel projection; row 0 of the raster is row 0 of what GL reads back.
+def clip_from_stack(view: View, corners_m: F64) -> F64:
+    """4x4 OpenGL clip matrix of a view, of whose depths (8n, 3) corners are the limits; row 0 of the raster is row 0
+    of what GL reads back.
 
     GL's first row in memory is its lowest, so the raster's v runs along GL's +y and nothing need be flipped.
-    Depths `near_m` and `far_m` are values of the projection's third coordinate. Raises
-    ValueError unless 0 < near < far.
+    Raises ValueError where none of the corners is before the eye.
     """
+    near_m, far_m = _depth_bounds(view, corners_m)
     if not 0.0 < near_m < far_m:
         raise ValueError(f"near {near_m} and far {far_m} do not bound a view")
-    u, v, w = np.asarray(pixels_from_stack, dtype=np.float64)
+    u, v, w = view.pixels_from_stack
     span = far_m - near_m
     depth = w * ((far_m + near_m) / span) + np.array([0.0, 0.0, 0.0, -2.0 * far_m * near_m / span])
-    return np.array([u * (2.0 / width_px) - w, v * (2.0 / height_px) - w, depth, w])
+    return np.array([u * (2.0 / view.width_px) - w, v * (2.0 / view.height_px) - w, depth, w])
 
 
 def box_corners(low_m: ArrayLike, high_m: ArrayLike) -> F64:
@@ -39,24 +41,24 @@ def project(pixels_from_stack: F64, points_m: F64) -> tuple[F64, F64]:
         return homogeneous[:, :2] / homogeneous[:, 2:], homogeneous[:, 2]
 
 
-def depth_bounds(pixels_from_stack: F64, corners_m: F64) -> tuple[float, float] | None:
-    """Near and far, with a margin, that hold all of `corners_m` before the eye; None: nothing is before it."""
-    depths = project(pixels_from_stack, corners_m)[1]
-    far = float(depths.max()) * 1.001 + NEAREST_M
-    if far <= 2 * NEAREST_M:
-        return None
-    return max(float(depths.min()) * 0.999 - NEAREST_M, min(NEAREST_M, far / 2)), far
-
-
-def covered_box(
-    pixels_from_stack: F64, corners_m: F64, *, width_px: int, height_px: int, align_px: int = 32
-) -> PixelRect:
-    """The part of the raster that a convex hull of corners may touch, grown to multiples of `align_px`."""
-    pixels, depths = project(pixels_from_stack, corners_m)
+def covered_box(view: View, corners_m: F64, *, align_px: int = 32) -> PixelRect:
+    """The part of the raster that a convex hull of corners may touch, grown to multiples of `align_px`; empty where
+    all of it is behind the eye."""
+    pixels, depths = project(view.pixels_from_stack, corners_m)
+    if _depth_bounds(view, corners_m)[1] <= 2 * NEAREST_M:
+        return PixelRect(0, 0, 0, 0)
+    size = [view.width_px, view.height_px]
     if (depths <= NEAREST_M).any():
-        return PixelRect(0, 0, width_px, height_px)
+        return PixelRect(0, 0, *size)
     low = np.floor((pixels.min(0) - 1) / align_px) * align_px
     high = np.ceil((pixels.max(0) + 1) / align_px) * align_px
-    u0, v0 = (int(value) for value in np.clip(low, 0, [width_px, height_px]))
-    u1, v1 = (int(value) for value in np.clip(high, 0, [width_px, height_px]))
+    u0, v0 = (int(value) for value in np.clip(low, 0, size))
+    u1, v1 = (int(value) for value in np.clip(high, 0, size))
     return PixelRect(u0, v0, max(u1, u0), max(v1, v0))
+
+
+def _depth_bounds(view: View, corners_m: F64) -> tuple[float, float]:
+    """Near and far, with a margin, that hold all of `corners_m` before the eye."""
+    depths = project(view.pixels_from_stack, corners_m)[1]
+    far = float(depths.max()) * 1.001 + NEAREST_M
+    return max(float(depths.min()) * 0.999 - NEAREST_M, min(NEAREST_M, far / 2)), far

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from runtime.content.base import View
 from runtime.optics.rect import PixelRect
 from runtime.records import U8
 from runtime.support.gl import DrawnPicture
@@ -40,12 +41,10 @@ class Canvas:
         self.clear_colour = (*background, 0.0)
         self._targets: dict[tuple[int, int], _Target] = {}
 
-    def draw(
-        self, *, width_px: int, height_px: int, side: int, box: PixelRect, paint: Callable[[], None]
-    ) -> DrawnPicture:
-        """Clear, let `paint` issue its draw calls inside `box`; that side's picture, until its next of this size."""
-        target = self._target(width_px, height_px)
-        plain = target.plain[side]
+    def draw(self, view: View, box: PixelRect, paint: Callable[[], None]) -> DrawnPicture:
+        """Clear, let `paint` issue its draw calls inside `box`; the picture of the view's side, until its next one."""
+        target = self._target(view.width_px, view.height_px)
+        plain = target.plain[view.side]
         plain.use()
         plain.clear(*self.clear_colour, depth=1.0)
         area = (box.u0, box.v0, box.width_px, box.height_px)
@@ -63,7 +62,7 @@ class Canvas:
                 plain.use()
                 self._context.copy_framebuffer(plain, drawn)
                 plain.scissor = None
-        return DrawnPicture(plain.color_attachments[0], plain, target.pictures[side])
+        return DrawnPicture(plain.color_attachments[0], plain, target.pictures[view.side])
 
     def close(self) -> None:
         """Release every framebuffer. May be called twice."""

@@ -20,7 +20,8 @@ from runtime.optics.views import image_from_stack
 from runtime.records import F64, U8
 from runtime.support.artifacts import read_image
 
-NAME = re.compile(r"pair(\d+)_x(-?[\d.]+)_y(-?[\d.]+)_z(-?[\d.]+)_([01]|left|right)\.(?:jpg|jpeg|png)$", re.IGNORECASE)
+NUMBER = r"(-?(?:\d+\.?\d*|\.\d+))"
+NAME = re.compile(rf"pair(\d+)_x{NUMBER}_y{NUMBER}_z{NUMBER}_([01]|left|right)\.(?:jpg|jpeg|png)$", re.IGNORECASE)
 KEPT = 4  # pairs in memory
 USUAL_SEPARATION_M, SEPARATION_DIFFERS_M = 0.06, 0.006
 NEAREST_M, FARTHEST_M = 0.1, 2.0  # of viewers
@@ -56,42 +57,30 @@ def read_folder(folder: Path, preset: Preset) -> tuple[Pair, ...]:
     drew the pictures.
     """
     stack_from_scene: F64 = np.linalg.inv(preset.scene_from_stack).astype(np.float64)
-    found: dict[int, dict[str, tuple[Path, F64]]] = {}
+    found: dict[int, list[tuple[str, Path, F64]]] = {}
     for path in sorted(folder.iterdir()):
         match = NAME.match(path.name)
         if not match:
             continue
-        try:
-            digital = np.array([float(match[2]), float(match[3]), float(match[4])])
-        except ValueError:
-            raise InputError(path, "name", "its coordinates are not numbers") from None
-        eye = (stack_from_scene @ np.append(digital, 1.0))[:3]
+        eye = (stack_from_scene @ [float(match[2]), float(match[3]), float(match[4]), 1.0])[:3]
         if eye[0] <= 0:
-            raise InputError(
-                path, "name", f"its eye is behind the display (x = {eye[0]:.3f} m) with preset {preset.name}"
-            )
-        halves = found.setdefault(int(match[1]), {})
-        half = match[5].lower()
-        if half in halves:
-            raise InputError(path, f"pair{int(match[1])}", f"_{half} is there twice, as {halves[half][0].name} too")
-        halves[half] = (path, eye)
+            problem = f"its eye is behind the display (x = {eye[0]:.3f} m) with preset {preset.name}"
+            raise InputError(path, "name", problem)
+        found.setdefault(int(match[1]), []).append((match[5].lower(), path, eye))
     if not found:
         raise InputError(folder, "", "holds no pair0_x.._y.._z.._0.jpg")
     pairs = []
     for number, halves in sorted(found.items()):
-        names = ("left", "right") if "left" in halves or "right" in halves else ("0", "1")
-        path = next(iter(halves.values()))[0]
-        if sorted(halves) != [*names]:
-            there = " and ".join(f"_{half}" for half in halves)
-            raise InputError(path, f"pair{number}", f"has {there}; _{names[0]} and _{names[1]} are needed")
-        (first, first_eye), (second, second_eye) = (halves[name] for name in names)
-        if first_eye[1] == second_eye[1]:
-            raise InputError(first, f"pair{number}", "both eyes are at the same y: left can't be told from right")
-        if first_eye[1] > second_eye[1] and names[0] == "left":
-            raise InputError(first, f"pair{number}", f"_left stands to the right of _right with preset {preset.name}")
-        if first_eye[1] > second_eye[1]:
-            first, second, first_eye, second_eye = second, first, second_eye, first_eye
-        pairs.append(Pair(number, (first, second), np.array([first_eye, second_eye]), stack_from_scene[:3, 3]))
+        names = [half for half, _, _ in halves]
+        if sorted(names) not in (["0", "1"], ["left", "right"]):
+            problem = f"has {', '.join(f'_{half}' for half in names)}; _0 and _1, or _left and _right are needed"
+            raise InputError(halves[0][1], f"pair{number}", problem)
+        (name, left, left_eye), (_, right, right_eye) = sorted(halves, key=lambda half: half[2][1])
+        if left_eye[1] == right_eye[1]:
+            raise InputError(left, f"pair{number}", "both eyes are at the same y: left can't be told from right")
+        if name == "right":
+            raise InputError(right, f"pair{number}", f"_left stands to the right of _right with preset {preset.name}")
+        pairs.append(Pair(number, (left, right), np.array([left_eye, right_eye]), stack_from_scene[:3, 3]))
     return tuple(pairs)
 
 
@@ -158,7 +147,7 @@ class EyeRealSource(ContentSource):
         except InputError as error:
             raise ContentFailure(str(error)) from None
         matrix = image_from_view(projection, view.pixels_from_stack, x_m=0.0)
-        return picture.warped(matrix, width_px=view.width_px, height_px=view.height_px, side=view.side)
+        return picture.warped(matrix, view)
 
     def _load(self, index: int) -> list[tuple[WarpedPicture, F64]]:
         return [self._opened(self._pairs[index], side) for side in (0, 1)]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
+from runtime.content.base import View
 from runtime.content.ply import Header, read_vertices
 from runtime.errors import InputError
 from runtime.records import F32, F64
@@ -113,15 +114,13 @@ def moved(gaussians: Gaussians, target_from_source: F64) -> Gaussians:
     return Gaussians(centres.astype(np.float32), packed, gaussians.opacities, gaussians.harmonics)
 
 
-def seen_splats(
-    gaussians: Gaussians, pixels_from_stack: F64, *, width_px: int, height_px: int, nearest_m: float = 1e-3
-) -> Splats:
+def seen_splats(gaussians: Gaussians, view: View, *, nearest_m: float = 1e-3) -> Splats:
     """Project to first order about each centre (EWA, Zwicker et al. 2001), leave out what can't be seen, sort.
 
     A 3x4 projection of any kind will do: the Jacobian is (P_i - u_i P_3)/w, so a panel's own pixels are as good
     as an eye's image.
     """
-    projection = pixels_from_stack.astype(np.float32)
+    projection = view.pixels_from_stack.astype(np.float32)
     homogeneous = gaussians.centres @ projection[:, :3].T + projection[:, 3]
     w = homogeneous[:, 2]
     shown = np.flatnonzero((w > nearest_m) & (gaussians.opacities > ALPHA_MIN))
@@ -131,17 +130,17 @@ def seen_splats(
     j0 = (p0[:, None] - p2[:, None] * u) * weight
     j1 = (p1[:, None] - p2[:, None] * v) * weight
     xx, xy, xz, yy, yz, zz = gaussians.covariances[shown].T
-    k0, k1, k2 = xx * j0[0] + xy * j0[1] + xz * j0[2], xy * j0[0] + yy * j0[1] + yz * j0[2], None
+    k0, k1 = xx * j0[0] + xy * j0[1] + xz * j0[2], xy * j0[0] + yy * j0[1] + yz * j0[2]
     k2 = xz * j0[0] + yz * j0[1] + zz * j0[2]
     a = j0[0] * k0 + j0[1] * k1 + j0[2] * k2 + LOW_PASS_PX2
     b = j1[0] * k0 + j1[1] * k1 + j1[2] * k2
-    l0, l1, l2 = xx * j1[0] + xy * j1[1] + xz * j1[2], xy * j1[0] + yy * j1[1] + yz * j1[2], None
+    l0, l1 = xx * j1[0] + xy * j1[1] + xz * j1[2], xy * j1[0] + yy * j1[1] + yz * j1[2]
     l2 = xz * j1[0] + yz * j1[1] + zz * j1[2]
     c = j1[0] * l0 + j1[1] * l1 + j1[2] * l2 + LOW_PASS_PX2
     opacity = gaussians.opacities[shown]
     reach = np.sqrt(2 * np.log(opacity / np.float32(ALPHA_MIN)))
     half_u, half_v = reach * np.sqrt(a), reach * np.sqrt(c)
-    inside = (u + half_u > 0) & (u - half_u < width_px) & (v + half_v > 0) & (v - half_v < height_px)
+    inside = (u + half_u > 0) & (u - half_u < view.width_px) & (v + half_v > 0) & (v - half_v < view.height_px)
     keep = np.flatnonzero(inside)
     keep = keep[np.argsort(-w[shown[keep]], kind="stable")]
     a, b, c = a[keep], b[keep], c[keep]

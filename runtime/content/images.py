@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from runtime.content.base import View
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster
@@ -44,11 +45,9 @@ def plane_from_pixels(pixels_from_stack: F64, plane: PlaneRaster) -> F64 | None:
         return None
 
 
-def reduction(picture_from_view: F64, *, width_px: int, height_px: int) -> int:
+def reduction(picture_from_view: F64, view: View) -> int:
     """How often a picture is halved before it is warped, so that one sample stands for at most about 1.5 pixels."""
-    middle = np.array(
-        [[width_px / 2, height_px / 2], [width_px / 2 + 1, height_px / 2], [width_px / 2, height_px / 2 + 1]]
-    )
+    middle = np.array([view.width_px, view.height_px]) / 2 + np.array([[0, 0], [1, 0], [0, 1]])
     mapped = cv2.perspectiveTransform(middle[None], picture_from_view)[0]
     steps = np.linalg.norm(mapped[1:] - mapped[0], axis=1)
     return int(np.clip(np.floor(np.log2(max(float(steps.min()), 1e-9) / 1.5) + 1), 0, 8))
@@ -62,24 +61,24 @@ class WarpedPicture:
         self._border = (*(round(value * 255) for value in background), 0)
         self._out: dict[tuple[int, int, int], U8] = {}
 
-    def warped(self, picture_from_view: F64 | None, *, width_px: int, height_px: int, side: int) -> U8:
+    def warped(self, picture_from_view: F64 | None, view: View) -> U8:
         """(h, w, 4): the picture at each of the view's pixels; the background with alpha 0 beside it, or alone (None).
 
         The array is kept and written again by the next call of the same size and side.
         """
-        key = (width_px, height_px, side)
+        key = (view.width_px, view.height_px, view.side)
         if key not in self._out:
-            self._out[key] = np.empty((height_px, width_px, 4), np.uint8)
+            self._out[key] = np.empty((view.height_px, view.width_px, 4), np.uint8)
         out = self._out[key]
         if picture_from_view is None:
             out[:] = self._border
             return out
-        picture, shrink = self._level(reduction(picture_from_view, width_px=width_px, height_px=height_px))
+        picture, shrink = self._level(reduction(picture_from_view, view))
         matrix = _MINUS_HALF @ np.diag([*shrink, 1.0]) @ picture_from_view @ _HALF
         cv2.warpPerspective(
             picture,
             matrix,
-            (width_px, height_px),
+            (view.width_px, view.height_px),
             dst=out,
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_CONSTANT,

@@ -265,7 +265,7 @@ class ScreenSource(ContentSource):
             shown = rgba_from_rgb(shown) if shown.shape[2] == 3 else shown
             self._shown[which] = WarpedPicture(shown, background=self._file.background)
         matrix = plane_from_pixels(view.pixels_from_stack, self._screen)
-        return self._shown[which].warped(matrix, width_px=view.width_px, height_px=view.height_px, side=view.side)
+        return self._shown[which].warped(matrix, view)
 
     def _take(self, number: int, picture: U8) -> None:
         """Raises ValueError where it is too small."""

@@ -139,34 +139,22 @@ class PointSource(DrawingSource):
         self.info = ContentInfo(name, background=background)
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
-        size = {"width_px": view.width_px, "height_px": view.height_px}
-        bounds = camera.depth_bounds(view.pixels_from_stack, self._corners_m)
-        box = self._box(view) if bounds else PixelRect(0, 0, 0, 0)
-
         def paint() -> None:
-            near_m, far_m = bounds or (0.0, 0.0)
-            clip = camera.clip_from_stack(view.pixels_from_stack, near_m=near_m, far_m=far_m, **size)
+            clip = camera.clip_from_stack(view, self._corners_m)
             self._context.enable_only(self._context.DEPTH_TEST | self._context.PROGRAM_POINT_SIZE)
             self._program["clip_from_stack"].write(np.ascontiguousarray(clip.T, np.float32))
             self._program["pixels"] = self._disc_m * _pixels_per_radian(view)
             self._vertices.render()
 
-        return self._canvas.draw(side=view.side, box=box, paint=paint, **size)
+        return self._canvas.draw(view, self.extent(view, time_ns=time_ns), paint)
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect:
-        if camera.depth_bounds(view.pixels_from_stack, self._corners_m) is None:
-            return PixelRect(0, 0, 0, 0)
-        return self._box(view)
+        return camera.covered_box(view, self._corners_m, align_px=1)
 
     def close(self) -> None:
         self._canvas.close()
         for held in (self._vertices, self._buffer, self._program):
             held.release()
-
-    def _box(self, view: View) -> PixelRect:
-        return camera.covered_box(
-            view.pixels_from_stack, self._corners_m, width_px=view.width_px, height_px=view.height_px, align_px=1
-        )
 
 
 def _pixels_per_radian(view: View) -> float:

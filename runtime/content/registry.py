@@ -47,47 +47,39 @@ def prepare_content(settings: ContentSettings, stack: PanelStack, *, limits: Lim
     This is the slow part and needs no GL: it may run on any thread. How far it is goes to `support.progress`.
     limits: of what files may hold; None: the defaults. Raises InputError, naming file and field.
     """
-    limits = limits or LimitSettings()
-    with progress.task(f"loading {settings.scene}", seconds=limits.load_s, too_slow=_too_slow(settings.scene, limits)):
-        return _placed(settings, stack, limits)
+    file = SceneFile(Path(settings.scene), settings, stack, limits or LimitSettings())
+    too_slow = InputError(settings.scene, "", f"takes longer to load than {file.limits.load_s:g} s")
+    with progress.task(f"loading {settings.scene}", seconds=file.limits.load_s, too_slow=too_slow):
+        return _placed(file)
 
 
-def _placed(settings: ContentSettings, stack: PanelStack, limits: LimitSettings) -> Opener:
-    opener, placing = _prepared(settings, stack, limits), placing_of(settings)
-    return lambda context: placed_source(opener(context), placing, stack)
+def _placed(file: SceneFile) -> Opener:
+    opener, placing = _prepared(file), placing_of(file.settings)
+    return lambda context: placed_source(opener(context), placing, file.stack)
 
 
-def _too_slow(scene: str, limits: LimitSettings) -> InputError:
-    return InputError(scene, "", f"takes longer to load than {limits.load_s:g} s")
-
-
-def _prepared(settings: ContentSettings, stack: PanelStack, limits: LimitSettings) -> Opener:
-    name = settings.scene
+def _prepared(file: SceneFile) -> Opener:
+    name, settings = file.settings.scene, file.settings
     if name in SCENES:
-        return _built_in(name, settings, stack)
+        return _built_in(name, file)
     if name in preset_names():
         if settings.file:
             chosen = preset(name, settings.reading)
-            return _from_path(SceneFile(Path(settings.file), settings, stack, limits, chosen))
-        return _built_in("demo", settings, stack, stands_for=name)
+            return _from_path(replace(file, path=Path(settings.file), preset=chosen))
+        return _built_in("demo", file, stands_for=name)
     if is_live(name):
         from runtime.content import stream
 
-        return stream.prepare(name, settings, stack, limits)
+        return stream.prepare(file)
     if is_plugin(name):
-        return _plugin(name, settings, stack)
-    path = foreign.checked_path(name, source="content", field="scene")
-    if not path.exists():
-        raise InputError("content", "scene", f"`{name}` {_no_scene(name)}")
-    return _from_path(SceneFile(path, settings, stack, limits))
-
-
-def _no_scene(name: str) -> str:
-    """What a name is not, and what was meant; not all names, which one line does not hold."""
-    presets = preset_names()
-    meant = nearest(name, (*SCENES, *presets))
-    some = f"built in: {', '.join(SCENES)}; {len(presets)} presets, such as lego_bulldozer"
-    return f"is neither a file or folder nor a scene's name{meant} ({some})"
+        return _plugin(name, file)
+    if not foreign.checked_path(name, source="content", field="scene").exists():
+        presets = preset_names()
+        meant = nearest(name, (*SCENES, *presets))
+        some = f"built in: {', '.join(SCENES)}; {len(presets)} presets, such as lego_bulldozer"
+        problem = f"`{name}` is neither a file or folder nor a scene's name{meant} ({some})"
+        raise InputError("content", "scene", problem)
+    return _from_path(file)
 
 
 def _from_path(file: SceneFile) -> Opener:
@@ -105,21 +97,26 @@ def _from_path(file: SceneFile) -> Opener:
             return eyereal.prepare(file)
     elif suffix in PLAYLISTS:
         return _playlist(file)
-    elif suffix in MESHES or (suffix == ".ply" and read_header(path, file.limits).kind == "triangles"):
+    elif suffix in MESHES:
         from runtime.content import mesh
 
         return mesh.prepare(file)
     elif suffix == ".ply":
-        from runtime.content import points, splat
+        from runtime.content import mesh, points, splat
 
-        return splat.prepare(file) if read_header(path, file.limits).kind == "splats" else points.prepare(file)
+        kinds: dict[str, Callable[[SceneFile], Opener]] = {
+            "triangles": mesh.prepare,
+            "splats": splat.prepare,
+            "points": points.prepare,
+        }
+        return kinds[read_header(path, file.limits).kind](file)
     from runtime.content import pictures, rgbd
 
     is_rgbd = pictures.layout_of(path, file.settings).kind == "rgbd"
     return rgbd.prepare(file) if is_rgbd else pictures.prepare(file)
 
 
-def _built_in(name: str, settings: ContentSettings, stack: PanelStack, *, stands_for: str = "") -> Opener:
+def _built_in(name: str, file: SceneFile, *, stands_for: str = "") -> Opener:
     """stands_for: the preset in whose place it is shown: the paper's scenes are not shipped."""
     from runtime.content.procedural import ProceduralSource, parts_of
 
@@ -127,10 +124,10 @@ def _built_in(name: str, settings: ContentSettings, stack: PanelStack, *, stands
     parts = parts_of(scene)
 
     def make(context: Any) -> ContentSource:
-        source = ProceduralSource(scene, stack=stack, context=context, background=settings.background, parts=parts)
+        background = file.settings.background
+        source = ProceduralSource(scene, stack=file.stack, context=context, background=background, parts=parts)
         if stands_for:
-            shown = f"{stands_for} (stand-in `{name}`: content.file is empty)"
-            source.info = replace(source.info, name=shown)
+            source.info = replace(source.info, name=f"{stands_for} (stand-in `{name}`: content.file is empty)")
         return source
 
     return make
@@ -144,22 +141,22 @@ def _playlist(file: SceneFile) -> Opener:
     for number, entry in enumerate(playlist.entries):
         progress.tell(f"{file.path.name}: {Path(entry.scene).name}", number, len(playlist.entries))
         try:
-            openers.append(_placed(entry, file.stack, file.limits))
+            openers.append(_placed(replace(file, path=Path(entry.scene), settings=entry, preset=None)))
         except InputError as error:
             raise InputError(file.path, f"show[{number}]", str(error)) from None
     return lambda context: PlaylistSource(playlist, openers, context=context)
 
 
-def _plugin(name: str, settings: ContentSettings, stack: PanelStack) -> Opener:
+def _plugin(name: str, file: SceneFile) -> Opener:
     """A class of the user's own: imported and its options checked here, made and tried once with the context."""
     plugin = plugin_class(name, ContentSource, field="content.scene")
-    options = validated(plugin.Options, settings.options, source="content.options")
+    options = validated(plugin.Options, file.settings.options, source="content.options")
 
     def make(context: Any) -> ContentSource:
         eye = np.array([0.6, 0.0, 0.0])
-        plane = replace(stack, width_px=TRIED_PX[0], height_px=TRIED_PX[1]).panel(0)
+        plane = replace(file.stack, width_px=TRIED_PX[0], height_px=TRIED_PX[1]).panel(0)
         try:
-            source: ContentSource = plugin(options, stack=stack, context=context)
+            source: ContentSource = plugin(options, stack=file.stack, context=context)
             picture = source.render(View(eye, 0, raster_from_stack(eye, plane), *TRIED_PX), time_ns=0)
         except PhasestackError:
             raise

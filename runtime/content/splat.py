@@ -96,9 +96,7 @@ class SplatSource(DrawingSource):
             self._vertices.render(vertices=6 * count)
 
         whole = PixelRect(0, 0, view.width_px, view.height_px if count else 0)
-        return self._canvas.draw(
-            width_px=view.width_px, height_px=view.height_px, side=view.side, box=whole, paint=paint
-        )
+        return self._canvas.draw(view, whole, paint)
 
     def close(self) -> None:
         self._canvas.close()
@@ -107,7 +105,7 @@ class SplatSource(DrawingSource):
 
     def _prepare(self, view: View) -> int:
         """Fill the vertex buffer for a view; returns how many splats it holds."""
-        splats = seen_splats(self._gaussians, view.pixels_from_stack, width_px=view.width_px, height_px=view.height_px)
+        splats = seen_splats(self._gaussians, view)
         count = len(splats.index)
         directions = self._gaussians.centres[splats.index] - view.eye_m.astype(np.float32)
         directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), np.float32(1e-9))

@@ -13,6 +13,7 @@ import time
 import weakref
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from queue import Queue
@@ -26,7 +27,6 @@ from runtime.content.base import ContentInfo, ContentSource
 from runtime.content.pictures import CONTAINERS, Layout, ScreenSource, layout_of
 from runtime.content.placing import SceneFile
 from runtime.errors import ContentFailure, InputError, MissingPart, one_line
-from runtime.optics.stack import PanelStack
 from runtime.records import U8
 from runtime.support import foreign
 from runtime.support.live import LIVE
@@ -259,17 +259,15 @@ class _Packets:
             self._waiting.put(error)
 
 
-def prepare(
-    name: str, settings: ContentSettings, stack: PanelStack, limits: LimitSettings
-) -> Callable[[Any], ContentSource]:
+def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
     """Begin to read, and wait a moment for the first picture. Raises InputError, MissingPart."""
-    target = Target(name)
-    layout = layout_of(target.path, settings)
+    target = Target(file.settings.scene)
+    file = replace(file, path=target.path)
+    layout = layout_of(file.path, file.settings)
     if layout.kind == "rgbd":
         raise InputError("content", "layout", "rgbd is not for live pictures")
-    feed = Feed(target, settings, limits)
+    feed = Feed(target, file.settings, file.limits)
     feed.reader.first.wait(FIRST_PICTURE_S)
-    file = SceneFile(target.path, settings, stack, limits)
     return lambda context: LiveSource(feed, layout=layout, file=file)
 
 

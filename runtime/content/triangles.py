@@ -199,29 +199,22 @@ class TriangleSource(DrawingSource):
         return self.stack_from_parts
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect:
-        size = {"width_px": view.width_px, "height_px": view.height_px}
         boxes = []
         for part, matrix in zip(self.parts, self.places(time_ns), strict=True):
             points = part.corners_m if len(part.vertices) > PROJECTED_MAX else part.positions.astype(np.float64)
-            placed = points @ matrix[:3, :3].T + matrix[:3, 3]
-            if camera.depth_bounds(view.pixels_from_stack, placed) is not None:
-                boxes.append(camera.covered_box(view.pixels_from_stack, placed, align_px=1, **size))
+            boxes.append(camera.covered_box(view, points @ matrix[:3, :3].T + matrix[:3, 3], align_px=1))
         return union(boxes)
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         """The same bytes for the same view and time."""
-        size = {"width_px": view.width_px, "height_px": view.height_px}
         placed = list(zip(self.parts, self.places(time_ns), strict=True))
         corners = np.stack([part.corners_m @ matrix[:3, :3].T + matrix[:3, 3] for part, matrix in placed])
-        bounds = camera.depth_bounds(view.pixels_from_stack, corners.reshape(-1, 3))
-        boxes = [camera.covered_box(view.pixels_from_stack, part, **size) for part in corners]
-        area = union(boxes) if bounds else PixelRect(0, 0, 0, 0)
+        area = union([camera.covered_box(view, part) for part in corners])
         # Nearest first: what they hide need not be shaded.
         placed = [placed[index] for index in np.argsort(-corners[..., 0].mean(1), kind="stable")]
 
         def paint() -> None:
-            near_m, far_m = bounds or (0.0, 0.0)
-            clip = camera.clip_from_stack(view.pixels_from_stack, near_m=near_m, far_m=far_m, **size)
+            clip = camera.clip_from_stack(view, corners.reshape(-1, 3))
             self.context.enable_only(self.context.DEPTH_TEST)
             for part, stack_from_part in placed:
                 _set_look(part.surface_program, part, stack_from_part, view)
@@ -230,7 +223,7 @@ class TriangleSource(DrawingSource):
             if self._with_ramps:
                 self._draw_outlines(placed, clip, view)
 
-        return self._canvas.draw(side=view.side, box=area, paint=paint, **size)
+        return self._canvas.draw(view, area, paint)
 
     def close(self) -> None:
         self._canvas.close()

@@ -103,7 +103,7 @@ def test_the_nearest_pair_is_shown(tmp_path: Path, context: Any, stack: PanelSta
 def test_half_a_pair_is_named(tmp_path: Path, context: Any, stack: PanelStack) -> None:
     write_pair(tmp_path, context, stack)
     next(tmp_path.glob("*_0.png")).unlink()
-    with pytest.raises(InputError, match=r"_1.png: pair0: has _1; _0 and _1 are needed"):
+    with pytest.raises(InputError, match=r"_1.png: pair0: has _1; _0 and _1"):
         read_folder(tmp_path, LEGO)
 
 

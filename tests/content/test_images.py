@@ -28,8 +28,7 @@ class Pair:
 
     def render(self, view: View) -> U8:
         matrix = image_from_view(self._projections[view.side], view.pixels_from_stack, x_m=0.0)
-        size = {"width_px": view.width_px, "height_px": view.height_px}
-        return self._pictures[view.side].warped(matrix, side=view.side, **size)
+        return self._pictures[view.side].warped(matrix, view)
 
 
 def test_the_picture_s_own_view_gives_back_the_picture() -> None:
