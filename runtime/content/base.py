@@ -109,16 +109,6 @@ class ContentSource(ABC):
         """Release GL objects and files. May be called twice."""
 
 
-class DrawingSource(ContentSource):
-    """A source that draws with OpenGL: its pictures are read back only where somebody wants the pixels."""
-
-    @abstractmethod
-    def draw(self, view: View, *, time_ns: int) -> DrawnPicture: ...
-
-    def render(self, view: View, *, time_ns: int) -> U8:
-        return self.draw(view, time_ns=time_ns).pixels()
-
-
 class ForwardingSource(ContentSource):
     """A source that shows another one."""
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from runtime.content.base import View
+from runtime.content.base import WHITE, ContentInfo, ContentSource, View
 from runtime.optics.rect import PixelRect
 from runtime.records import U8
 from runtime.support.gl import DrawnPicture
@@ -24,35 +25,41 @@ class _Target:
     pictures: list[U8]  # one (h, w, 4) array a side, reused
 
 
-class Canvas:
-    """Draws into an offscreen framebuffer of a view's size, where the picture stays until it is asked for.
+class CanvasSource(ContentSource):
+    """A source that draws with OpenGL, into framebuffers of the views' sizes: who wants the pixels reads them back.
 
     Only the box that the content may touch is cleared, drawn and resolved with several samples a pixel: on a
     software rasteriser resolving is the dearest step.
     """
 
-    def __init__(
-        self, context: Any, *, samples: int, background: tuple[float, float, float], deep: bool = False
-    ) -> None:
-        """deep: draw in half floats, for sums of many layers, some brighter than white."""
-        self._context = context
+    def __init__(self, context: Any, *, info: ContentInfo, samples: int = 0, deep: bool = False) -> None:
+        """samples: a pixel; deep: draw in half floats, for sums of many layers, some brighter than white."""
+        self.info, self.context = info, context
+        self.draws_in = context
+        self.held: list[Any] = []  # GL objects that are released with it
         self._deep = deep
         self._samples = min(samples, context.max_samples)
-        self.clear_colour = (*background, 0.0)
+        self._clear_colour = (*(info.background or WHITE), 0.0)
         self._targets: dict[tuple[int, int], _Target] = {}
 
-    def draw(self, view: View, box: PixelRect, paint: Callable[[], None]) -> DrawnPicture:
+    @abstractmethod
+    def draw(self, view: View, *, time_ns: int) -> DrawnPicture: ...
+
+    def render(self, view: View, *, time_ns: int) -> U8:
+        return self.draw(view, time_ns=time_ns).pixels()
+
+    def drawn(self, view: View, box: PixelRect, paint: Callable[[], None]) -> DrawnPicture:
         """Clear, let `paint` issue its draw calls inside `box`; the picture of the view's side, until its next one."""
         target = self._target(view.width_px, view.height_px)
         plain = target.plain[view.side]
         plain.use()
-        plain.clear(*self.clear_colour, depth=1.0)
+        plain.clear(*self._clear_colour, depth=1.0)
         area = (box.u0, box.v0, box.width_px, box.height_px)
         if box.width_px and box.height_px:
             drawn = target.smooth or plain
             if drawn is not plain:
                 drawn.use()
-                drawn.clear(*self.clear_colour, depth=1.0, viewport=area)
+                drawn.clear(*self._clear_colour, depth=1.0, viewport=area)
             drawn.scissor = area
             drawn.use()
             paint()
@@ -60,19 +67,20 @@ class Canvas:
             if drawn is not plain:
                 plain.scissor = area
                 plain.use()
-                self._context.copy_framebuffer(plain, drawn)
+                self.context.copy_framebuffer(plain, drawn)
                 plain.scissor = None
         return DrawnPicture(plain.color_attachments[0], plain, target.pictures[view.side])
 
     def close(self) -> None:
-        """Release every framebuffer. May be called twice."""
         while self._targets:
             self._forget_oldest()
+        while self.held:
+            self.held.pop().release()
 
     def _forget_oldest(self) -> None:
         target = self._targets.pop(next(iter(self._targets)))
         # moderngl binds the last framebuffer again on later calls: it must not be one that is no more.
-        self._context.detect_framebuffer(0).use()
+        self.context.detect_framebuffer(0).use()
         for framebuffer in (*target.plain, *([target.smooth] if target.smooth else [])):
             for attachment in (*framebuffer.color_attachments, framebuffer.depth_attachment):
                 attachment.release()
@@ -83,13 +91,13 @@ class Canvas:
         if size not in self._targets:
             if len(self._targets) >= SIZES_KEPT:
                 self._forget_oldest()
-            plain = [self._framebuffer(size, self._context.texture(size, 4)) for _ in range(SIDES)]
+            plain = [self._framebuffer(size, self.context.texture(size, 4)) for _ in range(SIDES)]
             smooth = None
             if self._samples > 1 or self._deep:
                 dtype = "f2" if self._deep else "f1"
                 samples = self._samples
                 smooth = self._framebuffer(
-                    size, self._context.renderbuffer(size, 4, samples=samples, dtype=dtype), samples=samples
+                    size, self.context.renderbuffer(size, 4, samples=samples, dtype=dtype), samples=samples
                 )
             pictures = [np.zeros((height_px, width_px, 4), np.uint8) for _ in range(SIDES)]
             self._targets[size] = _Target(smooth, plain, pictures)
@@ -97,4 +105,4 @@ class Canvas:
 
     def _framebuffer(self, size: tuple[int, int], colour: Any, *, samples: int = 0) -> Any:
         # Depth in a texture: Mesa keeps a renderbuffer's for good where another context of the group releases it.
-        return self._context.framebuffer([colour], self._context.depth_texture(size, samples=samples))
+        return self.context.framebuffer([colour], self.context.depth_texture(size, samples=samples))

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from runtime.content import camera
-from runtime.content.base import ContentInfo, DrawingSource, View
-from runtime.content.canvas import Canvas
+from runtime.content.base import ContentInfo, View
+from runtime.content.canvas import CanvasSource
 from runtime.content.placing import SceneFile
 from runtime.content.ply import Header, Table, read_header, read_vertices
 from runtime.errors import InputError
@@ -67,9 +67,8 @@ def prepare(file: SceneFile) -> Callable[[Any], PointSource]:
     cloud = load_points(read_header(file.path, file.limits))
     low, high = np.percentile(cloud.positions.astype(np.float64), [STRAY, 100 - STRAY], axis=0)
     matrix = file.placed(low, high)
-    return lambda context: PointSource(
-        cloud, stack_from_scene=matrix, context=context, background=file.background, name=file.path.stem
-    )
+    info = ContentInfo(file.path.stem, background=file.background)
+    return lambda context: PointSource(cloud, stack_from_scene=matrix, context=context, info=info)
 
 
 def load_points(header: Header) -> Cloud:
@@ -108,53 +107,39 @@ def _gap(positions: F32) -> float:
     return float(np.median(distances))
 
 
-class PointSource(DrawingSource):
+class PointSource(CanvasSource):
     """A cloud at its place in the stack frame."""
 
-    def __init__(
-        self,
-        cloud: Cloud,
-        *,
-        stack_from_scene: F64,
-        context: Any,
-        background: tuple[float, float, float],
-        name: str,
-    ) -> None:
+    def __init__(self, cloud: Cloud, *, stack_from_scene: F64, context: Any, info: ContentInfo) -> None:
+        super().__init__(context, info=info)
         linear = stack_from_scene[:3, :3]
         positions = (cloud.positions @ linear.T + stack_from_scene[:3, 3]).astype(np.float32)
         extent_m = float(np.ptp(positions, axis=0).max())
         gap_m = cloud.gap * float(np.cbrt(abs(np.linalg.det(linear))))
         # Two points, or many at one place, have no gap that says how large they are.
         self._disc_m = DISC_PER_GAP * min(max(gap_m, extent_m / 1000), max(extent_m / 20, 1e-4)) or 1e-3
-        self._context = self.draws_in = context
-        self._canvas = Canvas(context, samples=1, background=background)
         self._program = linked_program(context, vertex=VERTEX, fragment=FRAGMENT)
-        self._buffer = context.buffer(np.concatenate([positions, cloud.colours], axis=1, dtype=np.float32))
+        buffer = context.buffer(np.concatenate([positions, cloud.colours], axis=1, dtype=np.float32))
         self._vertices = context.vertex_array(
-            self._program, [(self._buffer, "3f 3f", "in_position", "in_colour")], mode=moderngl.POINTS
+            self._program, [(buffer, "3f 3f", "in_position", "in_colour")], mode=moderngl.POINTS
         )
         margin = self._disc_m / 2
         low, high = positions.min(0).astype(np.float64) - margin, positions.max(0).astype(np.float64) + margin
         self._corners_m = camera.box_corners(low, high)
-        self.info = ContentInfo(name, background=background)
+        self.held += [self._program, buffer, self._vertices]
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         def paint() -> None:
             clip = camera.clip_from_stack(view, self._corners_m)
-            self._context.enable_only(self._context.DEPTH_TEST | self._context.PROGRAM_POINT_SIZE)
+            self.context.enable_only(self.context.DEPTH_TEST | self.context.PROGRAM_POINT_SIZE)
             self._program["clip_from_stack"].write(np.ascontiguousarray(clip.T, np.float32))
             self._program["pixels"] = self._disc_m * _pixels_per_radian(view)
             self._vertices.render()
 
-        return self._canvas.draw(view, self.extent(view, time_ns=time_ns), paint)
+        return self.drawn(view, self.extent(view, time_ns=time_ns), paint)
 
     def extent(self, view: View, *, time_ns: int) -> PixelRect:
         return camera.covered_box(view, self._corners_m, align_px=1)
-
-    def close(self) -> None:
-        self._canvas.close()
-        for held in (self._vertices, self._buffer, self._program):
-            held.release()
 
 
 def _pixels_per_radian(view: View) -> float:

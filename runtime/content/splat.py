@@ -8,8 +8,8 @@ from typing import Any
 import moderngl
 import numpy as np
 
-from runtime.content.base import ContentInfo, DrawingSource, View
-from runtime.content.canvas import Canvas
+from runtime.content.base import ContentInfo, View
+from runtime.content.canvas import CanvasSource
 from runtime.content.gaussians import Gaussians, colours_towards, load_gaussians, moved, seen_splats
 from runtime.content.placing import SceneFile
 from runtime.content.ply import read_header
@@ -51,57 +51,42 @@ def prepare(file: SceneFile) -> Callable[[Any], SplatSource]:
     gaussians = load_gaussians(read_header(file.path, file.limits))
     low, high = np.percentile(gaussians.centres.astype(np.float64), [STRAY, 100 - STRAY], axis=0)
     matrix = file.placed(low, high)
-    return lambda context: SplatSource(
-        gaussians, stack_from_scene=matrix, context=context, background=file.background, name=file.path.stem
-    )
+    info = ContentInfo(file.path.stem, background=file.background)
+    return lambda context: SplatSource(gaussians, stack_from_scene=matrix, context=context, info=info)
 
 
-class SplatSource(DrawingSource):
+class SplatSource(CanvasSource):
     """A scene of splats at its place in the stack frame."""
 
-    def __init__(
-        self,
-        gaussians: Gaussians,
-        *,
-        stack_from_scene: F64,
-        context: Any,
-        background: tuple[float, float, float],
-        name: str,
-    ) -> None:
+    def __init__(self, gaussians: Gaussians, *, stack_from_scene: F64, context: Any, info: ContentInfo) -> None:
+        super().__init__(context, info=info, deep=True)
         self._gaussians = moved(gaussians, stack_from_scene)
         linear = stack_from_scene[:3, :3]
         self._scene_from_stack_rotation = (np.linalg.inv(linear) * np.cbrt(np.linalg.det(linear))).astype(np.float32)
-        self._context = self.draws_in = context
-        self._canvas = Canvas(context, samples=0, background=background, deep=True)
         self._program = linked_program(context, vertex=VERTEX, fragment=FRAGMENT)
         count = len(gaussians.centres)
         self._corners = np.empty((count, 4, FLOATS), np.float32)
         self._buffer = context.buffer(reserve=max(self._corners.nbytes, 1), dynamic=True)
         quads = np.arange(count, dtype=np.int32)[:, None] * 4 + np.array([0, 1, 2, 2, 1, 3], np.int32)
-        self._quads = context.buffer(np.ascontiguousarray(quads).tobytes())
+        indices = context.buffer(np.ascontiguousarray(quads).tobytes())
         self._vertices = context.vertex_array(
             self._program,
             [(self._buffer, "2f 2f 4f", "in_place", "in_deviations", "in_colour")],
-            index_buffer=self._quads,
+            index_buffer=indices,
         )
-        self.info = ContentInfo(name, background=background)
+        self.held += [self._program, self._buffer, indices, self._vertices]
 
     def draw(self, view: View, *, time_ns: int) -> DrawnPicture:
         """Every splat that the eye can see, farthest first."""
         count = self._prepare(view)
 
         def paint() -> None:
-            self._context.enable_only(self._context.BLEND)
-            self._context.blend_func = OVER
+            self.context.enable_only(self.context.BLEND)
+            self.context.blend_func = OVER
             self._vertices.render(vertices=6 * count)
 
         whole = PixelRect(0, 0, view.width_px, view.height_px if count else 0)
-        return self._canvas.draw(view, whole, paint)
-
-    def close(self) -> None:
-        self._canvas.close()
-        for held in (self._vertices, self._buffer, self._quads, self._program):
-            held.release()
+        return self.drawn(view, whole, paint)
 
     def _prepare(self, view: View) -> int:
         """Fill the vertex buffer for a view; returns how many splats it holds."""

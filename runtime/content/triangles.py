@@ -13,8 +13,8 @@ import moderngl
 import numpy as np
 
 from runtime.content import camera
-from runtime.content.base import WHITE, ContentInfo, DrawingSource, View
-from runtime.content.canvas import Canvas
+from runtime.content.base import ContentInfo, View
+from runtime.content.canvas import CanvasSource
 from runtime.content.fringe import edges_of, ramps, silhouette
 from runtime.content.shapes import I32, Shape
 from runtime.optics.rect import PixelRect, union
@@ -168,7 +168,7 @@ class DrawnPart:
             held.release()
 
 
-class TriangleSource(DrawingSource):
+class TriangleSource(CanvasSource):
     """Parts at their places, over a background."""
 
     def __init__(
@@ -182,10 +182,8 @@ class TriangleSource(DrawingSource):
     ) -> None:
         """stack_from_parts: 4x4 each, a similarity; samples: per pixel, for outlines; 0: ramps along the outlines,
         which a software rasteriser draws faster."""
-        self.info = info
-        self.context = self.draws_in = context
+        super().__init__(context, info=info, samples=samples)
         self.parts, self.stack_from_parts = list(parts), list(stack_from_parts)
-        self._canvas = Canvas(context, samples=samples, background=info.background or WHITE)
         self._with_ramps = samples == 0
         self._programs: dict[tuple[str, ...], Any] = {}
         self._textures: dict[int, Any] = {}
@@ -193,6 +191,7 @@ class TriangleSource(DrawingSource):
             programs = self._program(part.features), self._program((*part.features, "OUTLINE"))
             picture = part.part.picture
             part.upload(context, *programs, None if picture is None else self._texture(picture))
+        self.held += [*self.parts, *self._textures.values(), *self._programs.values()]
 
     def places(self, time_ns: int) -> Sequence[F64]:
         """4x4 stack_from_part of every part, which what moves works out anew."""
@@ -223,13 +222,7 @@ class TriangleSource(DrawingSource):
             if self._with_ramps:
                 self._draw_outlines(placed, clip, view)
 
-        return self._canvas.draw(view, area, paint)
-
-    def close(self) -> None:
-        self._canvas.close()
-        for held in (*self.parts, *self._textures.values(), *self._programs.values()):
-            held.release()
-        self.parts, self._textures, self._programs = [], {}, {}
+        return self.drawn(view, area, paint)
 
     def _program(self, features: tuple[str, ...]) -> Any:
         if features not in self._programs:

@@ -158,7 +158,7 @@ def changed(path: Path, change: Any) -> Path:
 
 
 def many_bones(table: dict[str, Any]) -> None:
-    table["skins"][0]["joints"] = [1] * 1_000_000
+    table["skins"][0]["joints"] = [1] * 100_000
 
 
 def many_nodes(table: dict[str, Any]) -> None:
@@ -168,7 +168,7 @@ def many_nodes(table: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (many_bones, "nodes and bones: 1,000,003 is over the limit of 5,000"),
+        (many_bones, "nodes and bones: 100,003 is over the limit of 5,000"),
         (many_nodes, "nodes and bones: 20,005 is over the limit of 5,000"),
         (lambda t: t["skins"][0].update(joints=[1]), "JOINTS_0 names bones beyond the 1 there are"),
         (lambda t: t["accessors"][4].update(count=1), "is damaged, or no glTF (ValueError"),

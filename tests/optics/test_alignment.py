@@ -87,19 +87,6 @@ def test_a_head_that_moves_parallel_to_the_panels_is_aligned_exactly_for_each_of
             assert moved_px(matrix, shown) == pytest.approx(met, rel=1e-9, abs=1e-6)
 
 
-@given(stack=ANY_STACK, first=heads(), second=heads(), third=heads())
-def test_two_steps_one_after_the_other_are_one_step(
-    stack: PanelStack, first: NDArray[np.float64], second: NDArray[np.float64], third: NDArray[np.float64]
-) -> None:
-    """Solved from shown at third, by way of what would be shown at second."""
-    to_second = align(stack, solved_for_m=first, eyes_m=second)
-    to_third = align(stack, solved_for_m=second, eyes_m=third)
-    at_once = align(stack, solved_for_m=first, eyes_m=third)
-    assume(not (to_second.limited or to_third.limited or at_once.limited))
-    for a, b, both in zip(*(x.solved_from_shown for x in (to_second, to_third, at_once)), strict=True):
-        assert a @ b == pytest.approx(both, rel=1e-9, abs=1e-6)
-
-
 @given(stack=ANY_STACK, head=heads())
 def test_eyes_that_have_not_moved_change_no_bit(stack: PanelStack, head: NDArray[np.float64]) -> None:
     aligned = align(stack, solved_for_m=head, eyes_m=head.copy())
