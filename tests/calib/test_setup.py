@@ -269,7 +269,7 @@ def test_sizes_are_set_with_arrows_and_measured_distances_stay(tmp_path: Path) -
     keys = [Key.COARSER, Key.RIGHT, Key.DOWN, Key.FINER, Key.LEFT, Key.ACCEPT]
     geometry(Scripted(tmp_path, keys).setup)
     found = load_settings(config).stack
-    assert (found.width_m, found.height_m) == (pytest.approx(0.5194), pytest.approx(0.2915))
+    assert (found.width_m, found.height_m) == pytest.approx((0.5194, 0.2915))
     assert found.x_m == (-0.0601, 0.0, 0.0593)
     geometry(Scripted(tmp_path, [Key.DOWN, Key.DOWN, Key.LEFT, Key.ACCEPT]).setup)
     assert load_settings(config).stack.x_m == pytest.approx((-0.0587, 0.0, 0.0587))

@@ -22,7 +22,8 @@ def cell() -> RunCell:
 
 
 def test_a_change_is_another_value_with_another_version_and_the_one_before_is_handed_back(cell: RunCell) -> None:
-    before, content = cell.state, Part()
+    before: Any = cell.state
+    content: Any = Part()
     answered = cell.replace(content=content)
     assert answered is before
     assert cell.state.content is content

@@ -91,7 +91,7 @@ def test_it_works_out_what_the_same_steps_do_one_by_one(iterations: int, channel
     rear, front, check = answers(net, feeds)
     assert np.isfinite(check).all() and check.shape == (1,)
     for found, want in zip((rear, front), wanted, strict=True):
-        assert found.dtype == np.int16
+        assert found.dtype == np.dtype(np.int16)
         assert np.abs(found - np.clip(want, 0, 1) * FULL).max() < 0.5 + 0.02  # rounded, not cut off
 
 

@@ -72,7 +72,7 @@ def test_a_small_defect_of_the_operator_is_found_too(defect: str, monkeypatch: p
     real = solve.eye_operator
 
     def bent(eye: object, stack: object, **size: object) -> object:
-        moved = np.asarray(eye) * [1, -1, 1] if defect == "eyes exchanged" else np.add(eye, [0, 0.01, 0])
+        moved = np.asarray(eye) * [1, -1, 1] if defect == "eyes exchanged" else np.add(np.asarray(eye), [0, 0.01, 0])
         return real(moved, stack, **size)  # type: ignore[arg-type]
 
     monkeypatch.setattr(solve, "eye_operator", bent)
