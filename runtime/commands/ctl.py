@@ -87,51 +87,24 @@ def model(
     tell({"command": "model", "value": model_from_here(name)}, config, socket)
 
 
-@app.command()
-def pause(config: Config = None, socket: Socket = None) -> None:
-    """Freeze the picture as it is, until `resume`.
-
-    Example: phasestack ctl pause
-    """
-    tell({"command": "pause"}, config, socket)
-
-
-@app.command()
-def resume(config: Config = None, socket: Socket = None) -> None:
-    """Follow the viewer again, after `pause` or `flat`.
-
-    Example: phasestack ctl resume
-    """
-    tell({"command": "resume"}, config, socket)
+PLAIN = {
+    "pause": "Freeze the picture as it is, until `resume`.",
+    "resume": "Follow the viewer again, after `pause` or `flat`.",
+    "flat": "Show the flat (2D) picture whoever looks, until `resume`.",
+    "reload": "Read the configuration again; a bad one is refused and the old one stays.\n\n"
+    "Scene, model and place that `ctl` chose stay, but where the file says something new of them.",
+    "blackbox": "Write the last minutes to a file (MCAP), and print its name: eyes, states, times, log.",
+}  # commands that take nothing but where the daemon is
 
 
-@app.command()
-def flat(config: Config = None, socket: Socket = None) -> None:
-    """Show the flat (2D) picture whoever looks, until `resume`.
-
-    Example: phasestack ctl flat
-    """
-    tell({"command": "flat"}, config, socket)
+def _add_plain(name: str, meaning: str) -> None:
+    @app.command(name, help=f"{meaning}\n\nExample: phasestack ctl {name}")
+    def plain(config: Config = None, socket: Socket = None) -> None:
+        tell({"command": name}, config, socket)
 
 
-@app.command()
-def reload(config: Config = None, socket: Socket = None) -> None:
-    """Read the configuration again; a bad one is refused and the old one stays.
-
-    Scene, model and place that `ctl` chose stay, but where the file says something new of them.
-
-    Example: phasestack ctl reload
-    """
-    tell({"command": "reload"}, config, socket)
-
-
-@app.command()
-def blackbox(config: Config = None, socket: Socket = None) -> None:
-    """Write the last minutes to a file (MCAP), and print its name: eyes, states, times, log.
-
-    Example: phasestack ctl blackbox
-    """
-    tell({"command": "blackbox"}, config, socket)
+for _name, _meaning in PLAIN.items():
+    _add_plain(_name, _meaning)
 
 
 def tell(request: dict[str, Any], config: Path | None, socket: Path | None) -> None:

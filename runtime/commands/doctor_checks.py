@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -49,6 +50,7 @@ def sensor(settings: Settings) -> Iterator[Row]:
     """The configured driver opens and delivers."""
     from runtime.clock import MonotonicClock
     from runtime.errors import EndOfRecording, SensorLost, SensorTimeout
+    from runtime.eyes.calibration import load_calibration
     from runtime.sensor.registry import open_sensor
 
     if settings.sensor.driver not in NO_DEVICE and (answer := _daemon(settings)):
@@ -74,20 +76,12 @@ def sensor(settings: Settings) -> Iterator[Row]:
         finder = EyeFinder(settings)
         found = finder.find(frame)
         seen = f"; a viewer {found.eyes_m[:, 2].mean():.2f} m away" if found is not None else f"; {finder.reason}"
-    kinds = ("eyes" if frame.eyes is not None else "", "colour" if frame.colour is not None else "",
-             "depth" if frame.depth_mm is not None else "")  # fmt: skip
+    streams = {"eyes": frame.eyes, "colour": frame.colour, "depth": frame.depth_mm}
+    kinds = [name for name, value in streams.items() if value is not None]
     serial = f", serial {driver.serial}" if driver.serial else ""
-    yield Row(
-        "sensor", "ok", f"{what} delivers {', '.join(filter(None, kinds)) or 'frames without a face'}{serial}{seen}"
-    )
-    yield from _calibrated_for(settings, driver.serial)
-
-
-def _calibrated_for(settings: Settings, serial: str) -> Iterator[Row]:
-    from runtime.eyes.calibration import load_calibration
-
-    calibration = load_calibration(Path(settings.calibration.file) if settings.calibration.file else None)
-    if warning := calibration.serial_warning(serial):
+    yield Row("sensor", "ok", f"{what} delivers {', '.join(kinds) or 'frames without a face'}{serial}{seen}")
+    calibrated = load_calibration(Path(settings.calibration.file) if settings.calibration.file else None)
+    if warning := calibrated.serial_warning(driver.serial):
         yield Row("calibration", "fail", warning, "phasestack calibrate capture, then solve, with this sensor")
 
 
@@ -97,16 +91,15 @@ def usb(settings: Settings) -> Iterator[Row]:
     from runtime.sensor.usb_devices import usb_report
 
     needed = settings.sensor.driver not in (*NO_DEVICE, "usb-camera")
+    absent: Verdict = "fail" if needed else "skip"
     try:
         devices = usb_report()
     except MissingPart as error:
-        yield Row("usb", "fail" if needed else "skip", str(error), "install it" if needed else "")
+        yield Row("usb", absent, str(error), "install it" if needed else "")
         return
     if not devices:
-        yield Row(
-            "usb", "fail" if needed else "skip", "no known depth camera is plugged in",
-            "plug one in; docs/hardware.md lists them" if needed else "",
-        )  # fmt: skip
+        remedy = "plug one in; docs/hardware.md lists them" if needed else ""
+        yield Row("usb", absent, "no known depth camera is plugged in", remedy)
     for device in devices:
         problems = device["problems"]
         name = f"{device['name']} ({device['usb_id']}, {device['speed']})"
@@ -128,16 +121,11 @@ def opengl(settings: Settings) -> Iterator[Row]:
     for node in sorted(Path("/dev/dri").glob("renderD*")):
         if not os.access(node, os.R_OK | os.W_OK):
             yield Row("opengl", "warn", f"{node} may not be opened by this user", "join the groups video and render")
-    problem = ""
-    if speed.slow:
-        problem = "slow: its shaders are a processor's, or nearly; install the GPU's driver where there is one"
+    slow = "slow: its shaders are a processor's, or nearly; install the GPU's driver where there is one"
     bad = speed.slow and (settings.output.kind != "offscreen" or settings.model.backend == "gl")
-    yield Row(
-        "opengl", "warn" if bad else "ok",
-        f"{found['renderer']}, {found['version']} ({found['vendor']}): shaders copy {speed.copy_gb_s:.1f} GB/s, "
-        f"{speed.down_gb_s:.1f} GB/s are read back, textures to {widest} pixels",
-        problem,
-    )  # fmt: skip
+    detail = f"{found['renderer']}, {found['version']} ({found['vendor']}): shaders copy {speed.copy_gb_s:.1f} GB/s, "
+    detail += f"{speed.down_gb_s:.1f} GB/s are read back, textures to {widest} pixels"
+    yield Row("opengl", "warn" if bad else "ok", detail, slow if speed.slow else "")
 
 
 def monitors(settings: Settings) -> Iterator[Row]:
@@ -195,29 +183,23 @@ def model(settings: Settings) -> Iterator[Row]:
 
     predictor = load_predictor(settings.model.name, settings.stack.stack(), settings.model)
     name = predictor.name
-    contexts: list[Any] = []
+    with ExitStack() as cleanup:
 
-    def context() -> Any:
-        contexts.append(offscreen_context())
-        return contexts[-1]
+        def context() -> Any:
+            made = offscreen_context()
+            cleanup.callback(made.release)
+            return made
 
-    try:
         choice = choose(settings.model.backend, predictor, context)
-    finally:
         predictor.close()
-        for made in contexts:
-            made.release()
     other = settings.model.name not in name and "/" not in settings.model.name
-    yield Row(
-        "model", "warn" if other else "ok", f"{name} on {settings.model.provider}",
-        f"{settings.model.name} was asked for and does not fit this stack" if other else "",
-    )  # fmt: skip
+    remedy = f"{settings.model.name} was asked for and does not fit this stack" if other else ""
+    yield Row("model", "warn" if other else "ok", f"{name} on {settings.model.provider}", remedy)
     if predictor.fell_back:
         count, which = told_nodes(predictor.fell_back)
-        yield Row(
-            "provider", "warn", f"{settings.model.provider} leaves {count} to another: {which}",
-            "they cross to the processor and back: model.provider = \"cpu\" may be faster",
-        )  # fmt: skip
+        detail = f"{settings.model.provider} leaves {count} to another: {which}"
+        remedy = 'they cross to the processor and back: model.provider = "cpu" may be faster'
+        yield Row("provider", "warn", detail, remedy)
     yield Row("backend", "ok", f"{choice.backend.name} around the network: {choice.why}")
     if choice.backend.name == "cpu":
         from runtime.model.compiled import KEPT_IN
@@ -232,10 +214,8 @@ def calibration(settings: Settings) -> Iterator[Row]:
 
     if not settings.calibration.file:
         real = settings.sensor.driver not in NO_DEVICE
-        yield Row(
-            "calibration", "fail" if real else "ok", "the built-in one of the demo recording",
-            "phasestack calibrate capture, then solve, and set calibration.file" if real else "",
-        )  # fmt: skip
+        remedy = "phasestack calibrate capture, then solve, and set calibration.file" if real else ""
+        yield Row("calibration", "fail" if real else "ok", "the built-in one of the demo recording", remedy)
         return
     found = load_calibration(Path(settings.calibration.file))
     fit = f", residual {found.residuals.rms_m * 1000:.1f} mm" if found.residuals else ""
