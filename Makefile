@@ -72,11 +72,11 @@ install: system
 uninstall:
 	sh systemd/uninstall.sh
 
-# The gallery's pictures from the commands (minutes).
 # The networks that find eyes anew from their publishers' files, beside those that are shipped.
 eye-models:
 	sh docs/make_eye_models.sh out/eye-models
 
+# docs/performance.md and the pages' pictures from the commands (minutes).
 gallery: $(VENV)/.test
 	$(BIN)/python docs/make_gallery.py
 

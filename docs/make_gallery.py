@@ -1,4 +1,4 @@
-"""Writes docs/performance.md and its pictures from one demo and one report. `make gallery` (minutes), or
+"""Writes docs/performance.md, from one demo and one report, and the pages' pictures. `make gallery` (minutes), or
 
     python docs/make_gallery.py [--work FOLDER] [--keep] [REPORT OPTION ...]
 
@@ -16,12 +16,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
+import numpy as np
+from PIL import Image, ImageDraw
+
+from calib.board import board_layers
+from calib.placed import PlacedPanel
+from calib.simulator import Exposure, Scene, camera_from_stack, camera_rays, phone, photograph
+from runtime.config import StackGeometry
 
 DOCS = Path(__file__).resolve().parent
 IMAGES = DOCS / "images"
 WIDTH_PX, LIMIT_BYTES = 1200, 200_000
-PICTURES = {  # in docs/images: what the commands leave
+PICTURES = {  # in docs/images: what the commands leave, and what is made here
+    "boards.jpg": "boards.png",
+    "kinds.jpg": "kinds.png",
     "contact-sheet.jpg": "demo/contact-sheet.png",
     "frontier.png": "report/frontier-scenes.png",
     "moving-viewer.png": "report/moving-viewer.png",
@@ -117,6 +125,32 @@ def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
+def kinds(folder: Path) -> Image.Image:
+    """What `examples/content.py` leaves: the front layer, what each eye sees, and what the left one should see."""
+    names = ("layer-2.png", "seen-left.png", "seen-right.png", "wanted-left.png")
+    runs = sorted(path.parent for path in folder.glob(f"*/{names[0]}"))
+    width, height, rows = 176, 99, -(-len(runs) // 2)
+    sheet = Image.new("RGB", (2 * len(names) * width + 8, rows * (height + 16)), "white")
+    for number, run in enumerate(runs):
+        x, y = number // rows * (len(names) * width + 8), number % rows * (height + 16)
+        ImageDraw.Draw(sheet).text((x + 2, y + 2), run.name, fill="black")
+        for column, name in enumerate(names):
+            sheet.paste(Image.open(run / name).convert("RGB").resize((width, height)), (x + column * width, y + 15))
+    return sheet
+
+
+def boards() -> Image.Image:
+    """The boards of three panels as a phone sees them from the left."""
+    stack, random = StackGeometry().stack(), np.random.default_rng(0)
+    panels = tuple(PlacedPanel(np.eye(3), np.array([x_m, 0.0, 0.0])) for x_m in stack.x_m)
+    lens = phone(random=random, width_px=800, height_px=600)
+    pose = camera_from_stack(np.array([0.44, -0.26, 0.07]), towards_m=np.array([0.0, -0.06, 0.0]))
+    scene = Scene(stack, panels, board_layers(stack)[..., 0])
+    return Image.fromarray(
+        photograph(scene, lens, pose, Exposure(electrons=1e6, read_noise=0.0), random=random, rays=camera_rays(lens))
+    )
+
+
 def smaller(source: Path, name: str) -> bytes:
     """A picture as the pages show it. Raises SystemExit where it stays too large."""
     image = Image.open(source).convert("RGB")
@@ -142,6 +176,13 @@ def main() -> None:
         out = arguments.work / command[0]
         if not (arguments.keep and out.is_dir()):
             subprocess.run([sys.executable, "-m", "runtime.cli", *command, "--out", str(out)], check=True)
+    content = arguments.work / "content"
+    if not (arguments.keep and content.is_dir()):
+        subprocess.run(
+            [sys.executable, str(DOCS.parent / "examples" / "content.py"), "--out", str(content)], check=True
+        )
+    kinds(content).save(arguments.work / "kinds.png")
+    boards().save(arguments.work / "boards.png")
     files = {name: smaller(arguments.work / source, name) for name, source in PICTURES.items()}
     text = page(json.loads((arguments.work / "report" / "report.json").read_text(encoding="utf-8")))
     for old in IMAGES.iterdir():

@@ -38,9 +38,8 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
             if dots:
                 places = [(r.ms_p50, r.quoted_db) for r in dots]
                 axes.plot(*zip(*places, strict=True), marker=marker, markersize=7, color=colour, label=kind)
-            for index, result in enumerate(dots):  # above and below the curve in turn, so that no name lies on another
-                above = {"xytext": (0, (9, -16)[index % 2]), "ha": "center"}
-                axes.annotate(result.name, (result.ms_p50, result.quoted_db), **above, **beside)
+            for result in dots:  # up and to the left of a curve that rises
+                axes.annotate(result.name, (result.ms_p50, result.quoted_db), xytext=(-5, 6), ha="right", **beside)
         for result in (result for result in results if not result.trained):
             axes.axvline(result.ms_p50, color=COLOURS[5], linestyle=":", linewidth=1.4)
             place: Any = {"xycoords": axes.get_xaxis_transform(), "xytext": (-3, 0), "ha": "right", "rotation": 90}
