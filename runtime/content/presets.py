@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from runtime.config import Positive, Section, read_table, validated
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
@@ -24,45 +23,6 @@ CM = 0.01
 Reading = Literal["seed", "published-code", "published-training"]
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 Triple = tuple[float, float, float]
-
-
-class Published(Section):
-    """A scene's values in the published code."""
-
-    scale_per_cm: Positive = Field(description="digital units per centimetre")
-    thickness_cm: Positive = Field(description="distance between neighbouring panels")
-    width_cm: Positive = Field(description="active width of the panels")
-    out: Axis = Field(description="the scene's axis out of the screen")
-    up: Axis = Field(description="the scene's axis that is up")
-    shift: Triple = Field((0.0, 0.0, 0.0), description="of the panels along the scene's axes, digital units")
-    ground: float | None = Field(None, description="half a gap behind the middle panel, along `out`, digital units")
-    ground_coefficient: float | None = Field(None, description="the same in gaps, where the code has it so")
-
-    @property
-    def middle(self) -> float:
-        """Where that code puts the middle panel: half a gap beyond its ground, along `out`, digital units."""
-        gap = self.thickness_cm * self.scale_per_cm
-        if self.ground_coefficient is not None:
-            return gap * self.ground_coefficient + gap / 2
-        return (self.ground or 0.0) + gap / 2
-
-
-class SceneTable(Section):
-    """One scene of the data file."""
-
-    title: str = Field(description="name in the EyeReal supplement's tables")
-    scale_per_cm: Positive = Field(description="r_p2d")
-    thickness_cm: Positive = Field(description="d_thick: from the first panel to the last")
-    rotation_deg: Triple = Field(description="about x, y, z")
-    translation_m: Triple = Field(description="metres, light-field frame")
-    published: Published = Field(description="the published code's values")
-
-
-class PresetFile(Section):
-    """The whole data file."""
-
-    rotation_order: str = Field(pattern="^([xyz]{3}|[XYZ]{3})$", description="scipy's letters")
-    scene: dict[str, SceneTable] = Field(description="by name")
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,14 +43,14 @@ class Preset:
 
 
 @cache
-def preset_file(path: Path = FILE) -> PresetFile:
-    """The data file, checked. Raises InputError."""
-    return validated(PresetFile, read_table(path), source=path)
+def preset_file() -> dict[str, Any]:
+    """The data file, which says what its keys are."""
+    return tomllib.loads(FILE.read_text(encoding="utf-8"))
 
 
 def preset_names() -> tuple[str, ...]:
     """Every preset's name."""
-    return tuple(preset_file().scene)
+    return tuple(preset_file()["scene"])
 
 
 def preset(name: str, reading: Reading = "seed") -> Preset:
@@ -104,27 +64,28 @@ def preset(name: str, reading: Reading = "seed") -> Preset:
     network trained there knows matrixcity and room_floor so.
     """
     file = preset_file()
-    if name not in file.scene:
-        raise InputError("content", "scene", f"no preset `{name}`; there are {', '.join(file.scene)}")
-    table = file.scene[name]
-    published = table.published
+    if name not in file["scene"]:
+        raise InputError("content", "scene", f"no preset `{name}`; there are {', '.join(preset_names())}")
+    table = file["scene"][name]
     if reading == "seed":
-        scale_per_m = table.scale_per_cm / CM
-        rotation = rotation_matrix(table.rotation_deg, file.rotation_order)
         stack_from_scene = np.eye(4)
-        stack_from_scene[:3, :3] = rotation / scale_per_m
-        stack_from_scene[:3, 3] = table.translation_m
+        rotation = rotation_matrix(table["rotation_deg"], file["rotation_order"])
+        stack_from_scene[:3, :3] = rotation / (table["scale_per_cm"] / CM)
+        stack_from_scene[:3, 3] = table["translation_m"]
         scene_from_stack = np.asarray(np.linalg.inv(stack_from_scene), dtype=np.float64)
-        gap_m, width_m = table.thickness_cm * CM / (PANELS - 1), None
-    else:
-        axes = axes_matrix(out=published.out, up=published.up)
-        scale_per_m = published.scale_per_cm / CM
-        scene_from_stack = np.eye(4)
-        scene_from_stack[:3, :3] = axes * scale_per_m
-        shift = np.array(published.shift if reading == "published-code" or published.shift[0] else (0.0, 0.0, 0.0))
-        scene_from_stack[:3, 3] = shift + axes[:, 0] * published.middle
-        gap_m, width_m = published.thickness_cm * CM, published.width_cm * CM
-    return Preset(name, gap_m, width_m, scene_from_stack)
+        return Preset(name, table["thickness_cm"] * CM / (PANELS - 1), None, scene_from_stack)
+    code = table["published"]
+    axes = axes_matrix(out=code["out"], up=code["up"])
+    gap = code["thickness_cm"] * code["scale_per_cm"]
+    # The middle panel stands half a gap beyond that code's ground, along `out`; the ground may be in gaps.
+    middle = gap / 2 + code.get("ground", gap * code.get("ground_coefficient", 0.0))
+    shift = np.array(code.get("shift", (0.0, 0.0, 0.0)))
+    if reading == "published-training" and not shift[0]:
+        shift = np.zeros(3)
+    scene_from_stack = np.eye(4)
+    scene_from_stack[:3, :3] = axes * (code["scale_per_cm"] / CM)
+    scene_from_stack[:3, 3] = shift + axes[:, 0] * middle
+    return Preset(name, code["thickness_cm"] * CM, code["width_cm"] * CM, scene_from_stack)
 
 
 def rotation_matrix(angles_deg: Triple, order: str) -> F64:

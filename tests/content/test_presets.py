@@ -109,20 +109,22 @@ SEED = {
 
 
 def test_the_data_file_is_tables_s1_and_s2() -> None:
-    tables = {table.title: table for table in preset_file().scene.values()}
+    tables = {table["title"]: table for table in preset_file()["scene"].values()}
     assert set(tables) == set(SEED)
     for title, (scale, thickness_cm, rotation, translation) in SEED.items():
         table = tables[title]
-        assert (table.scale_per_cm, table.thickness_cm) == (scale, thickness_cm)
-        assert (list(table.rotation_deg), list(table.translation_m)) == (rotation, translation)
+        assert (table["scale_per_cm"], table["thickness_cm"]) == (scale, thickness_cm)
+        assert (table["rotation_deg"], table["translation_m"]) == (rotation, translation)
 
 
 def test_the_seed_s_pose_takes_the_scene_into_the_light_field_frame(stack: PanelStack) -> None:
-    table = preset_file().scene["traffic"]
+    table = preset_file()["scene"]["traffic"]
     chosen = preset("traffic")
     point = np.array([0.4, -1.2, 2.0])
-    turned = Rotation.from_euler("xyz", table.rotation_deg, degrees=True).apply(point / (100 * table.scale_per_cm))
-    in_stack = turned + table.translation_m
+    turned = Rotation.from_euler("xyz", table["rotation_deg"], degrees=True).apply(
+        point / (100 * table["scale_per_cm"])
+    )
+    in_stack = turned + table["translation_m"]
     assert chosen.scene_from_stack @ np.append(in_stack, 1.0) == pytest.approx(np.append(point, 1.0))
     assert preset("lego_bulldozer").stack(stack).x_m == pytest.approx((-0.03, 0.0, 0.03))  # 6 cm from first to last
 
