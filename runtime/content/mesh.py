@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import logging
 from collections.abc import Callable, Sequence
@@ -21,7 +20,7 @@ from runtime.content.ply import read_header
 from runtime.content.rig import Binding, Node, Rig
 from runtime.content.shapes import Shape
 from runtime.content.triangles import DrawnPart, Part, TriangleSource
-from runtime.errors import InputError, MissingPart, one_line
+from runtime.errors import InputError, one_line
 from runtime.records import F32, F64, U8
 from runtime.support import foreign, progress
 from runtime.support.picture_header import check_picture
@@ -66,8 +65,6 @@ def load_mesh(path: Path, *, limits: LimitSettings | None = None, animation: str
     data = foreign.read_bytes(path, most_bytes=round(limits.file_mib * foreign.MIB))
     if path.suffix.lower() in GLTF:
         return _boxed(path, *load_gltf(path, data, limits=limits, animation=animation))
-    if importlib.util.find_spec("trimesh") is None:
-        raise MissingPart("meshes need trimesh: pip install trimesh")
     _check_counts(path, data, limits)
     pictures: dict[int, U8] = {}
     with np.errstate(all="ignore"):  # coordinates beyond any scene overflow; they are refused below

@@ -63,13 +63,6 @@ def test_a_cloud_without_colours_is_fitted_and_grey(tmp_path: Path, context: Any
     assert len(seen) > 3000 and (np.ptp(seen[:, :3], axis=0) <= 1).all()
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "binary"])
-def test_text_and_binary_files_are_read_alike(tmp_path: Path, encoding: str) -> None:
-    points = np.random.default_rng(1).random((500, 3))
-    held = load_points(read_header(cloud(tmp_path / "a.ply", points, encoding=encoding), LimitSettings()))
-    assert np.abs(held.positions - points).max() < 1e-5
-
-
 HEAD = "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
 
 
