@@ -397,7 +397,7 @@ class PlanSettings(Section):
     align: bool = Field(True, description="shift and scale the panels at every refresh to where the eyes are then")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class LimitSettings:
     """What a file from outside may hold: more is refused with its figure, before memory is taken for it."""
 
@@ -413,6 +413,13 @@ class LimitSettings:
     start_s: float = 600.0  # a start is given up where content and model are not ready after this
     recording_s: float = 21_600.0  # length of a recording that is replayed
     chunk_mib: float = 32.0  # one chunk or message of a recording, unpacked
+
+    @property
+    def file_bytes(self) -> int:
+        return round(self.file_mib * (1 << 20))
+
+
+LIMITS = LimitSettings()  # the same for every display; tests lower them
 
 
 class ServiceSettings(Section):
@@ -446,8 +453,8 @@ class Settings(Section):
 
     @property
     def limits(self) -> LimitSettings:
-        """Of files; the same for every display."""
-        return LimitSettings()
+        """Of files."""
+        return LIMITS
 
     @model_validator(mode="after")
     def _agree(self) -> Settings:

@@ -17,7 +17,7 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from runtime.config import LimitSettings
+from runtime.config import LIMITS
 from runtime.content.rig import Binding, Channel, Node, Rig, Skin
 from runtime.content.shapes import I32, Shape
 from runtime.content.triangles import Part
@@ -52,7 +52,7 @@ class _Look:
     uv_from_uv: F64 | None = None  # 3x3
 
 
-def load_gltf(path: Path, data: bytes, *, limits: LimitSettings, animation: str = "") -> tuple[list[Part], Rig]:
+def load_gltf(path: Path, data: bytes, *, animation: str = "") -> tuple[list[Part], Rig]:
     """Parts in their own frames, and the rig that places them. animation: which one plays, by name or number.
 
     Raises InputError.
@@ -60,9 +60,9 @@ def load_gltf(path: Path, data: bytes, *, limits: LimitSettings, animation: str 
     text, binary = data, b""
     if path.suffix.lower() == ".glb" or data[:4] == b"glTF":
         text, binary = _chunks(path, data)
-    table = foreign.parsed_json(text, source=path, most_depth=limits.depth)
+    table = foreign.parsed_json(text, source=path, most_depth=LIMITS.depth)
     try:
-        return _Reader(path, table, binary, limits).scene(animation)
+        return _Reader(path, table, binary).scene(animation)
     except (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError) as error:
         problem = one_line(f"{type(error).__name__}: {error}", most=120)
         raise InputError(path, "", f"is damaged, or no glTF ({problem})") from None
@@ -97,9 +97,9 @@ def file_of(uri: str, *, source: Path, field: str) -> Path:
 
 
 class _Reader:
-    def __init__(self, path: Path, table: Table, binary: bytes, limits: LimitSettings) -> None:
+    def __init__(self, path: Path, table: Table, binary: bytes) -> None:
         """binary: a GLB's own buffer."""
-        self._path, self._table, self._binary, self._limits = path, table, binary, limits
+        self._path, self._table, self._binary = path, table, binary
         self._elements = 0  # that were read of all accessors
         # What several things refer to is read once.
         self._buffer, self._mesh = cache(self._buffer_of), cache(self._mesh_of)
@@ -114,7 +114,7 @@ class _Reader:
         bones = [table["joints"] for table in self._table.get("skins", [])]
         if bones or self._table.get("animations"):  # each of them is worked out for every picture
             moving = len(nodes) + sum(map(len, bones))
-            self._within(moving, self._limits.nodes, "nodes and bones")
+            self._within(moving, LIMITS.nodes, "nodes and bones")
         skins = [self._skin(table) for table in self._table.get("skins", [])]
         channels = self._channels(animation)
         standing = [number for number in order if "mesh" in tables[number]]
@@ -126,9 +126,9 @@ class _Reader:
             skin = skins[_index(table["skin"])] if "skin" in table else None
             for part, binding in self._mesh(table["mesh"]):
                 triangles += len(part.shape.triangles)
-                self._within(triangles, self._limits.triangles, "meshes")
+                self._within(triangles, LIMITS.triangles, "meshes")
                 placed.append((part, _bound(binding, number, table.get("weights"), skin)))
-            self._within(len(placed), self._limits.instances, "nodes")
+            self._within(len(placed), LIMITS.instances, "nodes")
         rig = Rig(tuple(nodes), tuple(order), tuple(binding for _, binding in placed), channels)
         return [part for part, _ in placed], rig
 
@@ -148,9 +148,8 @@ class _Reader:
         if uri is None:
             return None
         if not uri.startswith("data:"):
-            most = round(self._limits.file_mib * foreign.MIB)
             name = file_of(uri, source=self._path, field=field)
-            return foreign.read_bytes(name, most_bytes=most, source=self._path, field=field)
+            return foreign.read_bytes(name, most_bytes=LIMITS.file_bytes, source=self._path, field=field)
         head, mark, coded = uri.partition("base64,")
         return base64.b64decode(coded) if mark else unquote(head).encode()
 
@@ -175,7 +174,7 @@ class _Reader:
         item = self._at("accessors", index)
         count, width = _index(item["count"]), WIDTHS[item["type"]]
         self._elements += count
-        most = ELEMENTS_PER_TRIANGLE * self._limits.triangles
+        most = ELEMENTS_PER_TRIANGLE * LIMITS.triangles
         self._within(self._elements, most, f"accessors[{index}].count")
         if item["type"] not in kinds:
             raise ValueError(f"accessors[{index}] is {item['type']}, not {' or '.join(kinds)}")
@@ -222,8 +221,8 @@ class _Reader:
         queue = [(-1, root, 1) for root in reversed(roots)]
         while queue:
             parent, number, depth = queue.pop()
-            if depth > self._limits.depth:
-                raise InputError(self._path, "nodes", f"are nested deeper than {self._limits.depth}")
+            if depth > LIMITS.depth:
+                raise InputError(self._path, "nodes", f"are nested deeper than {LIMITS.depth}")
             if number not in order:
                 nodes[_index(number)] = replace(nodes[number], parent=parent)
                 order[number] = None
@@ -329,7 +328,7 @@ class _Reader:
         coded = self._bytes_of(item, "texture")
         if coded is None:
             coded = self._view(item["bufferView"])[0]
-        check_picture(coded, source=self._path, field="texture", name=f"images[{index}]", limits=self._limits)
+        check_picture(coded, source=self._path, field="texture", name=f"images[{index}]")
         with Image.open(io.BytesIO(coded)) as image:
             rgba = texture_of(image)
         rgba[..., 3] = np.clip(rgba[..., 3] * (0.5 / max(cutoff, 1e-3)), 0, 255) if cutoff else 255

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from runtime.clock import NS_PER_S
-from runtime.config import LimitSettings
+from runtime.config import LIMITS
 from runtime.content.base import ContentInfo
 from runtime.content.gltf import file_of, load_gltf, texture_of
 from runtime.content.placing import SceneFile
@@ -45,7 +45,7 @@ class MeshData:
 
 def prepare(file: SceneFile) -> Callable[[Any], MeshSource]:
     """Read it and make its outlines ready; the answer uploads them. Raises InputError."""
-    data = load_mesh(file.path, limits=file.limits, animation=file.settings.animation)
+    data = load_mesh(file.path, animation=file.settings.animation)
     parts = []
     for number, part in enumerate(data.parts):
         progress.tell(f"{file.path.name}: outlines", number, len(data.parts))
@@ -55,22 +55,21 @@ def prepare(file: SceneFile) -> Callable[[Any], MeshSource]:
     return lambda context: MeshSource(parts, matrix, context=context, info=info, rig=data.rig)
 
 
-def load_mesh(path: Path, *, limits: LimitSettings | None = None, animation: str = "") -> MeshData:
+def load_mesh(path: Path, *, animation: str = "") -> MeshData:
     """Read a file. Raises InputError: unreadable, over a limit, no faces, NaN vertices, a texture missing.
 
     animation: which one of a glTF plays; empty: the first.
     """
-    limits = limits or LimitSettings()
     progress.tell(f"reading {path.name}", 0)
-    data = foreign.read_bytes(path, most_bytes=round(limits.file_mib * foreign.MIB))
+    data = foreign.read_bytes(path, most_bytes=LIMITS.file_bytes)
     if path.suffix.lower() in GLTF:
-        return _boxed(path, *load_gltf(path, data, limits=limits, animation=animation))
-    _check_counts(path, data, limits)
+        return _boxed(path, *load_gltf(path, data, animation=animation))
+    _check_counts(path, data)
     pictures: dict[int, U8] = {}
     with np.errstate(all="ignore"):  # coordinates beyond any scene overflow; they are refused below
-        parts = [_part(mesh, path, pictures) for mesh in _loaded(path, data, limits)]
+        parts = [_part(mesh, path, pictures) for mesh in _loaded(path, data)]
     triangles = sum(len(part.shape.triangles) for part in parts)
-    foreign.within(triangles, limits.triangles, source=path, field="faces")
+    foreign.within(triangles, LIMITS.triangles, source=path, field="faces")
     return _boxed(path, parts, Rig((Node(),), (0,), (Binding(0),) * len(parts)))
 
 
@@ -106,20 +105,20 @@ def _boxed(path: Path, parts: Sequence[Part], rig: Rig) -> MeshData:
     return MeshData(tuple(parts), rig, np.min(corners, axis=0), np.max(corners, axis=0))
 
 
-def _check_counts(path: Path, data: bytes, limits: LimitSettings) -> None:
+def _check_counts(path: Path, data: bytes) -> None:
     """What a file promises, before its loader takes memory for it. Raises InputError."""
     suffix, promised = path.suffix.lower(), 0
     if suffix == ".ply":
-        read_header(path, limits)
+        read_header(path)
     elif suffix == ".stl":
         text = data[:5] == b"solid" and b"facet normal" in data[:1024]
         promised = data.count(b"facet normal") if text else (len(data) - STL_HEAD) // STL_FACET
     elif suffix == ".obj":
         promised = data.count(b"\nf ")
-    foreign.within(promised, limits.triangles, source=path, field="faces")
+    foreign.within(promised, LIMITS.triangles, source=path, field="faces")
 
 
-def _loaded(path: Path, data: bytes, limits: LimitSettings) -> list[Any]:
+def _loaded(path: Path, data: bytes) -> list[Any]:
     """Every trimesh of a file that has faces. Raises InputError."""
     import trimesh
 
@@ -132,12 +131,11 @@ def _loaded(path: Path, data: bytes, limits: LimitSettings) -> list[Any]:
         has_materials = kind != "obj" or b"mtllib" in data
 
         def get(self, name: str) -> bytes:
-            most = round(limits.file_mib * foreign.MIB)
             try:
                 beside = file_of(name, source=path, field="texture")
-                found = foreign.read_bytes(beside, most_bytes=most, source=path, field="texture")
+                found = foreign.read_bytes(beside, most_bytes=LIMITS.file_bytes, source=path, field="texture")
                 if not name.lower().endswith(".mtl"):
-                    check_picture(found, source=path, field="texture", name=foreign.shown(name), limits=limits)
+                    check_picture(found, source=path, field="texture", name=foreign.shown(name))
             except InputError as error:
                 if name.lower().endswith(".mtl"):
                     log.warning("%s: is drawn grey without its materials (%s)", path, error.problem)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from runtime.clock import NS_PER_S
-from runtime.config import ContentSettings, LimitSettings
+from runtime.config import ContentSettings
 from runtime.content.base import ContentInfo, ContentSource, View
 from runtime.content.images import WarpedPicture, plane_from_pixels, rgba_from_rgb
 from runtime.content.placing import SceneFile
@@ -135,14 +135,14 @@ class Frames(ABC):
 class PictureFiles(Frames):
     """One picture for ever, or those of a folder in the order of their names; turned as their EXIF says."""
 
-    def __init__(self, paths: Sequence[Path], *, rate_hz: float, limits: LimitSettings) -> None:
-        size_of_file(paths[0], limits=limits)  # before it is unpacked
+    def __init__(self, paths: Sequence[Path], *, rate_hz: float) -> None:
+        size_of_file(paths[0])  # before it is unpacked
         self._paths, self._held = paths, (0, read_image(paths[0]))
         self._size = self._held[1].shape[1::-1]
         for number, path in enumerate(paths[1:], start=1):
             if number % TELL_EVERY == 0:
                 progress.tell(f"{path.parent.name}: pictures", number, len(paths))
-            size = size_of_file(path, limits=limits)  # by its header alone: a long sequence opens quickly
+            size = size_of_file(path)  # by its header alone: a long sequence opens quickly
             if size != self._size:
                 problem = "{} x {} pixels; the folder's first picture has {} x {}".format(*size, *self._size)
                 raise InputError(path, "size", problem)
@@ -175,7 +175,7 @@ def _opened(path: Path) -> cv2.VideoCapture:
 class Video(Frames):
     """A video file, read by OpenCV as it goes."""
 
-    def __init__(self, path: Path, *, limits: LimitSettings) -> None:
+    def __init__(self, path: Path) -> None:
         self._path = path
         foreign.open_regular(path).close()
         self._capture = _opened(path)
@@ -185,7 +185,7 @@ class Video(Frames):
             count, self.rate_hz, width, height = (float(self._capture.get(key)) for key in VIDEO_PROPERTIES)
             if not (1 <= count <= VIDEO_FRAMES_MAX and 0.1 < self.rate_hz < 1000):
                 raise InputError(path, "frames", f"{count:g} at {self.rate_hz:g} Hz cannot be played")
-            check_size(round(width), round(height), source=path, limits=limits)
+            check_size(round(width), round(height), source=path)
         except BaseException:
             self._capture.release()
             raise
@@ -217,23 +217,22 @@ class Video(Frames):
         self._capture.release()
 
 
-def open_frames(path: Path, settings: ContentSettings, *, limits: LimitSettings | None = None) -> Frames:
+def open_frames(path: Path, settings: ContentSettings) -> Frames:
     """A picture, a video, or a folder of pictures. Raises InputError."""
-    limits = limits or LimitSettings()
     if path.suffix.lower() in VIDEOS and not path.is_dir():
-        return Video(path, limits=limits)
+        return Video(path)
     paths = [path]
     if path.is_dir():
         paths = sorted(item for item in path.iterdir() if item.suffix.lower() in PICTURES)
     if not paths:
         raise InputError(path, "", "the folder holds no pictures")
-    return PictureFiles(paths, rate_hz=settings.picture_rate_hz, limits=limits)
+    return PictureFiles(paths, rate_hz=settings.picture_rate_hz)
 
 
 def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
     """Open a picture, a video or a folder of pictures. Raises InputError."""
     layout = layout_of(file.path, file.settings)
-    source = PicturesSource(open_frames(file.path, file.settings, limits=file.limits), layout=layout, file=file)
+    source = PicturesSource(open_frames(file.path, file.settings), layout=layout, file=file)
     return lambda context: source
 
 

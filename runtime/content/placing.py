@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from runtime.config import ContentSettings, LimitSettings
+from runtime.config import ContentSettings
 from runtime.content.presets import Preset, axes_matrix
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
@@ -31,7 +31,6 @@ class SceneFile:
     path: Path
     settings: ContentSettings
     stack: PanelStack
-    limits: LimitSettings
     preset: Preset | None = None  # that the file is of
 
     @property

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.config import LimitSettings
+from runtime.config import LIMITS
 from runtime.errors import InputError, one_line
 from runtime.support import foreign
 
@@ -47,9 +47,9 @@ class Header:
         return "triangles" if self.counts.get("face") or self.counts.get("tristrips") else "points"
 
 
-def read_header(path: Path, limits: LimitSettings) -> Header:
+def read_header(path: Path) -> Header:
     """Raises InputError: no header, or counts that are over a limit or more than the file has bytes."""
-    with foreign.open_regular(path, most_bytes=round(limits.file_mib * foreign.MIB)) as file:
+    with foreign.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         head = file.read(LONGEST_HEADER)
         size = file.seek(0, 2)
     text, mark, _ = head.partition(b"end_header")
@@ -77,7 +77,7 @@ def read_header(path: Path, limits: LimitSettings) -> Header:
     header = Header(path, order, counts, tuple(fields), newline + 1, size)
     for name, count in counts.items():
         field, kind = f"element {foreign.shown(name)}", header.kind
-        most = getattr(limits, kind) * (3 if kind == "triangles" and name == "vertex" else 1)
+        most = getattr(LIMITS, kind) * (3 if kind == "triangles" and name == "vertex" else 1)
         foreign.within(count, most, source=path, field=field)
         if count > size:  # the shortest has a byte
             raise InputError(path, field, f"the file is cut off: {count:,} are promised in {size:,} bytes")

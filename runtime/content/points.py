@@ -64,7 +64,7 @@ class Cloud:
 
 def prepare(file: SceneFile) -> Callable[[Any], PointSource]:
     """Read it; the answer uploads it. Raises InputError."""
-    cloud = load_points(read_header(file.path, file.limits))
+    cloud = load_points(read_header(file.path))
     low, high = np.percentile(cloud.positions.astype(np.float64), [STRAY, 100 - STRAY], axis=0)
     matrix = file.placed(low, high)
     info = ContentInfo(file.path.stem, background=file.background)

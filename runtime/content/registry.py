@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from runtime.config import ContentSettings, LimitSettings, validated
+from runtime.config import LIMITS, ContentSettings, validated
 from runtime.content.base import ContentSource, View
 from runtime.content.placed import placed_source, placing_of
 from runtime.content.placing import SceneFile
@@ -31,25 +31,23 @@ TRIED_PX = (32, 18)  # a picture that a class is asked for before it is shown
 Opener = Callable[[Any], ContentSource]
 
 
-def open_content(
-    settings: ContentSettings, stack: PanelStack, context: Any, *, limits: LimitSettings | None = None
-) -> ContentSource:
+def open_content(settings: ContentSettings, stack: PanelStack, context: Any) -> ContentSource:
     """The source of `settings.scene`: a built-in scene, a preset, a class, a file or a folder.
 
     context: the moderngl context of the thread that will call `render`. Raises InputError, naming file and field.
     """
-    return prepare_content(settings, stack, limits=limits)(context)
+    return prepare_content(settings, stack)(context)
 
 
-def prepare_content(settings: ContentSettings, stack: PanelStack, *, limits: LimitSettings | None = None) -> Opener:
+def prepare_content(settings: ContentSettings, stack: PanelStack) -> Opener:
     """Read and check what `settings.scene` names; the answer makes the source on the thread that has the context.
 
     This is the slow part and needs no GL: it may run on any thread. How far it is goes to `support.progress`.
-    limits: of what files may hold; None: the defaults. Raises InputError, naming file and field.
+    Raises InputError, naming file and field.
     """
-    file = SceneFile(Path(settings.scene), settings, stack, limits or LimitSettings())
-    too_slow = InputError(settings.scene, "", f"takes longer to load than {file.limits.load_s:g} s")
-    with progress.task(f"loading {settings.scene}", seconds=file.limits.load_s, too_slow=too_slow):
+    file = SceneFile(Path(settings.scene), settings, stack)
+    too_slow = InputError(settings.scene, "", f"takes longer to load than {LIMITS.load_s:g} s")
+    with progress.task(f"loading {settings.scene}", seconds=LIMITS.load_s, too_slow=too_slow):
         return _placed(file)
 
 
@@ -109,7 +107,7 @@ def _from_path(file: SceneFile) -> Opener:
             "splats": splat.prepare,
             "points": points.prepare,
         }
-        return kinds[read_header(path, file.limits).kind](file)
+        return kinds[read_header(path).kind](file)
     from runtime.content import pictures, rgbd
 
     is_rgbd = pictures.layout_of(path, file.settings).kind == "rgbd"

@@ -48,7 +48,7 @@ void main() {
 
 def prepare(file: SceneFile) -> Callable[[Any], SplatSource]:
     """Read it; the answer uploads it. Raises InputError."""
-    gaussians = load_gaussians(read_header(file.path, file.limits))
+    gaussians = load_gaussians(read_header(file.path))
     low, high = np.percentile(gaussians.centres.astype(np.float64), [STRAY, 100 - STRAY], axis=0)
     matrix = file.placed(low, high)
     info = ContentInfo(file.path.stem, background=file.background)

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from runtime.clock import NS_PER_S
-from runtime.config import ContentSettings, LimitSettings
+from runtime.config import ContentSettings
 from runtime.content.base import ContentInfo, ContentSource
 from runtime.content.pictures import CONTAINERS, Layout, ScreenSource, layout_of
 from runtime.content.placing import SceneFile
@@ -83,14 +83,14 @@ class Target:
 class Feed:
     """A source that is being read, from when this is made until it is closed or forgotten."""
 
-    def __init__(self, target: Target, settings: ContentSettings, limits: LimitSettings) -> None:
+    def __init__(self, target: Target, settings: ContentSettings) -> None:
         """Raises MissingPart without PyAV."""
         try:
             import av
         except ImportError:
             raise MissingPart("live pictures need PyAV: pip install av") from None
         av.logging.set_level(av.logging.PANIC)
-        self.reader = Reader(target, settings, limits)
+        self.reader = Reader(target, settings)
         threading.Thread(target=self.reader.run, name="stream", daemon=True).start()
         # A scene that was skipped while it was loaded is dropped, and its thread ends with it.
         self.close = weakref.finalize(self, self.reader.ending.set)
@@ -99,13 +99,13 @@ class Feed:
 class Reader:
     """The decoding thread, and the newest picture that it has. Holds no Feed: who forgets that ends this."""
 
-    def __init__(self, target: Target, settings: ContentSettings, limits: LimitSettings) -> None:
+    def __init__(self, target: Target, settings: ContentSettings) -> None:
         self.shown = target.shown
         self.ending, self.first = threading.Event(), threading.Event()
         self.newest: tuple[int, U8] | None = None  # number, (h, w, 4) RGBA
         self.arrived_ns = time.monotonic_ns()
         self.problem = "waiting for its first picture"
-        self._target, self._limits = target, limits
+        self._target = target
         self._options = dict(settings.stream_options)
         self._size: tuple[int, int] | None = None
         self._reported = ""
@@ -194,7 +194,7 @@ class Reader:
 
     def _check_size(self, width_px: int, height_px: int) -> None:
         """Raises InputError for too many pixels; reports a change."""
-        check_size(width_px, height_px, source=self.shown, limits=self._limits)
+        check_size(width_px, height_px, source=self.shown)
         if self._size not in (None, (width_px, height_px)) and width_px:
             now = f"{width_px} x {height_px}"
             log.warning("%s: its pictures changed from %d x %d to %s pixels", self.shown, *self._size, now)
@@ -266,7 +266,7 @@ def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
     layout = layout_of(file.path, file.settings)
     if layout.kind == "rgbd":
         raise InputError("content", "layout", "rgbd is not for live pictures")
-    feed = Feed(target, file.settings, file.limits)
+    feed = Feed(target, file.settings)
     feed.reader.first.wait(FIRST_PICTURE_S)
     return lambda context: LiveSource(feed, layout=layout, file=file)
 

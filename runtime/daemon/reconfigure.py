@@ -84,7 +84,7 @@ class Reconfiguration:
                 self.progress = f"{what}: {done} of {total}" if total else f"{what}: {done}" if done else what
 
         with progress.listening(tell):
-            return prepare_content(self.settings.content, stack, limits=self.settings.limits)
+            return prepare_content(self.settings.content, stack)
 
     def _open(self, opener: Opener, context: Any) -> None:
         try:

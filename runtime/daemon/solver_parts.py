@@ -130,7 +130,7 @@ class SolverMaker:
             settings = self.run.state.settings if self.run is not None else self._settings
             predictor = ready_predictor(settings, self._stack)
             try:
-                content = open_content(settings.content, self._stack, made, limits=settings.limits)
+                content = open_content(settings.content, self._stack, made)
                 try:
                     backend = self._chosen(predictor, made, group, simulated=simulated)
                     predictor.set_backend(backend.backend)

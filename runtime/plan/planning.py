@@ -52,7 +52,7 @@ def plan_for(
     with ExitStack() as cleanup:
         context = offscreen_context()
         cleanup.callback(context.release)
-        content = open_content(settings.content, stack, context, limits=settings.limits)
+        content = open_content(settings.content, stack, context)
         cleanup.callback(content.close)
         predictor = load_predictor(settings.model.name, stack, settings.model)
         backend = choose(settings.model.backend, predictor, lambda: context).backend

@@ -7,7 +7,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from runtime.config import LimitSettings
+from runtime.config import LIMITS
 from runtime.errors import InputError
 from runtime.support import foreign
 
@@ -66,22 +66,20 @@ def _orientation(image: Any) -> int:
     return found if isinstance(found, int) else 1
 
 
-def check_size(
-    width_px: int, height_px: int, *, source: str | Path, field: str = "", name: str = "", limits: LimitSettings
-) -> None:
+def check_size(width_px: int, height_px: int, *, source: str | Path, field: str = "", name: str = "") -> None:
     """Raises InputError for more pixels than the limit, with both figures. name: of a picture within `source`."""
-    if max(width_px, height_px) > SIDE_MAX_PX or width_px * height_px > limits.pixels:
-        problem = f"has {width_px} x {height_px} pixels; at most {limits.pixels:,}"
+    if max(width_px, height_px) > SIDE_MAX_PX or width_px * height_px > LIMITS.pixels:
+        problem = f"has {width_px} x {height_px} pixels; at most {LIMITS.pixels:,}"
         raise InputError(source, field, f"{name} {problem}".strip())
 
 
-def check_picture(coded: bytes, *, source: str | Path, field: str, name: str, limits: LimitSettings) -> None:
+def check_picture(coded: bytes, *, source: str | Path, field: str, name: str) -> None:
     """A picture that is whole and within the limit. Raises InputError."""
     from PIL import Image
 
     try:
         width, height = picture_size(coded)
-        check_size(width, height, source=source, field=field, name=name, limits=limits)
+        check_size(width, height, source=source, field=field, name=name)
         with Image.open(io.BytesIO(coded)) as image:
             image.load()
     except InputError:
@@ -90,22 +88,20 @@ def check_picture(coded: bytes, *, source: str | Path, field: str, name: str, li
         raise InputError(source, field, f"{name} is not an image that can be decoded") from None
 
 
-def read_coded(path: Path, *, limits: LimitSettings | None = None) -> bytes:
+def read_coded(path: Path) -> bytes:
     """A picture file's bytes, undecoded; refused by its header where it has too many pixels. Raises InputError."""
-    limits = limits or LimitSettings()
-    data = foreign.read_bytes(path, most_bytes=round(limits.file_mib * foreign.MIB))
+    data = foreign.read_bytes(path, most_bytes=LIMITS.file_bytes)
     try:
         width, height = picture_size(data)
     except ValueError:
         raise InputError(path, "", "is not an image that can be decoded") from None
-    check_size(width, height, source=path, limits=limits)
+    check_size(width, height, source=path)
     return data
 
 
-def size_of_file(path: Path, *, limits: LimitSettings | None = None) -> tuple[int, int]:
+def size_of_file(path: Path) -> tuple[int, int]:
     """Width and height as a decoder shows them, from the file's beginning. Raises InputError."""
-    limits = limits or LimitSettings()
-    with foreign.open_regular(path, most_bytes=round(limits.file_mib * foreign.MIB)) as file:
+    with foreign.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         head = file.read(SNIFFED_BYTES)
         try:
             width, height = picture_size(head, turned=True)
@@ -114,5 +110,5 @@ def size_of_file(path: Path, *, limits: LimitSettings | None = None) -> tuple[in
                 width, height = picture_size(head + file.read(), turned=True)
             except ValueError:
                 raise InputError(path, "", "is not an image that can be decoded") from None
-    check_size(width, height, source=path, limits=limits)
+    check_size(width, height, source=path)
     return width, height

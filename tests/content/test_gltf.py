@@ -13,7 +13,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation, Slerp
 
 from runtime.clock import NS_PER_S
-from runtime.config import ContentSettings, LimitSettings
+from runtime.config import ContentSettings
 from runtime.content.base import ContentSource
 from runtime.content.camera import project
 from runtime.content.mesh import load_mesh
@@ -182,7 +182,7 @@ def many_nodes(table: dict[str, Any]) -> None:
 def test_a_hostile_rig_is_one_line_that_names_the_field(tmp_path: Path, change: Any, told: str) -> None:
     path = changed(bending_bar(tmp_path / "a.gltf"), change)
     with pytest.raises(InputError) as refused:
-        load_mesh(path, limits=LimitSettings())
+        load_mesh(path)
     assert str(refused.value).startswith(f"{path}: ") and told in str(refused.value)
     assert "\n" not in str(refused.value)
 

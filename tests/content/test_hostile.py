@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from runtime.config import ContentSettings, LimitSettings
+from runtime.config import LIMITS, ContentSettings
 from runtime.content.mesh import load_mesh
 from runtime.content.pictures import open_frames
 from runtime.content.registry import prepare_content
@@ -45,10 +45,10 @@ def png_header(width: int, height: int) -> bytes:
     return small[:12] + body + struct.pack(">I", zlib.crc32(body)) + small[33:]
 
 
-def refused(path: Path, limits: LimitSettings | None = None, **settings: Any) -> str:
+def refused(path: Path, **settings: Any) -> str:
     """The one line with which content is refused."""
     with pytest.raises(InputError) as caught:
-        prepare_content(ContentSettings(scene=str(path), **settings), STACK, limits=limits)
+        prepare_content(ContentSettings(scene=str(path), **settings), STACK)
     line = str(caught.value)
     assert "\n" not in line and "\0" not in line and len(line) < 1000
     return line
@@ -106,10 +106,13 @@ def video(path: Path, size: tuple[int, int]) -> Path:
     return path
 
 
-def test_a_large_video_is_refused_and_one_of_the_right_size_is_not(tmp_path: Path) -> None:
+def test_a_large_video_is_refused_and_one_of_the_right_size_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = video(tmp_path / "a.mp4", (320, 240))
-    assert "320 x 240 pixels; at most 50,000" in refused(path, LimitSettings(pixels=50_000))
     assert open_frames(path, ContentSettings()).count == 2
+    monkeypatch.setattr(LIMITS, "pixels", 50_000)
+    assert "320 x 240 pixels; at most 50,000" in refused(path)
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv"])
@@ -154,9 +157,10 @@ def test_a_ply_that_promises_too_much_is_refused(
     assert time.monotonic() - start < HANG_S
 
 
-def test_an_obj_of_too_many_triangles_is_refused(tmp_path: Path) -> None:
+def test_an_obj_of_too_many_triangles_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(LIMITS, "triangles", 100)
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 3 1 2\n" * 40)
-    assert "faces: 120 is over the limit of 100" in refused(tmp_path / "a.obj", LimitSettings(triangles=100))
+    assert "faces: 120 is over the limit of 100" in refused(tmp_path / "a.obj")
 
 
 def gltf(**changes: Any) -> dict[str, Any]:
@@ -270,10 +274,10 @@ def test_what_lies_beside_an_obj_is_read_only_where_it_is_a_file(tmp_path: Path)
         assert told in refused(tmp_path / "a.obj")
 
 
-def test_a_loading_that_takes_too_long_is_given_up(tmp_path: Path) -> None:
+def test_a_loading_that_takes_too_long_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.gltf").write_text(json.dumps(gltf()))
-    at_once = LimitSettings(load_s=1e-9)
-    line = refused(tmp_path / "a.gltf", at_once)
+    monkeypatch.setattr(LIMITS, "load_s", 1e-9)
+    line = refused(tmp_path / "a.gltf")
     assert "takes longer to load than 1e-09 s" in line
 
 

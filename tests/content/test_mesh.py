@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from runtime.config import ContentSettings, LimitSettings
+from runtime.config import LIMITS, ContentSettings
 from runtime.content.camera import project
 from runtime.content.mesh import MeshSource, load_mesh, prepare
 from runtime.content.placing import SceneFile, guessed_axes
@@ -22,7 +22,7 @@ EYE = (0.7, 0.05, 0.1)
 
 
 def source_of(path: Path, context: Any, stack: PanelStack, **settings: Any) -> MeshSource:
-    return prepare(SceneFile(path, ContentSettings(**settings), stack, LimitSettings()))(context)
+    return prepare(SceneFile(path, ContentSettings(**settings), stack))(context)
 
 
 def textured_quad(folder: Path, suffix: str) -> Path:
@@ -194,11 +194,14 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         ),
     ],
 )
-def test_a_broken_file_is_one_line_that_names_the_field(tmp_path: Path, name: str, data: str, told: str) -> None:
+def test_a_broken_file_is_one_line_that_names_the_field(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, data: str, told: str
+) -> None:
+    monkeypatch.setattr(LIMITS, "triangles", 20)
     path = tmp_path / name
     path.write_bytes(data.encode())
     with pytest.raises(InputError) as refused:
-        load_mesh(path, limits=LimitSettings(triangles=20))
+        load_mesh(path)
     assert str(refused.value).startswith(f"{path}: {told}")
     assert "\n" not in str(refused.value)
 

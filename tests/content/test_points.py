@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from runtime.config import ContentSettings, LimitSettings
+from runtime.config import LIMITS, ContentSettings
 from runtime.content.camera import project
 from runtime.content.ply import read_header
 from runtime.content.points import load_points
@@ -76,9 +76,10 @@ HEAD = "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty flo
         (HEAD.format(1).replace("float z", "float w") + "0 0 0\n", "z: the property is missing"),
     ],
 )
-def test_a_broken_cloud_is_one_line(tmp_path: Path, text: str, told: str) -> None:
+def test_a_broken_cloud_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, told: str) -> None:
+    monkeypatch.setattr(LIMITS, "points", 50)
     path = tmp_path / "a.ply"
     path.write_text(text)
     with pytest.raises(InputError) as refused:
-        load_points(read_header(path, LimitSettings(points=50)))
+        load_points(read_header(path))
     assert str(refused.value).startswith(f"{path}: ") and told in str(refused.value)

@@ -10,7 +10,7 @@ import numpy.lib.recfunctions as rfn
 import pytest
 from plyfile import PlyData, PlyElement
 
-from runtime.config import ContentSettings, LimitSettings
+from runtime.config import ContentSettings
 from runtime.content.base import ContentInfo
 from runtime.content.gaussians import Gaussians, harmonic_basis, load_gaussians
 from runtime.content.placing import SceneFile
@@ -52,13 +52,13 @@ def written(folder: Path, table: np.ndarray, name: str = "scene.ply") -> Path:
 
 
 def loaded(path: Path) -> Gaussians:
-    return load_gaussians(read_header(path, LimitSettings()))
+    return load_gaussians(read_header(path))
 
 
 def placed(path: Path, context: Any, stack: PanelStack, **settings: Any) -> tuple[SplatSource, np.ndarray]:
     gaussians = loaded(path)
     low, high = gaussians.centres.min(0).astype(float), gaussians.centres.max(0).astype(float)
-    matrix = SceneFile(path, ContentSettings(**settings), stack, LimitSettings()).placed(low, high)
+    matrix = SceneFile(path, ContentSettings(**settings), stack).placed(low, high)
     info = ContentInfo("a", background=(1.0, 0.9, 0.8))
     return SplatSource(gaussians, stack_from_scene=matrix, context=context, info=info), matrix
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from runtime.clock import MonotonicClock
-from runtime.config import ContentSettings, LimitSettings, located
+from runtime.config import ContentSettings, located
 from runtime.content import stream
 from runtime.content.base import ContentSource
 from runtime.content.registry import open_content, prepare_content
@@ -33,9 +33,9 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stream, "AGAIN_S", 0.1)
 
 
-def opened(name: str, context: Any, stack: PanelStack, limits: LimitSettings | None = None, **settings: Any) -> Any:
+def opened(name: str, context: Any, stack: PanelStack, **settings: Any) -> Any:
     settings = {"layout": "side-by-side"} | settings
-    return open_content(ContentSettings(scene=name, **settings), stack, context, limits=limits)
+    return open_content(ContentSettings(scene=name, **settings), stack, context)
 
 
 def seen(source: ContentSource, stack: PanelStack) -> list[list[int]]:

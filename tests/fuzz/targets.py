@@ -26,7 +26,7 @@ from calib.grey import fit_series, read_series
 from calib.pairs import read_pairs
 from calib.setup_run import read_progress
 from runtime.clock import MonotonicClock, SimulatedClock
-from runtime.config import ContentSettings, LimitSettings, Settings, load_settings, load_stack
+from runtime.config import LIMITS, ContentSettings, Settings, load_settings, load_stack
 from runtime.content.gaussians import load_gaussians
 from runtime.content.mesh import load_mesh
 from runtime.content.pictures import open_frames
@@ -56,7 +56,7 @@ from tests.panels.edids import block
 from tests.sensor.taken import taken_until
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 64, 36)
-LIMITS = LimitSettings(pixels=1 << 22, triangles=50_000, splats=50_000, instances=200, file_mib=16, chunk_mib=2)
+LOW = {"pixels": 1 << 22, "triangles": 50_000, "splats": 50_000, "instances": 200, "file_mib": 16, "chunk_mib": 2}
 MODELS = sorted((Path(__file__).resolve().parents[2] / "runtime" / "model" / "data").glob("*.onnx"))
 EYES = EyePoints(np.array([[0.03, 0.0, 0.6], [-0.03, 0.0, 0.6]]), np.ones(2))
 
@@ -208,8 +208,8 @@ def pictures() -> list[bytes]:
 def picture(data: bytes, folder: Path) -> object:
     path = at(folder, "a.png", data)
     with contextlib.suppress(PhasestackError):
-        open_frames(folder, ContentSettings(), limits=LIMITS).frame(0)
-    return open_frames(path, ContentSettings(), limits=LIMITS).frame(0)
+        open_frames(folder, ContentSettings()).frame(0)
+    return open_frames(path, ContentSettings()).frame(0)
 
 
 def videos() -> list[bytes]:
@@ -225,7 +225,7 @@ def videos() -> list[bytes]:
 
 
 def video(path: Path) -> object:
-    with contextlib.closing(open_frames(path, ContentSettings(), limits=LIMITS)) as frames:
+    with contextlib.closing(open_frames(path, ContentSettings())) as frames:
         return [frames.frame(index).shape for index in range(min(frames.count, 5))]
 
 
@@ -251,7 +251,7 @@ def rigs() -> list[bytes]:
 
 def mesh(path: Path) -> object:
     """Loaded, its outlines looked for, and posed at a time that no key has."""
-    data = load_mesh(path, limits=LIMITS)
+    data = load_mesh(path)
     return [DrawnPart(part) for part in data.parts], data.rig.posed([part.shape for part in data.parts], 0.377)
 
 
@@ -291,7 +291,7 @@ class Hurried(threading.Event):
 
 def stream(path: Path) -> object:
     """Decoded as a live film is, without its thread and its times."""
-    reader = Reader(Live(f"live:{path}"), ContentSettings(), LIMITS)
+    reader = Reader(Live(f"live:{path}"), ContentSettings())
     reader.ending = Hurried()
     av.logging.set_level(av.logging.PANIC)
     try:
@@ -345,11 +345,11 @@ TARGETS: dict[str, Target] = {
     "stl": Target(lambda: [box("stl"), box("stl_ascii")], file("a.stl", mesh)),
     "cloud": Target(
         lambda: [cloud(), *points(2, [*"xyz"], "double")],
-        file("a.ply", lambda path: load_points(read_header(path, LIMITS))),
+        file("a.ply", lambda path: load_points(read_header(path))),
     ),
     "splat": Target(
         lambda: points(20, [*"xyz", *SPLAT], "float"),
-        file("a.ply", lambda path: load_gaussians(read_header(path, LIMITS))),
+        file("a.ply", lambda path: load_gaussians(read_header(path))),
     ),
     "playlist": Target(
         lambda: [PLAYLIST.encode(), b'{"show": [{"scene": "flat", "seconds": 3}]}'],

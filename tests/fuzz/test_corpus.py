@@ -11,15 +11,22 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 
+from runtime.config import LIMITS
 from runtime.errors import PhasestackError
 from tests.fuzz.mutations import mutated
-from tests.fuzz.targets import TARGETS
+from tests.fuzz.targets import LOW, TARGETS
 
 CORPUS = Path(__file__).parent / "corpus"
 KEPT = sorted(path for path in CORPUS.glob("*/*") if path.is_file())
 EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "40"))  # of each reader; `make fuzz` tries thousands
 HEAVY = {"checkpoint", "model"}  # what they stand on takes seconds to load, or belongs to their own tests
 CASE_S, CASE_MIB = 10, 400  # that one file may take
+
+
+@pytest.fixture(autouse=True)
+def low_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in LOW.items():
+        monkeypatch.setattr(LIMITS, name, value)
 
 
 def read(name: str, data: bytes, folder: Path) -> None:
