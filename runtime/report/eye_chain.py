@@ -23,6 +23,7 @@ from runtime.eyes.motions import Path as Way
 from runtime.eyes.motions import true_eyes
 from runtime.records import F64, U16, EyePoints, Intrinsics, SensorFrame, State
 from runtime.report.moving import settings_for, simulated_run
+from runtime.report.page import in_columns
 from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.support import progress
@@ -132,12 +133,6 @@ def _run(recording: Path) -> dict[str, float]:
 
 def told(rows: list[dict[str, Any]]) -> str:
     """The same as a table."""
-    lines = ["motion  eyes           dB at the eyes used   at the true eyes   eyes off, mm: p50    p95"]
-    return "\n".join(
-        lines
-        + [
-            "{motion:7} {eyes:14} {carried_db:19.1f}   {carried_db_true_eyes:16.1f}   "
-            "{eyes_p50_mm:17.1f} {eyes_p95_mm:6.1f}".format(**row)
-            for row in rows
-        ]
-    )
+    headings = ["motion", "eyes", "dB at the eyes used", "at the true eyes", "eyes off, mm: p50", "p95"]
+    figures = ("carried_db", "carried_db_true_eyes", "eyes_p50_mm", "eyes_p95_mm")
+    return in_columns([headings, *([r["motion"], r["eyes"], *(f"{r[name]:.1f}" for name in figures)] for r in rows)])

@@ -39,26 +39,22 @@ def texts(old: dict[str, Any], new: dict[str, Any]) -> list[tuple[bool, str]]:
     return [(change.worse, change.text) for change in benchmark.compare(*files)]
 
 
-def test_a_file_does_not_differ_from_itself() -> None:
-    assert texts(regression_file(), regression_file()) == []
-
-
-def test_slower_by_more_than_the_noise_is_worse_and_faster_is_better() -> None:
-    assert texts(regression_file(), regression_file(ms=110)) == []
-    ((worse, text),) = texts(regression_file(), regression_file(ms=130))
-    assert worse and text.startswith("1.30 times")
-    ((worse, _),) = texts(regression_file(), regression_file(ms=60))
-    assert not worse
-
-
-def test_a_scattered_measurement_needs_a_larger_difference() -> None:
-    assert texts(regression_file(scatter=0.2), regression_file(ms=130, scatter=0.2)) == []
-
-
-def test_a_slower_machine_is_not_a_slower_program() -> None:
-    assert texts(regression_file(), regression_file(ms=200, yardstick=20)) == []
-    ((worse, _),) = texts(regression_file(), regression_file(ms=100, yardstick=5))
-    assert worse
+@pytest.mark.parametrize(
+    ("old", "new", "found"),
+    [
+        ({}, {}, ""),
+        ({}, {"ms": 110}, ""),
+        ({}, {"ms": 130}, "worse 1.30 times"),
+        ({}, {"ms": 60}, "better 0.60 times"),
+        ({"scatter": 0.2}, {"ms": 130, "scatter": 0.2}, ""),  # a scattered measurement needs a larger difference
+        ({}, {"ms": 200, "yardstick": 20}, ""),  # a slower machine is not a slower program
+        ({}, {"ms": 100, "yardstick": 5}, "worse 2.00 times"),
+    ],
+)
+def test_slower_than_the_noise_and_the_machine_is_worse_and_faster_is_better(old: Any, new: Any, found: str) -> None:
+    told = texts(regression_file(**old), regression_file(**new))
+    assert len(told) == bool(found)
+    assert " ".join(f"{'worse' if worse else 'better'} {text}" for worse, text in told).startswith(found)
 
 
 def test_lost_light_and_memory_are_named() -> None:

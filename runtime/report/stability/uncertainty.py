@@ -4,36 +4,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from functools import lru_cache, partial
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from runtime.config import ModelSettings
 from runtime.model.chain import chain_modes
 from runtime.model.job import Job
-from runtime.model.predictor import load_predictor
 from runtime.model.transfer import FULL
 from runtime.model.unrolled import UnrolledPredictor
-from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
+from runtime.report.stability.networks import MODELS, STACK, ready
 from runtime.report.stability.trial import Answer, Trial, refusal
 
 STAGE = "unsure eyes"
-STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
 SIGMAS_MM = (0.0, 1e-6, 0.1, 1.0, 2.0, 4.0, 10.0, 50.0)
-MODELS = ("fast", "balanced", "best")
 ROWS, PANEL_CODE = 8, 1 / 255
 MOST_LEFT = 0.1  # of the mean square drive of sure eyes, for 50 columns of doubt
 DRIVEN_MOST = ((1.0, 0.97), (50.0, 0.5))  # from so many millimetres on, of the drive of sure eyes, at most
 LEAST_SURE = 0.05  # of the outer panels' mean drive for two points
 
 
-@lru_cache(maxsize=len(MODELS))
 def loaded(model: str) -> UnrolledPredictor:
     """A shipped model on the small panels."""
-    predictor = load_predictor(model, STACK, ModelSettings(threads=1))
+    predictor = ready(model, STACK)
     assert isinstance(predictor, UnrolledPredictor)
     return predictor
 
