@@ -47,7 +47,7 @@ def capture_live(
 def capture_recording(out: Path, settings: Settings, *, source: str) -> dict[str, Any]:
     """Pairs from a recording that knows its true eyes, half a second each. Raises InputError."""
     chosen = settings.sensor.model_copy(update={"driver": "replay", "source": source, "loop": False, "start_s": 0.0})
-    driver = open_sensor(chosen, SimulatedClock(), limits=settings.limits)
+    driver = open_sensor(chosen, SimulatedClock())
     if not isinstance(driver, SteppedSensor):
         raise InputError(source, "", "cannot be replayed sample by sample")
     file = PairsFile(out)

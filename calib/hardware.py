@@ -34,7 +34,7 @@ from runtime.panels.card import identity_card
 from runtime.panels.monitors import Monitor
 from runtime.records import F64, U8, EyePoints, PanelFrame, SensorFrame
 from runtime.sensor.registry import open_sensor
-from runtime.sensor.worker import SensorWorker
+from runtime.sensor.worker import OPEN_TIMEOUT_S, SensorWorker
 
 Poll = Callable[[], Key | None]
 Say = Callable[[str], None]
@@ -151,12 +151,10 @@ class SetupHardware:
         """Start the sensor and wait for it; returns what it is. Raises InputError."""
         self._stop_sensor()
         open_sensor(settings.sensor, self._clock)  # refuses unknown names before anything starts
-        worker = SensorWorker(
-            lambda: open_sensor(settings.sensor, self._clock, limits=settings.limits), settings.sensor, self._clock
-        )
+        worker = SensorWorker(lambda: open_sensor(settings.sensor, self._clock), settings.sensor, self._clock)
         worker.start()
         self._worker = worker
-        until_ns = self._clock.now_ns() + round(settings.sensor.open_timeout_s * NS_PER_S)
+        until_ns = self._clock.now_ns() + round(OPEN_TIMEOUT_S * NS_PER_S)
         while worker.capabilities is None:
             if worker.error is not None:
                 raise worker.error
@@ -180,8 +178,8 @@ class SetupHardware:
             return None
         if self._worker.error is not None:
             raise self._worker.error
-        frame = self._worker.newest()
-        return None if frame is None else Sample(frame.capture_ns, self._find(frame), self._worker.serial)
+        frames = self._worker.take()
+        return Sample(frames[-1].capture_ns, self._find(frames[-1]), self._worker.serial) if frames else None
 
     def chart(self, settings: Settings) -> ChartDisplay | None:
         """What shows charts and captions while capturing; None: nobody sees any."""
@@ -216,7 +214,7 @@ class SetupHardware:
 
     def _stop_sensor(self) -> None:
         if self._worker is not None:
-            self._worker.stop()
+            self._worker.close()
             self._worker = None
 
 

@@ -136,15 +136,6 @@ class SensorSettings(Section):
     timeout_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
         0.5, description="without a new sample for this long the sensor counts as stalled"
     )
-    reopen_backoff_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
-        0.25, description="first wait before a lost sensor is reopened; doubles"
-    )
-    reopen_backoff_max_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
-        0.5, description="longest wait between attempts"
-    )
-    open_timeout_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
-        10.0, description="an SDK that takes longer to open is given up and opened anew"
-    )
     loop: bool = Field(False, description="driver `replay`: begin again at the end")
     start_s: Annotated[float, within(0.0, 604_800.0, "s")] = Field(
         0.0, description="driver `replay`: begin this far into the recording"
@@ -172,9 +163,6 @@ class TrackerSettings(Section):
 
     hold_s: Annotated[float, within(0.0, 60.0, "s")] = Field(
         0.5, description="hold the last eyes for this long after a loss, then go flat"
-    )
-    blend_s: Annotated[float, within(0.0, 60.0, "s")] = Field(
-        0.3, description="time to blend to the flat picture and back"
     )
     noise_m: Annotated[float, within(1e-6, 0.2, "m")] = Field(
         0.003, description="noise on an eye of a sensor that does not say its own, standard deviation of an axis"
@@ -363,12 +351,6 @@ class LoopSettings(Section):
     )
     scanout_ms: Annotated[float, within(0.0, 1000.0, "ms")] = Field(
         8.0, description="from the swap to the middle of the panel's light"
-    )
-    solver_late_s: Annotated[float, within(0.001, 600.0, "s")] = Field(
-        0.5, description="a solution that takes longer is told as missing"
-    )
-    solver_abandon_s: Annotated[float, within(0.01, 3600.0, "s")] = Field(
-        10.0, description="a solver that does not answer for so long is left behind and made anew"
     )
     simulated_stage_ms: dict[str, NonNegative] = Field(
         default_factory=lambda: {

@@ -115,10 +115,9 @@ def soak(
     frames: int, *, warm: int, fault_every: int, change_every: int, least_changes: int = 0, report: bool = False
 ) -> Soak:
     """Run it. `warm` refreshes come before the first look at memory; it goes on until so many changes are made."""
-    quick = {"rate_hz": 1000.0, "solver_late_s": 30.0, "solver_abandon_s": 600.0}
     with (
         tempfile.TemporaryDirectory() as folder,
-        Rig(stack=SIZE, loop=quick, tracker={"hold_s": 1.0}) as rig,
+        Rig(stack=SIZE, late_s=30.0, abandon_s=600.0, loop={"rate_hz": 1000.0}, tracker={"hold_s": 1.0}) as rig,
     ):
         server = StatusServer(Path(folder) / "status.sock", group="root", clock=MonotonicClock())
         rig.run.observer._on_account = None  # the rig keeps every account: that alone would be a leak

@@ -144,7 +144,7 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
     with ExitStack() as cleanup:
         shown = Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True)
         task = cleanup.enter_context(shown).add_task("recording", total=seconds, note="")
-        cleanup.callback(worker.stop)
+        cleanup.callback(worker.close)
         worker.start()
         try:
             for frame in _samples(worker, limits.max_s):

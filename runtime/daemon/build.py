@@ -22,7 +22,6 @@ from runtime.eyes.detect import EyeFinder
 from runtime.frame.observer import Output, RunObserver
 from runtime.frame.pacing import Pacer
 from runtime.frame.presenter import Observers, Presenter, Unsupervised
-from runtime.frame.samples import LiveSamples, RecordedSamples, Samples
 from runtime.frame.solver_host import SimulatedSolver, SolverHost, total_ns
 from runtime.frame.solver_thread import SolverThread
 from runtime.frame.viewer import Viewer
@@ -34,6 +33,8 @@ from runtime.records import RefreshAccount
 from runtime.sensor.base import Sensor
 from runtime.sensor.detecting import DetectingDriver
 from runtime.sensor.registry import open_sensor
+from runtime.sensor.samples import RecordedSamples, Samples
+from runtime.sensor.worker import SensorWorker
 from runtime.support.gl import offscreen_context
 from runtime.support.memory import gc_frozen
 from runtime.support.priority import PRESENTER_NICENESS, niceness
@@ -144,7 +145,7 @@ def build_run(
 
     def make_driver() -> Sensor:
         latency_ms = settings.loop.sensor_latency_ms
-        driver = open_sensor(settings.sensor, clock, latency_ms=latency_ms, limits=settings.limits)
+        driver = open_sensor(settings.sensor, clock, latency_ms=latency_ms)
         return DetectingDriver(driver, lambda: EyeFinder(settings).find)
 
     driver = make_driver()
@@ -175,15 +176,14 @@ def build_run(
         thread = SolverThread(
             maker,
             clock,
-            late_s=settings.loop.solver_late_s,
-            abandon_s=settings.loop.solver_abandon_s,
             first_cost_ns=total_ns(settings.loop.simulated_stage_ms),
         )
         solver = thread
         cleanup.callback(solver.close)
         thread.wait_ready(lambda: host.starting("loading content and model"), most_s=settings.limits.start_s)
-        samples = LiveSamples(make_driver, settings.sensor, clock)
-        cleanup.callback(samples.close)
+        samples = worker = SensorWorker(make_driver, settings.sensor, clock)
+        cleanup.callback(worker.close)
+        worker.start()
     run = maker.run
     if run is None:
         raise Stopped("told to stop while starting")

@@ -25,7 +25,7 @@ class Observation:
 Motion = Callable[[F64], tuple[F64, F64]]  # times (n,) s -> neck (n, 3) m, frame `stack`; pitch (n,) rad
 
 
-def _minimum_jerk(times_s: F64, *, knots_s: F64, values: F64) -> F64:
+def minimum_jerk(times_s: F64, *, knots_s: F64, values: F64) -> F64:
     """Point-to-point movements at rest in each knot (Flash and Hogan 1985); values (k, ...)."""
     index = np.clip(np.searchsorted(knots_s, times_s, side="right") - 1, 0, len(knots_s) - 2)
     s = np.clip((times_s - knots_s[index]) / (knots_s[index + 1] - knots_s[index]), 0, 1)
@@ -57,7 +57,7 @@ def _nod(times_s: F64) -> tuple[F64, F64]:
 def _walk(times_s: F64) -> tuple[F64, F64]:
     """To and fro past the display, 2.4 m at up to 1 m/s, with the bob of steps at 1.9 Hz."""
     knots = np.arange(0.0, times_s.max() + 4.0, 3.5)
-    side = _minimum_jerk(times_s, knots_s=knots, values=np.where(np.arange(len(knots)) % 2, 1.0, -1.0))
+    side = minimum_jerk(times_s, knots_s=knots, values=np.where(np.arange(len(knots)) % 2, 1.0, -1.0))
     bob = 0.02 * np.sin(2 * np.pi * 1.9 * times_s)
     sway = 0.02 * np.sin(np.pi * 1.9 * times_s)
     return np.stack([0.3 + 0.1 * side + sway, side, bob], 1), np.zeros_like(times_s)
@@ -74,7 +74,7 @@ def _stop_and_go(times_s: F64) -> tuple[F64, F64]:
         places += [place, target]
         place = target
     neck, pitch = _still(times_s)
-    return neck + _minimum_jerk(times_s, knots_s=np.array(knots), values=np.array(places)), pitch
+    return neck + minimum_jerk(times_s, knots_s=np.array(knots), values=np.array(places)), pitch
 
 
 MOTIONS: dict[str, Motion] = {

@@ -13,6 +13,8 @@ from runtime.clock import NS_PER_S
 from runtime.plan.savings import Plan, selected_eyes
 from runtime.records import F64, EyesEstimate, SolveRequest
 
+BLEND_S = 0.3  # in which the picture goes over to the flat one, or back
+
 Kind = Literal["solve", "flat", "nothing"]
 
 
@@ -99,10 +101,10 @@ class Flatness:
     value: float = 1.0
     since_ns: int = -1
 
-    def toward(self, target: float, *, blend_s: float, now_ns: int) -> float:
+    def toward(self, target: float, *, now_ns: int) -> float:
         """One step towards 0 or 1."""
         elapsed_s = 0.0 if self.since_ns < 0 else (now_ns - self.since_ns) / NS_PER_S
         self.since_ns = now_ns
-        step = elapsed_s / blend_s if blend_s > 0 else 1.0
+        step = elapsed_s / BLEND_S
         self.value = max(target, self.value - step) if target < self.value else min(target, self.value + step)
         return self.value

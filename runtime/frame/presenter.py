@@ -18,7 +18,6 @@ from runtime.frame.lateness import Lateness
 from runtime.frame.pacing import Pacer
 from runtime.frame.policy import Flatness, wants_flat
 from runtime.frame.run_state import RunCell
-from runtime.frame.samples import Samples
 from runtime.frame.solver_host import News, SolverHost, still_there
 from runtime.frame.states import Conditions, Part, StateMachine
 from runtime.frame.stats import RunStats
@@ -40,6 +39,7 @@ from runtime.records import (
     SolveRequest,
     State,
 )
+from runtime.sensor.samples import Samples
 
 log = logging.getLogger("phasestack.presenter")
 
@@ -196,17 +196,15 @@ class Presenter:
 
     def _compose(self, timing: FrameTiming, eyes: EyesEstimate, news: News) -> tuple[PanelFrame, str]:
         """What the panels are given, and why an alignment is at its limit (empty: it is not)."""
-        settings = self.run_cell.state.settings
         solution, flat = news.solution, news.flat
         target = 1.0 if eyes.eyes_m is None or self.flat_asked else 0.0
         if solution is None:
             self._flatness.value = 1.0
         elif not self._drew_solution and target == 0.0:
             self._flatness.value = 0.0  # the first picture is not faded in
-        blend_s = settings.tracker.blend_s
         flatness = self._flatness.value
         if not self.paused:
-            flatness = self._flatness.toward(target, blend_s=blend_s, now_ns=self.clock.now_ns())
+            flatness = self._flatness.toward(target, now_ns=self.clock.now_ns())
         if solution is None or flat is None:
             flatness = self._flatness.value = 1.0 if solution is None else 0.0
         self._drew_solution = self._drew_solution or (solution is not None and flatness < 1.0)

@@ -18,6 +18,8 @@ from runtime.support.priority import SOLVER_NICENESS, set_niceness
 
 log = logging.getLogger("phasestack.solver")
 
+LATE_S = 0.5  # a step that takes longer is late; one that takes twice as long is a fault by itself
+ABANDON_S = 10.0  # a step that does not return for so long is left behind, and the solver is made anew
 IDLE_S = 0.02  # between two looks at tasks while nothing is asked
 LATE_STEPS = 3  # in a row that are late begin a fault, so many in time end it: a busy processor is none
 ANSWER_STEP_MS = 500  # of how long no answer came, as it is reported
@@ -39,16 +41,10 @@ class _Attempt:
 class SolverThread(SolverHost):
     """Runs a solver alongside the presenter. `post`, `news` and `watch` never wait."""
 
-    def __init__(
-        self, make: Callable[[], SolverParts], clock: Clock, *, late_s: float, abandon_s: float, first_cost_ns: int = 0
-    ) -> None:
-        """make: a solver with its own GL context, called on the thread that will use it, again after it hung.
-
-        late_s: steps that take longer, one after the other, or one that takes twice as long, are a fault; abandon_s:
-        after this the thread is left behind.
-        """
+    def __init__(self, make: Callable[[], SolverParts], clock: Clock, *, first_cost_ns: int = 0) -> None:
+        """make: a solver with its own GL context, called on the thread that will use it, again after it hung."""
         self._make, self._clock = make, clock
-        self._late_ns, self._abandon_ns = round(late_s * NS_PER_S), round(abandon_s * NS_PER_S)
+        self._late_ns, self._abandon_ns = round(LATE_S * NS_PER_S), round(ABANDON_S * NS_PER_S)
         self._lock = threading.Condition()
         self._request: SolveRequest | None = None
         self._news = News()

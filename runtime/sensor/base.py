@@ -10,8 +10,12 @@ from typing import ClassVar, Self
 
 from pydantic import BaseModel
 
+from runtime.clock import NS_PER_S, Clock
 from runtime.config import Section
+from runtime.errors import SensorTimeout
 from runtime.records import SensorFrame
+
+ARRIVED_MAX = 1024  # samples in one answer: who was away for long gets them in several
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +85,12 @@ class Sensor(ABC):
 
 
 class SteppedSensor(Sensor):
-    """A driver that also delivers sample after sample without waiting, for runs on a simulated clock."""
+    """A driver that also delivers sample after sample without waiting, for runs on a simulated clock.
+
+    What it reads by its own clock is what has arrived by then.
+    """
+
+    _clock: Clock
 
     @abstractmethod
     def next_sample(self) -> SensorFrame:
@@ -97,3 +106,33 @@ class SteppedSensor(Sensor):
     @abstractmethod
     def available_ns(self, frame: SensorFrame) -> int:
         """When a sample arrives, on the run's clock: the caller lets its clock pass until then."""
+
+    def read_newest(self, timeout_s: float) -> SensorFrame:
+        frame = self._first_due(timeout_s)
+        now_ns = self._clock.now_ns()
+        while self._is_due(now_ns):
+            frame, self.skipped = self.next_sample(), self.skipped + 1
+        return frame
+
+    def read_arrived(self, timeout_s: float) -> list[SensorFrame]:
+        frames = [self._first_due(timeout_s)]
+        now_ns = self._clock.now_ns()
+        while len(frames) < ARRIVED_MAX and self._is_due(now_ns):
+            frames.append(self.next_sample())
+        return frames
+
+    def _is_due(self, now_ns: int) -> bool:
+        following = self.peek()
+        return following is not None and self.available_ns(following) <= now_ns
+
+    def _first_due(self, timeout_s: float) -> SensorFrame:
+        """The oldest unread sample, once it is available. Raises SensorTimeout, EndOfRecording, SensorLost."""
+        following = self.peek()
+        if following is None:
+            return self.next_sample()  # which says why
+        due_ns = self.available_ns(following)
+        deadline_ns = self._clock.now_ns() + round(timeout_s * NS_PER_S)
+        self._clock.sleep_until_ns(min(due_ns, deadline_ns))
+        if due_ns > deadline_ns:
+            raise SensorTimeout(f"{self.name}: no sample within {timeout_s} s")
+        return self.next_sample()

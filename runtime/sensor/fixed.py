@@ -6,7 +6,7 @@ import numpy as np
 
 from runtime.clock import NS_PER_S, Clock
 from runtime.config import SensorSettings
-from runtime.errors import InputError, SensorLost, SensorTimeout
+from runtime.errors import InputError, SensorLost
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.base import Capabilities, SteppedSensor
 
@@ -45,20 +45,6 @@ class FixedDriver(SteppedSensor):
 
     def available_ns(self, frame: SensorFrame) -> int:
         return frame.capture_ns
-
-    def read_newest(self, timeout_s: float) -> SensorFrame:
-        if self._start_ns is None:
-            raise SensorLost("not open")
-        now_ns = self._clock.now_ns()
-        due = max((now_ns - self._start_ns) // PERIOD_NS, self._count)
-        due_ns = self._start_ns + due * PERIOD_NS
-        if due_ns > now_ns + timeout_s * NS_PER_S:
-            self._clock.sleep_until_ns(now_ns + round(timeout_s * NS_PER_S))
-            raise SensorTimeout("the next sample is not due yet")
-        self._clock.sleep_until_ns(due_ns)
-        self.skipped += due - self._count
-        self._count = due
-        return self.next_sample()
 
     def close(self) -> None:
         self._start_ns = None

@@ -9,10 +9,10 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Any, TypeVar
 
 T = TypeVar("T")
-Answer = tuple[Any, BaseException | None]
 
 _idle: list[PersistentThread] = []
 _lock = threading.Lock()
@@ -22,28 +22,23 @@ class PersistentThread:
     """One call at a time; whoever calls waits for it."""
 
     def __init__(self, name: str) -> None:
-        self._asked: queue.SimpleQueue[tuple[Callable[[], Any], queue.SimpleQueue[Answer]]] = queue.SimpleQueue()
+        self._asked: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = queue.SimpleQueue()
         threading.Thread(target=self._run, name=name, daemon=True).start()
 
     def __call__(self, call: Callable[[], T]) -> T:
         """The answer; raises what the call raises."""
-        answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
-        self._asked.put((call, answers))
-        result, error = answers.get()
-        if error is not None:
-            raise error
-        answer: T = result
-        return answer
+        answer: Future[T] = Future()
+        self._asked.put((answer, call))
+        return answer.result()
 
     def _run(self) -> None:
         while True:
-            call, answers = self._asked.get()
+            answer, call = self._asked.get()
             try:
-                answer: Answer = call(), None
+                answer.set_result(call())
             except BaseException as error:  # it belongs to who asked
-                answer = None, error
-            answers.put(answer)
-            del call, answers, answer  # nothing of the last call is kept until the next
+                answer.set_exception(error)
+            del answer, call  # nothing of the last call is kept until the next
 
 
 def borrowed(name: str) -> PersistentThread:

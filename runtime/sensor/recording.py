@@ -6,7 +6,7 @@ import fcntl
 import json
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +24,7 @@ from runtime.support import foreign, progress
 CHUNK_BYTES = 4096  # some 20 eye samples
 MESSAGE_OVERHEAD_BYTES = 64
 INDEX_BYTES_PER_CHUNK = 256
+SUMMARY_BYTES = 10_000  # with the schemas
 TELL_EVERY = 1024
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -47,10 +48,12 @@ class RecordingWriter:
         header: RecordingHeader,
         *,
         limits: RecordingLimits | None = None,
+        on_first: Callable[[], object] = lambda: None,
     ) -> None:
+        """on_first: called when the first sample is written."""
         from mcap.writer import CompressionType, IndexType, Writer
 
-        self._file, self._limits = file, limits or RecordingLimits()
+        self._file, self._limits, self._on_first = file, limits or RecordingLimits(), on_first
         self._images, self._eye_points = header.colour or header.depth, header.eye_points or header.truth
         # Eye points alone are so few that plain bytes, the same with every version of a library, are worth more.
         compression = CompressionType.LZ4 if self._images else CompressionType.NONE
@@ -59,7 +62,7 @@ class RecordingWriter:
         self._writer.start(profile="phasestack", library="phasestack")
         self._writer.add_metadata(fmt.METADATA_NAME, header.metadata())
         self._channels: dict[str, int] = {}
-        self._pending = self._chunks = self.count = 0
+        self._chunks = self.count = 0
         self._first_ns: int | None = None
         self._intrinsics: Intrinsics | None = None
 
@@ -84,19 +87,19 @@ class RecordingWriter:
             messages.append((fmt.EYES_TOPIC, fmt.eyes_message(frame)))
         first_ns = at if self._first_ns is None else self._first_ns
         size = sum(len(data) + MESSAGE_OVERHEAD_BYTES for _, data in messages)
-        chunks = self._chunks + len(messages)
-        total = self._file.tell() + self._pending + size + 8192 + INDEX_BYTES_PER_CHUNK * chunks
+        indices = INDEX_BYTES_PER_CHUNK * (self._chunks + len(messages))
+        total = self._file.tell() + CHUNK_BYTES + size + SUMMARY_BYTES + indices
         if at - first_ns > self._limits.max_s * NS_PER_S or total > self._limits.max_bytes:
             return False
         for topic, data in messages:
             before = self._file.tell()
             self._writer.add_message(self._channel(topic), at, data, at, frame.sequence & 0xFFFFFFFF)
-            flushed = self._file.tell() > before
-            self._pending = 0 if flushed else self._pending + len(data) + MESSAGE_OVERHEAD_BYTES
-            self._chunks += flushed
+            self._chunks += self._file.tell() > before
         self._file.flush()
         self._first_ns, self._intrinsics = first_ns, frame.intrinsics or self._intrinsics
         self.count += 1
+        if self.count == 1:
+            self._on_first()
         return True
 
     def finish(self) -> None:
@@ -130,7 +133,7 @@ def recording_to(
         raise InputError(path, "", f"cannot be written ({error.strerror})") from None
     try:
         with file:
-            writer = _Appearing(file, header, limits=limits, part=part, path=path)
+            writer = RecordingWriter(file, header, limits=limits, on_first=lambda: part.replace(path))
             try:
                 yield writer
             finally:
@@ -142,22 +145,6 @@ def recording_to(
         if error.filename is None and error.errno is not None:  # of writing to an open file: a full disk
             raise InputError(path, "", f"cannot be written ({error.strerror})") from None
         raise
-
-
-class _Appearing(RecordingWriter):
-    """Renames its file once there is something in it."""
-
-    def __init__(
-        self, file: IO[bytes], header: RecordingHeader, *, limits: RecordingLimits | None, part: Path, path: Path
-    ) -> None:
-        super().__init__(file, header, limits=limits)
-        self._part, self._path = part, path
-
-    def write(self, frame: SensorFrame) -> bool:
-        done = super().write(frame)
-        if done and self.count == 1:
-            self._part.replace(self._path)
-        return done
 
 
 class Recording:
@@ -190,37 +177,35 @@ class Recording:
         return foreign.open_regular(self.path, most_bytes=round(self._limits.file_mib * foreign.MIB))
 
     def _read_header(self) -> RecordingHeader:
-        for kind, record in self._records():
-            if kind == "metadata" and record.name == fmt.METADATA_NAME:
+        for topic, record in self._records():
+            if topic:
+                break
+            if record.name == fmt.METADATA_NAME:
                 try:
                     return RecordingHeader.from_metadata(record.metadata)
                 except ValueError as error:
                     raise InputError(self.path, fmt.METADATA_NAME, str(error)) from None
-            if kind == "message":
-                break
         raise InputError(self.path, fmt.METADATA_NAME, "is missing: not a recording of phasestack")
 
     def _records(self) -> Iterator[tuple[str, Any]]:
-        """Metadata, and messages as pairs of topic and record, until the end or the break."""
-        for number, record in enumerate(self._to_the_break()):
-            if number and number % TELL_EVERY == 0:
-                progress.tell(f"{self.path.name}: records read", number)
-            yield record
-
-    def _to_the_break(self) -> Iterator[tuple[str, Any]]:
+        """Messages with their topic, and metadata without one, until the end or the break."""
         from mcap.records import Channel, Message, Metadata
 
         topics: dict[int, str] = {}
-        most_bytes = round(self._limits.chunk_mib * foreign.MIB)
+        with self._opened() as file:
+            for number, record in enumerate(self._to_the_break(file), start=1):
+                if number % TELL_EVERY == 0:
+                    progress.tell(f"{self.path.name}: records read", number)
+                if isinstance(record, Channel):
+                    topics[record.id] = record.topic
+                elif isinstance(record, Message):
+                    yield topics.get(record.channel_id, "?"), record
+                elif isinstance(record, Metadata):
+                    yield "", record
+
+    def _to_the_break(self, file: IO[bytes]) -> Iterator[Any]:
         try:
-            with self._opened() as file:
-                for record in mcap_records(file, source=self.path, most_bytes=most_bytes):
-                    if isinstance(record, Channel):
-                        topics[record.id] = record.topic
-                    elif isinstance(record, Message):
-                        yield "message", (topics.get(record.channel_id, ""), record)
-                        continue
-                    yield ("metadata" if isinstance(record, Metadata) else "other"), record
+            yield from mcap_records(file, source=self.path, most_bytes=round(self._limits.chunk_mib * foreign.MIB))
         except InputError:
             raise
         except OSError as error:
@@ -240,10 +225,7 @@ class Recording:
         stamp_ns: int | None = None  # of the pictures in `parts`
         intrinsics: Intrinsics | None = None
         number = 0
-        for kind, value in self._records():
-            if kind != "message":
-                continue
-            topic, message = value
+        for topic, message in self._records():
             try:
                 if topic in (fmt.COLOUR_TOPIC, fmt.DEPTH_TOPIC) and not self.header.eye_points:
                     at_ns = fmt.capture_ns_of_image(message.data)

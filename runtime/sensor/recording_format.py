@@ -1,20 +1,18 @@
-"""What stands in a recording: topics, schemas, and each message as bytes and back."""
+"""What stands in a recording: topics, the messages in each with their schemas, and messages as bytes and back."""
 
 from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar
 
 import cv2
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, WithJsonSchema, field_validator
 
 from runtime.clock import NS_PER_S
-from runtime.errors import InputError
 from runtime.records import F64, U8, U16, EyePoints, Intrinsics, SensorFrame
-from runtime.support.foreign import parsed_json, real, shown, whole
 from runtime.support.picture_header import is_cut_off, picture_size
 
 SCHEMA_VERSION = 1
@@ -22,59 +20,110 @@ METADATA_NAME = "phasestack.recording"
 EYES_TOPIC, COLOUR_TOPIC, DEPTH_TOPIC, CALIBRATION_TOPIC = "/eyes", "/colour", "/depth", "/camera"
 POSITION_DIGITS = 7  # a tenth of a micrometre: four digits below the best sensor's noise
 JPEG_QUALITY = 92
-TIME_MAX_NS = 1 << 62  # 146 years: sums and differences of two still fit 64 bits
-SEQUENCE_MAX = 1 << 62
+NUMBER_MAX = 1 << 62  # as a time, 146 years: sums and differences of two still fit 64 bits
 COORDINATE_MAX_M = 1e6  # beyond what any sensor says, in any unit; the tracker judges what a viewer's eyes are
 IMAGE_SIDE_MAX_PX = 1 << 15
-MESSAGE_DEPTH_MAX = 16
 
-_PAIR = {"type": ["array", "null"], "minItems": 2, "maxItems": 2}
-EYES_SCHEMA = {
-    "title": "phasestack.EyeSample",
-    "description": "One sample of an eye-tracking sensor: the viewer's left eye, then the right; metres.",
-    "type": "object",
-    "required": ["sequence", "capture_ns", "eyes_m"],
-    "properties": {
-        "sequence": {"type": "integer", "description": "counts the device's frames; gaps are losses"},
-        "capture_ns": {"type": "integer", "description": "monotonic clock when the light was integrated"},
-        "eyes_m": _PAIR | {"description": "frame `sensor` (+x right, +y down, +z away); null: no face"},
-        "confidence": {"type": "array", "description": "0 to 1, left and right"},
-        "covariance_m2": {
-            "type": "array",
-            "description": "3x3, of the middle between the eyes; where it is known",
-        },
-        "completed": {"enum": ["", "left", "right"], "description": "the eye that was hidden and filled in"},
-        "true_eyes_m": _PAIR | {"description": "frame `stack`; only where the truth is known"},
-    },
+Count = Annotated[int, Field(ge=0, le=NUMBER_MAX)]
+Unit = Annotated[float, Field(ge=0, le=1)]
+Side = Annotated[int, Field(ge=1, le=IMAGE_SIDE_MAX_PX)]
+Coordinate = Annotated[float, Field(ge=-COORDINATE_MAX_M, le=COORDINATE_MAX_M)]
+Point = tuple[Coordinate | None, Coordinate | None, Coordinate | None]  # null: this one was not measured
+Square = Annotated[float, Field(ge=-(COORDINATE_MAX_M**2), le=COORDINATE_MAX_M**2)]
+Row = tuple[Square, Square, Square]
+Bytes = Annotated[str, Field(json_schema_extra={"contentEncoding": "base64"})]
+Number = Annotated[float, Field(ge=-1e6, le=1e6)]
+M = TypeVar("M", bound=BaseModel)
+
+
+class Message(BaseModel):
+    """Numbers are finite ones of JSON: no text and no true stands for one."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
+
+
+class EyeSample(Message):
+    """One sample of an eye-tracking sensor: the viewer's left eye, then the right; metres."""
+
+    model_config = ConfigDict(title="phasestack.EyeSample")
+
+    sequence: Count = Field(description="counts the device's frames; gaps are losses")
+    capture_ns: Count = Field(description="monotonic clock when the light was integrated")
+    eyes_m: tuple[Point, Point] | None = Field(description="frame `sensor` (+x right, +y down, +z away); null: no face")
+    confidence: tuple[Unit, Unit] = Field((1.0, 1.0), description="0 to 1, left and right")
+    covariance_m2: tuple[Row, Row, Row] | None = Field(
+        None, description="3x3, of the middle between the eyes; where it is known"
+    )
+    completed: Literal["", "left", "right"] = Field("", description="the eye that was hidden and filled in")
+    true_eyes_m: tuple[Point, Point] | None = Field(None, description="frame `stack`; only where the truth is known")
+
+    @field_validator("covariance_m2")
+    @classmethod
+    def _is_covariance(cls, rows: tuple[Row, Row, Row] | None) -> tuple[Row, Row, Row] | None:
+        matrix = np.array(rows or np.eye(3))
+        if not np.allclose(matrix, matrix.T, rtol=1e-3, atol=0):
+            raise ValueError("is no covariance")
+        if np.linalg.eigvalsh(matrix)[0] < -1e-3 * matrix.max():
+            raise ValueError("is no covariance")
+        return rows
+
+
+class Stamp(Message):
+    """When a picture was taken."""
+
+    sec: Annotated[int, Field(ge=0, le=NUMBER_MAX // NS_PER_S)]
+    nsec: Annotated[int, Field(ge=0, lt=NS_PER_S)]
+
+
+class Stamped(Message):
+    """What all messages of pictures have: they follow Foxglove's schemas, so that its viewer and others show them."""
+
+    timestamp: Annotated[Stamp, WithJsonSchema({"type": "object"})]
+    frame_id: str = "sensor"
+
+
+class ColourImage(Stamped):
+    """A JPEG."""
+
+    model_config = ConfigDict(title="foxglove.CompressedImage")
+
+    data: Bytes
+    format: str = "jpeg"
+
+
+class DepthImage(Stamped):
+    """Millimetres, 16 bits each, little-endian."""
+
+    model_config = ConfigDict(title="foxglove.RawImage")
+
+    width: Side
+    height: Side
+    encoding: str = "16UC1"
+    step: int = 0
+    data: Bytes
+
+
+class Camera(Stamped):
+    """A pinhole without distortion."""
+
+    model_config = ConfigDict(title="foxglove.CameraCalibration")
+
+    width: Side
+    height: Side
+    distortion_model: str = ""
+    D: tuple[Number, ...] = ()
+    K: Annotated[tuple[Number, ...], Field(min_length=9, max_length=9)]
+    R: tuple[Number, ...] = ()
+    P: tuple[Number, ...] = ()
+
+
+MESSAGES: dict[str, type[Message]] = {
+    EYES_TOPIC: EyeSample,
+    COLOUR_TOPIC: ColourImage,
+    DEPTH_TOPIC: DepthImage,
+    CALIBRATION_TOPIC: Camera,
 }
-# The image messages follow Foxglove's well-known schemas, so that its viewer and others show them.
-_STAMP = {"timestamp": {"type": "object"}, "frame_id": {"type": "string"}}
-_BYTES = {"type": "string", "contentEncoding": "base64"}
-COLOUR_SCHEMA = {
-    "title": "foxglove.CompressedImage",
-    "type": "object",
-    "properties": _STAMP | {"data": _BYTES, "format": {"type": "string"}},
-}
-_SIZE = {"width": {"type": "integer"}, "height": {"type": "integer"}}
-DEPTH_SCHEMA = {
-    "title": "foxglove.RawImage",
-    "type": "object",
-    "properties": _STAMP | _SIZE | {"encoding": {"type": "string"}, "step": {"type": "integer"}, "data": _BYTES},
-}
-_NUMBERS = {"type": "array", "items": {"type": "number"}}
-CALIBRATION_SCHEMA = {
-    "title": "foxglove.CameraCalibration",
-    "type": "object",
-    "properties": _STAMP
-    | _SIZE
-    | {"distortion_model": {"type": "string"}, "D": _NUMBERS, "K": _NUMBERS, "R": _NUMBERS, "P": _NUMBERS},
-}
-SCHEMAS = {
-    EYES_TOPIC: EYES_SCHEMA,
-    COLOUR_TOPIC: COLOUR_SCHEMA,
-    DEPTH_TOPIC: DEPTH_SCHEMA,
-    CALIBRATION_TOPIC: CALIBRATION_SCHEMA,
-}
+SCHEMAS = {topic: message.model_json_schema() for topic, message in MESSAGES.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,10 +153,23 @@ class RecordingHeader:
         return cls(metadata.get("driver", ""), metadata.get("serial", ""), **flags)
 
 
+def _read(kind: type[M], data: bytes) -> M:
+    """A message. Raises ValueError, in one line that names the field."""
+    try:
+        return kind.model_validate_json(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+
+
 def _points(eyes_m: F64 | None) -> list[list[float | None]] | None:
     if eyes_m is None:
         return None
     return [[round(float(x), POSITION_DIGITS) if np.isfinite(x) else None for x in eye] for eye in eyes_m]
+
+
+def _array(points: tuple[Point, Point] | None) -> F64 | None:
+    return None if points is None else np.array(points, dtype=np.float64)  # None becomes NaN
 
 
 def eyes_message(frame: SensorFrame) -> bytes:
@@ -125,97 +187,27 @@ def eyes_message(frame: SensorFrame) -> bytes:
     return json.dumps(record, separators=(",", ":"), allow_nan=False).encode()
 
 
-def _pair(value: Any) -> F64 | None:
-    if value is None:
-        return None
-    if not (_has(value, 2) and all(_has(point, 3) for point in value)):
-        raise ValueError(f"two points of three coordinates expected, got {shown(value)}")
-    return np.array([[_coordinate(number) for number in point] for point in value])
-
-
-def _covariance(value: Any) -> F64 | None:
-    if value is None:
-        return None
-    if not (_has(value, 3) and all(_has(row, 3) for row in value)):
-        raise ValueError(f"covariance_m2: three rows of three numbers expected, got {shown(value)}")
-    limit = COORDINATE_MAX_M**2
-    rows = [[real(x, least=-limit, most=limit, problem=_of("covariance_m2")) for x in row] for row in value]
-    matrix = np.array(rows)
-    if not np.allclose(matrix, matrix.T, rtol=1e-3, atol=0) or np.linalg.eigvalsh(matrix)[0] < -1e-3 * matrix.max():
-        raise ValueError("covariance_m2 is no covariance")
-    return matrix
-
-
-def _has(value: Any, count: int) -> bool:
-    return isinstance(value, list) and len(value) == count
-
-
-def _coordinate(value: Any) -> float:
-    if value is None:  # this one was not measured
-        return float("nan")
-    return real(value, least=-COORDINATE_MAX_M, most=COORDINATE_MAX_M, problem=_of("a coordinate"))
-
-
-def _of(name: str) -> Callable[[str], ValueError]:
-    return lambda problem: ValueError(f"{name} {problem}")
-
-
-def _table(data: bytes) -> dict[str, Any]:
-    """A message's JSON object. Raises ValueError."""
-    try:
-        table = parsed_json(data, source="", most_depth=MESSAGE_DEPTH_MAX)
-    except InputError as error:
-        raise ValueError(str(error)) from None
-    if not isinstance(table, dict):
-        raise ValueError(f"an object expected, got {shown(table)}")
-    return table
-
-
-def _required(table: dict[str, Any], name: str) -> Any:
-    if name not in table:
-        raise ValueError(f"{name} is missing")
-    return table[name]
-
-
 def frame_from_eyes_message(data: bytes) -> SensorFrame:
     """Back from `eyes_message`. Raises ValueError where the message is not one."""
-    record = _table(data)
-    eyes_m = _pair(_required(record, "eyes_m"))
+    sample = _read(EyeSample, data)
+    eyes_m, covariance_m2 = _array(sample.eyes_m), sample.covariance_m2
     eyes = None
     if eyes_m is not None:
-        confidence = record.get("confidence", [1.0, 1.0])
-        completed = record.get("completed", "")
-        if not _has(confidence, 2) or completed not in ("", "left", "right"):
-            raise ValueError("malformed confidence or completed")
-        certain = [real(c, least=0, most=1, problem=_of("confidence")) for c in confidence]
-        eyes = EyePoints(eyes_m, np.array(certain), completed, _covariance(record.get("covariance_m2")))
-    return SensorFrame(
-        sequence=whole(_required(record, "sequence"), least=0, most=SEQUENCE_MAX, problem=_of("sequence")),
-        capture_ns=whole(_required(record, "capture_ns"), least=0, most=TIME_MAX_NS, problem=_of("capture_ns")),
-        eyes=eyes,
-        true_eyes_m=_pair(record.get("true_eyes_m")),
-    )
+        known = None if covariance_m2 is None else np.array(covariance_m2)
+        eyes = EyePoints(eyes_m, np.array(sample.confidence), sample.completed, known)
+    return SensorFrame(sample.sequence, sample.capture_ns, eyes, true_eyes_m=_array(sample.true_eyes_m))
 
 
-def _stamp(capture_ns: int) -> dict[str, Any]:
-    seconds, nanoseconds = divmod(capture_ns, 1_000_000_000)
-    return {"timestamp": {"sec": seconds, "nsec": nanoseconds}, "frame_id": "sensor"}
+def _stamped(capture_ns: int, **values: Any) -> bytes:
+    """A message of pictures."""
+    seconds, nanoseconds = divmod(capture_ns, NS_PER_S)
+    return json.dumps({"timestamp": {"sec": seconds, "nsec": nanoseconds}, "frame_id": "sensor"} | values).encode()
 
 
 def capture_ns_of_image(data: bytes) -> int:
     """The capture time that a colour or depth message carries. Raises ValueError."""
-    stamp = _required(_table(data), "timestamp")
-    if not isinstance(stamp, dict):
-        raise ValueError("timestamp is not an object")
-    seconds = whole(stamp.get("sec"), least=0, most=TIME_MAX_NS // NS_PER_S, problem=_of("timestamp.sec"))
-    return seconds * NS_PER_S + whole(stamp.get("nsec"), least=0, most=NS_PER_S - 1, problem=_of("timestamp.nsec"))
-
-
-def _coded_bytes(table: dict[str, Any]) -> bytes:
-    text = _required(table, "data")
-    if not isinstance(text, str):
-        raise ValueError("data is not text")
-    return base64.b64decode(text)  # raises ValueError
+    stamp = _read(Stamped, data).timestamp
+    return stamp.sec * NS_PER_S + stamp.nsec
 
 
 def colour_message(colour: U8, *, capture_ns: int) -> bytes:
@@ -223,13 +215,12 @@ def colour_message(colour: U8, *, capture_ns: int) -> bytes:
     done, jpeg = cv2.imencode(".jpg", colour[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
         raise ValueError("JPEG encoding failed")
-    text = base64.b64encode(jpeg.tobytes()).decode()
-    return json.dumps(_stamp(capture_ns) | {"data": text, "format": "jpeg"}).encode()
+    return _stamped(capture_ns, data=base64.b64encode(jpeg.tobytes()).decode(), format="jpeg")
 
 
 def colour_from_message(data: bytes, *, most_pixels: int = 1 << 26) -> U8:
     """(h, w, 3) back from `colour_message` (JPEG is lossy). Raises ValueError."""
-    coded = _coded_bytes(_table(data))
+    coded = base64.b64decode(_read(ColourImage, data).data)
     width, height = picture_size(coded)
     if max(width, height) > IMAGE_SIDE_MAX_PX or width * height > most_pixels:
         raise ValueError(f"a colour image has {width} by {height} pixels; at most {most_pixels:,}")
@@ -242,21 +233,17 @@ def colour_from_message(data: bytes, *, most_pixels: int = 1 << 26) -> U8:
 def depth_message(depth_mm: U16, *, capture_ns: int) -> bytes:
     """(h, w) depth as raw 16-bit little-endian numbers in JSON."""
     height, width = depth_mm.shape
-    raw = np.ascontiguousarray(depth_mm, dtype="<u2").tobytes()
-    record = _stamp(capture_ns) | {"width": width, "height": height, "encoding": "16UC1", "step": 2 * width}
-    return json.dumps(record | {"data": base64.b64encode(raw).decode()}).encode()
+    raw = base64.b64encode(np.ascontiguousarray(depth_mm, dtype="<u2").tobytes()).decode()
+    return _stamped(capture_ns, width=width, height=height, encoding="16UC1", step=2 * width, data=raw)
 
 
 def depth_from_message(data: bytes) -> U16:
     """(h, w) millimetres back from `depth_message`, exactly. Raises ValueError."""
-    record = _table(data)
-    width, height = (
-        whole(record.get(name), least=1, most=IMAGE_SIDE_MAX_PX, problem=_of(name)) for name in ("width", "height")
-    )
-    raw = _coded_bytes(record)
-    if len(raw) != 2 * width * height:
-        raise ValueError(f"{width} by {height} pixels of 16 bits don't have {len(raw)} bytes")
-    return np.frombuffer(raw, "<u2").reshape(height, width).astype(np.uint16)
+    image = _read(DepthImage, data)
+    raw = base64.b64decode(image.data)
+    if len(raw) != 2 * image.width * image.height:
+        raise ValueError(f"{image.width} by {image.height} pixels of 16 bits don't have {len(raw)} bytes")
+    return np.frombuffer(raw, "<u2").reshape(image.height, image.width).astype(np.uint16)
 
 
 def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
@@ -264,19 +251,15 @@ def calibration_message(intrinsics: Intrinsics, *, capture_ns: int) -> bytes:
     i = intrinsics
     matrix = [i.fx_px, 0.0, i.cx_px - 0.5, 0.0, i.fy_px, i.cy_px - 0.5, 0.0, 0.0, 1.0]
     projection = [*matrix[:3], 0.0, *matrix[3:6], 0.0, *matrix[6:], 0.0]
-    record = _stamp(capture_ns) | {"width": i.width_px, "height": i.height_px, "distortion_model": "", "D": []}
-    return json.dumps(record | {"K": matrix, "R": [1, 0, 0, 0, 1, 0, 0, 0, 1], "P": projection}).encode()
+    size = {"width": i.width_px, "height": i.height_px}
+    turn = [1, 0, 0, 0, 1, 0, 0, 0, 1]
+    return _stamped(capture_ns, **size, distortion_model="", D=[], K=matrix, R=turn, P=projection)
 
 
 def intrinsics_from_message(data: bytes) -> Intrinsics:
     """Back from `calibration_message`. Raises ValueError."""
-    record = _table(data)
-    width, height = (
-        whole(record.get(name), least=1, most=IMAGE_SIDE_MAX_PX, problem=_of(name)) for name in ("width", "height")
-    )
-    if not _has(record.get("K"), 9):
-        raise ValueError("K is not nine numbers")
-    k = [real(number, least=-1e6, most=1e6, problem=_of("K")) for number in record["K"]]
+    camera = _read(Camera, data)
+    k = camera.K
     if k[0] <= 0 or k[4] <= 0:
         raise ValueError(f"K: focal lengths of {k[0]:g} and {k[4]:g} pixels")
-    return Intrinsics(width, height, k[0], k[4], k[2] + 0.5, k[5] + 0.5)
+    return Intrinsics(camera.width, camera.height, k[0], k[4], k[2] + 0.5, k[5] + 0.5)

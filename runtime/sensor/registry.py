@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from runtime.clock import Clock
-from runtime.config import LimitSettings, SensorSettings, validated
+from runtime.config import SensorSettings, validated
 from runtime.errors import InputError, PhasestackError
 from runtime.sensor.base import Sensor
 from runtime.support.crash import written
@@ -13,43 +13,29 @@ from runtime.support.plausible import nearest
 from runtime.support.plugins import is_plugin, plugin_class
 
 
-def _replay(settings: SensorSettings, clock: Clock, latency_ms: float, limits: LimitSettings | None) -> Sensor:
+def _replay(settings: SensorSettings, clock: Clock, latency_ms: float) -> Sensor:
     from runtime.sensor.replay import ReplayDriver
 
     s = settings
-    return ReplayDriver(s.source, clock, loop=s.loop, start_s=s.start_s, latency_ms=latency_ms, limits=limits)
+    return ReplayDriver(s.source, clock, loop=s.loop, start_s=s.start_s, latency_ms=latency_ms)
 
 
-def _fixed(settings: SensorSettings, clock: Clock, latency_ms: float, limits: LimitSettings | None) -> Sensor:
-    from runtime.sensor.fixed import FixedDriver
+def _device(name: str) -> Callable[[SensorSettings, Clock, float], Sensor]:
+    """A driver whose class, `module:Class`, is imported when one is made."""
 
-    return FixedDriver(settings, clock)
+    def make(settings: SensorSettings, clock: Clock, latency_ms: float) -> Sensor:
+        driver: Sensor = plugin_class(f"runtime.sensor.{name}", Sensor, field="sensor.driver")(settings, clock)
+        return driver
 
-
-def _openni2(settings: SensorSettings, clock: Clock, latency_ms: float, limits: LimitSettings | None) -> Sensor:
-    from runtime.sensor.openni2 import OpenNI2Driver
-
-    return OpenNI2Driver(settings, clock)
+    return make
 
 
-def _usb_eyes(settings: SensorSettings, clock: Clock, latency_ms: float, limits: LimitSettings | None) -> Sensor:
-    from runtime.sensor.usb_eyes import UsbEyesDriver
-
-    return UsbEyesDriver(settings, clock)
-
-
-def _usb_camera(settings: SensorSettings, clock: Clock, latency_ms: float, limits: LimitSettings | None) -> Sensor:
-    from runtime.sensor.usb_camera import UsbCameraDriver
-
-    return UsbCameraDriver(settings, clock)
-
-
-_FACTORIES: dict[str, Callable[[SensorSettings, Clock, float, LimitSettings | None], Sensor]] = {
+_FACTORIES: dict[str, Callable[[SensorSettings, Clock, float], Sensor]] = {
     "replay": _replay,
-    "fixed": _fixed,
-    "openni2": _openni2,
-    "usb-eyes": _usb_eyes,
-    "usb-camera": _usb_camera,
+    "fixed": _device("fixed:FixedDriver"),
+    "openni2": _device("openni2:OpenNI2Driver"),
+    "usb-eyes": _device("usb_eyes:UsbEyesDriver"),
+    "usb-camera": _device("usb_camera:UsbCameraDriver"),
 }
 
 
@@ -58,12 +44,10 @@ def driver_names() -> tuple[str, ...]:
     return tuple(_FACTORIES)
 
 
-def open_sensor(
-    settings: SensorSettings, clock: Clock, *, latency_ms: float = 0.0, limits: LimitSettings | None = None
-) -> Sensor:
+def open_sensor(settings: SensorSettings, clock: Clock, *, latency_ms: float = 0.0) -> Sensor:
     """The configured driver, not yet opened: one of ours, or a class of the user's own (`module:Class`).
 
-    latency_ms: from capture to arrival, of what is only replayed; limits: of a recording's bytes, None: the defaults.
+    latency_ms: from capture to arrival, of what is only replayed.
 
     Raises InputError for a name that nobody knows or options that the class refuses, MissingPart for an SDK that is
     not installed.
@@ -74,7 +58,7 @@ def open_sensor(
     if name not in _FACTORIES:
         known = f"{', '.join(_FACTORIES)}, or a class of yours: module:Class"
         raise InputError("sensor", "driver", f"unknown: {name!r}{nearest(name, driver_names())}; known: {known}")
-    return _FACTORIES[name](settings, clock, latency_ms, limits)
+    return _FACTORIES[name](settings, clock, latency_ms)
 
 
 def _plugin(name: str, settings: SensorSettings, clock: Clock) -> Sensor:

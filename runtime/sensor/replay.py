@@ -11,13 +11,12 @@ from pathlib import Path
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
 from runtime.config import LimitSettings
-from runtime.errors import EndOfRecording, InputError, SensorLost, SensorTimeout
+from runtime.errors import EndOfRecording, InputError, SensorLost
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, SteppedSensor
 from runtime.sensor.recording import Recording
 
 ROUND_INTERVAL_MIN_NS = NS_PER_S // 240  # between the rounds of a looped recording: the fastest sensor's period
-ARRIVED_MAX = 1024  # samples in one answer: who was away for long gets them in several
 OLDER, SAME_INSTANT = "older than the sample before", "of the same instant as the sample before"
 
 log = logging.getLogger(__name__)
@@ -34,10 +33,7 @@ class ReplayDriver(SteppedSensor):
     Any rate and any gap is played as it was recorded. A sample that is no later than the one before it is not
     delivered; `refused` counts them by reason, and the first is told.
 
-    `next_sample` delivers every sample once, in order, and never waits: the caller's simulated clock is
-    advanced by the caller (a sample is available at `available_ns(frame)`). `read_arrived` waits for its clock to
-    reach a sample's availability and answers with all that are due; `read_newest`, like a camera, passes over
-    samples that newer ones overtook.
+    A sample arrives at its capture and the latency.
     """
 
     name = "replay"
@@ -96,7 +92,7 @@ class ReplayDriver(SteppedSensor):
             if frame.capture_ns - recording.first.capture_ns > self._limits.recording_s * NS_PER_S:
                 seconds = (frame.capture_ns - recording.first.capture_ns) / NS_PER_S
                 problem = f"sample {number} is {seconds:.6g} s after the first; at most {self._limits.recording_s:g}"
-                raise InputError(self.path, "capture_ns", f"{problem}")
+                raise InputError(self.path, "capture_ns", problem)
             last_ns = frame.capture_ns
             if frame.capture_ns >= start_ns:
                 yield frame
@@ -141,36 +137,6 @@ class ReplayDriver(SteppedSensor):
             raise EndOfRecording(f"{self.path}: no more samples")
         self._next = next(self._frames, None)
         return frame
-
-    def read_newest(self, timeout_s: float) -> SensorFrame:
-        frame = self._first_due(timeout_s)
-        now_ns = self._clock.now_ns()
-        while self._is_due(now_ns):
-            frame, self.skipped = self.next_sample(), self.skipped + 1
-        return frame
-
-    def read_arrived(self, timeout_s: float) -> list[SensorFrame]:
-        frames = [self._first_due(timeout_s)]
-        now_ns = self._clock.now_ns()
-        while len(frames) < ARRIVED_MAX and self._is_due(now_ns):
-            frames.append(self.next_sample())
-        return frames
-
-    def _is_due(self, now_ns: int) -> bool:
-        return self._next is not None and self.available_ns(self._next) <= now_ns
-
-    def _first_due(self, timeout_s: float) -> SensorFrame:
-        """The oldest unread sample, once it is available. Raises SensorTimeout, EndOfRecording, SensorLost."""
-        following = self.peek()
-        if following is None:
-            raise EndOfRecording(f"{self.path}: no more samples")
-        due_ns = self.available_ns(following)
-        deadline_ns = self._clock.now_ns() + round(timeout_s * NS_PER_S)
-        if due_ns > deadline_ns:
-            self._clock.sleep_until_ns(deadline_ns)
-            raise SensorTimeout(f"{self.path}: no sample within {timeout_s} s")
-        self._clock.sleep_until_ns(due_ns)
-        return self.next_sample()
 
     def close(self) -> None:
         self._frames = self._next = None

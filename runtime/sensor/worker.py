@@ -15,9 +15,12 @@ from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
 from runtime.sensor.device_clock import DeviceClock
+from runtime.sensor.samples import Samples
 from runtime.support.transient import is_retryable
 
 TIMEOUTS_TO_REOPEN = 2
+REOPEN_AFTER_S, REOPEN_AFTER_MAX_S = 0.25, 0.5  # the wait before a lost sensor is opened again doubles up to the second
+OPEN_TIMEOUT_S = 10.0  # an SDK that takes longer to open is given up and opened anew
 HANG_MARGIN_S = 0.5
 ABANDONED_MAX = 8
 QUEUE_MAX = 1024  # samples that wait to be read: four seconds of the fastest sensor
@@ -44,16 +47,16 @@ class SensorState(StrEnum):
 class _Attempt:
     """One thread with one driver. Once `abandoned`, nothing it says counts any more."""
 
-    def __init__(self, number: int, now_ns: int, limit_s: float) -> None:
+    def __init__(self, number: int, run: Callable[[_Attempt], None], *, wait_s: float, deadline_ns: int) -> None:
         self.number, self.abandoned = number, threading.Event()
-        self.deadline_ns = now_ns + round(limit_s * NS_PER_S)
-        self.thread: threading.Thread | None = None
+        self.wait_s, self.deadline_ns = wait_s, deadline_ns
+        self.thread = threading.Thread(target=run, args=(self,), name=f"sensor-{number}", daemon=True)
         self.received = 0
         self.times: DeviceClock | None = None  # of stamps that are not of this machine's clock
 
 
-class SensorWorker:
-    """Runs a driver in a thread of its own. No method blocks, `stop` but for its time-out."""
+class SensorWorker(Samples):
+    """Runs a driver in a thread of its own. No method blocks, `close` but for its time-out."""
 
     def __init__(self, make_driver: Callable[[], Sensor], settings: SensorSettings, clock: Clock) -> None:
         """make_driver: an unopened driver, a fresh one at each call."""
@@ -63,42 +66,47 @@ class SensorWorker:
         self._attempt: _Attempt | None = None
         self._hung: list[_Attempt] = []
         self._state, self.reason = SensorState.STOPPED, ""
-        self._passed_over = self._skipped = 0
+        self._skipped = 0  # samples that a newer one overtook, but those that the driver at hand counts
         self._refused: Counter[str] = Counter()
         self._driver: Sensor | None = None
-        self._serial = ""
+        self.serial = ""  # of the device, once it was open; it is reopened by this
         self.error: FatalError | None = None
         self.reopened = 0
 
     def start(self) -> None:
         """Begin, in the background."""
-        self._set(None, SensorState.OPENING, "")
+        self._state = SensorState.OPENING
         self._begin(0.0)
 
     def _begin(self, wait_s: float) -> None:
-        limit_s = wait_s + self._settings.open_timeout_s
         number = self._attempt.number + 1 if self._attempt else 1
-        attempt = _Attempt(number, self._clock.now_ns(), limit_s)
-        attempt.thread = threading.Thread(
-            target=self._run, args=(attempt, wait_s), name=f"sensor-{number}", daemon=True
-        )
-        self._attempt = attempt
-        attempt.thread.start()
+        deadline_ns = self._clock.now_ns() + round((wait_s + OPEN_TIMEOUT_S) * NS_PER_S)
+        self._attempt = _Attempt(number, self._run, wait_s=wait_s, deadline_ns=deadline_ns)
+        self._attempt.thread.start()
 
     def take(self) -> list[SensorFrame]:
-        """All samples that arrived and were not read yet, oldest first. Never waits."""
+        """All samples that arrived and were not read yet, oldest first."""
         self._watch()
         with self._lock:
             frames = list(self._queue)
             self._queue.clear()
         return frames
 
-    def newest(self) -> SensorFrame | None:
-        """The newest sample that was not read yet, or None; those that it overtook are counted. Never waits."""
+    def arrived(self, now_ns: int) -> list[SensorFrame]:
+        state = self.state  # asked first: its last samples come before it says that it is over
         frames = self.take()
+        if not frames and state is SensorState.ENDED:
+            raise EndOfRecording(self.reason)
+        if not frames and state is SensorState.FAILED:
+            raise self.error or FatalError(self.reason)
         with self._lock:
-            self._passed_over += max(0, len(frames) - 1)
-        return frames[-1] if frames else None
+            self._skipped += max(0, len(frames) - 1)
+        return frames
+
+    def fault(self) -> str:
+        if self.state in (SensorState.RUNNING, SensorState.OPENING, SensorState.ENDED):
+            return ""
+        return self.reason or str(self._state)
 
     @property
     def state(self) -> SensorState:
@@ -107,13 +115,11 @@ class SensorWorker:
         return self._state
 
     @property
-    def stale_inputs(self) -> int:
-        """Samples that a newer one overtook and that `take` never handed out."""
-        return self._passed_over + self._skipped + (self._driver.skipped if self._driver else 0)
+    def stale_inputs(self) -> int:  # type: ignore[override]
+        return self._skipped + (self._driver.skipped if self._driver else 0)
 
     @property
-    def refused_inputs(self) -> Mapping[str, int]:
-        """Samples that arrived and are none, by reason, as the driver tells them."""
+    def refused_inputs(self) -> Mapping[str, int]:  # type: ignore[override]
         return self._refused + Counter(self._driver.refused) if self._driver else self._refused
 
     @property
@@ -121,19 +127,12 @@ class SensorWorker:
         """Of the driver, once it was open."""
         return self._driver.capabilities if self._driver else None
 
-    @property
-    def serial(self) -> str:
-        """Of the device, once it was open; it is reopened by this."""
-        return self._serial
-
-    def stop(self, timeout_s: float = 1.0) -> None:
+    def close(self, timeout_s: float = 1.0) -> None:
         """Close the driver; where that takes longer than the time-out, leave it behind."""
-        attempt = self._attempt
+        attempt, self._attempt = self._attempt, None
         if attempt is not None:
             attempt.abandoned.set()
-            if attempt.thread is not None and attempt.thread is not threading.current_thread():
-                attempt.thread.join(timeout_s)
-        self._attempt = None
+            attempt.thread.join(timeout_s)
         self._state, self.reason = SensorState.STOPPED, ""
 
     def _watch(self) -> None:
@@ -146,11 +145,9 @@ class SensorWorker:
             self._watching.release()
 
     def _leave_behind(self, attempt: _Attempt | None) -> None:
-        if attempt is None or self._clock.now_ns() <= attempt.deadline_ns:
+        if attempt is None or self._clock.now_ns() <= attempt.deadline_ns or not attempt.thread.is_alive():
             return
-        if attempt.thread is None or not attempt.thread.is_alive():
-            return
-        self._hung = [a for a in self._hung if a.thread is not None and a.thread.is_alive()]
+        self._hung = [a for a in self._hung if a.thread.is_alive()]
         reason = f"a call into the sensor's driver does not return ({len(self._hung) + 1} left behind)"
         if not attempt.abandoned.is_set():
             log.warning("sensor: %s", reason)
@@ -160,11 +157,11 @@ class SensorWorker:
             self._hung.append(attempt)
         if len(self._hung) <= ABANDONED_MAX:
             self.reopened += 1
-            self._begin(self._settings.reopen_backoff_s)
+            self._begin(REOPEN_AFTER_S)
 
-    def _set(self, attempt: _Attempt | None, state: SensorState, reason: str) -> None:
+    def _set(self, attempt: _Attempt, state: SensorState, reason: str) -> None:
         with self._lock:
-            if attempt is None or not attempt.abandoned.is_set():
+            if not attempt.abandoned.is_set():
                 if state != self._state:
                     log.info("sensor: %s%s", state, f" ({reason})" if reason else "")
                 self._state, self.reason = state, reason
@@ -180,16 +177,15 @@ class SensorWorker:
     def _allow(self, attempt: _Attempt, limit_s: float) -> None:
         attempt.deadline_ns = self._clock.now_ns() + round(limit_s * NS_PER_S)
 
-    def _run(self, attempt: _Attempt, wait_s: float) -> None:
-        s = self._settings
-        backoff_s = s.reopen_backoff_s
+    def _run(self, attempt: _Attempt) -> None:
+        wait_s, backoff_s = attempt.wait_s, REOPEN_AFTER_S
         while not attempt.abandoned.wait(wait_s):
             driver: Sensor | None = None
             attempt.received = 0
             try:
                 driver = self._make()
-                driver.serial = driver.serial or self._serial
-                self._allow(attempt, s.open_timeout_s)
+                driver.serial = driver.serial or self.serial
+                self._allow(attempt, OPEN_TIMEOUT_S)
                 driver.open()
                 self._receive(attempt, driver)
             except EndOfRecording as error:
@@ -210,15 +206,15 @@ class SensorWorker:
                 self._set(attempt, SensorState.LOST, f"{type(error).__name__}: {error}")
             finally:
                 if driver is not None:
-                    self._allow(attempt, s.open_timeout_s)
+                    self._allow(attempt, OPEN_TIMEOUT_S)
                     driver.close()
                     self._account(driver)
             if attempt.abandoned.is_set():
                 return
             if attempt.received:
-                backoff_s = s.reopen_backoff_s
-            wait_s, backoff_s = backoff_s, min(2 * backoff_s, s.reopen_backoff_max_s)
-            self._allow(attempt, wait_s + s.open_timeout_s)
+                backoff_s = REOPEN_AFTER_S
+            wait_s, backoff_s = backoff_s, min(2 * backoff_s, REOPEN_AFTER_MAX_S)
+            self._allow(attempt, wait_s + OPEN_TIMEOUT_S)
             self.reopened += 1
 
     def _receive(self, attempt: _Attempt, driver: Sensor) -> None:
@@ -228,7 +224,7 @@ class SensorWorker:
         if attempt.abandoned.is_set():
             return
         with self._lock:
-            self._driver, self._serial = driver, driver.serial
+            self._driver, self.serial = driver, driver.serial
         while not attempt.abandoned.is_set():
             self._allow(attempt, s.timeout_s + HANG_MARGIN_S)
             try:
@@ -269,5 +265,5 @@ class SensorWorker:
         most = QUEUE_MAX if frame.colour is None and frame.depth_mm is None else PICTURES_MAX
         while len(self._queue) >= most:
             self._queue.popleft()
-            self._passed_over += 1
+            self._skipped += 1
         self._queue.append(frame)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from runtime.clock import MonotonicClock
+from runtime.clock import NS_PER_S, MonotonicClock
 from runtime.config import OutputSettings, Settings
 from runtime.daemon.solver_parts import SolverMaker
 from runtime.errors import PanelLost
@@ -58,7 +58,8 @@ def soaked(solutions: int, *, lost_every: int, look_every: int) -> Soak:
     sink = open_panels(OutputSettings(), SMALL, MonotonicClock(), context)
     settings = Settings.model_validate(SETTINGS)
     maker = SolverMaker(settings, SMALL, load_calibration(None), panels_group=lambda: sink.group)
-    host = SolverThread(maker, MonotonicClock(), late_s=60.0, abandon_s=0.05)
+    host = SolverThread(maker, MonotonicClock())
+    host._late_ns, host._abandon_ns = 60 * NS_PER_S, NS_PER_S // 20
     try:
         host.wait_ready()
         newest = 0

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -20,14 +21,16 @@ from runtime.sensor.base import Capabilities, Sensor
 
 SMALL: dict[str, Any] = {
     "stack": {"width_px": 192, "height_px": 108},
-    "sensor": {
-        "driver": "fragile", "timeout_s": 0.1, "reopen_backoff_s": 0.02, "reopen_backoff_max_s": 0.05,
-        "open_timeout_s": 0.3,
-    },
-    "tracker": {"hold_s": 0.1, "blend_s": 0.02},
+    "sensor": {"driver": "fragile", "timeout_s": 0.1},
+    "tracker": {"hold_s": 0.1},
     "model": {"name": "fast", "threads": 1, "backend": "opencv"},  # auto would be what the machine is like today
-    "loop": {"rate_hz": 200.0, "solver_late_s": 5.0, "solver_abandon_s": 60.0},  # a busy machine is no fault
-}  # fmt: skip
+    "loop": {"rate_hz": 200.0},
+}
+QUICK = {
+    "sensor.worker.REOPEN_AFTER_S": 0.02,
+    "sensor.worker.REOPEN_AFTER_MAX_S": 0.05,
+    "frame.policy.BLEND_S": 0.02,
+}
 
 
 class Plan:
@@ -80,9 +83,23 @@ class FragileDriver(Sensor):
 class Rig:
     """A run and the means to break it. Use as a context manager."""
 
-    def __init__(self, *, host: Any = None, recorder: Any = None, **changes: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        *,
+        host: Any = None,
+        recorder: Any = None,
+        late_s: float = 5.0,  # a busy machine is no fault
+        abandon_s: float = 60.0,
+        open_timeout_s: float = 0.3,
+        **changes: dict[str, Any],
+    ) -> None:
+        self._times = QUICK | {
+            "frame.solver_thread.LATE_S": late_s,
+            "frame.solver_thread.ABANDON_S": abandon_s,
+            "sensor.worker.OPEN_TIMEOUT_S": open_timeout_s,
+        }
         self.plan = Plan()
-        registry._FACTORIES["fragile"] = lambda settings, clock, latency_ms, limits: FragileDriver(self.plan, clock)
+        registry._FACTORIES["fragile"] = lambda settings, clock, latency_ms: FragileDriver(self.plan, clock)
         tables = {name: {**SMALL.get(name, {}), **changes.get(name, {})} for name in {**SMALL, **changes}}
         self.settings = Settings.model_validate(tables)
         self.host, self.recorder = host, recorder
@@ -91,6 +108,8 @@ class Rig:
 
     def __enter__(self) -> Rig:
         try:
+            for name, seconds in self._times.items():
+                self._cleanup.enter_context(patch(f"runtime.{name}", seconds))
             self.run: Run = build_run(
                 self.settings,
                 RunOptions(),

@@ -27,13 +27,13 @@ from runtime.support import progress
 from tests.content.gltf_files import bending_bar
 from tests.daemon.rig import SMALL, TRACKING, Rig
 
-STEADY = {"sensor": {"timeout_s": 5.0, "open_timeout_s": 20.0}, "tracker": {"hold_s": 20.0}}  # on a busy machine too
+STEADY: dict[str, Any] = {"sensor": {"timeout_s": 5.0}, "tracker": {"hold_s": 20.0}}  # on a busy machine too
 
 
 class Served:
     """A run with a daemon that listens; what is asked of it is answered while it refreshes."""
 
-    def __init__(self, folder: Path, **changes: dict[str, Any]) -> None:
+    def __init__(self, folder: Path, **changes: Any) -> None:
         self.config = folder / "phasestack.toml"
         self.server = StatusServer(folder / "status.sock", group="root", clock=MonotonicClock())
         self.daemon = Daemon(
@@ -42,7 +42,7 @@ class Served:
             notifier=Notifier(MonotonicClock(), {}),
             server=self.server,
         )
-        self.rig = Rig(host=self.daemon, **(STEADY | changes))
+        self.rig = Rig(host=self.daemon, open_timeout_s=20.0, **(STEADY | changes))
 
     def __enter__(self) -> Served:
         self.rig.__enter__()

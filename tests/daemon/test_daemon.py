@@ -18,7 +18,7 @@ import pytest
 from runtime.daemon.client import ask
 from runtime.errors import TransientError
 from tests.daemon.test_notify import Supervisor
-from tests.waiting import eventually
+from tests.waiting import PATIENT, eventually
 
 CONFIG = """
 [stack]
@@ -32,15 +32,13 @@ threads = 1
 backend = "opencv"
 [loop]
 rate_hz = 60.0
-solver_late_s = 60.0  # a busy machine is no fault
-solver_abandon_s = 600.0
 [service]
 socket = "{folder}/status.sock"
 log_format = "json"
 """
 
 
-PHASESTACK = (sys.executable, "-c", "from runtime.cli import main; main()")
+PHASESTACK = (sys.executable, "-c", PATIENT)
 
 
 class Daemon:

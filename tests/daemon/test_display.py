@@ -29,8 +29,6 @@ name = "fast"
 threads = 1
 [loop]
 rate_hz = 30.0
-solver_late_s = 60.0  # a busy machine is no fault
-solver_abandon_s = 600.0
 [service]
 socket = "{{folder}}/status.sock"
 [output]

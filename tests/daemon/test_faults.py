@@ -34,10 +34,11 @@ def rig() -> Iterator[Rig]:
 @pytest.fixture
 def steady() -> Iterator[Rig]:
     """The same, on a machine however busy: nothing is late, lost or left behind unless the test says so."""
-    patient = {"solver_late_s": 60.0, "solver_abandon_s": 600.0}
     with Rig(
-        loop=patient,
-        sensor={"timeout_s": 5.0, "open_timeout_s": 20.0},
+        late_s=60.0,
+        abandon_s=600.0,
+        open_timeout_s=20.0,
+        sensor={"timeout_s": 5.0},
         tracker={"hold_s": 20.0},
         plan={"enabled": False},
     ) as made:
@@ -294,7 +295,7 @@ def heard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Superviso
 @pytest.fixture
 def fed(heard: Supervisor) -> Iterator[Rig]:
     notifier = Notifier(MonotonicClock(), {"WATCHDOG_USEC": str(int(WATCHDOG_S * 1e6))})
-    with Rig(host=Watched(notifier), loop={"solver_late_s": 0.3}) as rig:
+    with Rig(host=Watched(notifier), late_s=0.3) as rig:
         rig.refresh_until_solved()
         rig.refresh_until(TRACKING)
         assert "WATCHDOG=1" in heard.heard()

@@ -110,9 +110,11 @@ def test_pictures_in_textures_are_solved_as_pictures_in_arrays_are(scene: str, m
     assert (np.abs(layers[0] - layers[1]) <= 1).mean() >= 0.999
 
 
-def test_a_lost_context_is_made_anew_from_the_settings() -> None:
+def test_a_lost_context_is_made_anew_from_the_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("runtime.frame.solver_thread.LATE_S", 60.0)
+    monkeypatch.setattr("runtime.frame.solver_thread.ABANDON_S", 0.1)
     maker = maker_of("gl")
-    host = SolverThread(maker, MonotonicClock(), late_s=60.0, abandon_s=0.1)
+    host = SolverThread(maker, MonotonicClock())
     try:
         host.wait_ready()
         host.post(wish())

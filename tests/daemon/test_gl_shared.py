@@ -178,8 +178,7 @@ def test_a_context_that_the_panels_lost_is_made_anew_with_the_solver(
     server: xserver.XServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DISPLAY", server.name)
-    loop = {"rate_hz": 100.0, "solver_late_s": 5.0, "solver_abandon_s": 0.2}
-    with Rig(model=MODEL, loop=loop, **on_windows()) as rig:
+    with Rig(model=MODEL, abandon_s=0.2, loop={"rate_hz": 100.0}, **on_windows()) as rig:
         rig.refresh_until_solved()
         parts, group = rig.run.parts, rig.presenter.panels.group
         monkeypatch.setattr("runtime.panels.window._reset_status", lambda: "was reset (0x8253)")

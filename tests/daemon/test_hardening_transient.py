@@ -125,8 +125,7 @@ class Refusing:
 @pytest.mark.parametrize(("number", "opened"), [(errno.EMFILE, True), (errno.ENOMEM, True), (errno.ENOENT, False)])
 def test_a_sensor_that_can_not_be_reopened_for_want_of_descriptors_is_tried_again(number: int, opened: bool) -> None:
     errors: list[Exception] = [read_by_a_reader(number), read_by_a_reader(number)]
-    settings = SensorSettings(reopen_backoff_s=0.01, reopen_backoff_max_s=0.02)
-    worker = SensorWorker(lambda: Refusing(errors), settings, MonotonicClock())
+    worker = SensorWorker(lambda: Refusing(errors), SensorSettings(), MonotonicClock())
     worker.start()
     try:
         if opened:
@@ -135,4 +134,4 @@ def test_a_sensor_that_can_not_be_reopened_for_want_of_descriptors_is_tried_agai
             assert eventually(lambda: worker.state is SensorState.FAILED, within_s=20)
             assert isinstance(worker.error, InputError)
     finally:
-        worker.stop()
+        worker.close()

@@ -14,13 +14,13 @@ from runtime.eyes.calibration import load_calibration
 from runtime.frame.pacing import Pacer
 from runtime.frame.presenter import Presenter, Refresh
 from runtime.frame.run_state import RunCell
-from runtime.frame.samples import Samples
 from runtime.frame.solver import SolverStep
 from runtime.frame.solver_host import News, SolverHost, Task
 from runtime.frame.viewer import Viewer
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.records import EyePoints, PanelFrame, PresentReport, SensorFrame, Solution, SolveRequest
+from runtime.sensor.samples import Samples
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 32, 18)
 EYES = np.array([[0.6, -0.031, 0.0], [0.6, 0.031, 0.0]])
@@ -49,7 +49,7 @@ class FakeSamples(Samples):
 
     def __init__(self) -> None:
         self.waiting: list[SensorFrame] = []
-        self.stale_inputs = 0
+        self.stale_inputs, self.refused_inputs, self.serial = 0, {}, "F-1"
         self.why = ""  # why there is no sensor
         self.ends_ns: int | None = None
         self._sequence = 0
@@ -70,10 +70,6 @@ class FakeSamples(Samples):
 
     def fault(self) -> str:
         return self.why
-
-    @property
-    def serial(self) -> str:
-        return "F-1"
 
     def close(self) -> None:
         """Nothing is held."""
@@ -170,7 +166,7 @@ class Stage:
     """A presenter on a test clock, among fakes; a sensor of `sensor_hz` sees the eyes where `eyes` says."""
 
     def __init__(self, *, sensor_hz: float = 60.0, **tables: dict[str, Any]) -> None:
-        defaults: dict[str, Any] = {"tracker": {"hold_s": 0.5, "blend_s": 0.3}, "plan": {"enabled": False}}
+        defaults: dict[str, Any] = {"plan": {"enabled": False}}
         merged = {name: {**defaults.get(name, {}), **tables.get(name, {})} for name in {**defaults, **tables}}
         self.settings = Settings.model_validate(merged)
         self.clock = SimulatedClock(NS_PER_S)

@@ -152,7 +152,7 @@ def test_a_lost_viewer_is_held_then_the_picture_goes_flat_evenly_and_comes_back_
     assert seen == [State.TRACKING, State.HOLDING, State.FLAT, State.TRACKING]
     assert all(f == 0.0 for f, state in zip(flatness, states, strict=True) if state is State.HOLDING)
     steps = np.abs(np.diff(flatness))
-    assert steps.max() == pytest.approx(PERIOD_NS / NS_PER_S / 0.3, rel=0.01)  # tracker.blend_s
+    assert steps.max() == pytest.approx(PERIOD_NS / NS_PER_S / 0.3, rel=0.01)  # BLEND_S
     assert max(flatness) == 1.0
     assert flatness[-1] == 0.0
     assert all(done.account.presented for done in stage.watching.refreshes)
@@ -364,9 +364,9 @@ def test_every_sample_reaches_the_viewer_and_the_observer_in_order() -> None:
 
 def test_other_settings_reach_the_viewer_with_the_next_refresh(stage: Stage) -> None:
     settings = stage.cell.state.settings
-    tracker = settings.tracker.model_copy(update={"hold_s": 0.0, "blend_s": 0.0})
+    tracker = settings.tracker.model_copy(update={"hold_s": 0.0})
     stage.cell.replace(settings=settings.model_copy(update={"tracker": tracker}))
     stage.eyes = lambda _: None
-    stage.refresh(10)
+    stage.refresh(30)
     assert stage.presenter.machine.state is State.FLAT
     assert stage.panels.frame.flatness == 1.0

@@ -12,12 +12,11 @@ import pytest
 from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
 from runtime.errors import FatalError, InputError
 from runtime.frame.solver import SolverStep
-from runtime.frame.solver_thread import ABANDONED_MAX, SolverThread
+from runtime.frame.solver_thread import ABANDON_S, ABANDONED_MAX, LATE_S, SolverThread
 from runtime.records import SolveRequest
 from tests.frame.fakes import FakeParts, aside, solution
 from tests.waiting import eventually
 
-LATE_S, ABANDON_S = 0.5, 10.0
 PATIENCE_S = 20.0  # of a test with another thread, on a busy machine
 
 Behaviour = Callable[[SolveRequest], SolverStep]
@@ -47,7 +46,7 @@ class Workshop:
         self.gates: list[threading.Event] = []  # of steps that hang
         self.hung: list[threading.Thread] = []  # that are, or were, in such a step
         self.closed: queue.Queue[str] = queue.Queue()  # names of the threads that closed parts
-        self.host = SolverThread(self._make, self.clock, late_s=LATE_S, abandon_s=ABANDON_S, first_cost_ns=7)
+        self.host = SolverThread(self._make, self.clock, first_cost_ns=7)
 
     def _make(self) -> FakeParts:
         assert self.open.wait(PATIENCE_S)
@@ -146,7 +145,7 @@ def test_what_can_t_be_made_is_raised_to_who_waits_for_it() -> None:
     def refuse() -> Any:
         raise InputError("model", "name", "is unknown")
 
-    shop.host = SolverThread(refuse, SimulatedClock(1), late_s=LATE_S, abandon_s=ABANDON_S)
+    shop.host = SolverThread(refuse, SimulatedClock(1))
     with pytest.raises(InputError, match="is unknown"):
         shop.host.wait_ready()
     shop.host.close(PATIENCE_S)
@@ -157,8 +156,6 @@ def test_who_waits_for_one_that_is_never_ready_gives_up() -> None:
     host = SolverThread(
         lambda: FakeParts(lambda _: SolverStep()) if gate.wait(PATIENCE_S) else None,
         MonotonicClock(),
-        late_s=LATE_S,
-        abandon_s=ABANDON_S,
     )
     with pytest.raises(FatalError, match=r"not ready after 0\.2 s"):
         host.wait_ready(most_s=0.2)
@@ -171,8 +168,6 @@ def test_who_waits_for_it_may_stop_waiting() -> None:
     host = SolverThread(
         lambda: FakeParts(lambda _: SolverStep()) if gate.wait(PATIENCE_S) else None,
         SimulatedClock(1),
-        late_s=LATE_S,
-        abandon_s=ABANDON_S,
     )
     told = []
     host.wait_ready(lambda: bool(told.append(None)))  # answers False

@@ -29,7 +29,6 @@ threads = 1
 backend = "opencv"
 [loop]
 rate_hz = 60.0
-solver_late_s = 10.0
 [service]
 socket = "s.sock"
 blackbox_folder = "boxes"

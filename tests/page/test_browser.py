@@ -18,7 +18,7 @@ import pytest
 
 from runtime.daemon.client import NotRunning, ask
 from tests.page.rig import CONFIGURATION, ROOT, page_of, short_folder
-from tests.waiting import eventually
+from tests.waiting import PATIENT, eventually
 
 pytestmark = pytest.mark.slow
 
@@ -41,7 +41,7 @@ class RunningDaemon:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        command = [sys.executable, "-m", "runtime.cli", "run", "--config", str(self._folder / "d.toml"), "--headless"]
+        command = [sys.executable, "-c", PATIENT, "run", "--config", str(self._folder / "d.toml"), "--headless"]
         environment = {**os.environ, "PYTHONPATH": str(ROOT)}
         with (self._folder / "log").open("ab") as log:
             self._process = subprocess.Popen(

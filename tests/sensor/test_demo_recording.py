@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from runtime.evaluation.demo_recording import demo_recording_bytes, samples
 from runtime.eyes.demo_geometry import demo_sensor_from_stack, demo_stack_from_sensor
-from runtime.sensor.demo_recording import demo_recording_bytes, samples, sensor_from_stack
 from runtime.sensor.replay import demo_recording_path
 
 FRAMES = list(samples())
@@ -32,9 +32,7 @@ def test_there_are_two_dropouts_and_a_blink() -> None:
     assert len(unsure) == 3 and np.ptp(unsure) == 2
 
 
-def test_generator_and_demo_geometry_put_the_sensor_at_the_same_place() -> None:
-    points = np.random.default_rng(0).normal(size=(20, 3))
+def test_the_demo_s_geometry_and_its_inverse_are_rotations() -> None:
     forward, back = demo_stack_from_sensor(), demo_sensor_from_stack()
-    np.testing.assert_allclose(sensor_from_stack(points) @ forward[:3, :3].T + forward[:3, 3], points, atol=1e-12)
     np.testing.assert_allclose(forward @ back, np.eye(4), atol=1e-12)
     assert np.linalg.det(forward[:3, :3]) > 0.999999

@@ -19,7 +19,7 @@ from runtime.sensor.usb_eyes import UsbEyesDriver
 from runtime.sensor.worker import SensorWorker
 from tests.sensor.fake_usb import FakeDevice, FakeUsb, packet
 
-SETTINGS = SensorSettings(driver="usb-eyes", source="", timeout_s=0.1, reopen_backoff_s=0.05)
+SETTINGS = SensorSettings(driver="usb-eyes", source="", timeout_s=0.1)
 PERIOD_S = 0.01
 
 
@@ -70,8 +70,7 @@ def test_eyes_stay_where_they_are_through_a_fault_and_after_it(fault: Callable[.
     truth = calibration.apply(packet(1).points).eyes_m
     end = time.monotonic() + 5
     while last < 90 and time.monotonic() < end:
-        frame = worker.newest()
-        if frame is not None:
+        for frame in worker.take():
             last = frame.sequence if frame.sequence > 40 or last < 40 else last
             tracker.update(calibration.apply(frame.eyes), capture_ns=frame.capture_ns)
         answer = tracker.at(clock.now_ns() + 20_000_000)
@@ -79,5 +78,5 @@ def test_eyes_stay_where_they_are_through_a_fault_and_after_it(fault: Callable[.
             assert np.abs(answer.eyes_m - truth).max() < 0.005
             labels.append(answer.label)
         time.sleep(0.002)
-    worker.stop()
+    worker.close()
     assert last >= 90 and labels[-1] == "predicted" and worker.reopened == 0

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from runtime.errors import InputError
+from runtime.evaluation.demo_recording import demo_recording_bytes, samples
 from runtime.records import EyePoints, Intrinsics, SensorFrame
-from runtime.sensor.demo_recording import demo_recording_bytes, samples
 from runtime.sensor.recording import Recording, RecordingLimits, recording_to
 from runtime.sensor.recording_format import RecordingHeader, eyes_message, frame_from_eyes_message
 

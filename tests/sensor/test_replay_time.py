@@ -49,7 +49,7 @@ def play(
 ) -> tuple[list[tuple[SensorFrame, int]], set[str], SensorWorker]:
     """Every sample that a worker hands out, with the time at which the reader got it, and the worker."""
     clock = MonotonicClock()
-    settings = SensorSettings(timeout_s=timeout_s, reopen_backoff_s=0.02)
+    settings = SensorSettings(timeout_s=timeout_s)
     worker = SensorWorker(lambda: ReplayDriver(str(path), clock, loop=loop, latency_ms=latency_ms), settings, clock)
     worker.start()
     got, states, end = [], set(), time.monotonic() + at_most_s
@@ -61,7 +61,7 @@ def play(
         if is_over and not frames:
             break
         time.sleep(busy_s)
-    worker.stop()
+    worker.close()
     return got, states, worker
 
 

@@ -18,7 +18,7 @@ from runtime.sensor.worker import SensorWorker
 from tests.sensor.fake_usb import FakeDevice, FakeUsb, Ticking, packet
 from tests.waiting import eventually
 
-SETTINGS = SensorSettings(driver="usb-eyes", source="", timeout_s=0.1, reopen_backoff_s=0.05)
+SETTINGS = SensorSettings(driver="usb-eyes", source="", timeout_s=0.1)
 
 
 def opened(device: FakeDevice) -> UsbEyesDriver:
@@ -80,26 +80,24 @@ def watched(bus: FakeUsb) -> SensorWorker:
     return worker
 
 
-@pytest.mark.parametrize("away_s", [1.0, pytest.param(60.0, marks=pytest.mark.slow)])
-def test_a_camera_unplugged_in_mid_stream_is_back_within_a_second_of_its_return(away_s: float) -> None:
+def test_a_camera_unplugged_in_mid_stream_is_back_within_a_second_of_its_return() -> None:
     device = FakeDevice(stream=Ticking())
     bus = FakeUsb(device, FakeDevice(serial="ANOTHER", ids=(0x8086, 0x0B07), address=9))
     worker = watched(bus)
-    assert eventually(lambda: worker.newest() is not None)
+    assert eventually(worker.take)
     bus.devices.remove(device)
     assert eventually(lambda: worker.state == "lost")
     # Meanwhile another tracker is plugged in: it is not taken for the one that left.
     bus.devices.append(FakeDevice(serial="B2", address=7, stream=Ticking()))
-    time.sleep(away_s)
-    while worker.newest() is not None:
-        pass
+    time.sleep(0.5)
+    worker.take()
     assert worker.state == "lost"
     bus.devices.append(FakeDevice(serial="A1", address=8, stream=Ticking()))
     returned = time.monotonic()
-    assert eventually(lambda: worker.newest() is not None)
+    assert eventually(worker.take)
     assert time.monotonic() - returned < 1.0
     assert worker.serial == "A1"
-    worker.stop()
+    worker.close()
 
 
 def test_after_ten_seconds_worth_of_garbage_a_reset_brings_the_device_back() -> None:
@@ -109,7 +107,7 @@ def test_after_ten_seconds_worth_of_garbage_a_reset_brings_the_device_back() -> 
     worker = watched(FakeUsb(device))
     assert eventually(lambda: device.resets > 0)
     assert eventually(lambda: worker.state == "running")
-    worker.stop()
+    worker.close()
 
 
 def test_a_stream_that_stalls_without_an_error_is_reset_and_comes_back() -> None:
@@ -118,8 +116,8 @@ def test_a_stream_that_stalls_without_an_error_is_reset_and_comes_back() -> None
     device = FakeDevice(stream=lambda: b"" if state["stalled"] else ticking())
     device.on_reset = lambda: state.update(stalled=False)
     worker = watched(FakeUsb(device))
-    assert eventually(lambda: worker.newest() is not None)
+    assert eventually(worker.take)
     state["stalled"] = True
     assert eventually(lambda: device.resets == 1)
-    assert eventually(lambda: worker.newest() is not None and worker.state == "running")
-    worker.stop()
+    assert eventually(lambda: worker.take() and worker.state == "running")
+    worker.close()

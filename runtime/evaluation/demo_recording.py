@@ -1,9 +1,8 @@
 """Makes the built-in recording: a viewer who leans, comes near, goes far, and looks from the side.
 
-    python -m runtime.sensor.demo_recording [FILE.mcap]
+    python -m runtime.evaluation.demo_recording [FILE.mcap]
 
-Seeded and deterministic to the byte. The sensor's place is that of `runtime.eyes.demo_geometry` (the stages
-do not import each other; a test holds the two together).
+Seeded and deterministic to the byte.
 """
 
 from __future__ import annotations
@@ -16,6 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from runtime.clock import NS_PER_S
+from runtime.eyes.demo_geometry import demo_sensor_from_stack
+from runtime.eyes.motions import minimum_jerk
 from runtime.optics.views import stack_from_eye
 from runtime.records import F64, EyePoints, SensorFrame
 from runtime.sensor.recording import RecordingWriter
@@ -25,7 +26,6 @@ from runtime.support.artifacts import write_bytes
 
 RATE_HZ, SECONDS, SEED = 30, 10, 20240229
 IPD_M, NOISE_M = 0.062, 0.0025
-SENSOR_POSITION_M, SENSOR_TILT_DOWN_DEG = (0.05, 0.02, 0.22), 10.0
 NO_FACE_S = ((2.0, 2.2), (5.0, 5.8))
 BLINK_S, BLINK_CONFIDENCE, BLINK_NOISE = (7.5, 7.6), 0.2, 2.0
 # Time s, distance m, azimuth deg (towards the viewer's right), height m, roll deg; at rest in each.
@@ -45,11 +45,8 @@ POSES = np.array(
 
 def true_eyes(time_s: float) -> F64:
     """(2, 3) left and right eye in `stack`, metres: the head faces the display, and tilts."""
-    index = int(np.clip(np.searchsorted(POSES[:, 0], time_s, side="right") - 1, 0, len(POSES) - 2))
-    before, after = POSES[index], POSES[index + 1]
-    s = float(np.clip((time_s - before[0]) / (after[0] - before[0]), 0.0, 1.0))
-    # The minimum-jerk profile of human movements (Flash and Hogan 1985).
-    _, distance, azimuth_deg, height, roll_deg = before + (after - before) * (s**3 * (10 + s * (6 * s - 15)))
+    (pose_now,) = minimum_jerk(np.array([time_s]), knots_s=POSES[:, 0], values=POSES[:, 1:])
+    distance, azimuth_deg, height, roll_deg = pose_now
     azimuth, roll = np.deg2rad(azimuth_deg), np.deg2rad(roll_deg)
     middle = np.array([distance * np.cos(azimuth), distance * np.sin(azimuth), height])
     pose = stack_from_eye(middle)
@@ -57,18 +54,9 @@ def true_eyes(time_s: float) -> F64:
     return np.array([middle - IPD_M / 2 * towards_right, middle + IPD_M / 2 * towards_right])
 
 
-def sensor_from_stack(points_m: F64) -> F64:
-    """(n, 3) points of `stack` in the sensor's frame (+x image right, +y down, +z away)."""
-    tilt = np.deg2rad(SENSOR_TILT_DOWN_DEG)
-    c, s = np.cos(tilt), np.sin(tilt)
-    axes = np.array([[0.0, -1.0, 0.0], [-s, 0.0, -c], [c, 0.0, -s]])  # rows: the sensor's axes in `stack`
-    result: F64 = (points_m - np.array(SENSOR_POSITION_M)) @ axes.T
-    return result
-
-
 def samples() -> Iterator[SensorFrame]:
     """The recording's samples."""
-    random = np.random.default_rng(SEED)
+    random, sensor = np.random.default_rng(SEED), demo_sensor_from_stack()
     for k in range(RATE_HZ * SECONDS):
         time_s = k / RATE_HZ
         truth = true_eyes(time_s)
@@ -79,7 +67,7 @@ def samples() -> Iterator[SensorFrame]:
         yield SensorFrame(
             sequence=k + 1,
             capture_ns=NS_PER_S + k * NS_PER_S // RATE_HZ,
-            eyes=None if lost else EyePoints(sensor_from_stack(truth) + noise, confidence),
+            eyes=None if lost else EyePoints(truth @ sensor[:3, :3].T + sensor[:3, 3] + noise, confidence),
             true_eyes_m=truth,
         )
 

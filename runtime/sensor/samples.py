@@ -1,0 +1,72 @@
+"""Where a run's samples come from: a sensor thread in real time (`worker`), or a recording on the simulated clock."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+
+from runtime.clock import NS_PER_S
+from runtime.errors import EndOfRecording, InputError
+from runtime.records import SensorFrame
+from runtime.sensor.base import Sensor, SteppedSensor
+
+AHEAD_NS = NS_PER_S // 10  # more than from a sample to the light of a refresh that used it
+
+
+class Samples(ABC):
+    """The presenter's view of the sensor; nothing here waits or lets time pass."""
+
+    stale_inputs: int  # samples that a newer one overtook before they were looked at
+    refused_inputs: Mapping[str, int]  # samples that arrived and are none, by reason, as the driver says
+    serial: str  # the sensor's, where it is known
+
+    @abstractmethod
+    def arrived(self, now_ns: int) -> list[SensorFrame]:
+        """Samples that have arrived and were not given yet, in order. Raises EndOfRecording, FatalError."""
+
+    def fault(self) -> str:
+        """Why there is no sensor now; empty while all is well."""
+        return ""
+
+    def recorded_ahead(self) -> list[SensorFrame]:
+        """Samples of the next moment that a recording holds already; [] of a sensor. For what was known afterwards."""
+        return []
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let the sensor go. May be called twice."""
+
+
+class RecordedSamples(Samples):
+    """A recording on the simulated clock: each sample arrives at its capture plus the configured latency."""
+
+    def __init__(self, driver: Sensor) -> None:
+        """Raises InputError where the driver can't be stepped, or the recording can't be read."""
+        if not isinstance(driver, SteppedSensor):
+            raise InputError("run", "--max-speed", f"needs a recording, not the sensor {driver.name}")
+        self._driver = driver
+        self.stale_inputs = 0
+        driver.open()
+        self.serial, self.refused_inputs = driver.serial, driver.refused
+
+    def arrived(self, now_ns: int) -> list[SensorFrame]:
+        if self._driver.peek() is None:
+            raise EndOfRecording("no more samples")
+        frames = self._next_while(lambda frame: self._driver.available_ns(frame) <= now_ns)
+        self.stale_inputs += max(0, len(frames) - 1)
+        return frames
+
+    def recorded_ahead(self) -> list[SensorFrame]:
+        first = self._driver.peek()
+        if first is None:
+            return []
+        return self._next_while(lambda frame: frame.capture_ns - first.capture_ns < AHEAD_NS)
+
+    def _next_while(self, holds: Callable[[SensorFrame], bool]) -> list[SensorFrame]:
+        frames = []
+        while (following := self._driver.peek()) is not None and holds(following):
+            frames.append(self._driver.next_sample())
+        return frames
+
+    def close(self) -> None:
+        self._driver.close()

@@ -1,0 +1,12 @@
+"""What all tests of sensors share."""
+
+from __future__ import annotations
+
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def quick_to_reopen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lost sensor is opened again at once."""
+    monkeypatch.setattr("runtime.sensor.worker.REOPEN_AFTER_S", 0.02)
+    monkeypatch.setattr("runtime.sensor.worker.REOPEN_AFTER_MAX_S", 0.1)
