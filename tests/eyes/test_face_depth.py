@@ -7,6 +7,8 @@ import pytest
 
 from runtime.config import Settings
 from runtime.eyes.detect import EyeFinder, covariance
+from runtime.eyes.face_depth import FaceDepth
+from runtime.eyes.pupils import CORNERS, Pupils
 from runtime.records import SensorFrame
 from tests.eyes.scene import IPD_M, camera, frame, scene
 
@@ -74,6 +76,35 @@ def test_depth_that_stops_is_bridged_by_this_viewers_eye_distance() -> None:
         assert np.abs(found.eyes_m[:, 2] - truth[:, 2]).max() < 0.009
         sigmas.append(np.sqrt(found.covariance_m2[2, 2]))
     assert sigmas[-1] > sigmas[9]
+
+
+@pytest.mark.parametrize("has_depth", [False, True])
+@pytest.mark.parametrize("place", [(0.3, 0.05, 0.6), (-0.2, -0.25, 0.6), (0.0, 0.0, 0.6)])
+def test_the_eyes_of_a_head_beside_the_picture_s_middle_are_across_its_line_of_sight(
+    place: tuple[float, float, float], has_depth: bool
+) -> None:
+    """A head that looks into the camera: one eye is nearer to the picture's plane than the other."""
+    middle = np.array(place)
+    sight = middle / np.linalg.norm(middle)
+    across = np.array([sight[2], 0.0, -sight[0]]) / np.hypot(sight[0], sight[2])
+    axes = np.array([across, np.cross(sight, across)])
+    eyes = middle + np.outer([IPD_M / 2, -IPD_M / 2], across)
+    face = middle + np.random.default_rng(1).normal(0, 0.02, (468, 2)) @ axes
+    for eye, corners in zip(eyes, CORNERS, strict=True):
+        face[list(corners)] = eye + np.outer([0.012, -0.012], across)
+    mesh_px = np.column_stack([seen(face), np.zeros(468)])  # the mesh has nothing of it along the line of sight
+    pupils = Pupils(seen(eyes), 0.3, mesh_px, 12.0, "found", "", 1.0)
+    rows, columns = np.mgrid[0:480, 0:640] + 0.5
+    rays = np.stack([(columns - CAMERA.cx_px) / CAMERA.fx_px, (rows - CAMERA.cy_px) / CAMERA.fy_px], 2)
+    depth_mm = np.rint(1000 * (sight @ middle) / (rays @ sight[:2] + sight[2])).astype(np.uint16)
+    found = FaceDepth(eye_distance_m=IPD_M).at(pupils, depth_mm if has_depth else None, CAMERA, np.ones(2))
+    assert np.abs(found.eyes_m - eyes[:, 2]).max() < 0.001
+    assert found.measured == has_depth
+
+
+def seen(points_m: np.ndarray) -> np.ndarray:
+    """(n, 2) pixels of points."""
+    return points_m[:, :2] / points_m[:, 2:] * CAMERA.fx_px + [CAMERA.cx_px, CAMERA.cy_px]
 
 
 @pytest.mark.parametrize("depth_mm", [0, 90, 9000], ids=["nothing", "too near", "the wall"])
