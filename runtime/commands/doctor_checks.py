@@ -131,8 +131,7 @@ def opengl(settings: Settings) -> Iterator[Row]:
 def monitors(settings: Settings) -> Iterator[Row]:
     """Each panel has its monitor."""
     from runtime.errors import InputError, PanelLost
-    from runtime.panels.modes import check_mode, refresh_difference
-    from runtime.panels.monitors import bind, check_shape
+    from runtime.panels.monitors import bind, check_modes, refresh_difference
     from runtime.panels.registry import panel_settings
 
     if settings.output.kind == "offscreen":
@@ -151,10 +150,8 @@ def monitors(settings: Settings) -> Iterator[Row]:
     panels = panel_settings(settings.output, len(settings.stack.x_m))
     try:
         bound = bind(panels, there)
-        for number, (panel, monitor) in enumerate(zip(panels, bound, strict=True)):
-            size = {"width_px": settings.stack.width_px, "height_px": settings.stack.height_px}
-            check_shape(number, panel, monitor, **size)
-            check_mode(number, panel, monitor, **size, allow_rescaling=settings.output.allow_rescaling)
+        size = {"width_px": settings.stack.width_px, "height_px": settings.stack.height_px}
+        check_modes(panels, bound, **size, allow_rescaling=settings.output.allow_rescaling)
     except (InputError, PanelLost) as error:
         yield Row("panels", "fail", str(error), remedy)
         return

@@ -38,8 +38,8 @@ class Lenient(Section):
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
 
-class ResidualTable(Lenient):
-    """`[residuals]`: how well the pairs fit, metres."""
+class Residuals(Lenient):
+    """`[residuals]`: how well the pairs fit the matrix, metres, in `stack`."""
 
     rms_m: Annotated[float, Field(ge=0)]
     max_m: Annotated[float, Field(ge=0)]
@@ -77,23 +77,13 @@ class CalibrationFile(Lenient):
     panel_ids: tuple[str, ...] = ()
     pairs: Annotated[int, Field(ge=0)] = 0
     condition: Annotated[float, Field(ge=0)] | None = None
-    residuals: ResidualTable | None = None
+    residuals: Residuals | None = None
     covariance: CovarianceTable | None = None
 
     @field_validator("date", mode="before")
     @classmethod
     def _date_text(cls, value: Any) -> Any:
         return value.isoformat() if isinstance(value, datetime.date) else value
-
-
-@dataclass(frozen=True, slots=True)
-class Residuals:
-    """How well the pairs fit the matrix, metres, in `stack`."""
-
-    rms_m: float
-    max_m: float
-    axis_rms_m: F64  # (3,)
-    leave_one_out_rms_m: float | None = None  # None: not known
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,17 +123,16 @@ class Calibration:
             covariance_m2=None if covariance is None else turn @ covariance @ turn.T,
         )
 
-    def position_covariance(self, stack_m: ArrayLike) -> F64 | None:
-        """(..., 3, 3) covariance, m², of points (..., 3) in `stack` due to the calibration alone; None: not known."""
+    def position_error_m(self, stack_m: ArrayLike) -> F64 | None:
+        """(...) expected (RMS) distance, m, by which points (..., 3) in `stack` are off due to the calibration alone.
+
+        None where that is not known.
+        """
         if self.covariance is None or self.pivot_m is None:
             return None
         jacobian = position_jacobian(stack_m, pivot_m=self.pivot_m)
-        return jacobian @ self.covariance @ np.swapaxes(jacobian, -1, -2)
-
-    def position_error_m(self, stack_m: ArrayLike) -> F64 | None:
-        """(...) expected (RMS) distance, m, by which points (..., 3) in `stack` are off; None where not known."""
-        covariance = self.position_covariance(stack_m)
-        return None if covariance is None else np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
+        spread = jacobian @ self.covariance @ np.swapaxes(jacobian, -1, -2)
+        return np.sqrt(np.trace(spread, axis1=-2, axis2=-1))
 
     def serial_warning(self, serial: str) -> str:
         """One line where a sensor is not the one that was calibrated, else an empty text."""
@@ -220,17 +209,6 @@ def _warnings(matrix: F64, source: str) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _residuals(table: ResidualTable | None) -> Residuals | None:
-    if table is None:
-        return None
-    return Residuals(
-        rms_m=table.rms_m,
-        max_m=table.max_m,
-        axis_rms_m=np.array(table.axis_rms_m),
-        leave_one_out_rms_m=table.leave_one_out_rms_m,
-    )
-
-
 def load_calibration(path: Path | None) -> Calibration:
     """A calibration file, checked; None: the built-in one of the demo recording.
 
@@ -256,7 +234,7 @@ def load_calibration(path: Path | None) -> Calibration:
         panel_ids=parsed.panel_ids,
         pairs=parsed.pairs,
         condition=parsed.condition,
-        residuals=_residuals(parsed.residuals),
+        residuals=parsed.residuals,
         pivot_m=None if spread is None else np.array(spread.pivot_m),
         covariance=None if spread is None else np.array(spread.matrix),
         warnings=_warnings(matrix, source),

@@ -12,7 +12,7 @@ import moderngl
 
 from runtime.errors import MissingPart, PanelLost
 from runtime.panels import edid, xlib
-from runtime.panels.monitors import Monitor, in_order
+from runtime.panels.monitors import Monitor, Rectangle, in_order
 from runtime.support.gl import MINIMUM_VERSION
 from runtime.support.gl_sharing import ShareGroup, shared
 
@@ -46,7 +46,7 @@ class WindowContext:
         """The window owns its context."""
 
 
-@dataclass
+@dataclass(eq=False)
 class Window:
     """A GLFW window and its moderngl context."""
 
@@ -118,14 +118,14 @@ class Display:
         handle = glfw.create_window(monitor.width_px, monitor.height_px, title, handles[monitor.connector], share)
         return self._adopt(handle)
 
-    def spanning_window(self, *, x_px: int, y_px: int, width_px: int, height_px: int, title: str) -> Window:
+    def spanning_window(self, place: Rectangle, *, title: str) -> Window:
         """One borderless window over a part of the X screen, whatever monitors are there."""
         share = self.root.handle
         glfw.window_hint(glfw.VISIBLE, False)
         glfw.window_hint(glfw.DECORATED, False)
-        handle = glfw.create_window(width_px, height_px, title, None, share)
+        handle = glfw.create_window(place.width_px, place.height_px, title, None, share)
         glfw.window_hint(glfw.DECORATED, True)
-        glfw.set_window_pos(handle, x_px, y_px)
+        glfw.set_window_pos(handle, place.x_px, place.y_px)
         glfw.show_window(handle)
         return self._adopt(handle)
 
@@ -182,21 +182,24 @@ class Display:
     def output_state(self, connector: str) -> xlib.OutputState | None:
         """What an output sends now, and to which monitor; None: nothing, or it has gone."""
         output = self._outputs.get(connector)
-        return None if output is None else xlib.output_state(self._pointer, output)
+        return xlib.output_state(self._pointer, output) if output else None
 
-    def window_state(self, window: Window) -> xlib.WindowState | None:
-        """Where a window is now; None: somebody destroyed it."""
-        return xlib.window_state(self._pointer, glfw.get_x11_window(window.handle))
+    def window_state(self, window: Window) -> tuple[bool, Rectangle] | None:
+        """Whether a window and all above it are mapped, and where it is now; None: somebody destroyed it."""
+        refused = xlib.refusals()
+        place = Rectangle(*glfw.get_window_pos(window.handle), *glfw.get_window_size(window.handle))
+        is_viewable = bool(glfw.get_window_attrib(window.handle, glfw.VISIBLE))
+        return (is_viewable, place) if xlib.refusals() == refused else None
 
     @property
     def _pointer(self) -> int:
         return _address(glfw.get_x11_display())
 
     def _pairs(self) -> list[tuple[Monitor, Any]]:
-        self._outputs = xlib.outputs(self._pointer)
-        pairs = []
+        self._outputs, pairs = {}, []
         for handle in glfw.get_monitors():
             connector = glfw.get_monitor_name(handle).decode()
+            self._outputs[connector] = glfw.get_x11_monitor(handle)
             mode = glfw.get_video_mode(handle)
             x_px, y_px = glfw.get_monitor_pos(handle)
             state = self.output_state(connector)

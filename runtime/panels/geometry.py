@@ -8,8 +8,6 @@ import numpy as np
 
 from runtime.records import F64
 
-IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
 
 def panel_size_px(*, screen_width_px: int, screen_height_px: int, rotation_deg: int) -> tuple[int, int]:
     """Columns and rows of a panel as the viewer sees it, from those of its monitor."""

@@ -16,17 +16,6 @@ ENTRIES = 256
 COLUMNS = ("phase", "red", "green", "blue")
 
 
-def identity() -> F32:
-    """(256, 3) grey in [0, 1] for each 8-bit phase and channel: the grey is the phase."""
-    return gamma_curve(1.0)
-
-
-def gamma_curve(gamma: float) -> F32:
-    """(256, 3) grey = phase^(1/gamma), for a panel whose phase is grey^gamma."""
-    phase = np.linspace(0.0, 1.0, ENTRIES)
-    return np.repeat((phase ** (1.0 / gamma))[:, None], 3, axis=1).astype(np.float32)
-
-
 def measured_curve(path: Path) -> F32:
     """(256, 3) grey from a CSV with columns phase, red, green, blue (or phase, grey), all in [0, 1].
 
@@ -64,5 +53,11 @@ def measured_curve(path: Path) -> F32:
 
 
 def curve(*, lut: str, gamma: float) -> F32:
-    """(256, 3) grey of one panel: its measured curve, or else its gamma. Raises InputError."""
-    return measured_curve(Path(lut)) if lut else gamma_curve(gamma)
+    """(256, 3) grey in [0, 1] for each 8-bit phase and channel: a panel's measured curve, or else its gamma's.
+
+    A panel's phase is then grey^gamma. Raises InputError.
+    """
+    if lut:
+        return measured_curve(Path(lut))
+    phase = np.linspace(0.0, 1.0, ENTRIES)
+    return np.repeat((phase ** (1.0 / gamma))[:, None], 3, axis=1).astype(np.float32)

@@ -1,15 +1,30 @@
-"""Which monitor is which panel: by EDID serial, else connector, else explicit index. Never by a guess."""
+"""Which monitor is which panel: by EDID serial, else connector, else explicit index, never by a guess; and whether
+their modes fit the stack: phases must reach the panel's pixels as they are, at one rate."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from runtime.config import PanelSettings
 from runtime.errors import InputError, PanelLost
 from runtime.panels.geometry import panel_size_px
 
 ASPECT_TOLERANCE = 0.01
+REFRESH_TOLERANCE_HZ = 0.05  # 59.94 and 60 Hz drift apart by a frame in 17 s
+
+
+class Rectangle(NamedTuple):
+    """A part of the X screen, pixels, from its top left corner."""
+
+    x_px: int
+    y_px: int
+    width_px: int
+    height_px: int
+
+    def __str__(self) -> str:
+        return f"{self.width_px}x{self.height_px}+{self.x_px}+{self.y_px}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,11 +40,15 @@ class Monitor:
     height_px: int
     refresh_hz: float  # 0: unknown
 
+    @property
+    def place(self) -> Rectangle:
+        """What it shows of the X screen."""
+        return Rectangle(self.x_px, self.y_px, self.width_px, self.height_px)
+
     def __str__(self) -> str:
         serial = f", serial {self.serial}" if self.serial else ""
         model = f" {self.model}" if self.model else ""
-        size = f"{self.width_px}x{self.height_px}+{self.x_px}+{self.y_px}"
-        return f"{self.connector}{model} ({size}{serial})"
+        return f"{self.connector}{model} ({self.place}{serial})"
 
 
 def in_order(monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
@@ -79,13 +98,39 @@ def _find(number: int, panel: PanelSettings, monitors: tuple[Monitor, ...]) -> M
     raise PanelLost(f"panel {number}: {problem} with {' and '.join(wanted)} (there are: {there})")
 
 
-def check_shape(number: int, panel: PanelSettings, monitor: Monitor, *, width_px: int, height_px: int) -> None:
-    """Raises PanelLost where a monitor's mode has another shape than the panel: its picture would be distorted."""
-    columns, rows = panel_size_px(
-        screen_width_px=monitor.width_px, screen_height_px=monitor.height_px, rotation_deg=panel.rotation_deg
-    )
-    if abs(columns * height_px / (rows * width_px) - 1.0) > ASPECT_TOLERANCE:
-        raise PanelLost(
-            f"panel {number}: {monitor.connector} shows {columns}x{rows} (mounted at {panel.rotation_deg} degrees), "
-            f"the stack is {width_px}x{height_px}: set its mode or rotation_deg"
+def check_modes(
+    panels: Sequence[PanelSettings],
+    monitors: Sequence[Monitor],
+    *,
+    width_px: int,
+    height_px: int,
+    allow_rescaling: bool,
+) -> None:
+    """Raise PanelLost where a monitor's mode has another shape than the stack, or, unless allowed, other pixels.
+
+    A picture of another shape is distorted. A phase between two pixels' phases is none that was solved for: a rescaled
+    layer shows neither eye its picture.
+    """
+    for number, (panel, monitor) in enumerate(zip(panels, monitors, strict=True)):
+        columns, rows = panel_size_px(
+            screen_width_px=monitor.width_px, screen_height_px=monitor.height_px, rotation_deg=panel.rotation_deg
         )
+        shows = f"panel {number}: {monitor.connector} shows {columns}x{rows}"
+        if abs(columns * height_px / (rows * width_px) - 1.0) > ASPECT_TOLERANCE:
+            mounted = f"mounted at {panel.rotation_deg} degrees"
+            raise PanelLost(f"{shows} ({mounted}), the stack is {width_px}x{height_px}: set its mode or rotation_deg")
+        if (columns, rows) != (width_px, height_px) and not allow_rescaling:
+            raise PanelLost(
+                f"{shows}, the stack is {width_px}x{height_px}: phases would be rescaled. Set its mode or "
+                "stack.width_px and height_px, or output.allow_rescaling = true"
+            )
+
+
+def refresh_difference(monitors: Sequence[Monitor]) -> str:
+    """One line where the panels' monitors refresh at different rates, else an empty text; unknown rates (0) pass."""
+    known = [monitor for monitor in monitors if monitor.refresh_hz > 0]
+    rates = [monitor.refresh_hz for monitor in known]
+    if not rates or max(rates) - min(rates) <= REFRESH_TOLERANCE_HZ:
+        return ""
+    each = ", ".join(f"{monitor.connector} {monitor.refresh_hz:.2f} Hz" for monitor in known)
+    return f"the panels refresh at different rates ({each}): a frame is not on all of them at once"

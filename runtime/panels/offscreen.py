@@ -9,7 +9,7 @@ from runtime.clock import Clock
 from runtime.config import PanelSettings
 from runtime.errors import PanelLost
 from runtime.panels.base import PanelSink
-from runtime.panels.presentation import FrameTextures, Mounting, Painter, check
+from runtime.panels.presentation import FrameTextures, Painter
 from runtime.records import U8, PanelFrame, PresentReport
 from runtime.support.gl_sharing import ShareGroup, shared
 
@@ -35,25 +35,15 @@ class OffscreenPanels(PanelSink):
         """`width_px` by `height_px` is the panel as the viewer sees it. Raises InputError for a bad curve."""
         self._context, self._clock = context, clock
         self._size = (width_px, height_px)
-        self._count = len(panels)
         self._frame: PanelFrame | None = None
         self._group = shared()
-        self._textures: FrameTextures | None = FrameTextures(
-            context, width_px=width_px, height_px=height_px, count=self._count, group=self._group
-        )
+        self._textures = FrameTextures(context, self._size, count=len(panels), group=self._group)
+        self._closed = False
         self._painters: list[Painter] = []
         self._targets: list[moderngl.Framebuffer] = []
         for settings in panels:
-            sideways = settings.rotation_deg in (90, 270)
-            screen = (height_px, width_px) if sideways else (width_px, height_px)
-            mounting = Mounting.of(
-                settings,
-                screen_width_px=screen[0],
-                screen_height_px=screen[1],
-                layer_width_px=width_px,
-                layer_height_px=height_px,
-            )
-            self._painters.append(Painter(context, mounting))
+            screen = (height_px, width_px) if settings.rotation_deg in (90, 270) else (width_px, height_px)
+            self._painters.append(Painter(context, settings, screen_px=screen, layer_px=self._size))
             self._targets.append(context.framebuffer([context.texture(screen, 4)]))
 
     @property
@@ -62,8 +52,8 @@ class OffscreenPanels(PanelSink):
 
     def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
         """Keep it, unless it is the one before."""
-        check(frame, width_px=self._size[0], height_px=self._size[1], count=self._count)
-        if self._textures is None:
+        self._textures.check(frame)
+        if self._closed:
             raise PanelLost("offscreen panels: closed")
         if not unchanged or self._frame is None:
             self._frame = frame
@@ -95,16 +85,14 @@ class OffscreenPanels(PanelSink):
             for attachment in target.color_attachments:
                 attachment.release()
             target.release()
-        if self._textures is not None:
-            self._textures.release()
+        self._textures.release()
         if self._group is not None:
             self._group.close()
-        self._textures, self._painters, self._targets = None, [], []
+        self._closed, self._painters, self._targets = True, [], []
 
     def _draw(self, frame: PanelFrame) -> None:
         """Upload and draw. Raises PanelLost."""
         try:
-            assert self._textures is not None
             self._textures.upload(frame)
             for index, (target, painter) in enumerate(zip(self._targets, self._painters, strict=True)):
                 target.use()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import moderngl
 import numpy as np
 
@@ -11,7 +9,7 @@ from runtime.config import PanelSettings
 from runtime.optics.alignment import EVEN_CODE, is_identity, scale_and_shift
 from runtime.panels import lut
 from runtime.panels.geometry import layer_from_screen, permutes_pixels
-from runtime.records import F32, F64, Layers, PanelFrame, pixels_of
+from runtime.records import Layers, PanelFrame, pixels_of
 from runtime.support.gl import linked_program
 from runtime.support.gl_sharing import LayerTextures, ShareGroup, lies_in
 
@@ -96,60 +94,36 @@ void main() {
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Mounting:
-    """How one panel turns a layer into its monitor's picture."""
-
-    layer_from_screen: F64  # 3x3, positive third coordinate inside the panel
-    curve: F32  # (256, 3) grey of each 8-bit phase, per channel
-    screen_width_px: int
-    screen_height_px: int
-
-    @classmethod
-    def of(
-        cls,
-        settings: PanelSettings,
-        *,
-        screen_width_px: int,
-        screen_height_px: int,
-        layer_width_px: int,
-        layer_height_px: int,
-    ) -> Mounting:
-        """From a panel's settings. Raises InputError (curve), ValueError (homography)."""
-        matrix = layer_from_screen(
-            screen_width_px=screen_width_px,
-            screen_height_px=screen_height_px,
-            layer_width_px=layer_width_px,
-            layer_height_px=layer_height_px,
-            rotation_deg=settings.rotation_deg,
-            mirror=settings.mirror,
-            homography=settings.homography,
-        )
-        # A homography's sign means nothing; the shader wants the panel's middle before the horizon.
-        middle = matrix[2] @ np.array([screen_width_px / 2, screen_height_px / 2, 1.0])
-        return cls(
-            matrix / middle,
-            lut.curve(lut=settings.lut, gamma=settings.gamma),
-            screen_width_px,
-            screen_height_px,
-        )
-
-
 class FrameTextures:
     """The layers of the newest frame in one share group: uploaded where they are not in it and their version is
     another one."""
 
     def __init__(
-        self, context: moderngl.Context, *, width_px: int, height_px: int, count: int, group: ShareGroup | None = None
+        self, context: moderngl.Context, size_px: tuple[int, int], *, count: int, group: ShareGroup | None = None
     ) -> None:
-        """group: the context's; layers that lie in its textures are shown from there."""
+        """size_px: columns and rows of a layer; group: the context's; layers in its textures are shown from there."""
         self._context, self._group = context, group
-        self.size_px = (width_px, height_px)  # of a layer
-        self._count = count
+        self.size_px, self._count = size_px, count
         self._solved: tuple[moderngl.Texture, ...] = ()
         self._flat: tuple[moderngl.Texture, ...] = ()
         self._solved_version: int | None = None
         self._flat_version: int | None = None
+
+    def check(self, frame: PanelFrame) -> None:
+        """Raises ValueError for layers of another shape, too few matrices, or nothing to show."""
+        width_px, height_px = self.size_px
+        for name, layers, needed in (
+            ("solved", frame.solved, shows_solved(frame)),
+            ("flat", frame.flat, shows_flat(frame)),
+        ):
+            if layers is None and needed:
+                raise ValueError(f"a frame without its {name} layers")
+            if layers is not None and layers.shape != (self._count, height_px, width_px, 4):
+                raise ValueError(
+                    f"{name} layers are {layers.shape}, the panels {self._count} of {width_px}x{height_px}"
+                )
+        if frame.solved_from_shown and len(frame.solved_from_shown) != self._count:
+            raise ValueError(f"a frame aligns {len(frame.solved_from_shown)} panels of {self._count}")
 
     def lacks(self, frame: PanelFrame) -> tuple[bool, bool]:
         """Whether its solution, and its flat picture, are seen and not here yet."""
@@ -208,27 +182,32 @@ def shows_flat(frame: PanelFrame) -> bool:
     return frame.solved is None or frame.flatness > 0.0
 
 
-def check(frame: PanelFrame, *, width_px: int, height_px: int, count: int) -> None:
-    """Raises ValueError for layers of another shape, too few matrices, or nothing to show."""
-    for name, layers, needed in (
-        ("solved", frame.solved, shows_solved(frame)),
-        ("flat", frame.flat, shows_flat(frame)),
-    ):
-        if layers is None and needed:
-            raise ValueError(f"a frame without its {name} layers")
-        if layers is not None and layers.shape != (count, height_px, width_px, 4):
-            raise ValueError(f"{name} layers are {layers.shape}, the panels {count} of {width_px}x{height_px}")
-    if frame.solved_from_shown and len(frame.solved_from_shown) != count:
-        raise ValueError(f"a frame aligns {len(frame.solved_from_shown)} panels of {count}")
-
-
 class Painter:
     """The presentation shader in one context; vertex arrays and framebuffers are not shared between contexts."""
 
-    def __init__(self, context: moderngl.Context, mounting: Mounting) -> None:
+    def __init__(
+        self,
+        context: moderngl.Context,
+        settings: PanelSettings,
+        *,
+        screen_px: tuple[int, int],
+        layer_px: tuple[int, int],
+    ) -> None:
+        """Of one panel. Raises InputError (curve), ValueError (homography)."""
+        matrix = layer_from_screen(
+            screen_width_px=screen_px[0],
+            screen_height_px=screen_px[1],
+            layer_width_px=layer_px[0],
+            layer_height_px=layer_px[1],
+            rotation_deg=settings.rotation_deg,
+            mirror=settings.mirror,
+            homography=settings.homography,
+        )
+        # A homography's sign means nothing; the shader wants the panel's middle before the horizon.
+        matrix = matrix / (matrix[2] @ np.array([screen_px[0] / 2, screen_px[1] / 2, 1.0]))
         self._program = linked_program(context, vertex=VERTEX, fragment=FRAGMENT)
         self._array = context.vertex_array(self._program, [])
-        table = np.ascontiguousarray(mounting.curve.T)
+        table = np.ascontiguousarray(lut.curve(lut=settings.lut, gamma=settings.gamma).T)
         self._curve = context.texture((lut.ENTRIES, 3), 1, table.tobytes(), dtype="f4")
         self._curve.filter = (moderngl.LINEAR, moderngl.LINEAR)
         self._curve.repeat_x = self._curve.repeat_y = False
@@ -236,9 +215,9 @@ class Painter:
         self._program["flat_picture"] = 1
         self._program["curve"] = 2
         self._program["even"] = EVEN_CODE / 255
-        self._program["screen_px"] = (float(mounting.screen_width_px), float(mounting.screen_height_px))
-        self._program["layer_from_screen"] = tuple(mounting.layer_from_screen.T.ravel())
-        self._program["exact"] = permutes_pixels(mounting.layer_from_screen)
+        self._program["screen_px"] = tuple(map(float, screen_px))
+        self._program["layer_from_screen"] = tuple(matrix.T.ravel())
+        self._program["exact"] = permutes_pixels(matrix)
 
     def draw(self, textures: FrameTextures, frame: PanelFrame, index: int) -> None:
         """Panel `index` of the frame that was uploaded, over the whole of the framebuffer in use."""

@@ -9,26 +9,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from runtime.clock import NS_PER_S, Clock
 from runtime.panels import xlib
 from runtime.panels.display import Display, Window
-from runtime.panels.monitors import Monitor
+from runtime.panels.monitors import Monitor, Rectangle
 
 EVERY_NS = NS_PER_S  # a round of all questions
 REFRESH_TOLERANCE = 1e-3  # of a monitor's rate
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Where one window belongs on the X screen."""
+class Surface:
+    """One window, where it belongs, and the panels in it."""
 
     window: Window
-    panels: tuple[int, ...]  # that are shown in it
-    x_px: int
-    y_px: int
-    width_px: int
-    height_px: int
+    place: Rectangle
+    panels: tuple[int, ...]
 
 
 class PlacementWatch:
@@ -37,15 +35,17 @@ class PlacementWatch:
     All at once where the X server has refused a request since the last look: something has gone.
     """
 
-    def __init__(self, display: Display, monitors: Sequence[Monitor], places: Sequence[Place], clock: Clock) -> None:
+    def __init__(
+        self, display: Display, monitors: Sequence[Monitor], surfaces: Sequence[Surface], clock: Clock
+    ) -> None:
         """monitors: as they were bound, one a panel. Nothing is asked in the first EVERY_NS."""
         self._display, self._clock = display, clock
         # Against what was there when it was bound; what came between binding and here differs from the monitor.
         self._states = [display.output_state(monitor.connector) for monitor in monitors]
         self._monitors = monitors
         self._questions: list[Callable[[], str]] = [
-            *(lambda place=place: self._window_fault(place) for place in places),
-            *(lambda panel=panel: self._monitor_fault(panel) for panel in range(len(monitors))),
+            *(partial(self._window_fault, surface) for surface in surfaces),
+            *(partial(self._monitor_fault, panel) for panel in range(len(monitors))),
         ]
         self._next = 0
         self._due_ns = clock.now_ns() + EVERY_NS
@@ -65,36 +65,26 @@ class PlacementWatch:
         self._next = (self._next + 1) % len(self._questions)
         return question()
 
-    def _window_fault(self, place: Place) -> str:
-        state = self._display.window_state(place.window)
-        whose = f"panel {place.panels[0]}" if len(place.panels) == 1 else "the panels"
+    def _window_fault(self, surface: Surface) -> str:
+        state = self._display.window_state(surface.window)
+        whose = f"panel {surface.panels[0]}" if len(surface.panels) == 1 else "the panels"
         if state is None:
             return f"{whose}: the window was destroyed"
-        if not state.viewable:
+        is_viewable, place = state
+        if not is_viewable:
             return f"{whose}: the window was unmapped"
-        now = (state.x_px, state.y_px, state.width_px, state.height_px)
-        then = (place.x_px, place.y_px, place.width_px, place.height_px)
-        return "" if now == then else f"{whose}: the window is {_rectangle(*now)}, not {_rectangle(*then)}"
+        return "" if place == surface.place else f"{whose}: the window is {place}, not {surface.place}"
 
     def _monitor_fault(self, panel: int) -> str:
-        monitor, then, now = (
-            self._monitors[panel],
-            self._states[panel],
-            self._display.output_state(self._monitors[panel].connector),
-        )
+        monitor, then = self._monitors[panel], self._states[panel]
+        now = self._display.output_state(monitor.connector)
         whose = f"panel {panel}: {monitor.connector}"
         if now is None:
             return f"{whose} shows nothing any more"
-        place = (now.x_px, now.y_px, now.width_px, now.height_px)
-        bound = (monitor.x_px, monitor.y_px, monitor.width_px, monitor.height_px)
-        if place != bound:
-            return f"{whose} became {_rectangle(*place)}, it was {_rectangle(*bound)}"
+        if now.place != monitor.place:
+            return f"{whose} became {now.place}, it was {monitor.place}"
         if monitor.refresh_hz and abs(now.refresh_hz / monitor.refresh_hz - 1.0) > REFRESH_TOLERANCE:
             return f"{whose} shows {now.refresh_hz:.3f} frames a second, it was {monitor.refresh_hz:.3f}"
         if then is not None and now.edid != then.edid:
             return f"{whose} has another monitor"
         return ""
-
-
-def _rectangle(x_px: int, y_px: int, width_px: int, height_px: int) -> str:
-    return f"{width_px}x{height_px}+{x_px}+{y_px}"

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import logging
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import moderngl
 
@@ -15,10 +14,9 @@ from runtime.errors import ContextLost, PanelLost
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.panels.display import Display, Window, glfw
-from runtime.panels.modes import check_mode, refresh_difference
-from runtime.panels.monitors import Monitor, bind, check_shape
-from runtime.panels.presentation import FrameTextures, Mounting, Painter, check
-from runtime.panels.watch import Place, PlacementWatch
+from runtime.panels.monitors import Monitor, Rectangle, bind, check_modes, refresh_difference
+from runtime.panels.presentation import FrameTextures, Painter
+from runtime.panels.watch import PlacementWatch, Surface
 from runtime.records import PanelFrame, PresentReport
 from runtime.support.gl_sharing import ShareGroup
 
@@ -28,21 +26,12 @@ RETRY_NS = NS_PER_S // 2  # between attempts to open what was lost
 LOOK_NS = 5 * NS_PER_S  # between looks at monitors that X has not said anything about
 
 
-@dataclass
-class Spot:
-    """Where one panel's picture goes in a window."""
+class Spot(NamedTuple):
+    """Where one panel's picture goes in its window."""
 
-    index: int  # of the panel
+    panel: int
     viewport: tuple[int, int, int, int]  # x, y (from the bottom), width, height
     painter: Painter
-
-
-@dataclass
-class Surface:
-    """One window and the panels in it."""
-
-    window: Window
-    spots: tuple[Spot, ...]
 
 
 class WindowPanels(PanelSink):
@@ -75,7 +64,7 @@ class WindowPanels(PanelSink):
         self._settings, self._panels, self._stack = settings, panels, stack
         self._clock, self._content = clock, content
         self._display: Display | None = None
-        self._surfaces: list[Surface] = []
+        self._surfaces: dict[Surface, list[Spot]] = {}
         self._textures: FrameTextures | None = None
         self._watch: PlacementWatch | None = None
         self._retry_ns, self._lost = 0, ""
@@ -122,13 +111,6 @@ class WindowPanels(PanelSink):
         finally:
             self._give_back()
 
-    def screen_size_px(self) -> tuple[int, int]:
-        """Columns and rows that the bound monitors cover on the X screen, from its origin."""
-        return (
-            max(monitor.x_px + monitor.width_px for monitor in self.monitors),
-            max(monitor.y_px + monitor.height_px for monitor in self.monitors),
-        )
-
     def close(self) -> None:
         """Close windows and the display. May be called twice."""
         self._drop()
@@ -139,7 +121,7 @@ class WindowPanels(PanelSink):
         assert display is not None and textures is not None and watch is not None
         if fault := display.poll() or watch.look():
             raise PanelLost(fault)
-        check(frame, width_px=self._stack.width_px, height_px=self._stack.height_px, count=len(self._panels))
+        textures.check(frame)
         if unchanged and self._shown:
             return PresentReport(frame.number, self._clock.now_ns(), 0.0)
         self._away = True
@@ -148,8 +130,8 @@ class WindowPanels(PanelSink):
             textures.upload(frame)
             # Another context may use what this one has uploaded only after this one is known to be done.
             display.root.context.finish()
-        for surface in self._surfaces:
-            self._draw(surface, textures, frame)
+        for surface, spots in self._surfaces.items():
+            self._draw(surface, spots, textures, frame)
         swapped_ns = [self._swap(surface) for surface in self._surfaces]
         self._shown = True
         return PresentReport(
@@ -159,20 +141,20 @@ class WindowPanels(PanelSink):
             vblank_ns=swapped_ns[0] if self._settings.vsync else None,
         )
 
-    def _draw(self, surface: Surface, textures: FrameTextures, frame: PanelFrame) -> None:
+    def _draw(self, surface: Surface, spots: list[Spot], textures: FrameTextures, frame: PanelFrame) -> None:
         surface.window.make_current()
         context = surface.window.context
         context.screen.use()
-        if len(surface.spots) > 1:
+        if len(spots) > 1:
             context.screen.viewport = (0, 0, *context.screen.size)
             context.clear()
-        for spot in surface.spots:
+        for spot in spots:
             context.viewport = spot.viewport
-            spot.painter.draw(textures, frame, spot.index)
+            spot.painter.draw(textures, frame, spot.panel)
         context.finish()
         if fault := _reset_status() or _error(context):
             self._context_lost = True
-            raise PanelLost(f"the GL context of panel {surface.spots[0].index}: {fault}")
+            raise PanelLost(f"the GL context of panel {spots[0].panel}: {fault}")
 
     def _swap(self, surface: Surface) -> int:
         surface.window.make_current()
@@ -191,70 +173,45 @@ class WindowPanels(PanelSink):
         self._away = True
         self._display = display = self._display or Display()
         self.monitors = bind(self._panels, display.monitors())
+        layer_px = self._stack.width_px, self._stack.height_px
         if not self._any_shape:
-            for number, (panel, monitor) in enumerate(zip(self._panels, self.monitors, strict=True)):
-                size = {"width_px": self._stack.width_px, "height_px": self._stack.height_px}
-                check_shape(number, panel, monitor, **size)
-                check_mode(number, panel, monitor, **size, allow_rescaling=self._settings.allow_rescaling)
+            size = {"width_px": layer_px[0], "height_px": layer_px[1]}
+            check_modes(self._panels, self.monitors, **size, allow_rescaling=self._settings.allow_rescaling)
         if difference := refresh_difference(self.monitors):
             log.warning("%s", difference)
         display.root.make_current()
-        self._textures = FrameTextures(
-            display.root.context,
-            width_px=self._stack.width_px,
-            height_px=self._stack.height_px,
-            count=len(self._panels),
-            group=display.group,
-        )
-        spanning = self._settings.kind == "span"
-        self._surfaces = [self._span(display)] if spanning else self._windows(display)
-        for number, surface in enumerate(self._surfaces):
-            surface.window.make_current()
+        self._textures = FrameTextures(display.root.context, layer_px, count=len(self._panels), group=display.group)
+        for number, (place, panels) in enumerate(self._places()):
+            if self._settings.kind == "span":
+                window = display.spanning_window(place, title="panels")
+            else:
+                window = display.fullscreen_window(self.monitors[number], title=f"panel {number}")
+            spots = [self._spot(window, place, panel) for panel in panels]
+            self._surfaces[Surface(window, place, panels)] = spots
             glfw.swap_interval(1 if self._settings.vsync and number == 0 else 0)
         glfw.poll_events()
-        self._watch = PlacementWatch(display, self.monitors, self._places(), self._clock)
+        self._watch = PlacementWatch(display, self.monitors, tuple(self._surfaces), self._clock)
 
-    def _places(self) -> tuple[Place, ...]:
-        """Where each window belongs, with the panels in it."""
-        return tuple(
-            Place(surface.window, tuple(spot.index for spot in surface.spots), *rectangle)
-            for surface, rectangle in zip(self._surfaces, self._rectangles(), strict=True)
-        )
-
-    def _rectangles(self) -> list[tuple[int, int, int, int]]:
+    def _places(self) -> list[tuple[Rectangle, tuple[int, ...]]]:
+        """Of each window, with the panels in it."""
         if self._settings.kind != "span":
-            return [(m.x_px, m.y_px, m.width_px, m.height_px) for m in self.monitors]
+            return [(monitor.place, (panel,)) for panel, monitor in enumerate(self.monitors)]
         left, top = min(m.x_px for m in self.monitors), min(m.y_px for m in self.monitors)
-        right, bottom = self.screen_size_px()
-        return [(left, top, right - left, bottom - top)]
+        right = max(m.x_px + m.width_px for m in self.monitors)
+        bottom = max(m.y_px + m.height_px for m in self.monitors)
+        return [(Rectangle(left, top, right - left, bottom - top), tuple(range(len(self.monitors))))]
 
-    def _windows(self, display: Display) -> list[Surface]:
-        surfaces = []
-        for index, monitor in enumerate(self.monitors):
-            window = display.fullscreen_window(monitor, title=f"panel {index}")
-            viewport = (0, 0, monitor.width_px, monitor.height_px)
-            surfaces.append(Surface(window, (self._spot(window, index, viewport),)))
-        return surfaces
-
-    def _span(self, display: Display) -> Surface:
-        ((left, top, width, height),) = self._rectangles()
-        window = display.spanning_window(x_px=left, y_px=top, width_px=width, height_px=height, title="panels")
-        spots = []
-        for index, monitor in enumerate(self.monitors):
-            below = top + height - (monitor.y_px + monitor.height_px)
-            viewport = (monitor.x_px - left, below, monitor.width_px, monitor.height_px)
-            spots.append(self._spot(window, index, viewport))
-        return Surface(window, tuple(spots))
-
-    def _spot(self, window: Window, index: int, viewport: tuple[int, int, int, int]) -> Spot:
-        mounting = Mounting.of(
-            self._panels[index],
-            screen_width_px=viewport[2],
-            screen_height_px=viewport[3],
-            layer_width_px=self._stack.width_px,
-            layer_height_px=self._stack.height_px,
+    def _spot(self, window: Window, place: Rectangle, panel: int) -> Spot:
+        monitor = self.monitors[panel]
+        below = place.y_px + place.height_px - (monitor.y_px + monitor.height_px)
+        viewport = (monitor.x_px - place.x_px, below, monitor.width_px, monitor.height_px)
+        painter = Painter(
+            window.context,
+            self._panels[panel],
+            screen_px=(monitor.width_px, monitor.height_px),
+            layer_px=(self._stack.width_px, self._stack.height_px),
         )
-        return Spot(index, viewport, Painter(window.context, mounting))
+        return Spot(panel, viewport, painter)
 
     def _retreat(self) -> None:
         """After a failure: keep the connection, and where it is sound the context that all windows share."""
@@ -269,9 +226,9 @@ class WindowPanels(PanelSink):
         self._away = True
         try:
             display.root.make_current()
-            for surface in self._surfaces:
+            for surface, spots in self._surfaces.items():
                 surface.window.make_current()
-                for spot in surface.spots:
+                for spot in spots:
                     spot.painter.release()
             display.root.make_current()
             if self._textures is not None:
@@ -280,20 +237,23 @@ class WindowPanels(PanelSink):
         except Exception:
             log.exception("closing windows")
             self._drop()
-        self._surfaces, self._textures, self._watch, self._shown = [], None, None, False
-        self._retry_ns = self._clock.now_ns() + RETRY_NS
+        self._forget()
 
     def _drop(self) -> None:
         self._away = True
         display, self._display = self._display, None
-        self._surfaces, self._textures, self._watch = [], None, None
-        self._retry_ns = self._clock.now_ns() + RETRY_NS
-        self._shown = self._context_lost = False
+        self._context_lost = False
+        self._forget()
         if display is not None:
             try:
                 display.close()
             except Exception:
                 log.exception("closing the display")
+
+    def _forget(self) -> None:
+        """There are no windows any more; they are made again after a while."""
+        self._surfaces, self._textures, self._watch, self._shown = {}, None, None, False
+        self._retry_ns = self._clock.now_ns() + RETRY_NS
 
     def _give_back(self) -> None:
         if self._away:

@@ -1,4 +1,4 @@
-"""The little of Xlib and RandR that GLFW does not offer: outputs, windows as others see them, and X's errors.
+"""The little of Xlib and RandR that GLFW does not offer: what outputs send, and X's errors.
 
 Bound by ctypes to libraries that GLFW needs anyway. By default Xlib ends the process on any error.
 """
@@ -11,8 +11,10 @@ import logging
 import os
 import select
 import threading
-from ctypes import POINTER, byref, c_char_p, c_int, c_long, c_ubyte, c_uint, c_ulong, c_ushort, c_void_p
+from ctypes import POINTER, byref, c_char_p, c_int, c_long, c_ubyte, c_uint, c_ulong, c_void_p
 from dataclasses import dataclass
+
+from runtime.panels.monitors import Rectangle
 
 log = logging.getLogger("phasestack.panels")
 
@@ -54,15 +56,9 @@ class _Resources(ctypes.Structure):
 
 
 class _Output(ctypes.Structure):
-    _fields_ = (
-        ("timestamp", c_ulong),
-        ("crtc", c_ulong),
-        ("name", c_char_p),
-        ("name_length", c_int),
-        ("mm_width", c_ulong),
-        ("mm_height", c_ulong),
-        ("connection", c_ushort),
-    )
+    """The beginning of XRROutputInfo."""
+
+    _fields_ = (("timestamp", c_ulong), ("crtc", c_ulong))
 
 
 class _Crtc(ctypes.Structure):
@@ -78,64 +74,18 @@ class _Crtc(ctypes.Structure):
     )
 
 
-class _Attributes(ctypes.Structure):
-    """XWindowAttributes."""
-
-    _fields_ = (
-        ("x", c_int),
-        ("y", c_int),
-        ("width", c_int),
-        ("height", c_int),
-        ("border_width", c_int),
-        ("depth", c_int),
-        ("visual", c_void_p),
-        ("root", c_ulong),
-        ("window_class", c_int),
-        ("bit_gravity", c_int),
-        ("win_gravity", c_int),
-        ("backing_store", c_int),
-        ("backing_planes", c_ulong),
-        ("backing_pixel", c_ulong),
-        ("save_under", c_int),
-        ("colormap", c_ulong),
-        ("map_installed", c_int),
-        ("map_state", c_int),
-        ("all_event_masks", c_long),
-        ("your_event_mask", c_long),
-        ("do_not_propagate_mask", c_long),
-        ("override_redirect", c_int),
-        ("screen", c_void_p),
-    )
-
-
 @dataclass(frozen=True, slots=True)
 class OutputState:
     """What one output of the graphics card sends, and to which monitor."""
 
-    x_px: int  # of its top left corner on the X screen
-    y_px: int
-    width_px: int
-    height_px: int
+    place: Rectangle
     refresh_hz: float  # 0: unknown
     edid: bytes  # empty: none
-
-
-@dataclass(frozen=True, slots=True)
-class WindowState:
-    """Where a window is on the X screen, and whether it and all above it are mapped."""
-
-    viewable: bool
-    x_px: int
-    y_px: int
-    width_px: int
-    height_px: int
 
 
 @functools.cache
 def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
     x11, randr = ctypes.CDLL("libX11.so.6"), ctypes.CDLL("libXrandr.so.2")
-    x11.XOpenDisplay.restype, x11.XOpenDisplay.argtypes = c_void_p, [c_char_p]
-    x11.XCloseDisplay.argtypes = [c_void_p]
     x11.XDefaultRootWindow.restype, x11.XDefaultRootWindow.argtypes = c_ulong, [c_void_p]
     x11.XInternAtom.restype, x11.XInternAtom.argtypes = c_ulong, [c_void_p, c_char_p, c_int]
     x11.XFree.argtypes = [c_void_p]
@@ -150,10 +100,6 @@ def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
     randr.XRRGetCrtcInfo.restype = POINTER(_Crtc)
     randr.XRRGetCrtcInfo.argtypes = [c_void_p, POINTER(_Resources), c_ulong]
     randr.XRRFreeCrtcInfo.argtypes = [POINTER(_Crtc)]
-    x11.XGetWindowAttributes.argtypes = [c_void_p, c_ulong, POINTER(_Attributes)]
-    x11.XTranslateCoordinates.argtypes = [
-        c_void_p, c_ulong, c_ulong, c_int, c_int, POINTER(c_int), POINTER(c_int), POINTER(c_ulong)
-    ]  # fmt: skip
     randr.XRRGetOutputProperty.argtypes = [
         c_void_p, c_ulong, c_ulong, c_long, c_long, c_int, c_int, c_ulong,
         POINTER(c_ulong), POINTER(c_int), POINTER(c_ulong), POINTER(c_ulong), POINTER(POINTER(c_ubyte)),
@@ -161,19 +107,17 @@ def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
     return x11, randr
 
 
-class _Refusals:
-    """Requests that the X server has refused in this process."""
-
-    count = 0
+_refused = 0  # requests, in this process
 
 
 def refusals() -> int:
     """How many requests the X server has refused so far: another number says that something has gone."""
-    return _Refusals.count
+    return _refused
 
 
 def _note_error(_display: int, _event: int) -> int:
-    _Refusals.count += 1
+    global _refused
+    _refused += 1
     log.warning("the X server refused a request")
     return 0
 
@@ -232,22 +176,6 @@ class ServerWatch:
                 _end()
 
 
-def outputs(display: int) -> dict[str, int]:
-    """The X server's number of every output, by connector name. `display` is an open Display pointer."""
-    x11, randr = _libraries()
-    resources = randr.XRRGetScreenResourcesCurrent(display, x11.XDefaultRootWindow(display))
-    if not resources:
-        return {}
-    found = {}
-    for output in resources.contents.outputs[: resources.contents.noutput]:
-        info = randr.XRRGetOutputInfo(display, resources, output)
-        if info:
-            found[info.contents.name.decode()] = output
-            randr.XRRFreeOutputInfo(info)
-    randr.XRRFreeScreenResources(resources)
-    return found
-
-
 def output_state(display: int, output: int) -> OutputState | None:
     """What an output sends now; None: nothing, or there is no such output any more. Four round trips."""
     x11, randr = _libraries()
@@ -265,10 +193,7 @@ def output_state(display: int, output: int) -> OutputState | None:
         place = state.contents
         refresh_hz = {mode.id: _refresh_hz(mode) for mode in resources.contents.modes[: resources.contents.nmode]}
         answer = OutputState(
-            place.x,
-            place.y,
-            place.width,
-            place.height,
+            Rectangle(place.x, place.y, place.width, place.height),
             refresh_hz.get(place.mode, 0.0),
             _property(x11, randr, display, output, x11.XInternAtom(display, b"EDID", 0)),
         )
@@ -276,19 +201,6 @@ def output_state(display: int, output: int) -> OutputState | None:
         return answer
     finally:
         randr.XRRFreeScreenResources(resources)
-
-
-def window_state(display: int, window: int) -> WindowState | None:
-    """Where a window is now; None: it was destroyed. Three round trips."""
-    x11 = _libraries()[0]
-    attributes = _Attributes()
-    if not x11.XGetWindowAttributes(display, window, byref(attributes)):
-        return None
-    x, y, child = c_int(), c_int(), c_ulong()
-    if not x11.XTranslateCoordinates(display, window, attributes.root, 0, 0, byref(x), byref(y), byref(child)):
-        return None
-    is_viewable = 2
-    return WindowState(attributes.map_state == is_viewable, x.value, y.value, attributes.width, attributes.height)
 
 
 def _refresh_hz(mode: _Mode) -> float:

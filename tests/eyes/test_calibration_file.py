@@ -87,7 +87,7 @@ pivot_m = [0.5, 0.1, 0.2]
     assert (told.panel_ids, told.pairs, told.condition, told.source) == (("rear", "front"), 27, 3.5, str(file))
     assert told.residuals is not None and told.pivot_m is not None
     assert (told.residuals.rms_m, told.residuals.max_m, told.residuals.leave_one_out_rms_m) == (0.001, 0.004, None)
-    assert told.residuals.axis_rms_m.tolist() == [0.0005, 0.0006, 0.0007]
+    assert told.residuals.axis_rms_m == (0.0005, 0.0006, 0.0007)
     assert told.pivot_m.tolist() == [0.5, 0.1, 0.2]
     np.testing.assert_array_equal(told.covariance, spread)
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.panels.geometry import IDENTITY, layer_from_screen, panel_from_screen, permutes_pixels
+from runtime.panels.geometry import layer_from_screen, panel_from_screen, permutes_pixels
 
 SIZES = st.tuples(st.integers(16, 4096), st.integers(16, 4096))
 MOUNTED = st.sampled_from([0, 90, 180, 270])
@@ -61,7 +61,7 @@ def test_what_should_be_at_an_ideal_pixel_is_drawn_where_registration_found_it(
 def test_layers_of_half_the_resolution_fill_the_panel() -> None:
     matrix = layer_from_screen(
         screen_width_px=1920, screen_height_px=1080, layer_width_px=960, layer_height_px=540,
-        rotation_deg=0, mirror="none", homography=IDENTITY,
+        rotation_deg=0, mirror="none", homography=np.eye(3),
     )  # fmt: skip
     assert apply(matrix, 1920, 1080) == pytest.approx((960, 540))
     assert not permutes_pixels(matrix)

@@ -1,16 +1,24 @@
-"""Panels are bound to monitors by EDID serial, then connector, then explicit index; never by a guess."""
+"""Panels are bound to monitors by EDID serial, then connector, then explicit index; never by a guess. A monitor must
+show the stack's own pixels, and all panels at one rate: else phases are rescaled, or frames torn."""
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 from hypothesis import given
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
+from runtime.commands.doctor import doctor
 from runtime.config import PanelSettings
 from runtime.errors import InputError, PanelLost
-from runtime.panels.monitors import Monitor, bind, check_shape
+from runtime.panels.monitors import Monitor, bind, check_modes, refresh_difference
+from tests.panels.xserver import XServer
 
 
 def monitor(connector: str, serial: str = "", x_px: int = 0) -> Monitor:
@@ -56,7 +64,53 @@ def test_a_panel_that_names_nothing_is_a_mistake_that_no_waiting_mends() -> None
         bind([PanelSettings()], [LEFT])
 
 
-def test_a_mode_of_another_shape_is_refused_and_a_smaller_one_of_the_same_is_not() -> None:
-    check_shape(0, PanelSettings(), LEFT, width_px=960, height_px=540)
-    with pytest.raises(PanelLost, match="panel 1: DP-1 shows 1080x1920"):
-        check_shape(1, PanelSettings(rotation_deg=90), LEFT, width_px=1920, height_px=1080)
+FULL = Monitor("DP-1", "A", "EIZ", 0, 0, 1920, 1080, 60.0)
+
+
+def check(panel: PanelSettings, monitor: Monitor, *, allow_rescaling: bool = False) -> None:
+    """As the second panel of a stack of 1920x1080."""
+    panels, monitors = (PanelSettings(), panel), (FULL, monitor)
+    check_modes(panels, monitors, width_px=1920, height_px=1080, allow_rescaling=allow_rescaling)
+
+
+def test_a_mode_of_the_stacks_shape_but_not_its_pixels_is_refused_unless_rescaling_is_allowed() -> None:
+    small = replace(FULL, width_px=1280, height_px=720)
+    check(PanelSettings(), FULL)
+    with pytest.raises(PanelLost, match=r"panel 1: DP-1 shows 1280x720, the stack is 1920x1080: .*allow_rescaling"):
+        check(PanelSettings(), small)
+    check(PanelSettings(), small, allow_rescaling=True)
+
+
+def test_a_mode_of_another_shape_is_refused_and_a_panel_on_its_side_is_compared_as_it_is_seen() -> None:
+    upright = replace(FULL, width_px=1080, height_px=1920)
+    check(PanelSettings(rotation_deg=90), upright)
+    for allow_rescaling in (False, True):
+        with pytest.raises(PanelLost, match="panel 1: DP-1 shows 1080x1920"):
+            check(PanelSettings(), upright, allow_rescaling=allow_rescaling)
+
+
+def test_rates_that_drift_apart_are_told_and_unknown_ones_are_not_guessed_at() -> None:
+    assert refresh_difference([FULL, replace(FULL, connector="DP-2", refresh_hz=59.98)]) == ""
+    assert refresh_difference([FULL, replace(FULL, refresh_hz=0.0)]) == ""
+    told = refresh_difference([FULL, replace(FULL, connector="DP-2", refresh_hz=59.94)])
+    assert "DP-1 60.00 Hz, DP-2 59.94 Hz" in told
+
+
+def test_the_doctor_fails_monitors_of_another_mode_and_passes_them_where_rescaling_is_allowed(
+    screen: XServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DISPLAY", screen.name)
+    state, detail = panels_row(tmp_path, "")
+    assert state == "fail" and "shows 320x180, the stack is 1920x1080" in detail
+    assert panels_row(tmp_path, "allow_rescaling = true")[0] == "ok"
+
+
+def panels_row(folder: Path, more: str) -> tuple[str, str]:
+    config = folder / "phasestack.toml"
+    panels = "".join(f'[[output.panels]]\nconnector = "DUMMY{n}"\n' for n in range(3))
+    config.write_text(f'[output]\nkind = "windows"\n{more}\n{panels}[service]\nsocket = "status.sock"\n')
+    app = typer.Typer()
+    app.command()(doctor)
+    result = CliRunner().invoke(app, ["--json", "--config", str(config)])
+    row = next(check for check in json.loads(result.stdout)["checks"] if check["name"] == "panels")
+    return row["state"], row["detail"]

@@ -13,7 +13,6 @@ import pytest
 from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
 from runtime.config import OutputSettings, PanelSettings
 from runtime.errors import PanelLost
-from runtime.panels import xlib
 from runtime.panels.display import glfw
 from runtime.panels.registry import open_panels
 from runtime.panels.watch import PlacementWatch
@@ -24,6 +23,15 @@ from tests.panels.xserver import XServer
 from tests.waiting import eventually
 
 pytestmark = pytest.mark.windows
+EVERY_S = 0.1  # a round of all questions
+
+
+@pytest.fixture(autouse=True)
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that no test waits for a second's end."""
+    monkeypatch.setattr("runtime.panels.watch.EVERY_NS", round(EVERY_S * NS_PER_S))
+    monkeypatch.setattr("runtime.panels.window.RETRY_NS", round(EVERY_S * NS_PER_S))
+    monkeypatch.setattr("runtime.panels.window.LOOK_NS", round(EVERY_S * NS_PER_S))
 
 
 @pytest.fixture
@@ -62,7 +70,7 @@ def lost(sink: WindowPanels, *, unchanged: bool = False, within_s: float = 3.0) 
 
 
 def x11_window(sink: WindowPanels, surface: int) -> int:
-    return glfw.get_x11_window(sink._surfaces[surface].window.handle)
+    return glfw.get_x11_window(list(sink._surfaces)[surface].window.handle)
 
 
 def comes_back(x: XServer, sink: WindowPanels, *monitors: int) -> bool:
@@ -161,14 +169,16 @@ def test_another_monitor_at_the_same_connector_is_noticed(x: XServer, opened: Ca
 @pytest.mark.parametrize("kind", ["windows", "span"])
 def test_where_nothing_happens_nothing_is_lost(opened: Callable[..., Any], kind: str) -> None:
     sink = opened(*BY_CONNECTOR, kind=kind)
-    assert lost(sink, within_s=2.5) == ""
+    assert lost(sink, within_s=6 * EVERY_S) == ""
 
 
 def test_a_refused_request_makes_it_look_at_everything_at_once(x: XServer, opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
-    watch = PlacementWatch(sink._display, sink.monitors, sink._places(), SimulatedClock())  # whose time never comes
+    watch = PlacementWatch(
+        sink._display, sink.monitors, list(sink._surfaces), SimulatedClock()
+    )  # whose time never comes
     x.do_to_window("XDestroyWindow", x11_window(sink, 2))
     x.xrandr("--query")
     assert watch.look() == ""
-    assert xlib.window_state(sink._display._pointer, x11_window(sink, 2)) is None  # refused
+    assert sink._display.window_state(list(sink._surfaces)[2].window) is None  # refused
     assert watch.look() == "panel 2: the window was destroyed"

@@ -137,7 +137,7 @@ def test_a_monitor_that_goes_is_named_and_one_that_returns_is_used_again(
 def test_a_closed_window_is_a_lost_panel_and_comes_back(x: XServer, opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
-    x.ask_to_close(glfw.get_x11_window(sink._surfaces[1].window.handle))
+    x.ask_to_close(glfw.get_x11_window(list(sink._surfaces)[1].window.handle))
     with pytest.raises(PanelLost, match="closed"):
         for number in range(1, 50):
             sink.present(frame(number))
