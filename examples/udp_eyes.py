@@ -41,7 +41,7 @@ class UdpEyes(Sensor):
         self._port, self._clock = options.port, clock
         self._covariance_m2 = np.diag(np.square(options.noise_mm)) * 1e-6
         self._socket: socket.socket | None = None
-        self._times, self._last = DeviceClock(), 0
+        self._times = DeviceClock()
 
     def open(self) -> None:
         self.close()
@@ -51,7 +51,7 @@ class UdpEyes(Sensor):
         except OSError as error:
             channel.close()  # what was acquired is released when the rest fails
             raise SensorLost(f"port {self._port}: {error.strerror}") from None
-        self._socket, self._times, self._last = channel, DeviceClock(), 0
+        self._socket, self._times = channel, DeviceClock()
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
         newest = self._receive(timeout_s)
@@ -65,8 +65,6 @@ class UdpEyes(Sensor):
             number, device_ns = int(message["n"]), int(message["t_ns"])
         except (ValueError, KeyError, TypeError) as error:
             raise SensorLost(f"not an eye message: {error!r}") from None
-        self.missed += max(number - self._last - 1, 0) if self._last else 0
-        self._last = number
         capture_ns = self._times.host_ns(device_ns, arrival_ns=self._clock.now_ns())
         return SensorFrame(number, capture_ns, EyePoints(eyes_m, np.ones(2), covariance_m2=self._covariance_m2))
 

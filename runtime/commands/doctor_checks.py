@@ -88,12 +88,12 @@ def sensor(settings: Settings) -> Iterator[Row]:
 def usb(settings: Settings) -> Iterator[Row]:
     """Known depth cameras on USB: port speed, permissions, driver."""
     from runtime.errors import MissingPart
-    from runtime.sensor.usb_devices import usb_report
+    from runtime.sensor.usb_devices import find_devices
 
     needed = settings.sensor.driver not in (*NO_DEVICE, "usb-camera")
     absent: Verdict = "fail" if needed else "skip"
     try:
-        devices = usb_report()
+        devices = find_devices()
     except MissingPart as error:
         yield Row("usb", absent, str(error), "install it" if needed else "")
         return
@@ -101,10 +101,9 @@ def usb(settings: Settings) -> Iterator[Row]:
         remedy = "plug one in; docs/hardware.md lists them" if needed else ""
         yield Row("usb", absent, "no known depth camera is plugged in", remedy)
     for device in devices:
-        problems = device["problems"]
-        name = f"{device['name']} ({device['usb_id']}, {device['speed']})"
+        problems = device.problems()
         state: Verdict = "ok" if not problems else "fail" if needed else "warn"
-        yield Row("usb", state, name, "; ".join(problems))
+        yield Row("usb", state, str(device), "; ".join(problems))
 
 
 def opengl(settings: Settings) -> Iterator[Row]:

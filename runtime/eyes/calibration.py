@@ -132,7 +132,8 @@ class Calibration:
             return None
         jacobian = position_jacobian(stack_m, pivot_m=self.pivot_m)
         spread = jacobian @ self.covariance @ np.swapaxes(jacobian, -1, -2)
-        return np.sqrt(np.trace(spread, axis1=-2, axis2=-1))
+        error_m: F64 = np.sqrt(np.trace(spread, axis1=-2, axis2=-1))
+        return error_m
 
     def serial_warning(self, serial: str) -> str:
         """One line where a sensor is not the one that was calibrated, else an empty text."""

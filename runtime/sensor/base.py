@@ -45,7 +45,6 @@ class Sensor(ABC):
     capabilities: Capabilities
     serial: str = ""  # known after `open`, empty where the device has none; set before: `open` takes that device only
     skipped: int = 0  # samples that arrived and that `read_newest` passed over for a newer one
-    missed: int = 0  # samples that never arrived: gaps in the device's own count
 
     @abstractmethod
     def open(self) -> None:

@@ -41,7 +41,7 @@ class DetectingDriver(SteppedSensor):
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
         frame = self._driver.read_newest(timeout_s)
-        self.skipped, self.missed = self._driver.skipped, self._driver.missed
+        self.skipped = self._driver.skipped
         return self._with_eyes(frame)
 
     def read_arrived(self, timeout_s: float) -> list[SensorFrame]:
@@ -49,7 +49,7 @@ class DetectingDriver(SteppedSensor):
             # A search takes as long as some cameras' period: only the newest picture is searched.
             return [self.read_newest(timeout_s)]
         frames = self._driver.read_arrived(timeout_s)
-        self.skipped, self.missed = self._driver.skipped, self._driver.missed
+        self.skipped = self._driver.skipped
         return [self._with_eyes(frame) for frame in frames]
 
     @property

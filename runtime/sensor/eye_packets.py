@@ -26,7 +26,6 @@ LAYOUT = struct.Struct("<4sBBHIQ8f")
 CRC = struct.Struct("<I")
 PACKET_BYTES = LAYOUT.size + CRC.size
 HAS_FACE, COMPLETED_LEFT, COMPLETED_RIGHT = 1, 2, 4
-SEQUENCE_MODULUS = 1 << 32
 M_PER_MM = 1e-3
 
 
@@ -74,9 +73,7 @@ class PacketReader:
 
     def __init__(self) -> None:
         self._buffer = b""
-        self._last: int | None = None
         self.garbage_bytes = 0  # skipped
-        self.missed = 0  # packets that the device counted and that never came
 
     def feed(self, data: bytes) -> list[EyePacket]:
         """All packets that are complete with these bytes."""
@@ -100,13 +97,4 @@ class PacketReader:
                 start = found + 1
                 continue
             packets.append(packet)
-            self._count(packet.sequence)
             start = found + PACKET_BYTES
-
-    def _count(self, sequence: int) -> None:
-        if self._last is not None:
-            ahead = (sequence - self._last) % SEQUENCE_MODULUS
-            # More than half the range ahead is behind: the device was restarted, or repeats itself.
-            if 1 < ahead < SEQUENCE_MODULUS // 2:
-                self.missed += ahead - 1
-        self._last = sequence

@@ -147,45 +147,42 @@ class OpenNI2Driver(Sensor):
 
     def _read_newest(self, timeout_s: float) -> SensorFrame:
         deadline_ns = self._clock.now_ns() + round(timeout_s * NS_PER_S)
-        main = "depth" if "depth" in self._streams else "colour"
-        before = self._newest.get(main)
-        while self._newest.get(main) is before:
+        before = self._newest.get(self._main)
+        while self._newest.get(self._main) is before:
             remaining_s = (deadline_ns - self._clock.now_ns()) / NS_PER_S
             if remaining_s <= 0 or not self._take(remaining_s):
                 self._nothing(timeout_s)
-        passed = 0
         for _ in range(DRAIN_MAX):
-            newest = self._newest[main]
+            newest = self._newest[self._main]
             if not self._take(0.0):
                 break
-            passed += self._newest[main] is not newest
-        picture = self._newest[main]
-        other = self._newest.get("colour") if main == "depth" else None
-        if main == "depth" and "colour" in self._streams:
-            wait_until_ns = self._clock.now_ns() + round(PAIR_WAIT_S * NS_PER_S)
-            while (other is None or picture.time_us - other.time_us > PAIR_APART_US) and (
-                self._clock.now_ns() < wait_until_ns and self._take(PAIR_WAIT_S)
-            ):
-                other = self._newest.get("colour")
-                picture = self._newest[main]
-        self._count(picture.number, passed)
-        capture_ns = self._times.host_ns(picture.time_us * 1000, arrival_ns=self._clock.now_ns())
-        if other is not None and abs(other.time_us - picture.time_us) > PAIR_APART_US:
-            other = None
-        shown = picture if main == "colour" else other
+            self.skipped += self._newest[self._main] is not newest
+        wait_until_ns = self._clock.now_ns() + round(PAIR_WAIT_S * NS_PER_S)
+        while self._lacks_colour() and self._clock.now_ns() < wait_until_ns and self._take(PAIR_WAIT_S):
+            pass
+        picture, colour = self._newest[self._main], self._newest.get("colour")
+        if colour is not None and abs(colour.time_us - picture.time_us) > PAIR_APART_US:
+            colour = None
+        ahead = picture.number - self._index if 0 < self._index < picture.number else 1
+        self._index, self._sequence = picture.number, self._sequence + ahead
         return SensorFrame(
             sequence=self._sequence,
-            capture_ns=capture_ns,
-            colour=shown.pixels if shown is not None else None,
-            depth_mm=picture.pixels if main == "depth" else None,
+            capture_ns=self._times.host_ns(picture.time_us * 1000, arrival_ns=self._clock.now_ns()),
+            colour=colour.pixels if colour is not None else None,
+            depth_mm=picture.pixels if self._main == "depth" else None,
             intrinsics=self._intrinsics,
         )
 
-    def _count(self, index: int, passed: int) -> None:
-        ahead = index - self._index if self._index and index > self._index else 1
-        self.skipped += passed
-        self.missed += max(ahead - 1 - passed, 0)
-        self._index, self._sequence = index, self._sequence + ahead
+    @property
+    def _main(self) -> str:
+        return "depth" if "depth" in self._streams else "colour"
+
+    def _lacks_colour(self) -> bool:
+        """Whether the colour picture of the newest depth may still come."""
+        colour = self._newest.get("colour")
+        return "colour" in self._streams and (
+            colour is None or self._newest[self._main].time_us - colour.time_us > PAIR_APART_US
+        )
 
     def _take(self, timeout_s: float) -> bool:
         """Copy one frame of whichever stream has one; False where none came in time."""
@@ -200,8 +197,6 @@ class OpenNI2Driver(Sensor):
                 self._newest[kind] = _Picture(int(frame.frameIndex), int(frame.timestamp), _pixels(frame))
             finally:
                 frame.close()
-        except ValueError as error:
-            raise SensorLost(f"OpenNI2: {error}") from None
         except Exception as error:
             raise SensorLost(f"OpenNI2: {_text(error)}") from None
         return True

@@ -33,6 +33,9 @@ class UsbDevice:
     def usb_id(self) -> str:
         return f"{self.known.vendor_id:04x}:{self.known.product_id:04x}"
 
+    def __str__(self) -> str:
+        return f"{self.known.name} ({self.usb_id}, {SPEEDS.get(self.speed, 'unknown')})"
+
     def problems(self) -> list[str]:
         """What stands in the way of using it, each with its remedy."""
         found = []
@@ -118,19 +121,3 @@ def reset_device(device: UsbDevice) -> None:
         raise SensorLost(f"{device.known.name}: cannot be reset ({error})") from None
     finally:
         usb.util.dispose_resources(device.handle)
-
-
-def usb_report(backend: Any = None) -> list[dict[str, Any]]:
-    """For the doctor: one object a known device, with its problems. Raises MissingPart, SensorLost."""
-    return [
-        {
-            "name": device.known.name,
-            "usb_id": device.usb_id,
-            "serial": device.serial,
-            "speed": SPEEDS.get(device.speed, "unknown"),
-            "driver": device.known.driver,
-            "note": device.known.note,
-            "problems": device.problems(),
-        }
-        for device in find_devices(backend)
-    ]

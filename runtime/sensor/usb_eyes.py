@@ -75,7 +75,6 @@ class UsbEyesDriver(Sensor):
         arrival_ns = self._clock.now_ns()
         capture_ns = [self._times.host_ns(p.device_time_us * 1000, arrival_ns=arrival_ns) for p in packets]
         self.skipped += len(packets) - 1
-        self.missed = self._reader.missed
         self._silent = 0
         return SensorFrame(packets[-1].sequence, capture_ns[-1], packets[-1].points)
 

@@ -5,24 +5,23 @@ from __future__ import annotations
 import pytest
 
 from runtime.errors import SensorLost
-from runtime.sensor.usb_devices import UDEV_RULE, find_device, usb_report
+from runtime.sensor.usb_devices import UDEV_RULE, find_device, find_devices
 from tests.sensor.fake_usb import KINECT_V2, FakeDevice, FakeUsb
 
 
-def test_a_kinect_v2_on_usb_2_is_told_so() -> None:
-    (row,) = usb_report(FakeUsb(FakeDevice(KINECT_V2, "K2", speed=3)))
-    assert row["name"].startswith("Microsoft Kinect v2") and row["serial"] == "K2"
-    assert any("USB 3" in problem for problem in row["problems"])
-
-
-def test_a_missing_permission_names_the_udev_rule() -> None:
-    (row,) = usb_report(FakeUsb(FakeDevice(readable=False)))
-    assert any(UDEV_RULE in problem for problem in row["problems"])
-
-
-def test_a_camera_without_a_driver_says_so() -> None:
-    (row,) = usb_report(FakeUsb(FakeDevice((0x8086, 0x0B07), speed=4)))
-    assert row["driver"] == "" and any("no driver" in problem for problem in row["problems"])
+@pytest.mark.parametrize(
+    ("device", "problem"),
+    [
+        (FakeDevice(KINECT_V2, "K2", speed=3), "USB 3"),
+        (FakeDevice(readable=False), UDEV_RULE),
+        (FakeDevice((0x8086, 0x0B07), speed=4), "no driver"),
+    ],
+    ids=["a Kinect v2 on USB 2", "no permission", "a camera without a driver"],
+)
+def test_what_stands_in_the_way_is_told_with_its_remedy(device: FakeDevice, problem: str) -> None:
+    (found,) = find_devices(FakeUsb(device))
+    assert any(problem in each for each in found.problems())
+    assert f"{device.ids[0]:04x}:{device.ids[1]:04x}" in str(found)
 
 
 def test_a_device_is_found_by_its_serial_and_never_guessed() -> None:
