@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -25,7 +25,6 @@ from runtime.frame.truth import TrueEyes, Unknown
 from runtime.optics.alignment import shown_layers
 from runtime.optics.carried import carried_quality, light_psnrs_db
 from runtime.optics.pupil import PUPIL_SIGMA_MM
-from runtime.optics.quality import Quality
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import retina_pictures
 from runtime.records import F64, U8, RefreshAccount, SensorFrame, State
@@ -35,7 +34,15 @@ from runtime.support.waiting import wait_for
 log = logging.getLogger("phasestack.quality")
 
 LIGHT_STEP = 2  # of the pixels whose light is measured
+FIGURES = ("light_db", "psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
 WAITING_MAX = 2048  # lines that wait for the truth; older ones go without
+
+
+LINE = (
+    "frame", "capture_ns", "predicted_for_ns", "present_ns", "eyes_m", "eyes_label", "eye_sigma_mm", "state",
+    "solution", "solved_for_m", "solution_age_ms", "true_eyes_m", "inference", "presented", "stage_ms", "skew_ms",
+)  # fmt: skip
+Pictures = dict[str, tuple[U8, U8]]  # of both eyes: `solved`, `used`, `true`
 
 
 class Output(Protocol):
@@ -52,36 +59,23 @@ class Output(Protocol):
 class Measured:
     """What eyes saw of one refresh."""
 
-    eye_views: EyeViews  # at the eyes aligned to, against their own truth
-    carried: Quality  # at the eyes aligned to
-    moment: Moment  # the same, as a sheet shows it
-    true_views: EyeViews | None = None  # at the true eyes, against their own truth
-    carried_true: Quality | None = None
+    moment: Moment  # at the eyes aligned to, against their own truth
+    figures: dict[str, float]  # of FIGURES, those that could be measured
 
 
-@dataclass(slots=True)
 class Means:
     """Over the sampled refreshes."""
 
-    values: dict[str, list[float]] = field(default_factory=dict)
+    def __init__(self) -> None:
+        self.values: dict[str, list[float]] = {}
 
-    def add(self, measured: Measured) -> None:
-        found: dict[str, float | None] = {
-            "light_db": measured.moment.light_db,
-            "psnr_db": measured.eye_views.quality.psnr_db,
-            "ssim": measured.eye_views.quality.ssim,
-            "carried_db": measured.carried.psnr_db,
-            "psnr_db_true_eyes": measured.true_views.quality.psnr_db if measured.true_views else None,
-            "carried_db_true_eyes": measured.carried_true.psnr_db if measured.carried_true else None,
-        }
-        for name, value in found.items():
-            if value is not None:
-                self.values.setdefault(name, []).append(value)
+    def add(self, figures: dict[str, float]) -> None:
+        for name, value in figures.items():
+            self.values.setdefault(name, []).append(value)
 
     def summary(self) -> dict[str, Any]:
         """The measured part of summary.json; None where nothing was measured."""
-        names = ("light_db", "psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
-        means = {name: round(float(np.mean(self.values[name])), 3) if self.values.get(name) else None for name in names}
+        means = {name: round(float(np.mean(self.values[name])), 3) if name in self.values else None for name in FIGURES}
         return {**means, "quality_frames": len(self.values.get("psnr_db", []))}
 
 
@@ -134,13 +128,19 @@ class RunObserver:
         self.truth.end()
         self._advance()
         last = self.last
-        wants_last = self._measure and last is not None and _has_picture(last) and last.account.eyes_m is not None
-        if last is not None and wants_last:
-            measured = self._measured_now(last)
-            if measured is not None:
-                self.eye_views = measured.eye_views
-                if not self.means.values and last.account.state is State.TRACKING:
-                    self._take(measured)
+        if last is None or not self._measure or not _has_picture(last) or last.account.eyes_m is None:
+            return
+        true_m = self.truth.at(last.account.photon_ns)
+        known_m = None if isinstance(true_m, Unknown) else true_m
+        found: list[Pictures] = []
+        self._draw(last, known_m, found.append)
+        if not self._simulated:
+            wait_for(lambda: bool(found), timeout_s=10.0)
+        measured = self._compared(last, known_m, found[0]) if found else None
+        if measured is not None:
+            self.eye_views = measured.moment.eye_views
+            if not self.means.values and last.account.state is State.TRACKING:
+                self._take(measured)
 
     @property
     def _busy(self) -> bool:
@@ -171,32 +171,29 @@ class RunObserver:
 
     def _begin(self, refresh: Refresh, true_m: F64 | None) -> None:
         """Draw what is compared, on the solver's thread, then compare."""
-        if self._simulated:
-            found: list[Any] = []
-            self._on_solver(lambda content: found.append(self._drawn(content, refresh, true_m)))
-            if found:
-                self._take(self._compared(refresh, true_m, found[0]))
-            return
-        self._drawing = True
 
-        def draw(parts: Any) -> bool:
-            try:
-                drawn = self._drawn(parts.content, refresh, true_m)
+        def compare(drawn: Pictures) -> None:
+            if self._simulated:
+                self._take(self._compared(refresh, true_m, drawn))
+            else:
                 self._job = Job("quality", lambda: self._compared(refresh, true_m, drawn))
+
+        self._draw(refresh, true_m, compare)
+
+    def _draw(self, refresh: Refresh, true_m: F64 | None, then: Callable[[Pictures], None]) -> None:
+        """Retina pictures, drawn between two steps of the solver."""
+
+        def task(parts: Any) -> bool:
+            try:
+                then(self._drawn(parts.content, refresh, true_m))
             finally:
                 self._drawing = False
             return True
 
-        self._solver.do(draw)
-
-    def _on_solver(self, draw: Callable[[ContentSource], None]) -> None:
-        def task(parts: Any) -> bool:
-            draw(parts.content)
-            return True
-
+        self._drawing = True
         self._solver.do(task)
 
-    def _drawn(self, content: ContentSource, refresh: Refresh, true_m: F64 | None) -> dict[str, tuple[U8, U8]]:
+    def _drawn(self, content: ContentSource, refresh: Refresh, true_m: F64 | None) -> Pictures:
         """Retina pictures: of the eyes solved for, of those aligned to, of the true ones."""
         solution, account = refresh.solution, refresh.account
         if solution is None or solution.solved_for_m is None:
@@ -223,7 +220,7 @@ class RunObserver:
             and (every == 0 or account.frame % every == every - 1 or refresh is self.last)
         )
 
-    def _compared(self, refresh: Refresh, true_m: F64 | None, drawn: dict[str, tuple[U8, U8]]) -> Measured | None:
+    def _compared(self, refresh: Refresh, true_m: F64 | None, drawn: Pictures) -> Measured | None:
         account = refresh.account
         try:
             layers = shown_layers(refresh.frame)
@@ -240,57 +237,46 @@ class RunObserver:
         if "used" not in drawn or account.eyes_m is None or account.solved_for_m is None:
             return None
         stack, fov_deg, solved_for_m = self._stack, self._fov_deg, account.solved_for_m
-        try:
-            eye_views = displayed(layers, drawn["used"], stack, eyes_m=account.eyes_m, fov_deg=fov_deg)
+
+        def seen(name: str, eyes_m: F64) -> tuple[EyeViews, float]:
+            """From where the eyes are: against their own truth, and the carried quality, dB."""
             carried = carried_quality(
-                layers, drawn["solved"], stack, solved_for_m=solved_for_m, eyes_m=account.eyes_m, fov_deg=fov_deg
+                layers, drawn["solved"], stack, solved_for_m=solved_for_m, eyes_m=eyes_m, fov_deg=fov_deg
             )
+            return displayed(layers, drawn[name], stack, eyes_m=eyes_m, fov_deg=fov_deg), carried.psnr_db
+
+        try:
+            views, carried_db = seen("used", account.eyes_m)
             light = light_psnrs_db(
                 layers,
                 drawn["solved"],
                 stack,
                 eyes_m=solved_for_m,
                 seen_from_m=account.eyes_m,
-                fov_deg=fov_deg,
                 sigmas_mm=(PUPIL_SIGMA_MM,),
+                fov_deg=fov_deg,
                 step=LIGHT_STEP,
             )
-            moment = Moment(layers, eye_views, light[PUPIL_SIGMA_MM], _told(account))
-            if true_m is None:
-                return Measured(eye_views, carried, moment)
-            return Measured(
-                eye_views,
-                carried,
-                moment,
-                displayed(layers, drawn["true"], stack, eyes_m=true_m, fov_deg=fov_deg),
-                carried_quality(
-                    layers, drawn["solved"], stack, solved_for_m=solved_for_m, eyes_m=true_m, fov_deg=fov_deg
-                ),
-            )
+            moment = Moment(layers, views, light[PUPIL_SIGMA_MM], _where(account))
+            quality = views.quality
+            values = [moment.light_db, quality.psnr_db, quality.ssim, carried_db]
+            if true_m is not None:
+                true_views, true_carried_db = seen("true", true_m)
+                values += [true_views.quality.psnr_db, true_carried_db]
+            return Measured(moment, dict(zip(FIGURES, values, strict=False)))
         except ValueError as error:
             log.info("quality: not measured here (%s)", error)
             return None
 
     def _take(self, measured: Measured | None) -> None:
         if measured is not None:
-            self.eye_views = measured.eye_views
+            self.eye_views = measured.moment.eye_views
             if self.moment is None or measured.moment.light_db > self.moment.light_db:
                 self.moment = measured.moment
-            self.means.add(measured)
-
-    def _measured_now(self, refresh: Refresh) -> Measured | None:
-        """One measurement, waited for: the run is over."""
-        true_m = self.truth.at(refresh.account.photon_ns)
-        known_m = None if isinstance(true_m, Unknown) else true_m
-        self.last = refresh
-        jobs: list[dict[str, tuple[U8, U8]]] = []
-        self._on_solver(lambda content: jobs.append(self._drawn(content, refresh, known_m)))
-        if not self._simulated:
-            wait_for(lambda: bool(jobs), timeout_s=10.0)
-        return self._compared(refresh, known_m, jobs[0]) if jobs else None
+            self.means.add(measured.figures)
 
 
-def _told(account: RefreshAccount) -> tuple[str, ...]:
+def _where(account: RefreshAccount) -> tuple[str, ...]:
     """Where the eyes are in a moment, what they do, and how well that is known."""
     assert account.eyes_m is not None and account.solved_for_m is not None
     x, y, z = 100 * account.eyes_m.mean(axis=0)
@@ -319,25 +305,12 @@ def _has_picture(refresh: Refresh) -> bool:
 
 def line_of(account: RefreshAccount) -> dict[str, Any]:
     """A line of frames.jsonl (contract 5.2)."""
-    return {
-        "frame": account.frame,
-        "capture_ns": account.capture_ns,
-        "predicted_for_ns": account.predicted_for_ns,
-        "present_ns": account.present_ns,
-        "eyes_m": account.eyes_m,
-        "eyes_label": account.eyes_label,
-        "eye_sigma_mm": _rounded(account.eye_sigma_mm, 4),
-        "state": str(account.state),
-        "solution": account.solution,
-        "solved_for_m": account.solved_for_m,
-        "solution_age_ms": _rounded(account.solution_age_ms, 4),
-        "true_eyes_m": account.true_eyes_m,
-        "inference": account.inference,
-        "presented": account.presented,
-        "stage_ms": {stage: round(value, 4) for stage, value in account.stage_ms.items()},
-        "skew_ms": round(account.skew_ms, 4),
-    }
+    return {name: _plain(getattr(account, name)) for name in LINE}
 
 
-def _rounded(value: float | None, digits: int) -> float | None:
-    return None if value is None else round(value, digits)
+def _plain(value: Any) -> Any:
+    if isinstance(value, float):
+        return round(value, 4)
+    if isinstance(value, dict):
+        return {name: _plain(each) for name, each in value.items()}
+    return str(value) if isinstance(value, State) else value

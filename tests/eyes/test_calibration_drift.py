@@ -59,9 +59,8 @@ def test_noise_alone_is_no_evidence_of_a_small_drift() -> None:
         assert watching.update(eyes(0.062 * 1.045, noise_m=0.006, random=random)) == ""
 
 
-@pytest.mark.parametrize("known_m", [0.0])
-def test_an_unknown_viewer_is_not_watched(known_m: float) -> None:
-    watching = watch(known_m)
+def test_an_unknown_viewer_is_not_watched() -> None:
+    watching = watch(known_m=0.0)
     assert {watching.update(eyes(0.2)) for _ in range(SAMPLES)} == {""}
     assert watching.ratio is None
 

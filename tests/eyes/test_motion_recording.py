@@ -50,7 +50,7 @@ def test_another_seed_is_another_path_and_not_only_other_noise(tmp_path: Path, m
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-@pytest.mark.parametrize("seed", range(1, 9))
+@pytest.mark.parametrize("seed", range(9))
 def test_every_path_is_a_motion_of_its_kind(motion: str, seed: int) -> None:
     eyes = true_eyes(motion, np.arange(0, 20, 1e-3), path=path_of(seed))
     np.testing.assert_allclose(np.linalg.norm(eyes[:, 1] - eyes[:, 0], axis=1), 0.063, atol=1e-9)
@@ -88,8 +88,3 @@ def test_what_makes_no_sense_is_refused_by_name_and_leaves_nothing(tmp_path: Pat
     answer = CliRunner().invoke(app, [*how, "--out", str(tmp_path / "a.mcap")])
     assert isinstance(answer.exception, InputError) and names in str(answer.exception)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_unknown_motion_is_refused_and_the_known_ones_are_listed(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="lean"):
-        write_motion(tmp_path / "a.mcap", "moonwalk")

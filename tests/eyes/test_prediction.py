@@ -96,15 +96,6 @@ def test_an_update_costs_less_than_thirty_thousand_calls_of_a_small_function() -
     assert min(ratios) < 30_000
 
 
-@pytest.mark.parametrize("motion", MOTIONS)
-def test_motions_are_smooth_and_the_eyes_keep_their_distance(motion: str) -> None:
-    eyes = true_eyes(motion, np.arange(0, 20, 1e-3))
-    np.testing.assert_allclose(np.linalg.norm(eyes[:, 1] - eyes[:, 0], axis=1), 0.063, atol=1e-9)
-    speed = np.linalg.norm(np.diff(eyes.mean(1), axis=0), axis=1) / 1e-3
-    assert speed.max() < {"still": 0.02, "lean": 0.5, "nod": 0.5, "walk": 1.7, "stop-and-go": 1.5}[motion]
-    assert (eyes[:, :, 0] > 0.2).all()
-
-
 def test_an_observation_has_its_faults() -> None:
     seen = observe("walk", seconds=20, rate_hz=30)
     assert sum(o.points is None for o in seen) == 5 * 6

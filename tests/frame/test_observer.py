@@ -128,20 +128,16 @@ def test_lines_come_in_order_each_once_whatever_they_wait_for(content: ContentSo
     assert [line["frame"] for line in kept.lines] == list(range(60))
 
 
-def test_a_recording_without_truth_holds_nothing_up(content: ContentSource) -> None:
+def test_what_the_recording_never_said_is_null_and_holds_nothing_up(content: ContentSource) -> None:
     observer, kept = looking(content)
     observer.sampled(sample(NS_PER_S, y_m=None))
-    observer.refreshed(refresh(1, None))
-    assert [line["true_eyes_m"] for line in kept.lines] == [None]
-
-
-def test_what_the_recording_never_told_is_null_at_the_end(content: ContentSource) -> None:
-    observer, kept = looking(content)
-    observer.sampled(sample(NS_PER_S))
     observer.refreshed(refresh(0, None))
+    assert [line["true_eyes_m"] for line in kept.lines] == [None]
+    observer.sampled(sample(NS_PER_S + PERIOD_NS))
     observer.refreshed(refresh(1, None))
+    observer.refreshed(refresh(2, None))
     observer.finish()
-    assert [line["true_eyes_m"] is None for line in kept.lines] == [False, True]
+    assert [line["true_eyes_m"] is None for line in kept.lines] == [True, False, True]
 
 
 def test_lines_that_wait_are_bounded(content: ContentSource, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -203,22 +199,18 @@ def test_every_so_many_refreshes_are_sampled_while_tracking_and_no_others(
     assert observer.means.summary()["quality_frames"] == 3
 
 
-@pytest.mark.parametrize("change", [{"presented": False}, {"eyes_m": None}])
-def test_what_no_eye_saw_is_not_measured(
-    content: ContentSource, solved: Solution, change: dict[str, bool | None]
+@pytest.mark.parametrize("change", [{"presented": False}, {"eyes_m": None}, {"flatness": 0.5}])
+def test_what_no_eye_saw_and_a_mixture_with_the_flat_picture_are_not_measured(
+    content: ContentSource, solved: Solution, change: dict[str, Any]
 ) -> None:
     observer, _ = looking(content, measure=True, evaluate_every=1)
     seen = refresh(1, solved)
-    observer.refreshed(replace(seen, account=replace(seen.account, **change)))
+    if "flatness" in change:
+        seen = replace(seen, frame=replace(seen.frame, flat=solved.layers, flat_version=2, **change))
+    else:
+        seen = replace(seen, account=replace(seen.account, **change))
+    observer.refreshed(seen)
     observer.finish()
-    assert observer.means.summary()["psnr_db"] is None
-
-
-def test_a_mixture_with_the_flat_picture_is_not_measured(content: ContentSource, solved: Solution) -> None:
-    observer, _ = looking(content, measure=True, evaluate_every=1)
-    seen = refresh(1, solved)
-    mixed = replace(seen.frame, flatness=0.5, flat=solved.layers, flat_version=2)
-    observer.refreshed(replace(seen, frame=mixed))
     assert observer.means.summary()["psnr_db"] is None
 
 

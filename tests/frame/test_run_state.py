@@ -21,16 +21,6 @@ def cell() -> RunCell:
     return RunCell(Settings(), calibration=load_calibration(None), content=Part(), predictor=Part())
 
 
-def test_a_change_is_another_value_with_another_version_and_the_one_before_is_handed_back(cell: RunCell) -> None:
-    before: Any = cell.state
-    content: Any = Part()
-    answered = cell.replace(content=content)
-    assert answered is before
-    assert cell.state.content is content
-    assert cell.state.predictor is before.predictor
-    assert cell.state.version == before.version + 1
-
-
 def test_changes_from_many_threads_are_all_made_and_each_part_is_handed_back_once(cell: RunCell) -> None:
     handed_back = []
     mine = [[Part() for _ in range(50)] for _ in range(4)]

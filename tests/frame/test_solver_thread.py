@@ -140,36 +140,21 @@ def test_parts_are_made_used_and_closed_on_one_thread_that_is_not_the_presenter_
 
 
 def test_what_can_t_be_made_is_raised_to_who_waits_for_it() -> None:
-    shop = Workshop.__new__(Workshop)
-
     def refuse() -> Any:
         raise InputError("model", "name", "is unknown")
 
-    shop.host = SolverThread(refuse, SimulatedClock(1))
+    host = SolverThread(refuse, SimulatedClock(1))
     with pytest.raises(InputError, match="is unknown"):
-        shop.host.wait_ready()
-    shop.host.close(PATIENCE_S)
-
-
-def test_who_waits_for_one_that_is_never_ready_gives_up() -> None:
-    gate = threading.Event()
-    host = SolverThread(
-        lambda: FakeParts(lambda _: SolverStep()) if gate.wait(PATIENCE_S) else None,
-        MonotonicClock(),
-    )
-    with pytest.raises(FatalError, match=r"not ready after 0\.2 s"):
-        host.wait_ready(most_s=0.2)
-    gate.set()
+        host.wait_ready()
     host.close(PATIENCE_S)
 
 
-def test_who_waits_for_it_may_stop_waiting() -> None:
+def test_who_waits_for_one_that_is_never_ready_gives_up_or_stops_waiting() -> None:
     gate = threading.Event()
-    host = SolverThread(
-        lambda: FakeParts(lambda _: SolverStep()) if gate.wait(PATIENCE_S) else None,
-        SimulatedClock(1),
-    )
-    told = []
+    host = SolverThread(lambda: FakeParts(lambda _: SolverStep()) if gate.wait(PATIENCE_S) else None, MonotonicClock())
+    with pytest.raises(FatalError, match=r"not ready after 0\.2 s"):
+        host.wait_ready(most_s=0.2)
+    told: list[None] = []
     host.wait_ready(lambda: bool(told.append(None)))  # answers False
     assert len(told) == 1
     gate.set()

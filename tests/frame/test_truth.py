@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from runtime.clock import NS_PER_MS, NS_PER_S
+from runtime.clock import NS_PER_MS
 from runtime.frame.truth import GAP_NS, UNKNOWN, TrueEyes
 
 
@@ -35,16 +35,11 @@ def test_after_the_newest_sample_it_is_not_known_yet_and_once_that_has_come_it_i
     assert truth.at(asked_ns) == pytest.approx(eyes(0.0105))
 
 
-def test_when_the_recording_has_ended_it_will_never_be_known(truth: TrueEyes) -> None:
+def test_before_the_first_sample_and_after_the_recording_s_end_it_will_never_be_known(truth: TrueEyes) -> None:
     truth.end()
     assert truth.at(105 * NS_PER_MS) is None
+    assert truth.at(-1) is None
     assert np.array_equal(truth.at(100 * NS_PER_MS), eyes(0.010))
-
-
-def test_before_the_first_sample_it_will_never_be_known() -> None:
-    truth = TrueEyes()
-    truth.add(NS_PER_S, eyes(0.0))
-    assert truth.at(NS_PER_S - 1) is None
 
 
 def test_nothing_is_made_up_for_a_gap(truth: TrueEyes) -> None:

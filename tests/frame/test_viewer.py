@@ -125,31 +125,3 @@ def test_samples_of_a_sensor_in_its_own_frame_go_through_the_calibration() -> No
     sensor_m = (np.linalg.inv(calibration.stack_from_sensor) @ np.c_[EYES, np.ones(2)].T).T[:, :3]
     seen.take(SensorFrame(0, NS_PER_S, EyePoints(sensor_m, np.ones(2))), serial="demo")
     assert seen.at(NS_PER_S).eyes_m == pytest.approx(EYES, abs=1e-9)
-
-
-def test_another_sensor_than_the_calibrated_one_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
-    calibration = load_calibration(None)
-    seen = Viewer(Settings(), calibration, front_m=FRONT_M)
-    for number in range(3):
-        frame = SensorFrame(number, NS_PER_S + number * NS_PER_S // 30, EyePoints(EYES, np.ones(2)))
-        seen.take(frame, serial="another")
-    warnings = [record for record in caplog.records if "another" in record.getMessage()]
-    assert len(warnings) == bool(calibration.serial_warning("another"))
-
-
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        (lambda eyes_m: eyes_m[::-1], "left and right exchanged"),
-        (lambda eyes_m: eyes_m * 1000.0, "in millimetres, not metres"),
-    ],
-)
-def test_eyes_that_can_not_be_a_viewer_s_are_told_and_counted_by_reason(
-    change: Callable[..., Any], reason: str
-) -> None:
-    seen = viewer()
-    for number in range(30):
-        points = EyePoints(change(aside(0.001 * number)), np.ones(2))
-        seen.take(SensorFrame(number, number * 33 * NS_PER_MS, points), serial="F-1")
-    assert seen.refused == {reason: 30} and seen.at(NS_PER_S).eyes_m is None
-    assert reason in seen.warning

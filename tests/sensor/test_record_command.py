@@ -87,31 +87,27 @@ def test_pictures_are_kept_only_with_images(tmp_path: Path) -> None:
         assert np.median(found) == pytest.approx(IPD_M, abs=0.004)
 
 
-def test_what_a_sensor_recorded_is_not_replaced_unless_told(tmp_path: Path) -> None:
-    out = tmp_path / "a.mcap"
-    make = ["--motion", "still", "--seconds", "1", "--out", str(out)]
-    assert CliRunner().invoke(app, make).exit_code == 0
-    before = out.read_bytes()
-    answer = CliRunner().invoke(app, ["--seconds", "1", "--out", str(out)])
-    assert isinstance(answer.exception, InputError) and "--force" in str(answer.exception)
-    assert out.read_bytes() == before
-    assert CliRunner().invoke(app, ["--seed", "5", *make]).exit_code == 0  # a motion is made again from its seed
-    assert out.read_bytes() != before
-
-
-def test_a_motion_replaces_a_motion_and_no_viewer(tmp_path: Path) -> None:
+def test_a_motion_replaces_a_motion_and_no_viewer_and_a_sensor_replaces_nothing_unless_told(tmp_path: Path) -> None:
     """Seen: a sensor's recording was gone after `record --motion` to the same name, without a word."""
     out = tmp_path / "a.mcap"
-    assert CliRunner().invoke(app, ["--seconds", "0.5", "--out", str(out)]).exit_code == 0
-    before = out.read_bytes()
-    motion = ["--motion", "still", "--seconds", "1", "--out", str(out)]
-    for what in (before, b"something else"):
-        out.write_bytes(what)
-        answer = CliRunner().invoke(app, motion)
+    motion, sensor = ["--motion", "still", "--seconds", "1"], ["--seconds", "0.5"]
+
+    def made(*arguments: str) -> bool:
+        """False: refused, and what was there stays."""
+        before = out.read_bytes() if out.exists() else b""
+        answer = CliRunner().invoke(app, [*arguments, "--out", str(out)])
+        if answer.exit_code == 0:
+            return out.read_bytes() != before
         assert isinstance(answer.exception, InputError) and "--force" in str(answer.exception)
-        assert out.read_bytes() == what
-    assert CliRunner().invoke(app, [*motion, "--force"]).exit_code == 0
-    assert CliRunner().invoke(app, motion).exit_code == 0
+        assert out.read_bytes() == before
+        return False
+
+    assert made(*motion) and not made(*sensor)
+    assert made(*motion, "--seed", "5")  # it is made again from its seed
+    out.unlink()
+    assert made(*sensor) and not made(*motion) and made(*motion, "--force")
+    out.write_bytes(b"something else")
+    assert not made(*motion)
 
 
 @pytest.mark.parametrize("name", ["a.txt", "a", "a.mcap.bak", "x" * 5000 + ".mcap"])

@@ -26,7 +26,9 @@ def test_no_sdk_is_imported_by_looking_drivers_up() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_fixed_eyes_stand_where_the_configuration_says() -> None:
+def test_fixed_eyes_stand_where_the_configuration_says_or_it_is_refused() -> None:
+    with pytest.raises(InputError, match="fixed_eyes_m"):
+        open_sensor(SensorSettings(driver="fixed"), SimulatedClock())
     clock = SimulatedClock(50)
     driver = open_sensor(SensorSettings(driver="fixed", fixed_eyes_m=EYES), clock)
     assert isinstance(driver, SteppedSensor) and driver.capabilities.in_stack_frame
@@ -37,8 +39,3 @@ def test_fixed_eyes_stand_where_the_configuration_says() -> None:
         clock.advance_ns(10**9)
         late = driver.read_newest(0.1)
         assert late.sequence == 31 and driver.skipped == 27 and late.capture_ns <= clock.now_ns()
-
-
-def test_fixed_without_eyes_is_refused() -> None:
-    with pytest.raises(InputError, match="fixed_eyes_m"):
-        open_sensor(SensorSettings(driver="fixed"), SimulatedClock())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 
@@ -40,21 +39,15 @@ def test_every_sample_is_delivered_once_in_order_and_without_waiting() -> None:
     assert driver.available_ns(frames[5]) == frames[5].capture_ns + 15_000_000
 
 
-def test_recorded_timing_is_kept_on_the_runs_clock() -> None:
+def test_recorded_timing_is_kept_and_who_comes_late_gets_the_newest_and_the_others_are_counted() -> None:
     clock = SimulatedClock(NS_PER_S)
     driver = opened(clock, latency_ms=20.0)
     for k in range(20):
         frame = driver.read_newest(0.5)
         assert frame.capture_ns == pytest.approx(NS_PER_S + k * PERIOD_NS, abs=2)
         assert clock.now_ns() == frame.capture_ns + 20_000_000
-
-
-def test_who_comes_late_gets_the_newest_and_the_others_are_counted() -> None:
-    clock = SimulatedClock()
-    driver = opened(clock)
-    driver.read_newest(1.0)
     clock.advance_ns(round(10.5 * PERIOD_NS))
-    assert driver.read_newest(1.0).sequence == 11 and driver.skipped == 9
+    assert driver.read_newest(1.0).sequence == 30 and driver.skipped == 9
 
 
 def test_waiting_ends_with_the_time_out() -> None:
@@ -65,14 +58,12 @@ def test_waiting_ends_with_the_time_out() -> None:
     assert clock.now_ns() == NS_PER_S // 10
 
 
-def test_it_starts_at_a_time() -> None:
+def test_it_starts_at_a_time_and_one_that_is_none_is_refused() -> None:
     frames = everything(opened(SimulatedClock(9), start_s=9.5))
     assert [f.sequence for f in frames] == list(range(286, 301)) and frames[0].capture_ns == 9
-
-
-def test_a_start_after_the_end_is_refused() -> None:
-    with pytest.raises(InputError, match="start"):
-        opened(SimulatedClock(), start_s=11.0)
+    for start_s in (11.0, 1e300, -1.0):
+        with pytest.raises(InputError, match="start"):
+            opened(SimulatedClock(), start_s=start_s)
 
 
 def test_a_loop_goes_on_evenly_and_counts_on() -> None:
@@ -93,10 +84,3 @@ def test_it_can_be_opened_again_and_closed_twice() -> None:
     driver.close()
     with pytest.raises(SensorLost):
         driver.next_sample()
-
-
-def test_it_tells_its_sensor(tmp_path: Path) -> None:
-    driver = opened(MonotonicClock())
-    assert driver.serial == "demo" and driver.capabilities.eye_points and not driver.capabilities.colour
-    with pytest.raises(InputError, match="none"):
-        ReplayDriver(str(tmp_path / "none.mcap"), MonotonicClock()).open()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from pathlib import Path
@@ -24,6 +23,7 @@ from tests.sensor.taken import taken_until
 from tests.waiting import eventually
 
 HEADER = RecordingHeader(driver="test", serial="S")
+RATE_HZ = 240
 EYES = EyePoints(np.array([[0.03, 0.0, 0.6], [-0.03, 0.0, 0.6]]), np.ones(2))
 
 
@@ -75,25 +75,23 @@ def test_a_gap_longer_than_the_time_out_is_waited_for_once_and_nothing_is_reopen
     assert late.min() > -1e-3 and np.median(late) < 0.3  # the gap is of two and a half seconds
 
 
-@pytest.mark.parametrize("rate_hz", [240])
-def test_fast_recordings_are_delivered_whole_and_in_order_to_a_slow_reader(tmp_path: Path, rate_hz: int) -> None:
-    path = recorded(tmp_path / "fast.mcap", evenly(rate_hz, 1.5))
+def test_fast_recordings_are_delivered_whole_and_in_order_to_a_slow_reader(tmp_path: Path) -> None:
+    path = recorded(tmp_path / "fast.mcap", evenly(RATE_HZ, 1.5))
     got, _, worker = play(path, busy_s=1 / 30)  # a reader that is slower than the recording
-    assert [frame.sequence for frame, _ in got] == list(range(1, 1 + round(1.5 * rate_hz)))
+    assert [frame.sequence for frame, _ in got] == list(range(1, 1 + round(1.5 * RATE_HZ)))
     assert worker.stale_inputs == 0
 
 
-@pytest.mark.parametrize("rate_hz", [240])
-def test_a_reader_that_was_away_has_caught_up_with_its_next_answer(tmp_path: Path, rate_hz: int) -> None:
+def test_a_reader_that_was_away_has_caught_up_with_its_next_answer(tmp_path: Path) -> None:
     """So no delay is ever carried on: every answer holds all that is due by the clock."""
     clock = SimulatedClock()
-    driver = ReplayDriver(str(recorded(tmp_path / "fast.mcap", evenly(rate_hz, 3.0))), clock)
+    driver = ReplayDriver(str(recorded(tmp_path / "fast.mcap", evenly(RATE_HZ, 3.0))), clock)
     driver.open()
     got = []
     for away_ms in (5, 40, 300, 1, 700, 16, 16, 900):
         clock.advance_ns(away_ms * 1_000_000)
         got += driver.read_arrived(1.0)
-        assert clock.now_ns() - NS_PER_S / rate_hz < got[-1].capture_ns <= clock.now_ns()
+        assert clock.now_ns() - NS_PER_S / RATE_HZ < got[-1].capture_ns <= clock.now_ns()
     assert [frame.sequence for frame in got] == list(range(1, 1 + len(got)))
 
 
@@ -138,34 +136,3 @@ def test_a_recording_longer_than_the_limit_is_refused_with_both_figures(tmp_path
     with pytest.raises(InputError, match=r"500 s.*60"):
         driver.open()
         taken_until(driver, 10**15)
-
-
-@pytest.mark.parametrize("start_s", [1e300, 1e9, -1.0])
-def test_an_absurd_start_is_refused(start_s: float) -> None:
-    with pytest.raises(InputError, match="start_s"):
-        ReplayDriver("demo", SimulatedClock(), start_s=start_s)
-
-
-HOSTILE_TIMES = ["Infinity", "-Infinity", "NaN", "1e999", str(2**70), "1e300", "-1", "1.5", '"12"', "true", "9" * 5000]
-
-
-@pytest.mark.parametrize("text", HOSTILE_TIMES, ids=lambda text: text[:12])
-def test_a_capture_time_that_is_none_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
-    from mcap.writer import Writer
-
-    path = tmp_path / "time.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        writer.add_metadata("phasestack.recording", HEADER.metadata())
-        schema = writer.register_schema("s", "jsonschema", b"{}")
-        channel = writer.register_channel("/eyes", "json", schema)
-        good = {"sequence": 1, "capture_ns": 1, "eyes_m": None}
-        writer.add_message(channel, 0, json.dumps(good).encode(), 0)
-        writer.add_message(channel, 0, f'{{"sequence":2,"eyes_m":null,"capture_ns":{text}}}'.encode(), 0)
-        writer.finish()
-    driver = ReplayDriver(str(path), SimulatedClock())
-    with pytest.raises(InputError, match="time") as caught:
-        driver.open()
-        taken_until(driver, 10**12)
-    assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
