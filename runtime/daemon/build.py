@@ -180,7 +180,7 @@ def build_run(
         )
         solver = thread
         cleanup.callback(solver.close)
-        thread.wait_ready(lambda: host.starting("loading content and model"), most_s=settings.limits.start_s)
+        thread.wait_ready(lambda: host.starting("loading content and model"), max_s=settings.limits.start_s)
         samples = worker = SensorWorker(make_driver, settings.sensor, clock)
         cleanup.callback(worker.close)
         worker.start()

@@ -139,7 +139,7 @@ class Calibration:
         """One line where a sensor is not the one that was calibrated, else an empty text."""
         if not self.sensor_serial or serial == self.sensor_serial:
             return ""
-        found = f"the sensor is {serial}" if serial else "the sensor tells no serial"
+        found = f"the sensor is {serial}" if serial else "the sensor reports no serial"
         return f"{self.source}: calibrated for sensor {self.sensor_serial}, but {found}: calibrate again"
 
 

@@ -10,8 +10,8 @@ from runtime.records import EyePoints
 
 TOLERANCE = 0.04  # by which the measured separation may part from the known one
 SAMPLES = 300  # ten seconds of a common depth camera
-LEAST_SAMPLES = 90
-LEAST_CONFIDENCE = 0.5
+SAMPLES_MIN = 90
+CONFIDENCE_MIN = 0.5
 SURE = 3.0  # standard errors of the median by which it must be beyond the tolerance
 MAD_TO_SIGMA = 1.4826
 MEDIAN_EFFICIENCY = 1.2533  # standard error of a median over that of a mean, Gaussian
@@ -29,13 +29,13 @@ class SeparationWatch:
     @property
     def ratio(self) -> float | None:
         """Measured over known separation, the median of the last samples; None before there are enough."""
-        if self._known_m <= 0.0 or len(self._samples) < LEAST_SAMPLES:
+        if self._known_m <= 0.0 or len(self._samples) < SAMPLES_MIN:
             return None
         return float(np.median(self._samples)) / self._known_m
 
     def update(self, eyes: EyePoints) -> str:
         """Take in eyes in frame `stack`. Answers a line to log when the state changes, else an empty text."""
-        if self._known_m <= 0.0 or eyes.completed or float(eyes.confidence.min()) < LEAST_CONFIDENCE:
+        if self._known_m <= 0.0 or eyes.completed or float(eyes.confidence.min()) < CONFIDENCE_MIN:
             return ""
         separation_m = float(np.linalg.norm(eyes.eyes_m[0] - eyes.eyes_m[1]))
         if not np.isfinite(separation_m):

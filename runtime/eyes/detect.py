@@ -81,8 +81,8 @@ def _eye_points(pupils: Pupils, depths: EyeDepths, intrinsics: Intrinsics) -> Ey
         confidence[SIDES.index(pupils.hidden)] = min(FILLED_IN_CONFIDENCE, pupils.certainty)
     middle = eyes.mean(axis=0)
     across = pupils.sigma_px / np.sqrt(i.fx_px * i.fy_px) * middle[2]
-    told = covariance(middle, eyes[0] - eyes[1], MIDDLE_SIDEWAYS * across, MIDDLE_UP * across, depths.sigma_m)
-    return EyePoints(eyes, confidence, pupils.hidden, told)
+    spread = covariance(middle, eyes[0] - eyes[1], MIDDLE_SIDEWAYS * across, MIDDLE_UP * across, depths.sigma_m)
+    return EyePoints(eyes, confidence, pupils.hidden, spread)
 
 
 def covariance(place: F64, line: F64, sideways_m: float, up_m: float, along_m: float) -> F64:

@@ -44,7 +44,7 @@ class FaceFlow:
         self._grey, self._mesh = self._crop(picture), mesh[RIGID, :2].copy()
 
     def moved(self, picture: U8, mesh: F64) -> F64 | None:
-        """(2, 3) similarity: where the remembered picture's pixels of the face are now; None: it can't be told."""
+        """(2, 3) similarity: where the remembered picture's pixels of the face are now; None: that is not known."""
         grey = self._crop(picture)
         matrix = self._crop_from_picture
         start = (transformed(matrix, self._mesh) - 0.5).astype(np.float32)

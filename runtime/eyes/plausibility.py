@@ -23,7 +23,7 @@ EXCHANGED = "left and right exchanged"
 
 IPD_MIN_M, IPD_MAX_M = 0.050, 0.078  # how far apart a person's eyes are
 WINDOW = 30  # samples: a second of a common depth camera
-LEAST_SAMPLES = 10
+SAMPLES_MIN = 10
 TELL_SHARE = 0.5  # of the window, for one reason
 UNIT_SLACK = 1.25  # a separation of 40 to 94 units is one in millimetres: people's is 50 to 75 mm
 DISTANT_M = 20.0
@@ -82,7 +82,7 @@ class RefusalWatch:
         self._last.append(reason if reason in MISTAKES else "")
         if reason:
             self._counts[reason] += 1
-        if len(self._last) < LEAST_SAMPLES:
+        if len(self._last) < SAMPLES_MIN:
             return ""
         commonest, count = Counter(filter(None, self._last)).most_common(1)[0] if any(self._last) else ("", 0)
         before = self.warning

@@ -13,9 +13,9 @@ from runtime.records import F64
 
 REST_NS = NS_PER_S  # a head that has stood for so long rests
 LOST_NS = NS_PER_S  # after a longer gap nothing is known
-DRIFT_NS = 3 * NS_PER_S  # drift is told from the median of so much
+DRIFT_NS = 3 * NS_PER_S  # drift is measured by the median of so much
 EVERY = 8  # samples, noise and drift are looked at: neither changes quickly
-FEWEST = 8  # samples that anything is told from
+FEWEST = 8  # samples that anything is concluded from
 KEPT = 256
 GRACE_M = 0.0005  # of every test, for sensors without noise
 NOISE_MAX_M = 0.005  # what scatters by more is no resting head's, whatever the sensor: it could never be seen to leave

@@ -35,7 +35,7 @@ CLOCK_RESET_NS = NS_PER_S  # a capture this far in the past is a clock that was 
 COMPLETED_NOISE = 2.0  # an eye that was filled in is this much less certain
 NOISE_FLOOR_M = 2e-5  # a driver that says less than this is not believed: nothing measures a pupil so well
 ESTABLISHED = 3  # samples of a head; one of fewer may have been a mistake
-SIGMA_AHEAD_S = 1.0  # how sure a guess is, is not told further ahead
+SIGMA_AHEAD_S = 1.0  # how sure a guess is, is not predicted further ahead
 NEAREST_M = 0.1  # from the display; nearer eyes count as so near, for what their depth matters
 PANEL_M = (0.5184, 0.2916)  # width and height, where nobody says
 NO_JUMP = np.zeros((2, 3))
@@ -277,7 +277,7 @@ class Tracker:
         return self._estimate(time_ns, after.head, eyes_m, "interpolated")
 
     def _estimate(self, time_ns: int, head: _Head, eyes_m: F64, label: EyesLabel) -> EyesEstimate:
-        """How far off the served eyes are, told from what the head can have done since its newest sample."""
+        """How far off the served eyes are, by what the head can have done since its newest sample."""
         age_s = min(max(head.age_s(time_ns), 0.0), SIGMA_AHEAD_S)
         middle_m, half_m = (eyes_m[0] + eyes_m[1]) / 2, (eyes_m[1] - eyes_m[0]) / 2
         if label in ("exact", "interpolated"):

@@ -1,6 +1,6 @@
 """Looks at a run's refreshes: the account's lines, sampled quality, kept light. Off the refreshes' own time.
 
-Lines wait until the recording has told where the eyes really were; so do measurements. In simulated time they are
+Lines wait until the recording has said where the eyes really were; so do measurements. In simulated time they are
 made at once; in real time the solver's thread draws what is compared and a thread of its own compares, and while one
 measurement is under way no other begins.
 """

@@ -1,7 +1,7 @@
 """When refreshes wake, are presented and send their light: predicted from the display's own vertical blanks.
 
-Pure: it is told the time and what happened, and never reads a clock. The manner is that of Monado's compositor
-pacing: predict, tell what happened, learn the phase of the blanks and the time that a refresh needs before one.
+Pure: it is given the time and what happened, and never reads a clock. The manner is that of Monado's compositor
+pacing: predict, report what happened, learn the phase of the blanks and the time that a refresh needs before one.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ WORK_GAIN = 0.05  # with which the time a refresh needs is forgotten; more is be
 LATE_SHARE = 0.5  # of a period: later than this, the next slot is taken
 MARGIN_GROWTH = 1.5  # of the margin after a missed blank
 MARGIN_DECAY = 0.9995  # of the margin after a blank that was met: where drawing needs more, one in 800 is missed
-MARGIN_LEAST_NS = NS_PER_MS
+MARGIN_MIN_NS = NS_PER_MS
 
 
 class Pacer:
@@ -29,7 +29,7 @@ class Pacer:
             raise ValueError("a period must be positive")
         self.period_ns, self._photon_ns = period_ns, photon_ns
         self._work_ns = float(work_ns)
-        self._margin_ns = float(MARGIN_LEAST_NS)
+        self._margin_ns = float(MARGIN_MIN_NS)
         self._has_blanks = False
         self._target_ns: int | None = None  # of the last refresh
         self._number = -1
@@ -52,9 +52,9 @@ class Pacer:
         return FrameTiming(self._number, target_ns - lead_ns, target_ns, target_ns + self._photon_ns)
 
     def presented(self, timing: FrameTiming, *, woke_ns: int, done_ns: int, blank_ns: int | None = None) -> int:
-        """What became of a refresh; answers when its light leaves, as well as that is known.
+        """What became of a refresh; answers its display time, as well as that is known.
 
-        blank_ns: when its vertical blank happened; None where the sink can't tell, or left the swap out.
+        blank_ns: when its vertical blank happened; None where the sink does not know, or left the swap out.
         """
         if blank_ns is None:
             self._learn_work(done_ns - woke_ns)
@@ -67,7 +67,7 @@ class Pacer:
             self.missed += slots
             self._margin_ns = min(self._margin_ns * MARGIN_GROWTH, self.period_ns / 2)
         else:
-            self._margin_ns = max(self._margin_ns * MARGIN_DECAY, float(MARGIN_LEAST_NS))
+            self._margin_ns = max(self._margin_ns * MARGIN_DECAY, float(MARGIN_MIN_NS))
         remaining_ns = error_ns - slots * self.period_ns
         assert self._target_ns is not None
         self._target_ns += slots * self.period_ns + round(PHASE_GAIN * remaining_ns)

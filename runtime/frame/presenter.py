@@ -1,7 +1,7 @@
 """One refresh after the other: receive, map, predict, align, present, account. It waits for nothing but its time.
 
 The solver works alongside it (`solver_host`) and hands over complete solutions; every refresh shows the newest one,
-aligned to where the eyes will be when its light leaves.
+aligned to where the eyes will be at its display time.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ log = logging.getLogger("phasestack.presenter")
 
 
 class Supervisor(Protocol):
-    """What the presenter tells the outside, and asks it, once a refresh. Nothing here may wait."""
+    """What the presenter reports to the outside, and asks it, once a refresh. Nothing here may wait."""
 
     def stop_reason(self) -> str:
         """Why to stop; empty: go on."""
@@ -249,7 +249,7 @@ class Presenter:
         return report, ""
 
     def _presented_at(self, timing: FrameTiming, report: PresentReport | None, *, woke_ns: int) -> int:
-        """Tell the pacer what happened; answers when the light leaves."""
+        """Report to the pacer what happened; answers the display time."""
         blank_ns = report.vblank_ns if report is not None else None
         return self.pacer.presented(timing, woke_ns=woke_ns, done_ns=self.clock.now_ns(), blank_ns=blank_ns)
 

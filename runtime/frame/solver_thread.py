@@ -56,17 +56,17 @@ class SolverThread(SolverHost):
         self.restarts = 0
         self._attempt = self._begin(1)
 
-    def wait_ready(self, tell: Callable[[], bool] = lambda: True, *, most_s: float = math.inf) -> None:
-        """Until the solver can be asked. tell: called now and then; False: stop waiting.
+    def wait_ready(self, go_on: Callable[[], bool] = lambda: True, *, max_s: float = math.inf) -> None:
+        """Until the solver can be asked. go_on: asked now and then; False: stop waiting.
 
-        Raises whatever making it raised, and FatalError after `most_s`.
+        Raises whatever making it raised, and FatalError after `max_s`.
         """
         begun_ns = self._clock.now_ns()
         while not self._attempt.ready.wait(0.1):
-            if not tell():
+            if not go_on():
                 return
-            if self._clock.now_ns() - begun_ns > most_s * NS_PER_S:
-                raise FatalError(f"content and model: not ready after {most_s:g} s")
+            if self._clock.now_ns() - begun_ns > max_s * NS_PER_S:
+                raise FatalError(f"content and model: not ready after {max_s:g} s")
         if self._attempt.error is not None:
             raise self._attempt.error
 

@@ -25,7 +25,7 @@ class Ring:
     def __init__(self, size: int = WINDOW) -> None:
         self._values = np.zeros(size)
         self._count = 0
-        self._told: dict[tuple[str, ...], tuple[int, dict[str, float] | None]] = {}  # at how many values, and what
+        self._known: dict[tuple[str, ...], tuple[int, dict[str, float] | None]] = {}  # at how many values, and what
 
     def add(self, value: float) -> None:
         self._values[self._count % self._values.size] = value
@@ -36,17 +36,17 @@ class Ring:
 
         nearly: those taken before will do, where hardly a value has come since. Who asks often costs little then.
         """
-        asked_at, told = self._told.get(names, (0, None))
-        if nearly and told is not None and self._count - asked_at <= RECENT_SHARE * min(asked_at, self._values.size):
-            return told
+        asked_at, known = self._known.get(names, (0, None))
+        if nearly and known is not None and self._count - asked_at <= RECENT_SHARE * min(asked_at, self._values.size):
+            return known
         count = self._count
         held = self._values[: min(count, self._values.size)]
         if held.size == 0:
             return None
         shares = [1.0 if name == "max" else float(name[1:]) / 100.0 for name in names]
-        told = {name: round(value, 4) for name, value in zip(names, _quantiles(held, shares), strict=True)}
-        self._told[names] = count, told
-        return told
+        known = {name: round(value, 4) for name, value in zip(names, _quantiles(held, shares), strict=True)}
+        self._known[names] = count, known
+        return known
 
 
 def _quantiles(held: F64, shares: list[float]) -> list[float]:

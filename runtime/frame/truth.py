@@ -1,4 +1,4 @@
-"""Where the eyes really were, for recordings that know it: asked about an instant once later samples have told."""
+"""Where the eyes really were, for recordings that know it: asked about an instant once later samples have come."""
 
 from __future__ import annotations
 

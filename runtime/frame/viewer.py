@@ -1,4 +1,4 @@
-"""From a sensor's samples to the eyes at any instant: map, track, tell rest; with the settings of the moment."""
+"""From a sensor's samples to the eyes at any instant: map, track, find rest; with the settings of the moment."""
 
 from __future__ import annotations
 
@@ -93,9 +93,9 @@ class Viewer:
         if not self._in_stack_frame and (line := self._drift.update(points)):
             log.warning("%s", line)
 
-    def at(self, light_ns: int) -> EyesEstimate:
-        """The eyes at the light of a refresh: what is shown next is aligned to them."""
-        return self._served(self._tracker.at(light_ns))
+    def at(self, display_ns: int) -> EyesEstimate:
+        """The eyes at the display time of a refresh: what is shown next is aligned to them."""
+        return self._served(self._tracker.at(display_ns))
 
     def ahead(self, time_ns: int) -> EyesEstimate:
         """The eyes at an instant that is not shown yet: for the solver."""

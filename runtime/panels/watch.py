@@ -1,7 +1,7 @@
 """Whether windows and monitors are still what was bound: asked of the X server once a second, a question at a time.
 
-GLFW tells of monitors that come and go and of windows that are asked to close or become another size. It doesn't tell
-of a window that somebody destroyed, unmapped or moved, nor of a monitor that got another place or mode: what is shown
+GLFW reports monitors that come and go and of windows that are asked to close or become another size. It doesn't
+report a window that somebody destroyed, unmapped or moved, nor a monitor that got another place or mode: what is shown
 then is on the wrong panel, or on none, and every swap succeeds.
 """
 

@@ -169,7 +169,7 @@ class ServerWatch:
 
     def _watch(self) -> None:
         poll = select.poll()
-        poll.register(self._connection, 0)  # hanging up is always told; what comes in is not our business
+        poll.register(self._connection, 0)  # hanging up is always reported; what comes in is not our business
         poll.register(self._stop_reading, select.POLLIN)
         for file, _ in poll.poll():
             if file == self._connection:

@@ -36,7 +36,7 @@ class Sensor(ABC):
     One thread uses a driver; that thread may be abandoned when an SDK hangs.
 
     A class of the user's own is named by `sensor.driver = "module:Class"` and made as `Class(options, clock=clock)`:
-    `options` is what `Options` makes of `[sensor.options]`, `clock` the run's clock, which its captures are told in.
+    `options` is what `Options` makes of `[sensor.options]`, `clock` the run's clock, which its captures are times of.
     """
 
     Options: ClassVar[type[BaseModel]] = Section  # of a class of the user's own: what [sensor.options] may hold

@@ -6,7 +6,7 @@ WINDOW_NS = 5_000_000_000
 
 
 class DeviceClock:
-    """A device's time on the host's clock: the quickest delivery of the last seconds tells the offset.
+    """A device's time on the host's clock: the quickest delivery of the last seconds gives the offset.
 
     Every delivery is late by some delay; the least delay of a window is close to the least there is, and
     taking a fresh window every few seconds follows the drift between two quartzes.

@@ -134,7 +134,7 @@ class OpenNI2Driver(Sensor):
         if not 0 < fov_x < math.pi:
             fov_x, fov_y = math.radians(self._settings.fov_deg), 0.0
         if fov_x == 0.0:
-            log.warning("OpenNI2: the camera does not tell its field of view: set sensor.fov_deg")
+            log.warning("OpenNI2: the camera does not report its field of view: set sensor.fov_deg")
             return None
         fx = width / 2 / math.tan(fov_x / 2)
         fy = height / 2 / math.tan(fov_y / 2) if 0 < fov_y < math.pi else fx

@@ -205,7 +205,7 @@ class Recording:
 
     def _to_the_break(self, file: IO[bytes]) -> Iterator[Any]:
         try:
-            yield from mcap_records(file, source=self.path, most_bytes=round(self._limits.chunk_mib * foreign.MIB))
+            yield from mcap_records(file, source=self.path, max_bytes=round(self._limits.chunk_mib * foreign.MIB))
         except InputError:
             raise
         except OSError as error:
@@ -235,7 +235,7 @@ class Recording:
                         parts = {}
                     stamp_ns = at_ns
                 if topic == fmt.COLOUR_TOPIC:
-                    parts["colour"] = fmt.colour_from_message(message.data, most_pixels=self._limits.pixels)
+                    parts["colour"] = fmt.colour_from_message(message.data, max_pixels=self._limits.pixels)
                 elif topic == fmt.DEPTH_TOPIC:
                     parts["depth_mm"] = fmt.depth_from_message(message.data)
                 elif topic == fmt.CALIBRATION_TOPIC:

@@ -218,12 +218,12 @@ def colour_message(colour: U8, *, capture_ns: int) -> bytes:
     return _stamped(capture_ns, data=base64.b64encode(jpeg.tobytes()).decode(), format="jpeg")
 
 
-def colour_from_message(data: bytes, *, most_pixels: int = 1 << 26) -> U8:
+def colour_from_message(data: bytes, *, max_pixels: int = 1 << 26) -> U8:
     """(h, w, 3) back from `colour_message` (JPEG is lossy). Raises ValueError."""
     coded = base64.b64decode(_read(ColourImage, data).data)
     width, height = picture_size(coded)
-    if max(width, height) > IMAGE_SIDE_MAX_PX or width * height > most_pixels:
-        raise ValueError(f"a colour image has {width} by {height} pixels; at most {most_pixels:,}")
+    if max(width, height) > IMAGE_SIDE_MAX_PX or width * height > max_pixels:
+        raise ValueError(f"a colour image has {width} by {height} pixels; at most {max_pixels:,}")
     image = None if is_cut_off(coded) else cv2.imdecode(np.frombuffer(coded, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise ValueError("a colour image cannot be decoded")

@@ -31,7 +31,7 @@ class ReplayDriver(SteppedSensor):
     """Recorded times are shifted on to the run's clock: the first sample is captured at `open`.
 
     Any rate and any gap is played as it was recorded. A sample that is no later than the one before it is not
-    delivered; `refused` counts them by reason, and the first is told.
+    delivered; `refused` counts them by reason, and the first is logged.
 
     A sample arrives at its capture and the latency.
     """

@@ -10,7 +10,7 @@ from runtime.errors import EndOfRecording, InputError
 from runtime.records import SensorFrame
 from runtime.sensor.base import Sensor, SteppedSensor
 
-AHEAD_NS = NS_PER_S // 10  # more than from a sample to the light of a refresh that used it
+AHEAD_NS = NS_PER_S // 10  # more than from a sample to the display time of a refresh that used it
 
 
 class Samples(ABC):

@@ -30,7 +30,7 @@ class UsbCameraDriver(Sensor):
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
         """settings.source: empty or `demo`: the first camera; a number, a device, or a stream's address.
 
-        Raises InputError without a field of view, which no webcam tells.
+        Raises InputError without a field of view, which no webcam reports.
         """
         if not settings.fov_deg:
             raise InputError("sensor", "fov_deg", "is needed by usb-camera: the picture's horizontal angle, degrees")

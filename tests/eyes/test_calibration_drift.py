@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from runtime.eyes.calibration_drift import LEAST_SAMPLES, SAMPLES, SeparationWatch
+from runtime.eyes.calibration_drift import SAMPLES, SAMPLES_MIN, SeparationWatch
 from runtime.records import EyePoints
 
 
@@ -46,7 +46,7 @@ def test_it_is_told_when_it_is_right_again() -> None:
 
 def test_too_few_samples_are_no_evidence() -> None:
     watching = watch()
-    for _ in range(LEAST_SAMPLES - 1):
+    for _ in range(SAMPLES_MIN - 1):
         assert watching.update(eyes(0.1)) == ""
     assert watching.ratio is None
     assert watching.update(eyes(0.1)) != ""
@@ -55,7 +55,7 @@ def test_too_few_samples_are_no_evidence() -> None:
 def test_noise_alone_is_no_evidence_of_a_small_drift() -> None:
     """Just beyond the tolerance, with noise that could explain it: silence."""
     watching, random = watch(), np.random.default_rng(1)
-    for _ in range(LEAST_SAMPLES):
+    for _ in range(SAMPLES_MIN):
         assert watching.update(eyes(0.062 * 1.045, noise_m=0.006, random=random)) == ""
 
 

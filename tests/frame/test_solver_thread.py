@@ -153,7 +153,7 @@ def test_who_waits_for_one_that_is_never_ready_gives_up_or_stops_waiting() -> No
     gate = threading.Event()
     host = SolverThread(lambda: FakeParts(lambda _: SolverStep()) if gate.wait(PATIENCE_S) else None, MonotonicClock())
     with pytest.raises(FatalError, match=r"not ready after 0\.2 s"):
-        host.wait_ready(most_s=0.2)
+        host.wait_ready(max_s=0.2)
     told: list[None] = []
     host.wait_ready(lambda: bool(told.append(None)))  # answers False
     assert len(told) == 1
