@@ -21,7 +21,7 @@ from runtime.eyes.calibration import load_calibration
 from runtime.eyes.detect import EyeFinder
 from runtime.frame.observer import Output, RunObserver
 from runtime.frame.pacing import Pacer
-from runtime.frame.presenter import Observers, Presenter, Unsupervised
+from runtime.frame.presenter import Presenter, Supervisor
 from runtime.frame.solver_host import SimulatedSolver, SolverHost, total_ns
 from runtime.frame.solver_thread import SolverThread
 from runtime.frame.viewer import Viewer
@@ -105,7 +105,7 @@ def scaled_stack(settings: Settings, scale: float) -> PanelStack:
     )
 
 
-class Host(Unsupervised):
+class Host(Supervisor):
     """Who a run is for: asked before its first refresh, its supervisor from then on. This one asks for nothing."""
 
     def starting(self, doing: str) -> bool:
@@ -210,7 +210,7 @@ def build_run(
         panels=panels,
         stage_ms=settings.loop.simulated_stage_ms,
         supervisor=host,
-        observer=observer if recorder is None else Observers(observer, recorder),
+        observers=[observer] if recorder is None else [observer, recorder],
     )
     if recorder is not None:
         in_stack_frame = driver.capabilities.in_stack_frame

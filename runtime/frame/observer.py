@@ -21,7 +21,7 @@ from runtime.evaluation.contact_sheet import Moment
 from runtime.evaluation.displayed import EyeViews, displayed
 from runtime.frame.presenter import Refresh
 from runtime.frame.solver_host import SolverHost
-from runtime.frame.truth import TrueEyes, Unknown
+from runtime.frame.truth import TrueEyes
 from runtime.optics.alignment import shown_layers
 from runtime.optics.carried import carried_quality, light_psnrs_db
 from runtime.optics.pupil import PUPIL_SIGMA_MM
@@ -131,12 +131,11 @@ class RunObserver:
         if last is None or not self._measure or not _has_picture(last) or last.account.eyes_m is None:
             return
         true_m = self.truth.at(last.account.photon_ns)
-        known_m = None if isinstance(true_m, Unknown) else true_m
         found: list[Pictures] = []
-        self._draw(last, known_m, found.append)
+        self._draw(last, true_m, found.append)
         if not self._simulated:
             wait_for(lambda: bool(found), timeout_s=10.0)
-        measured = self._compared(last, known_m, found[0]) if found else None
+        measured = self._compared(last, true_m, found[0]) if found else None
         if measured is not None:
             self.eye_views = measured.moment.eye_views
             if not self.means.values and last.account.state is State.TRACKING:
@@ -153,21 +152,19 @@ class RunObserver:
 
     def _advance(self) -> None:
         while self._lines:
-            true_m = self.truth.at(self._lines[0].photon_ns)
-            if isinstance(true_m, Unknown):
-                if len(self._lines) < WAITING_MAX:
-                    break
-                true_m = None
+            photon_ns = self._lines[0].photon_ns
+            if self.truth.may_come(photon_ns) and len(self._lines) < WAITING_MAX:
+                break
             assert self._output is not None
-            self._output.refresh(line_of(replace(self._lines.popleft(), true_eyes_m=true_m)))
+            self._output.refresh(line_of(replace(self._lines.popleft(), true_eyes_m=self.truth.at(photon_ns))))
         if self._job is not None and self._job.done:
             job, self._job = self._job, None
             self._take(job.take())
         while self._samples and self._job is None and not self._drawing:
-            true_m = self.truth.at(self._samples[0].account.photon_ns)
-            if isinstance(true_m, Unknown):
+            photon_ns = self._samples[0].account.photon_ns
+            if self.truth.may_come(photon_ns):
                 break
-            self._begin(self._samples.popleft(), true_m)
+            self._begin(self._samples.popleft(), self.truth.at(photon_ns))
 
     def _begin(self, refresh: Refresh, true_m: F64 | None) -> None:
         """Draw what is compared, on the solver's thread, then compare."""

@@ -7,6 +7,7 @@ aligned to where the eyes will be at its display time.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -44,30 +45,18 @@ from runtime.sensor.samples import Samples
 log = logging.getLogger("phasestack.presenter")
 
 
-class Supervisor(Protocol):
-    """What the presenter reports to the outside, and asks it, once a refresh. Nothing here may wait."""
+class Supervisor:
+    """What the presenter reports to the outside, and asks it, once a refresh, never waiting. This one does nothing."""
 
     def stop_reason(self) -> str:
         """Why to stop; empty: go on."""
+        return ""
 
     def carry_out_commands(self, presenter: Presenter) -> None:
         """Carry out what an operator asked for since the last refresh."""
 
     def refreshed(self, presenter: Presenter, account: RefreshAccount) -> None:
         """One refresh is complete."""
-
-
-class Unsupervised:
-    """Nobody watches: a demo, a test."""
-
-    def stop_reason(self) -> str:
-        return ""
-
-    def carry_out_commands(self, presenter: Presenter) -> None:
-        return
-
-    def refreshed(self, presenter: Presenter, account: RefreshAccount) -> None:
-        return
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,21 +78,6 @@ class Observer(Protocol):
         """A refresh is complete."""
 
 
-class Observers:
-    """Tells each of them everything, in their order."""
-
-    def __init__(self, *observers: Observer) -> None:
-        self._observers = observers
-
-    def sampled(self, sample: SensorFrame) -> None:
-        for observer in self._observers:
-            observer.sampled(sample)
-
-    def refreshed(self, refresh: Refresh) -> None:
-        for observer in self._observers:
-            observer.refreshed(refresh)
-
-
 class Presenter:
     """One run. Everything it needs is given; it owns none of it but what it counts."""
 
@@ -120,13 +94,13 @@ class Presenter:
         panels: PanelSink,
         stage_ms: dict[str, float],
         supervisor: Supervisor | None = None,
-        observer: Observer | None = None,
+        observers: Sequence[Observer] = (),
     ) -> None:
         """stage_ms: what stages of a refresh cost on a simulated clock."""
         self.run_cell, self.stack, self.clock = run, stack, clock
         self.pacer, self.samples, self.viewer, self.solver, self.panels = pacer, samples, viewer, solver, panels
         self._stage_ms = stage_ms
-        self._supervisor, self._observer = supervisor or Unsupervised(), observer or Observers()
+        self._supervisor, self._observers = supervisor or Supervisor(), observers
         self._adopted = run.state.version
         self.stats = RunStats()
         self.machine = StateMachine(now_ns=clock.now_ns())
@@ -192,7 +166,8 @@ class Presenter:
     def _receive(self, now_ns: int) -> None:
         for sample in self.samples.arrived(now_ns):
             self.viewer.take(sample, serial=self.samples.serial)
-            self._observer.sampled(sample)
+            for observer in self._observers:
+                observer.sampled(sample)
 
     def _compose(self, timing: FrameTiming, eyes: EyesEstimate, news: News) -> tuple[PanelFrame, str]:
         """What the panels are given, and why an alignment is at its limit (empty: it is not)."""
@@ -243,7 +218,7 @@ class Presenter:
         try:
             report = self.panels.present(frame, unchanged=unchanged)
         except PanelLost as error:
-            self.fault("panel")
+            self.stats.fault("panel")
             return None, str(error)
         self._presented = True
         return report, ""
@@ -282,7 +257,7 @@ class Presenter:
             missing["sensor"] = fault
         for part in news.missing:
             if part not in self.missing or news.missing[part] != self.missing[part]:
-                self.fault(part)
+                self.stats.fault(part)
         return missing
 
     def _judge(self, eyes: EyesEstimate, limited: str, *, shown: bool) -> State:
@@ -296,11 +271,10 @@ class Presenter:
             late=self._lateness.update(presented=shown, now_ns=self.clock.now_ns()),
             paused=self.paused,
         )
-        transition = self.machine.update(conditions, now_ns=self.clock.now_ns())
-        if transition is not None:
-            log.info(
-                "state: %s -> %s (%s)", transition.before, transition.after, transition.reason, extra={"always": True}
-            )
+        before = self.machine.name
+        if self.machine.update(conditions, now_ns=self.clock.now_ns()):
+            line = f"state: {before} -> {self.machine.name} ({self.machine.reason})"
+            log.info("%s", line, extra={"always": True})
         return self.machine.state
 
     def _account(
@@ -347,15 +321,8 @@ class Presenter:
         self._supervisor.refreshed(self, account)
         overhead_ms = times.overhead_ms()
         self.stats.add(account, overhead_ms=overhead_ms, missed_blanks=self.pacer.missed)
-        self._observer.refreshed(self.last)
-
-    def fault(self, part: str) -> None:
-        """Count a fault that the run lives on with."""
-        self.stats.fault(part)
-
-    def seconds(self) -> float:
-        """Since the first refresh, on the run's clock."""
-        return self.stats.seconds()
+        for observer in self._observers:
+            observer.refreshed(self.last)
 
     def summary(self, *, simulated: bool = False) -> dict[str, Any]:
         """The part of summary.json that is counted (contract 5.2); simulated: every time is the run's clock's."""

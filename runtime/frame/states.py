@@ -26,16 +26,6 @@ class Conditions:
     paused: bool = False  # the operator froze the picture; it is still aligned to the eyes
 
 
-@dataclass(frozen=True, slots=True)
-class Transition:
-    """A change of state (or of what is missing) and its reason."""
-
-    before: str  # as `StateMachine.name` writes it
-    after: str
-    reason: str
-    time_ns: int
-
-
 def judge(conditions: Conditions) -> tuple[State, str]:
     """The state that the conditions call for, and why. Stopping, starting and what is missing come before the eyes."""
     if conditions.stopping:
@@ -60,13 +50,12 @@ def judge(conditions: Conditions) -> tuple[State, str]:
 
 
 class StateMachine:
-    """Holds the state, how long it has lasted and how long each has been held."""
+    """Holds the state, and how long each has been held."""
 
     def __init__(self, *, now_ns: int) -> None:
         self.state = State.STARTING
         self.missing: tuple[Part, ...] = ()
         self.reason = "started"
-        self.since_ns = now_ns
         self._counted_ns = now_ns
         self._held_ns = {state: 0 for state in State}
 
@@ -75,20 +64,16 @@ class StateMachine:
         """The state as people read it: `tracking`, `degraded: sensor, panel`."""
         return f"{self.state}: {', '.join(self.missing)}" if self.state is State.DEGRADED else str(self.state)
 
-    def update(self, conditions: Conditions, *, now_ns: int) -> Transition | None:
-        """Take in one turn. Answers the transition, if this is one: log it. Stopping is never left."""
+    def update(self, conditions: Conditions, *, now_ns: int) -> bool:
+        """Take in one turn; True where the state, or what is missing, is another: log it. Stopping is never left."""
         self._held_ns[self.state] += now_ns - self._counted_ns
         self._counted_ns = now_ns
         if self.state is State.STOPPING:
-            return None
+            return False
         before = self.name
-        self.state, reason = judge(conditions)
+        self.state, self.reason = judge(conditions)
         self.missing = tuple(part for part in PARTS if part in conditions.missing)
-        self.reason = reason
-        if self.name == before:
-            return None
-        self.since_ns = now_ns
-        return Transition(before, self.name, reason, now_ns)
+        return self.name != before
 
     def seconds(self, *, now_ns: int) -> dict[str, float]:
         """Seconds spent in every state up to now; the states that never were are left out."""

@@ -11,13 +11,6 @@ GAP_NS = NS_PER_S // 5  # a longer gap says nothing of what happened in it
 KEPT = 512
 
 
-class Unknown:
-    """The truth of that instant is not known yet."""
-
-
-UNKNOWN = Unknown()
-
-
 class TrueEyes:
     """The recorded truth at samples' captures, interpolated between them."""
 
@@ -34,12 +27,14 @@ class TrueEyes:
         """No more samples will come."""
         self._ended = True
 
-    def at(self, time_ns: int) -> F64 | Unknown | None:
-        """(2, 3) at an instant; None: it will never be known."""
-        if not self._known:
+    def may_come(self, time_ns: int) -> bool:
+        """Whether the truth of an instant is not known yet, and may be once later samples have come."""
+        return bool(self._known) and time_ns > self._known[-1][0] and not self._ended
+
+    def at(self, time_ns: int) -> F64 | None:
+        """(2, 3) at an instant; None: it is not known."""
+        if not self._known or time_ns > self._known[-1][0]:
             return None
-        if time_ns > self._known[-1][0]:
-            return None if self._ended else UNKNOWN
         after_ns, after_m = self._known[-1]
         for before_ns, before_m in reversed(self._known):
             if before_ns <= time_ns:

@@ -186,7 +186,7 @@ class Stage:
             solver=self.solver,
             panels=self.panels,
             stage_ms=STAGE_MS,
-            observer=self.watching,
+            observers=[self.watching],
         )
         self.eyes: Callable[[float], Any] = lambda time_s: EYES  # of seconds since the start; None: no face
         self._sensor_ns, self._next_ns, self._start_ns = round(NS_PER_S / sensor_hz), NS_PER_S, NS_PER_S

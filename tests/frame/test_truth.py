@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from runtime.clock import NS_PER_MS
-from runtime.frame.truth import GAP_NS, UNKNOWN, TrueEyes
+from runtime.frame.truth import GAP_NS, TrueEyes
 
 
 def eyes(y_m: float) -> np.ndarray:
@@ -30,15 +30,15 @@ def test_at_a_sample_it_is_the_sample_s_and_between_two_it_lies_between(truth: T
 
 def test_after_the_newest_sample_it_is_not_known_yet_and_once_that_has_come_it_is(truth: TrueEyes) -> None:
     asked_ns = 105 * NS_PER_MS
-    assert truth.at(asked_ns) is UNKNOWN
+    assert truth.may_come(asked_ns) and truth.at(asked_ns) is None
     truth.add(110 * NS_PER_MS, eyes(0.011))
     assert truth.at(asked_ns) == pytest.approx(eyes(0.0105))
 
 
 def test_before_the_first_sample_and_after_the_recording_s_end_it_will_never_be_known(truth: TrueEyes) -> None:
     truth.end()
-    assert truth.at(105 * NS_PER_MS) is None
-    assert truth.at(-1) is None
+    for never_ns in (105 * NS_PER_MS, -1):
+        assert truth.at(never_ns) is None and not truth.may_come(never_ns)
     assert np.array_equal(truth.at(100 * NS_PER_MS), eyes(0.010))
 
 
