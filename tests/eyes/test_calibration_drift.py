@@ -26,19 +26,13 @@ def test_a_true_separation_says_nothing() -> None:
 
 
 @pytest.mark.parametrize("share", [0.9, 1.1])
-def test_drift_is_told_once(share: float) -> None:
+def test_drift_is_reported_once_and_so_is_its_end(share: float) -> None:
     watching, random = watch(), np.random.default_rng(0)
     said = [watching.update(eyes(0.062 * share, noise_m=0.003, random=random)) for _ in range(1000)]
     told = [text for text in said if text]
     assert len(told) == 1
     assert "62.0 mm" in told[0]
     assert watching.warning == told[0]
-
-
-def test_it_is_told_when_it_is_right_again() -> None:
-    watching = watch()
-    for _ in range(SAMPLES):
-        watching.update(eyes(0.07))
     said = [watching.update(eyes(0.062)) for _ in range(SAMPLES)]
     assert [text for text in said if text] == ["calibration: the eyes' separation is right again"]
     assert watching.warning == ""

@@ -92,14 +92,6 @@ pivot_m = [0.5, 0.1, 0.2]
     np.testing.assert_array_equal(told.covariance, spread)
 
 
-def test_points_in_single_precision_or_whole_metres_are_taken_as_doubles() -> None:
-    calibration = load_calibration(None)
-    for points in (np.array([[0.1, 0.2, 0.7]], np.float32), np.array([[0, 0, 1]])):
-        mapped = calibration.points(points)
-        assert mapped.dtype == np.float64
-        assert np.array_equal(mapped, calibration.points(points.astype(np.float64)))
-
-
 def test_the_published_prototype_matrix_is_a_similarity_to_its_printed_digits(tmp_path: Path) -> None:
     file = tmp_path / "published.toml"
     file.write_text(PUBLISHED)
@@ -133,11 +125,6 @@ def test_the_published_prototype_matrix_is_a_similarity_to_its_printed_digits(tm
 )
 def test_a_wrong_file_is_refused_with_its_name_and_the_field(tmp_path: Path, text: str, wanted: str) -> None:
     assert wanted in refusal(tmp_path, text)
-
-
-def test_a_missing_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot be read"):
-        load_calibration(tmp_path / "none.toml")
 
 
 def test_a_covariance_that_is_none_is_refused(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from runtime.config import TrackerSettings
 from runtime.eyes.motions import true_eyes
 from runtime.eyes.plausibility import NOT_NEWER
 from runtime.eyes.tracker import DECAY_S, ELSEWHERE, UNCERTAIN, Tracker, sideways_sigma_m
-from runtime.records import EyePoints
+from runtime.records import EyePoints, EyesEstimate
 
 MS = 1_000_000
 PERIOD = 33_333_333
@@ -46,11 +46,6 @@ def fed(count: int = 30, motion: Callable[..., Any] = lambda k: STILL, **noise: 
 
 
 # --- what an answer is called
-
-
-def test_before_the_first_sample_nobody_is_there() -> None:
-    answer = Tracker().at(123)
-    assert (answer.label, answer.eyes_m, answer.capture_ns, answer.time_ns) == ("none", None, 0, 123)
 
 
 def test_at_a_sample_the_answer_is_exact_between_two_interpolated_and_after_the_last_predicted() -> None:
@@ -94,6 +89,7 @@ def test_a_stalled_stream_is_held_even_without_word_of_a_loss() -> None:
 
 @given(ms=st.integers(-2000, 2000))
 def test_every_answer_is_for_the_instant_asked_and_eyes_are_there_unless_none(ms: int) -> None:
+    assert Tracker().at(ms) == EyesEstimate(ms, 0, None, "none")
     tracker, last = fed()
     answer = tracker.at(last + ms * MS)
     assert answer.time_ns == last + ms * MS

@@ -122,24 +122,16 @@ def test_codes_never_change_at_rest_under_noise_and_do_when_the_same_head_moves(
 # --- the flat picture --------------------------------------------------------------------------------------------
 
 
-def test_before_the_first_solution_the_flat_picture_is_shown_whole() -> None:
+def test_before_the_first_solution_the_flat_picture_is_shown_whole_and_the_first_picture_is_not_faded_in() -> None:
     stage = Stage()
     stage.solver.hand_over(flat=solution(1, None))
     (done,) = stage.refresh()
     assert done.frame.flatness == 1.0
-    assert done.account.inference == "skipped"
-    assert done.account.solution is None
-    assert done.account.presented
-
-
-def test_the_first_picture_is_not_faded_in() -> None:
-    stage = Stage()
-    stage.solver.hand_over(flat=solution(1, None))
+    assert (done.account.inference, done.account.solution, done.account.presented) == ("skipped", None, True)
     stage.refresh(10)
     stage.solver.hand_over(solved=solution(2))
     (done,) = stage.refresh()
-    assert done.frame.flatness == 0.0
-    assert done.account.inference == "ran"
+    assert (done.frame.flatness, done.account.inference) == (0.0, "ran")
 
 
 def test_a_lost_viewer_is_held_then_the_picture_goes_flat_evenly_and_comes_back_evenly(stage: Stage) -> None:
@@ -229,44 +221,28 @@ def test_a_picture_is_vouched_to_be_unchanged_only_where_nothing_differs() -> No
     assert not stage.panels.unchanged  # and now it is seen
 
 
-def test_after_a_lost_panel_nothing_is_vouched_for(stage: Stage) -> None:
-    stage.change(align=False)
-    stage.refresh(2)
-    assert stage.panels.unchanged
-    stage.panels.lost = "unplugged"
-    stage.refresh()
-    stage.panels.lost = ""
-    stage.refresh()
-    assert not stage.panels.unchanged
-
-
 # --- faults ------------------------------------------------------------------------------------------------------
 
 
 def test_a_lost_panel_drops_refreshes_says_so_and_comes_back_with_the_newest(stage: Stage) -> None:
+    stage.change(align=False)
+    stage.refresh(2)
+    assert stage.panels.unchanged
     stage.panels.lost = "DUMMY1 was disconnected"
+    stage.solver.hand_over(solved=solution(8))
     lost = stage.refresh(3)
     assert [done.account.presented for done in lost] == [False] * 3
+    assert "ran" not in [done.account.inference for done in lost]
     assert stage.presenter.machine.name == "degraded: panel"
     assert "DUMMY1" in stage.presenter.machine.reason
     assert stage.presenter.stats.dropped == 3
     assert stage.presenter.stats.faults == {"panel": 3}
-    stage.solver.hand_over(solved=solution(8))
     stage.panels.lost = ""
     (back,) = stage.refresh()
-    assert back.account.presented
+    assert back.account.presented and back.account.inference == "ran"  # with the refresh that first shows it
+    assert not stage.panels.unchanged  # nothing is vouched for
     assert stage.panels.frame.solved_version == 8
     assert stage.presenter.machine.state is State.TRACKING
-
-
-def test_a_solution_that_came_while_the_panel_was_lost_ran_with_the_refresh_that_first_showed_it(stage: Stage) -> None:
-    stage.panels.lost = "unplugged"
-    stage.solver.hand_over(solved=solution(8))
-    (lost,) = stage.refresh()
-    assert lost.account.inference != "ran"
-    stage.panels.lost = ""
-    (back,) = stage.refresh()
-    assert back.account.inference == "ran"
 
 
 @pytest.mark.parametrize("part", ["content", "model"])

@@ -63,13 +63,6 @@ def test_a_moving_head_is_predicted_and_its_eyes_differ_from_refresh_to_refresh(
     assert all((a.eyes_m != b.eyes_m).any() for a, b in pairwise(told))
 
 
-def test_a_head_that_sets_off_is_let_go() -> None:
-    told = watched(viewer(), 4.0, noise_m=0.001, y_m=lambda s: 0.2 * max(0.0, s - 2.5))
-    labels = [estimate.label for estimate in told]
-    assert labels[round(2.4 * DISPLAY_HZ)] == "rested"
-    assert set(labels[round(2.8 * DISPLAY_HZ) :]) == {"predicted"}
-
-
 def test_where_the_plan_may_not_let_it_rest_every_refresh_is_predicted_anew() -> None:
     told = watched(viewer(plan={"enabled": False}), 3.0, noise_m=0.003)[2 * DISPLAY_HZ :]
     assert {estimate.label for estimate in told} == {"predicted"}

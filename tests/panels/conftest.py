@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import moderngl
 import pytest
 
+from runtime.clock import MonotonicClock
+from runtime.config import OutputSettings, PanelSettings
+from runtime.optics.stack import PanelStack
+from runtime.panels.registry import open_panels
 from runtime.support.gl import offscreen_context
 from tests.panels import xserver
 
@@ -23,3 +28,28 @@ def screen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[xserver.XServer
     server = xserver.start_or_skip(tmp_path_factory.mktemp("xorg"))
     yield server
     server.stop()
+
+
+@pytest.fixture
+def x(screen: xserver.XServer, monkeypatch: pytest.MonkeyPatch) -> Iterator[xserver.XServer]:
+    """The X server that windows are opened on; its monitors are put right afterwards."""
+    monkeypatch.setenv("DISPLAY", screen.name)
+    yield screen
+    screen.place(0, 1, 2)
+    screen.xrandr("--query")
+
+
+@pytest.fixture
+def opened(x: xserver.XServer, context: moderngl.Context) -> Iterator[Callable[..., Any]]:
+    """Opens windows that are closed at the end."""
+    sinks = []
+
+    def open_(*panels: PanelSettings, **settings: bool | str) -> Any:
+        output = OutputSettings(**{"kind": "windows", "panels": panels, **settings})
+        stack = PanelStack(0.5, 0.28, (-0.06, 0.0, 0.06), xserver.WIDTH_PX, xserver.HEIGHT_PX)
+        sinks.append(open_panels(output, stack, MonotonicClock(), context))
+        return sinks[-1]
+
+    yield open_
+    for sink in sinks:
+        sink.close()

@@ -24,6 +24,7 @@ from runtime.support.gl_sharing import ShareGroup
 from tests.support.left_in_textures import on_a_thread_of_its_own
 
 WIDTH, HEIGHT = 48, 32
+TINY = PanelStack(0.5, 0.3, (-0.1, 0.0, 0.1), WIDTH, HEIGHT)
 
 
 @pytest.fixture
@@ -31,10 +32,13 @@ def layers() -> NDArray[np.uint8]:
     return np.random.default_rng(7).integers(0, 256, (3, HEIGHT, WIDTH, 4), dtype=np.uint8)
 
 
-def shown(
-    context: moderngl.Context, layers: NDArray[np.uint8], *panels: PanelSettings, clock: None = None
-) -> list[NDArray[np.uint8]] | None:
-    sink = OffscreenPanels(context, clock=clock or SimulatedClock(), width_px=WIDTH, height_px=HEIGHT, panels=panels)
+def offscreen(context: moderngl.Context, stack: PanelStack, *panels: PanelSettings) -> OffscreenPanels:
+    size = {"width_px": stack.width_px, "height_px": stack.height_px}
+    return OffscreenPanels(context, clock=SimulatedClock(), **size, panels=panels)
+
+
+def shown(context: moderngl.Context, layers: NDArray[np.uint8], *panels: PanelSettings) -> list[NDArray[np.uint8]]:
+    sink = offscreen(context, TINY, *panels)
     try:
         sink.present(PanelFrame(1, layers, 1))
         return [picture[..., :3] for picture in sink.read_back()]
@@ -161,9 +165,7 @@ def test_layers_are_aligned_as_the_viewer_sees_them_then_mirrored_and_turned(
     context: moderngl.Context, rotation_deg: int, clockwise_quarters: int, mirror: str, axis: int | None
 ) -> None:
     panels = (PanelSettings(rotation_deg=rotation_deg, mirror=mirror),) * 3
-    sink = OffscreenPanels(
-        context, clock=SimulatedClock(), width_px=STACK.width_px, height_px=STACK.height_px, panels=panels
-    )
+    sink = offscreen(context, STACK, *panels)
     matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.02, 0.016, 0.03])).solved_from_shown
     frame = PanelFrame(1, smooth(1), 1, matrices)
     sink.present(frame)
@@ -178,9 +180,7 @@ def test_a_registered_panel_is_aligned_first_and_then_sent_where_registration_fo
     context: moderngl.Context,
 ) -> None:
     shift = PanelSettings(homography=((1.0, 0.0, 5.0), (0.0, 1.0, -3.0), (0.0, 0.0, 1.0)))
-    sink = OffscreenPanels(
-        context, clock=SimulatedClock(), width_px=STACK.width_px, height_px=STACK.height_px, panels=(shift,) * 3
-    )
+    sink = offscreen(context, STACK, *(shift,) * 3)
     matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.02, 0.016, 0.03])).solved_from_shown
     frame = PanelFrame(1, smooth(1), 1, matrices)
     sink.present(frame)
@@ -192,7 +192,7 @@ def test_a_registered_panel_is_aligned_first_and_then_sent_where_registration_fo
 
 def test_a_gamma_is_applied_to_what_is_aligned_and_mixed(context: moderngl.Context) -> None:
     gamma = (PanelSettings(gamma=2.0),) * 3
-    sink = OffscreenPanels(context, clock=SimulatedClock(), width_px=480, height_px=320, panels=gamma)
+    sink = offscreen(context, STACK, *gamma)
     matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 0.016, 0.03])).solved_from_shown
     frame = PanelFrame(1, smooth(1) // 2 + 64, 1, matrices, smooth(2) // 2 + 64, 1, 0.4)
     sink.present(frame)
@@ -250,9 +250,7 @@ def test_a_frame_that_does_not_fit_is_a_mistake_of_the_caller(
 
 
 def test_an_unchanged_frame_costs_nothing_and_stays(context: moderngl.Context, layers: NDArray[np.uint8]) -> None:
-    sink = OffscreenPanels(
-        context, clock=SimulatedClock(), width_px=WIDTH, height_px=HEIGHT, panels=(PanelSettings(),) * 3
-    )
+    sink = offscreen(context, TINY, *(PanelSettings(),) * 3)
     other = np.zeros_like(layers)
     sink.present(PanelFrame(0, layers, 0), unchanged=True)  # nothing was shown before: it must be uploaded all the same
     assert sink.present(PanelFrame(1, other, 1), unchanged=True).number == 1
@@ -262,7 +260,7 @@ def test_an_unchanged_frame_costs_nothing_and_stays(context: moderngl.Context, l
 
 def test_a_lost_context_is_a_lost_panel_not_a_crash(context: moderngl.Context, layers: NDArray[np.uint8]) -> None:
     own = offscreen_context()
-    sink = OffscreenPanels(own, clock=SimulatedClock(), width_px=WIDTH, height_px=HEIGHT, panels=(PanelSettings(),) * 3)
+    sink = offscreen(own, TINY, *(PanelSettings(),) * 3)
     sink.present(PanelFrame(1, layers, 1))
     sink.read_back()
     assert sink._textures is not None
@@ -311,6 +309,5 @@ def aligned(solved: NDArray[np.uint8], flat: NDArray[np.uint8]) -> PanelFrame:
 
 
 def test_a_wrong_number_of_panel_tables_is_refused(context: moderngl.Context) -> None:
-    stack = PanelStack(0.5, 0.3, (-0.1, 0.0, 0.1), WIDTH, HEIGHT)
     with pytest.raises(InputError, match="output: panels"):
-        open_panels(OutputSettings(panels=(PanelSettings(),)), stack, SimulatedClock(), context)
+        open_panels(OutputSettings(panels=(PanelSettings(),)), TINY, SimulatedClock(), context)

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
-import moderngl
 import numpy as np
 import pytest
 
-from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
-from runtime.config import OutputSettings, PanelSettings
+from runtime.clock import NS_PER_S, SimulatedClock
 from runtime.errors import PanelLost
 from runtime.panels.display import glfw
-from runtime.panels.registry import open_panels
 from runtime.panels.watch import PlacementWatch
 from runtime.panels.window import WindowPanels
 from tests.panels.edids import block
-from tests.panels.test_windows import BY_CONNECTOR, STACK, frame, picture, presents, shows
+from tests.panels.test_windows import BY_CONNECTOR, frame, picture, presents, shows
 from tests.panels.xserver import XServer
 from tests.waiting import eventually
 
@@ -32,28 +29,6 @@ def often(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("runtime.panels.watch.EVERY_NS", round(EVERY_S * NS_PER_S))
     monkeypatch.setattr("runtime.panels.window.RETRY_NS", round(EVERY_S * NS_PER_S))
     monkeypatch.setattr("runtime.panels.window.LOOK_NS", round(EVERY_S * NS_PER_S))
-
-
-@pytest.fixture
-def x(screen: XServer, monkeypatch: pytest.MonkeyPatch) -> Iterator[XServer]:
-    monkeypatch.setenv("DISPLAY", screen.name)
-    yield screen
-    screen.place(0, 1, 2)
-    screen.xrandr("--query")
-
-
-@pytest.fixture
-def opened(x: XServer, context: moderngl.Context) -> Iterator[Callable[..., Any]]:
-    sinks = []
-
-    def open_(*panels: PanelSettings, **settings: bool | str) -> WindowPanels:
-        output = OutputSettings(**{"kind": "windows", "panels": panels, **settings})
-        sinks.append(open_panels(output, STACK, MonotonicClock(), context))
-        return sinks[-1]
-
-    yield open_
-    for sink in sinks:
-        sink.close()
 
 
 def lost(sink: WindowPanels, *, unchanged: bool = False, within_s: float = 3.0) -> str:

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -46,27 +46,6 @@ def picture(number: int, index: int) -> np.ndarray:
 
 def frame(number: int) -> PanelFrame:
     return PanelFrame(number, np.stack([picture(number, index) for index in range(3)]), number)
-
-
-@pytest.fixture
-def x(screen: xserver.XServer, monkeypatch: pytest.MonkeyPatch) -> Iterator[XServer]:
-    monkeypatch.setenv("DISPLAY", screen.name)
-    yield screen
-    for index in range(3):
-        screen.plug(index)
-
-
-@pytest.fixture
-def opened(x: XServer, context: moderngl.Context) -> Iterator[Callable[..., Any]]:
-    sinks = []
-
-    def open_(*panels: PanelSettings, kind: str = "windows") -> WindowPanels:
-        sinks.append(open_panels(OutputSettings(kind=kind, panels=panels), STACK, MonotonicClock(), context))
-        return sinks[-1]
-
-    yield open_
-    for sink in sinks:
-        sink.close()
 
 
 BY_CONNECTOR = tuple(PanelSettings(connector=f"DUMMY{index}") for index in (2, 0, 1))

@@ -174,16 +174,12 @@ def test_a_recording_of_another_program_or_version_is_refused(tmp_path: Path) ->
             Recording(path)
 
 
-def test_it_ends_before_it_is_too_long(tmp_path: Path) -> None:
+@pytest.mark.parametrize("limit", [30_000, 200_000])
+def test_it_ends_before_it_is_too_long_and_its_file_is_never_larger_than_allowed(tmp_path: Path, limit: int) -> None:
     done = write(tmp_path / "a.mcap", [sample(k) for k in range(100)], limits=RecordingLimits(max_s=1.0))
     assert done.count(True) == 31 and not done[-1]  # 0 to 30/30 s
     assert len(list(Recording(tmp_path / "a.mcap").samples())) == 31
-
-
-@pytest.mark.parametrize("limit", [30_000, 200_000])
-def test_its_file_is_never_larger_than_allowed(tmp_path: Path, limit: int) -> None:
-    random = np.random.default_rng(0)
-    depth = random.integers(0, 65535, (48, 64), dtype=np.uint16)
+    depth = np.random.default_rng(0).integers(0, 65535, (48, 64), dtype=np.uint16)
     frames = [sample(k, depth_mm=depth) for k in range(1500)]
     for header in (EYES_ONLY, WITH_IMAGES):
         write(tmp_path / "a.mcap", frames, header, RecordingLimits(max_bytes=limit))
