@@ -166,7 +166,6 @@ class Solution:
     seeing: tuple[bool, bool] = (True, True)  # left, right: an eye that can't see the display gave way to the other
     eye_sigma_mm: float | None = None  # how far off the eyes it was made to hold: pupil and tracker together
     stage_ms: dict[str, float] = field(default_factory=dict)  # render, prepare, inference, finish; the run's clock
-    machine_ms: dict[str, float] = field(default_factory=dict)  # the same on the machine's clock
 
     @property
     def layers(self) -> U8:
@@ -195,4 +194,3 @@ class RefreshAccount:
     photon_ns: int = 0  # the light, from when it was really presented
     true_eyes_m: F64 | None = None  # (2, 3) at the light, where the recording knows them
     stage_ms: dict[str, float] = field(default_factory=dict)  # on the run's clock
-    machine_ms: dict[str, float] = field(default_factory=dict)  # on the machine's clock, whatever the run's is

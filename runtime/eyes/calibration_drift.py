@@ -20,9 +20,9 @@ MEDIAN_EFFICIENCY = 1.2533  # standard error of a median over that of a mean, Ga
 class SeparationWatch:
     """Compares the measured separation of the eyes with the known one."""
 
-    def __init__(self, *, known_ipd_m: float, tolerance: float) -> None:
-        """tolerance: relative; a known separation of 0 watches nothing."""
-        self._known_m, self._tolerance = known_ipd_m, tolerance
+    def __init__(self, *, known_ipd_m: float) -> None:
+        """A known separation of 0 watches nothing."""
+        self._known_m = known_ipd_m
         self._samples: deque[float] = deque(maxlen=SAMPLES)
         self.warning = ""  # what is wrong at present; empty: nothing
 
@@ -51,13 +51,13 @@ class SeparationWatch:
         sigma = MAD_TO_SIGMA * float(np.median(np.abs(values - ratio)))
         doubt = SURE * MEDIAN_EFFICIENCY * sigma / np.sqrt(len(values))
         off = abs(ratio - 1.0)
-        if not self.warning and off > self._tolerance + doubt:
+        if not self.warning and off > TOLERANCE + doubt:
             self.warning = (
                 f"calibration: the eyes measure {ratio * self._known_m * 1e3:.1f} mm apart, known "
                 f"{self._known_m * 1e3:.1f} mm ({(ratio - 1) * 100:+.1f}%): another viewer, or calibrate again"
             )
             return self.warning
-        if self.warning and off < self._tolerance / 2:
+        if self.warning and off < TOLERANCE / 2:
             self.warning = ""
             return "calibration: the eyes' separation is right again"
         return ""

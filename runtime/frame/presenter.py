@@ -153,7 +153,7 @@ class Presenter:
         self.missing = self._missing(news, lost)
         state = self._judge(eyes, limited, shown=report is not None)
         account = self._account(timing, eyes, news, frame, report, photon_ns, state, times)
-        self._tell(account, frame, news.solution, times)
+        self._report(account, frame, news.solution, times)
         return account
 
     def _adopt_settings(self) -> None:
@@ -290,10 +290,9 @@ class Presenter:
     ) -> RefreshAccount:
         solution = news.solution if report is not None and frame.flatness < 1.0 else None  # that is shown
         ran = solution is not None and solution.number != self._shown_solution
-        stage_ms, machine_ms = dict(times.stage_ms), dict(times.machine_ms)
+        stage_ms = dict(times.stage_ms)
         if solution is not None and ran:
             stage_ms |= {stage: solution.stage_ms.get(stage, 0.0) for stage in SOLVING_STAGES}
-            machine_ms |= {stage: solution.machine_ms.get(stage, 0.0) for stage in SOLVING_STAGES}
         if solution is not None:
             self._shown_solution = solution.number
         return RefreshAccount(
@@ -313,14 +312,14 @@ class Presenter:
             skew_ms=report.skew_ms if report is not None else 0.0,
             photon_ns=photon_ns,
             stage_ms=stage_ms,
-            machine_ms=machine_ms,
         )
 
-    def _tell(self, account: RefreshAccount, frame: PanelFrame, solution: Solution | None, times: RefreshTimes) -> None:
+    def _report(
+        self, account: RefreshAccount, frame: PanelFrame, solution: Solution | None, times: RefreshTimes
+    ) -> None:
         self.last = Refresh(account, frame, solution)
         self._supervisor.refreshed(self, account)
-        overhead_ms = times.overhead_ms()
-        self.stats.add(account, overhead_ms=overhead_ms, missed_blanks=self.pacer.missed)
+        self.stats.add(account, overhead_ms=times.overhead_ms(), missed_blanks=self.pacer.missed)
         for observer in self._observers:
             observer.refreshed(self.last)
 

@@ -135,7 +135,6 @@ class Solver:
             seeing=self.plan.eyes if self.plan is not None else (True, True),
             eye_sigma_mm=sigma_mm,
             stage_ms=stages,
-            machine_ms=stages,
         )
         return SolverStep(solution=solution)
 
@@ -157,7 +156,7 @@ class Solver:
             self._missing.pop("content", None)
             self._flat = SolutionKey(state.version, revision, None, self._policy.episode)
         stages = {"render": watch.lap_ms()}
-        flat = Solution(self.run.next_number(), layers, None, time_ns, stage_ms=stages, machine_ms=stages)
+        flat = Solution(self.run.next_number(), layers, None, time_ns, stage_ms=stages)
         return SolverStep(flat=flat, missing=missing)
 
     def plan_items(self, measured: Measured | None = None) -> tuple[PlanItem, ...]:

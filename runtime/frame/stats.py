@@ -10,7 +10,7 @@ import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.frame.timing import SOLVING_STAGES, STAGES
-from runtime.records import F64, RefreshAccount, State
+from runtime.records import RefreshAccount, State
 
 WINDOW = 8192  # values that quantiles are taken over
 RECENT_SHARE = 1 / 64  # of the values held, that a quantile which is nearly the newest may be without
@@ -44,21 +44,9 @@ class Ring:
         if held.size == 0:
             return None
         shares = [1.0 if name == "max" else float(name[1:]) / 100.0 for name in names]
-        known = {name: round(value, 4) for name, value in zip(names, _quantiles(held, shares), strict=True)}
+        known = {name: round(value, 4) for name, value in zip(names, np.quantile(held, shares).tolist(), strict=True)}
         self._known[names] = count, known
         return known
-
-
-def _quantiles(held: F64, shares: list[float]) -> list[float]:
-    """Linear between the two nearest values, as `numpy.percentile` has them, at a quarter of its cost."""
-    places = [share * (held.size - 1) for share in shares]
-    below = [int(place) for place in places]
-    above = [min(index + 1, held.size - 1) for index in below]
-    ordered = np.partition(held, sorted({*below, *above}))
-    return [
-        float(ordered[low] + (ordered[high] - ordered[low]) * (place - low))
-        for low, high, place in zip(below, above, places, strict=True)
-    ]
 
 
 class RunStats:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from runtime.clock import NS_PER_S
 from runtime.config import Settings
 from runtime.eyes.calibration import Calibration
-from runtime.eyes.calibration_drift import TOLERANCE, SeparationWatch
+from runtime.eyes.calibration_drift import SeparationWatch
 from runtime.eyes.plausibility import RefusalWatch
 from runtime.eyes.rest import RestWatch
 from runtime.eyes.tracker import Tracker
@@ -33,7 +33,7 @@ class Viewer:
         self._nearest_m, self._in_stack_frame = front_m + IN_FRONT_M, in_stack_frame
         self._tracker = self._new_tracker()
         self._rest = _rest_watch(settings)
-        self._drift = _drift_watch(settings)
+        self._drift = SeparationWatch(known_ipd_m=settings.calibration.ipd_m)
         self._refusals = RefusalWatch()
         self._serial_checked = False
         self._captures_ns: deque[int] = deque(maxlen=64)
@@ -46,7 +46,7 @@ class Viewer:
         if (settings.plan, settings.model) != (before.plan, before.model):
             self._rest = _rest_watch(settings)
         if settings.calibration != before.calibration:
-            self._drift = _drift_watch(settings)
+            self._drift = SeparationWatch(known_ipd_m=settings.calibration.ipd_m)
 
     def _new_tracker(self) -> Tracker:
         stack = self._settings.stack
@@ -116,7 +116,3 @@ class Viewer:
 def _rest_watch(settings: Settings) -> RestWatch | None:
     """None where the plan may not show a picture again for eyes that are only nearly the same."""
     return RestWatch(max_drift_m=MAX_REST_DRIFT_M) if settings.plan.enabled else None
-
-
-def _drift_watch(settings: Settings) -> SeparationWatch:
-    return SeparationWatch(known_ipd_m=settings.calibration.ipd_m, tolerance=TOLERANCE)

@@ -15,7 +15,7 @@ def eyes(separation_m: float, *, noise_m: float = 0.0, random: np.random.Generat
 
 
 def watch(known_m: float = 0.062) -> SeparationWatch:
-    return SeparationWatch(known_ipd_m=known_m, tolerance=0.04)
+    return SeparationWatch(known_ipd_m=known_m)
 
 
 def test_a_true_separation_says_nothing() -> None:
