@@ -8,6 +8,8 @@ import select
 import shutil
 import signal
 import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -151,43 +153,38 @@ class XServer:
 
     def set_edid(self, index: int, data: bytes) -> None:
         """Give an output the EDID that a real monitor would have brought."""
-        x11, randr = ctypes.CDLL("libX11.so.6"), ctypes.CDLL("libXrandr.so.2")
-        x11.XOpenDisplay.restype = ctypes.c_void_p
-        x11.XDefaultRootWindow.restype = ctypes.c_ulong
-        x11.XInternAtom.restype = ctypes.c_ulong
-        randr.XRRGetScreenResourcesCurrent.restype = ctypes.POINTER(ctypes.c_ulong)
-        display = ctypes.c_void_p(x11.XOpenDisplay(self.name.encode()))
-        root = ctypes.c_ulong(x11.XDefaultRootWindow(display))
-        resources = randr.XRRGetScreenResourcesCurrent(display, root)
-        # XRRScreenResources: two times, count and pointer of CRTCs, count and pointer of outputs.
-        outputs = ctypes.cast(ctypes.c_void_p(resources[5]), ctypes.POINTER(ctypes.c_ulong))
-        edid, integer, replace = x11.XInternAtom(display, b"EDID", 0), 19, 0
-        randr.XRRChangeOutputProperty(
-            display, ctypes.c_ulong(outputs[index]), ctypes.c_ulong(edid), ctypes.c_ulong(integer), 8, replace,
-            data, len(data),
-        )  # fmt: skip
-        x11.XCloseDisplay(display)
+        with self._connected() as (x11, display):
+            randr = ctypes.CDLL("libXrandr.so.2")
+            randr.XRRGetScreenResourcesCurrent.restype = ctypes.POINTER(ctypes.c_ulong)
+            root = ctypes.c_ulong(x11.XDefaultRootWindow(display))
+            resources = randr.XRRGetScreenResourcesCurrent(display, root)
+            # XRRScreenResources: two times, count and pointer of CRTCs, count and pointer of outputs.
+            output = ctypes.c_ulong(ctypes.cast(ctypes.c_void_p(resources[5]), ctypes.POINTER(ctypes.c_ulong))[index])
+            edid, integer, replace = ctypes.c_ulong(x11.XInternAtom(display, b"EDID", 0)), ctypes.c_ulong(19), 0
+            randr.XRRChangeOutputProperty(display, output, edid, integer, 8, replace, data, len(data))
 
     def ask_to_close(self, window: int) -> None:
         """What a window manager's close button sends: WM_DELETE_WINDOW."""
-        x11 = ctypes.CDLL("libX11.so.6")
-        x11.XOpenDisplay.restype = ctypes.c_void_p
-        x11.XInternAtom.restype = ctypes.c_ulong
-        display = ctypes.c_void_p(x11.XOpenDisplay(self.name.encode()))
-        protocols = x11.XInternAtom(display, b"WM_PROTOCOLS", 0)
-        delete = x11.XInternAtom(display, b"WM_DELETE_WINDOW", 0)
-        # XClientMessageEvent: type, serial, send_event, display, window, message_type, format, five longs.
-        client_message, bits = 33, 32
-        event = (ctypes.c_ulong * 24)(client_message, 0, 1, display.value, window, protocols, bits, delete)
-        x11.XSendEvent(display, ctypes.c_ulong(window), 0, ctypes.c_long(0), event)
-        x11.XCloseDisplay(display)
+        with self._connected() as (x11, display):
+            protocols = x11.XInternAtom(display, b"WM_PROTOCOLS", 0)
+            delete = x11.XInternAtom(display, b"WM_DELETE_WINDOW", 0)
+            # XClientMessageEvent: type, serial, send_event, display, window, message_type, format, five longs.
+            client_message, bits = 33, 32
+            event = (ctypes.c_ulong * 24)(client_message, 0, 1, display.value, window, protocols, bits, delete)
+            x11.XSendEvent(display, ctypes.c_ulong(window), 0, ctypes.c_long(0), event)
 
     def do_to_window(self, request: str, window: int, *arguments: int) -> None:
         """A request of Xlib about somebody else's window, as another program would make it."""
+        with self._connected() as (x11, display):
+            getattr(x11, request)(display, ctypes.c_ulong(window), *arguments)
+
+    @contextmanager
+    def _connected(self) -> Iterator[tuple[ctypes.CDLL, ctypes.c_void_p]]:
         x11 = ctypes.CDLL("libX11.so.6")
         x11.XOpenDisplay.restype = ctypes.c_void_p
+        x11.XDefaultRootWindow.restype = x11.XInternAtom.restype = ctypes.c_ulong
         display = ctypes.c_void_p(x11.XOpenDisplay(self.name.encode()))
-        getattr(x11, request)(display, ctypes.c_ulong(window), *arguments)
+        yield x11, display
         x11.XCloseDisplay(display)
 
     def stop(self) -> None:
