@@ -19,7 +19,8 @@ from runtime.frame.lateness import Lateness
 from runtime.frame.pacing import Pacer
 from runtime.frame.policy import Flatness, wants_flat
 from runtime.frame.run_state import RunCell
-from runtime.frame.solver_host import News, SolverHost, still_there
+from runtime.frame.solver import SolverStep
+from runtime.frame.solver_host import SolverHost, still_there
 from runtime.frame.states import Conditions, Part, StateMachine
 from runtime.frame.stats import RunStats
 from runtime.frame.timing import SOLVING_STAGES, RefreshTimes
@@ -169,7 +170,7 @@ class Presenter:
             for observer in self._observers:
                 observer.sampled(sample)
 
-    def _compose(self, timing: FrameTiming, eyes: EyesEstimate, news: News) -> tuple[PanelFrame, str]:
+    def _compose(self, timing: FrameTiming, eyes: EyesEstimate, news: SolverStep) -> tuple[PanelFrame, str]:
         """What the panels are given, and why an alignment is at its limit (empty: it is not)."""
         solution, flat = news.solution, news.flat
         target = 1.0 if eyes.eyes_m is None or self.flat_asked else 0.0
@@ -249,7 +250,7 @@ class Presenter:
             self.paused,
         )
 
-    def _missing(self, news: News, lost: str) -> dict[str, str]:
+    def _missing(self, news: SolverStep, lost: str) -> dict[str, str]:
         missing = dict(news.missing)
         if lost:
             missing["panel"] = lost
@@ -281,7 +282,7 @@ class Presenter:
         self,
         timing: FrameTiming,
         eyes: EyesEstimate,
-        news: News,
+        news: SolverStep,
         frame: PanelFrame,
         report: PresentReport | None,
         photon_ns: int,

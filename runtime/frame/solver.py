@@ -33,7 +33,7 @@ FLAT_EYE_M = (0.7, 0.0, 0.0)  # where the flat picture is drawn from before any 
 
 @dataclass(frozen=True, slots=True)
 class SolverStep:
-    """What became of one request."""
+    """What became of one request; or the newest of what all requests so far came to, one value, replaced as a whole."""
 
     solution: Solution | None = None  # a new one for two eyes
     flat: Solution | None = None  # a new flat picture

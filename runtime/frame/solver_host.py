@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from runtime.clock import NS_PER_MS, Clock
 from runtime.frame.solver import SolverStep
 from runtime.frame.timing import SOLVING_STAGES
-from runtime.records import Solution, SolveRequest
+from runtime.records import SolveRequest
 
 FIRST_REQUEST = SolveRequest(0, None, "none", 0.0, flat_wanted=True)  # before the first refresh: the flat picture
 COST_GAIN = 0.2  # of the newest solution in the running mean of what one costs
@@ -31,16 +31,6 @@ class SolverParts(Protocol):
         """Release everything, on the thread that made it; abandoned: only what no other solver uses by now."""
 
 
-@dataclass(frozen=True, slots=True)
-class News:
-    """The newest of what the solver made; one value, replaced as a whole."""
-
-    solution: Solution | None = None
-    flat: Solution | None = None
-    missing: Mapping[str, str] = field(default_factory=dict)  # content, model: why the last step failed
-    solutions: int = 0  # made so far
-
-
 Task = Callable[[SolverParts], bool]  # done on the solver's thread between two steps, until it answers True
 
 
@@ -54,7 +44,7 @@ class SolverHost(ABC):
         """Ask for a solution; a request that was not begun is forgotten."""
 
     @abstractmethod
-    def news(self) -> News:
+    def news(self) -> SolverStep:
         """The newest complete solution and flat picture, and what failed."""
 
     @abstractmethod
@@ -71,17 +61,12 @@ class SolverHost(ABC):
         """Stop, and release what the solver holds. May be called twice."""
 
 
-def taken_in(news: News, step: SolverStep) -> News:
+def taken_in(news: SolverStep, step: SolverStep) -> SolverStep:
     """The news with what a step made; the newest wins, and what failed is as the last step found it."""
-    return News(
-        step.solution or news.solution,
-        step.flat or news.flat,
-        step.missing,
-        news.solutions + (step.solution is not None),
-    )
+    return SolverStep(step.solution or news.solution, step.flat or news.flat, step.missing)
 
 
-def still_there(news: News) -> News:
+def still_there(news: SolverStep) -> SolverStep:
     """The news without a solution whose textures went with their context: the flat picture is shown until the next."""
     solution = news.solution
     if solution is None or isinstance(solution.made, np.ndarray) or not solution.made.lost:
@@ -99,7 +84,7 @@ class SimulatedSolver(SolverHost):
 
     def __init__(self, parts: SolverParts, clock: Clock) -> None:
         self._parts, self._clock = parts, clock
-        self._news = taken_in(News(), parts.step(FIRST_REQUEST))
+        self._news = taken_in(SolverStep(), parts.step(FIRST_REQUEST))
         self._posted: tuple[int, SolveRequest] | None = None
         self._under_way: tuple[int, SolverStep] | None = None  # when it is complete
         self._idle_since_ns = clock.now_ns()
@@ -112,7 +97,7 @@ class SimulatedSolver(SolverHost):
         self._posted = self._clock.now_ns(), request
         self._advance()
 
-    def news(self) -> News:
+    def news(self) -> SolverStep:
         self._advance()
         return self._news
 

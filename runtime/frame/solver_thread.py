@@ -8,10 +8,12 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
 from runtime.errors import ContextLost, FatalError, PhasestackError
-from runtime.frame.solver_host import COST_GAIN, FIRST_REQUEST, News, SolverHost, SolverParts, Task, taken_in, total_ns
+from runtime.frame.solver import SolverStep
+from runtime.frame.solver_host import COST_GAIN, FIRST_REQUEST, SolverHost, SolverParts, Task, taken_in, total_ns
 from runtime.records import SolveRequest
 from runtime.support.memory import give_back
 from runtime.support.priority import SOLVER_NICENESS, set_niceness
@@ -47,7 +49,7 @@ class SolverThread(SolverHost):
         self._late_ns, self._abandon_ns = round(LATE_S * NS_PER_S), round(ABANDON_S * NS_PER_S)
         self._lock = threading.Condition()
         self._request: SolveRequest | None = None
-        self._news = News()
+        self._news = SolverStep()
         self._tasks: queue.SimpleQueue[Task] = queue.SimpleQueue()
         self._closing = threading.Event()
         self._hung: list[_Attempt] = []
@@ -75,12 +77,12 @@ class SolverThread(SolverHost):
             self._request = request
             self._lock.notify()
 
-    def news(self) -> News:
+    def news(self) -> SolverStep:
         late = self._late_reason()
         news = self._news
         if not late:
             return news
-        return News(news.solution, news.flat, {**news.missing, "model": late}, news.solutions)
+        return replace(news, missing={**news.missing, "model": late})
 
     def do(self, task: Task) -> None:
         self._tasks.put(task)

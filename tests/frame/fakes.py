@@ -15,7 +15,7 @@ from runtime.frame.pacing import Pacer
 from runtime.frame.presenter import Presenter, Refresh
 from runtime.frame.run_state import RunCell
 from runtime.frame.solver import SolverStep
-from runtime.frame.solver_host import News, SolverHost, Task
+from runtime.frame.solver_host import SolverHost, Task
 from runtime.frame.viewer import Viewer
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
@@ -80,17 +80,17 @@ class FakeSolver(SolverHost):
 
     def __init__(self, *, cost_ns: int = 20 * NS_PER_MS) -> None:
         self.solve_cost_ns = cost_ns
-        self.there = News()
+        self.there = SolverStep()
         self.requests: list[SolveRequest] = []
         self.tasks: list[Task] = []
 
     def hand_over(self, *, solved: Solution | None = None, flat: Solution | None = None, **missing: str) -> None:
-        self.there = News(solved or self.there.solution, flat or self.there.flat, missing, self.there.solutions + 1)
+        self.there = SolverStep(solved or self.there.solution, flat or self.there.flat, missing)
 
     def post(self, request: SolveRequest) -> None:
         self.requests.append(request)
 
-    def news(self) -> News:
+    def news(self) -> SolverStep:
         return self.there
 
     def do(self, task: Task) -> None:
