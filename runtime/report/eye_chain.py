@@ -42,7 +42,9 @@ HEAD = 1.5  # radius of a head about the middle between its eyes, in eye distanc
 CAMERA = Intrinsics(WIDTH_PX, HEIGHT_PX, FOCAL_PX, FOCAL_PX, WIDTH_PX / 2, HEIGHT_PX / 2)
 
 
-def measure(folder: Path, *, motions: Sequence[str] = MOTIONS, seconds: float = SECONDS) -> list[dict[str, Any]]:
+def measure(
+    folder: Path, *, motions: Sequence[str] = MOTIONS, seconds: float = SECONDS, scale: float = SCALE
+) -> list[dict[str, Any]]:
     """A row for each motion and source of eyes, means over the faces. Raises InputError, FatalError."""
     faces = sorted(read_faces(folder), key=lambda face: -face.foreshortening)[:FACES]
     rows = []
@@ -53,7 +55,7 @@ def measure(folder: Path, *, motions: Sequence[str] = MOTIONS, seconds: float = 
                 progress.tell("motions", number * len(faces) + count, len(motions) * len(faces))
                 # Points do not depend on the face.
                 for source, path in record(Path(scratch), motion, face, seconds=seconds, points=count == 0).items():
-                    runs[source].append(_run(path))
+                    runs[source].append(_run(path, scale))
         rows += [
             {"motion": motion, "eyes": source} | {name: float(np.mean([r[name] for r in found])) for name in found[0]}
             for source, found in runs.items()
@@ -116,11 +118,11 @@ def _depth(pupils: F64, eyes_mm: F64, random: np.random.Generator) -> U16:
     return np.rint(depth).astype(np.uint16)
 
 
-def _run(recording: Path) -> dict[str, float]:
+def _run(recording: Path, scale: float) -> dict[str, float]:
     """What one run says of itself, and how far from the truth it had the eyes at its refreshes."""
     settings = settings_for(recording, solver_ms=SOLVER_MS)
     settings = settings.model_copy(update={"loop": settings.loop.model_copy(update={"evaluate_every": EVERY})})
-    watched = simulated_run(settings, scale=SCALE, quality=True)
+    watched = simulated_run(settings, scale=scale, quality=True)
     tracked = [line for line in watched.lines if line["state"] == State.TRACKING]
     known = [line for line in tracked if line["true_eyes_m"] is not None]
     if not known or watched.summary["carried_db_true_eyes"] is None:

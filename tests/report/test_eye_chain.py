@@ -17,7 +17,7 @@ def test_eyes_that_a_camera_sees_are_worth_more_than_points_with_3_mm_of_noise_a
     write_png(tmp_path / "eileen.png", face.picture)
     row = {"file": "eileen.png", "left": face.pupils[0].tolist(), "right": face.pupils[1].tolist()}
     (tmp_path / "truth.json").write_text(json.dumps([row]))
-    rows = measure(tmp_path, motions=("still",), seconds=0.8)
+    rows = measure(tmp_path, motions=("still",), seconds=0.8, scale=0.15)
     by_eyes = {row["eyes"]: row for row in rows}
     assert by_eyes[NETWORKS]["eyes_p50_mm"] < 2.5 < by_eyes[NOISY]["eyes_p95_mm"]
     assert by_eyes[TRUE]["eyes_p50_mm"] < 0.5
