@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 # `phasestack` in a process of its own, whose solver is never late: a busy machine is no fault.
 PATIENT = (
-    "from runtime.frame import solver_thread; solver_thread.LATE_S, solver_thread.ABANDON_S = 60.0, 600.0; "
-    "from runtime.cli import main; main()"
+    "from runtime.cli import main; from runtime.frame import solver_thread; "
+    "solver_thread.LATE_S, solver_thread.ABANDON_S = 60.0, 600.0; main()"
 )
 
 
