@@ -16,12 +16,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from runtime.blackbox import messages
 from runtime.clock import NS_PER_S
+from runtime.errors import InputError, Stopped, one_line
 from runtime.frame.presenter import Presenter, Refresh
 from runtime.records import F64, SensorFrame
 from runtime.sensor import recording_format as fmt
@@ -32,7 +34,6 @@ from runtime.support.version import version
 
 log = logging.getLogger("phasestack.blackbox")
 
-Message = tuple[str, int, bytes, int]  # topic, wall clock in nanoseconds since 1970, JSON, sequence number
 Saved = Callable[[str, Path | None], None]  # why it could not be written (empty: it was), and the file
 
 BYTES_MAX = 32 << 20  # that are kept in memory
@@ -45,28 +46,37 @@ LINES_KEPT, STATES_KEPT = 200, 50  # for the operator's page
 FILES_MAX = 20  # in the folder
 PREFIX = "blackbox-"
 ASKED = "asked"
-METADATA_NAME = "phasestack.blackbox"
 
 
-class Recorder:
-    """An observer of a run. `watches` begins; `close` ends it."""
+class Message(NamedTuple):
+    """What happened, as it will stand in a file."""
+
+    at_ns: int  # on the run's clock: the wall's may be set
+    wall_ns: int  # since 1970
+    topic: str
+    data: bytes  # JSON
+    sequence: int
+
+
+class Recorder(logging.Handler):
+    """An observer of a run, and of its log. `watches` begins; `close` ends it."""
 
     def __init__(self, folder: Path, *, minutes: float) -> None:
         """folder: where files are written; minutes: kept in memory; 0: none, and nothing is written."""
+        super().__init__()
         self._folder, self._most_ns = folder, round(60 * minutes * NS_PER_S)
-        self._lock = threading.Lock()  # of what is kept
-        self._kept: deque[tuple[int, Message]] = deque()  # and when, by the run's clock: the wall's may be set
+        self._kept_lock = threading.Lock()
+        self._kept: deque[Message] = deque()
         self._bytes = 0
         self._presenter: Presenter | None = None
         self._sensor_from_stack: F64 | None = None
         self._state, self._state_ns = ("", ""), 0
         self._fault: tuple[int, str] | None = None  # since when, and its kind: it waits for what follows it
         self._faults_ns: dict[str, int] = {}  # by kind: when its file was written
-        self._files: dict[str, list[Path]] = {}  # of this run, by kind: the first, and the last
+        self._last_file: Path | None = None
         self._lines: deque[dict[str, Any]] = deque(maxlen=LINES_KEPT)
         self._passed: deque[dict[str, Any]] = deque(maxlen=STATES_KEPT)
         self._jobs: list[Job[None]] = []
-        self._tap = _LogTap(self._logged)
 
     def watches(self, presenter: Presenter, *, in_stack_frame: bool) -> None:
         """Begin. in_stack_frame: the sensor's points are in `stack`: they are written as a sensor would see them."""
@@ -74,7 +84,7 @@ class Recorder:
         if in_stack_frame:
             self._sensor_from_stack = np.asarray(np.linalg.inv(presenter.run_cell.state.calibration.stack_from_sensor))
         for name in ROOTS:
-            logging.getLogger(name).addHandler(self._tap)
+            logging.getLogger(name).addHandler(self)
 
     def sampled(self, sample: SensorFrame) -> None:
         eyes, matrix = sample.eyes, self._sensor_from_stack
@@ -106,8 +116,8 @@ class Recorder:
         if at_ns - self._faults_ns.get(kind, -FAULTS_APART_NS) >= FAULTS_APART_NS:
             self._fault, self._faults_ns[kind] = (at_ns, kind), at_ns
 
-    def _logged(self, record: logging.LogRecord) -> None:
-        """On whichever thread logs."""
+    def emit(self, record: logging.LogRecord) -> None:
+        """A log line, on whichever thread logs."""
         line = {"time_s": round(record.created, 3), "level": record.levelname.lower()}
         self._lines.append(line | {"text": messages.text_of(record)})
         self._keep(messages.LOG, messages.log(record))
@@ -115,47 +125,35 @@ class Recorder:
     def _keep(self, topic: str, data: bytes, sequence: int = 0) -> None:
         assert self._presenter is not None
         at_ns = self._presenter.clock.now_ns()
-        with self._lock:
-            self._kept.append((at_ns, (topic, time.time_ns(), data, sequence & 0xFFFFFFFF)))
+        with self._kept_lock:
+            self._kept.append(Message(at_ns, time.time_ns(), topic, data, sequence & 0xFFFFFFFF))
             self._bytes += len(data) + OVERHEAD_BYTES
-            while self._kept and (self._bytes > BYTES_MAX or at_ns - self._kept[0][0] > self._most_ns):
-                self._bytes -= len(self._kept.popleft()[1][2]) + OVERHEAD_BYTES
+            while self._kept and (self._bytes > BYTES_MAX or at_ns - self._kept[0].at_ns > self._most_ns):
+                self._bytes -= len(self._kept.popleft().data) + OVERHEAD_BYTES
 
     def save(self, kind: str, saved: Saved = lambda problem, path: None) -> None:
         """Write what is kept to a file as the run goes on; kind: `asked`, or of a fault. saved: called at its end."""
         if not self._most_ns or self._presenter is None:
             saved("nothing is kept in memory (service.blackbox_minutes is 0)", None)
             return
-        with self._lock:
-            kept = [message for _, message in self._kept]
+        with self._kept_lock:
+            kept = list(self._kept)
         settings = self._presenter.run_cell.state.settings
         header = RecordingHeader(settings.sensor.driver, self._presenter.samples.serial)
 
         def work() -> None:
             try:
-                path = _written(self._folder, kind, kept, header, settings.model_dump_json())
-                self._make_room(kind, path)
+                path = write_file(self._folder, kind, kept, header, settings.model_dump_json())
+                make_room(self._folder)
             except OSError as error:
                 log.error("the black box could not be written: %s", error)
                 saved(f"{self._folder}: cannot be written ({error.strerror})", None)
                 return
+            self._last_file = path
             log.info("black box written: %s", path, extra={"always": True})
             saved("", path)
 
         self._jobs = [job for job in self._jobs if not job.done] + [Job("black box", work)]
-
-    def _make_room(self, kind: str, path: Path) -> None:
-        """Of a run's faults of one kind the first and the last stay; no kind's flood takes another kind's place."""
-        mine = self._files.setdefault(kind, [])
-        mine.append(path)
-        if kind != ASKED and len(mine) > 2:
-            mine.pop(1).unlink(missing_ok=True)
-        kinds: dict[str, list[Path]] = {}
-        for file in sorted(self._folder.glob(f"{PREFIX}*.mcap")):
-            kinds.setdefault(file.stem.partition("Z-")[2].partition("~")[0], []).append(file)
-        for _ in range(sum(map(len, kinds.values())) - FILES_MAX):
-            largest = max(kinds.values(), key=len)
-            largest.pop(1 if len(largest) > 2 else 0).unlink(missing_ok=True)
 
     def look_at_log(self) -> dict[str, Any]:
         """The newest log lines and states, the oldest first; times since 1970."""
@@ -163,33 +161,41 @@ class Recorder:
 
     def describe(self) -> dict[str, Any]:
         """For the status."""
-        with self._lock:
-            kept_ns = self._kept[-1][0] - self._kept[0][0] if self._kept else 0
+        with self._kept_lock:
+            kept_ns = self._kept[-1].at_ns - self._kept[0].at_ns if self._kept else 0
             held_bytes = self._bytes
-        newest = max((paths[-1] for paths in self._files.values()), default=None)
         return {
             "kept_s": round(kept_ns / NS_PER_S, 1),
             "kept_mib": round(held_bytes / (1 << 20), 2),
-            "last_file": str(newest) if newest is not None else None,
+            "last_file": str(self._last_file) if self._last_file is not None else None,
         }
 
-    def close(self, *, crashed: str = "") -> None:
-        """No more; crashed: why the run ended with an error: what is kept is written. May be called twice."""
-        if crashed and self._presenter is not None:
-            log.error("%s", crashed)
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Where the run ends with an error of its own, what is kept is written."""
+        if isinstance(error, Exception) and not isinstance(error, Stopped | InputError) and self._presenter is not None:
+            log.error("%s", one_line(f"{type(error).__name__}: {error}"))
+            self._fault = (0, "error")
+        self.close()
+
+    def close(self) -> None:
+        """No more; what waits to be written is. May be called twice."""
         for name in ROOTS:
-            logging.getLogger(name).removeHandler(self._tap)
-        if crashed:
-            self.save("error")
-        elif self._fault is not None:
+            logging.getLogger(name).removeHandler(self)
+        if self._fault is not None:
             self.save(self._fault[1])
         self._fault = None
         for job in self._jobs:
             job.wait(WRITTEN_WITHIN_S)
         self._presenter = None
+        super().close()
 
 
-def _written(folder: Path, kind: str, kept: list[Message], header: RecordingHeader, settings: str) -> Path:
+def write_file(folder: Path, kind: str, kept: list[Message], header: RecordingHeader, settings: str) -> Path:
     """A new file in a folder, whole or not there, for its owner alone: who was here is private. Raises OSError."""
     from mcap.writer import CompressionType, Writer
 
@@ -202,15 +208,15 @@ def _written(folder: Path, kind: str, kept: list[Message], header: RecordingHead
             writer: Any = Writer(file, compression=CompressionType.LZ4)
             writer.start(profile="phasestack", library=f"phasestack {version()}")
             writer.add_metadata(fmt.METADATA_NAME, header.metadata())
-            writer.add_metadata(METADATA_NAME, {"why": kind, "version": version()})
             writer.add_attachment(0, 0, "settings.json", "application/json", settings.encode())
             channels: dict[str, int] = {}
-            for topic, wall_ns, data, sequence in kept:
+            for message in kept:
+                topic = message.topic
                 if topic not in channels:
                     schema = messages.SCHEMAS[topic]
                     number = writer.register_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
                     channels[topic] = writer.register_channel(topic, "json", number)
-                writer.add_message(channels[topic], wall_ns, data, wall_ns, sequence)
+                writer.add_message(channels[topic], message.wall_ns, message.data, message.wall_ns, message.sequence)
             writer.finish()
         part.replace(path)
     except BaseException:
@@ -219,12 +225,11 @@ def _written(folder: Path, kind: str, kept: list[Message], header: RecordingHead
     return path
 
 
-class _LogTap(logging.Handler):
-    """Hands every log line on."""
-
-    def __init__(self, put: Callable[[logging.LogRecord], None]) -> None:
-        super().__init__()
-        self._put = put
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self._put(record)
+def make_room(folder: Path) -> None:
+    """Of too many files the commonest kind makes way, all but its first: no kind's flood takes another kind's place."""
+    kinds: dict[str, list[Path]] = {}
+    for file in sorted(folder.glob(f"{PREFIX}*.mcap")):
+        kinds.setdefault(file.stem.partition("Z-")[2].partition("~")[0], []).append(file)
+    for _ in range(sum(map(len, kinds.values())) - FILES_MAX):
+        largest = max(kinds.values(), key=len)
+        largest.pop(1 if len(largest) > 2 else 0).unlink(missing_ok=True)

@@ -31,8 +31,7 @@ def demo(
     summary = drive(
         settings,
         RunOptions(max_speed=True, measure=True, frames=frames, out=out),
-        total=min(refreshes, frames or refreshes),
-        progress=True,
+        expected=refreshes,
     )
     if as_json:
         typer.echo(json.dumps(summary))

@@ -40,11 +40,11 @@ def page(
     except ImportError as error:
         raise MissingPart(f"page: {error.name} is not installed: pip install starlette uvicorn") from None
 
-    from runtime.blackbox.location import state_folder
     from runtime.commands.status import sockets
     from runtime.page.daemon import Daemon
     from runtime.page.thumbnails import Thumbnails
     from runtime.page.token import token_of
+    from runtime.support.folders import state_folder
     from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
 
     set_niceness(BACKGROUND_NICENESS)  # the display comes first; its threads are started after this

@@ -60,7 +60,7 @@ def run(
         max_speed=max_speed, measure=out is not None, scale=scale, keep_light=keep_light, frames=frames, out=out
     )
     with blame_option("run", scene=scene, model=model):
-        summary = run_daemon(read_settings, options, progress=max_speed and not as_json)
+        summary = run_daemon(read_settings, options)
     if as_json:
         typer.echo(json.dumps(summary))
     elif "frames" in summary and "NOTIFY_SOCKET" not in os.environ:

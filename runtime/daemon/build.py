@@ -12,9 +12,8 @@ from typing import Any
 
 import cv2
 
-from runtime.blackbox.recorder import Recorder
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock, SimulatedClock
-from runtime.config import OutputSettings, Settings
+from runtime.config import Settings
 from runtime.daemon.solver_parts import RunningSolver, SolverMaker
 from runtime.errors import PanelLost, Stopped
 from runtime.eyes.calibration import load_calibration
@@ -108,6 +107,8 @@ def scaled_stack(settings: Settings, scale: float) -> PanelStack:
 class Host(Supervisor):
     """Who a run is for: asked before its first refresh, its supervisor from then on. This one asks for nothing."""
 
+    recorder: Any = None  # another observer, whose `watches` is called before the first refresh
+
     def starting(self, doing: str) -> bool:
         """Something before the first refresh takes long. False: leave it."""
         return True
@@ -124,19 +125,18 @@ def build_run(
     settings: Settings,
     options: RunOptions,
     cleanup: ExitStack,
-    *,
     host: Host | None = None,
+    *,
     output: Output | None = None,
     on_account: Callable[[RefreshAccount], None] | None = None,
-    recorder: Recorder | None = None,
 ) -> Run:
     """A run ready for its first refresh; whatever it holds is closed by `cleanup`.
 
-    recorder: begins to watch; who gives it closes it. Raises FatalError, PanelLost, Stopped where the host says so.
+    Raises FatalError, PanelLost, Stopped where the host says so.
     """
     host = host or Host()
     cv2.setNumThreads(settings.model.threads or -1)
-    simulated = options.max_speed
+    simulated, stage_ms = options.max_speed, settings.loop.simulated_stage_ms
     clock: Clock = SimulatedClock() if simulated else MonotonicClock()
     stack = scaled_stack(settings, options.scale)
     calibration = load_calibration(Path(settings.calibration.file) if settings.calibration.file else None)
@@ -148,23 +148,19 @@ def build_run(
         driver = open_sensor(settings.sensor, clock, latency_ms=latency_ms)
         return DetectingDriver(driver, lambda: EyeFinder(settings).find)
 
+    def keep_on(what: str, done: int, total: int | None) -> None:
+        if not host.starting("reading the recording"):
+            raise Stopped("told to stop while starting")
+
     driver = make_driver()
     samples: Samples
     if simulated:
-
-        def keep_on(what: str, done: int, total: int | None) -> None:
-            if not host.starting("reading the recording"):
-                raise Stopped("told to stop while starting")
-
         with listening(keep_on):  # a recording may be long to skip through
             samples = RecordedSamples(driver)
         cleanup.callback(samples.close)
     context = offscreen_context()
     cleanup.callback(context.release)
-    output_settings = settings.output
-    if options.scale != 1.0:  # asked for: no monitor's mode fits such a stack
-        output_settings = output_settings.model_copy(update={"allow_rescaling": True})
-    panels = _open_panels(output_settings, stack, clock, context, host)
+    panels = _open_panels(settings, options, stack, clock, context, host)
     cleanup.callback(panels.close)
     maker = SolverMaker(settings, stack, calibration, panels_group=lambda: panels.group)
     solver: SolverHost
@@ -173,21 +169,14 @@ def build_run(
         cleanup.callback(solver.close)
     else:
         sys.setswitchinterval(SWITCH_INTERVAL_S)
-        thread = SolverThread(
-            maker,
-            clock,
-            first_cost_ns=total_ns(settings.loop.simulated_stage_ms),
-        )
-        solver = thread
+        solver = thread = SolverThread(maker, clock, first_cost_ns=total_ns(stage_ms))
         cleanup.callback(solver.close)
         thread.wait_ready(lambda: host.starting("loading content and model"), max_s=settings.limits.start_s)
         samples = worker = SensorWorker(make_driver, settings.sensor, clock)
         cleanup.callback(worker.close)
         worker.start()
-    run = maker.run
-    if run is None:
         raise Stopped("told to stop while starting")
-    viewer = Viewer(settings, calibration, front_m=max(stack.x_m), in_stack_frame=driver.capabilities.in_stack_frame)
+    in_stack_frame = driver.capabilities.in_stack_frame
     observer = RunObserver(
         stack,
         solver,
@@ -199,45 +188,43 @@ def build_run(
         on_account=on_account,
         simulated=simulated,
     )
+    pacer = Pacer(
+        period_ns=panels.period_ns or round(NS_PER_S / settings.loop.rate_hz),
+        photon_ns=round(settings.loop.scanout_ms * NS_PER_MS),
+        work_ns=round(sum(stage_ms.get(stage, 0.0) for stage in ("sensor", "track", "present")) * NS_PER_MS),
+    )
     presenter = Presenter(
-        run,
+        maker.run,
         stack,
         clock=clock,
-        pacer=_pacer(settings, panels),
+        pacer=pacer,
         samples=samples,
-        viewer=viewer,
+        viewer=Viewer(settings, calibration, front_m=max(stack.x_m), in_stack_frame=in_stack_frame),
         solver=solver,
         panels=panels,
-        stage_ms=settings.loop.simulated_stage_ms,
+        stage_ms=stage_ms,
         supervisor=host,
-        observers=[observer] if recorder is None else [observer, recorder],
+        observers=[observer] if host.recorder is None else [observer, host.recorder],
     )
-    if recorder is not None:
-        in_stack_frame = driver.capabilities.in_stack_frame
-        recorder.watches(presenter, in_stack_frame=in_stack_frame)
+    if host.recorder is not None:
+        host.recorder.watches(presenter, in_stack_frame=in_stack_frame)
     if not simulated:
         cleanup.enter_context(gc_frozen())
         cleanup.enter_context(niceness(PRESENTER_NICENESS))  # this thread's, once all others have been started
-    built = Run(presenter, observer, solver, maker, simulated)
-    host.watches(built)
-    return built
+    run = Run(presenter, observer, solver, maker, simulated)
+    host.watches(run)
+    return run
 
 
-def _pacer(settings: Settings, panels: PanelSink) -> Pacer:
-    period_ns = panels.period_ns or round(NS_PER_S / settings.loop.rate_hz)
-    stage_ms = settings.loop.simulated_stage_ms
-    work_ms = sum(stage_ms.get(stage, 0.0) for stage in ("sensor", "track", "present"))
-    return Pacer(
-        period_ns=period_ns,
-        photon_ns=round(settings.loop.scanout_ms * NS_PER_MS),
-        work_ns=round(work_ms * NS_PER_MS),
-    )
-
-
-def _open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, context: Any, host: Host) -> PanelSink:
+def _open_panels(
+    settings: Settings, options: RunOptions, stack: PanelStack, clock: Clock, context: Any, host: Host
+) -> PanelSink:
+    output = settings.output
+    if options.scale != 1.0:  # asked for: no monitor's mode fits such a stack
+        output = output.model_copy(update={"allow_rescaling": True})
     while True:
         try:
-            return open_panels(settings, stack, clock, context)
+            return open_panels(output, stack, clock, context)
         except PanelLost as error:
             if not host.wait_for_panel(str(error)):
                 raise

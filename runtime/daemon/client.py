@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import socket
-import time
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,7 +14,6 @@ from typing import Any
 from runtime.errors import InputError, TransientError
 from runtime.support import foreign
 
-ANSWER_MAX_BYTES = 1 << 22
 # Where the daemon listens without a configuration: `ServiceSettings().socket`, without loading all settings.
 DEFAULT_SOCKET = "/run/phasestack/status.sock"
 
@@ -57,41 +55,28 @@ class NotRunning(TransientError):
 
 
 def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10.0) -> dict[str, Any]:
-    """The daemon's answer. Raises NotRunning where none answers, within the time, at any of the paths."""
+    """The daemon's answer. Raises NotRunning where none answers at any of the paths; timeout_s: of each step."""
     problems = []
     for path in paths:
         try:
-            answer = json.loads(_exchanged(path, json.dumps(request).encode() + b"\n", timeout_s))
+            return _exchanged(path, request, timeout_s)
         except (OSError, ValueError) as error:
             problems.append(f"{path}: {_advice(error)}")
-            continue
-        if isinstance(answer, dict):
-            return answer
-        problems.append(f"{path}: answered nonsense")
     raise NotRunning("; ".join(problems) or "no socket is configured")
 
 
-def _exchanged(path: Path, line: bytes, timeout_s: float) -> bytes:
-    """One line there and one back, within the time altogether."""
-    deadline_s = time.monotonic() + timeout_s
-    received = b""
+def _exchanged(path: Path, request: dict[str, Any], timeout_s: float) -> dict[str, Any]:
+    """One line there and one back."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as channel:
         channel.settimeout(timeout_s)
         channel.connect(str(path))
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # turned away: the answer says why
-            channel.sendall(line)
-        while b"\n" not in received and len(received) <= ANSWER_MAX_BYTES:
-            remaining_s = deadline_s - time.monotonic()
-            if remaining_s <= 0:
-                raise TimeoutError
-            channel.settimeout(remaining_s)
-            data = channel.recv(65536)
-            if not data:
-                break
-            received += data
-    if not received:
+            channel.sendall(json.dumps(request).encode() + b"\n")
+        line = channel.makefile("rb").readline()
+    if not line:
         raise ConnectionResetError("the connection was closed without an answer")
-    return received.partition(b"\n")[0]
+    answer: dict[str, Any] = json.loads(line)
+    return answer
 
 
 def _advice(error: Exception) -> str:

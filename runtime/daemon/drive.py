@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import ExitStack
 from pathlib import Path
 from time import perf_counter
@@ -11,34 +10,35 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from runtime.blackbox.recorder import Recorder
 from runtime.config import Settings
 from runtime.daemon.build import Host, RunOptions, build_run
 from runtime.evaluation.run_output import RunOutput
 from runtime.optics.alignment import shown_layers
 from runtime.records import RefreshAccount
+from runtime.support import progress
 from runtime.support.background import wait_for_all
-from runtime.support.progress import ShownProgress
 
 JOBS_END_WITHIN_S = 3.0  # what is still loading at the end
 
 
 def drive(
-    settings: Settings,
-    options: RunOptions,
-    *,
-    host: Host | None = None,
-    recorder: Recorder | None = None,
-    progress: bool = False,
-    total: int | None = None,
+    settings: Settings, options: RunOptions, host: Host | None = None, *, expected: int | None = None
 ) -> dict[str, Any]:
-    """Run to the end and answer the summary. total: refreshes that the progress counts to, where it is known."""
+    """Run to the end and answer the summary. expected: refreshes that the progress counts to, where it is known."""
+    done = 0
+
+    def advance(account: RefreshAccount) -> None:
+        nonlocal done
+        done += 1
+        progress.tell(f"{account.state}: refresh", done, options.frames or expected)
+
     with ExitStack() as cleanup:
+        cleanup.callback(progress.tell, "", 0)
         output = None
         if options.out is not None:
             output = cleanup.enter_context(RunOutput(options.out, every_one=options.max_speed))
-        on_account = _progress(total, cleanup) if progress else None
-        run = build_run(settings, options, cleanup, host=host, output=output, on_account=on_account, recorder=recorder)
+        on_account = advance if options.max_speed else None
+        run = build_run(settings, options, cleanup, host, output=output, on_account=on_account)
         begin_s = perf_counter()
         reason = run.presenter.run(frames=options.frames)
         machine_s = perf_counter() - begin_s
@@ -53,18 +53,6 @@ def drive(
             output.finish(summary, layers, run.observer.eye_views, run.observer.moment)
     wait_for_all(JOBS_END_WITHIN_S)
     return summary | {"machine_s": round(machine_s, 3)}
-
-
-def _progress(total: int | None, cleanup: ExitStack) -> Any:
-    shown, done = ShownProgress(sys.stderr, after_s=0.0), 0
-    cleanup.callback(shown, "", 0, None)
-
-    def advance(account: RefreshAccount) -> None:
-        nonlocal done
-        done += 1
-        shown(f"{account.state}: refresh", done, total)
-
-    return advance
 
 
 def print_summary(summary: dict[str, Any], out: Path | None) -> None:

@@ -7,8 +7,7 @@ read, and where all places are taken the client that has waited longest for a wh
 from __future__ import annotations
 
 import asyncio
-import errno
-import fcntl
+import contextlib
 import grp
 import json
 import logging
@@ -16,6 +15,7 @@ import os
 import queue
 import socket
 import stat
+import struct
 import threading
 from asyncio import StreamReader, StreamWriter
 from collections.abc import Callable
@@ -24,10 +24,10 @@ from typing import Any
 
 from runtime.clock import NS_PER_S, Clock
 from runtime.config import ServiceSettings
-from runtime.daemon.client import user_socket
+from runtime.daemon.client import DEFAULT_SOCKET, user_socket
 from runtime.daemon.commands import Command, parse
 from runtime.errors import InputError, TransientError
-from runtime.support.artifacts import to_json
+from runtime.support.artifacts import locked, to_json
 from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
 
 log = logging.getLogger("phasestack.service")
@@ -38,7 +38,6 @@ CLIENTS_MAX = 64
 REQUEST_S = 5.0  # for a whole request to come, and for its answer to be read
 LOOP_ANSWERS_WITHIN_S = 5.0
 LOADED_WITHIN_S = 60.0  # what has begun is waited for so long
-OWN_MODE = 0o600
 
 
 class SocketInUse(TransientError):
@@ -66,17 +65,26 @@ class StatusServer:
         self._snapshot: tuple[int, Callable[[], dict[str, Any]]] = (self._started_ns, dict)
         self._clients: set[asyncio.Task[None]] = set()
         self._reading: dict[asyncio.Task[None], None] = {}  # who waits for a whole request, the longest first
-        self._lock = _claim(path)
         try:
-            listening = _bound(path, group)
-        except BaseException:
-            os.close(self._lock)
-            raise
-        self._own = _identity(path)
-        self._loop = asyncio.new_event_loop()
-        self._server = self._loop.run_until_complete(
-            asyncio.start_unix_server(self._serve, sock=listening, limit=LINE_MAX_BYTES, backlog=BACKLOG)
-        )
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with locked(path.parent):  # of two that start at once the second finds the first listening
+                _check_dead(path)
+                self._loop = asyncio.new_event_loop()
+                # The mode must hold from the first moment, so it is the mask that makes it, not a later chmod.
+                mask = os.umask(0o117)
+                try:
+                    self._server = self._loop.run_until_complete(
+                        asyncio.start_unix_server(self._serve, path, limit=LINE_MAX_BYTES, backlog=BACKLOG)
+                    )
+                finally:
+                    os.umask(mask)
+            self._own = path.lstat().st_ino
+        except OSError as error:
+            raise InputError("service", "socket", f"{path} can't be made ({error.strerror or error})") from error
+        try:
+            os.chown(path, -1, grp.getgrnam(group).gr_gid)
+        except (KeyError, PermissionError):
+            log.info("the status socket is this user's alone: group %s is not there or not ours", group)
         self._thread: threading.Thread | None = threading.Thread(target=self._run, name="status", daemon=True)
         self._thread.start()
 
@@ -99,9 +107,9 @@ class StatusServer:
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(timeout=2.0)
         self._thread = None
-        if _identity(self.path) == self._own:  # where it was deleted, another daemon's may be there
-            self.path.unlink(missing_ok=True)
-        os.close(self._lock)
+        with contextlib.suppress(OSError):
+            if self.path.lstat().st_ino == self._own:  # where it was deleted, another daemon's may be there
+                self.path.unlink()
 
     def answer(self, line: bytes) -> dict[str, Any] | Command:
         """One request to one answer (`ok` says whether it was done, `error` why not), or to a command for the loop."""
@@ -228,89 +236,25 @@ async def _outcome(command: Command) -> dict[str, Any]:
     return {"ok": True, "note": f"still loading after {LOADED_WITHIN_S:g} s: ask `phasestack status`"}
 
 
-def _claim(path: Path) -> int:
-    """A locked file next to the socket: the daemon that holds it owns the socket, whatever else has crashed.
-
-    A link is never followed, and nothing is written to a file that is not ours alone.
-    """
-    lock_path = path.with_name(path.name + ".lock")
-    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        lock = os.open(lock_path, flags, OWN_MODE)
-    except OSError as error:
-        problem = "is a link" if error.errno == errno.ELOOP else f"can't be made ({error.strerror})"
-        raise InputError("service", "socket", f"{lock_path} {problem}") from error
-    try:
-        found = os.fstat(lock)
-        if not stat.S_ISREG(found.st_mode) or found.st_nlink != 1 or found.st_uid != os.geteuid():
-            raise InputError("service", "socket", f"{lock_path} is not a file of this user's alone")
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            owner = os.pread(lock, 32, 0).decode(errors="replace").strip()
-            raise SocketInUse(
-                f"service: socket: {path} is in use by another phasestack (pid {owner if owner.isdigit() else '?'})"
-            ) from None
-        os.fchmod(lock, OWN_MODE)
-        os.ftruncate(lock, 0)
-        os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
-    except OSError as error:
-        os.close(lock)
-        raise InputError("service", "socket", f"{lock_path} can't be written ({error.strerror})") from error
-    except BaseException:
-        os.close(lock)
-        raise
-    return lock
-
-
-def _bound(path: Path, group: str) -> socket.socket:
-    """The socket at its place. Only a dead one is replaced: with its lock deleted, one may still be listened to."""
-    try:
-        found = path.lstat() if path.is_symlink() or path.exists() else None
-        if found is not None and not stat.S_ISSOCK(found.st_mode):
-            raise InputError("service", "socket", f"{path} exists and is not a socket")
-        if found is not None and _is_listened_to(path):
-            raise SocketInUse(f"service: socket: {path} is in use by another phasestack")
-        path.unlink(missing_ok=True)
-        made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        # The mode must hold from the first moment, so it is the mask that makes it, not a later chmod.
-        mask = os.umask(0o117)
-        try:
-            made.bind(str(path))
-        except BaseException:
-            made.close()
-            raise
-        finally:
-            os.umask(mask)
-    except OSError as error:
-        raise InputError("service", "socket", f"{path} can't be made ({error.strerror or error})") from error
-    try:
-        os.chown(path, -1, grp.getgrnam(group).gr_gid)
-    except (KeyError, PermissionError):
-        log.info("the status socket is this user's alone: group %s is not there or not ours", group)
-    return made
-
-
-def _is_listened_to(path: Path) -> bool:
+def _check_dead(path: Path) -> None:
+    """Raise InputError where something else than a socket is there, SocketInUse where one is listened to."""
+    if not os.path.lexists(path):
+        return
+    if not stat.S_ISSOCK(path.lstat().st_mode):
+        raise InputError("service", "socket", f"{path} exists and is not a socket")
+    owner = ""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
             probe.connect(str(path))
-        except BlockingIOError:
-            return True  # its backlog is full
         except ConnectionRefusedError:
-            return False
-        return True
-
-
-def _identity(path: Path) -> tuple[int, int] | None:
-    """What is at a path, whatever it is called later."""
-    try:
-        found = path.lstat()
-    except OSError:
-        return None
-    return found.st_dev, found.st_ino
+            return
+        except BlockingIOError:
+            pass  # its backlog is full
+        else:
+            pid, _, _ = struct.unpack("3i", probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+            owner = f" (pid {pid})"
+    raise SocketInUse(f"service: socket: {path} is in use by another phasestack{owner}")
 
 
 def open_status_server(settings: ServiceSettings, *, clock: Clock, supervised: bool) -> StatusServer | None:
@@ -321,7 +265,7 @@ def open_status_server(settings: ServiceSettings, *, clock: Clock, supervised: b
     """
     path = Path(settings.socket)
     own = user_socket()
-    if own is not None and path == Path(ServiceSettings().socket) and not _may_write(path.parent):
+    if own is not None and path == Path(DEFAULT_SOCKET) and not _may_write(path.parent):
         path = own
     try:
         return StatusServer(path, group=settings.group, clock=clock)

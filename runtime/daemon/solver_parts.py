@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -29,29 +31,22 @@ PanelsGroup = Callable[[], ShareGroup | None]  # that panels show textures of at
 WARM_EYES_M = ((0.6, -0.031, 0.0), (0.6, 0.031, 0.0))
 
 
+@dataclass(eq=False)
 class RunningSolver:
     """`SolverParts` of a real run; made and used on one thread."""
 
-    def __init__(
-        self,
-        run: RunCell,
-        stack: PanelStack,
-        *,
-        context: Any,
-        owns_context: bool,
-        group: ShareGroup | None,
-        panels_group: PanelsGroup,
-        backend: Choice,
-        simulated: bool,
-    ) -> None:
-        """context: current on this thread; owns_context: it is released with the rest. group: the context's, if any;
-        panels_group: the one that panels show textures of at present. backend: of every model."""
-        self.run, self.context, self.backend = run, context, backend
-        self._owns_context = owns_context
-        self._group, self._panels_group = group, panels_group
-        self._wanted_backend = run.state.settings.model.backend
-        self._held: RunState = run.state
-        self.solver = Solver(run, stack, timed=not simulated)
+    run: RunCell
+    solver: Solver
+    backend: Choice  # of every model
+    context: Any  # current on this thread
+    owns_context: bool  # it is released with the rest
+    group: ShareGroup | None  # the context's
+    panels_group: PanelsGroup
+    wanted_backend: Wanted
+    _held: RunState = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._held = self.run.state
 
     @property
     def content(self) -> ContentSource:
@@ -63,16 +58,16 @@ class RunningSolver:
 
         Raises PhasestackError where that can't be had; nothing has changed then.
         """
-        wanted, before = settings.model.backend, self.backend
-        if wanted != self._wanted_backend:
-            self.backend = choose(wanted, predictor, lambda: self.context, group=self._group)
-            self._wanted_backend = wanted
+        before = self.backend
+        if settings.model.backend != self.wanted_backend:
+            self.backend = choose(settings.model.backend, predictor, lambda: self.context, group=self.group)
+            self.wanted_backend = settings.model.backend
         predictor.set_backend(self.backend.backend)
         if before is not self.backend:
             before.backend.close()
 
     def step(self, request: SolveRequest) -> SolverStep:
-        if self._panels_group() is not self._group or (self._group is not None and self._group.lost):
+        if self.panels_group() is not self.group or (self.group is not None and self.group.lost):
             raise ContextLost("the panels have another OpenGL context")
         self._held = self.run.state
         return self.solver.step(request)
@@ -83,7 +78,7 @@ class RunningSolver:
     def close(self, *, abandoned: bool = False) -> None:
         stand_in = self._stand_in()
         state = self._held if abandoned else self.run.state
-        own = [leave_context, self.context.release] if self._owns_context else []
+        own = [leave_context, self.context.release] if self.owns_context else []
         own += [] if stand_in is None else [stand_in.release]
         for release in (state.content.close, state.predictor.close, self.backend.backend.close, *own):
             try:
@@ -94,10 +89,10 @@ class RunningSolver:
     def _stand_in(self) -> SharingContext | None:
         """A context of the group, current: textures outlive the solver's own, which may be lost, and are released in
         this one. None: they go with their context."""
-        if not self._owns_context or self._group is None or self._group.lost:
+        if not self.owns_context or self.group is None or self.group.lost:
             return None
         try:
-            return self._group.stand_in()
+            return self.group.stand_in()
         except Exception as error:
             log.warning("solver: its textures stay: %s", error)
             return None
@@ -125,41 +120,33 @@ class SolverMaker:
         """context: one to use together with the panels; None: one of this thread's own, which shares textures with
         theirs where that can be. Raises FatalError; leaves nothing open then."""
         own, group = context is None, self._shared_group()
-        made = context if context is not None else own_context(group)
-        try:
-            settings = self.run.state.settings if self.run is not None else self._settings
-            predictor = ready_predictor(settings, self._stack)
-            try:
-                content = open_content(settings.content, self._stack, made)
-                try:
-                    backend = self._chosen(predictor, made, group, simulated=simulated)
-                    predictor.set_backend(backend.backend)
-                except BaseException:
-                    content.close()
-                    raise
-            except BaseException:
-                predictor.close()
-                raise
-        except BaseException:
+        settings = self.run.state.settings if self.run is not None else self._settings
+        with ExitStack() as undo:
             if own:
-                made.release()
-            raise
+                context = offscreen_context() if group is None else group.context()
+                undo.callback(context.release)
+            predictor = ready_predictor(settings, self._stack)
+            undo.callback(predictor.close)
+            content = open_content(settings.content, self._stack, context)
+            undo.callback(content.close)
+            backend = self._chosen(predictor, context, group, simulated=simulated)
+            predictor.set_backend(backend.backend)
+            undo.pop_all()
         if self.run is None:
             self.run = RunCell(settings, calibration=self._calibration, content=content, predictor=predictor)
         else:
             self.run.replace(content=content, predictor=predictor)
-        parts = RunningSolver(
+        self.parts = RunningSolver(
             self.run,
-            self._stack,
-            context=made,
+            Solver(self.run, self._stack, timed=not simulated),
+            backend,
+            context,
             owns_context=own,
             group=group,
             panels_group=self._shared_group,
-            backend=backend,
-            simulated=simulated,
+            wanted_backend=settings.model.backend,
         )
-        self.parts = parts
-        return parts
+        return self.parts
 
     def _shared_group(self) -> ShareGroup | None:
         """Of the panels, where solutions may be left in textures; a solver that never draws any is kept apart."""
@@ -175,11 +162,6 @@ class SolverMaker:
         choice = choose(wanted, predictor, lambda: context, group=group)
         self._wanted = "gl" if choice.backend.name == "gl" else "cpu"
         return choice
-
-
-def own_context(group: ShareGroup | None) -> Any:
-    """A context for this thread, current on it, of a group if there is one. Raises MissingPart."""
-    return offscreen_context() if group is None else group.context()
 
 
 def ready_predictor(settings: Settings, stack: PanelStack) -> Predictor:

@@ -168,11 +168,11 @@ class OutputFolder:
         try:
             missing = [folder for folder in (self.target, *self.target.parents) if not folder.exists()]
             self.target.mkdir(parents=True, exist_ok=True)
-            with _locked(self.target):  # nobody takes the new folder for a dead one before it has its lock
+            with locked(self.target):  # nobody takes the new folder for a dead one before it has its lock
                 _clear_dead(self.target)
                 self.staging = Path(tempfile.mkdtemp(prefix=STAGING, dir=self.target))
                 self._lock = ExitStack()
-                self._lock.enter_context(_locked(self.staging))
+                self._lock.enter_context(locked(self.staging))
         except OSError as error:
             raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
         self._made = missing
@@ -228,7 +228,7 @@ def _check_free(place: Path, *, within: Path) -> None:
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path) -> Iterator[None]:
     """A lock on a folder that ends with the process, however it ends; none where the file system has no locks."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:

@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 
 from runtime.blackbox import recorder as recording
-from runtime.blackbox.recorder import Recorder
+from runtime.blackbox.recorder import Recorder, make_room
 from runtime.clock import NS_PER_S
 from runtime.config import Settings
-from runtime.daemon.build import RunOptions, build_run
+from runtime.daemon.build import Host, RunOptions, build_run
 from runtime.errors import SensorLost
 from runtime.eyes.calibration import load_calibration
 from runtime.records import RefreshAccount
@@ -29,7 +29,7 @@ from runtime.sensor.recording import Recording, recording_to
 from runtime.sensor.replay import demo_recording_path
 from tests.daemon.rig import Rig
 
-SMALL: dict[str, Any] = {"stack": {"width_px": 192, "height_px": 108}, "model": {"name": "fast", "threads": 1}}
+SMALL: dict[str, Any] = {"stack": {"width_px": 64, "height_px": 36}, "model": {"name": "fast", "threads": 1}}
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,9 @@ def run_of(source: Path, *, recorder: Recorder | None = None) -> list[RefreshAcc
     settings = Settings.model_validate({**SMALL, "sensor": {"driver": "replay", "source": str(source)}})
     accounts: list[RefreshAccount] = []
     with ExitStack() as cleanup:
-        run = build_run(settings, RunOptions(max_speed=True), cleanup, on_account=accounts.append, recorder=recorder)
+        host = Host()
+        host.recorder = recorder
+        run = build_run(settings, RunOptions(max_speed=True), cleanup, host, on_account=accounts.append)
         run.presenter.run()
         if recorder is not None:
             recorder.save("asked")
@@ -169,10 +171,9 @@ def test_where_nothing_is_kept_asking_is_refused(tmp_path: Path) -> None:
 
 
 def test_an_error_that_ends_the_run_leaves_its_black_box(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path, minutes=2.0)
-    with Rig(recorder=recorder) as rig:
+    with pytest.raises(ValueError), Recorder(tmp_path, minutes=2.0) as recorder, Rig(recorder=recorder) as rig:
         rig.refresh_until("tracking")
-        recorder.close(crashed="ValueError: a bug")
+        raise ValueError("a bug")
     messages = read(the_file(tmp_path))
     assert any("ValueError: a bug" in m.value["message"] for m in messages if m.topic == "/log")
 
@@ -193,17 +194,13 @@ def test_a_flood_of_one_kind_keeps_its_first_and_last_and_takes_no_other_kinds_p
     earlier = tmp_path / "blackbox-20200101T000000Z-fault-sensor.mcap"
     earlier.write_bytes(b"an earlier run's")
     (tmp_path / "mine.mcap").write_bytes(b"kept")
-    recorder = Recorder(tmp_path, minutes=2.0)
-    first = tmp_path / "blackbox-20200102T000000Z-fault-model.mcap"
-    for number in range(100):
-        path = first.with_name(f"blackbox-20200102T00{number:04}Z-fault-model.mcap") if number else first
-        path.write_bytes(b"new")
-        recorder._make_room("fault-model", path)
-    assert {path.name for path in tmp_path.iterdir()} == {earlier.name, "mine.mcap", first.name, path.name}
-    for number in range(50):  # of other runs
-        file = tmp_path / f"blackbox-20200103T00{number:04}Z-fault-panel.mcap"
-        file.write_bytes(b"new")
-        Recorder(tmp_path, minutes=2.0)._make_room("fault-panel", file)
+    for day, kind in ((2, "fault-model"), (3, "fault-panel")):
+        for number in range(100):
+            file = tmp_path / f"blackbox-2020010{day}T00{number:04}Z-{kind}.mcap"
+            file.write_bytes(b"new")
+            make_room(tmp_path)
     kept = [path.name for path in sorted(tmp_path.glob("blackbox-*.mcap"))]
-    assert len(kept) == recording.FILES_MAX and kept[:3] == [earlier.name, first.name, path.name]
-    assert kept[3].startswith("blackbox-20200103T000000Z") and kept[-1] == file.name
+    assert len(kept) == recording.FILES_MAX and (tmp_path / "mine.mcap").exists()
+    assert kept[:2] == [earlier.name, "blackbox-20200102T000000Z-fault-model.mcap"]
+    assert "blackbox-20200102T000099Z-fault-model.mcap" in kept
+    assert "blackbox-20200103T000000Z-fault-panel.mcap" in kept and kept[-1] == file.name

@@ -12,7 +12,7 @@ from unittest.mock import patch
 import numpy as np
 
 from runtime.config import Settings
-from runtime.daemon.build import Run, RunOptions, build_run
+from runtime.daemon.build import Host, Run, RunOptions, build_run
 from runtime.errors import PanelLost
 from runtime.frame.presenter import Presenter
 from runtime.records import EyePoints, PanelFrame, PresentReport, RefreshAccount, SensorFrame, State
@@ -102,7 +102,8 @@ class Rig:
         registry._FACTORIES["fragile"] = lambda settings, clock, latency_ms: FragileDriver(self.plan, clock)
         tables = {name: {**SMALL.get(name, {}), **changes.get(name, {})} for name in {**SMALL, **changes}}
         self.settings = Settings.model_validate(tables)
-        self.host, self.recorder = host, recorder
+        self.host = host or Host()
+        self.host.recorder = recorder or self.host.recorder
         self._cleanup = ExitStack()
         self.accounts: list[RefreshAccount] = []
 
@@ -114,9 +115,8 @@ class Rig:
                 self.settings,
                 RunOptions(),
                 self._cleanup,
-                host=self.host,
+                self.host,
                 on_account=self.accounts.append,
-                recorder=self.recorder,
             )
         except BaseException:
             self._cleanup.close()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from runtime.commands.status import describe
-from runtime.daemon.supervise import snapshot
+from runtime.daemon.status import snapshot
 from runtime.support.artifacts import to_json
 from tests.daemon.rig import Rig
 
@@ -18,7 +18,7 @@ from tests.daemon.rig import Rig
 def told_by(rig: Rig) -> tuple[dict, str]:
     """The snapshot as it comes through the socket, and as a person reads it."""
     account = rig.presenter.last.account
-    answer = json.loads(to_json({"ok": True, "pid": 1, "uptime_s": 1.0, **snapshot(rig.run, rig.presenter, account)}))
+    answer = json.loads(to_json({"ok": True, "pid": 1, "uptime_s": 1.0, **snapshot(rig.run, account)}))
     return answer, "\n".join(describe(answer))
 
 

@@ -82,7 +82,7 @@ def raising(error: Exception) -> Callable[..., Any]:
 
 
 def lived(read_settings: Callable[[], Settings] = Settings) -> None:
-    supervise.run_daemon(read_settings, RunOptions(max_speed=True, frames=1, scale=0.1), progress=False)
+    supervise.run_daemon(read_settings, RunOptions(max_speed=True, frames=1, scale=0.1))
 
 
 @pytest.mark.parametrize("limit", [8, 10, 12, 14, 18, 24])

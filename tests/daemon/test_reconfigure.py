@@ -14,7 +14,7 @@ from runtime.config import Settings
 from runtime.daemon import reconfigure
 from runtime.daemon.reconfigure import Reconfiguration
 from runtime.daemon.solver_parts import RunningSolver, SolverMaker, ready_predictor
-from runtime.errors import InputError
+from runtime.errors import InputError, MissingPart
 from runtime.eyes.calibration import load_calibration
 from runtime.frame.run_state import RunState
 from runtime.records import SolveRequest
@@ -129,7 +129,7 @@ def test_nothing_changes_until_all_of_it_is_ready(bench: Bench) -> None:
     bench.gate.clear()
     before = bench.state
     change = bench.change(settings(**SCENE, **MODEL))
-    assert eventually(lambda: change.advance(bench.parts) or bool(bench.contents), within_s=PATIENCE_S)
+    assert eventually(lambda: bool(bench.models), within_s=PATIENCE_S)
     for _ in range(5):
         assert change.advance(bench.parts) is False
         bench.solve()
@@ -143,14 +143,31 @@ def test_nothing_changes_until_all_of_it_is_ready(bench: Bench) -> None:
 BAD = {"content": {"scene": "no-such-scene"}}
 
 
-def test_where_a_part_can_t_be_had_everything_stays_and_what_was_loaded_is_closed(bench: Bench) -> None:
+def test_where_a_part_can_t_be_had_everything_stays(bench: Bench) -> None:
     before = bench.state
     change = bench.change(settings(**BAD, **MODEL))
     bench.advance(change)
-    assert "no-such-scene" in change.problem
-    assert "\n" not in change.problem
-    assert bench.state is before
-    assert eventually(lambda: [model.closed for model in bench.models] == [1], within_s=PATIENCE_S)
+    assert "no-such-scene" in change.problem and "\n" not in change.problem
+    assert bench.state is before and not bench.models
+    bench.solve()
+
+
+@pytest.mark.parametrize("fails", ["uploading the scene", "choosing the backend"])
+def test_what_was_loaded_is_closed_where_it_can_t_be_taken_over(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, fails: str
+) -> None:
+    def failing(*_: Any, **__: Any) -> Any:
+        raise MissingPart("no OpenGL") if fails == "choosing the backend" else RuntimeError("out of textures")
+
+    before = bench.state
+    if fails == "choosing the backend":
+        monkeypatch.setattr(bench.parts, "set_backend", failing)
+    else:
+        monkeypatch.setattr(reconfigure, "prepare_content", lambda *_, **__: failing)
+    change = bench.change(settings(**SCENE, **MODEL))
+    bench.advance(change)
+    assert change.problem and bench.state is before
+    assert [made.closed for made in (*bench.models, *bench.contents)] == [1] * (1 + len(bench.contents))
     assert (bench.first_content.closed, bench.first_model.closed) == (0, 0)
     bench.solve()
 
@@ -163,23 +180,16 @@ def test_a_bad_calibration_is_refused_before_anything_is_loaded(bench: Bench, tm
     assert (bench.models, bench.contents) == ([], [])
 
 
-@pytest.mark.parametrize("when", ["at once", "when the scene is there", "when all is there"])
-def test_what_is_no_longer_wanted_is_closed_and_changes_nothing(bench: Bench, when: str) -> None:
+def test_what_is_no_longer_wanted_is_closed_and_changes_nothing(bench: Bench) -> None:
     before = bench.state
     bench.gate.clear()
     change = bench.change(settings(**SCENE, **MODEL))
-    if when != "at once":
-        assert eventually(lambda: change.advance(bench.parts) or bool(bench.contents), within_s=PATIENCE_S)
-    if when == "when all is there":
-        bench.gate.set()
-        assert eventually(lambda: change._model.done, within_s=PATIENCE_S)
+    assert eventually(lambda: bool(bench.models), within_s=PATIENCE_S)
     change.abandon()
-    assert change.advance(bench.parts) is True
-    assert change.finished
     bench.gate.set()
+    bench.advance(change)
     assert bench.state is before
-    assert eventually(lambda: [model.closed for model in bench.models] in ([], [1]), within_s=PATIENCE_S)
-    assert all(content.closed == 1 for content in bench.contents)
+    assert [model.closed for model in bench.models] == [1] and not bench.contents
     assert (bench.first_content.closed, bench.first_model.closed) == (0, 0)
     bench.solve()
 
@@ -187,6 +197,6 @@ def test_what_is_no_longer_wanted_is_closed_and_changes_nothing(bench: Bench, wh
 def test_what_is_decided_anew_for_every_solution_loads_no_model(bench: Bench) -> None:
     before = bench.state
     change = bench.change(settings(model={"eye_sigma_mm": 2.0}))
-    assert change.advance(bench.parts) is True
+    bench.advance(change)
     assert bench.state.predictor is before.predictor
     assert bench.models == []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import grp
-import json
 import os
 import resource
 import socket
@@ -297,62 +296,6 @@ def test_without_descriptors_it_waits_and_then_serves_again(server: StatusServer
     assert all(b'"ok": true' in client.recv(65536) for client in clients[:4])
     for client in clients:
         client.close()
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "told"),
-    [
-        ("playlist", '[{"scene": "demo", "seconds": HUGE}]', "value[0].seconds: playlist wants a number"),
-        ("playlist", '[{"scene": "demo", "seconds": 1e999}]', "value[0].seconds: playlist wants a number"),
-    ],
-)
-def test_numbers_that_nothing_can_hold_are_refused_by_field(
-    server: StatusServer, path: Path, name: str, value: str, told: str
-) -> None:
-    """Seen: a playlist of 310 digits ended the daemon."""
-    line = f'{{"command": "{name}", "value": {value}}}\n'.replace("HUGE", "1" + "0" * 400)
-    with connected(path) as client:
-        client.sendall(line.encode())
-        answer = json.loads(client.makefile("rb").readline())
-    assert not answer["ok"] and answer["error"].startswith(told)
-    assert server.commands.empty()
-
-
-# The lock and the socket's place
-
-
-def lock_of(path: Path) -> Path:
-    return path.with_name(path.name + ".lock")
-
-
-@pytest.mark.parametrize("link", ["symlink_to", "hardlink_to"])
-def test_a_link_in_the_locks_place_is_refused_and_its_target_stays_as_it_was(
-    path: Path, tmp_path: Path, link: str
-) -> None:
-    path.parent.mkdir()
-    precious = tmp_path / "precious"
-    precious.write_text("precious")
-    getattr(lock_of(path), link)(precious)
-    with pytest.raises(InputError, match=r"status\.sock\.lock"):
-        StatusServer(path, group=OWN_GROUP, clock=SimulatedClock())
-    assert precious.read_text() == "precious"
-    assert stat.S_IMODE(precious.stat().st_mode) & 0o044
-
-
-@pytest.mark.parametrize("kind", ["fifo", "folder"])
-def test_what_is_no_file_in_the_locks_place_is_refused_without_waiting(path: Path, kind: str) -> None:
-    path.parent.mkdir()
-    os.mkfifo(lock_of(path)) if kind == "fifo" else lock_of(path).mkdir()
-    with pytest.raises(InputError, match=r"status\.sock\.lock"):
-        StatusServer(path, group=OWN_GROUP, clock=SimulatedClock())
-
-
-def test_where_the_lock_was_deleted_a_second_daemon_does_not_steal_the_socket(server: StatusServer, path: Path) -> None:
-    lock_of(path).unlink()
-    with pytest.raises(SocketInUse):
-        StatusServer(path, group=OWN_GROUP, clock=SimulatedClock())
-    server.publish(lambda: {"state": "the first"})
-    assert ask([path], STATUS)["state"] == "the first"
 
 
 # The client

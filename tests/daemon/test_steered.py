@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from runtime.daemon.commands import parse
+from runtime.daemon.status import about
 from tests.daemon.test_changes import Served
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -88,20 +89,21 @@ def test_a_playlist_of_the_operators_is_written_shown_and_gone_through(
     with Served(tmp_path) as served:
         assert served.asked("playlist", shows)["ok"]
         told = served.status()
-        assert told["scene"] == str(tmp_path / "state" / "playlist.toml")
+        assert told["scene"] == str(tmp_path / "state" / "playlist.json")
         assert told["playlist"]["entries"] == shows and told["playlist"]["index"] == 0
         assert served.asked("next")["ok"]
         assert served.status()["playlist"]["index"] == 1 and "grey (2 of 2)" in served.status()["content"]
         answer = served.asked("playlist", [{"scene": 'no"such\n.glb', "seconds": 5}])
         assert not answer["ok"] and "show[0]" in answer["error"]
+        for huge in (10**400, float("inf")):  # seen: a number that nothing can hold ended the daemon
+            answer = served.asked("playlist", [{"scene": "demo", "seconds": huge}])
+            assert not answer["ok"] and "show[0].seconds: " in answer["error"]
         assert "grey (2 of 2)" in served.status()["content"]
         assert served.asked("scene", "flat")["ok"]
         assert "no playlist" in served.asked("next")["error"]
 
 
 def test_the_library_is_offered_with_the_scenes(tmp_path: Path) -> None:
-    from runtime.daemon.supervise import about
-
     library = tmp_path / "library"
     library.mkdir()
     for name in ("b.glb", "a.ply", "film_sbs.mp4", "list.toml", "notes.txt", ".hidden.glb"):

@@ -93,14 +93,11 @@ class Operator(Host):
 def play(case: Case, out: Path) -> Played:
     """Run it; `out` is the folder of the run's own files."""
     settings = Settings.model_validate(case.settings())
-    collector: Any = Collector(case)
+    collector = Collector(case)
     runs: list[Run] = []
-    summary = drive(
-        settings,
-        RunOptions(max_speed=True, measure=True, out=out),
-        host=Operator(case, runs),
-        recorder=collector,
-    )
+    operator = Operator(case, runs)
+    operator.recorder = collector
+    summary = drive(settings, RunOptions(max_speed=True, measure=True, out=out), operator)
     lines = [json.loads(line) for line in (out / "frames.jsonl").read_text(encoding="utf-8").splitlines()]
     refreshes = [line | told for line, told in zip(lines, collector.refreshes, strict=True)]
     for line in refreshes:

@@ -1,0 +1,96 @@
+"""What the socket answers of a run: its status, what does not change, and what is shown now."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from typing import Any
+
+from runtime.clock import NS_PER_MS
+from runtime.config import Settings
+from runtime.daemon.build import Run
+from runtime.daemon.commands import PLACING
+from runtime.daemon.names import library_scenes, model_names, scene_names
+from runtime.daemon.pictures import pictures_of
+from runtime.errors import ContextLost
+from runtime.frame.presenter import Presenter
+from runtime.records import RefreshAccount
+from runtime.support import logs
+from runtime.support.version import version
+
+
+def placing_in(settings: Settings) -> dict[str, Any]:
+    """What `place` may change, as it is in the settings."""
+    return settings.content.model_dump(include=set(PLACING))
+
+
+def holds(presenter: Presenter) -> dict[str, Any]:
+    """What an operator chooses, as it is now: the answer to every command."""
+    state = presenter.run_cell.state
+    return {
+        "scene": state.settings.content.scene,
+        "content": state.content.info.name,
+        "model": state.predictor.name,
+        "placing": placing_in(state.settings),
+        "paused": presenter.paused,
+        "flat_asked": presenter.flat_asked,
+    }
+
+
+def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
+    """What `status` answers."""
+    presenter = run.presenter
+    machine, stats, state = presenter.machine, presenter.stats, presenter.run_cell.state
+    return {
+        "state": machine.name,
+        "reason": machine.reason,
+        "missing": presenter.missing,
+        **holds(presenter),
+        "content_problem": state.content.problem,
+        "playlist": state.content.describe(time_ns=presenter.clock.now_ns()),
+        "plan": run.plan_items(),
+        "model_asked": state.settings.model.name,
+        "provider": state.predictor.provider,
+        "backend": state.predictor.backend,
+        "backend_why": run.parts.backend.why,
+        "panels": presenter.panels.name,
+        "eyes_m": account.eyes_m,
+        "eyes_label": account.eyes_label,
+        "eye_sigma_now_mm": account.eye_sigma_mm,
+        "solution": account.solution,
+        # What was solved for an instant after this light has no age yet.
+        "solution_age_now_ms": None if account.solution_age_ms is None else max(0.0, account.solution_age_ms),
+        "photon_now_ms": (account.photon_ns - account.capture_ns) / NS_PER_MS if account.capture_ns else None,
+        "rejected_samples": {**presenter.viewer.refused, **presenter.samples.refused_inputs},
+        "sensor_hz": presenter.viewer.rate_hz if "sensor" not in presenter.missing else None,
+        "log_lines_lost": logs.lost(),
+        **stats.rates_now(),
+        **stats.summary(stale_inputs=presenter.samples.stale_inputs, nearly=True),
+    }
+
+
+def about(run: Run | None) -> dict[str, Any]:
+    """What does not change while it runs, and which scenes there are: for the page."""
+    if run is None:
+        return {}
+    settings, stack = run.presenter.run_cell.state.settings, run.presenter.stack
+    return {
+        "version": version(),
+        "stack": {"width_m": stack.width_m, "height_m": stack.height_m, "x_m": stack.x_m},
+        "viewing_m": settings.calibration.viewing_m,
+        "viewing_side_deg": settings.calibration.viewing_side_deg,
+        "viewing_up_deg": settings.calibration.viewing_up_deg,
+        "models": model_names(),
+        "scenes": (*scene_names(), *library_scenes(settings.content)),
+    }
+
+
+def pictures(run: Run | None) -> dict[str, Any]:
+    """What is shown now, as JPEGs in base64: for the page."""
+    refresh = run.presenter.last if run is not None else None
+    if run is None or refresh is None:
+        return {"frame": None, "jpegs": {}}
+    try:
+        jpegs = pictures_of(refresh, run.presenter.stack)
+    except ContextLost:  # its layers were in textures: the next refresh has others
+        jpegs = {}
+    return {"frame": refresh.account.frame, "jpegs": {name: b64encode(jpeg).decode() for name, jpeg in jpegs.items()}}
