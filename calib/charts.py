@@ -23,8 +23,8 @@ from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import relative_scale_shift
 from runtime.records import F64, U8
-from runtime.report.progress import tracked
 from runtime.support.artifacts import OutputFolder, write_json, write_png
+from runtime.support.progress import tracked
 
 MODEL = "best"
 LINE_PX = 10.0

@@ -21,8 +21,8 @@ from runtime.errors import InputError
 from runtime.optics.stack import UNEVEN_MOST, PanelStack
 from runtime.records import U8
 from runtime.report.page import in_columns
-from runtime.report.progress import status_line
 from runtime.support.artifacts import OutputFolder, write_json, write_png, write_text
+from runtime.support.progress import status_line
 
 NOTED_TILT_DEG = 0.3
 EVEN_MODELS = ("fast", "balanced", "best")  # networks for evenly spaced panels

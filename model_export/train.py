@@ -22,8 +22,8 @@ from model_export.recipe import Recipe, Training, read_recipe
 from model_export.sight import displayed_mse, sight_of
 from runtime.config import validated
 from runtime.errors import InputError
-from runtime.report.progress import progress_bar
 from runtime.support.artifacts import write_text
+from runtime.support.progress import progress_bar
 
 HELD_OUT_SEED = 9_000_001  # of the validation pairs: no training seed reaches it
 PAIRS_A_STEP = 2

@@ -19,8 +19,8 @@ from model_export.stress import ORDINARY, Feeds, picture_cases, spectral_cases
 from runtime.errors import InputError
 from runtime.model.contract import VERSION, Contract, parse_contract
 from runtime.model.transfer import FULL
-from runtime.report.progress import tracked
 from runtime.support import foreign
+from runtime.support.progress import tracked
 
 FILE_BYTES_MAX = 4 << 30
 

@@ -25,8 +25,8 @@ def bench(
     if context.invoked_subcommand is not None:
         return
     from runtime.report import benchmark
-    from runtime.report.progress import status_line
     from runtime.support.artifacts import to_json, write_json
+    from runtime.support.progress import status_line
 
     with status_line("bench") as tell:
         record = benchmark.measured(progress=tell)

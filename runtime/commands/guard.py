@@ -24,12 +24,10 @@ def run_guarded(*, interrupts_leave: bool) -> None:
     try:
         from runtime.commands.app import app
         from runtime.support.crash import watch_threads
-        from runtime.support.privacy import keep_quiet
         from runtime.support.progress import ShownProgress, listening
 
         if interrupts_leave:
             signal.signal(signal.SIGINT, signal.default_int_handler)
-        keep_quiet()
         watch_threads()
         with listening(ShownProgress(sys.stderr)):
             code = _code_of(app, output)

@@ -29,8 +29,8 @@ def report(
     from rich.console import Console
 
     from runtime.report.assemble import whole_report
-    from runtime.report.progress import status_line
     from runtime.support.artifacts import to_json
+    from runtime.support.progress import status_line
 
     parts = ["phasestack report", *([f"--pairs {pairs.name}"] if pairs else []), *(["--focal"] if focal else [])]
     parts += [f"--model {Path(name).name}" for name in model or []] + (["--quick"] if quick else [])

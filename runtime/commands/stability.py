@@ -34,11 +34,11 @@ def stability(
 
     from runtime.commands.solving import checked_eyes
     from runtime.report.machine import describe
-    from runtime.report.progress import progress_bar
     from runtime.report.stability import suite
     from runtime.report.stability.limits import load_limits, recorded
     from runtime.report.stability.page import stability_page, stages_of
     from runtime.support.artifacts import to_json, write_text
+    from runtime.support.progress import progress_bar
 
     started = time.perf_counter()
     limits = load_limits()

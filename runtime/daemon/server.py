@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import grp
 import json
 import logging
@@ -18,7 +19,7 @@ import stat
 import struct
 import threading
 from asyncio import StreamReader, StreamWriter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from runtime.config import ServiceSettings
 from runtime.daemon.client import DEFAULT_SOCKET, user_socket
 from runtime.daemon.commands import Command, parse
 from runtime.errors import InputError, TransientError
-from runtime.support.artifacts import locked, to_json
+from runtime.support.artifacts import to_json
 from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
 
 log = logging.getLogger("phasestack.service")
@@ -67,7 +68,7 @@ class StatusServer:
         self._reading: dict[asyncio.Task[None], None] = {}  # who waits for a whole request, the longest first
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with locked(path.parent):  # of two that start at once the second finds the first listening
+            with _locked(path.parent):  # of two that start at once the second finds the first listening
                 _check_dead(path)
                 self._loop = asyncio.new_event_loop()
                 # The mode must hold from the first moment, so it is the mask that makes it, not a later chmod.
@@ -234,6 +235,18 @@ async def _outcome(command: Command) -> dict[str, Any]:
     if done:
         return answer.result()
     return {"ok": True, "note": f"still loading after {LOADED_WITHIN_S:g} s: ask `phasestack status`"}
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """A lock on a folder that ends with the process, however it ends; none where the file system has no locks."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        with contextlib.suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
 
 
 def _check_dead(path: Path) -> None:

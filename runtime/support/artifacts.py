@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -157,8 +154,8 @@ class OutputFolder:
     """A folder whose new files appear together at the end, or not at all.
 
     Used as a context manager: write into `staging`; on success every file is renamed into `target`,
-    replacing those of the same names; on an error nothing new is left. A staging folder is locked as long as its
-    process lives, so that the next one to write here can tell what a killed one left, and clears it away.
+    replacing those of the same names; on an error nothing new is left. What a killed process left staged is cleared
+    away by the next one that writes here.
     """
 
     def __init__(self, target: Path) -> None:
@@ -166,16 +163,14 @@ class OutputFolder:
 
     def __enter__(self) -> Self:
         try:
-            missing = [folder for folder in (self.target, *self.target.parents) if not folder.exists()]
+            self._made = [folder for folder in (self.target, *self.target.parents) if not folder.exists()]
             self.target.mkdir(parents=True, exist_ok=True)
-            with locked(self.target):  # nobody takes the new folder for a dead one before it has its lock
-                _clear_dead(self.target)
-                self.staging = Path(tempfile.mkdtemp(prefix=STAGING, dir=self.target))
-                self._lock = ExitStack()
-                self._lock.enter_context(locked(self.staging))
+            for left in self.target.glob(f"{STAGING}*"):
+                if not Path("/proc", left.name.split("-")[1]).exists():
+                    shutil.rmtree(left, ignore_errors=True)
+            self.staging = Path(tempfile.mkdtemp(prefix=f"{STAGING}{os.getpid()}-", dir=self.target))
         except OSError as error:
             raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
-        self._made = missing
         return self
 
     def __exit__(
@@ -186,7 +181,6 @@ class OutputFolder:
                 self._put_in_place()
         finally:
             self.discard()
-            self._lock.close()
         if kind is None:
             return
         for folder in self._made:
@@ -225,32 +219,3 @@ def _check_free(place: Path, *, within: Path) -> None:
             raise InputError(folder, "", "is no folder: it is in the way of an output")
     if place.is_dir():
         raise InputError(place, "", "is a folder: it is in the way of an output")
-
-
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """A lock on a folder that ends with the process, however it ends; none where the file system has no locks."""
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        with suppress(OSError):
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)
-
-
-def _clear_dead(target: Path) -> None:
-    """Remove the staging folders that no living process holds."""
-    for folder in target.glob(f"{STAGING}*"):
-        try:
-            handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-        except OSError:
-            continue
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:  # alive, or a file system that can't tell
-            continue
-        else:
-            shutil.rmtree(folder, ignore_errors=True)
-        finally:
-            os.close(handle)

@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from runtime.errors import one_line
+from runtime.support.folders import state_folder
 
 APPLICATION = "phasestack"
 KEPT = 20  # files in a folder; older ones make way
@@ -43,33 +44,22 @@ def _report(error: BaseException) -> str:
 
 
 def _folders() -> Iterator[Path]:
-    """Where such a file belongs, the best place first: systemd's, then the user's, then the system's temporary one."""
-    for name in ("LOGS_DIRECTORY", "STATE_DIRECTORY"):
-        if os.environ.get(name):
-            yield Path(os.environ[name].split(":")[0])
-    state = os.environ.get("XDG_STATE_HOME", "")
-    if Path(state).is_absolute():
-        yield Path(state) / APPLICATION
-    elif os.environ.get("HOME"):
-        yield Path(os.environ["HOME"]) / ".local" / "state" / APPLICATION
+    """Where such a file belongs, the best place first."""
+    if os.environ.get("LOGS_DIRECTORY"):
+        yield Path(os.environ["LOGS_DIRECTORY"].split(":")[0])
+    yield state_folder()
     yield Path(tempfile.gettempdir())
 
 
 def _write(folder: Path, text: str) -> Path:
     """A new file that only its owner reads: a path or a name in it may be private. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
-    stem = f"{APPLICATION}-error-{datetime.now(UTC):%Y%m%dT%H%M%S}-{os.getpid()}"
-    for number in range(100):
-        path = folder / f"{stem}{f'-{number}' if number else ''}.log"
-        try:
-            file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-        except FileExistsError:
-            continue
-        with os.fdopen(file, "w", encoding="utf-8", errors="backslashreplace") as opened:
-            opened.write(text)
-        _make_room(folder)
-        return path
-    raise FileExistsError(folder)
+    stem = f"{APPLICATION}-error-{datetime.now(UTC):%Y%m%dT%H%M%S}-{os.getpid()}-"
+    file, path = tempfile.mkstemp(".log", stem, folder)
+    with os.fdopen(file, "w", encoding="utf-8", errors="backslashreplace") as opened:
+        opened.write(text)
+    _make_room(folder)
+    return Path(path)
 
 
 def _make_room(folder: Path) -> None:

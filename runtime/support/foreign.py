@@ -6,10 +6,10 @@ field; what is over a limit is told with its figure and the limit.
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
-import re
 import stat
 from collections.abc import Callable
 from contextlib import suppress
@@ -18,32 +18,25 @@ from typing import IO, Any
 
 from runtime.errors import InputError
 
-PATH_CHARACTERS_MAX = 4095  # Linux's PATH_MAX less the terminating zero
-NAME_BYTES_MAX = 255
 JSON_DEPTH_MAX = 64
 JSON_BYTES_MAX = 64 << 20
 DIGITS_MAX = 19  # of a 63-bit number
 MIB = 1 << 20
 
-# A string (also one that never ends) is taken whole and never tried again: hostile ones would take for ever.
-_JSON_TOKEN = re.compile(rb'"(?:[^"\\]++|\\.)*+(?:"|\\?\Z)|[\[{]|[\]}]', re.DOTALL)
-
 
 def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") -> Path:
-    """A path that the system can take: no NUL, not too long. Names nothing that exists. Raises InputError.
+    """A path that the system can take, whether something is there or not. Raises InputError.
 
     source, field: who gave it, where that is not the path itself.
     """
-    text = str(path)
-    whence = source or text
-    if "\0" in text:
-        raise InputError(whence, field, "the path holds a NUL character")
-    if len(text.encode(errors="surrogatepass")) > PATH_CHARACTERS_MAX:
-        raise InputError(whence, field, f"the path has {len(text)} characters; at most {PATH_CHARACTERS_MAX}")
-    longest = max((len(part.encode(errors="surrogatepass")) for part in Path(text).parts), default=0)
-    if longest > NAME_BYTES_MAX:
-        raise InputError(whence, field, f"a name in the path has {longest} bytes; at most {NAME_BYTES_MAX}")
-    return Path(text)
+    try:
+        os.lstat(path)
+    except ValueError:
+        raise InputError(source or str(path), field, "the path holds a NUL character, or is not UTF-8") from None
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise InputError(source or str(path), field, f"is no path ({error.strerror})") from None
+    return Path(path)
 
 
 def is_there(path: str | Path, *, folder: bool = False) -> bool:
@@ -127,28 +120,24 @@ def read_json(path: str | Path, *, most_bytes: int = JSON_BYTES_MAX, most_depth:
 def parsed_json(text: str | bytes, *, source: str | Path, field: str = "", most_depth: int = JSON_DEPTH_MAX) -> Any:
     """JSON, nested no deeper than `most_depth`, without NaN and Infinity, which are not JSON. Raises InputError."""
     data = text if isinstance(text, bytes) else text.encode(errors="surrogatepass")
-    depth = nesting(data, most=most_depth)
-    if depth > most_depth:
-        raise InputError(source, field, f"JSON is nested deeper than {most_depth}")
     try:
-        return json.loads(decoded(data, source=source, field=field), parse_constant=_no_constant, parse_int=_whole)
+        value = json.loads(decoded(data, source=source, field=field), parse_constant=_no_constant, parse_int=_whole)
+        if _depth(value) <= most_depth:
+            return value
     except ValueError as error:
         raise InputError(source, field, f"malformed JSON: {error}") from None
+    except RecursionError:
+        pass
+    raise InputError(source, field, f"JSON is nested deeper than {most_depth}")
 
 
-def nesting(data: bytes, *, most: int) -> int:
-    """How deep brackets nest outside of strings; stops counting once it is more than `most`."""
-    depth = deepest = 0
-    for token in _JSON_TOKEN.finditer(data):
-        first = data[token.start()]
-        if first in b"[{":
-            depth += 1
-            deepest = max(deepest, depth)
-            if deepest > most:
-                break
-        elif first in b"]}":
-            depth -= 1
-    return deepest
+def _depth(value: Any) -> int:
+    """How deep lists and objects nest."""
+    if isinstance(value, dict):
+        return 1 + max(map(_depth, value.values()), default=0)
+    if isinstance(value, list):
+        return 1 + max(map(_depth, value), default=0)
+    return 0
 
 
 def _no_constant(name: str) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import resource
 from dataclasses import dataclass
 from functools import cache
@@ -28,6 +29,8 @@ def offscreen_context() -> moderngl.Context:
     """
     import moderngl
 
+    if "MESA_SHADER_CACHE_DIR" not in os.environ:  # nothing is left in a home: ours compile in milliseconds
+        os.environ["MESA_SHADER_CACHE_DISABLE"] = "true"
     try:
         with interrupts_held():
             return moderngl.create_context(require=MINIMUM_VERSION, standalone=True, **EGL)

@@ -10,7 +10,6 @@ import json
 import logging
 import os
 import queue
-import select
 import sys
 import time
 from collections.abc import Mapping
@@ -48,9 +47,9 @@ class TextFormat(logging.Formatter):
         self._journald = journald
 
     def format(self, record: logging.LogRecord) -> str:
-        text = one_line(record.getMessage(), most=LINE_MAX)  # nobody's name or message forges a line
-        if record.exc_info and record.exc_info[1]:
-            text += f": {written(record.exc_info[1])}"  # a traceback is for whoever mends it, not for the log
+        text = _message(record)
+        if problem := _exception(record):
+            text += f": {problem}"
         if self._journald:
             return PRIORITY.get(record.levelno, "<6>") + text
         when = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
@@ -61,15 +60,25 @@ class JsonFormat(logging.Formatter):
     """One JSON object a line: time, level, logger, message."""
 
     def format(self, record: logging.LogRecord) -> str:
-        line: dict[str, Any] = {
+        line = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
             "logger": record.name,
-            "message": one_line(record.getMessage(), most=LINE_MAX),
+            "message": _message(record),
         }
-        if record.exc_info and record.exc_info[1]:
-            line["exception"] = written(record.exc_info[1])
-        return json.dumps(line, default=str)
+        if problem := _exception(record):
+            line["exception"] = problem
+        return json.dumps(line)
+
+
+def _message(record: logging.LogRecord) -> str:
+    """On one line: nobody's name or message forges another."""
+    return one_line(record.getMessage(), most=LINE_MAX)
+
+
+def _exception(record: logging.LogRecord) -> str:
+    """One line that names the file where it stands whole: a traceback is for whoever mends it. Empty: there is none."""
+    return written(record.exc_info[1]) if record.exc_info and record.exc_info[1] else ""
 
 
 class RateLimit(logging.Filter):
@@ -124,12 +133,9 @@ class _Lines(logging.Handler):
     def _written(self, record: logging.LogRecord) -> bool:
         data = self.format(record).encode("utf-8", "backslashreplace") + b"\n"
         try:
-            while data:
-                select.select((), (self._descriptor,), ())  # it may have been made not to block
-                data = data[os.write(self._descriptor, data[: select.PIPE_BUF]) :]
+            return os.write(self._descriptor, data) == len(data)
         except OSError:  # nobody reads any more, or the disk is full
             return False
-        return True
 
 
 class QueuedLines(QueueHandler):
@@ -176,22 +182,12 @@ def configure(
     clock: Clock | None = None,
     environment: Mapping[str, str] = os.environ,
 ) -> None:
-    """Send every log line of ours to a stream (stderr), in the configured form. Calling it again replaces.
-
-    What is written to memory is written at once.
-    """
+    """Send every log line of ours to a stream (stderr), in the configured form. Calling it again replaces."""
     for old in logging.getLogger(ROOTS[0]).handlers[:]:
         if isinstance(old, QueuedLines):
             old.close()
-    target = stream or sys.stderr
-    journald = "JOURNAL_STREAM" in environment
-    form = JsonFormat() if settings.log_format == "json" else TextFormat(journald=journald)
-    handler: logging.Handler
-    try:
-        handler = QueuedLines(os.dup(target.fileno()), form)  # whatever becomes of the number
-    except (OSError, ValueError):  # it is in memory, or closed
-        handler = logging.StreamHandler(target)
-        handler.setFormatter(form)
+    form = JsonFormat() if settings.log_format == "json" else TextFormat(journald="JOURNAL_STREAM" in environment)
+    handler = QueuedLines(os.dup((stream or sys.stderr).fileno()), form)  # whatever becomes of the number
     handler.addFilter(RateLimit(clock or MonotonicClock()))
     for name in ROOTS:
         root = logging.getLogger(name)

@@ -6,13 +6,11 @@ import os
 from functools import cache
 from typing import Any
 
-NO_TELEMETRY = "ORT_DISABLE_TELEMETRY"  # read by builds that collect, as the library is loaded
-
 
 @cache
 def onnxruntime() -> Any:
     """The module, its telemetry switched off before its import by environment and after it by its own switch."""
-    os.environ[NO_TELEMETRY] = "1"
+    os.environ["ORT_DISABLE_TELEMETRY"] = "1"
     import onnxruntime as ort
 
     ort.disable_telemetry_events()

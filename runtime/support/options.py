@@ -43,20 +43,9 @@ def _checked(low: float, high: float, unit: str) -> Callable[[typer.Context, typ
     def checked(context: typer.Context, parameter: typer.CallbackParam, value: Any) -> Any:
         for each in () if value is None else value if isinstance(value, tuple | list) else (value,):
             if problem := refusal(each, low, high, unit):
-                raise InputError(_command(context), _option(parameter), problem)
+                command = context.command_path.partition(" ")[2] or str(context.command.name)
+                option = parameter.opts[0] if parameter.opts else str(parameter.name)
+                raise InputError(command, option, problem)
         return value
 
     return checked
-
-
-def _command(context: Any) -> str:
-    """The words of the command behind the program's own name, where there are more."""
-    words: list[str] = []
-    while context.parent is not None:
-        words.insert(0, context.info_name or "")
-        context = context.parent
-    return " ".join(words) or str(context.command.name)
-
-
-def _option(parameter: typer.CallbackParam) -> str:
-    return parameter.opts[0] if parameter.opts else str(parameter.name)

@@ -7,11 +7,12 @@ listener raises ends the work: so a signal is heard within one step.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
 
+T = TypeVar("T")
 NOW_AND_THEN_S = 30.0  # between two lines where nobody watches
 
 Listener = Callable[[str, int, int | None], None]  # what is done, how many of them, of how many (None: not known)
@@ -58,47 +59,60 @@ def listening(listener: Listener) -> Iterator[None]:
         _LISTENER.reset(token)
 
 
-class NowAndThen:
-    """Where long work is, in a log or a pipe: a line once in a while, none of what is quick."""
+@contextmanager
+def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar that is told (done, of)."""
+    try:
+        yield lambda done, of: tell(title, done, of)
+    finally:
+        tell("", 0)
 
-    def __init__(self, stream: TextIO, *, every_s: float = NOW_AND_THEN_S) -> None:
-        self._stream, self._every_s = stream, every_s
-        self._begin_s = self._last_s = time.monotonic()
 
-    def __call__(self, text: str) -> None:
-        now_s = time.monotonic()
-        if now_s - self._last_s < self._every_s:
-            return
-        self._last_s = now_s
-        minutes, seconds = divmod(round(now_s - self._begin_s), 60)
-        with suppress(OSError, ValueError):
-            self._stream.write(f"{minutes}:{seconds:02} {text}\n")
-            self._stream.flush()
+@contextmanager
+def status_line(title: str) -> Iterator[Callable[[str], None]]:
+    """A line that says what is being done."""
+    try:
+        yield lambda text: tell(f"{title}: {text}", 0)
+    finally:
+        tell("", 0)
+
+
+def tracked(title: str, items: Sequence[T]) -> Iterator[T]:
+    """The items, one after the other, with a bar of how many are done."""
+    with progress_bar(title) as told:
+        for number, item in enumerate(items, start=1):
+            yield item
+            told(number, len(items))
 
 
 class ShownProgress:
-    """A listener that shows a task which takes long: on a terminal with rich, elsewhere by a line now and then."""
+    """A listener that shows what takes long: on a terminal with rich, elsewhere by a line now and then."""
 
     def __init__(self, stream: TextIO, *, after_s: float = 1.0, now_and_then_s: float = NOW_AND_THEN_S) -> None:
         self._stream, self._after_s, self._now_and_then_s = stream, after_s, now_and_then_s
-        self._lines = NowAndThen(stream, every_s=now_and_then_s)
-        self._begun_s: float | None = None
+        self._begun_s = self._last_s = 0.0
+        self._is_under_way = False
         self._shown: Any = None
 
     def __call__(self, what: str, done: int, total: int | None) -> None:
+        now_s = time.monotonic()
         if not what:
-            self._begun_s = None
+            self._is_under_way = False
             if self._shown is not None:
                 self._shown.stop()
                 self._shown = None
             return
-        if self._begun_s is None:
-            self._begun_s = time.monotonic()
-            self._lines = NowAndThen(self._stream, every_s=self._now_and_then_s)
-        if not self._stream.isatty():
-            self._lines(what + (f": {done} of {total}" if total else f": {done}" if done else ""))
-        elif time.monotonic() - self._begun_s >= self._after_s:
-            self._show(what, done, total)
+        if not self._is_under_way:
+            self._is_under_way, self._begun_s, self._last_s = True, now_s, now_s
+        if self._stream.isatty():
+            if now_s - self._begun_s >= self._after_s:
+                self._show(what, done, total)
+        elif now_s - self._last_s >= self._now_and_then_s:
+            self._last_s = now_s
+            minutes, seconds = divmod(round(now_s - self._begun_s), 60)
+            count = f": {done} of {total}" if total else f": {done}" if done else ""
+            with suppress(OSError, ValueError):
+                print(f"{minutes}:{seconds:02} {what}{count}", file=self._stream, flush=True)
 
     def _show(self, what: str, done: int, total: int | None) -> None:
         from rich.console import Console

@@ -38,10 +38,15 @@ class Plan:
 
     def __init__(self) -> None:
         self.opened = 0
-        self.fault: Exception | None = None
-        self.refuse: Exception | None = None
         self.hang = threading.Event()  # set: calls don't return
         self.released = threading.Event()  # set: hung calls return after all
+        self.mend()
+
+    def mend(self) -> None:
+        """All is well from now on."""
+        self.hang.clear()
+        self.fault: Exception | None = None
+        self.refuse: Exception | None = None
         self.eyes_m = np.array([[0.7, -0.031, 0.0], [0.7, 0.031, 0.0]])
         self.sway_m = 0.002
         self.noise_m = 0.0  # standard deviation of each axis of each eye
@@ -121,7 +126,14 @@ class Rig:
         except BaseException:
             self._cleanup.close()
             raise
+        self._well = self.presenter.panels, self.predictor
         return self
+
+    def mend(self) -> None:
+        """What was broken is as it was at the beginning."""
+        self.plan.mend()
+        self.presenter.panels, predictor = self._well
+        self.presenter.run_cell.replace(predictor=predictor)
 
     def __exit__(self, *exception: object) -> None:
         self.plan.released.set()

@@ -82,6 +82,7 @@ def test_the_configuration_says_where_the_socket_is(server: StatusServer, tmp_pa
     ("arguments", "name", "value"),
     [
         (["scene", "lego_bulldozer"], "scene", "lego_bulldozer"),
+        (["scene", "a.glb"], "scene", "{folder}/a.glb"),
         (["pause"], "pause", None),
         (["resume"], "resume", None),
         (["flat"], "flat", None),
@@ -90,7 +91,11 @@ def test_the_configuration_says_where_the_socket_is(server: StatusServer, tmp_pa
         (["reload"], "reload", None),
     ],
 )
-def test_every_command_arrives(server: StatusServer, arguments: list[str], name: str, value: Any) -> None:
+def test_every_command_arrives(
+    server: StatusServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], name: str, value: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.glb").touch()  # a file is sent with its whole path
     taken = []
 
     def loop() -> None:
@@ -102,7 +107,8 @@ def test_every_command_arrives(server: StatusServer, arguments: list[str], name:
     result = CliRunner().invoke(ctl.app, [*arguments, "--socket", str(server.path)])
     thread.join()
     assert result.exit_code == 0 and result.stdout == "scene demo, model fast, scale 1.5, paused\n"
-    assert (taken[0].name, taken[0].value) == (name, value)
+    expected = value.format(folder=tmp_path) if isinstance(value, str) else value
+    assert (taken[0].name, taken[0].value) == (name, expected)
 
 
 def test_a_refusal_is_bad_input(server: StatusServer) -> None:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from signal import Signals
 from typing import Any
@@ -45,7 +46,13 @@ class Daemon:
     """One process of `phasestack run`."""
 
     def __init__(
-        self, folder: Path, *extra: str, config: str = CONFIG, watchdog_s: float = 0.0, headless: bool = True
+        self,
+        folder: Path,
+        *extra: str,
+        config: str = CONFIG,
+        watchdog_s: float = 0.0,
+        headless: bool = True,
+        **streams: Any,
     ) -> None:
         self.socket = folder / "status.sock"
         self.config = folder / "phasestack.toml"
@@ -58,9 +65,8 @@ class Daemon:
         arguments = ["run", "--config", str(self.config), "--replay", "demo", *extra]
         if headless:
             arguments.append("--headless")
-        self.process = subprocess.Popen(
-            [*PHASESTACK, *arguments], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
+        given = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **streams}
+        self.process = subprocess.Popen([*PHASESTACK, *arguments], env=environment, text=True, **given)
 
     def hears(self, message: str, *, within_s: float = 90.0) -> bool:
         deadline = time.monotonic() + within_s
@@ -84,7 +90,9 @@ class Daemon:
     def close(self) -> None:
         if self.process.poll() is None:
             self.process.kill()
-        if not self.process.stderr.closed:
+        if self.process.stderr is None:
+            self.process.wait(90)
+        elif not self.process.stderr.closed:
             self.process.communicate(timeout=90)
         self.supervisor.close()
 
@@ -147,23 +155,7 @@ def test_a_hangup_during_the_start_is_a_reload_that_comes_when_it_can(
     assert "Traceback" not in errors
 
 
-def test_a_bad_configuration_on_reload_is_refused_and_the_old_one_stays(started: Callable[..., Any]) -> None:
-    daemon = started()
-    assert daemon.hears("READY=1")
-    daemon.config.write_text("[loop]\nrate_hz = -1\n")
-    daemon.process.send_signal(signal.SIGHUP)
-    assert daemon.hears("RELOADING=1")
-    answer = ask([daemon.socket], {"command": "reload"})
-    assert not answer["ok"]
-    assert "rate_hz" in answer["error"]
-    assert eventually(lambda: daemon.status()["state"] == "tracking")  # a busy machine may have starved its sensor
-    daemon.process.send_signal(signal.SIGTERM)
-    code, errors = daemon.ends()
-    assert code == 0
-    assert any("refused" in line and "rate_hz" in line for line in errors.splitlines())
-
-
-def test_commands_change_what_it_does(started: Callable[..., Any]) -> None:
+def test_an_operator_steers_it_and_every_line_of_its_log_is_one_object(started: Callable[..., Any]) -> None:
     daemon = started()
     assert daemon.hears("READY=1")
     assert ask([daemon.socket], {"command": "flat"})["ok"]
@@ -171,12 +163,23 @@ def test_commands_change_what_it_does(started: Callable[..., Any]) -> None:
     assert ask([daemon.socket], {"command": "resume"})["ok"]
     assert daemon.hears("STATUS=tracking")
     refused = ask([daemon.socket], {"command": "scene", "value": "no-such-scene"})
-    assert not refused["ok"]
-    assert "no-such-scene" in refused["error"]
+    assert not refused["ok"] and "no-such-scene" in refused["error"]
     assert ask([daemon.socket], {"command": "pause"})["ok"]
     frames = daemon.status()["frames"]
-    time.sleep(0.2)
-    assert daemon.status()["frames"] > frames  # paused is a still picture, not a still loop
+    assert eventually(lambda: daemon.status()["frames"] > frames)  # a still picture, not a still loop
+    assert ask([daemon.socket], {"command": "resume"})["ok"]
+    daemon.config.write_text("[loop]\nrate_hz = -1\n")
+    daemon.process.send_signal(signal.SIGHUP)
+    assert daemon.hears("RELOADING=1")
+    refused = ask([daemon.socket], {"command": "reload"})
+    assert not refused["ok"] and "rate_hz" in refused["error"]
+    assert eventually(lambda: daemon.status()["state"] == "tracking")  # a busy machine may have starved its sensor
+    daemon.process.send_signal(signal.SIGTERM)
+    code, errors = daemon.ends()
+    assert code == 0
+    told = [json.loads(line)["message"] for line in errors.splitlines()]
+    assert any(line.startswith("state: starting ->") for line in told)
+    assert sum("refused" in line and "rate_hz" in line for line in told) == 2
 
 
 def test_the_status_socket_in_use_is_refused_in_one_line_and_the_other_goes_on(
@@ -190,14 +193,6 @@ def test_the_status_socket_in_use_is_refused_in_one_line_and_the_other_goes_on(
     assert "is in use by another phasestack" in errors.splitlines()[-1]
     assert "Traceback" not in errors
     assert first.status()["ok"]
-
-
-def test_every_log_line_is_one_object(started: Callable[..., Any]) -> None:
-    daemon = started("--frames", "20")
-    code, errors = daemon.ends()
-    assert code == 0
-    lines = [line for line in errors.splitlines() if line.startswith("{")]
-    assert any(json.loads(line)["message"].startswith("state: starting ->") for line in lines)
 
 
 PANEL = '[[output.panels]]\nconnector = "HDMI-%d"\n'
@@ -241,3 +236,33 @@ def test_killed_outright_it_leaves_a_socket_that_the_next_one_takes_over(started
     second = started(config=CONFIG.replace("{folder}", str(first.socket.parent)))
     assert second.hears("READY=1")
     assert first.status()["pid"] == second.process.pid
+
+
+@pytest.mark.parametrize("reader", ["never reads", "has died", "was never there"])
+def test_where_nobody_reads_its_log_the_display_goes_on_and_it_can_be_ended(
+    started: Callable[..., Any], reader: str
+) -> None:
+    out, descriptor = os.pipe()
+    if reader == "never reads":
+        os.set_blocking(descriptor, False)
+        with suppress(BlockingIOError):
+            while os.write(descriptor, b"x" * 4096):  # full from the start
+                pass
+        os.set_blocking(descriptor, True)
+    streams: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": descriptor}
+    if reader == "was never there":
+        streams = {"stdout": None, "stderr": None, "preexec_fn": lambda: os.closerange(1, 3)}
+    daemon = started(**streams)
+    os.close(descriptor)
+    if reader != "never reads":
+        os.close(out)
+    assert daemon.hears("READY=1")
+    for command in ("flat", "resume"):
+        assert ask([daemon.socket], {"command": command}, timeout_s=30)["ok"]
+    before = daemon.status()["presented"]
+    assert eventually(lambda: daemon.status()["presented"] > before + 10)
+    assert (daemon.status()["log_lines_lost"] > 0) == (reader == "has died")
+    daemon.process.send_signal(signal.SIGTERM)
+    assert daemon.process.wait(timeout=60) == 0
+    if reader == "never reads":
+        os.close(out)

@@ -18,10 +18,8 @@ from threading import Thread
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 from runtime.clock import NS_PER_S, SimulatedClock
-from runtime.commands import ctl
 from runtime.config import ServiceSettings, load_settings
 from runtime.daemon import server as server_module
 from runtime.daemon.client import NotRunning, ask, configured_socket
@@ -109,16 +107,14 @@ def test_nonsense_is_refused_and_never_reaches_the_loop(server: StatusServer, li
 
 
 def test_a_request_without_end_is_cut_off(server: StatusServer, path: Path) -> None:
-    with socket.socket(socket.AF_UNIX) as client:
-        client.connect(str(path))
+    with connected(path) as client:
         client.sendall(b"x" * (server_module.LINE_MAX_BYTES + 1))
         assert b"too long" in client.makefile("rb").readline()
 
 
 def test_where_all_places_are_taken_the_one_that_has_waited_longest_goes(server: StatusServer, path: Path) -> None:
-    crowd = [socket.socket(socket.AF_UNIX) for _ in range(server_module.CLIENTS_MAX)]
+    crowd = [connected(path) for _ in range(server_module.CLIENTS_MAX)]
     for client in crowd:
-        client.connect(str(path))
         client.sendall(b'{"command": "status"}\n')
         assert b"true" in client.makefile("rb").readline()
     assert status(path)["ok"]
@@ -149,12 +145,18 @@ def test_the_socket_of_a_daemon_that_crashed_is_taken_over(path: Path, clock: Si
     assert not path.exists()
 
 
-def test_somebody_elses_file_is_not_removed(path: Path, clock: SimulatedClock) -> None:
+@pytest.mark.parametrize("is_link", [False, True])
+def test_somebody_elses_file_is_neither_removed_nor_followed(
+    path: Path, tmp_path: Path, clock: SimulatedClock, is_link: bool
+) -> None:
     path.parent.mkdir()
-    path.write_text("precious")
+    precious = tmp_path / "precious" if is_link else path
+    precious.write_text("precious")
+    if is_link:
+        path.symlink_to(precious)
     with pytest.raises(InputError, match="not a socket"):
         StatusServer(path, group=OWN_GROUP, clock=clock)
-    assert path.read_text() == "precious"
+    assert precious.read_text() == "precious" and path.is_symlink() == is_link
 
 
 def test_by_hand_a_run_goes_on_without_its_socket_and_under_a_supervisor_it_does_not(
@@ -170,9 +172,8 @@ def test_without_a_daemon_the_client_says_what_to_do(path: Path) -> None:
     with pytest.raises(NotRunning, match="systemctl start"):
         status(path)
     path.parent.mkdir()
-    listener = socket.socket(socket.AF_UNIX)
-    listener.bind(str(path))
-    listener.close()
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(path))
     with pytest.raises(NotRunning, match="nobody listens"):
         status(path)
 
@@ -336,50 +337,3 @@ def test_a_client_loads_nothing_heavy(tmp_path: Path, arguments: list[str]) -> N
         [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )
     assert done.stdout.split() == ["1"], done.stdout + done.stderr
-
-
-@pytest.mark.parametrize("name", ["pictures", "a.glb", "sub/a.glb", "./a.glb"])
-def test_a_file_or_folder_is_sent_with_its_whole_path(
-    server: StatusServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "sub").mkdir()
-    (tmp_path / "pictures").mkdir()
-    for file in ("a.glb", "sub/a.glb"):
-        (tmp_path / file).write_bytes(b"")
-    assert sent_scene(server, name) == str(tmp_path / name.removeprefix("./"))
-
-
-@pytest.mark.parametrize("name", ["demo", "lego_bulldozer", "nowhere.glb"])
-def test_a_known_name_and_what_is_not_there_are_sent_as_they_are(
-    server: StatusServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "demo").mkdir()  # the built-in scene is meant all the same
-    assert sent_scene(server, name) == name
-
-
-def sent_scene(server: StatusServer, name: str) -> str:
-    taken = []
-
-    def loop() -> None:
-        taken.append(server.commands.get(timeout=60))
-        taken[0].done()
-
-    thread = threading.Thread(target=loop)
-    thread.start()
-    result = CliRunner().invoke(ctl.app, ["scene", name, "--socket", str(server.path)])
-    thread.join()
-    assert result.exit_code == 0, result.output
-    return taken[0].value
-
-
-def test_a_link_in_the_sockets_place_is_not_followed(path: Path, tmp_path: Path) -> None:
-    path.parent.mkdir()
-    precious = tmp_path / "precious"
-    precious.write_text("precious")
-    path.symlink_to(precious)
-    with pytest.raises(InputError, match="not a socket"):
-        StatusServer(path, group=OWN_GROUP, clock=SimulatedClock())
-    assert path.is_symlink()
-    assert precious.read_text() == "precious"
