@@ -1,44 +1,56 @@
-"""A long run with faults: python tests/soak.py --frames 100000 --changes 400.
+"""An operator's hour, faster: 20 scenes, models, reloads, lost parts, hung solvers, a busy processor.
 
-Fails where memory, files or threads pile up, or a refresh is lost.
+    python -m tests.soak --rounds 200
 
-A real run with real content, network, panels and status socket, small; every so often the sensor is lost, a panel
-is lost, the model fails, the picture is paused, another scene or configuration is taken over, and somebody asks for
-the status. No refresh is lost but those without a panel.
+Fails where status, page or black box say anything else than what is so, where a refresh is lost, and where memory,
+files or threads grow.
 """
 
 from __future__ import annotations
 
 import argparse
 import gc
+import json
+import os
+import subprocess
 import sys
 import tempfile
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import psutil
 
-if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from runtime.clock import MonotonicClock
+from runtime.blackbox.recorder import Recorder
+from runtime.clock import NS_PER_S
 from runtime.daemon.client import ask
-from runtime.daemon.reconfigure import Reconfiguration
-from runtime.daemon.server import StatusServer
+from runtime.daemon.names import scene_names
 from runtime.errors import SensorLost
-from tests.daemon.rig import TRACKING, Rig
+from runtime.page.daemon import LOOKED_UP_AGAIN_S, Daemon
+from runtime.page.thumbnails import Thumbnails
+from tests.daemon.rig import TRACKING
+from tests.daemon.test_changes import Served
 from tests.waiting import eventually
 
-SIZE = {"width_px": 64, "height_px": 36}
-GROWTH_MAX = 0.01
+SETTINGS: dict[str, dict[str, Any]] = {
+    "stack": {"width_px": 64, "height_px": 36},
+    "loop": {"rate_hz": 200.0},
+    "tracker": {"hold_s": 0.5},
+}
+SCENES, MODELS = scene_names()[:20], ("balanced", "fast")
+KEPT_MIN = 0.05  # by the black box, so that it is full before memory is looked at
+COUNTED = ("state", "reason", "scene", "model", "paused", "frames", "presented", "dropped", "faults")
 
 
 @dataclass(frozen=True, slots=True)
 class Usage:
     """What the process holds."""
 
-    resident_bytes: int
+    resident_mib: float
     files: int
     threads: int
 
@@ -46,167 +58,135 @@ class Usage:
     def now(cls) -> Usage:
         gc.collect()
         process = psutil.Process()
-        return cls(process.memory_info().rss, process.num_fds(), process.num_threads())
+        return cls(process.memory_info().rss / 2**20, process.num_fds(), process.num_threads())
 
 
-@dataclass(frozen=True, slots=True)
 class Soak:
-    """What a soak came to."""
+    """A run with its socket, page and black box; `round` does all that an operator and the world do to it."""
 
-    frames: int
-    presented: int
-    without_a_panel: int
-    changes: int  # of scene and of model, that were taken over
-    solutions: int
-    faults: dict[str, int]
-    seconds: float
-    before: Usage
-    after: Usage
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.recorder = Recorder(folder / "boxes", minutes=KEPT_MIN)
+        self.served = Served(folder, recorder=self.recorder, late_s=60.0, abandon_s=600.0, **SETTINGS)
+        self.page = Daemon(lambda: (self.served.server.path,), Thumbnails(folder))
+        self.without_a_panel = 0
 
-    @property
-    def growth(self) -> float:
-        """Of resident memory, relative."""
-        return self.after.resident_bytes / self.before.resident_bytes - 1.0
+    def __enter__(self) -> Soak:
+        self.served.__enter__()
+        self.served.run.observer._on_account = None  # the rig keeps every account: that alone would be a leak
+        return self
 
-    def problems(self, *, growth_max: float = GROWTH_MAX) -> list[str]:
-        """Empty: passed."""
-        found = []
-        if self.presented + self.without_a_panel < self.frames:
-            found.append(f"{self.frames - self.presented - self.without_a_panel} refreshes lost")
-        if self.growth > growth_max:
-            found.append(f"memory grew by {self.growth:.2%}")
-        if self.after.files > self.before.files:
-            found.append(f"{self.after.files - self.before.files} file descriptors leaked")
-        if self.after.threads > self.before.threads:
-            found.append(f"{self.after.threads - self.before.threads} threads leaked")
-        return found
+    def __exit__(self, *exception: object) -> None:
+        self.recorder.close()
+        self.served.__exit__(*exception)
 
-
-class Changes:
-    """Another scene, then another model, and so on: one after the other, while refreshes go on."""
-
-    def __init__(self, rig: Rig) -> None:
-        self._rig, self._change, self.done, self.refused = rig, None, 0, ""
-
-    def begin(self) -> None:
-        """The next one, if the last one is over."""
-        presenter = self._rig.presenter
-        if self._change is not None:
-            return
-        old = presenter.run_cell.state.settings
-        number = self.done // 2
-        if self.done % 2:
-            model = old.model.model_copy(update={"name": ("balanced", "fast")[number % 2]})
-            new = old.model_copy(update={"model": model})
-        else:
-            content = old.content.model_copy(update={"scene": ("sparse", "demo")[number % 2]})
-            new = old.model_copy(update={"content": content})
-        self._change = Reconfiguration(new, old, presenter.stack, reload_content=self.done % 2 == 0)
-        presenter.solver.do(self._change.advance)
-
-    def look(self) -> None:
-        """Whether it is over."""
-        if self._change is not None and self._change.finished:
-            self.refused = self.refused or self._change.problem
-            self._change, self.done = None, self.done + 1
-
-
-def soak(
-    frames: int, *, warm: int, fault_every: int, change_every: int, least_changes: int = 0, report: bool = False
-) -> Soak:
-    """Run it. `warm` refreshes come before the first look at memory; it goes on until so many changes are made."""
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        Rig(stack=SIZE, late_s=30.0, abandon_s=600.0, loop={"rate_hz": 1000.0}, tracker={"hold_s": 1.0}) as rig,
-    ):
-        server = StatusServer(Path(folder) / "status.sock", group="root", clock=MonotonicClock())
-        rig.run.observer._on_account = None  # the rig keeps every account: that alone would be a leak
+    def round(self, number: int) -> None:
+        served, rig = self.served, self.served.rig
+        scene, model = SCENES[number % len(SCENES)], MODELS[number % len(MODELS)]
+        assert served.asked("scene", scene)["ok"] and served.asked("model", model)["ok"]
+        refused = served.asked("scene", "nobody's")
+        assert served.asked("reload")["ok"] and not refused["ok"]
+        rig.refresh_until_solved()
+        self._told_is_so(TRACKING)
+        assert served.asked("pause")["paused"] and not served.asked("resume")["paused"]
+        rig.plan.fault = SensorLost("soaked")
+        rig.refresh_until("degraded: sensor")
+        self._told_is_so("degraded: sensor")
+        rig.plan.fault = None
+        rig.refresh_until(TRACKING)
         panels = rig.break_panels(keep=False)
-        presenter, changes, without = rig.presenter, Changes(rig), 0
+        panels.lost = "soaked"
+        self.without_a_panel += len(rig.refreshes(5))
+        self._told_is_so("degraded: panel", refresh=False)
+        rig.presenter.panels = panels._panels
+        self._hang_the_solver()
+        with busy_processor():
+            rig.refreshes(200)
+            self._told_is_so(None)
+        rig.refresh_until(TRACKING)
+        self._told_is_so(TRACKING)
 
-        def cycle(refreshes: int) -> None:
-            nonlocal without
-            for number in range(refreshes):
-                account = presenter.refresh()
-                without += bool(panels.lost)
-                server.publish(lambda account=account: {"state": str(account.state)})
-                changes.look()
-                phase = number % fault_every
-                if phase == fault_every // 4:
-                    rig.plan.fault = SensorLost("soaked")
-                elif phase == fault_every // 4 + 20:
-                    rig.plan.fault = None
-                elif phase == fault_every // 2:
-                    panels.lost = "soaked"
-                elif phase == fault_every // 2 + 5:
-                    panels.lost = ""
-                elif phase == 3 * fault_every // 4:
-                    assert ask([server.path], {"command": "status"})["ok"]
-                    presenter.paused = True
-                elif phase == 3 * fault_every // 4 + 20:
-                    presenter.paused = False
-                if number % change_every == change_every - 1:
-                    changes.begin()
-            rig.plan.fault, panels.lost, presenter.paused = None, "", False
-            settle(1)
+    def _hang_the_solver(self) -> None:
+        """It is left behind and made anew; what it held is released once it returns."""
+        rig, solver = self.served.rig, self.served.rig.presenter.solver
+        predictor, gate, begun = rig.break_predictor(), threading.Event(), threading.Event()
+        predictor.answer = lambda job: (begun.set(), gate.wait(60.0), predictor.well(job))[-1]
+        rig.refresh_until(begun.is_set)
+        restarts, patience = solver.restarts, (solver._late_ns, solver._abandon_ns)
+        solver._late_ns = solver._abandon_ns = 1
+        rig.refreshes(1)
+        solver._late_ns, solver._abandon_ns = patience
+        rig.refresh_until_solved()
+        gate.set()
+        assert solver.restarts == restarts + 1
+        assert eventually(lambda: not any(hung.thread.is_alive() for hung in solver._hung))
 
-        def settle(at_least: int) -> None:
-            """Until all is well again, and so many changes were made."""
-            nonlocal without
-            while not (presenter.machine.name == TRACKING and changes.done >= at_least):
-                presenter.refresh()
-                changes.look()
+    def _told_is_so(self, state: str | None, *, refresh: bool = True) -> None:
+        """Status, page and pictures against the run; no refresh goes on meanwhile."""
+        run = self.served.run
+        presenter, stats = run.presenter, run.presenter.stats
+        if refresh:
+            presenter.refresh()
+        status = self.served.status()
+        now = presenter.run_cell.state
+        assert state in (None, status["state"]) and status["state"] == presenter.machine.name
+        assert (status["frames"], status["dropped"]) == (stats.frames, stats.dropped)
+        assert status["dropped"] == self.without_a_panel and status["presented"] == stats.frames - stats.dropped
+        assert status["scene"] == now.settings.content.scene and status["model"] == now.predictor.name
+        time.sleep(LOOKED_UP_AGAIN_S["status"])
+        page = self.page.look_up("status")
+        assert {name: page[name] for name in COUNTED} == {name: status[name] for name in COUNTED}
+        shown = ask([self.served.server.path], {"command": "pictures"})
+        assert shown["frame"] == presenter.last.account.frame and len(shown["jpegs"]) >= presenter.stack.count
 
-        changes.begin()
-        cycle(warm)
-        while changes.done < 8:  # each scene and each model has been there twice
-            changes.begin()
-            cycle(20)
-        before, started = Usage.now(), time.perf_counter()
-        stats = presenter.stats
-        counted = stats.frames, stats.presented, without, changes.done, stats.solutions
-        done = 0
-        while done < frames:
-            part = min(max(frames // 10, fault_every), frames - done)
-            cycle(part)
-            done += part
-            if report:
-                now = Usage.now()
-                print(
-                    f"{done:8} refreshes  {now.resident_bytes / 2**20:7.1f} MiB  {now.files} files  "
-                    f"{now.threads} threads  {changes.done} changes  {time.perf_counter() - started:6.0f} s",
-                    flush=True,
-                )
-        while changes._change is not None or changes.done - counted[3] < least_changes:
-            if changes.done - counted[3] < least_changes:
-                changes.begin()
-            cycle(20)
+    def check_black_box(self) -> None:
+        """What it kept: every refresh of its time, up to the last, and the states that they were in."""
+        from mcap.reader import make_reader
+
+        rig = self.served.rig
+        answer = self.served.asked("blackbox")
+        last = rig.presenter.last.account.frame
+        with Path(answer["file"]).open("rb") as file:
+            told = [json.loads(message.data) for _, _, message in make_reader(file).iter_messages(["/refresh"])]
+        frames = [refresh["frame"] for refresh in told]
+        assert frames == list(range(frames[0], frames[-1] + 1)) and frames[-1] <= last
+        kept_s = (told[-1]["present_ns"] - told[0]["present_ns"]) / NS_PER_S
+        assert 0.5 * 60 * KEPT_MIN < kept_s <= 60 * KEPT_MIN + 0.1
+        assert {refresh["state"] for refresh in told} <= {"tracking", "holding", "flat", "degraded"}
+
+
+@contextmanager
+def busy_processor() -> Iterator[None]:
+    """Every core has something else to do."""
+    spinning = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(os.cpu_count() or 1)]
+    try:
+        yield
+    finally:
+        for process in spinning:
+            process.kill()
+            process.wait()
+
+
+def soak(rounds: int, *, warm: int, growth_max: float) -> None:
+    """Raises AssertionError where something piles up, is lost or told wrongly. warm: rounds before memory counts."""
+    with tempfile.TemporaryDirectory(prefix="ps-") as folder, Soak(Path(folder)) as run:
+        for number in range(warm):
+            run.round(number)
+        before, began_s = Usage.now(), time.perf_counter()
+        print(f"warm: {before}")
+        for number in range(warm, warm + rounds):
+            run.round(number)
+            kept_mib, seconds = run.recorder.describe()["kept_mib"], time.perf_counter() - began_s
+            print(f"{number + 1 - warm:5} rounds {seconds:6.0f} s, {kept_mib} MiB kept, {Usage.now()}", flush=True)
+        run.check_black_box()
         # What a change left to be released in the background may be on its way; a leak stays.
         eventually(lambda: Usage.now().threads <= before.threads)
         after = Usage.now()
-        server.close()
-        assert not changes.refused, changes.refused
-        return Soak(
-            stats.frames - counted[0], stats.presented - counted[1], without - counted[2], changes.done - counted[3],
-            stats.solutions - counted[4], dict(stats.faults), time.perf_counter() - started, before, after,
-        )  # fmt: skip
-
-
-def main() -> int:
-    """The command line; exit 1 where something piled up or was lost."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--frames", type=int, default=100_000)
-    parser.add_argument("--changes", type=int, default=400, help="of scene and of model in turns")
-    chosen = parser.parse_args()
-    every = max(20, chosen.frames // max(1, chosen.changes))
-    result = soak(chosen.frames, warm=2000, fault_every=500, change_every=every, report=True)
-    print(f"{result.frames} refreshes, {result.presented} presented, {result.without_a_panel} without a panel")
-    print(f"{result.solutions} solutions, {result.changes} changes, faults {result.faults}, {result.seconds:.0f} s")
-    print(f"memory {result.before.resident_bytes / 2**20:.1f} MiB, growth {result.growth:+.3%}")
-    for problem in result.problems():
-        print(f"FAILED: {problem}")
-    return bool(result.problems())
+    assert after.resident_mib <= before.resident_mib * (1.0 + growth_max), (before, after)
+    assert after.files <= before.files and after.threads <= before.threads, (before, after)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=200)
+    soak(parser.parse_args().rounds, warm=len(SCENES), growth_max=0.01)

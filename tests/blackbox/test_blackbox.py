@@ -29,7 +29,11 @@ from runtime.sensor.recording import Recording, recording_to
 from runtime.sensor.replay import demo_recording_path
 from tests.daemon.rig import Rig
 
-SMALL: dict[str, Any] = {"stack": {"width_px": 64, "height_px": 36}, "model": {"name": "fast", "threads": 1}}
+SMALL: dict[str, Any] = {
+    "stack": {"width_px": 64, "height_px": 36},
+    "model": {"name": "fast", "threads": 1},
+    "loop": {"rate_hz": 20.0},
+}
 
 
 @dataclass(frozen=True)

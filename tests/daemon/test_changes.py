@@ -33,7 +33,7 @@ STEADY: dict[str, Any] = {"sensor": {"timeout_s": 5.0}, "tracker": {"hold_s": 20
 class Served:
     """A run with a daemon that listens; what is asked of it is answered while it refreshes."""
 
-    def __init__(self, folder: Path, **changes: Any) -> None:
+    def __init__(self, folder: Path, *, recorder: Any = None, **changes: Any) -> None:
         self.config = folder / "phasestack.toml"
         self.server = StatusServer(folder / "status.sock", group="root", clock=MonotonicClock())
         self.daemon = Daemon(
@@ -41,6 +41,7 @@ class Served:
             signals=Signals(),
             notifier=Notifier(MonotonicClock(), {}),
             server=self.server,
+            recorder=recorder,
         )
         self.rig = Rig(host=self.daemon, open_timeout_s=20.0, **(STEADY | changes))
 

@@ -91,7 +91,7 @@ def test_without_descriptors_the_exit_code_is_never_that_of_bad_configuration(tm
         "import resource, sys; from runtime.cli import main\n"
         "import runtime.commands.app, runtime.daemon.supervise, runtime.daemon.build\n"
         f"resource.setrlimit(resource.RLIMIT_NOFILE, ({limit}, {limit}))\n"
-        "sys.argv = ['phasestack', 'run', '--headless', '--replay', 'demo', '--frames', '3', '--scale', '0.1']\n"
+        "sys.argv = 'phasestack run --headless --replay demo --frames 1 --scale 0.1 --model fast'.split()\n"
         "main()"
     )
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_RUNTIME_DIR": str(tmp_path), "OMP_NUM_THREADS": "1"}
