@@ -225,24 +225,6 @@ def test_a_reload_keeps_the_scene_model_and_place_that_were_chosen_until_the_fil
     assert served.status()["scene"] == "thin"
 
 
-def test_changes_of_scene_model_and_settings_lose_no_refresh_and_keep_a_picture_on_the_panels(served: Served) -> None:
-    before = len(served.rig.accounts)
-    for number in range(4):
-        assert served.asked("scene", ("sparse", "texture")[number % 2])["ok"]
-        served.config.write_text(configuration(name=("balanced", "fast")[number % 2]))
-        assert served.asked("reload")["ok"]
-        served.rig.refresh_until_solved()
-    accounts = served.rig.accounts[before:]
-    assert all(account.presented for account in accounts)
-    assert all(account.solution is not None for account in accounts)
-    frames = [account.frame for account in accounts]
-    assert frames == list(range(frames[0], frames[0] + len(frames)))
-    numbers = [account.solution for account in accounts]
-    assert numbers == sorted(numbers)
-    assert served.rig.presenter.stats.dropped == 0
-    assert served.rig.presenter.stats.faults == {}
-
-
 def test_what_is_paused_stays_and_is_told_and_goes_on(served: Served) -> None:
     assert served.asked("pause")["ok"]
     served.rig.settle()  # what was under way comes yet

@@ -17,7 +17,6 @@ from typing import Any
 import pytest
 
 from runtime.daemon.client import ask
-from runtime.errors import TransientError
 from tests.daemon.test_notify import Supervisor
 from tests.waiting import PATIENT, eventually
 
@@ -182,19 +181,6 @@ def test_an_operator_steers_it_and_every_line_of_its_log_is_one_object(started: 
     assert sum("refused" in line and "rate_hz" in line for line in told) == 2
 
 
-def test_the_status_socket_in_use_is_refused_in_one_line_and_the_other_goes_on(
-    started: Callable[..., Any], tmp_path: Path
-) -> None:
-    first = started()
-    assert first.hears("READY=1")
-    second = started(config=CONFIG.replace("{folder}", str(tmp_path / "0")))
-    code, errors = second.ends()
-    assert code == 75  # the other may be gone at the next start
-    assert "is in use by another phasestack" in errors.splitlines()[-1]
-    assert "Traceback" not in errors
-    assert first.status()["ok"]
-
-
 PANEL = '[[output.panels]]\nconnector = "HDMI-%d"\n'
 NO_SCREEN = CONFIG + '[output]\nkind = "windows"\n' + "".join(PANEL % n for n in range(3))
 
@@ -223,19 +209,6 @@ def test_by_hand_a_missing_panel_is_refused_in_one_line(tmp_path: Path, monkeypa
     assert result.returncode == 75  # there may be one later
     assert "no X server" in result.stderr.splitlines()[-1]
     assert "Traceback" not in result.stderr
-
-
-def test_killed_outright_it_leaves_a_socket_that_the_next_one_takes_over(started: Callable[..., Any]) -> None:
-    first = started()
-    assert first.hears("READY=1")
-    first.process.kill()
-    first.ends()
-    assert first.socket.exists()
-    with pytest.raises(TransientError):
-        first.status()
-    second = started(config=CONFIG.replace("{folder}", str(first.socket.parent)))
-    assert second.hears("READY=1")
-    assert first.status()["pid"] == second.process.pid
 
 
 @pytest.mark.parametrize("reader", ["never reads", "has died", "was never there"])

@@ -314,7 +314,9 @@ def fed(heard: Supervisor) -> Iterator[Rig]:
     notifier.close()
 
 
-def test_a_solver_that_hangs_does_not_starve_the_watchdog(fed: Rig, heard: Supervisor) -> None:
+def test_a_solver_that_hangs_does_not_starve_the_watchdog_and_a_refresh_that_takes_for_ever_does(
+    fed: Rig, heard: Supervisor
+) -> None:
     """The presenter's clock alone feeds it: there is a picture, it follows the eyes, and the solver is made anew."""
     gate = threading.Event()
     predictor = fed.break_predictor()
@@ -324,9 +326,6 @@ def test_a_solver_that_hangs_does_not_starve_the_watchdog(fed: Rig, heard: Super
     fed.refreshes_for(2 * WATCHDOG_S)
     gate.set()
     assert heard.heard().count("WATCHDOG=1") >= 1
-
-
-def test_a_refresh_that_takes_for_ever_starves_the_watchdog(fed: Rig, heard: Supervisor) -> None:
     panels, spoken = fed.break_panels(keep=False), []
     present = panels.present
 

@@ -11,10 +11,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import pytest
@@ -67,23 +66,6 @@ def test_status_is_the_newest_published_account(server: StatusServer, path: Path
     answer = status(path)
     assert (answer["ok"], answer["state"], answer["fps"], answer["pid"]) == (True, "tracking", 60.0, os.getpid())
     assert (answer["uptime_s"], answer["turn_age_s"]) == (2.0, 2.0)
-
-
-def answered_by_loop(server: StatusServer, respond: Callable[..., Any]) -> Thread:
-    def loop() -> None:
-        respond(server.commands.get(timeout=60))
-
-    thread = threading.Thread(target=loop)
-    thread.start()
-    return thread
-
-
-def test_a_command_reaches_the_loop_and_its_answer_the_client(server: StatusServer, path: Path) -> None:
-    taken = []
-    thread = answered_by_loop(server, lambda command: (taken.append((command.name, command.value)), command.done()))
-    assert ask([path], {"command": "scene", "value": "demo"}) == {"ok": True}
-    thread.join()
-    assert taken == [("scene", "demo")]
 
 
 @pytest.mark.parametrize(
