@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from runtime.config import LIMITS
 from runtime.errors import InputError
@@ -16,18 +16,17 @@ CHUNK_BYTES = 12  # of a PNG's part without what it holds: length, kind, checksu
 SIDE_MAX_PX = 1 << 16
 ORIENTATION = 0x0112  # EXIF's tag
 TURNED = (5, 6, 7, 8)  # by a quarter: width and height are exchanged
-SNIFFED_BYTES = 1 << 20  # of a file: headers, EXIF and colour profiles end before
 
 
-def picture_size(coded: bytes, *, turned: bool = False) -> tuple[int, int]:
-    """Width and height of a coded picture; turned: after its EXIF orientation. Raises ValueError."""
+def picture_size(coded: bytes | IO[bytes], *, turned: bool = False) -> tuple[int, int]:
+    """Width and height of a coded picture, or of an open file; turned: after its EXIF orientation. Raises ValueError."""
     from PIL import Image
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Pillow's own warning of large pictures: the caller has limits
         most, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
-            with Image.open(io.BytesIO(coded)) as image:
+            with Image.open(io.BytesIO(coded) if isinstance(coded, bytes) else coded) as image:
                 width, height = image.size
                 is_turned = turned and _orientation(image) in TURNED
         except Exception as error:  # each of Pillow's formats raises its own
@@ -102,13 +101,9 @@ def read_coded(path: Path) -> bytes:
 def size_of_file(path: Path) -> tuple[int, int]:
     """Width and height as a decoder shows them, from the file's beginning. Raises InputError."""
     with foreign.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
-        head = file.read(SNIFFED_BYTES)
         try:
-            width, height = picture_size(head, turned=True)
+            width, height = picture_size(file, turned=True)
         except ValueError:
-            try:
-                width, height = picture_size(head + file.read(), turned=True)
-            except ValueError:
-                raise InputError(path, "", "is not an image that can be decoded") from None
+            raise InputError(path, "", "is not an image that can be decoded") from None
     check_size(width, height, source=path)
     return width, height
