@@ -72,7 +72,8 @@ def _exchanged(path: Path, request: dict[str, Any], timeout_s: float) -> dict[st
         channel.connect(str(path))
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # turned away: the answer says why
             channel.sendall(json.dumps(request).encode() + b"\n")
-        line = channel.makefile("rb").readline()
+        with channel.makefile("rb") as answers:
+            line = answers.readline()
     if not line:
         raise ConnectionResetError("the connection was closed without an answer")
     answer: dict[str, Any] = json.loads(line)

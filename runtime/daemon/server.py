@@ -149,7 +149,9 @@ class StatusServer:
 
     async def _end(self) -> None:
         self._server.close()
-        clients = list(self._clients)
+        for _ in range(4):  # who has just come in is served by then, and is told too
+            await asyncio.sleep(0)
+        clients = asyncio.all_tasks() - {asyncio.current_task()}
         for client in clients:
             client.cancel("the daemon stops")
         await asyncio.gather(*clients, return_exceptions=True)

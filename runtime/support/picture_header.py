@@ -19,7 +19,7 @@ TURNED = (5, 6, 7, 8)  # by a quarter: width and height are exchanged
 
 
 def picture_size(coded: bytes | IO[bytes], *, turned: bool = False) -> tuple[int, int]:
-    """Width and height of a coded picture, or of an open file; turned: after its EXIF orientation. Raises ValueError."""
+    """Width and height of a coded picture or an open file; turned: after its EXIF orientation. Raises ValueError."""
     from PIL import Image
 
     with warnings.catch_warnings():
