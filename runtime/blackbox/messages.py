@@ -15,7 +15,7 @@ from runtime.support.artifacts import to_json
 LOG, REFRESH, STATE = "/log", "/refresh", "/state"
 # Viewers plot a number wherever it stands; only what they show in a way of its own needs its fields named.
 SCHEMAS: dict[str, dict[str, Any]] = {
-    fmt.EYES_TOPIC: fmt.EYES_SCHEMA,
+    **fmt.SCHEMAS,
     LOG: {
         "title": "foxglove.Log",
         "type": "object",

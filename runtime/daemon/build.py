@@ -175,6 +175,7 @@ def build_run(
         samples = worker = SensorWorker(make_driver, settings.sensor, clock)
         cleanup.callback(worker.close)
         worker.start()
+    if maker.run is None:
         raise Stopped("told to stop while starting")
     in_stack_frame = driver.capabilities.in_stack_frame
     observer = RunObserver(
