@@ -103,10 +103,6 @@ def board(stack: PanelStack, panel: int) -> U8:
     return picture
 
 
-def board_layers(stack: PanelStack) -> U8:
-    """(N, H, W, 4) all panels' boards together."""
-    layers = np.zeros((stack.count, stack.height_px, stack.width_px, 4), np.uint8)
-    layers[..., 3] = 255
-    for index in range(stack.count):
-        layers[index, ..., :3] = board(stack, index)[..., None]
-    return layers
+def boards(stack: PanelStack) -> U8:
+    """(N, H, W) what all panels show together."""
+    return np.stack([board(stack, index) for index in range(stack.count)])

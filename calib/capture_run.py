@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from calib.capture import MAX_SPREAD_M, WINDOW_S, midpoint, true_pair
+from calib.capture import midpoint
 from calib.hardware import SetupHardware, eye_finder
 from calib.pairs import PairRow, PairsFile
 from calib.viewpoints import grid
@@ -16,7 +14,7 @@ from calib.walk import Walk
 from runtime.clock import NS_PER_S, SimulatedClock
 from runtime.config import Settings
 from runtime.errors import EndOfRecording, InputError
-from runtime.records import F64, EyePoints, SensorFrame
+from runtime.records import SensorFrame
 from runtime.sensor.base import SteppedSensor
 from runtime.sensor.registry import open_sensor
 
@@ -40,34 +38,35 @@ def capture_live(
             walk.press(key)
         return walk.summary()
     finally:
+        hardware.let_go()
         if chart is not None:
             chart.close()
 
 
 def capture_recording(out: Path, settings: Settings, *, source: str) -> dict[str, Any]:
-    """Pairs from a recording that knows its true eyes, half a second each. Raises InputError."""
+    """A pair for every sample of a recording that knows its true eyes. Raises InputError."""
     chosen = settings.sensor.model_copy(update={"driver": "replay", "source": source, "loop": False, "start_s": 0.0})
     driver = open_sensor(chosen, SimulatedClock())
     if not isinstance(driver, SteppedSensor):
         raise InputError(source, "", "cannot be replayed sample by sample")
-    file = PairsFile(out)
-    accepted, skipped = 0, []
+    file, pairs, known = PairsFile(out), [], False
     with driver:
         if driver.capabilities.in_stack_frame:
             raise InputError(source, "", "its eyes are in the stack's frame already: there is nothing to calibrate")
         find = eye_finder(driver, settings)
-        frames = list(_all_samples(driver))
-        if all(frame.true_eyes_m is None for frame in frames):
-            raise InputError(source, "", "does not know where the eyes truly were: capture from the live sensor")
-        for pair in _from_truth(frames, find, serial=driver.serial):
-            if isinstance(pair, str):
-                skipped.append(pair)
-            else:
-                file.accept(pair)
-                accepted += 1
-    if not len(file):
-        raise InputError(source, "", "gives no pair: " + ("; ".join(skipped[:3]) or "no usable eyes"))
-    return {"file": str(out), "pairs": len(file), "accepted": accepted, "skipped": skipped}
+        for frame in _all_samples(driver):
+            if frame.true_eyes_m is None:
+                continue
+            known = True
+            middle = midpoint(find(frame))
+            if middle is not None:
+                name = f"at {frame.capture_ns / NS_PER_S:.3f} s"
+                pairs.append(PairRow.of(middle, frame.true_eyes_m.mean(axis=0), name, serial=driver.serial))
+    if not pairs:
+        why = "gives no pair: no usable eyes" if known else "does not know where the eyes truly were"
+        raise InputError(source, "", f"{why}: capture from the live sensor")
+    file.accept(*pairs)
+    return {"file": str(out), "pairs": len(file), "accepted": len(pairs)}
 
 
 def _all_samples(driver: SteppedSensor) -> Iterator[SensorFrame]:
@@ -76,25 +75,3 @@ def _all_samples(driver: SteppedSensor) -> Iterator[SensorFrame]:
             yield driver.next_sample()
         except EndOfRecording:
             return
-
-
-def _from_truth(
-    frames: Sequence[SensorFrame], find: Callable[[SensorFrame], EyePoints | None], *, serial: str
-) -> Iterator[PairRow | str]:
-    """A pair for each stretch of `WINDOW_S`, or why there is none."""
-    first_ns = frames[0].capture_ns
-    stretches: dict[int, list[tuple[float, F64, F64]]] = {}
-    for frame in frames:
-        middle = midpoint(find(frame))
-        if middle is not None and frame.true_eyes_m is not None:
-            seconds = (frame.capture_ns - first_ns) / NS_PER_S
-            stretches.setdefault(int(seconds / WINDOW_S), []).append((seconds, middle, frame.true_eyes_m.mean(axis=0)))
-    for number, samples in sorted(stretches.items()):
-        times, sensor, true = (np.array(column) for column in zip(*samples, strict=True))
-        found = true_pair(times, sensor, true)
-        name = f"at {number * WINDOW_S:.2f} s"
-        if found is None or found[0].spread_m > MAX_SPREAD_M:
-            yield f"{name}: " + ("too few samples" if found is None else f"spread {found[0].spread_m * 1e3:.1f} mm")
-            continue
-        seen, true_m = found
-        yield seen.paired(true_m, name, serial=serial)

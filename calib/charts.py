@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calib.display import FONT, PanelDisplay, show_pages
+from calib.display import FONT, open_display
 from calib.viewpoints import IPD_M, Viewpoint
 from runtime.config import Settings
 from runtime.model.predictor import load_predictor
@@ -77,6 +77,13 @@ class Drawer:
         prediction = solve_still(picture, picture, eyes_m=eyes_m, fov_deg=fov_deg, predictor=self._predictor)
         return np.array(prediction.layers)  # a copy: the predictor uses its own again
 
+    def seen(self, viewpoint: Viewpoint, *, aside_m: float) -> U8:
+        """(h, w, 3) what the right eye sees of a viewpoint's chart from there, or so far to the right of it."""
+        eye_m = viewpoint.eyes_m(self.ipd_m)[1] + np.array([0.0, aside_m, 0.0])
+        fov_deg = chart_fov_deg(viewpoint, self.stack)
+        light = seen_by(eye_m, self.layers(viewpoint), self.stack, fov_deg=fov_deg).image
+        return np.asarray(np.rint(255 * np.clip(light, 0, 1)).astype(np.uint8))
+
     def close(self) -> None:
         """Release the model. May be called twice."""
         if self._predictor is not None:
@@ -87,35 +94,23 @@ class Drawer:
 def make_charts(out: Path, viewpoints: Sequence[Viewpoint], drawer: Drawer) -> dict[str, Any]:
     """Write a PNG for each panel and viewpoint, `charts.json`, and what an eye sees at the first viewpoint and 3 cm
     beside it. Raises InputError, MissingPart."""
-    stack = drawer.stack
-    entries: list[dict[str, Any]] = []
+    charts = []
     with OutputFolder(out) as folder:
+        for name, aside_m in (("fused", 0.0), ("unfused", UNFUSED_M)):
+            write_png(folder.staging / f"reference-{name}.png", drawer.seen(viewpoints[0], aside_m=aside_m))
         for viewpoint in tracked("charts", viewpoints):
-            layers = drawer.layers(viewpoint)
-            files = [f"chart-{viewpoint.name}-layer-{index}.png" for index in range(stack.count)]
-            for name, layer in zip(files, layers, strict=True):
+            files = [f"chart-{viewpoint.name}-layer-{index}.png" for index in range(drawer.stack.count)]
+            for name, layer in zip(files, drawer.layers(viewpoint), strict=True):
                 write_png(folder.staging / name, layer)
-            if not entries:
-                for name, aside_m in (("fused", 0.0), ("unfused", UNFUSED_M)):
-                    eye_m = viewpoint.eyes_m(drawer.ipd_m)[1] + np.array([0.0, aside_m, 0.0])
-                    seen = seen_by(eye_m, layers, stack, fov_deg=chart_fov_deg(viewpoint, stack)).image
-                    picture = np.rint(255 * np.clip(seen, 0, 1)).astype(np.uint8)
-                    write_png(folder.staging / f"reference-{name}.png", picture)
-            entries.append({
+            charts.append({
                 "viewpoint": viewpoint.name,
                 "midpoint_m": viewpoint.midpoint_m,
                 "eyes_m": viewpoint.eyes_m(drawer.ipd_m),
-                "fov_deg": chart_fov_deg(viewpoint, stack),
+                "fov_deg": chart_fov_deg(viewpoint, drawer.stack),
                 "files": files,
             })  # fmt: skip
-        write_json(folder.staging / "charts.json", {"ipd_m": drawer.ipd_m, "model": MODEL, "charts": entries})
-    return {"out": str(out), "viewpoints": [v.name for v in viewpoints], "files": len(entries) * stack.count}
-
-
-def show_charts(settings: Settings, viewpoints: Sequence[Viewpoint], drawer: Drawer) -> None:
-    """One after the other on the panels. Raises as `PanelDisplay`."""
-    display = PanelDisplay(settings, drawer.stack, registered=True)
-    show_pages(display, [v.name for v in viewpoints], lambda number: drawer.layers(viewpoints[number]))
+        write_json(folder.staging / "charts.json", {"ipd_m": drawer.ipd_m, "model": MODEL, "charts": charts})
+    return {"out": str(out), "viewpoints": [v.name for v in viewpoints], "files": len(charts) * drawer.stack.count}
 
 
 class ChartDisplay:
@@ -124,19 +119,15 @@ class ChartDisplay:
     def __init__(self, settings: Settings) -> None:
         """Opens the panels. Raises InputError, MissingPart, PanelLost."""
         self._drawer = Drawer(settings)
-        self.display = PanelDisplay(settings, self._drawer.stack, registered=True)
-        self._viewpoint: Viewpoint | None = None
+        self.display = open_display(settings, registered=True)
 
-    def show(self, viewpoint: Viewpoint) -> None:
-        """The viewpoint's chart. Raises PanelLost."""
-        self._viewpoint = viewpoint
-        self.display.show(self._drawer.layers(viewpoint))
-
-    def caption(self, text: str) -> None:
-        """A line of words below the chart. Raises PanelLost."""
-        if self._viewpoint is not None:
-            eyes_m, layers = self._viewpoint.eyes_m(self._drawer.ipd_m), self._drawer.layers(self._viewpoint)
-            self.display.show(captioned(layers, text, stack=self._drawer.stack, eyes_m=eyes_m))
+    def show(self, viewpoint: Viewpoint, *, caption: str = "") -> None:
+        """The viewpoint's chart, and a line of words below it. Raises PanelLost."""
+        layers = self._drawer.layers(viewpoint)
+        if caption:
+            eyes_m = viewpoint.eyes_m(self._drawer.ipd_m)
+            layers = captioned(layers, caption, stack=self._drawer.stack, eyes_m=eyes_m)
+        self.display.show(layers)
 
     def close(self) -> None:
         """Close the panels and the model. May be called twice."""

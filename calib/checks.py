@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from calib.pairs import Pairs
@@ -23,49 +21,42 @@ MIRROR_GAIN = 0.5  # mirrored data fit a mirrored sensor this much better at lea
 NAMED = 8  # pairs that a message lists
 
 
-@dataclass(frozen=True, slots=True)
-class Checked:
-    """Pairs that may be solved, and what was noticed about them."""
-
-    pairs: Pairs
-    warnings: tuple[str, ...]
-
-
-def check_pairs(pairs: Pairs) -> Checked:
-    """Refuse what no method can solve; drop exact duplicates. Raises InputError with the pairs' file.
+def check_pairs(pairs: Pairs) -> tuple[Pairs, list[str]]:
+    """The pairs that may be solved, without exact duplicates, and warnings. Raises InputError with the pairs' file.
 
     Refused: fewer than 3 pairs, coincident, collinear, beyond double precision, mirrored, mixed units.
     """
     warnings = []
-    unique = _unique_rows(pairs)
+    table = np.column_stack([pairs.sensor_m, pairs.stack_m])
+    unique = np.sort(np.unique(table, axis=0, return_index=True)[1])
     if len(unique) < len(pairs):
-        dropped = sorted(set(range(len(pairs))) - set(unique))
+        dropped = np.setdiff1d(np.arange(len(pairs)), unique).tolist()
         warnings.append(f"{_listed(pairs, dropped)}: repeats an earlier pair exactly; left out")
         pairs = pairs.only(unique)
-    try:
-        plain = fit(pairs.sensor_m, pairs.stack_m, rule="inverse")
-    except Degenerate as problem:
-        if _is_mirrored(pairs):
-            raise InputError(pairs.source, "pairs", _MIRRORED) from None
-        raise InputError(pairs.source, "pairs", str(problem)) from None
     if _is_mirrored(pairs):
-        raise InputError(pairs.source, "pairs", _MIRRORED)
-    _refuse_units(pairs, float(plain.scale))
+        raise InputError(
+            pairs.source,
+            "pairs",
+            "sensor and stack are mirror images (determinant negative): an axis points the wrong way; "
+            "sensor is x right, y down, z away from the camera, stack is x to the viewer, y right, z up",
+        )
+    try:
+        scale = float(fit(pairs.sensor_m, pairs.stack_m, rule="inverse").scale)
+    except Degenerate as error:
+        raise InputError(pairs.source, "pairs", str(error)) from None
+    for wrong, side in ((1e-3, "sensor"), (1e3, "stack")):
+        if 0.8 < scale / wrong < 1.25:
+            problem = f"units are mixed (scale {scale:.4g}): {side} is in millimetres? Metres are wanted"
+            raise InputError(pairs.source, f"{side}_x", problem)
     first, _, third = extents(pairs.stack_m)
     if third <= COPLANAR * first:
         warnings.append(
             "the viewpoints lie in one plane: enough for the rotation, but mirrored axes would go unnoticed"
         )
-    return Checked(pairs, tuple(warnings))
+    return pairs, warnings
 
 
-_MIRRORED = (
-    "sensor and stack are mirror images (determinant negative): an axis points the wrong way; "
-    "sensor is x right, y down, z away from the camera, stack is x to the viewer, y right, z up"
-)
-
-
-def check_solution(pairs: Pairs, solution: Solution, volume_m: F64) -> tuple[str, ...]:
+def check_solution(pairs: Pairs, solution: Solution, volume_m: F64) -> list[str]:
     """Warnings about a solution; `volume_m` (..., 3): where viewers are. Raises InputError: not to be used."""
     warnings = []
     check_similarity(solution.similarity.matrix, source=pairs.source)
@@ -104,25 +95,12 @@ def check_solution(pairs: Pairs, solution: Solution, volume_m: F64) -> tuple[str
         warnings.append(f"the scale is {scale:.5g}: the runtime expects metres in both frames")
     if not np.isfinite(solution.leave_one_out_m).all():
         warnings.append("some pair cannot be left out without losing the solution: take more viewpoints")
-    return tuple(warnings)
-
-
-def _unique_rows(pairs: Pairs) -> list[int]:
-    table = np.column_stack([pairs.sensor_m, pairs.stack_m])
-    _, index = np.unique(table, axis=0, return_index=True)
-    return sorted(index.tolist())
+    return warnings
 
 
 def _listed(pairs: Pairs, index: list[int]) -> str:
     names = [pairs.names[i] for i in index[:NAMED]]
     return ", ".join(names) + (f" and {len(index) - NAMED} more" if len(index) > NAMED else "")
-
-
-def _refuse_units(pairs: Pairs, scale: float) -> None:
-    for wrong, side in ((1e-3, "sensor"), (1e3, "stack")):
-        if 0.8 < scale / wrong < 1.25:
-            problem = f"units are mixed (scale {scale:.4g}): {side} is in millimetres? Metres are wanted"
-            raise InputError(pairs.source, f"{side}_x", problem)
 
 
 def _is_mirrored(pairs: Pairs) -> bool:

@@ -52,24 +52,25 @@ def panels(
         raise InputError("calibrate panels", "--write", "needs --config and --photos")
     settings = _settings(config)
     if photos is not None and out is not None:
-        from calib.photographs import photograph_files, read_photograph
+        from calib.photographs import photographs
         from calib.registration_run import register_photos
 
-        pictures = ((path.name, read_photograph(path)) for path in photograph_files(photos))
-        summary, text = register_photos(pictures, str(photos), out, settings, config=config if write else None)
-        _report(summary, as_json, text)
+        summary, text = register_photos(
+            photographs(photos), str(photos), out, settings, config=config if write else None
+        )
+        _report(summary, text, as_json)
         return
-    from calib.board import board_layers
-    from calib.display import PanelDisplay, show_pages
+    from calib.board import boards
+    from calib.display import grey_layers, open_display, show_pages
     from calib.registration_run import write_boards
 
     stack = settings.stack.stack()
     if out is not None:
         summary = write_boards(out, stack)
-        _report(summary, as_json, f"{len(summary['files'])} boards in {out}")
+        _report(summary, f"{len(summary['files'])} boards in {out}", as_json)
     if show:
-        layers = board_layers(stack)
-        show_pages(PanelDisplay(settings, stack), ["the boards of all panels"], lambda page: layers)
+        layers = grey_layers(boards(stack))
+        show_pages(open_display(settings), ["the boards of all panels"], lambda page: layers)
 
 
 @app.command()
@@ -103,30 +104,27 @@ def grey(
         raise InputError("calibrate grey", "--panel", f"must be 0 to {stack.count - 1}")
     source = photos or series
     if source is not None and out is not None:
-        from calib.grey import read_series
-        from calib.grey_run import fit_lut, photographed_series
-        from calib.photographs import photograph_files, read_photograph
+        from calib.grey import fit_lut, read_series
+        from calib.grey_chart import photographed_series
+        from calib.photographs import photographs
 
         if photos is None:
             measured = read_series(source)
         else:
-            pictures = ((path.name, read_photograph(path)) for path in photograph_files(photos))
-            measured = photographed_series(pictures, stack, panel=panel, source=str(photos))
-        summary, text = fit_lut(out, measured, source=str(source))
-        _report(summary, as_json, text)
+            measured = photographed_series(photographs(photos), stack, panel=panel, source=str(photos))
+        _report(*fit_lut(out, measured, source=source), as_json)
         return
-    from calib.display import PanelDisplay, alone, show_pages
+    from calib.display import alone, open_display, show_pages
     from calib.grey_chart import grey_chart
     from runtime.support.artifacts import write_png
 
     chart = grey_chart(stack, panel)
     if out is not None:
         write_png(out, chart)
-        _report({"file": str(out)}, as_json, f"{out}")
+        _report({"file": str(out)}, str(out), as_json)
     if show:
         layers = alone(chart, stack, index=panel)
-        display = PanelDisplay(settings, stack, grey_curve=False)
-        show_pages(display, [f"the grey chart of panel {panel}"], lambda page: layers)
+        show_pages(open_display(settings, grey_curve=False), [f"the chart of panel {panel}"], lambda page: layers)
 
 
 @app.command()
@@ -143,7 +141,8 @@ def charts(
     """
     if out is None and not show:
         raise InputError("calibrate charts", "--out", "is missing (or give --show)")
-    from calib.charts import Drawer, make_charts, show_charts
+    from calib.charts import Drawer, make_charts
+    from calib.display import open_display, show_pages
 
     settings = _settings(config)
     chosen = _viewpoints(viewpoint, settings)
@@ -151,9 +150,10 @@ def charts(
     try:
         if out is not None:
             summary = make_charts(out, chosen, drawer)
-            _report(summary, as_json, f"{summary['files']} files for {len(chosen)} viewpoints in {out}")
+            _report(summary, f"{summary['files']} files for {len(chosen)} viewpoints in {out}", as_json)
         if show:
-            show_charts(settings, chosen, drawer)
+            display = open_display(settings, registered=True)
+            show_pages(display, [v.name for v in chosen], lambda number: drawer.layers(chosen[number]))
     finally:
         drawer.close()
 
@@ -189,7 +189,7 @@ def capture(
         finally:
             keys.close()
             hardware.close()
-    _report(summary, as_json, f"{summary['pairs']} pairs in {out} ({summary['accepted']} new)")
+    _report(summary, f"{summary['pairs']} pairs in {out} ({summary['accepted']} new)", as_json)
 
 
 @app.command()
@@ -212,7 +212,7 @@ def solve(
     summary, text = solve_file(pairs, out, settings=_settings(config), method=method, known_scale=scale)
     for warning in summary["warnings"]:
         typer.echo(f"warning: {warning}", err=True)
-    _report(summary, as_json, text)
+    _report(summary, text, as_json)
 
 
 @app.command()
@@ -230,7 +230,7 @@ def report(
 
     settings = _settings(config)
     summary = write_report(file, out, stack=settings.stack.stack(), viewing=settings.calibration)
-    _report(summary, as_json, f"{out / 'index.html'}")
+    _report(summary, str(out / "index.html"), as_json)
 
 
 def _settings(config: Path | None) -> Settings:
@@ -239,7 +239,7 @@ def _settings(config: Path | None) -> Settings:
     return load_settings(config)
 
 
-def _report(summary: dict[str, Any], as_json: bool, text: str) -> None:
+def _report(summary: dict[str, Any], text: str, as_json: bool) -> None:
     """Print a command's summary as one JSON object, or its text for a person."""
     from runtime.support.artifacts import to_json
 

@@ -13,6 +13,7 @@ from calib.keys import Key, TerminalKeys, WindowKeys
 from runtime.clock import NS_PER_MS, MonotonicClock
 from runtime.config import Settings
 from runtime.optics.stack import PanelStack
+from runtime.panels.base import PanelSink
 from runtime.panels.registry import open_panels, panel_settings
 from runtime.records import U8, PanelFrame
 from runtime.support.gl import offscreen_context
@@ -26,26 +27,13 @@ LETTERS = 0.055  # of the height
 
 
 class PanelDisplay:
-    """All panels, showing one set of layers until given another."""
+    """All panels, showing one set of layers until given another, and the keys that are pressed on them."""
 
-    def __init__(
-        self, settings: Settings, stack: PanelStack, *, registered: bool = False, grey_curve: bool = True
-    ) -> None:
-        """registered, grey_curve: as configured; False: the bare panels, for what measures them.
-
-        Raises InputError, MissingPart, PanelLost.
-        """
-        changes: dict[str, object] = {} if registered else {"homography": IDENTITY}
-        if not grey_curve:
-            changes |= {"lut": "", "gamma": 1.0}
-        panels = tuple(panel.model_copy(update=changes) for panel in panel_settings(settings.output, stack.count))
-        output = settings.output.model_copy(update={"panels": panels})
-        self._sink = open_panels(output, stack, MonotonicClock(), offscreen_context())
+    def __init__(self, sink: PanelSink) -> None:
+        self._sink = sink
         self._layers: U8 | None = None
         self._number = 0
-        self.keys = WindowKeys(self._sink)
-        if settings.output.kind == "offscreen":
-            typer.echo("warning: output.kind is offscreen: nobody sees what is shown", err=True)
+        self._keys = WindowKeys(sink)
 
     def show(self, layers: U8) -> None:
         """(N, H, W, 4) layers on all panels. Raises PanelLost."""
@@ -53,14 +41,34 @@ class PanelDisplay:
         self._number += 1
         self._sink.present(PanelFrame(self._number, layers, self._number))
 
-    def again(self) -> None:
-        """The same once more: it takes in the windows' events and keeps them alive. Raises PanelLost."""
+    def key(self) -> Key | None:
+        """The next key, or None. The same layers once more: it takes in the windows' events and keeps them alive.
+
+        Raises PanelLost.
+        """
         if self._layers is not None:
             self.show(self._layers)
+        return self._keys.poll()
 
     def close(self) -> None:
         """Close the panels. May be called twice."""
         self._sink.close()
+
+
+def open_display(settings: Settings, *, registered: bool = False, grey_curve: bool = True) -> PanelDisplay:
+    """The configured panels. registered, grey_curve: as configured; False: the bare panels, for what measures them.
+
+    Raises InputError, MissingPart, PanelLost.
+    """
+    stack = settings.stack.stack()
+    changes: dict[str, object] = {} if registered else {"homography": IDENTITY}
+    if not grey_curve:
+        changes |= {"lut": "", "gamma": 1.0}
+    panels = tuple(panel.model_copy(update=changes) for panel in panel_settings(settings.output, stack.count))
+    output = settings.output.model_copy(update={"panels": panels})
+    if output.kind == "offscreen":
+        typer.echo("warning: output.kind is offscreen: nobody sees what is shown", err=True)
+    return PanelDisplay(open_panels(output, stack, MonotonicClock(), offscreen_context()))
 
 
 def show_pages(display: PanelDisplay, titles: Sequence[str], draw: Callable[[int], U8]) -> None:
@@ -75,33 +83,30 @@ def show_pages(display: PanelDisplay, titles: Sequence[str], draw: Callable[[int
                 shown = number
                 display.show(draw(number))
                 typer.echo(f"{titles[number]}  (Enter, n: next, p: previous, q: stop)", err=True)
-            key = keys.poll() or display.keys.poll()
+            key = keys.poll() or display.key()
             if key is Key.QUIT:
                 return
             if key in (Key.ACCEPT, Key.NEXT, Key.RIGHT):
                 number += 1
             elif key in (Key.PREVIOUS, Key.LEFT):
                 number = max(0, number - 1)
-            elif key is None:
+            else:
                 clock.sleep_until_ns(clock.now_ns() + POLL_NS)
-                display.again()
     finally:
         display.close()
         keys.close()
 
 
-def blank_layers(stack: PanelStack) -> U8:
-    """(N, H, W, 4) layers that turn no light."""
-    layers = np.zeros((stack.count, stack.height_px, stack.width_px, 4), np.uint8)
-    layers[..., 3] = 255
-    return layers
+def grey_layers(pictures: U8) -> U8:
+    """(N, H, W, 4) layers of grey pictures (N, H, W), one for each panel."""
+    return np.concatenate([np.repeat(pictures[..., None], 3, axis=-1), np.full_like(pictures[..., None], 255)], axis=-1)
 
 
 def alone(picture: U8, stack: PanelStack, *, index: int) -> U8:
     """(N, H, W, 4) layers in which one panel shows a grey (H, W) picture and the others turn no light."""
-    layers = blank_layers(stack)
-    layers[index, ..., :3] = picture[..., None]
-    return layers
+    pictures = np.zeros((stack.count, *picture.shape), np.uint8)
+    pictures[index] = picture
+    return grey_layers(pictures)
 
 
 def message_layers(stack: PanelStack, lines: Sequence[str]) -> U8:

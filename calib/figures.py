@@ -2,44 +2,52 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
 from runtime.report.plots import drawing, png
 
-BARS = 200  # of more points each is a dot
-AXES = ("X", "Y", "Z")
-COLOURS = ("#c0392b", "#27803b", "#2260a8")
+COLOURS = {"X": "#c0392b", "Y": "#27803b", "Z": "#2260a8"}
+GAZE_M = 0.12  # length of the arrow of the camera's line of sight
 
 
-def residual_figure(residual_m: F64, used: Any, *, limit_m: float) -> bytes:
+@dataclass(frozen=True, slots=True)
+class Points:
+    """The pairs behind a calibration."""
+
+    names: tuple[str, ...]
+    stack_m: F64  # (K, 3) known
+    fitted_m: F64  # (K, 3) where the calibration puts them, frame `stack`
+    used: NDArray[np.bool_]  # (K,)
+
+    @property
+    def residual_m(self) -> F64:
+        """(K, 3) calibrated minus known."""
+        return self.fitted_m - self.stack_m
+
+
+def residual_figure(points: Points, *, limit_m: float) -> bytes:
     """X, Y, Z error of every calibration point (the EyeReal supplement's figure S5), millimetres."""
+    residual_m, used = points.residual_m, points.used
     with drawing(9, 6.5) as canvas:
         axes = canvas.subplots(nrows=3, sharex=True, sharey=True)
         numbers = np.arange(1, len(residual_m) + 1)
         largest = 1e3 * max(float(np.abs(residual_m[used]).max(initial=0.0)), 1e-6)
-        for axis, (panel, name) in enumerate(zip(axes, AXES, strict=True)):
-            values = residual_m[:, axis] * 1e3
+        for panel, (name, colour), values in zip(axes, COLOURS.items(), residual_m.T * 1e3, strict=True):
             shown = np.clip(values, -2 * largest, 2 * largest)
-            for chosen, colour, label in (
-                (used, COLOURS[axis], "used"),
-                (~used, "#bbbbbb", "rejected (may be cut off)"),
-            ):
-                if not chosen.any():
-                    continue
-                if len(numbers) <= BARS:
-                    panel.bar(numbers[chosen], shown[chosen], color=colour, width=0.7, label=label)
-                else:
-                    panel.plot(numbers[chosen], shown[chosen], ".", color=colour, markersize=1.5, label=label)
+            panel.vlines(numbers[used], 0, shown[used], color=colour, linewidth=2, label="used")
+            panel.vlines(numbers[~used], 0, shown[~used], color="#bbbbbb", linewidth=2,
+                         label="rejected (may be cut off)")  # fmt: skip
             rms = float(np.sqrt((values[used] ** 2).mean()))
             panel.axhline(0, color="#222222", linewidth=0.8)
             panel.set(ylabel=f"{name} error (mm)", title=f"{name}: RMS {rms:.2f} mm")
             if limit_m * 1e3 < 2 * largest:
-                panel.axhline(limit_m * 1e3, color="#c0392b", linestyle="--", linewidth=0.8)
-                panel.axhline(-limit_m * 1e3, color="#c0392b", linestyle="--", linewidth=0.8)
+                for limit_mm in (-limit_m * 1e3, limit_m * 1e3):
+                    panel.axhline(limit_mm, color="#c0392b", linestyle="--", linewidth=0.8)
         if (~used).any():
             axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, fontsize=8, frameon=False)
         axes[-1].set_xlabel("calibration point")
@@ -47,33 +55,28 @@ def residual_figure(residual_m: F64, used: Any, *, limit_m: float) -> bytes:
         return png(canvas)
 
 
-def geometry_figure(
-    camera_m: F64, gaze: F64, stack: PanelStack, *, points_m: F64 | None, fitted_m: F64 | None, used: Any = None
-) -> bytes:
+def geometry_figure(stack_from_sensor: F64, stack: PanelStack, points: Points | None) -> bytes:
     """Camera, panels and points from above (x, y) and from the side (x, z); frame `stack`."""
+    camera_m = stack_from_sensor[:3, 3]
+    tip_m = camera_m + GAZE_M * stack_from_sensor[:3, 2] / np.linalg.norm(stack_from_sensor[:3, 2])
     with drawing(11, 5) as canvas:
         axes = canvas.subplots(ncols=2)
         views = ((1, stack.width_m, "from above", "y: the viewer's right (m)"), (2, stack.height_m, "from the side",
                                                                                "z: up (m)"))  # fmt: skip
         for panel, (axis, size, title, label) in zip(axes, views, strict=True):
+            plane = [0, axis]
             for index, x_m in enumerate(stack.x_m):
                 name = "panels" if index == 0 else None
                 panel.plot([x_m, x_m], [-size / 2, size / 2], color="#2260a8", linewidth=2, label=name)
-            if points_m is not None and fitted_m is not None:
-                good = points_m[used]
-                panel.plot(good[:, 0], good[:, axis], "o", color="none", markeredgecolor="#222222", label="known")
-                panel.plot(fitted_m[used][:, 0], fitted_m[used][:, axis], "x", color="#c0392b", label="calibrated")
-                if (~used).any():
-                    wrong = fitted_m[~used]
-                    panel.plot(wrong[:, 0], wrong[:, axis], "x", color="#aaaaaa", label="rejected")
-            reach = 0.12
-            panel.plot(camera_m[0], camera_m[axis], "s", color="#27803b", markersize=8, label="camera")
-            panel.annotate(
-                "",
-                (camera_m[0] + reach * gaze[0], camera_m[axis] + reach * gaze[axis]),
-                (camera_m[0], camera_m[axis]),
-                arrowprops={"arrowstyle": "->", "color": "#27803b", "linewidth": 1.5},
-            )
+            if points is not None:
+                known, fitted = (values[:, plane] for values in (points.stack_m, points.fitted_m))
+                panel.plot(*known[points.used].T, "o", color="none", markeredgecolor="#222222", label="known")
+                panel.plot(*fitted[points.used].T, "x", color="#c0392b", label="calibrated")
+                if not points.used.all():
+                    panel.plot(*fitted[~points.used].T, "x", color="#aaaaaa", label="rejected")
+            panel.plot(*camera_m[plane], "s", color="#27803b", markersize=8, label="camera")
+            arrow = {"arrowstyle": "->", "color": "#27803b", "linewidth": 1.5}
+            panel.annotate("", tip_m[plane], camera_m[plane], arrowprops=arrow)
             panel.set_aspect("equal", adjustable="datalim")
             panel.set(xlabel="x: towards the viewer (m)", ylabel=label, title=f"Seen {title}")
         canvas.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)

@@ -13,22 +13,22 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import BaseModel
-from scipy.interpolate import PchipInterpolator
+from scipy.interpolate import BPoly, PchipInterpolator
 from scipy.optimize import least_squares
-from scipy.special import comb
 
 from calib.tables import Number, read_table, validated_rows
 from runtime.errors import InputError
 from runtime.optics.malus import intensity_from_phase, phase_from_intensity
 from runtime.panels.lut import COLUMNS
 from runtime.records import F64
+from runtime.support.artifacts import write_text
 
 CHANNELS = ("red", "green", "blue")
 MIN_LEVELS = 4
@@ -59,7 +59,8 @@ class GreyCurve:
         return value if self.of_intensity else intensity_from_phase(value)
 
     def _polynomial(self, grey: ArrayLike) -> F64:
-        return _bernstein(np.clip(np.asarray(grey, dtype=np.float64), 0, 1) ** self.gamma, self.coefficients)
+        polynomial = BPoly(self.coefficients[:, None], [0.0, 1.0])
+        return np.asarray(polynomial(np.clip(np.asarray(grey, dtype=np.float64), 0, 1) ** self.gamma))
 
     def grey(self, phase: ArrayLike) -> F64:
         """Grey in [0, 1] for a phase in [0, 1]: the inverse, by monotone interpolation of a dense table."""
@@ -71,14 +72,6 @@ class GreyCurve:
         inverse = PchipInterpolator(phases[rising], greys[rising])
         found: F64 = np.clip(inverse(np.clip(phase, 0.0, phases[-1])), 0.0, 1.0)
         return found
-
-
-def _bernstein(x: F64, coefficients: F64) -> F64:
-    degree = len(coefficients) - 1
-    order = np.arange(degree + 1)
-    basis = comb(degree, order) * x[..., None] ** order * (1 - x[..., None]) ** (degree - order)
-    found: F64 = basis @ coefficients
-    return found
 
 
 def _coefficients(free: F64) -> F64:
@@ -172,10 +165,6 @@ class GreyRow(BaseModel):
     grey: Number
     luminance: Number
 
-    @property
-    def channels(self) -> tuple[float, float, float]:
-        return self.luminance, self.luminance, self.luminance
-
 
 class ColourRow(BaseModel):
     """The luminances of the three channels at a grey."""
@@ -185,10 +174,6 @@ class ColourRow(BaseModel):
     green: Number
     blue: Number
 
-    @property
-    def channels(self) -> tuple[float, float, float]:
-        return self.red, self.green, self.blue
-
 
 def read_series(path: Path) -> Series:
     """CSV with columns grey and luminance, or grey, red, green, blue. Greys above 1 are taken as 0 to 255.
@@ -197,17 +182,16 @@ def read_series(path: Path) -> Series:
     """
     table = read_table(path)
     coloured = set(CHANNELS) <= table.columns
-    rows: Sequence[GreyRow | ColourRow] = validated_rows(table, ColourRow if coloured else GreyRow)
+    rows = [list(row.model_dump().values()) for row in validated_rows(table, ColourRow if coloured else GreyRow)]
     if not rows:
         raise InputError(path, "grey", "there are no rows")
-    grey = np.array([row.grey for row in rows])
+    grey, luminance = np.array(rows)[:, 0], np.array(rows)[:, 1:]
     grey = grey / (255.0 if grey.max() > 1.0 else 1.0)
     if grey.min() < 0.0 or grey.max() > 1.0:
         raise InputError(path, "grey", "must lie between 0 and 1, or 0 and 255")
-    luminance = np.array([row.channels for row in rows])
     if luminance.min() < 0.0:
         raise InputError(path, "luminance", "must not be negative")
-    return Series(grey, luminance)
+    return Series(grey, np.broadcast_to(luminance, (len(grey), 3)))
 
 
 def fit_series(series: Series, source: Path | str) -> tuple[GreyCurve, GreyCurve, GreyCurve]:
@@ -219,3 +203,21 @@ def fit_series(series: Series, source: Path | str) -> tuple[GreyCurve, GreyCurve
         except ValueError as problem:
             raise InputError(source, name, str(problem)) from None
     return curves[0], curves[1], curves[2]
+
+
+def fit_lut(out: Path, series: Series, *, source: Path | str) -> tuple[dict[str, Any], str]:
+    """Write a panel's LUT; returns the summary and its text. Raises InputError."""
+    curves = fit_series(series, source)
+    write_text(out, lut_text(curves))
+    channels = dict(zip(CHANNELS, curves, strict=True))
+    lines = [
+        f"{name}: smooth in {'intensity' if curve.of_intensity else 'phase'}, gamma {curve.gamma:.3f}, contrast "
+        f"{1 + curve.span / max(curve.dark, 1e-9 * curve.span):.4g}, residual {100 * curve.residual:.2f}% of the range"
+        for name, curve in channels.items()
+    ]
+    summary = {
+        "file": str(out),
+        "channels": {name: asdict(curve) for name, curve in channels.items()},
+        "residual": max(curve.residual for curve in curves),
+    }
+    return summary, "\n".join([*lines, str(out)])

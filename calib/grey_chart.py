@@ -7,6 +7,7 @@ camera. The board's marks among them tell where each patch lies in a photograph.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -18,6 +19,7 @@ from scipy.optimize import least_squares
 from calib.board import CORNER, TILE, board, marks
 from calib.detect_marks import find_marks
 from calib.grey import Series
+from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 
@@ -31,10 +33,6 @@ MIN_MARKS = 4
 FALLS = 0.01  # of the range: a brighter grey that is darker by more is no grey curve
 CLIPPED = 0.02
 BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
-
-
-class Unusable(ValueError):
-    """A photograph without a grey curve; the text says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +55,7 @@ def patches(stack: PanelStack, panel: int) -> tuple[Patch, ...]:
         (left, top)
         for top in range(round(MARGIN * stack.height_px), round((1 - MARGIN) * stack.height_px) - side, pitch)
         for left in range(round(MARGIN * stack.width_px), round((1 - MARGIN) * stack.width_px) - side, pitch)
-        if not any(_covers(stack, panel, left, top, side))
+        if not _is_covered(stack, panel, left, top, side)
     ]
     kinds = [(grey, 0.0) for grey in GREYS] + [(-1, share) for share in SHARES]
     order = np.random.default_rng(panel).permutation(len(free))
@@ -68,15 +66,15 @@ def patches(stack: PanelStack, panel: int) -> tuple[Patch, ...]:
     return tuple(found)
 
 
-def _covers(stack: PanelStack, panel: int, left: int, top: int, side: int) -> list[bool]:
-    found = []
+def _is_covered(stack: PanelStack, panel: int, left: int, top: int, side: int) -> bool:
+    """Whether a square lies on one of the board's marks, or nearly."""
     for mark in marks(stack):
-        if mark.panel == panel:
-            u, v = (place - CORNER * mark.unit_px for place in (mark.left_px, mark.top_px))
-            tile, gap = TILE * mark.unit_px, 2 * mark.unit_px
-            found.append(u - gap < left + side and left < u + tile + gap and v - gap < top + side
-                         and top < v + tile + gap)  # fmt: skip
-    return found
+        gap, tile = 2 * mark.unit_px, TILE * mark.unit_px
+        u, v = (place - CORNER * mark.unit_px - gap for place in (mark.left_px, mark.top_px))
+        reach = tile + 2 * gap
+        if mark.panel == panel and u - side < left < u + reach and v - side < top < v + reach:
+            return True
+    return False
 
 
 def grey_chart(stack: PanelStack, panel: int) -> U8:
@@ -92,15 +90,22 @@ def grey_chart(stack: PanelStack, panel: int) -> U8:
     return picture
 
 
-def histograms(picture: U8, stack: PanelStack, panel: int) -> NDArray[np.float64]:
+def photographed_series(pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, panel: int, source: str) -> Series:
+    """Relative luminance of every grey from named photographs (h, w) of a panel's chart. Raises InputError."""
+    found = [histograms(picture, stack, panel, source=f"{source}, {name}") for name, picture in pictures]
+    return measure(found, stack, panel, source=source)
+
+
+def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> NDArray[np.float64]:
     """(P, 256) shares of the code values in the middle of every patch of a grey photograph (h, w).
 
-    Raises Unusable.
+    Raises InputError.
     """
     seen = find_marks(picture, stack, name="")
-    mine = seen.panel == panel
-    if seen.marks[panel] < MIN_MARKS:
-        raise Unusable(f"shows {seen.marks[panel]} marks of panel {panel}: blurred, cut off, or another panel's chart")
+    mine, marks_seen = seen.panel == panel, seen.marks[panel]
+    if marks_seen < MIN_MARKS:
+        problem = f"shows {marks_seen} marks of panel {panel}: blurred, cut off, or another panel's chart"
+        raise InputError(source, "", problem)
     image_from_panel, _ = cv2.findHomography(seen.panel_px[mine], seen.image_px[mine], cv2.RANSAC, 8.0)
     step = (np.arange(SAMPLES) + 0.5) / SAMPLES * INNER + (1 - INNER) / 2
     found = []
@@ -109,22 +114,22 @@ def histograms(picture: U8, stack: PanelStack, panel: int) -> NDArray[np.float64
         places = cv2.perspectiveTransform(np.stack([u, v], axis=-1).reshape(1, -1, 2), image_from_panel)[0]
         column, row = np.rint(places).astype(int).T
         if min(column.min(), row.min()) < 0 or column.max() >= picture.shape[1] or row.max() >= picture.shape[0]:
-            raise Unusable("does not show the whole chart")
+            raise InputError(source, "", "does not show the whole chart")
         found.append(np.bincount(picture[row, column], minlength=256) / len(row))
     counts = np.array(found)
     white = np.array([patch.grey == 255 for patch in patches(stack, panel)])
     if counts[white, 253:].sum(axis=1).mean() > CLIPPED:
-        raise Unusable("is overexposed: white is cut off; expose less")
+        raise InputError(source, "", "is overexposed: white is cut off; expose less")
     if (counts[white] @ np.arange(256)).mean() < 60:
-        raise Unusable("is too dark: expose more")
+        raise InputError(source, "", "is too dark: expose more")
     return counts
 
 
-def measure(pictures: list[NDArray[np.float64]], stack: PanelStack, panel: int) -> Series:
+def measure(pictures: list[NDArray[np.float64]], stack: PanelStack, panel: int, *, source: str) -> Series:
     """Relative luminance of every grey from the histograms of one or more photographs with one exposure.
 
     Fitted together: the camera's tone curve, each photograph's uneven light (a quadratic of its logarithm), and the
-    greys. Raises Unusable where the greys do not ascend.
+    greys. Raises InputError where the greys do not ascend.
     """
     chart = patches(stack, panel)
     place = np.array([[p.left_px / stack.width_px - 0.5, p.top_px / stack.height_px - 0.5] for p in chart])
@@ -160,8 +165,7 @@ def measure(pictures: list[NDArray[np.float64]], stack: PanelStack, panel: int) 
     falls = np.flatnonzero(np.diff(levels) < -FALLS)
     if falls.size:
         lower, upper = GREYS[int(falls[0])], GREYS[int(falls[0]) + 1]
-        raise Unusable(
-            f"grey {upper} is darker than grey {lower}: not a grey curve (a reflection, another exposure, a wrong LUT)"
-        )
+        problem = f"grey {upper} is darker than grey {lower}: not a grey curve"
+        raise InputError(source, "greys", f"{problem} (a reflection, another exposure, a wrong LUT)")
     luminance = dark + (1 - dark) * np.clip(levels, 0.0, None)
     return Series(np.array(GREYS) / 255, np.repeat(luminance[:, None], 3, axis=1))

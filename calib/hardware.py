@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
-import cv2
 import numpy as np
-from rich.console import Console
-from rich.text import Text
 
 from calib.charts import ChartDisplay
-from calib.display import PanelDisplay, message_layers
-from calib.keys import Key, WindowKeys
-from calib.photographs import photograph_files, read_photograph
+from calib.display import PanelDisplay, grey_layers, message_layers, open_display
+from calib.keys import Key
+from calib.photographs import photographs
 from calib.placed import PlacedPanel, misplaced
 from calib.simulator import Exposure, Scene, by_hand, camera_from_stack, camera_rays, phone, photograph, smaller
 from calib.viewpoints import Viewpoint
@@ -32,7 +28,7 @@ from runtime.optics.malus import phase_from_intensity
 from runtime.optics.stack import PanelStack
 from runtime.panels.card import identity_card
 from runtime.panels.monitors import Monitor
-from runtime.records import F64, U8, EyePoints, PanelFrame, SensorFrame
+from runtime.records import F64, U8, EyePoints, SensorFrame
 from runtime.sensor.registry import open_sensor
 from runtime.sensor.worker import OPEN_TIMEOUT_S, SensorWorker
 
@@ -41,7 +37,6 @@ Say = Callable[[str], None]
 Named = tuple[str, U8]  # a photograph (h, w), and what to call it
 POLL_NS = 20 * NS_PER_MS
 CARD_CHARACTERS = 32  # of a line on a card
-TERMINAL_COLUMNS = 72  # of a picture in the terminal
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,18 +65,15 @@ class SetupHardware:
         """keys: of the terminal; those of the panels' windows count besides."""
         self._keys, self._photos = keys, photos
         self._clock = MonotonicClock()
-        self._monitors: tuple[Any, list[U8], tuple[Monitor, ...]] | None = None  # panels, cards
-        self._card: tuple[Any, U8] | None = None  # the one that was shown last, and of what
-        self._display: PanelDisplay | None = None
-        self._bound: Any = None  # the output settings that the display was opened for
-        self._window_keys: WindowKeys | None = None
+        self._display: PanelDisplay | None = None  # whatever windows are open: only one owner at a time
+        self._bound: Any = None  # the output settings that words are shown on
+        self._cards: tuple[list[U8], tuple[Monitor, ...]] = ([], ())
         self._worker: SensorWorker | None = None
         self._find: Any = None
-        self._number = 0
 
     def poll(self) -> Key | None:
-        """A key that was pressed in the terminal or on a panel's window."""
-        return self._keys() or (self._window_keys.poll() if self._window_keys is not None else None)
+        """A key that was pressed in the terminal or on a panel's window, which stays alive by being asked."""
+        return self._keys() or (self._display.key() if self._display is not None else None)
 
     def key(self) -> Key:
         """Wait for a key."""
@@ -90,62 +82,58 @@ class SetupHardware:
         return key
 
     def wait(self) -> None:
-        """A moment; windows stay alive meanwhile."""
+        """A moment."""
         self._clock.sleep_until_ns(self._clock.now_ns() + POLL_NS)
-        if self._display is not None:
-            self._display.again()
 
     def monitors(self) -> tuple[Monitor, ...]:
         """The active monitors. Raises InputError."""
-        self._let_go()
+        self.let_go()
         try:
-            self._monitors = every_monitor()
+            panels, cards, monitors = every_monitor()
         except PanelLost as error:
             raise InputError("monitors", "", str(error)) from None
-        self._window_keys = WindowKeys(self._monitors[0])
-        return self._monitors[2]
+        self._display, self._cards = PanelDisplay(panels), (cards, monitors)
+        return monitors
 
     def show_card(self, number: int, words: Sequence[str]) -> None:
         """Monitor `number` shows its identity card with words as it is sent, the others are clear."""
-        assert self._monitors is not None
-        panels, cards, monitors = self._monitors
-        wanted = (number, tuple(words))
-        if self._card is None or self._card[0] != wanted:
-            height, width = cards[number].shape[:2]
-            lines = [line for text in words for line in wrap(text, CARD_CHARACTERS)]
-            self._card = wanted, identity_card(width, height, title=monitors[number].connector, lines=lines)
-        shown = [self._card[1] if index == number else card for index, card in enumerate(cards)]
-        self._number += 1
-        panels.present(PanelFrame(self._number, card_alone(shown, number), self._number))
+        cards, monitors = self._cards
+        height, width = cards[number].shape[:2]
+        lines = [line for text in words for line in wrap(text, CARD_CHARACTERS)]
+        card = identity_card(width, height, title=monitors[number].connector, lines=lines)
+        if self._display is not None:
+            self._display.show(card_alone([*cards[:number], card, *cards[number + 1 :]], number))
 
     def show_words(self, settings: Settings, lines: Sequence[str]) -> None:
         """Words on the panels, where they are bound already."""
+        if settings.output.kind == "offscreen" or not settings.output.panels:
+            return
         try:
-            display = self._bare_panels(settings)
-            if display is not None:
-                display.show(message_layers(settings.stack.stack(), lines))
+            if self._display is None or self._bound != settings.output:
+                self.let_go()
+                self._display, self._bound = open_display(settings), settings.output
+            self._display.show(message_layers(settings.stack.stack(), lines))
         except (InputError, PanelLost):
-            self._let_go()  # the terminal has the same words
+            self.let_go()  # the terminal has the same words
 
-    def photographs(self, settings: Settings, layers: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
-        """Photographs of layers that the bare panels show: the boards, or the grey chart of one panel.
+    def photographs(self, settings: Settings, pictures: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
+        """Photographs of what the bare panels show (N, H, W): the boards, or the grey chart of one panel.
 
         Raises InputError, PanelLost.
         """
-        self._let_go()
+        self.let_go()
         folder = self._photos if panel is None else self._photos / f"grey-{panel}"
         count = "8 to 20 photographs of the boards" if panel is None else "two or three photographs of it"
-        self._display = PanelDisplay(settings, settings.stack.stack(), grey_curve=panel is None)
-        self._window_keys = self._display.keys
+        self._display = open_display(settings, grey_curve=panel is None)
         try:
-            self._display.show(layers)
+            self._display.show(grey_layers(pictures))
             say(f"put {count} into {folder}, then Enter (q: stop)")
             while (key := self.key()) is not Key.ACCEPT:
                 if key is Key.QUIT:
                     raise InputError("photographs", "", "stopped before there were any")
         finally:
-            self._let_go()
-        return ((path.name, read_photograph(path)) for path in photograph_files(folder))
+            self.let_go()
+        return photographs(folder)
 
     def open_sensor(self, settings: Settings) -> str:
         """Start the sensor and wait for it; returns what it is. Raises InputError."""
@@ -183,34 +171,21 @@ class SetupHardware:
 
     def chart(self, settings: Settings) -> ChartDisplay | None:
         """What shows charts and captions while capturing; None: nobody sees any."""
-        self._let_go()
+        self.let_go()
         chart = ChartDisplay(settings)
-        self._display, self._window_keys = chart.display, chart.display.keys
+        self._display = chart.display
         return chart
 
     def close(self) -> None:
         """Give everything back. May be called twice."""
-        self._let_go()
+        self.let_go()
         self._stop_sensor()
 
-    def _bare_panels(self, settings: Settings) -> PanelDisplay | None:
-        if settings.output.kind == "offscreen" or not settings.output.panels:
-            return None
-        if self._display is None or self._bound != settings.output:
-            self._let_go()
-            self._display, self._bound = PanelDisplay(settings, settings.stack.stack()), settings.output
-            self._window_keys = self._display.keys
-        return self._display
-
-    def _let_go(self) -> None:
-        """Close whatever windows are open: only one owner at a time."""
-        self._window_keys = self._bound = None
-        if self._monitors is not None:
-            self._monitors[0].close()
-            self._monitors = None
+    def let_go(self) -> None:
+        """Close whatever windows are open."""
         if self._display is not None:
             self._display.close()
-            self._display = None
+        self._display = self._bound = None
 
     def _stop_sensor(self) -> None:
         if self._worker is not None:
@@ -232,7 +207,7 @@ GREY_GAMMA, GREY_SPREAD = 2.2, 0.2  # of the light that a panel's monitor makes 
 class SimulatedHardware(SetupHardware):
     """A display that is not there: its panels are off, its monitors mixed up, and a person stands where asked to.
 
-    The terminal shows what a person would see. The depth sensor stands where the built-in recording's does, so that
+    The terminal says what a person would see. The depth sensor stands where the built-in recording's does, so that
     `run` can replay that afterwards.
     """
 
@@ -264,15 +239,8 @@ class SimulatedHardware(SetupHardware):
         )
 
     def show_card(self, number: int, words: Sequence[str]) -> None:
-        """In the terminal: the card as it stands before the person, and which panel it is on."""
-        if self._card is not None and self._card[0] == (number, tuple(words)):
-            return
+        """In the terminal: which panel the card is on, and how it looks."""
         rotation_deg, mirror = self.mounted[number]
-        lines = [line for text in words for line in wrap(text, CARD_CHARACTERS)]
-        card = identity_card(self._stack.width_px, self._stack.height_px, title=f"SIM-{number}", lines=lines)
-        seen = card[::-1, ::-1] if rotation_deg else card
-        self._card = (number, tuple(words)), card
-        show_in_terminal(seen[:, ::-1] if mirror != "none" else seen)
         self._say(
             f"(simulated: it is panel {self.order[number]}; its arrow points {'down' if rotation_deg else 'up'}, its "
             f"writing {'is mirrored' if mirror != 'none' else 'reads rightly'})"
@@ -285,10 +253,10 @@ class SimulatedHardware(SetupHardware):
         """(...) the phase that a panel truly has where it is sent a grey in [0, 1]."""
         return phase_from_intensity(np.asarray(grey, dtype=np.float64) ** self.grey_gammas[panel], branch=1)
 
-    def photographs(self, settings: Settings, layers: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
+    def photographs(self, settings: Settings, pictures: U8, *, panel: int | None, say: Say) -> Iterator[Named]:
         stack, codes = settings.stack.stack(), np.arange(256) / 255
         turned = [np.rint(255 * self.phase_of(index, codes)).astype(np.uint8) for index in range(stack.count)]
-        phases = np.stack([turn[layer[..., 0]] for turn, layer in zip(turned, layers, strict=True)])
+        phases = np.stack([turn[picture] for turn, picture in zip(turned, pictures, strict=True)])
         scene = Scene(stack, self.true_panels, phases)
         if panel is None:
             lens, exposure = smaller(phone(random=self._random), BOARD_SIZE), Exposure()
@@ -301,10 +269,7 @@ class SimulatedHardware(SetupHardware):
         say(f"(simulated: {len(poses)} photographs by hand, with a phone)")
         rays = camera_rays(lens)
         for number, pose in enumerate(poses, start=1):
-            picture = photograph(scene, lens, pose, exposure, random=self._random, rays=rays)
-            if number == 1:
-                show_in_terminal(np.repeat(picture[..., None], 3, axis=2))
-            yield f"photograph {number}", picture
+            yield f"photograph {number}", photograph(scene, lens, pose, exposure, random=self._random, rays=rays)
 
     def open_sensor(self, settings: Settings) -> str:
         return "a simulated sensor, where the built-in recording's stands"
@@ -330,18 +295,3 @@ class SimulatedHardware(SetupHardware):
 
     def chart(self, settings: Settings) -> ChartDisplay | None:
         return None
-
-
-def show_in_terminal(picture: U8) -> None:
-    """A picture (h, w, 3 or 4) as coloured half blocks, where stdout is a terminal that has colours."""
-    if not sys.stdout.isatty():
-        return
-    height, width = picture.shape[:2]
-    rows = round(TERMINAL_COLUMNS * height / width / 2) * 2
-    small = cv2.resize(np.ascontiguousarray(picture[..., :3]), (TERMINAL_COLUMNS, rows), interpolation=cv2.INTER_AREA)
-    text = Text()
-    for above, below in zip(small[::2].tolist(), small[1::2].tolist(), strict=True):
-        for (r, g, b), (s, h, c) in zip(above, below, strict=True):
-            text.append("▀", style=f"rgb({r},{g},{b}) on rgb({s},{h},{c})")
-        text.append("\n")
-    Console().print(text)

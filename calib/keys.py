@@ -25,24 +25,21 @@ class Key(Enum):
     QUIT = auto()
 
 
-_MEANINGS = {
-    b"\x1b[C": Key.RIGHT,
-    b"\x1b[D": Key.LEFT,
-    b"\x1b[A": Key.UP,
-    b"\x1b[B": Key.DOWN,
-    b"\n": Key.ACCEPT,
-    b"\r": Key.ACCEPT,
-    b" ": Key.ACCEPT,
-    b"n": Key.NEXT,
-    b"p": Key.PREVIOUS,
-    b"f": Key.FINER,
-    b"c": Key.COARSER,
-    b"u": Key.UNDO,
-    b"\x7f": Key.UNDO,
-    b"\x08": Key.UNDO,
-    b"q": Key.QUIT,
-    b"\x04": Key.QUIT,
+# What a key means: GLFW's names of it, and its bytes in a terminal.
+_MEANINGS: dict[Key, tuple[str, tuple[bytes, ...]]] = {
+    Key.RIGHT: ("RIGHT", (b"\x1b[C",)),
+    Key.LEFT: ("LEFT", (b"\x1b[D",)),
+    Key.UP: ("UP", (b"\x1b[A",)),
+    Key.DOWN: ("DOWN", (b"\x1b[B",)),
+    Key.ACCEPT: ("ENTER KP_ENTER SPACE", (b"\n", b"\r", b" ")),
+    Key.NEXT: ("N", (b"n",)),
+    Key.PREVIOUS: ("P", (b"p",)),
+    Key.FINER: ("F", (b"f",)),
+    Key.COARSER: ("C", (b"c",)),
+    Key.UNDO: ("U BACKSPACE", (b"u", b"\x7f", b"\x08")),
+    Key.QUIT: ("Q ESCAPE", (b"q", b"\x04")),
 }
+_OF_BYTES = {data: key for key, (_, pieces) in _MEANINGS.items() for data in pieces}
 
 
 def parse(data: bytes) -> tuple[list[Key], bytes]:
@@ -52,9 +49,8 @@ def parse(data: bytes) -> tuple[list[Key], bytes]:
         if data[:1] == b"\x1b" and len(data) < 3 and b"\x1b[".startswith(data[:2]):
             return keys, data
         length = 3 if data[:2] == b"\x1b[" else 1
-        meaning = _MEANINGS.get(data[:length])
-        if meaning is not None:
-            keys.append(meaning)
+        if data[:length] in _OF_BYTES:
+            keys.append(_OF_BYTES[data[:length]])
         data = data[length:]
     return keys, b""
 
@@ -118,32 +114,17 @@ class WindowKeys:
 
     def poll(self) -> Key | None:
         """The next key, or None. Never waits. Call it after a frame was presented, on the windows' thread."""
-        self._watch()
-        return self._pending.pop(0) if self._pending else None
-
-    def _watch(self) -> None:
         # The panels keep their windows to themselves; nothing but their keyboard is wanted of them.
         handles = [surface.window.handle for surface in getattr(self._sink, "_surfaces", ())]
-        if handles == self._watched:
-            return
+        if handles != self._watched:
+            self._watch(handles)
+        return self._pending.pop(0) if self._pending else None
+
+    def _watch(self, handles: list[Any]) -> None:
         from runtime.panels.display import glfw
 
         meanings = {
-            glfw.KEY_RIGHT: Key.RIGHT,
-            glfw.KEY_LEFT: Key.LEFT,
-            glfw.KEY_UP: Key.UP,
-            glfw.KEY_DOWN: Key.DOWN,
-            glfw.KEY_ENTER: Key.ACCEPT,
-            glfw.KEY_KP_ENTER: Key.ACCEPT,
-            glfw.KEY_SPACE: Key.ACCEPT,
-            glfw.KEY_N: Key.NEXT,
-            glfw.KEY_P: Key.PREVIOUS,
-            glfw.KEY_F: Key.FINER,
-            glfw.KEY_C: Key.COARSER,
-            glfw.KEY_U: Key.UNDO,
-            glfw.KEY_BACKSPACE: Key.UNDO,
-            glfw.KEY_Q: Key.QUIT,
-            glfw.KEY_ESCAPE: Key.QUIT,
+            getattr(glfw, f"KEY_{name}"): key for key, (names, _) in _MEANINGS.items() for name in names.split()
         }
 
         def pressed(_window: Any, key: int, _code: int, action: int, _modifiers: int) -> None:

@@ -33,24 +33,13 @@ class PairRow(BaseModel):
     stack_z: Number
     viewpoint: str = ""
     spread_mm: str = ""
-    samples: str = ""
-    accepted_at: str = ""
     sensor_serial: str = ""
 
-    @property
-    def sensor_m(self) -> tuple[float, float, float]:
-        return self.sensor_x, self.sensor_y, self.sensor_z
-
-    @property
-    def stack_m(self) -> tuple[float, float, float]:
-        return self.stack_x, self.stack_y, self.stack_z
-
-    def cells(self) -> dict[str, str]:
-        """The row as text."""
-        return {
-            name: f"{value:.9g}" if isinstance(value, float) else str(value)
-            for name, value in self.model_dump().items()
-        }
+    @classmethod
+    def of(cls, sensor_m: F64, stack_m: F64, viewpoint: str, *, serial: str, spread_mm: str = "") -> PairRow:
+        """The pair of a point (3,) in `sensor` and one in `stack`."""
+        places = dict(zip(COLUMNS, np.concatenate([sensor_m, stack_m]).tolist(), strict=True))
+        return cls(**places, viewpoint=viewpoint, sensor_serial=serial, spread_mm=spread_mm)
 
 
 COLUMNS = tuple(name for name, field in PairRow.model_fields.items() if field.is_required())
@@ -98,7 +87,7 @@ def read_pairs(path: Path) -> Pairs:
 
 def points_of(rows: Iterable[PairRow]) -> tuple[F64, F64]:
     """(K, 3) in `sensor` and (K, 3) in `stack`."""
-    table = np.array([(*row.sensor_m, *row.stack_m) for row in rows], dtype=np.float64).reshape(-1, 6)
+    table = np.array([[getattr(row, name) for name in COLUMNS] for row in rows], dtype=np.float64).reshape(-1, 6)
     return table[:, :3].copy(), table[:, 3:].copy()
 
 
@@ -128,22 +117,24 @@ class PairsFile:
         self._write()
         return name
 
-    def accept(self, pair: PairRow) -> None:
-        """Add a pair; one of the same viewpoint is replaced. On disk when this returns.
+    def accept(self, *pairs: PairRow) -> None:
+        """Add pairs of one sensor; those of the same viewpoints are replaced. On disk when this returns.
 
-        Raises InputError for a pair of another sensor than those that are there.
+        Raises InputError for pairs of another sensor than those that are there.
         """
-        others = {row.sensor_serial for row in self.rows} - {"", pair.sensor_serial}
-        if others and pair.sensor_serial:
-            problem = f"its pairs are of sensor {min(others)}, this one is of {pair.sensor_serial}"
+        serial, taken = pairs[0].sensor_serial, {pair.viewpoint for pair in pairs} - {""}
+        others = {row.sensor_serial for row in self.rows} - {"", serial}
+        if others and serial:
+            problem = f"its pairs are of sensor {min(others)}, this one is of {serial}"
             raise InputError(self.path, "sensor_serial", problem)
-        self.rows = [row for row in self.rows if not pair.viewpoint or row.viewpoint != pair.viewpoint]
-        self.rows.append(pair)
+        self.rows = [row for row in self.rows if row.viewpoint not in taken] + list(pairs)
         self._write()
 
     def _write(self) -> None:
         text = io.StringIO()
         writer = csv.DictWriter(text, list(PairRow.model_fields), lineterminator="\n")
         writer.writeheader()
-        writer.writerows(row.cells() for row in self.rows)
+        for row in self.rows:
+            cells = row.model_dump().items()
+            writer.writerow({name: f"{value:.9g}" if isinstance(value, float) else value for name, value in cells})
         write_text(self.path, text.getvalue())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -18,8 +19,8 @@ MAX_PHOTOGRAPHS = 100
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 
 
-def photograph_files(folder: Path) -> list[Path]:
-    """The photographs of a folder, by name. Raises InputError."""
+def photographs(folder: Path) -> Iterator[tuple[str, U8]]:
+    """The photographs (h, w) of a folder with their names, in the order of these. Raises InputError."""
     if not foreign.is_there(folder, folder=True):
         raise InputError(folder, "", "is not a folder of photographs")
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
@@ -27,7 +28,8 @@ def photograph_files(folder: Path) -> list[Path]:
         raise InputError(folder, "", "holds no photograph (" + ", ".join(sorted(SUFFIXES)) + ")")
     if len(found) > MAX_PHOTOGRAPHS:
         raise InputError(folder, "", f"holds {len(found)} pictures: at most {MAX_PHOTOGRAPHS}")
-    return found
+    for path in found:
+        yield path.name, read_photograph(path)
 
 
 def read_photograph(path: Path) -> U8:

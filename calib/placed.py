@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -92,14 +91,6 @@ def in_frame_of(panels: Sequence[PlacedPanel], *, reference: int, reference_x_m:
     turn = panels[reference].rotation.T
     middle, shift = panels[reference].centre_m, np.array([reference_x_m, 0.0, 0.0])
     return tuple(PlacedPanel(turn @ p.rotation, turn @ (p.centre_m - middle) + shift) for p in panels)
-
-
-def found_stack(panels: Sequence[PlacedPanel], stack: PanelStack) -> PanelStack:
-    """The geometry with the panels' true distances. Raises ValueError where they do not stand in order."""
-    x_m = tuple(panel.axis_x_m for panel in panels)
-    if any(b <= a for a, b in pairwise(x_m)):
-        raise ValueError("the panels do not stand one before the other in the order of the configuration")
-    return PanelStack(stack.width_m, stack.height_m, x_m, stack.width_px, stack.height_px)
 
 
 def misplaced(

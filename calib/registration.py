@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from calib.bundle import Bundle, Undetermined, adjust
 from calib.detect_marks import SeenMarks
-from calib.placed import PlacedPanel, corner_pixels, found_stack, through, true_from_ideal_seen
+from calib.placed import PlacedPanel, corner_pixels, through, true_from_ideal_seen
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.records import F64
 
@@ -30,17 +31,6 @@ FEWER_IS_NOTED_PX = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
-    """What became of one photograph."""
-
-    name: str
-    used: bool
-    points: int
-    rms_px: float  # of its residuals that were used, in the photograph; infinite where it was not
-    reason: str  # why it was left out; empty: it was not
-
-
-@dataclass(frozen=True, slots=True)
 class Registration:
     """Where the panels are, and how that is known."""
 
@@ -52,19 +42,9 @@ class Registration:
     corners_px: F64  # (N, 4, 2) displacement of the corners (0, 0), (W, 0), (W, H), (0, H)
     corner_sigma_px: F64  # (N, 4, 2)
     eye_m: F64  # (3,) the viewing place
-    verdicts: tuple[Verdict, ...]
-    notes: tuple[str, ...]
-
-    @property
-    def tilt_deg(self) -> F64:
-        """(N, 2) by how much each panel's right edge, and its top edge, come towards the viewer."""
-        return np.degrees(np.arctan([panel.slope for panel in self.bundle.panels]))
-
-    @property
-    def turn_deg(self) -> F64:
-        """(N,) by how much each panel is turned in its own plane, counter-clockwise as the viewer sees it."""
-        rows = np.array([panel.rotation[:, 1] for panel in self.bundle.panels])
-        return np.asarray(np.degrees(np.arctan2(rows[:, 2], rows[:, 1])), dtype=np.float64)
+    used: int  # photographs
+    left_out: dict[str, str]  # photographs by name, and why
+    notes: list[str]
 
     @property
     def sigma_panel_px(self) -> F64:
@@ -73,13 +53,9 @@ class Registration:
 
     def eye_error_mm(self) -> float:
         """The eye's displacement that would look like the worst panel's uncertainty."""
-        reference = self.bundle.reference
-        pitch_m, found = self.stack.width_m / self.stack.width_px, 0.0
-        for index, sigma in enumerate(self.sigma_panel_px):
-            gap = abs(self.stack.x_m[index] - self.stack.x_m[reference])
-            if gap:
-                found = max(found, float(sigma) * pitch_m * float(self.eye_m[0]) / gap)
-        return found * 1e3
+        gap_m = np.abs(np.array(self.stack.x_m) - self.stack.x_m[self.bundle.reference])
+        pitch_m, others = self.stack.width_m / self.stack.width_px, gap_m > 0
+        return float((self.sigma_panel_px[others] * pitch_m * self.eye_m[0] / gap_m[others]).max()) * 1e3
 
 
 def homographies(panels: Sequence[PlacedPanel], stack: PanelStack, eye_m: F64) -> F64:
@@ -87,62 +63,50 @@ def homographies(panels: Sequence[PlacedPanel], stack: PanelStack, eye_m: F64) -
     return np.stack([true_from_ideal_seen(panel, eye_m, stack, index) for index, panel in enumerate(panels)])
 
 
-def evenly_spaced(stack: PanelStack, *, reference: int) -> PanelStack:
+def evenly_spaced(x_m: Sequence[float], *, reference: int) -> tuple[float, ...]:
     """The even distances nearest to a stack's, the reference panel kept: what the shipped networks serve."""
-    steps = np.arange(stack.count) - reference
-    gap = float((steps * (np.array(stack.x_m) - stack.x_m[reference])).sum() / (steps**2).sum())
-    x_m = tuple(stack.x_m[reference] + gap * step for step in steps.tolist())
-    return replace(stack, x_m=x_m)
+    steps, origin_m = np.arange(len(x_m)) - reference, x_m[reference]
+    gap_m = (steps * (np.array(x_m) - origin_m)).sum() / (steps**2).sum()
+    return tuple((origin_m + gap_m * steps).tolist())
 
 
-def tilt_of(panels: Sequence[PlacedPanel], eye_m: F64) -> Tilt:
-    """What models need to know of tilted panels whose homographies are for an eye (3,)."""
-    x, y, z = np.asarray(eye_m, dtype=np.float64).tolist()
+def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64, even: bool) -> PanelStack:
+    """The geometry to configure for panels that stand so: distances, and tilts with homographies for an eye (3,).
+
+    even: where the shipped networks serve no gaps that differ so much, the even ones near them.
+    Raises Undetermined where the panels do not stand in order.
+    """
+    x_m = tuple(panel.axis_x_m for panel in panels)
+    if any(b <= a for a, b in pairwise(x_m)):
+        raise Undetermined("the panels do not stand one before the other in the order of the configuration")
     depth = tuple((0.0, float(right), float(up)) for right, up in (panel.slope + 0.0 for panel in panels))
-    return Tilt(depth, (x, y, z))
+    x, y, z = (float(value) for value in eye_m)
+    found = replace(stack, x_m=x_m, tilt=Tilt(depth, (x, y, z)))
+    if even and not found.is_evenly_spaced:
+        return replace(found, x_m=evenly_spaced(x_m, reference=stack.count // 2))
+    return found
 
 
-def geometry_of(
-    panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64, even: bool | None, reference: int
-) -> PanelStack:
-    """The geometry to configure for panels that stand so: their distances, or even ones near them, and tilts.
-
-    even: as in `register_photographs`. Raises ValueError where the panels do not stand in order.
-    """
-    true = found_stack(panels, stack)
-    if even is None:
-        even = not true.is_evenly_spaced
-    return replace(evenly_spaced(true, reference=reference) if even else true, tilt=tilt_of(panels, eye_m))
-
-
-def register_photographs(
-    seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m: F64, even: bool | None
-) -> Registration:
-    """Fit and judge. Raises Undetermined, saying what is wrong.
-
-    even: write even distances near the true ones; None: where those are too uneven for the shipped networks.
-    """
+def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m: F64, even: bool) -> Registration:
+    """Fit and judge; even: as in `geometry_of`. Raises Undetermined, saying what is wrong."""
     reference = stack.count // 2
-    faults = {s.name: s.fault for s in seen if s.fault}
-    faults |= _other_sizes([s for s in seen if not s.fault])
-    bundle, good = None, [s for s in seen if s.name not in faults]
+    left_out = {s.name: s.fault for s in seen if s.fault}
+    left_out |= _other_sizes([s for s in seen if not s.fault])
+    good = [s for s in seen if s.name not in left_out]
     while True:
-        _refuse_few(good, seen, faults)
+        _refuse_few(len(good), len(seen), left_out)
         bundle = adjust(good, stack, reference=reference)
-        odd = _disagreeing(bundle, good)
-        if not odd:
+        unfit = [1 - float(bundle.used[bundle.photograph == number].mean()) for number in range(len(good))]
+        if max(unfit) <= DISAGREES:
             break
-        faults[odd] = "does not agree with the others: another stack, or something moved"
-        good = [s for s in good if s.name != odd]
+        odd = good.pop(int(np.argmax(unfit)))
+        left_out[odd.name] = "does not agree with the others: another stack, or something moved"
     _refuse_one_place(bundle)
     if bundle.sigma_px > MISFIT_PX:
         raise Undetermined(
             f"the photographs do not show one rigid stack: points are {bundle.sigma_px:.1f} px off on average"
         )
-    try:
-        model = geometry_of(bundle.panels, stack, eye_m=eye_m, even=even, reference=reference)
-    except ValueError as problem:
-        raise Undetermined(str(problem)) from None
+    model = geometry_of(bundle.panels, stack, eye_m=eye_m, even=even)
     _refuse_implausible(bundle, stack)
     corners = corner_pixels(stack)
 
@@ -150,46 +114,46 @@ def register_photographs(
         matrices = homographies(panels, model, eye_m)
         return np.stack([through(matrix, corners) - corners for matrix in matrices])
 
-    def gaps(panels: Sequence[PlacedPanel]) -> F64:
-        return np.diff([panel.axis_x_m for panel in panels])
-
     corner_sigma_px = bundle.sigma_of(moved)
-    worst = float(np.linalg.norm(corner_sigma_px, axis=-1).max())
-    if worst > DOUBTFUL_PX:
+    worst_px = float(np.linalg.norm(corner_sigma_px, axis=-1).max())
+    if worst_px > DOUBTFUL_PX:
         raise Undetermined(
-            f"the photographs leave a panel's corner uncertain by {worst:.2f} px: take more, from more directions"
+            f"the photographs leave a panel's corner uncertain by {worst_px:.2f} px: take more, from more directions"
         )
+    notes = [f"{name} {why}: left out" for name, why in left_out.items()]
+    if len(good) < WANTED_PHOTOGRAPHS:
+        notes.append(f"{len(good)} photographs were used: 8 to 20 are better, and tell whether one of them is wrong")
+    if worst_px > FEWER_IS_NOTED_PX:
+        notes.append(f"a corner is uncertain by {worst_px:.2f} px: more photographs, from farther aside, would help")
     return Registration(
         bundle=bundle,
         stack=model,
         true_x_m=np.array([panel.axis_x_m for panel in bundle.panels]),
-        gap_sigma_m=bundle.sigma_of(gaps),
+        gap_sigma_m=bundle.sigma_of(lambda panels: np.diff([panel.axis_x_m for panel in panels])),
         homographies=homographies(bundle.panels, model, eye_m),
         corners_px=moved(bundle.panels),
         corner_sigma_px=corner_sigma_px,
-        eye_m=np.asarray(eye_m, dtype=np.float64),
-        verdicts=_verdicts(bundle, good, seen, faults),
-        notes=_notes(good, seen, faults, worst),
+        eye_m=eye_m,
+        used=len(good),
+        left_out=left_out,
+        notes=notes,
     )
 
 
 def _other_sizes(good: Sequence[SeenMarks]) -> dict[str, str]:
     sizes = [(s.width_px, s.height_px) for s in good]
-    if not sizes:
-        return {}
-    usual = max(set(sizes), key=sizes.count)
-    text = f"has another size than the others ({usual[0]}x{usual[1]}): one camera, one setting"
-    return {s.name: text for s, size in zip(good, sizes, strict=True) if size != usual}
+    width, height = max(sizes, key=sizes.count, default=(0, 0))
+    text = f"has another size than the others ({width}x{height}): one camera, one setting"
+    return {s.name: text for s, size in zip(good, sizes, strict=True) if size != (width, height)}
 
 
-def _refuse_few(good: Sequence[SeenMarks], seen: Sequence[SeenMarks], faults: dict[str, str]) -> None:
-    if len(good) >= MIN_PHOTOGRAPHS:
-        return
-    why = "; ".join(f"{name} {fault}" for name, fault in faults.items())
-    raise Undetermined(
-        f"{len(good)} of {len(seen)} photographs can be used, at least {MIN_PHOTOGRAPHS} are needed"
-        + (f": {why}" if why else "")
-    )
+def _refuse_few(good: int, count: int, left_out: dict[str, str]) -> None:
+    if good < MIN_PHOTOGRAPHS:
+        why = "; ".join(f"{name} {fault}" for name, fault in left_out.items())
+        raise Undetermined(
+            f"{good} of {count} photographs can be used, at least {MIN_PHOTOGRAPHS} are needed"
+            + (f": {why}" if why else "")
+        )
 
 
 def _refuse_one_place(bundle: Bundle) -> None:
@@ -218,36 +182,3 @@ def _refuse_implausible(bundle: Bundle, stack: PanelStack) -> None:
                 f"panel {index} lies {np.linalg.norm(off[1:]) * 1e3:.0f} mm beside panel {bundle.reference}: "
                 "photographs of another stack, or a panel that is to be put right by hand first"
             )
-
-
-def _disagreeing(bundle: Bundle, good: Sequence[SeenMarks]) -> str:
-    """The name of the photograph that fits the others worst, if it does not fit; empty: all do."""
-    shares = [1 - float(bundle.used[bundle.photograph == number].mean()) for number in range(len(good))]
-    worst = int(np.argmax(shares))
-    return good[worst].name if shares[worst] > DISAGREES else ""
-
-
-def _verdicts(
-    bundle: Bundle, good: Sequence[SeenMarks], seen: Sequence[SeenMarks], faults: dict[str, str]
-) -> tuple[Verdict, ...]:
-    numbers = {s.name: number for number, s in enumerate(good)}
-    found = []
-    for s in seen:
-        if s.name in faults:
-            found.append(Verdict(s.name, False, len(s.panel), float("inf"), faults[s.name]))
-            continue
-        mine = (bundle.photograph == numbers[s.name]) & bundle.used
-        rms = float(np.sqrt((bundle.residual_px[mine] ** 2).sum(1).mean()))
-        found.append(Verdict(s.name, True, int(mine.sum()), rms, ""))
-    return tuple(found)
-
-
-def _notes(
-    good: Sequence[SeenMarks], seen: Sequence[SeenMarks], faults: dict[str, str], worst_px: float
-) -> tuple[str, ...]:
-    notes = [f"{s.name} {faults[s.name]}: left out" for s in seen if s.name in faults]
-    if len(good) < WANTED_PHOTOGRAPHS:
-        notes.append(f"{len(good)} photographs were used: 8 to 20 are better, and tell whether one of them is wrong")
-    if worst_px > FEWER_IS_NOTED_PX:
-        notes.append(f"a corner is uncertain by {worst_px:.2f} px: more photographs, from farther aside, would help")
-    return tuple(notes)

@@ -54,13 +54,12 @@ def register_photos(
             say(name)
             seen.append(find_marks(picture, stack, name=name))
     eye_m = viewing_place_m(settings.calibration)
-    # Even distances where the true ones are too uneven for the configured network.
-    even = None if settings.model.name in EVEN_MODELS and stack.count == 3 else False
+    even = settings.model.name in EVEN_MODELS and stack.count == 3
     try:
         found = register_photographs(seen, stack, eye_m=eye_m, even=even)
     except Undetermined as problem:
         raise InputError(source, "photographs", str(problem)) from None
-    summary = registration_summary(found, stack) | {"source": source}
+    summary = registration_summary(found) | {"source": source}
     document = tomlkit.document()
     put_registration(document, found)
     with OutputFolder(out) as folder:
@@ -71,7 +70,7 @@ def register_photos(
         put_registration(configured, found)
         kept = save_document(config, configured)
         summary["kept_version"] = str(kept) if kept else None
-    return summary, summary_text(found, summary)
+    return summary, summary_text(summary)
 
 
 def put_registration(document: TOMLDocument, found: Registration) -> None:
@@ -85,59 +84,47 @@ def put_registration(document: TOMLDocument, found: Registration) -> None:
     put(document, "stack", table)
 
 
-def registration_summary(found: Registration, stack: PanelStack) -> dict[str, Any]:
+def registration_summary(found: Registration) -> dict[str, Any]:
     """What `registration.json` holds."""
-    tilt, turn, sigma = found.tilt_deg, found.turn_deg, found.sigma_panel_px
-    panels = []
-    for index in range(stack.count):
-        mine = (found.bundle.panel == index) & found.bundle.used
-        panels.append(
-            {
-                "panel": index,
-                "x_m": found.stack.x_m[index],
-                "true_x_m": found.true_x_m[index],
-                "tilt_right_deg": tilt[index, 0],
-                "tilt_up_deg": tilt[index, 1],
-                "turn_deg": turn[index],
-                "homography": found.homographies[index],
-                "corners_px": found.corners_px[index],
-                "corner_sigma_px": found.corner_sigma_px[index],
-                "sigma_px": sigma[index],
-                "residual_px": panel_residual_px(found, index),
-                "points": int(mine.sum()),
-            }
-        )
-    gaps = np.diff(found.true_x_m)
+    stack, bundle = found.stack, found.bundle
+    rows = np.array([panel.rotation[:, 1] for panel in bundle.panels])
+    tilt_deg = np.degrees(np.arctan([panel.slope for panel in bundle.panels]))
+    panels = [
+        {
+            "x_m": stack.x_m[index],
+            "true_x_m": found.true_x_m[index],
+            "tilt_deg": tilt_deg[index],  # by how much its right edge, and its top edge, come towards the viewer
+            "turn_deg": np.degrees(np.arctan2(rows[index, 2], rows[index, 1])),  # counter-clockwise, in its own plane
+            "homography": found.homographies[index],
+            "corner_off_px": np.linalg.norm(found.corners_px[index], axis=1).max(),
+            "sigma_px": found.sigma_panel_px[index],
+            "residual_px": panel_residual_px(found, index),
+        }
+        for index in range(stack.count)
+    ]
+    gap_m = np.diff(found.true_x_m)
     notes = list(found.notes)
-    if not np.allclose(found.true_x_m, found.stack.x_m, atol=5e-5):
+    if not np.allclose(found.true_x_m, stack.x_m, atol=5e-5):
         notes.append(
-            f"the gaps are {' and '.join(f'{gap * 1e3:.2f}' for gap in gaps)} mm; even ones of "
-            f"{(found.stack.x_m[1] - found.stack.x_m[0]) * 1e3:.2f} mm are written, since the shipped networks serve "
+            f"the gaps are {' and '.join(f'{gap * 1e3:.2f}' for gap in gap_m)} mm; even ones of "
+            f"{(stack.x_m[1] - stack.x_m[0]) * 1e3:.2f} mm are written, since the shipped networks serve "
             f"none that differ by more than {100 * UNEVEN_MOST:.0f}% (with the model sart the true ones are written)"
         )
-    worst = float(np.abs(tilt).max())
-    if worst > NOTED_TILT_DEG:
+    worst_deg = float(np.abs(tilt_deg).max())
+    if worst_deg > NOTED_TILT_DEG:
         notes.append(
-            f"a panel is tilted by {worst:.1f} degrees against panel {found.bundle.reference}: the shipped models "
+            f"a panel is tilted by {worst_deg:.1f} degrees against panel {bundle.reference}: the shipped models "
             "allow for it; with others it is exact from the viewing place alone"
         )
     return {
-        "reference": found.bundle.reference,
+        "reference": bundle.reference,
         "eye_m": found.eye_m,
-        "x_m": list(found.stack.x_m),
-        "true_x_m": found.true_x_m,
-        "gap_m": gaps,
+        "gap_m": gap_m,
         "gap_sigma_m": found.gap_sigma_m,
-        "sigma_px": found.bundle.sigma_px,
-        "points": int(found.bundle.used.sum()),
-        "outliers": int((~found.bundle.used).sum()),
-        "used": sum(v.used for v in found.verdicts),
-        "photographs": [
-            {"name": v.name, "used": v.used, "points": v.points, "rms_px": v.rms_px, "reason": v.reason}
-            for v in found.verdicts
-        ],
+        "points": int(bundle.used.sum()),
+        "outliers": int((~bundle.used).sum()),
+        "used": found.used,
         "eye_error_mm": found.eye_error_mm(),
-        "lens": dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"), found.bundle.lens, strict=True)),
         "panels": panels,
         "notes": notes,
     }
@@ -150,33 +137,25 @@ def panel_residual_px(found: Registration, index: int) -> float:
     if not mine.any():
         return 0.0
     distance_m = np.linalg.norm(bundle.places_m - bundle.panels[index].centre_m, axis=1)[bundle.photograph[mine]]
-    span = distance_m / bundle.lens[0] / (found.stack.width_m / found.stack.width_px)
+    span = distance_m / bundle.focal_px / (found.stack.width_m / found.stack.width_px)
     return float(np.sqrt(((bundle.residual_px[mine] * span[:, None]) ** 2).sum(1).mean()))
 
 
-def panel_rows(found: Registration) -> list[list[str]]:
-    """The table for people."""
+def summary_text(summary: dict[str, Any]) -> str:
+    """What the command prints."""
     rows = [["panel", "x (mm)", "true x (mm)", "turned (°)", "tilt right, up (°)", "corner off (px)", "± (px)",
              "residual (px)"]]  # fmt: skip
-    for index in range(len(found.true_x_m)):
-        moved = np.linalg.norm(found.corners_px[index], axis=1).max()
+    for index, panel in enumerate(summary["panels"]):
         rows.append([
-            str(index) + (", the reference" if index == found.bundle.reference else ""),
-            f"{found.stack.x_m[index] * 1e3:+.2f}", f"{found.true_x_m[index] * 1e3:+.2f}",
-            f"{found.turn_deg[index]:+.3f}", "{:+.2f}, {:+.2f}".format(*found.tilt_deg[index]),
-            f"{moved:.2f}", f"{found.sigma_panel_px[index]:.3f}", f"{panel_residual_px(found, index):.3f}",
+            str(index) + (", the reference" if index == summary["reference"] else ""),
+            f"{panel['x_m'] * 1e3:+.2f}", f"{panel['true_x_m'] * 1e3:+.2f}", f"{panel['turn_deg']:+.3f}",
+            "{:+.2f}, {:+.2f}".format(*panel["tilt_deg"]), f"{panel['corner_off_px']:.2f}",
+            f"{panel['sigma_px']:.3f}", f"{panel['residual_px']:.3f}",
         ])  # fmt: skip
-    return rows
-
-
-def summary_text(found: Registration, summary: dict[str, Any]) -> str:
-    """What the command prints."""
-    gaps = ", ".join(
-        f"{gap * 1e3:.2f} ± {sigma * 1e3:.2f}"
-        for gap, sigma in zip(summary["gap_m"], summary["gap_sigma_m"], strict=True)
-    )
+    pairs = zip(summary["gap_m"] * 1e3, summary["gap_sigma_m"] * 1e3, strict=True)
+    gaps = ", ".join(f"{gap:.2f} ± {sigma:.2f}" for gap, sigma in pairs)
     lines = [
-        in_columns(panel_rows(found)),
+        in_columns(rows),
         f"gaps {gaps} mm; {summary['points']} points of {summary['used']} photographs, {summary['outliers']} left out",
         f"what is uncertain is worth {summary['eye_error_mm']:.2f} mm at the eye",
     ]

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import model_validator
 
 from calib.checks import RESIDUAL_LIMIT_M
-from calib.figures import geometry_figure, residual_figure
+from calib.figures import Points, geometry_figure, residual_figure
 from calib.viewpoints import viewing_volume_m
 from runtime.config import CalibrationSettings, read_table, validated
 from runtime.eyes.calibration import Calibration, Lenient, Vector3, load_calibration, similarity_defect
@@ -39,96 +37,61 @@ class StoredPairs(Lenient):
         return self
 
 
-@dataclass(frozen=True, slots=True)
-class Points:
-    """The pairs behind a calibration."""
+def write_report(file: Path, out: Path, *, stack: PanelStack, viewing: CalibrationSettings) -> dict[str, Any]:
+    """Write `index.html`, its PNGs and `report.json`. Raises InputError."""
+    calibration, table = load_calibration(file), read_table(file)
+    points = _stored_points(table.get("data"), calibration, source=file)
+    summary = _summary(calibration, points, viewing_volume_m(viewing))
+    sections = [
+        section_of("Numbers", _numbers(calibration, summary)),
+        section_of("stack_from_sensor", _matrix(calibration)),
+        Section("Pictures", figures=_pictures(calibration, points, stack)),
+    ]
+    notes = [*calibration.warnings]
+    if isinstance(table.get("warnings"), list):
+        notes += [str(text) for text in table["warnings"]]
+    if points is None:
+        notes.append("This file holds no pairs (or too many): the error of each point is not known.")
+    else:
+        heading = "Points" if len(points.names) <= LISTED_POINTS else f"The {LISTED_POINTS} worst points"
+        sections.append(section_of(heading, _point_rows(points)))
+    if calibration.covariance is None:
+        notes.append("This file holds no covariance: the error at the eye is not known.")
+    lead = "Where the depth camera stands before the stack of panels, and how well that is known."
+    Page(f"Calibration {file.name}", lead, sections, notes=notes).write(out, record="report.json", data=summary)
+    return summary
 
-    names: tuple[str, ...]
-    stack_m: F64  # (K, 3) known
-    fitted_m: F64  # (K, 3) where the calibration puts them, frame `stack`
-    used: NDArray[np.bool_]  # (K,)
 
-    @property
-    def residual_m(self) -> F64:
-        """(K, 3) calibrated minus known."""
-        return self.fitted_m - self.stack_m
-
-
-def stored_points(path: Path, calibration: Calibration) -> Points | None:
+def _stored_points(data: Any, calibration: Calibration, *, source: Path) -> Points | None:
     """The pairs that a calibration file holds in `[data]`; None where it holds none. Raises InputError."""
-    data = read_table(path).get("data")
     if not isinstance(data, dict) or "sensor_m" not in data:
         return None
-    found = validated(StoredPairs, data, source=f"{path}: data")
+    found = validated(StoredPairs, data, source=f"{source}: data")
     names = found.names or tuple(str(number + 1) for number in range(len(found.sensor_m)))
     used = np.array(found.used or [True] * len(found.sensor_m))
     return Points(names, np.array(found.stack_m), calibration.points(found.sensor_m), used)
 
 
-def write_report(file: Path, out: Path, *, stack: PanelStack, viewing: CalibrationSettings) -> dict[str, Any]:
-    """Write `index.html`, its PNGs and `report.json`. Raises InputError."""
-    calibration = load_calibration(file)
-    points = stored_points(file, calibration)
-    pictures = _pictures(calibration, points, stack)
-    summary = _summary(calibration, points, viewing_volume_m(viewing))
-    sections = [
-        section_of("Numbers", _numbers(calibration, summary)),
-        section_of("stack_from_sensor", _matrix(calibration)),
-        Section("Pictures", figures=pictures),
-    ]
-    if points is not None:
-        heading = "Points" if len(points.names) <= LISTED_POINTS else f"The {LISTED_POINTS} worst points"
-        sections.append(section_of(heading, _point_rows(points)))
-    lead = "Where the depth camera stands before the stack of panels, and how well that is known."
-    page = Page(f"Calibration {file.name}", lead, sections, notes=_notes(calibration, points, file))
-    page.write(out, record="report.json", data=summary)
-    return summary | {"out": str(out), "pictures": [f"{picture.name}.png" for picture in pictures]}
-
-
 def _pictures(calibration: Calibration, points: Points | None, stack: PanelStack) -> list[Figure]:
-    matrix = calibration.stack_from_sensor
-    gaze = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
     found = []
     if points is not None:
-        found.append(
-            Figure(
-                "residuals",
-                residual_figure(points.residual_m, points.used, limit_m=RESIDUAL_LIMIT_M),
-                "X, Y and Z error of every calibration point (the EyeReal supplement's figure S5)",
-            )
-        )
-    found.append(
-        Figure(
-            "geometry",
-            geometry_figure(
-                matrix[:3, 3],
-                gaze,
-                stack,
-                points_m=None if points is None else points.stack_m,
-                fitted_m=None if points is None else points.fitted_m,
-                used=None if points is None else points.used,
-            ),
-            "Camera, panels and points; the arrow is the camera's line of sight",
-        )
-    )
+        text = "X, Y and Z error of every calibration point (the EyeReal supplement's figure S5)"
+        found.append(Figure("residuals", residual_figure(points, limit_m=RESIDUAL_LIMIT_M), text))
+    text = "Camera, panels and points; the arrow is the camera's line of sight"
+    found.append(Figure("geometry", geometry_figure(calibration.stack_from_sensor, stack, points), text))
     return found
 
 
 def _summary(calibration: Calibration, points: Points | None, volume_m: F64) -> dict[str, Any]:
-    eye_error = calibration.position_error_m(volume_m)
+    """What `report.json` holds, None where it is not known."""
     found: dict[str, Any] = {
-        "file": calibration.source,
         "method": calibration.method,
         "date": calibration.date,
         "sensor_serial": calibration.sensor_serial,
         "scale": calibration.scale,
         "similarity_defect": similarity_defect(calibration.stack_from_sensor),
         "condition": calibration.condition,
-        "eye_error_mm": None if eye_error is None else float(eye_error.mean()) * 1e3,
-        "eye_error_p95_mm": None if eye_error is None else float(np.percentile(eye_error, 95)) * 1e3,
     }
-    if calibration.residuals is not None and calibration.residuals.leave_one_out_rms_m is not None:
-        found["leave_one_out_mm"] = calibration.residuals.leave_one_out_rms_m * 1e3
     if points is not None:
         residual_m = points.residual_m[points.used]
         distance_m = np.linalg.norm(residual_m, axis=-1)
@@ -139,32 +102,19 @@ def _summary(calibration: Calibration, points: Points | None, volume_m: F64) -> 
             "max_mm": float(distance_m.max()) * 1e3,
             "axis_rms_mm": (np.sqrt((residual_m**2).mean(axis=0)) * 1e3).tolist(),
         }
+    if calibration.residuals is not None and calibration.residuals.leave_one_out_rms_m is not None:
+        found["leave_one_out_mm"] = calibration.residuals.leave_one_out_rms_m * 1e3
+    eye_error = calibration.position_error_m(volume_m)
+    found["eye_error_mm"] = None if eye_error is None else float(eye_error.mean()) * 1e3
+    found["eye_error_p95_mm"] = None if eye_error is None else float(np.percentile(eye_error, 95)) * 1e3
     return found
 
 
-def _notes(calibration: Calibration, points: Points | None, file: Path) -> list[str]:
-    notes = list(calibration.warnings)
-    stored = read_table(file).get("warnings")
-    if isinstance(stored, list):
-        notes += [str(text) for text in stored]
-    if points is None:
-        notes.append("This file holds no pairs (or too many): the error of each point is not known.")
-    if calibration.covariance is None:
-        notes.append("This file holds no covariance: the error at the eye is not known.")
-    return notes
-
-
 def _numbers(calibration: Calibration, summary: dict[str, Any]) -> list[list[str]]:
-    rows = [["", ""]]
     names = {
-        "method": "method",
-        "date": "date",
         "sensor_serial": "sensor",
-        "points": "points",
         "rejected": "rejected as outliers",
-        "scale": "scale",
         "similarity_defect": "departure from a similarity",
-        "condition": "condition",
         "rms_mm": "residual, RMS (mm)",
         "max_mm": "residual, largest (mm)",
         "axis_rms_mm": "residual along x, y, z (mm)",
@@ -172,10 +122,8 @@ def _numbers(calibration: Calibration, summary: dict[str, Any]) -> list[list[str
         "eye_error_mm": "expected error at the eye, mean over the viewing volume (mm)",
         "eye_error_p95_mm": "expected error at the eye, 95th percentile (mm)",
     }
-    for key, name in names.items():
-        value = summary.get(key)
-        if value not in (None, ""):
-            rows.append([name, _shown(value)])
+    rows = [["", ""]]
+    rows += [[names.get(key, key), _shown(value)] for key, value in summary.items() if value not in (None, "")]
     if calibration.covariance is not None:
         sigma = np.sqrt(np.diag(calibration.covariance))
         rows.append(["uncertainty of the rotation about x, y, z (degrees)", _shown(np.degrees(sigma[:3]).tolist())])

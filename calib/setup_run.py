@@ -116,57 +116,20 @@ def summarise(setup: Setup, *, finished: bool) -> tuple[dict[str, Any], str]:
         "missing": missing,
         "simulated": setup.hardware.simulated,
     }
-    rows = figure_rows(setup)
-    lines = [f"{row[0]}: {row[1]}" for row in rows[1:]]
+    rows = [[step.title, str(setup.done[step.name].get("text", ""))] for step in STEPS if step.name in setup.done]
+    lines = [f"{title}: {text}" for title, text in rows]
     if finished:
         notes = [note for figures in setup.done.values() for note in figures.get("notes", [])]
-        page = Page(
-            "Setting up", f"{setup.config}: the figures of each step.", [section_of("Figures", rows)], notes=notes
-        )
+        section = section_of("Figures", [["", "figure"], *rows])
+        page = Page("Setting up", f"{setup.config}: the figures of each step.", [section], notes=notes)
         write_text(setup.out / "index.html", page.html())
         write_json(setup.out / "setup.json", summary)
         lines.append(f"{setup.out / 'index.html'} has the figures; {setup.config} is valid")
-        lines += _next(setup)
+        if setup.hardware.simulated:
+            lines.append(f"look: phasestack run --config {setup.config} --replay demo --headless --frames 60 --out run")
+        else:
+            lines.append(f"try it: phasestack run --config {setup.config}")
+            lines.append(f"check it: phasestack doctor --config {setup.config}")
     if missing:
         lines.append(f"not done: {', '.join(missing)} (the same command goes on there)")
     return summary, "\n".join(lines)
-
-
-def figure_rows(setup: Setup) -> list[list[str]]:
-    """The table of figures of the steps that are done."""
-    rows, done = [["", "figure"]], setup.done
-    if "identify" in done:
-        rows.append(["panels", f"{len(done['identify']['panels'])} bound to their monitors"])
-    if "geometry" in done:
-        found = done["geometry"]
-        near, far = found["viewing_m"]
-        rows.append(["geometry", f"{found['width_m'] * 1e3:.1f} x {found['height_m'] * 1e3:.1f} mm; viewers {near:g} "
-                     f"to {far:g} m away"])  # fmt: skip
-    if "registration" in done:
-        found = done["registration"]
-        gaps = ", ".join(f"{gap:.2f}" for gap in found["gap_mm"])
-        rows.append(["registration", f"gaps {gaps} mm, from {found['used']} photographs; what is uncertain is worth "
-                     f"{found['eye_error_mm']:.2f} mm at the eye"])  # fmt: skip
-    if "grey" in done:
-        which = ", ".join(str(number) for number in done["grey"]["panels"])
-        worst = max(done["grey"]["residual"].values(), default=0.0)
-        rows.append(["grey curves", f"of panels {which}, measured to {100 * worst:.2f}% of the range"])
-    if "sensor" in done:
-        rows.append(["sensor", done["sensor"]["sensor"]])
-    if "calibration" in done:
-        found = done["calibration"]
-        rows.append(["error of the eyes' places", f"{found['eye_error_mm']:.1f} mm expected, from {found['pairs']} "
-                     f"pairs, {found['rms_mm']:.1f} mm off on average"])  # fmt: skip
-    if "service" in done:
-        rows.append(["service", f"{len(done['service']['files'])} files: {done['service']['commands'][0]}"])
-    return rows
-
-
-def _next(setup: Setup) -> list[str]:
-    if setup.hardware.simulated:
-        return [f"look: phasestack run --config {setup.config} --replay demo --headless --frames 60 --out run"]
-    return [
-        f"try it: phasestack run --config {setup.config}",
-        f"check it: phasestack doctor --config {setup.config}",
-        *(["at every start: " + "; ".join(setup.done["service"]["commands"])] if "service" in setup.done else []),
-    ]

@@ -7,12 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from calib.board import board_layers
+import numpy as np
+
+from calib.board import boards
 from calib.capture_run import capture_live
 from calib.config_file import put, put_lut, put_monitors, read_document, save_document
-from calib.display import alone
-from calib.grey_chart import grey_chart
-from calib.grey_run import fit_lut, photographed_series
+from calib.grey import fit_lut
+from calib.grey_chart import grey_chart, photographed_series
 from calib.hardware import Say, SetupHardware
 from calib.interview import Interview
 from calib.keys import Key
@@ -80,20 +81,17 @@ def identify(setup: Setup) -> Figures:
         interview = Interview(hardware.monitors(), panels=setup.settings.stack.stack().count, say=setup.say)
     except ValueError as problem:
         raise InputError(setup.config, "stack.x_m", str(problem)) from None
-    hardware.show_card(interview.shown, interview.asked)
     interview.ask()
+    shown: Any = None
     while not interview.finished:
-        key = hardware.poll()
-        if key is None:
-            hardware.wait()
-        else:
-            interview.press(key)
-        if not interview.finished:
-            hardware.show_card(interview.shown, interview.asked)
+        if shown != (interview.shown, interview.asked):
+            shown = interview.shown, interview.asked
+            hardware.show_card(*shown)
+        interview.press(hardware.key())
     if not interview.done:
         raise Stopped
     setup.write(lambda document: put_monitors(document, interview.tables))
-    return {"panels": interview.tables}
+    return {"text": f"{len(interview.tables)} bound to their monitors"}
 
 
 @dataclass
@@ -108,49 +106,50 @@ class Dial:
     show: Callable[[float], str]
     unknown: float | None = None  # the value to begin with, where 0 says that nothing is known
 
-    def turn(self, direction: int) -> None:
-        if self.unknown is not None and (self.value == 0 or self.value + direction * self.step < self.low):
-            self.value = self.unknown if direction > 0 else 0.0
-            return
-        self.value = min(max(self.value + direction * self.step, self.low), self.high)
+    def turn(self, steps: int) -> None:
+        if self.unknown is not None and (self.value == 0 or self.value + steps * self.step < self.low):
+            self.value = self.unknown if steps > 0 else 0.0
+        else:
+            self.value = min(max(self.value + steps * self.step, self.low), self.high)
+
+
+def _mm(value: float) -> str:
+    return f"{value * 1e3:.1f} mm" if value else "not known"
+
+
+def _m(value: float) -> str:
+    return f"{value:.2f} m"
 
 
 def geometry(setup: Setup) -> Figures:
     """Size of the panels, their gap, and where viewers stand: about; registration finds the gap exactly."""
     stack, calibration = setup.settings.stack, setup.settings.calibration
     gap_m = (stack.x_m[-1] - stack.x_m[0]) / (len(stack.x_m) - 1)
-
-    def mm(value: float) -> str:
-        return f"{value * 1e3:.1f} mm" if value else "not known"
-
-    def m(value: float) -> str:
-        return f"{value:.2f} m"
-
     dials = [
-        Dial("width of a panel's picture", stack.width_m, 0.0001, 0.02, 5.0, mm),
-        Dial("its height", stack.height_m, 0.0001, 0.02, 5.0, mm),
-        Dial("from panel to panel", gap_m, 0.001, 0.002, 0.5, mm),
-        Dial("nearest viewer", calibration.viewing_m[0], 0.05, 0.2, 5.0, m),
-        Dial("farthest viewer", calibration.viewing_m[1], 0.05, 0.25, 8.0, m),
+        Dial("width of a panel's picture", stack.width_m, 0.0001, 0.02, 5.0, _mm),
+        Dial("its height", stack.height_m, 0.0001, 0.02, 5.0, _mm),
+        Dial("from panel to panel", gap_m, 0.001, 0.002, 0.5, _mm),
+        Dial("nearest viewer", calibration.viewing_m[0], 0.05, 0.2, 5.0, _m),
+        Dial("farthest viewer", calibration.viewing_m[1], 0.05, 0.25, 8.0, _m),
         Dial("the eye separation of who will calibrate, if it is known (an optician's PD)", calibration.ipd_m, 0.0005,
-             0.05, 0.08, mm, unknown=IPD_M),
+             0.05, 0.08, _mm, unknown=IPD_M),
     ]  # fmt: skip
     _turn_dials(setup, dials)
     width_m, height_m, found_m, near_m, far_m, ipd_m = (round(dial.value, 5) for dial in dials)
-    values: dict[str, Any] = {"width_m": width_m, "height_m": height_m}
+    size: dict[str, Any] = {"width_m": width_m, "height_m": height_m}
     if abs(found_m - gap_m) > 1e-6:  # else distances that were measured stay as they are
         middle = (len(stack.x_m) - 1) / 2
-        values["x_m"] = [round((index - middle) * found_m, 6) for index in range(len(stack.x_m))]
+        size["x_m"] = [round((index - middle) * found_m, 6) for index in range(len(stack.x_m))]
     viewing: dict[str, Any] = {"viewing_m": [near_m, far_m]}
     if ipd_m != calibration.ipd_m:
         viewing["ipd_m"] = ipd_m
 
     def change(document: Any) -> None:
-        put(document, "stack", values)
+        put(document, "stack", size)
         put(document, "calibration", viewing)
 
     setup.write(change)
-    return {"width_m": width_m, "height_m": height_m, "gap_m": found_m, "viewing_m": [near_m, far_m]}
+    return {"text": f"{_mm(width_m)} by {_mm(height_m)}; viewers {_m(near_m)} to {_m(far_m)} away"}
 
 
 def _turn_dials(setup: Setup, dials: list[Dial]) -> None:
@@ -160,41 +159,42 @@ def _turn_dials(setup: Setup, dials: list[Dial]) -> None:
             f"{dials[chosen].name}: {dials[chosen].show(dials[chosen].value)}",
             "left, right: change; f, c: finer, coarser; up, down: another number; Enter: all are right; q: stop",
         )
-        key = setup.hardware.key()
-        if key is Key.ACCEPT:
-            return
-        if key is Key.QUIT:
-            raise Stopped
-        if key in (Key.UP, Key.DOWN):
-            chosen = (chosen + (1 if key is Key.DOWN else -1)) % len(dials)
-        elif key in (Key.FINER, Key.COARSER):
-            coarse = min(coarse * 10, 100) if key is Key.COARSER else max(coarse // 10, 1)
-        elif key in (Key.LEFT, Key.RIGHT):
-            for _ in range(coarse):
-                dials[chosen].turn(1 if key is Key.RIGHT else -1)
+        match setup.hardware.key():
+            case Key.ACCEPT:
+                return
+            case Key.QUIT:
+                raise Stopped
+            case Key.UP:
+                chosen = (chosen - 1) % len(dials)
+            case Key.DOWN:
+                chosen = (chosen + 1) % len(dials)
+            case Key.FINER:
+                coarse = max(coarse // 10, 1)
+            case Key.COARSER:
+                coarse = min(coarse * 10, 100)
+            case Key.LEFT:
+                dials[chosen].turn(-coarse)
+            case Key.RIGHT:
+                dials[chosen].turn(coarse)
 
 
 def registration(setup: Setup) -> Figures:
     """Where the panels truly are, from photographs of the boards."""
     setup.write(lambda document: None)  # an empty configuration where there was none
     settings = setup.settings
-    boards = board_layers(settings.stack.stack())
-    pictures = setup.hardware.photographs(settings, boards, panel=None, say=setup.say)
+    pictures = setup.hardware.photographs(settings, boards(settings.stack.stack()), panel=None, say=setup.say)
     summary, text = register_photos(pictures, "photographs", setup.out / "registration", settings, config=setup.config)
     setup.say(text)
-    return {
-        "eye_error_mm": summary["eye_error_mm"],
-        "gap_mm": [float(gap) * 1e3 for gap in summary["gap_m"]],
-        "used": summary["used"],
-        "notes": summary["notes"],
-    }
+    gaps = ", ".join(f"{gap * 1e3:.2f}" for gap in summary["gap_m"])
+    figures = f"gaps {gaps} mm, from {summary['used']} photographs; what is uncertain is worth"
+    return {"text": f"{figures} {summary['eye_error_mm']:.2f} mm at the eye", "notes": summary["notes"]}
 
 
 def grey(setup: Setup) -> Figures:
     """What each panel makes of a grey, from photographs of its chart; a panel at a time, each kept at once."""
     stack = setup.settings.stack.stack()
     known = [bool(panel.lut) for panel in setup.settings.output.panels] or [False] * stack.count
-    residual: dict[int, float] = {}
+    residuals = [0.0]
     number, problem = 0, ""
     while number < stack.count:
         state = "has a curve" if known[number] else "has no curve yet"
@@ -210,7 +210,7 @@ def grey(setup: Setup) -> Figures:
             number += 1
         elif key is Key.ACCEPT:
             try:
-                residual[number] = _measure_grey(setup, number)
+                residuals.append(_measure_grey(setup, number))
             except InputError as error:
                 problem = f"it did not work: {error}"
                 continue
@@ -219,15 +219,17 @@ def grey(setup: Setup) -> Figures:
     if not any(known):
         setup.say("no panel has a curve: gammas stay as they are configured")
         raise Stopped
-    return {"panels": [n for n, has in enumerate(known) if has], "residual": residual}
+    which = ", ".join(str(n) for n, has in enumerate(known) if has)
+    return {"text": f"of panels {which}, measured to {100 * max(residuals):.2f}% of the range"}
 
 
 def _measure_grey(setup: Setup, panel: int) -> float:
     """One panel's LUT into the configuration; returns how far the curve is off, of the range. Raises InputError."""
     settings = setup.settings
     stack = settings.stack.stack()
-    layers = alone(grey_chart(stack, panel), stack, index=panel)
-    pictures = setup.hardware.photographs(settings, layers, panel=panel, say=setup.say)
+    charts = np.zeros((stack.count, stack.height_px, stack.width_px), np.uint8)
+    charts[panel] = grey_chart(stack, panel)
+    pictures = setup.hardware.photographs(settings, charts, panel=panel, say=setup.say)
     series = photographed_series(pictures, stack, panel=panel, source="photographs")
     path = (setup.out / "grey" / f"panel-{panel}.csv").resolve()
     summary, text = fit_lut(path, series, source="photographs")
@@ -263,7 +265,7 @@ def sensor(setup: Setup) -> Figures:
         except InputError as error:
             problem = f"it does not work: {error}"
     setup.write(lambda document: put(document, "sensor", update))
-    return {"sensor": name}
+    return {"text": name}
 
 
 def calibration(setup: Setup) -> Figures:
@@ -276,7 +278,10 @@ def calibration(setup: Setup) -> Figures:
     summary, text = solve_file(pairs_path, target, settings=setup.settings)
     setup.say(text)
     setup.write(lambda document: put(document, "calibration", {"file": str(target.resolve())}))
-    return {key: summary[key] for key in ("eye_error_mm", "rms_mm", "pairs", "warnings")}
+    figures = (
+        f"{summary['eye_error_mm']:.1f} mm expected, from {summary['pairs']} pairs, {summary['rms_mm']:.1f} mm off"
+    )
+    return {"text": f"{figures} on average", "notes": summary["warnings"]}
 
 
 def service(setup: Setup) -> Figures:
@@ -288,7 +293,7 @@ def service(setup: Setup) -> Figures:
         "sudo systemctl enable --now phasestack",
     ]
     setup.say("the service reads its own copy of all this; it is installed by\n  " + "\n  ".join(commands))
-    return {"files": files, "commands": commands}
+    return {"text": f"{len(files)} files; at every start: {'; '.join(commands)}"}
 
 
 STEPS = (

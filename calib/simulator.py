@@ -140,24 +140,17 @@ def photograph(
 ) -> U8:
     """(h, w) the photograph from a camera at `pose` (4, 4; camera_from_stack). rays: `camera_rays(lens)`."""
     x, y = rays
-    if exposure.samples > 1:
-        light = _light_of_areas(scene, lens, pose, exposure, x, y)
-    else:
-        # A sensor's pixel is an area: sampled in its middle alone, edges would be jagged.
-        soft = [cv2.GaussianBlur(layer, (0, 0), APERTURE_PX) for layer in scene.layers]
-        light = _light(scene, soft, pose, exposure, x, y)
-    return _developed(_softened(light, exposure), lens, exposure, random)
-
-
-def _light_of_areas(scene: Scene, lens: Lens, pose: F64, exposure: Exposure, x: F32, y: F32) -> F32:
-    """(h, w) mean light over the area of each of the sensor's pixels."""
-    steps = ((np.arange(exposure.samples) + 0.5) / exposure.samples - 0.5) / lens.focal_px
-    layers = list(scene.layers)
-    total = np.zeros(x.shape, np.float32)
-    for across in steps.astype(np.float32):
-        for down in steps.astype(np.float32):
-            total += _light(scene, layers, pose, exposure, x + across, y + down)
-    return total / np.float32(exposure.samples**2)
+    layers, count = list(scene.layers), exposure.samples
+    if count == 1:  # a sensor's pixel is an area: sampled in its middle alone, edges would be jagged
+        layers = [cv2.GaussianBlur(layer, (0, 0), APERTURE_PX) for layer in layers]
+    steps = (((np.arange(count) + 0.5) / count - 0.5) / lens.focal_px).astype(np.float32)
+    light = np.zeros(x.shape, np.float32)
+    for across in steps:
+        for down in steps:
+            light += _light(scene, layers, pose, exposure, x + across, y + down) / np.float32(count**2)
+    if exposure.blur_px:
+        light = np.asarray(cv2.GaussianBlur(light, (0, 0), exposure.blur_px), np.float32)
+    return _developed(light, lens, exposure, random)
 
 
 def _light(scene: Scene, layers: Sequence[U8], pose: F64, exposure: Exposure, x: F32, y: F32) -> F32:
@@ -193,10 +186,6 @@ def _grid(position: F32, depth: float) -> F32:
     """Light that a panel's pixels let through along one axis: least between two pixels."""
     found: F32 = np.float32(1 - depth / 2) - np.float32(depth / 2) * np.cos(np.float32(2 * np.pi) * position)
     return found
-
-
-def _softened(light: F32, exposure: Exposure) -> F32:
-    return np.asarray(cv2.GaussianBlur(light, (0, 0), exposure.blur_px)) if exposure.blur_px else light
 
 
 def _developed(light: F32, lens: Lens, exposure: Exposure, random: np.random.Generator) -> U8:

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import datetime
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import tomlkit
 
 from calib.checks import check_pairs, check_solution
 from calib.pairs import Pairs, read_pairs
 from calib.similarity import Degenerate
 from calib.solution import METHODS, Solution, solve, solve_default
-from calib.store import Origin, calibration_text, save
+from calib.store import save
 from calib.viewpoints import viewing_volume_m
 from runtime.config import Settings
 from runtime.errors import InputError
 from runtime.records import F64
+from runtime.report.page import in_columns
+
+if TYPE_CHECKING:
+    from tomlkit.items import Array
+
+STORED_PAIRS = 500  # more are left in their own file
 
 
 def solve_file(
@@ -28,8 +36,8 @@ def solve_file(
     """
     if method and method not in METHODS:
         raise InputError("calibrate solve", "--method", f"must be one of {', '.join(METHODS)}, not {method}")
-    checked = check_pairs(read_pairs(pairs_path))
-    pairs = checked.pairs
+    pairs, warnings = check_pairs(read_pairs(pairs_path))
+    volume_m = viewing_volume_m(settings.calibration)
     try:
         chosen = (
             solve(pairs.sensor_m, pairs.stack_m, method=method, known_scale=known_scale, reason="asked for")
@@ -38,36 +46,24 @@ def solve_file(
         )
     except Degenerate as problem:
         raise InputError(pairs.source, "pairs", str(problem)) from None
-    volume_m = viewing_volume_m(settings.calibration)
-    warnings = checked.warnings + check_solution(pairs, chosen, volume_m)
-    origin = Origin(
-        date=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        sensor_driver=settings.sensor.driver,
-        sensor_serial=pairs.sensor_serial,
-        panel_ids=tuple(panel.edid_serial for panel in settings.output.panels),
-    )
-    kept = save(out, calibration_text(chosen, pairs, origin=origin, warnings=warnings, volume_m=volume_m))
-    table = [_figures(other, volume_m) for other in _all_methods(pairs, chosen, known_scale=known_scale)]
-    summary = _summary(pairs, chosen, warnings, volume_m) | {
+    warnings += check_solution(pairs, chosen, volume_m)
+    methods = []
+    for name in METHODS:
+        with suppress(Degenerate):
+            other = solve(pairs.sensor_m, pairs.stack_m, method=name, known_scale=known_scale)
+            methods.append(_figures(chosen if name == chosen.method else other, volume_m))
+    save(out, calibration_text(chosen, pairs, settings, warnings=warnings, volume_m=volume_m))
+    summary = _figures(chosen, volume_m) | {
         "file": str(out),
-        "kept_version": str(kept) if kept else None,
-        "methods": table,
+        "reason": chosen.reason,
+        "stack_from_sensor": chosen.similarity.matrix,
+        "pairs": len(pairs),
+        "axis_rms_mm": chosen.axis_rms_m * 1e3,
+        "outliers": [pairs.names[i] for i in np.flatnonzero(~chosen.used)],
+        "warnings": warnings,
+        "methods": methods,
     }
     return summary, _text(summary)
-
-
-def _all_methods(pairs: Pairs, chosen: Solution, *, known_scale: float) -> list[Solution]:
-    found = []
-    for method in METHODS:
-        try:
-            found.append(
-                chosen
-                if method == chosen.method
-                else solve(pairs.sensor_m, pairs.stack_m, method=method, known_scale=known_scale)
-            )
-        except Degenerate:
-            continue
-    return found
 
 
 def _figures(solution: Solution, volume_m: F64) -> dict[str, Any]:
@@ -85,34 +81,66 @@ def _figures(solution: Solution, volume_m: F64) -> dict[str, Any]:
     }
 
 
-def _summary(pairs: Pairs, solution: Solution, warnings: tuple[str, ...], volume_m: F64) -> dict[str, Any]:
-    return _figures(solution, volume_m) | {
-        "reason": solution.reason,
-        "stack_from_sensor": solution.similarity.matrix,
-        "pairs": len(pairs),
-        "axis_rms_mm": (solution.axis_rms_m * 1e3).tolist(),
-        "sigma_rotation_deg": np.degrees(np.sqrt(np.diag(solution.covariance)[:3])).tolist(),
-        "sigma_shift_mm": (np.sqrt(np.diag(solution.covariance)[3:6]) * 1e3).tolist(),
-        "sigma_scale": solution.scale_sigma,
-        "outliers": [pairs.names[i] for i in np.flatnonzero(~solution.used)],
-        "warnings": list(warnings),
-    }
-
-
 def _text(summary: dict[str, Any]) -> str:
-    lines = [
+    rows = [["method", "scale", "RMS mm", "max mm", "left out mm", "at the eye mm"]]
+    for row in summary["methods"]:
+        mark = "> " if row["method"] == summary["method"] else ""
+        figures = [row[name] for name in ("rms_mm", "max_mm", "leave_one_out_mm", "eye_error_mm")]
+        rows.append([mark + row["method"], f"{row['scale']:.5f}", *[f"{value:.3f}" for value in figures]])
+    axes = ", ".join(f"{value:.2f}" for value in summary["axis_rms_mm"])
+    return "\n".join([
         f"{summary['file']}: {summary['method']} ({summary['reason']})",
         f"  {summary['pairs']} pairs, {summary['rejected']} rejected; residual RMS {summary['rms_mm']:.2f} mm, "
-        f"largest {summary['max_mm']:.2f} mm; x, y, z " + ", ".join(f"{v:.2f}" for v in summary["axis_rms_mm"]) + " mm",
+        f"largest {summary['max_mm']:.2f} mm; x, y, z {axes} mm",
         f"  expected error at the eye {summary['eye_error_mm']:.2f} mm on average over the viewing volume, "
         f"95% below {summary['eye_error_p95_mm']:.2f} mm",
-        "",
-        "  method         scale     RMS mm   max mm   left out mm   at the eye mm",
-    ]
-    for row in summary["methods"]:
-        mark = ">" if row["method"] == summary["method"] else " "
-        lines.append(
-            f"{mark} {row['method']:13} {row['scale']:8.5f} {row['rms_mm']:9.3f} {row['max_mm']:8.3f}"
-            f" {row['leave_one_out_mm']:13.3f} {row['eye_error_mm']:15.3f}"
-        )
-    return "\n".join(lines)
+        in_columns(rows),
+    ])  # fmt: skip
+
+
+def calibration_text(
+    solution: Solution, pairs: Pairs, settings: Settings, *, warnings: list[str], volume_m: F64
+) -> str:
+    """The TOML of a solution; `runtime.eyes.calibration` reads it, `[data]` is the report's."""
+    document = tomlkit.document()
+    document.add(tomlkit.comment("Made by `phasestack calibrate solve`. Lengths in metres, angles in radians."))
+    document["stack_from_sensor"] = _rows(solution.similarity.matrix)
+    document.update({
+        "units": "m",
+        "method": solution.method,
+        "method_reason": solution.reason,
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "sensor_driver": settings.sensor.driver,
+        "sensor_serial": pairs.sensor_serial,
+        "panel_ids": [panel.edid_serial for panel in settings.output.panels],
+        "pairs": int(solution.used.sum()),
+        "condition": solution.condition,
+        "warnings": warnings,
+    })  # fmt: skip
+    residuals = {
+        "rms_m": solution.rms_m,
+        "max_m": solution.max_m,
+        "axis_rms_m": solution.axis_rms_m.tolist(),
+        "eye_error_m": float(solution.eye_error_m(volume_m).mean()),
+    }
+    if np.isfinite(solution.leave_one_out_rms_m):
+        residuals["leave_one_out_rms_m"] = solution.leave_one_out_rms_m
+    document["residuals"] = residuals
+    covariance = tomlkit.table()
+    covariance.add(tomlkit.comment("of rotation vector, shift and log scale about the pivot, in the stack's axes"))
+    covariance["pivot_m"] = solution.pivot_m.tolist()
+    covariance["matrix"] = _rows(solution.covariance)
+    document["covariance"] = covariance
+    data: dict[str, Any] = {"source": pairs.source}
+    if len(pairs) <= STORED_PAIRS:
+        data["names"], data["used"] = list(pairs.names), solution.used.tolist()
+        data["sensor_m"], data["stack_m"] = _rows(pairs.sensor_m), _rows(pairs.stack_m)
+    document["data"] = data
+    return tomlkit.dumps(document)
+
+
+def _rows(matrix: F64) -> Array:
+    rows = tomlkit.array()
+    for row in matrix.tolist():
+        rows.append(row)
+    return rows.multiline(True)

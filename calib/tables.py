@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, TypeAdapter, ValidationError
 
 from runtime.errors import InputError
 from runtime.support import foreign
@@ -71,19 +71,17 @@ def validated_rows(table: Table, model: type[M]) -> list[M]:
     missing = [name for name in wanted if name not in table.columns]
     if missing:
         raise InputError(table.path, missing[0], "column is missing (wanted: " + ", ".join(wanted) + ")")
-    found, wrong = [], []
-    for label, row in table.rows:
-        try:
-            found.append(model.model_validate(row))
-        except ValidationError as error:
-            wrong += [(f"{label}, {one['loc'][0]}", _problem(one)) for one in error.errors()]
-    if wrong:
-        field, problem = wrong[0]
-        more = [f"{place}: {text}" for place, text in wrong[1:MAX_LISTED]]
-        if len(wrong) > MAX_LISTED:
-            more.append(f"and {len(wrong) - MAX_LISTED} more")
-        raise InputError(table.path, field, "; ".join([problem, *more]))
-    return found
+    try:
+        return TypeAdapter(list[model]).validate_python([row for _, row in table.rows])  # type: ignore[valid-type]
+    except ValidationError as error:
+        wrong = error.errors()
+    listed = []
+    for one in wrong[:MAX_LISTED]:
+        row, column = one["loc"][:2]
+        listed.append(f"{table.rows[int(row)][0]}, {column}: {_problem(one)}")
+    if len(wrong) > MAX_LISTED:
+        listed.append(f"and {len(wrong) - MAX_LISTED} more")
+    raise InputError(table.path, "", "; ".join(listed))
 
 
 def _problem(error: Any) -> str:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from calib.capture import MAX_SPREAD_M, EyeWindow
 from calib.keys import Key
-from calib.pairs import PairsFile, points_of
+from calib.pairs import PairRow, PairsFile, points_of
 from calib.similarity import Degenerate, Similarity, extents, fit
 from calib.viewpoints import Viewpoint
 from runtime.clock import NS_PER_S
 from runtime.records import F64, EyePoints
+
+if TYPE_CHECKING:
+    from calib.charts import ChartDisplay
 
 HERE = "here: till the lines fuse; then hold still, or Enter"
 GUIDE_NS = NS_PER_S // 2  # between two words of guidance
@@ -24,16 +27,6 @@ MOVED_M = 0.02  # since the last pair or its undoing: a person who has not moved
 MIN_PAIRS = 3  # that show roughly where the camera stands
 MIN_WIDTH_M = 0.02  # of these across their longest direction: nearly a line leaves the turn about it open
 NEAR_M = 0.015  # nearer than this the lines themselves are the better guide
-
-
-class Chart(Protocol):
-    """What shows the charts and a line of words on the panels."""
-
-    def show(self, viewpoint: Viewpoint) -> None:
-        """The viewpoint's chart."""
-
-    def caption(self, text: str) -> None:
-        """A line of words below it."""
 
 
 def rough_similarity(sensor_m: F64, stack_m: F64) -> Similarity | None:
@@ -76,7 +69,7 @@ class Walk:
         viewpoints: Sequence[Viewpoint],
         *,
         say: Callable[[str], None],
-        chart: Chart | None = None,
+        chart: ChartDisplay | None = None,
     ) -> None:
         """chart: None: the person follows the charts elsewhere."""
         self._file, self._say, self._chart = file, say, chart
@@ -157,14 +150,16 @@ class Walk:
         if seen is None:
             self._say(f"{viewpoint.name}: not taken: the sensor sees no pair of eyes")
             return
-        spread = f"{seen.spread_m * 1e3:.1f} mm"
+        spread = f"{seen.spread_m * 1e3:.1f}"
         if seen.spread_m > MAX_SPREAD_M:
-            self._say(f"{viewpoint.name}: not taken: the eyes moved or scattered by {spread}: hold still")
+            self._say(f"{viewpoint.name}: not taken: the eyes moved or scattered by {spread} mm: hold still")
             return
-        self._file.accept(seen.paired(viewpoint.midpoint_m, viewpoint.name, serial=self._serial))
+        self._file.accept(
+            PairRow.of(seen.midpoint_m, viewpoint.midpoint_m, viewpoint.name, serial=self._serial, spread_mm=spread)
+        )
         self._accepted += 1
         self._rough = rough_similarity(*points_of(self._file.rows))
-        self._say(f"{viewpoint.name}: {how}taken, spread {spread}, {len(self._file)} pairs in all")
+        self._say(f"{viewpoint.name}: {how}taken, spread {spread} mm, {len(self._file)} pairs in all")
         if self._index + 1 == len(self._left):
             self.finished = True
         else:
@@ -195,7 +190,7 @@ class Walk:
             self._guide = way
             self._say(way)
             if self._chart is not None:
-                self._chart.caption(way)
+                self._chart.show(self.current, caption=way)
 
     def _go(self, step: int) -> None:
         index = min(max(self._index + step, 0), len(self._left) - 1)

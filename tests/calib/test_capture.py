@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from calib.capture import EyeWindow, true_pair
+from calib.capture import EyeWindow
 from calib.commands import app
 from calib.keys import Key
 from calib.pairs import PairsFile, read_pairs
@@ -45,17 +45,6 @@ def test_the_median_over_the_window_ignores_a_wild_sample() -> None:
     measured = window.measure()
     assert measured is not None
     np.testing.assert_allclose(measured.midpoint_m, eyes_at(place).eyes_m.mean(0), atol=1e-12)
-    assert measured.samples == 15
-
-
-def test_a_moving_head_with_known_truth_gives_an_exact_pair() -> None:
-    times = np.arange(15) / 30
-    true = np.array([0.5, 0.0, 0.1]) + np.outer(times, [0.2, -0.3, 0.1])
-    sensor = np.array([eyes_at(place).eyes_m.mean(0) for place in true])
-    sensor[4] += 0.5
-    seen, true_m = true_pair(times, sensor, true)
-    assert seen.samples == 14
-    np.testing.assert_allclose(seen.midpoint_m, eyes_at(true_m).eyes_m.mean(0), atol=1e-12)
 
 
 def walk(path: Path, said: list[str]) -> Walk:

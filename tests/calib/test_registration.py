@@ -37,7 +37,7 @@ def test_without_noise_the_panels_are_found_exactly() -> None:
     for panel, expected in zip(found.panels, true, strict=True):
         assert np.allclose(panel.centre_m, expected.centre_m, atol=2e-6)
         assert np.allclose(panel.rotation, expected.rotation, atol=1e-5)
-    assert found.lens[0] == pytest.approx(lens.focal_px, rel=1e-4)
+    assert found.focal_px == pytest.approx(lens.focal_px, rel=1e-4)
 
 
 @pytest.mark.slow
@@ -65,17 +65,23 @@ def test_gross_errors_among_the_points_do_no_harm() -> None:
     assert errors_of(register(seen), truth).pixels.max() < 0.3
 
 
-def test_even_distances_lie_nearest_to_the_true_ones_and_keep_the_reference() -> None:
-    uneven = replace(STACK, x_m=(-0.058, 0.0, 0.062))
-    assert evenly_spaced(uneven, reference=1).x_m == pytest.approx((-0.06, 0.0, 0.06))
-    truth, random = hands(2)
+def test_uneven_distances_become_the_even_ones_nearest_to_them_that_keep_the_reference() -> None:
+    assert evenly_spaced((-0.058, 0.0, 0.062), reference=1) == pytest.approx((-0.06, 0.0, 0.06))
+    truth, random = hands(2, replace(STACK, x_m=(-0.053, 0.0, 0.066)))
     seen, _ = photographed(STACK, truth, count=8, noise_px=0.05, random=random)
     even, true = register(seen, even=True), register(seen)
-    assert even.stack.is_evenly_spaced
     assert np.ptp(np.diff(even.stack.x_m)) < 1e-12
     assert true.stack.x_m == pytest.approx(true.true_x_m, abs=1e-12)
-    assert np.ptp(np.diff(true.stack.x_m)) > 1e-3
+    assert np.ptp(np.diff(true.stack.x_m)) > 1e-2
     assert np.allclose(even.true_x_m, true.stack.x_m)
+
+
+def test_distances_that_the_networks_serve_stay_as_they_are() -> None:
+    truth, random = hands(2)
+    seen, _ = photographed(STACK, truth, count=8, noise_px=0.05, random=random)
+    found = register(seen, even=True)
+    assert found.stack.x_m == pytest.approx(found.true_x_m, abs=1e-12)
+    assert np.ptp(np.diff(found.stack.x_m)) > 1e-3
 
 
 def test_a_stack_of_two_and_one_of_four_panels() -> None:
@@ -109,9 +115,8 @@ def test_a_photograph_of_another_stack_is_named_and_left_out() -> None:
     seen, _ = photographed(STACK, truth, count=9, noise_px=0.05, random=random)
     stranger, _ = photographed(STACK, hands(8)[0], count=9, noise_px=0.05, random=hands(0)[1])
     found = register([*seen[:4], stranger[4], *seen[5:]])
-    left_out = [v for v in found.verdicts if not v.used]
-    assert [v.name for v in left_out] == ["5.jpg"]
-    assert "does not agree" in left_out[0].reason
+    assert list(found.left_out) == ["5.jpg"]
+    assert "does not agree" in found.left_out["5.jpg"]
     assert errors_of(found, truth).pixels.max() < 0.3
 
 

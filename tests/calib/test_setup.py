@@ -103,7 +103,7 @@ def test_keys_alone_lead_from_nothing_to_a_configuration_that_is_valid(
     told = json.loads((folder / "out" / "setup.json").read_text())
     assert told["finished"]
     assert set(told["done"]) == {step.name for step in STEPS}
-    assert "error of the eyes&#39; places" in (folder / "out" / "index.html").read_text()
+    assert "mm of error expected at the eye" in (folder / "out" / "index.html").read_text()
 
 
 @pytest.mark.slow
@@ -302,7 +302,7 @@ def processor_s(process: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def test_a_simulated_card_is_shown_in_the_terminal_and_waiting_for_a_key_is_no_work(tmp_path: Path) -> None:
+def test_in_a_terminal_a_key_is_waited_for_without_work(tmp_path: Path) -> None:
     terminal, other_end = pty.openpty()
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "TERM": "xterm-256color"}
     command = [sys.executable, "-m", "runtime.cli", "setup", "--simulate"]
@@ -316,7 +316,6 @@ def test_a_simulated_card_is_shown_in_the_terminal_and_waiting_for_a_key_is_no_w
                 while wanted not in shown:
                     shown += os.read(terminal, 65536)
                 os.write(terminal, key)
-            assert shown.count("▀".encode()) > 1000
             before = processor_s(running.pid)
             time.sleep(4)
             assert processor_s(running.pid) - before < 0.8
