@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calib.board import Mark, dictionary, marks
+from calib.board import MARKER, Mark, dictionary, marks
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 
@@ -32,33 +32,7 @@ class SeenMarks:
     panel_px: F64  # (K, 2) where the saddle is on the panel
     image_px: F64  # (K, 2) where it is in the photograph; pixel centres at whole numbers
     marks: tuple[int, ...]  # how many of each panel's marks were found
-    edge_bits: float  # width of an edge in bits of a marker, median; infinite without marks
-    unit_px: float  # photograph's pixels in one bit, median; 0 without marks
-    extents: tuple[float, ...]  # how much of each panel's width or height, the lesser, lies between its marks seen
-    mirrored: tuple[int, ...]  # how many of each panel's marks are found in the mirrored photograph
-
-    @property
-    def fault(self) -> str:
-        """Why it cannot be used; empty: it can."""
-        least = min(self.marks)
-        for panel, (straight, turned) in enumerate(zip(self.marks, self.mirrored, strict=True)):
-            if turned >= MIN_MARKS and straight < MIN_MARKS:
-                if sum(self.marks) == 0 or max(self.marks) < MIN_MARKS:
-                    return "is mirrored (a selfie camera's habit; or the panels' `mirror` is wrong)"
-                return f"shows panel {panel} mirrored: its `mirror` in the configuration is wrong"
-        if sum(self.marks) == 0:
-            return "shows no mark of the board: blurred, too dark, or of something else"
-        if self.edge_bits > BLURRED_BITS:
-            return f"is blurred: its edges are {self.edge_bits * self.unit_px:.1f} px wide"
-        if self.unit_px < MIN_UNIT_PX:
-            return f"is too small: {self.unit_px:.1f} px for one bit of a mark; go nearer or use more pixels"
-        if least < MIN_MARKS:
-            panel = self.marks.index(least)
-            return f"shows {least} marks of panel {panel}, less than {MIN_MARKS}: covered, cut off or too oblique"
-        for panel, share in enumerate(self.extents):
-            if share < MIN_EXTENT:
-                return f"is covered or cut off: of panel {panel} {100 * share:.0f}% of its width or height are seen"
-        return ""
+    fault: str  # why it cannot be used; empty: it can
 
 
 def _detector() -> Any:
@@ -91,14 +65,8 @@ def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
     """The saddles of all panels' boards in a grey photograph (h, w)."""
     known = {mark.number: mark for mark in marks(stack)}
     found = _markers(picture, known)
-    mirrored = [0] * stack.count
-    if len(found) < MIN_MARKS * stack.count:
-        for mark, _ in _markers(np.ascontiguousarray(picture[:, ::-1]), known):
-            mirrored[mark.panel] += 1
-    height, width = picture.shape
-    panel, panel_px, image_px, edges, units = [], [], [], [], []
-    counts = [0] * stack.count
-    unit_px = float(np.median([_unit_px(mark, quad) for mark, quad in found])) if found else 0.0
+    panel, panel_px, image_px, edges = [], [np.zeros((0, 2))], [np.zeros((0, 2))], []
+    unit_px = float(np.median([_unit_px(quad) for _, quad in found])) if found else 0.0
     window = int(np.clip(round(1.3 * unit_px), 2, 15))
     for mark, quad in found:
         image_from_panel: Any = cv2.findHomography(mark.marker_px, quad)[0]
@@ -106,38 +74,70 @@ def find_marks(picture: U8, stack: PanelStack, *, name: str) -> SeenMarks:
             continue
         guess = cv2.perspectiveTransform(mark.saddles_px[None], image_from_panel)[0]
         good, refined = _refined(picture, guess, quad, window=window)
-        if not good.any():
-            continue
-        counts[mark.panel] += 1
-        panel += [mark.panel] * int(good.sum())
-        panel_px.append(mark.saddles_px[good])
-        image_px.append(refined[good])
-        units.append(_unit_px(mark, quad))
-        edges.append(_edge_px(picture, quad) / units[-1])
-    places = np.concatenate(panel_px) / [stack.width_px, stack.height_px] if panel_px else np.zeros((0, 2))
-    owners = np.array(panel, dtype=np.intp)
+        if good.any():
+            panel.append(np.full(int(good.sum()), mark.panel))
+            panel_px.append(mark.saddles_px[good])
+            image_px.append(refined[good])
+            edges.append(_edge_px(picture, quad) / _unit_px(quad))
+    owners, places_px = np.concatenate([np.zeros(0, np.intp), *panel]), np.concatenate(panel_px)
+    counts = [sum(int(part[0]) == index for part in panel) for index in range(stack.count)]
+    height, width = picture.shape
     return SeenMarks(
         name=name,
         width_px=width,
         height_px=height,
         panel=owners,
-        panel_px=np.concatenate(panel_px) if panel_px else np.zeros((0, 2)),
-        image_px=np.concatenate(image_px) if image_px else np.zeros((0, 2)),
+        panel_px=places_px,
+        image_px=np.concatenate(image_px),
         marks=tuple(counts),
-        edge_bits=float(np.median(edges)) if edges else float("inf"),
-        unit_px=unit_px,
-        extents=tuple(
-            float(np.ptp(places[owners == index], axis=0).min()) if (owners == index).any() else 0.0
-            for index in range(stack.count)
-        ),
-        mirrored=tuple(mirrored),
+        fault=_mirrored(picture, known, counts)
+        or _unreadable(counts, edges, unit_px)
+        or _covered(counts, places_px / [stack.width_px, stack.height_px], owners),
     )
 
 
-def _unit_px(mark: Mark, quad: F64) -> float:
+def _mirrored(picture: U8, known: dict[int, Mark], counts: list[int]) -> str:
+    """What is wrong with a picture whose marks are found in its mirror image; empty: nothing."""
+    if min(counts) >= MIN_MARKS:
+        return ""
+    turned = [mark.panel for mark, _ in _markers(np.ascontiguousarray(picture[:, ::-1]), known)]
+    for panel, count in enumerate(counts):
+        if count < MIN_MARKS <= turned.count(panel):
+            if max(counts) < MIN_MARKS:
+                return "is mirrored (a selfie camera's habit; or the panels' `mirror` is wrong)"
+            return f"shows panel {panel} mirrored: its `mirror` in the configuration is wrong"
+    return ""
+
+
+def _unreadable(counts: list[int], edges: list[float], unit_px: float) -> str:
+    """What is wrong with a picture's sharpness; edges: widths in bits of a marker, of each mark. Empty: nothing."""
+    if sum(counts) == 0:
+        return "shows no mark of the board: blurred, too dark, or of something else"
+    edge_bits = float(np.median(edges))
+    if edge_bits > BLURRED_BITS:
+        return f"is blurred: its edges are {edge_bits * unit_px:.1f} px wide"
+    if unit_px < MIN_UNIT_PX:
+        return f"is too small: {unit_px:.1f} px for one bit of a mark; go nearer or use more pixels"
+    return ""
+
+
+def _covered(counts: list[int], places: F64, owners: Any) -> str:
+    """Which panel cannot be placed by a picture; places (K, 2): of its saddles, in widths and heights. Empty: none."""
+    fewest = min(counts)
+    if fewest < MIN_MARKS:
+        panel = counts.index(fewest)
+        return f"shows {fewest} marks of panel {panel}, less than {MIN_MARKS}: covered, cut off or too oblique"
+    for panel in range(len(counts)):
+        share = float(np.ptp(places[owners == panel], axis=0).min())
+        if share < MIN_EXTENT:
+            return f"is covered or cut off: of panel {panel} {100 * share:.0f}% of its width or height are seen"
+    return ""
+
+
+def _unit_px(quad: F64) -> float:
     """Photograph's pixels in a bit of a marker, along its shorter side."""
     sides = np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1)
-    return float(sides.min()) / 6
+    return float(sides.min()) / MARKER
 
 
 def _refined(picture: U8, guess: F64, quad: F64, *, window: int) -> tuple[Any, F64]:

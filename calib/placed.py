@@ -6,7 +6,6 @@ rows to the viewer's right, z up. Its pixel pitch is the stack's.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,17 +79,6 @@ def true_from_ideal_seen(panel: PlacedPanel, eye_m: ArrayLike, stack: PanelStack
         raise ValueError("an eye in a panel's plane sees nothing through it")
     matrix = np.linalg.solve(seen, stack_from_pixels(ideal_panel(stack, index), stack) - eye)
     return np.asarray(matrix / matrix[2, 2] + 0.0, dtype=np.float64)  # + 0.0: no -0.0 in a file
-
-
-def in_frame_of(panels: Sequence[PlacedPanel], *, reference: int, reference_x_m: float) -> tuple[PlacedPanel, ...]:
-    """The same panels in the frame that this project gives a stack, whatever frame they were in.
-
-    The reference panel is the stack's: it lies at its ideal place, so that its picture is never resampled (the
-    centre panel's sharpness matters most: turning all three panels costs 1.5 dB more than turning the outer two).
-    """
-    turn = panels[reference].rotation.T
-    middle, shift = panels[reference].centre_m, np.array([reference_x_m, 0.0, 0.0])
-    return tuple(PlacedPanel(turn @ p.rotation, turn @ (p.centre_m - middle) + shift) for p in panels)
 
 
 def misplaced(

@@ -31,6 +31,10 @@ MIN_PAIRS = 9
 SERVICE_FOLDER = "/etc/phasestack"
 
 
+class Stopped(Exception):
+    """The person wants to go on another time."""
+
+
 @dataclass
 class Setup:
     """What every step works with."""
@@ -46,22 +50,25 @@ class Setup:
         """The configuration as it is now."""
         return load_settings(self.config if foreign.is_there(self.config) else None)
 
-    def ask(self, question: str, keys: str, *, before: str = "") -> None:
-        """In the terminal and on the panels: a question and the keys that answer it. before: what went wrong."""
+    def ask(self, question: str, keys: str, *, before: str = "") -> Key:
+        """The key that answers a question, asked in the terminal and on the panels. before: what went wrong.
+
+        Raises Stopped for q.
+        """
         if before:
             self.say(before)
-        self.say(f"{question}  ({keys})")
-        self.hardware.show_words(self.settings, [line for line in (question, keys, before) if line])
+        self.say(f"{question}  ({keys}; q: stop)")
+        self.hardware.show_words(self.settings, [line for line in (question, f"{keys}; q: stop", before) if line])
+        key = self.hardware.key()
+        if key is Key.QUIT:
+            raise Stopped
+        return key
 
     def write(self, change: Callable[[Any], None]) -> None:
         """Change the configuration by a function of its document. Raises InputError."""
         document = read_document(self.config)
         change(document)
         save_document(self.config, document)
-
-
-class Stopped(Exception):
-    """The person wants to go on another time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,15 +162,13 @@ def geometry(setup: Setup) -> Figures:
 def _turn_dials(setup: Setup, dials: list[Dial]) -> None:
     chosen, coarse = 0, 1  # which dial; how many of its steps at once
     while True:
-        setup.ask(
+        key = setup.ask(
             f"{dials[chosen].name}: {dials[chosen].show(dials[chosen].value)}",
-            "left, right: change; f, c: finer, coarser; up, down: another number; Enter: all are right; q: stop",
+            "left, right: change; f, c: finer, coarser; up, down: another number; Enter: all are right",
         )
-        match setup.hardware.key():
+        match key:
             case Key.ACCEPT:
                 return
-            case Key.QUIT:
-                raise Stopped
             case Key.UP:
                 chosen = (chosen - 1) % len(dials)
             case Key.DOWN:
@@ -198,12 +203,8 @@ def grey(setup: Setup) -> Figures:
     number, problem = 0, ""
     while number < stack.count:
         state = "has a curve" if known[number] else "has no curve yet"
-        keys = "Enter: measure it; n: leave it; u: the panel before; q: stop"
-        setup.ask(f"panel {number} {state}", keys, before=problem)
-        problem = ""
-        key = setup.hardware.key()
-        if key is Key.QUIT:
-            raise Stopped
+        keys = "Enter: measure it; n: leave it; u: the panel before"
+        key, problem = setup.ask(f"panel {number} {state}", keys, before=problem), ""
         if key in (Key.UNDO, Key.PREVIOUS, Key.LEFT):
             number = max(0, number - 1)
         elif key in (Key.NEXT, Key.RIGHT):
@@ -246,11 +247,8 @@ def sensor(setup: Setup) -> Figures:
         names = ["replay"]
     chosen, problem = names.index(settings.sensor.driver) if settings.sensor.driver in names else 0, ""
     while True:
-        setup.ask(f"depth sensor: {names[chosen]}", "up, down: another; Enter: try it; q: stop", before=problem)
-        problem = ""
-        key = setup.hardware.key()
-        if key is Key.QUIT:
-            raise Stopped
+        question = f"depth sensor: {names[chosen]}"
+        key, problem = setup.ask(question, "up, down: another; Enter: try it", before=problem), ""
         if key in (Key.UP, Key.DOWN):
             chosen = (chosen + (1 if key is Key.DOWN else -1)) % len(names)
         if key is not Key.ACCEPT:
@@ -278,10 +276,8 @@ def calibration(setup: Setup) -> Figures:
     summary, text = solve_file(pairs_path, target, settings=setup.settings)
     setup.say(text)
     setup.write(lambda document: put(document, "calibration", {"file": str(target.resolve())}))
-    figures = (
-        f"{summary['eye_error_mm']:.1f} mm expected, from {summary['pairs']} pairs, {summary['rms_mm']:.1f} mm off"
-    )
-    return {"text": f"{figures} on average", "notes": summary["warnings"]}
+    text = f"{summary['eye_error_mm']:.1f} mm of error expected at the eye, from {summary['pairs']} pairs"
+    return {"text": text, "notes": summary["warnings"]}
 
 
 def service(setup: Setup) -> Figures:

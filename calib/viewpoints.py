@@ -34,19 +34,14 @@ class Viewpoint:
 
     def eyes_m(self, ipd_m: float = IPD_M) -> F64:
         """(2, 3) left and right eye, level, square to the line to the stack's centre; frame `stack`."""
-        return eyes_at(self.midpoint_m, ipd_m)
+        right = stack_from_eye(self.midpoint_m)[:3, 0]
+        return self.midpoint_m + np.outer([-ipd_m / 2, ipd_m / 2], right)
 
 
 def spherical_m(radius_m: float, *, phi_deg: float, theta_deg: float) -> F64:
     """(3,) point in `stack` from the EyeReal supplement's polar angles."""
     phi, theta = np.radians(phi_deg), np.radians(theta_deg)
     return radius_m * np.array([np.sin(phi) * np.sin(theta), np.sin(phi) * np.cos(theta), np.cos(phi)])
-
-
-def eyes_at(midpoint_m: F64, ipd_m: float = IPD_M) -> F64:
-    """(2, 3) left and right eye about a midpoint, level, square to the line to the stack's centre; frame `stack`."""
-    right = stack_from_eye(midpoint_m)[:3, 0]
-    return midpoint_m + np.outer([-ipd_m / 2, ipd_m / 2], right)
 
 
 def viewing_place_m(viewing: CalibrationSettings) -> F64:

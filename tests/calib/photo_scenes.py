@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.board import board, marks
 from calib.detect_marks import SeenMarks
-from calib.placed import PlacedPanel, corner_pixels, in_frame_of, stack_from_pixels, through
+from calib.placed import PlacedPanel, corner_pixels, stack_from_pixels, through
 from calib.registration import Registration, homographies
 from calib.simulator import Exposure, Lens, Scene, by_hand, camera_rays, phone, photograph, smaller
 from runtime.optics.stack import PanelStack
@@ -26,6 +26,13 @@ class Errors:
     pixels: np.ndarray  # (K,) distance over an even grid of points of every panel but the reference
     gap_m: np.ndarray  # (N-1,)
     inside_95: Any  # (M,) which of the stated 95% intervals hold the truth: gaps, then corners' coordinates
+
+
+def in_frame_of(panels: tuple[PlacedPanel, ...], *, reference: int, reference_x_m: float) -> tuple[PlacedPanel, ...]:
+    """The same panels in the frame that a registration has: of the reference panel, which lies at its ideal place."""
+    turn = panels[reference].rotation.T
+    middle, shift = panels[reference].centre_m, np.array([reference_x_m, 0.0, 0.0])
+    return tuple(PlacedPanel(turn @ p.rotation, turn @ (p.centre_m - middle) + shift) for p in panels)
 
 
 def errors_of(found: Registration, truth: tuple[PlacedPanel, ...]) -> Errors:
@@ -86,7 +93,7 @@ def points_of(
     counts = tuple(panel.count(index) // 4 for index in range(stack.count))
     return SeenMarks(
         name, lens.width_px, lens.height_px, np.array(panel), np.concatenate(panel_px), np.concatenate(image_px),
-        counts, edge_bits=0.5, unit_px=5.0, extents=(1.0,) * stack.count, mirrored=(0,) * stack.count,
+        counts, fault="",
     )  # fmt: skip
 
 

@@ -152,16 +152,12 @@ def test_who_holds_still_at_the_viewpoint_is_taken_without_a_key(tmp_path: Path)
     assert person.current.name == grid()[20].name
 
 
-@pytest.mark.parametrize("away", [{"drift_m": 0.05}, {"noise_m": 0.02}])
-def test_who_moves_or_scatters_is_not_taken(tmp_path: Path, away: dict[str, float]) -> None:
+@pytest.mark.parametrize(("aside_m", "how"), [(0.0, {"drift_m": 0.05}), (0.0, {"noise_m": 0.02}), (0.1, {})], ids=str)
+def test_who_moves_or_scatters_or_stands_elsewhere_is_not_taken(
+    tmp_path: Path, aside_m: float, how: dict[str, float]
+) -> None:
     person = guided(tmp_path, [])
-    stand_long(person, grid()[13].midpoint_m, start_s=10, **away)
-    assert len(read_pairs(tmp_path / "p.csv")) == 3
-
-
-def test_who_holds_still_elsewhere_is_not_taken(tmp_path: Path) -> None:
-    person = guided(tmp_path, [])
-    stand_long(person, grid()[13].midpoint_m + np.array([0.0, 0.1, 0.0]), start_s=10)
+    stand_long(person, grid()[13].midpoint_m + np.array([0.0, aside_m, 0.0]), start_s=10, **how)
     assert len(read_pairs(tmp_path / "p.csv")) == 3
 
 

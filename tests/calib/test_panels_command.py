@@ -17,13 +17,13 @@ from calib.board import PER_PANEL, board, marks
 from calib.commands import app
 from calib.detect_marks import find_marks
 from calib.photographs import read_photograph
-from calib.placed import PlacedPanel, in_frame_of, misplaced, true_from_ideal_seen
+from calib.placed import PlacedPanel, misplaced, true_from_ideal_seen
 from calib.viewpoints import viewing_place_m
 from runtime.config import Settings, StackGeometry, load_settings
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import read_image
-from tests.calib.photo_scenes import error_over_panel_px, simulated_photographs
+from tests.calib.photo_scenes import error_over_panel_px, in_frame_of, simulated_photographs
 
 run = CliRunner()
 STACK = StackGeometry().stack()

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from calib.bundle import Undetermined, adjust
-from calib.placed import PlacedPanel, ideal_panel, in_frame_of, misplaced
+from calib.placed import PlacedPanel, ideal_panel, misplaced
 from calib.registration import evenly_spaced, register_photographs
 from calib.simulator import camera_from_stack
 from runtime.config import StackGeometry
 from runtime.optics.stack import PanelStack
-from tests.calib.photo_scenes import errors_of, photographed
+from tests.calib.photo_scenes import errors_of, in_frame_of, photographed
 
 STACK = StackGeometry().stack()
 EYE = np.array([0.5, 0.0, 0.05])
@@ -95,7 +95,7 @@ def test_a_stack_of_two_and_one_of_four_panels() -> None:
 def test_too_few_photographs_are_refused_with_what_is_wrong_with_the_others() -> None:
     truth, random = hands(0)
     seen, _ = photographed(STACK, truth, count=6, noise_px=0.1, random=random)
-    blurred = [replace(s, edge_bits=2.0) for s in seen[:3]]
+    blurred = [replace(s, fault="is blurred") for s in seen[:3]]
     with pytest.raises(Undetermined, match=r"3 of 6 photographs.*1\.jpg is blurred.*2\.jpg is blurred"):
         register([*blurred, *seen[3:]])
 

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from calib.commands import app
 from runtime.errors import InputError
 from runtime.support.artifacts import read_image
+from tests.calib.camera import measured, write_pairs
 
 run = CliRunner()
 PUBLISHED = """stack_from_sensor = [
@@ -30,13 +29,11 @@ def report(*options: str) -> dict:
 
 
 @pytest.fixture
-def calibration(
-    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
-) -> Path:
+def calibration(tmp_path: Path) -> Path:
     sensor = measured(sigma_m=0.003)
     sensor[5] += 0.3
     path = tmp_path / "c.toml"
-    result = run.invoke(app, ["solve", "--pairs", str(write_pairs(sensor, known_m)), "--out", str(path), "--json"])
+    result = run.invoke(app, ["solve", "--pairs", str(write_pairs(tmp_path, sensor)), "--out", str(path), "--json"])
     assert result.exit_code == 0
     return path
 

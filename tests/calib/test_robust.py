@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
 from calib.robust import fit_robust
 from calib.similarity import fit
 from calib.viewpoints import viewing_volume_m
+from tests.calib.camera import KNOWN_M, measured
 
 
 def spoiled(sensor: np.ndarray, wrong: list[int], *, by_m: float = 0.3) -> np.ndarray:
@@ -22,30 +21,26 @@ def spoiled(sensor: np.ndarray, wrong: list[int], *, by_m: float = 0.3) -> np.nd
 
 @pytest.mark.parametrize("sigma_m", [0.0, 0.001, 0.01])
 @pytest.mark.parametrize("wrong", [[], [0], [3, 9, 12, 20, 26], [0, 1, 2, 3, 4, 5, 6, 7]])
-def test_exactly_the_wrong_pairs_are_left_out(
-    measured: Callable[..., np.ndarray], known_m: np.ndarray, sigma_m: float, wrong: list[int]
-) -> None:
-    found = fit_robust(spoiled(measured(sigma_m=sigma_m), wrong), known_m)
+def test_exactly_the_wrong_pairs_are_left_out(sigma_m: float, wrong: list[int]) -> None:
+    found = fit_robust(spoiled(measured(sigma_m=sigma_m), wrong), KNOWN_M)
     assert np.flatnonzero(~found.inlier).tolist() == wrong
 
 
 @pytest.mark.parametrize("sigma_m", [0.001, 0.01])
-def test_the_result_is_that_of_the_good_pairs_alone(
-    measured: Callable[..., np.ndarray], known_m: np.ndarray, sigma_m: float
-) -> None:
+def test_the_result_is_that_of_the_good_pairs_alone(sigma_m: float) -> None:
     wrong = [2, 7, 11, 19, 24]
     good = np.setdiff1d(np.arange(27), wrong)
     sensor = spoiled(measured(sigma_m=sigma_m), wrong)
-    alone = fit(sensor[good], known_m[good], rule="inverse")
-    np.testing.assert_array_equal(fit_robust(sensor, known_m).similarity.matrix, alone.matrix)
+    alone = fit(sensor[good], KNOWN_M[good], rule="inverse")
+    np.testing.assert_array_equal(fit_robust(sensor, KNOWN_M).similarity.matrix, alone.matrix)
 
 
-def test_it_tells_the_noise_of_the_good_pairs(measured: Callable[..., np.ndarray], known_m: np.ndarray) -> None:
-    told = [fit_robust(spoiled(measured(sigma_m=0.004, seed=s), [1, 8]), known_m).noise_m for s in range(20)]
+def test_it_tells_the_noise_of_the_good_pairs() -> None:
+    told = [fit_robust(spoiled(measured(sigma_m=0.004, seed=s), [1, 8]), KNOWN_M).noise_m for s in range(20)]
     assert np.mean(told) == pytest.approx(0.004, rel=0.08)
 
 
-def test_many_pairs_are_scored_by_a_sample_and_rejected_one_by_one(measured: Callable[..., np.ndarray]) -> None:
+def test_many_pairs_are_scored_by_a_sample_and_rejected_one_by_one() -> None:
     volume = viewing_volume_m()
     points = np.random.default_rng(0).uniform(volume.min(0), volume.max(0), size=(5000, 3))
     wrong = list(range(0, 5000, 5))

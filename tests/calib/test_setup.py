@@ -19,7 +19,7 @@ import pytest
 
 from calib.hardware import SimulatedHardware
 from calib.keys import Key
-from calib.placed import ideal_panel, in_frame_of, through, true_from_ideal_seen
+from calib.placed import ideal_panel, through, true_from_ideal_seen
 from calib.setup_run import progress_path, read_progress, walk_through
 from calib.setup_steps import STEPS, Setup, geometry, identify
 from calib.viewpoints import grid
@@ -31,8 +31,10 @@ from runtime.optics.carried import CarriedView
 from runtime.optics.quality import psnr_db
 from runtime.panels import lut
 from runtime.support.artifacts import read_image
+from tests.calib.photo_scenes import in_frame_of
 
 STACK = Settings().stack.stack()
+SetUp = tuple[Path, subprocess.CompletedProcess[str], SimulatedHardware]
 UP, DOWN, RIGHT, LEFT = "\x1b[A", "\x1b[B", "\x1b[C", "\x1b[D"
 
 
@@ -81,9 +83,7 @@ def setup_command(folder: Path, keys: str, *options: str) -> subprocess.Complete
 
 
 @pytest.fixture(scope="module")
-def set_up(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> tuple[Path, subprocess.CompletedProcess[str], SimulatedHardware]:
+def set_up(tmp_path_factory: pytest.TempPathFactory) -> SetUp:
     folder = tmp_path_factory.mktemp("setup")
     done = setup_command(folder, every_key(5), "--simulate", "--seed", "5")
     return folder, done, simulated(5)
@@ -91,9 +91,7 @@ def set_up(
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_keys_alone_lead_from_nothing_to_a_configuration_that_is_valid(
-    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedHardware],
-) -> None:
+def test_keys_alone_lead_from_nothing_to_a_configuration_that_is_valid(set_up: SetUp) -> None:
     folder, done, _ = set_up
     assert done.returncode == 0, done.stdout + done.stderr
     assert "step calibration: done" in done.stdout
@@ -108,23 +106,13 @@ def test_keys_alone_lead_from_nothing_to_a_configuration_that_is_valid(
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_every_panel_is_bound_to_its_monitor_as_it_is_mounted(
-    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedHardware],
-) -> None:
+def test_panels_are_bound_as_they_are_mounted_and_the_sensor_is_found_where_it_stands(set_up: SetUp) -> None:
     folder, _, hardware = set_up
-    for index, panel in enumerate(load_settings(folder / "new.toml").output.panels):
+    settings = load_settings(folder / "new.toml")
+    for index, panel in enumerate(settings.output.panels):
         monitor = hardware.order.index(index)
         assert panel.edid_serial == f"S{monitor}"
         assert (panel.rotation_deg, panel.mirror) == hardware.mounted[monitor]
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1800)
-def test_the_sensor_is_found_where_it_stands(
-    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedHardware],
-) -> None:
-    folder, _, _ = set_up
-    settings = load_settings(folder / "new.toml")
     found = load_calibration(Path(settings.calibration.file)).stack_from_sensor
     eyes = np.array([viewpoint.midpoint_m for viewpoint in grid()])
     sensor = np.column_stack([eyes, np.ones(27)]) @ np.linalg.inv(demo_stack_from_sensor()).T
@@ -196,9 +184,7 @@ def carried_db(
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_a_run_of_it_shows_the_eyes_within_a_decibel_of_a_perfect_stack(
-    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedHardware], tmp_path: Path
-) -> None:
+def test_a_run_of_it_shows_the_eyes_within_a_decibel_of_a_perfect_stack(set_up: SetUp, tmp_path: Path) -> None:
     """The run's own light, sent through the registration to the panels where they truly are."""
     folder, _, hardware = set_up
     command = [sys.executable, "-m", "runtime.cli", "run", "--config", str(folder / "new.toml"), "--replay", "demo",
@@ -220,9 +206,7 @@ def test_a_run_of_it_shows_the_eyes_within_a_decibel_of_a_perfect_stack(
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-def test_what_the_service_reads_is_gathered_and_stands_by_itself(
-    set_up: tuple[Path, subprocess.CompletedProcess[str], SimulatedHardware], tmp_path: Path
-) -> None:
+def test_what_the_service_reads_is_gathered_and_stands_by_itself(set_up: SetUp, tmp_path: Path) -> None:
     folder, _, _ = set_up
     there = shutil.copytree(folder / "out" / "service", tmp_path / "etc")
     settings = load_settings(there / "phasestack.toml")

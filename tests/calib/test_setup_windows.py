@@ -1,7 +1,8 @@
-"""`phasestack setup` on real windows of a real X server: cards, words, boards, and photographs of them."""
+"""`phasestack setup` and `calibrate` on real windows of a real X server, with keys that are really pressed."""
 
 from __future__ import annotations
 
+import ctypes
 import os
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import pytest
 
 from calib.board import board
 from calib.display import message_layers
+from calib.grey_chart import grey_chart
 from calib.placed import misplaced
 from calib.setup_steps import STEPS
 from runtime.config import load_settings
@@ -91,3 +93,32 @@ def test_keys_lead_through_cards_words_and_boards_on_the_panels(screen: xserver.
     assert [panel.connector for panel in settings.output.panels] == ["DUMMY0", "DUMMY1", "DUMMY2"]
     assert settings.output.kind == "windows"
     assert all(panel.homography[0][0] == 1.0 for panel in settings.output.panels)
+
+
+def press_q(screen: xserver.XServer) -> None:
+    """On the keyboard, the pointer over the first panel: without a window manager that is where it goes."""
+    x11, xtst = ctypes.CDLL("libX11.so.6"), ctypes.CDLL("libXtst.so.6")
+    x11.XOpenDisplay.restype = ctypes.c_void_p
+    display = ctypes.c_void_p(x11.XOpenDisplay(screen.name.encode()))
+    code = x11.XKeysymToKeycode(display, ctypes.c_ulong(0x71))
+    xtst.XTestFakeMotionEvent(display, 0, 100, 100, 0)
+    for down in (1, 0):
+        xtst.XTestFakeKeyEvent(display, code, down, ctypes.c_ulong(0))
+    x11.XCloseDisplay(display)
+
+
+def test_a_chart_is_shown_until_a_key_is_pressed_on_a_panel(screen: xserver.XServer, tmp_path: Path) -> None:
+    panels = "".join(f'[[output.panels]]\nconnector = "DUMMY{index}"\n' for index in range(3))
+    (tmp_path / "c.toml").write_text(f'{CONFIG}[output]\nkind = "windows"\n{panels}')
+    command = [sys.executable, "-m", "runtime.cli", "calibrate", "grey", "--panel", "1", "--show", "--config",
+               str(tmp_path / "c.toml")]  # fmt: skip
+    environment = os.environ | {"DISPLAY": screen.name, "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen(command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as running:
+        try:
+            assert eventually(lambda: np.array_equal(screen.panel(1)[..., 0], grey_chart(STACK, 1)), within_s=30)
+            assert not screen.panel(0).any()
+            assert not screen.panel(2).any()
+            press_q(screen)
+            assert running.wait(timeout=60) == 0
+        finally:
+            running.kill()

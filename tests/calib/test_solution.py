@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import product
 
 import numpy as np
@@ -11,18 +10,17 @@ import pytest
 from calib.scale_prior import posterior_scale
 from calib.solution import solve, solve_default
 from calib.viewpoints import viewing_volume_m
+from tests.calib.camera import KNOWN_M, measured
 
 
 @pytest.mark.parametrize("method", ["inverse", "fixed-scale"])
-def test_the_predicted_error_at_the_eye_is_the_real_one(
-    measured: Callable[..., np.ndarray], known_m: np.ndarray, method: str
-) -> None:
+def test_the_predicted_error_at_the_eye_is_the_real_one(method: str) -> None:
     """200 noise samples: the RMS over samples against the covariance's promise, at every point of the volume."""
     volume = viewing_volume_m()
     seen = measured(volume)
     squares, promised = np.zeros(len(volume)), np.zeros(len(volume))
     for seed in range(200):
-        found = solve(measured(sigma_m=0.003, seed=seed), known_m, method=method)
+        found = solve(measured(sigma_m=0.003, seed=seed), KNOWN_M, method=method)
         squares += ((found.similarity.points(seen) - volume) ** 2).sum(-1) / 200
         promised += found.eye_error_m(volume) ** 2 / 200
     ratio = np.sqrt(squares / promised)
@@ -30,34 +28,28 @@ def test_the_predicted_error_at_the_eye_is_the_real_one(
     assert 0.8 < ratio.min() <= ratio.max() < 1.2
 
 
-def test_leaving_one_out_is_what_solving_without_it_gives(
-    measured: Callable[..., np.ndarray], known_m: np.ndarray
-) -> None:
+def test_leaving_one_out_is_what_solving_without_it_gives() -> None:
     sensor = measured(sigma_m=0.003)
-    quick = solve(sensor, known_m, method="inverse").leave_one_out_m
+    quick = solve(sensor, KNOWN_M, method="inverse").leave_one_out_m
     for index in range(27):
         rest = np.delete(np.arange(27), index)
-        alone = solve(sensor[rest], known_m[rest], method="inverse").similarity
-        slow = alone.points(sensor[index : index + 1])[0] - known_m[index]
+        alone = solve(sensor[rest], KNOWN_M[rest], method="inverse").similarity
+        slow = alone.points(sensor[index : index + 1])[0] - KNOWN_M[index]
         assert np.linalg.norm(quick[index] - slow) < 0.05 * np.linalg.norm(slow) + 2e-5
 
 
-def test_by_default_the_scale_is_one_where_the_data_agree(
-    measured: Callable[..., np.ndarray], known_m: np.ndarray
-) -> None:
-    found = [solve_default(measured(sigma_m=0.003, seed=seed), known_m) for seed in range(20)]
+def test_by_default_the_scale_is_one_where_the_data_agree() -> None:
+    found = [solve_default(measured(sigma_m=0.003, seed=seed), KNOWN_M) for seed in range(20)]
     assert {item.method for item in found} == {"fixed-scale"}
     assert np.median([abs(item.similarity.scale - 1) for item in found]) < 0.001
     assert "beforehand 1 or off by some 2%" in found[0].reason
 
 
 @pytest.mark.parametrize("scale", [0.5, 0.95, 1.1, 8.125])
-def test_by_default_another_scale_is_found_where_the_data_tell_it(
-    measured: Callable[..., np.ndarray], known_m: np.ndarray, scale: float
-) -> None:
-    found = solve_default(measured(sigma_m=0.0, scale=scale), known_m)
+def test_by_default_another_scale_is_found_where_the_data_tell_it(scale: float) -> None:
+    found = solve_default(measured(sigma_m=0.0, scale=scale), KNOWN_M)
     assert found.similarity.scale == pytest.approx(scale)
-    noisy = solve_default(measured(sigma_m=0.001 / scale, scale=scale), known_m)
+    noisy = solve_default(measured(sigma_m=0.001 / scale, scale=scale), KNOWN_M)
     assert noisy.similarity.scale == pytest.approx(scale, rel=0.01)
     assert noisy.scale_sigma > 0
 
@@ -78,13 +70,11 @@ def test_pairs_without_any_noise_leave_no_uncertainty() -> None:
     assert found.unit_covariance[6, 6] == 0.0
 
 
-def test_three_noisy_pairs_are_hardly_evidence_against_a_scale_of_one(
-    measured: Callable[..., np.ndarray], known_m: np.ndarray
-) -> None:
+def test_three_noisy_pairs_are_hardly_evidence_against_a_scale_of_one() -> None:
     """Two degrees of freedom: the noise itself is hardly known, and small by chance in every tenth sample."""
     three = [0, 8, 22]
     scales = [
-        float(solve_default(measured(sigma_m=0.003, seed=s)[three], known_m[three]).similarity.scale)
+        float(solve_default(measured(sigma_m=0.003, seed=s)[three], KNOWN_M[three]).similarity.scale)
         for s in range(300)
     ]
     assert np.mean(np.abs(np.log(scales)) > 0.01) < 0.06

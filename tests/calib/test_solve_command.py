@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from calib.solution import METHODS
 from runtime.errors import InputError
 from runtime.eyes.calibration import load_calibration
 from runtime.eyes.demo_geometry import demo_stack_from_sensor
+from tests.calib.camera import KNOWN_M, measured, write_pairs
 
 run = CliRunner()
 
@@ -37,11 +37,9 @@ def refusal(pairs: Path, tmp_path: Path, *options: str) -> str:
     return message
 
 
-def test_the_runtime_loads_what_solve_writes(
-    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
-) -> None:
+def test_the_runtime_loads_what_solve_writes(tmp_path: Path) -> None:
     out = tmp_path / "deep" / "calibration.toml"
-    told = solve(write_pairs(measured(sigma_m=0.003), known_m), out)
+    told = solve(write_pairs(tmp_path, measured(sigma_m=0.003)), out)
     loaded = load_calibration(out)
     np.testing.assert_array_equal(loaded.stack_from_sensor, told["stack_from_sensor"])
     np.testing.assert_allclose(loaded.stack_from_sensor, demo_stack_from_sensor(), atol=0.02)
@@ -53,142 +51,96 @@ def test_the_runtime_loads_what_solve_writes(
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_method_can_be_asked_for(
-    tmp_path: Path,
-    measured: Callable[..., np.ndarray],
-    known_m: np.ndarray,
-    write_pairs: Callable[..., Path],
-    method: str,
-) -> None:
-    told = solve(write_pairs(measured(sigma_m=0.002), known_m), tmp_path / "c.toml", "--method", method)
+def test_every_method_can_be_asked_for(tmp_path: Path, method: str) -> None:
+    told = solve(write_pairs(tmp_path, measured(sigma_m=0.002)), tmp_path / "c.toml", "--method", method)
     assert told["method"] == method
     assert {row["method"] for row in told["methods"]} == set(METHODS)
     assert load_calibration(tmp_path / "c.toml").method == method
 
 
-def test_the_sensors_serial_travels_from_the_pairs_to_the_runtimes_check(
-    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
-) -> None:
-    path = write_pairs(measured(), known_m)
+def test_the_sensors_serial_travels_from_the_pairs_to_the_runtimes_check(tmp_path: Path) -> None:
+    path = write_pairs(tmp_path, measured())
     lines = path.read_text().splitlines()
     path.write_text("\n".join([lines[0] + ",sensor_serial", *[line + ",A1" for line in lines[1:]]]))
     solve(path, tmp_path / "c.toml")
     assert "A1" in load_calibration(tmp_path / "c.toml").serial_warning("B2")
 
 
-def test_outliers_are_named(
-    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
-) -> None:
+def test_outliers_are_named(tmp_path: Path) -> None:
     sensor = measured(sigma_m=0.003)
     sensor[[4, 20]] += [0.2, -0.3, 0.1]
-    told = solve(write_pairs(sensor, known_m), tmp_path / "c.toml")
+    told = solve(write_pairs(tmp_path, sensor), tmp_path / "c.toml")
     assert told["method"] == "robust"
     assert told["outliers"] == ["line 6", "line 22"]
     assert any("line 6, line 22: rejected" in warning for warning in told["warnings"])
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_fewer_than_three_pairs_are_refused(
-    tmp_path: Path,
-    measured: Callable[..., np.ndarray],
-    known_m: np.ndarray,
-    write_pairs: Callable[..., Path],
-    count: int,
-) -> None:
-    assert "at least 3" in refusal(write_pairs(measured()[:count], known_m[:count]), tmp_path)
+def test_fewer_than_three_pairs_are_refused(tmp_path: Path, count: int) -> None:
+    assert "at least 3" in refusal(write_pairs(tmp_path, measured()[:count], KNOWN_M[:count]), tmp_path)
 
 
 @pytest.mark.parametrize("count", [3, 4, 5, 6])
-def test_three_pairs_and_more_are_enough(
-    tmp_path: Path,
-    measured: Callable[..., np.ndarray],
-    known_m: np.ndarray,
-    write_pairs: Callable[..., Path],
-    count: int,
-) -> None:
+def test_three_pairs_and_more_are_enough(tmp_path: Path, count: int) -> None:
     some = [0, 8, 22, 13, 4, 18][:count]
-    solve(write_pairs(measured()[some], known_m[some]), tmp_path / "c.toml")
+    solve(write_pairs(tmp_path, measured()[some], KNOWN_M[some]), tmp_path / "c.toml")
     np.testing.assert_allclose(
         load_calibration(tmp_path / "c.toml").stack_from_sensor, demo_stack_from_sensor(), atol=1e-9
     )
 
 
 @pytest.mark.parametrize("aspect", [1e-2, 1e-3, 1e-5])
-def test_nearly_collinear_points_are_refused_with_what_they_would_cost(
-    tmp_path: Path, measured: Callable[..., np.ndarray], write_pairs: Callable[..., Path], aspect: float
-) -> None:
+def test_nearly_collinear_points_are_refused_with_what_they_would_cost(tmp_path: Path, aspect: float) -> None:
     random = np.random.default_rng(0)
     line = np.outer(np.linspace(0.4, 0.6, 9), [1.0, 0.0, 0.0]) + 0.1 * aspect * random.normal(size=(9, 3))
-    message = refusal(write_pairs(measured(line), line), tmp_path)
+    message = refusal(write_pairs(tmp_path, measured(line), line), tmp_path)
     assert "do not determine" in message
     assert "condition" in message
 
 
-def test_coplanar_points_are_fine_and_said_to_be(
-    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
-) -> None:
-    flat = known_m * [1.0, 1.0, 0.0]
-    told = solve(write_pairs(measured(flat), flat), tmp_path / "c.toml")
+def test_coplanar_points_are_fine_and_said_to_be(tmp_path: Path) -> None:
+    flat = KNOWN_M * [1.0, 1.0, 0.0]
+    told = solve(write_pairs(tmp_path, measured(flat), flat), tmp_path / "c.toml")
     assert any("one plane" in warning for warning in told["warnings"])
     np.testing.assert_allclose(told["stack_from_sensor"], demo_stack_from_sensor(), atol=1e-9)
 
 
 @pytest.mark.parametrize("sigma_m", [0.0, 0.01])
 @pytest.mark.parametrize("axis", range(3))
-def test_mirrored_data_are_refused(
-    tmp_path: Path,
-    measured: Callable[..., np.ndarray],
-    known_m: np.ndarray,
-    write_pairs: Callable[..., Path],
-    axis: int,
-    sigma_m: float,
-) -> None:
+def test_mirrored_data_are_refused(tmp_path: Path, axis: int, sigma_m: float) -> None:
     mirror = np.ones(3)
     mirror[axis] = -1.0
-    assert "mirror" in refusal(write_pairs(measured(sigma_m=sigma_m) * mirror, known_m), tmp_path)
+    assert "mirror" in refusal(write_pairs(tmp_path, measured(sigma_m=sigma_m) * mirror), tmp_path)
 
 
 @pytest.mark.parametrize(("scale", "side"), [(1000.0, "stack"), (0.001, "sensor")])
-def test_millimetres_on_one_side_are_refused(
-    tmp_path: Path,
-    measured: Callable[..., np.ndarray],
-    known_m: np.ndarray,
-    write_pairs: Callable[..., Path],
-    scale: float,
-    side: str,
-) -> None:
-    mixed = (measured(scale=scale), known_m) if scale < 1 else (measured(), known_m * 1000)
-    path = write_pairs(*mixed)
+def test_millimetres_on_one_side_are_refused(tmp_path: Path, scale: float, side: str) -> None:
+    mixed = (measured(scale=scale), KNOWN_M) if scale < 1 else (measured(), KNOWN_M * 1000)
+    path = write_pairs(tmp_path, *mixed)
     message = refusal(path, tmp_path)
     assert "units are mixed" in message
     assert f"{side} is in millimetres" in message
 
 
-def test_repeated_rows_are_left_out_and_named(
-    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
-) -> None:
+def test_repeated_rows_are_left_out_and_named(tmp_path: Path) -> None:
     twice = [*range(27), 3]
-    told = solve(write_pairs(measured(sigma_m=0.001)[twice], known_m[twice]), tmp_path / "c.toml")
+    told = solve(write_pairs(tmp_path, measured(sigma_m=0.001)[twice], KNOWN_M[twice]), tmp_path / "c.toml")
     assert told["pairs"] == 27
     assert any("line 29: repeats" in warning for warning in told["warnings"])
 
 
-def test_pairs_that_do_not_fit_are_refused_with_a_hint(
-    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
-) -> None:
+def test_pairs_that_do_not_fit_are_refused_with_a_hint(tmp_path: Path) -> None:
     sensor = measured()
     sensor[::5] += [0.2, 0.1, -0.2]
-    message = refusal(write_pairs(sensor, known_m), tmp_path, "--method", "seed")
+    message = refusal(write_pairs(tmp_path, sensor), tmp_path, "--method", "seed")
     assert "more than 50 mm" in message
     assert "robust" in message
 
 
-def test_past_versions_are_kept(
-    tmp_path: Path, measured: Callable[..., np.ndarray], known_m: np.ndarray, write_pairs: Callable[..., Path]
-) -> None:
+def test_past_versions_are_kept(tmp_path: Path) -> None:
     out, texts = tmp_path / "c.toml", []
     for seed in range(3):
-        solve(write_pairs(measured(sigma_m=0.002, seed=seed), known_m), out)
+        solve(write_pairs(tmp_path, measured(sigma_m=0.002, seed=seed)), out)
         texts.append(out.read_text())
     kept = [(tmp_path / name).read_text() for name in ("c.1.toml", "c.2.toml", "c.toml")]
     assert kept == texts

@@ -1,0 +1,31 @@
+"""A camera before the stack, and pairs that it would measure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.pairs import COLUMNS
+from calib.viewpoints import grid
+from runtime.eyes.demo_geometry import demo_stack_from_sensor
+
+KNOWN_M = np.array([viewpoint.midpoint_m for viewpoint in grid()])  # (27, 3) the grid's viewpoints in `stack`
+
+
+def measured(
+    points: np.ndarray = KNOWN_M, *, sigma_m: float = 0.0, scale: float = 1.0, seed: int = 0
+) -> NDArray[np.float64]:
+    """What the demo's camera reports of points, with noise and with a metre of its own."""
+    sensor_from_stack = np.linalg.inv(demo_stack_from_sensor())
+    exact = points @ sensor_from_stack[:3, :3].T + sensor_from_stack[:3, 3]
+    return exact / scale + sigma_m * np.random.default_rng(seed).normal(size=exact.shape)
+
+
+def write_pairs(folder: Path, sensor_m: np.ndarray, stack_m: np.ndarray = KNOWN_M) -> Path:
+    """A CSV of pairs."""
+    path = folder / "pairs.csv"
+    table = np.hstack([sensor_m, stack_m])
+    np.savetxt(path, table, delimiter=",", header=",".join(COLUMNS), comments="", fmt="%.17g")
+    return path
