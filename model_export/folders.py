@@ -11,12 +11,13 @@ import numpy as np
 
 from model_export.data import CENTRE, TrainingPair
 from model_export.eyereal import PICTURE_FOV_DEG
+from model_export.scene import shift
 from runtime.content.eyereal import Pair, read_folder
 from runtime.content.presets import preset
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_raster
-from runtime.records import F64, U8
+from runtime.records import U8
 from runtime.support import foreign
 from runtime.support.artifacts import read_image
 
@@ -61,7 +62,7 @@ def on_centre(picture: U8, pair: Pair, side: int, stack: PanelStack, *, fov_deg:
     smaller = cv2.resize(picture, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
     height, width = smaller.shape[:2]
     projection = pair.image_from_stack(side, width_px=width, height_px=height, fov_deg=fov_deg)
-    matrix = _shift(-0.5) @ image_from_raster(projection, raster) @ _shift(0.5)
+    matrix = shift(-0.5, -0.5) @ image_from_raster(projection, raster) @ shift(0.5, 0.5)
     warped = cv2.warpPerspective(
         smaller,
         matrix,
@@ -85,7 +86,3 @@ def mixed(
     for pair, own in zip(procedural, begun, strict=False):
         yield pair
         yield own
-
-
-def _shift(by: float) -> F64:
-    return np.array([[1.0, 0.0, by], [0.0, 1.0, by], [0.0, 0.0, 1.0]])

@@ -78,58 +78,30 @@ class SpectralSolver(nn.Module):
         gain_h = m * torch.sqrt(c2) / (cost_h + beta2 + alpha2 * cost_h / cost_g)
         return share * m * spectrum[None], share * alpha2 + cost_g, gain_h
 
-    def forward(
-        self,
-        left: Tensor,
-        right: Tensor,
-        waves: Tensor,
-        shifted_waves: Tensor,
-        spectrum: Tensor,
-        modes_in: Tensor,
-        doubt: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """`panels` in 16-bit codes, and one number that is finite where all that was worked out is."""
-        rear, front, check = self._solved(left, right, waves, shifted_waves, spectrum, modes_in, doubt, added=0.5)
+    def forward(self, *feeds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """`panels` of `INPUTS` in 16-bit codes, and one number that is finite where all that was worked out is."""
+        rear, front, check = self._solved(feeds, added=0.5)
         # Nothing is below zero once it is clamped, and a cast cuts off what follows the point: the half makes it round.
-        codes = (_by_rows(torch.clamp(x, 0, FULL + 0.5), like=left).to(torch.int16) for x in (rear, front))
+        codes = (_by_rows(torch.clamp(x, 0, FULL + 0.5), like=feeds[0]).to(torch.int16) for x in (rear, front))
         return (*codes, check)  # type: ignore[return-value]
 
-    def panels(
-        self,
-        left: Tensor,
-        right: Tensor,
-        waves: Tensor,
-        shifted_waves: Tensor,
-        spectrum: Tensor,
-        modes_in: Tensor,
-        doubt: Tensor,
-    ) -> tuple[Tensor, Tensor]:
+    def panels(self, *feeds: Tensor) -> tuple[Tensor, Tensor]:
         """Rear and front panel (rows, cells + 1, 2K·C), from one parallax before the first column; not clamped.
 
-        left, right (rows, cells, 2K·C), 16-bit codes: what each eye lacks along its rays through the raster; waves
-        (cells + 1, cells + 1) V, shifted_waves Ũ, spectrum (cells + 1,) s and modes_in (cells + 1, cells) U^T
-        (`runtime.model.chain.chain_modes`); doubt (3,): c columns, r rows, e columns.
+        feeds: `INPUTS`. left, right (rows, cells, 2K·C), 16-bit codes: what each eye lacks along its rays through the
+        raster; waves (cells + 1, cells + 1) V, shifted_waves Ũ, spectrum (cells + 1,) s and modes_in
+        (cells + 1, cells) U^T (`runtime.model.chain.chain_modes`); doubt (3,): c columns, r rows, e columns.
         """
-        rear, front, _ = self._solved(left, right, waves, shifted_waves, spectrum, modes_in, doubt, added=0.0)
-        return _by_rows(rear, like=left) / FULL, _by_rows(front, like=left) / FULL
+        rear, front, _ = self._solved(feeds, added=0.0)
+        return _by_rows(rear, like=feeds[0]) / FULL, _by_rows(front, like=feeds[0]) / FULL
 
-    def _solved(
-        self,
-        left: Tensor,
-        right: Tensor,
-        waves: Tensor,
-        shifted_waves: Tensor,
-        spectrum: Tensor,
-        modes_in: Tensor,
-        doubt: Tensor,
-        *,
-        added: float,
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _solved(self, feeds: tuple[Tensor, ...], *, added: float) -> tuple[Tensor, Tensor, Tensor]:
         """Rear and front panel (1, block's rows, all else), codes with a number added to them, and the check.
 
         A row of a cell stays in one piece from end to end, those of all blocks beside each other: moving it is cheap,
         and the products with the rows' and the chain's matrices are few and large.
         """
+        left, right, waves, shifted_waves, spectrum, modes_in, doubt = feeds
         channels = left.shape[2] // (2 * self.cell_px)
         numerator, denominator, gain_h = self.gains(spectrum, doubt)
         numerator, gain_h = numerator * (IN_SCALE / FULL), gain_h * (IN_SCALE / FULL)

@@ -86,7 +86,7 @@ def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], 
     height, width = texture.shape[:2]
     texels = raster_from_plane @ np.diag([1 / width, 1 / height, 1.0])
     # OpenCV puts pixel centres at integers.
-    shifted = _shift(-0.5 - left, -0.5 - top) @ texels @ _shift(0.5, 0.5)
+    shifted = shift(-0.5 - left, -0.5 - top) @ texels @ shift(0.5, 0.5)
     drawn = cv2.warpPerspective(texture, shifted, (columns.stop - left, rows.stop - top), flags=cv2.INTER_LINEAR)
     inverse = np.linalg.inv(raster_from_plane)
     u, v = np.arange(left, columns.stop) + 0.5, np.arange(top, rows.stop)[:, None] + 0.5
@@ -205,5 +205,6 @@ def _highlight(random: Random, place_m: F64, size_m: float, pixel_m: float) -> P
     return Plane(glint(random, texels, texels), place_m - across / 2 - down / 2, across, down)
 
 
-def _shift(right: float, down: float) -> F64:
+def shift(right: float, down: float) -> F64:
+    """(3, 3) of pixels."""
     return np.array([[1.0, 0.0, right], [0.0, 1.0, down], [0.0, 0.0, 1.0]])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from model_export.curves import Point, write_curves
 from model_export.data import TrainingPair, endless_pairs
 from model_export.folders import folder_pairs, mixed
 from model_export.network import SpectralSolver
-from model_export.recipe import Recipe, Training, read_recipe
+from model_export.recipe import Recipe, read_recipe
 from model_export.sight import displayed_mse, sight_of
 from runtime.config import validated
 from runtime.errors import InputError
@@ -48,13 +48,14 @@ class TrainRequest:
 
 def run_training(request: TrainRequest) -> dict[str, Any]:
     """Train, write checkpoint, recipe and curves. Raises InputError."""
-    recipe = _asked(read_recipe(request.recipe), request)
+    recipe = read_recipe(request.recipe)
+    asked = {name: getattr(request, name) for name in ("iterations", "seed") if getattr(request, name) is not None}
+    training = recipe.training.model_copy(update=asked)
+    recipe = recipe.model_copy(update={"training": training})
     torch.set_num_threads(request.threads)
     device = chosen_device(request.device)
     model = solver_of(recipe, source=request.recipe).to(device)
-    training = recipe.training
-    rate = training.learning_rate
-    optimiser = torch.optim.Adam([{"params": list(model.parameters()), "lr": rate, "base": rate}])
+    optimiser = torch.optim.Adam(model.parameters(), lr=training.learning_rate)
     size = {"width_px": training.width_px, "height_px": training.height_px}
     own = folder_pairs(request.data, scene=request.scene, **size)
     held_out = held_out_pairs(training.validation_pairs, **size)
@@ -67,12 +68,12 @@ def run_training(request: TrainRequest) -> dict[str, Any]:
     # With folders, every other pair is one of theirs.
     taken = first * PAIRS_A_STEP
     own_taken = taken // 2 if own else 0
-    stream = mixed(_procedural(training, taken - own_taken), own, first=own_taken)
+    procedural = endless_pairs(training.seed, first=taken - own_taken, eye_sigma_mm=training.eye_sigma_mm, **size)
+    stream = mixed(procedural, own, first=own_taken)
     losses: list[float] = []
     with progress_bar(f"training {recipe.name}") as progress:
         for iteration in range(first, training.iterations):
-            for group in optimiser.param_groups:
-                group["lr"] = group["base"] * _annealed(iteration / training.iterations)
+            optimiser.param_groups[0]["lr"] = training.learning_rate * _annealed(iteration / training.iterations)
             losses.append(_step(model, optimiser, stream, recipe))
             done = iteration + 1
             progress(done, training.iterations)
@@ -121,18 +122,6 @@ def validate(model: SpectralSolver, pairs: Sequence[TrainingPair], recipe: Recip
     return float(np.mean(exact_db)), float(np.mean(expected_db)) if expected_db else math.nan, float(np.mean(losses))
 
 
-def trained_recipe(model: SpectralSolver, recipe: Recipe) -> Recipe:
-    """The recipe with the weights that were found."""
-    return recipe.model_copy(update={"weights": plain_weights(model)})
-
-
-def _asked(recipe: Recipe, request: TrainRequest) -> Recipe:
-    changes = {
-        name: value for name, value in (("iterations", request.iterations), ("seed", request.seed)) if value is not None
-    }
-    return recipe.model_copy(update={"training": recipe.training.model_copy(update=changes)})
-
-
 def _annealed(done: float) -> float:
     """Of the learning rate: a short warm-up, then half a cosine down to a twentieth."""
     return min(1.0, 0.1 + done * 20) * (0.05 + 0.95 * (1 + math.cos(math.pi * done)) / 2)
@@ -160,12 +149,6 @@ def _step(
     return total / used if used else math.nan
 
 
-def _procedural(training: Training, taken: int) -> Iterator[TrainingPair]:
-    """The procedural pairs after the first `taken` of them."""
-    size = {"width_px": training.width_px, "height_px": training.height_px}
-    return endless_pairs(training.seed, first=taken, eye_sigma_mm=training.eye_sigma_mm, **size)
-
-
 def chosen_device(name: str) -> torch.device:
     """`auto`: a GPU where there is one. Raises InputError for what isn't there."""
     if name == "auto":
@@ -191,7 +174,7 @@ def _save(
     seconds: float,
     data: dict[str, Any],
 ) -> None:
-    found = trained_recipe(model, recipe)
+    found = recipe.model_copy(update={"weights": plain_weights(model)})
     write_text(out / "recipe.json", found.text())
     save_checkpoint(
         out / "checkpoint.pth",
@@ -200,7 +183,7 @@ def _save(
             "recipe": found.model_copy(update={"weights": None}).model_dump(mode="json"),
             "optimiser": optimiser.state_dict(),
             "iteration": iteration,
-            "points": [list(point.row()) for point in points],
+            "points": [list(astuple(point)) for point in points],
             "seconds": seconds,
             "data": data,
         },

@@ -19,6 +19,7 @@ from model_export.stress import ORDINARY, Feeds, picture_cases, spectral_cases
 from runtime.errors import InputError
 from runtime.model.contract import VERSION, Contract, parse_contract
 from runtime.model.transfer import FULL
+from runtime.report.page import in_columns
 from runtime.support import foreign
 from runtime.support.progress import tracked
 
@@ -55,13 +56,11 @@ class Report:
 
     def table(self) -> str:
         """For a person: what was checked, found, wanted."""
-        rows = [("check", "found", "wanted", "")]
-        rows += [(c.name, c.found, c.wanted, "ok" if c.passed else "FAILED") for c in self.checks]
-        widths = [max(len(row[column]) for row in rows) for column in range(3)]
-        lines = ["  ".join([*(x.ljust(w) for x, w in zip(row, widths, strict=False)), row[3]]).rstrip() for row in rows]
+        rows = [["check", "found", "wanted", ""]]
+        rows += [[c.name, c.found, c.wanted, "ok" if c.passed else "FAILED"] for c in self.checks]
         failed = sum(not check.passed for check in self.checks)
         end = f"{failed} of {len(self.checks)} checks failed" if failed else f"all {len(self.checks)} checks passed"
-        return "\n".join([self.file, *lines, end])
+        return "\n".join([self.file, in_columns(rows), end])
 
 
 Reference = Callable[[Feeds], Sequence[np.ndarray]]

@@ -4,7 +4,10 @@ what the official code does and feeds (golden arrays, made by running that code)
 from __future__ import annotations
 
 import argparse
+import io
+import os
 import re
+import tarfile
 from pathlib import Path
 
 import numpy as np
@@ -74,21 +77,10 @@ def test_a_published_checkpoint_is_imported_with_every_weight(published: Path) -
     assert all(torch.equal(value, state[key]) for key, value in net.state_dict().items())
 
 
-def test_a_checkpoint_that_runs_code_is_refused_and_its_code_not_run(tmp_path: Path) -> None:
-    ran = tmp_path / "ran"
-
-    class Evil:
-        def __reduce__(self) -> tuple[object, tuple[str]]:
-            return (Path(ran).__class__.touch, (ran,))  # type: ignore[return-value]
-
-    path = tmp_path / "evil.pth"
-    torch.save({"model": Evil()}, path)
-    with pytest.raises(InputError, match="no checkpoint of plain weights"):
-        load_eyereal(path)
-    assert not ran.exists()
-
-
-def test_a_command_line_that_carries_code_is_refused_and_its_code_not_run(published: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("where", ["model", "args"])
+def test_a_checkpoint_that_carries_code_is_refused_and_its_code_not_run(
+    published: Path, tmp_path: Path, where: str
+) -> None:
     """The allow-list holds the table that `args` is, and nothing that could stand in it."""
     ran = tmp_path / "ran"
 
@@ -96,7 +88,8 @@ def test_a_command_line_that_carries_code_is_refused_and_its_code_not_run(publis
         def __reduce__(self) -> tuple[object, tuple[Path]]:
             return (Path.touch, (ran,))
 
-    saved(published, EyeRealNet(4), args=argparse.Namespace(hidden=Evil()))
+    content = {"model": Evil()} if where == "model" else {"args": argparse.Namespace(hidden=Evil())}
+    saved(published, EyeRealNet(4), **content)
     with pytest.raises(InputError, match="no checkpoint of plain weights"):
         load_eyereal(published)
     assert not ran.exists()
@@ -134,24 +127,30 @@ def test_a_checkpoint_of_another_architecture_is_refused_by_name(published: Path
         load_spectral(published, name="balanced")
 
 
-@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 cut"])
+def old_tar_format() -> bytes:
+    """As torch wrote checkpoints once."""
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w", format=tarfile.PAX_FORMAT) as archive:
+        for name in ("storages", "tensors", "pickle"):
+            archive.addfile(tarfile.TarInfo(name), io.BytesIO())
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 cut", old_tar_format()], ids=range(4))
 def test_a_corrupt_file_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "corrupt.pth"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=r"corrupt\.pth"):
+    with pytest.raises(InputError, match=r"corrupt\.pth: is no checkpoint of plain weights"):
         load_eyereal(path)
 
 
-def test_a_checkpoint_of_the_old_tar_format_is_one_line(tmp_path: Path) -> None:
-    import io
-    import tarfile
-
-    path = tmp_path / "legacy.pth"
-    with tarfile.open(path, "w", format=tarfile.PAX_FORMAT) as archive:
-        for name in ("storages", "tensors", "pickle"):
-            archive.addfile(tarfile.TarInfo(name), io.BytesIO())
-    with pytest.raises(InputError, match=r"legacy\.pth: is no checkpoint of plain weights"):
-        load_eyereal(path)
+def test_a_checkpoint_that_becomes_a_fifo_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Never waited for. It is read twice: the weights, and what they are told by."""
+    path = tmp_path / "a.pth"
+    os.mkfifo(path)
+    monkeypatch.setattr("model_export.export.load_eyereal", lambda checkpoint: None)
+    with pytest.raises(InputError, match=r"a\.pth: is a FIFO"):
+        eyereal_model(ExportRequest(arch="eyereal", out=tmp_path / "a.onnx", checkpoint=path))
 
 
 # ---- what the official code does and feeds

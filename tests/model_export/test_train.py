@@ -179,9 +179,12 @@ def test_training_is_the_same_twice_and_leaves_its_files(
     assert (folder / "validation.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize("pairs", [0, 3])  # three: so that where the row of them stands matters
 def test_a_training_that_was_cut_off_and_resumed_ends_as_if_nothing_had_happened(
-    tmp_path: Path, tiny: Path, whole: tuple[Path, Recipe], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, tiny: Path, whole: tuple[Path, Recipe], monkeypatch: pytest.MonkeyPatch, pairs: int
 ) -> None:
+    data = (folder_of_pairs(tmp_path / "data", pairs),) if pairs else ()
+    uncut = trained(tmp_path / "whole", tiny, data=data) if pairs else whole[1]
     with monkeypatch.context() as patch:
 
         def save_and_stop(*arguments: object) -> None:
@@ -191,10 +194,14 @@ def test_a_training_that_was_cut_off_and_resumed_ends_as_if_nothing_had_happened
         save = training._save
         patch.setattr(training, "_save", save_and_stop)
         with pytest.raises(KeyboardInterrupt):
-            trained(tmp_path / "cut", tiny)
+            trained(tmp_path / "cut", tiny, data=data)
     assert torch.load(tmp_path / "cut" / "checkpoint.pth", weights_only=True)["iteration"] == 2
-    assert trained(tmp_path / "cut", tiny, resume=True).weights == whole[1].weights
-    assert (tmp_path / "cut" / "validation.csv").read_text() == (whole[0] / "validation.csv").read_text()
+    assert trained(tmp_path / "cut", tiny, resume=True, data=data).weights == uncut.weights
+    if pairs:
+        with pytest.raises(InputError, match=r"data: was trained with 3 pairs of --data .*, not with 0 pairs"):
+            trained(tmp_path / "cut", tiny, resume=True)
+    else:
+        assert (tmp_path / "cut" / "validation.csv").read_text() == (whole[0] / "validation.csv").read_text()
 
 
 def folder_of_pairs(folder: Path, count: int) -> Path:
@@ -206,27 +213,6 @@ def folder_of_pairs(folder: Path, count: int) -> Path:
             picture = random.integers(0, 256, (90, 160, 3), dtype=np.uint8)
             write_png(folder / f"pair{number}_x6.486_y{y}_z2.004_{half}.png", picture)
     return folder
-
-
-def test_a_training_with_folders_that_is_resumed_takes_the_pairs_that_it_would_have_taken(
-    tmp_path: Path, tiny: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Three pairs, so that where the row of them stands matters; seen: weights that differed by 0.019."""
-    data = (folder_of_pairs(tmp_path / "data", 3),)
-    whole = trained(tmp_path / "whole", tiny, data=data)
-    with monkeypatch.context() as patch:
-
-        def save_and_stop(*arguments: object) -> None:
-            save(*arguments)
-            raise KeyboardInterrupt
-
-        save = training._save
-        patch.setattr(training, "_save", save_and_stop)
-        with pytest.raises(KeyboardInterrupt):
-            trained(tmp_path / "cut", tiny, data=data)
-    assert trained(tmp_path / "cut", tiny, resume=True, data=data).weights == whole.weights
-    with pytest.raises(InputError, match=r"data: was trained with 3 pairs of --data .*, not with 0 pairs"):
-        trained(tmp_path / "cut", tiny, resume=True)
 
 
 WRONG_SHAPE = {"state": {0: {"exp_avg": torch.zeros(1, 1)}}, "param_groups": []}
