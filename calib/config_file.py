@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def read_document(config: Path) -> TOMLDocument:
-    """A configuration to be changed; an empty one where the file is not there yet. Raises InputError."""
+    """A configuration; an empty one where the file is not there yet. Raises InputError."""
     if not foreign.is_there(config):
         return tomlkit.document()
     load_settings(config)
@@ -30,6 +30,21 @@ def read_document(config: Path) -> TOMLDocument:
         return tomlkit.parse(foreign.read_text(config))
     except ParseError as error:
         raise InputError(config, "", f"malformed: {error}") from None
+
+
+def rewrite(config: Path, change: Callable[[TOMLDocument], None]) -> Path | None:
+    """Change a configuration, where it is valid then, and only then; answers where the past one is kept.
+
+    Raises InputError.
+    """
+    document = read_document(config)
+    change(document)
+    text = tomlkit.dumps(document)
+    with tempfile.TemporaryDirectory() as folder:
+        trial = Path(folder) / config.name
+        write_text(trial, text)
+        load_settings(trial)
+    return save(config, text)
 
 
 def put(document: TOMLDocument, section: str, values: Mapping[str, Any]) -> None:
@@ -82,13 +97,3 @@ def put_monitors(document: TOMLDocument, tables: Sequence[Mapping[str, Any]]) ->
 
 
 _DEFAULTS: dict[str, Any] = {"rotation_deg": 0, "mirror": "none"}
-
-
-def save_document(config: Path, document: TOMLDocument) -> Path | None:
-    """Write it if it is valid, and only then; answers where the one it replaces is kept. Raises InputError."""
-    text = tomlkit.dumps(document)
-    with tempfile.TemporaryDirectory() as folder:
-        trial = Path(folder) / config.name
-        write_text(trial, text)
-        load_settings(trial)
-    return save(config, text)

@@ -12,7 +12,7 @@ from tomlkit import TOMLDocument
 
 from calib.board import board
 from calib.bundle import Undetermined
-from calib.config_file import put, put_homographies, read_document, save_document
+from calib.config_file import put, put_homographies, rewrite
 from calib.detect_marks import find_marks
 from calib.registration import Registration, register_photographs
 from calib.viewpoints import viewing_place_m
@@ -66,9 +66,7 @@ def register_photos(
         write_json(folder.staging / "registration.json", summary)
         write_text(folder.staging / "panels.toml", tomlkit.dumps(document))
     if config is not None:
-        configured = read_document(config)
-        put_registration(configured, found)
-        kept = save_document(config, configured)
+        kept = rewrite(config, lambda configured: put_registration(configured, found))
         summary["kept_version"] = str(kept) if kept else None
     return summary, summary_text(summary)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from calib.board import boards
 from calib.capture_run import capture_live
-from calib.config_file import put, put_lut, put_monitors, read_document, save_document
+from calib.config_file import put, put_lut, put_monitors, rewrite
 from calib.grey import fit_lut
 from calib.grey_chart import grey_chart, photographed_series
 from calib.hardware import Say, SetupHardware
@@ -66,9 +66,7 @@ class Setup:
 
     def write(self, change: Callable[[Any], None]) -> None:
         """Change the configuration by a function of its document. Raises InputError."""
-        document = read_document(self.config)
-        change(document)
-        save_document(self.config, document)
+        rewrite(self.config, change)
 
 
 @dataclass(frozen=True, slots=True)

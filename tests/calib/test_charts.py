@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 from calib.charts import captioned, chart_fov_deg, line_picture
 from calib.commands import app
 from calib.viewpoints import grid
-from runtime.errors import InputError
 from runtime.optics.quality import psnr_db
 from runtime.optics.retina import panel_positions, seen_by
 from runtime.optics.stack import PanelStack
@@ -52,20 +51,6 @@ def test_a_solved_chart_shows_both_eyes_the_picture_from_its_viewpoint_alone(tmp
     assert np.abs(fused - 255 * wanted).mean() < np.abs(unfused - 255 * wanted).mean()
     assert seen_db(0.0) > 16
     assert seen_db(0.0) > 1.5 + max(seen_db(0.03), seen_db(-0.03))
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        [],
-        ["--out", "x", "--viewpoint", "R1-phi2-theta3"],
-        ["--out", "x", "--config", "no-such-file.toml"],
-    ],
-)
-def test_wrong_requests_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert isinstance(run.invoke(app, ["charts", *options]).exception, InputError)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["R40-phi70-theta80", "R50-phi80-theta90", "R60-phi90-theta100"])

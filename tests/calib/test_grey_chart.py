@@ -16,7 +16,6 @@ from calib.grey_chart import grey_chart, histograms, measure
 from calib.placed import ideal_panel
 from calib.simulator import Exposure, Scene, camera_from_stack, camera_rays, phone, photograph, smaller
 from runtime.config import StackGeometry
-from runtime.errors import InputError
 from runtime.panels.lut import measured_curve
 
 STACK = StackGeometry().stack()
@@ -82,21 +81,3 @@ def test_a_wrong_exposure_is_told(gain: float, why: str) -> None:
 def test_another_panels_chart_is_told(pictures: list[np.ndarray]) -> None:
     with pytest.raises(match="marks of panel 0"):
         histograms(pictures[0], STACK, 0, source="p")
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        ["--out", "l.csv", "--photos", "none", "--panel", "1"],
-        ["--out", "l.csv", "--photos", "none", "--series", "none"],
-        ["--photos", ".", "--panel", "1"],
-        ["--panel", "3", "--out", "c.png"],
-        ["--panel", "1"],
-    ],
-)
-def test_wrong_requests_are_refused_and_leave_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert isinstance(run.invoke(app, ["grey", *options]).exception, InputError)
-    assert list(tmp_path.iterdir()) == []

@@ -156,25 +156,6 @@ def test_a_bad_photograph_among_good_ones_is_left_out_and_named(
     assert any(note.startswith("2.png") and note.endswith("left out") for note in told["notes"])
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        [],
-        ["--photos", "."],
-        ["--out", "r", "--photos", "none"],
-        ["--out", "r", "--photos", "."],
-        ["--out", "r", "--photos", ".", "--write"],
-    ],
-)
-def test_wrong_requests_are_refused_and_leave_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError):
-        panels(*options)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_photograph_of_too_many_pixels_is_refused_by_its_header(tmp_path: Path) -> None:
     small = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes()
     header = b"IHDR" + (30_000).to_bytes(4, "big") * 2 + small[24:29]
