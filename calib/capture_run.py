@@ -31,7 +31,7 @@ def capture_live(
         walk.begin()
         while not walk.finished:
             while not walk.finished and (sample := hardware.sample(walk.current)) is not None:
-                walk.see(sample.capture_ns, sample.eyes, serial=sample.serial)
+                walk.see(*sample)
             key = hardware.poll()
             if key is None:
                 hardware.wait()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -35,17 +34,9 @@ from runtime.sensor.worker import OPEN_TIMEOUT_S, SensorWorker
 Poll = Callable[[], Key | None]
 Say = Callable[[str], None]
 Named = tuple[str, U8]  # a photograph (h, w), and what to call it
+Sample = tuple[int, EyePoints | None, str]  # when it was taken, eyes in frame `sensor`, the sensor's serial
 POLL_NS = 20 * NS_PER_MS
 CARD_CHARACTERS = 32  # of a line on a card
-
-
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """What the sensor saw at one instant, frame `sensor`."""
-
-    capture_ns: int
-    eyes: EyePoints | None
-    serial: str
 
 
 def eye_finder(driver: Any, settings: Settings) -> Callable[[SensorFrame], EyePoints | None]:
@@ -167,7 +158,7 @@ class SetupHardware:
         if self._worker.error is not None:
             raise self._worker.error
         frames = self._worker.take()
-        return Sample(frames[-1].capture_ns, self._find(frames[-1]), self._worker.serial) if frames else None
+        return (frames[-1].capture_ns, self._find(frames[-1]), self._worker.serial) if frames else None
 
     def chart(self, settings: Settings) -> ChartDisplay | None:
         """What shows charts and captions while capturing; None: nobody sees any."""
@@ -291,7 +282,7 @@ class SimulatedHardware(SetupHardware):
         to_sensor = demo_sensor_from_stack()
         seen = eyes_m @ to_sensor[:3, :3].T + to_sensor[:3, 3]
         seen = seen + self._random.normal(scale=SENSOR_NOISE_M, size=(2, 3))
-        return Sample(self._seen_ns, EyePoints(seen, np.ones(2)), "demo")
+        return self._seen_ns, EyePoints(seen, np.ones(2)), "demo"
 
     def chart(self, settings: Settings) -> ChartDisplay | None:
         return None

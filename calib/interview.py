@@ -68,28 +68,23 @@ class Interview:
 
     def press(self, key: Key) -> None:
         """Take in an answer."""
-        if self.finished:
-            return
-        if key is Key.QUIT:
-            self.finished = True
-            return
-        if key is Key.UNDO:
-            self._back()
-        elif self.question is Question.WHICH:
-            self._which(key)
-        elif self.question is Question.ARROW:
-            if key in ARROWS:
-                self._arrow, self.question = ARROWS[key], Question.MIRROR
-        elif key in (Key.ACCEPT, Key.NEXT):
-            self._mounted(mirrored=key is Key.NEXT)
+        match self.question, key:
+            case _, Key.QUIT:
+                self.finished = True
+            case _, Key.UNDO:
+                self._back()
+            case Question.WHICH, Key.ACCEPT:
+                self.question = Question.ARROW
+            case Question.WHICH, Key.NEXT | Key.RIGHT:
+                self._show_free(1)
+            case Question.WHICH, Key.PREVIOUS | Key.LEFT:
+                self._show_free(-1)
+            case Question.ARROW, arrow if arrow in ARROWS:
+                self._arrow, self.question = ARROWS[arrow], Question.MIRROR
+            case Question.MIRROR, Key.ACCEPT | Key.NEXT:
+                self._mounted(mirrored=key is Key.NEXT)
         if not self.finished:
             self.ask()
-
-    def _which(self, key: Key) -> None:
-        if key is Key.ACCEPT:
-            self.question = Question.ARROW
-        elif key in (Key.NEXT, Key.RIGHT, Key.PREVIOUS, Key.LEFT):
-            self._show_free(1 if key in (Key.NEXT, Key.RIGHT) else -1)
 
     def _mounted(self, *, mirrored: bool) -> None:
         rotation_deg, mirror = mounting_of(self._arrow, mirrored=mirrored)

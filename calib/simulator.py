@@ -127,12 +127,8 @@ def camera_rays(lens: Lens) -> tuple[F32, F32]:
 
 def _weights(length_px: int, nodes: int, step: int) -> F32:
     """(length, nodes) linear interpolation between nodes at -step, 0, step, ..."""
-    place = np.arange(length_px) / step + 1
-    node = np.minimum(place.astype(int), nodes - 2)
-    weights = np.zeros((length_px, nodes), np.float32)
-    weights[np.arange(length_px), node] = 1 - (place - node)
-    weights[np.arange(length_px), node + 1] = place - node
-    return weights
+    place = np.arange(length_px)[:, None] / step + 1
+    return np.asarray(np.maximum(0, 1 - np.abs(place - np.arange(nodes))), dtype=np.float32)
 
 
 def photograph(

@@ -96,7 +96,7 @@ class Walk:
         else:
             self._announce()
 
-    def see(self, capture_ns: int, eyes: EyePoints | None, *, serial: str) -> None:
+    def see(self, capture_ns: int, eyes: EyePoints | None, serial: str) -> None:
         """Take in a sample in frame `sensor`."""
         if self.finished:
             return
@@ -110,18 +110,19 @@ class Walk:
 
     def press(self, key: Key | None) -> None:
         """Do what a key says; None: nothing was pressed."""
-        if key is None or self.finished:
+        if self.finished:
             return
-        if key is Key.QUIT:
-            self.finished = True
-        elif key is Key.ACCEPT:
-            self._accept(self._window)
-        elif key is Key.UNDO:
-            self._undo()
-        elif key in (Key.NEXT, Key.RIGHT):
-            self._go(1)
-        elif key in (Key.PREVIOUS, Key.LEFT):
-            self._go(-1)
+        match key:
+            case Key.QUIT:
+                self.finished = True
+            case Key.ACCEPT:
+                self._accept(self._window)
+            case Key.UNDO:
+                self._undo()
+            case Key.NEXT | Key.RIGHT:
+                self._go(1)
+            case Key.PREVIOUS | Key.LEFT:
+                self._go(-1)
 
     def summary(self) -> dict[str, Any]:
         """What came of it."""

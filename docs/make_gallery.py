@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
-from calib.board import board_layers
+from calib.board import boards as boards_of
 from calib.placed import PlacedPanel
 from calib.simulator import Exposure, Scene, camera_from_stack, camera_rays, phone, photograph
 from runtime.config import StackGeometry
@@ -145,7 +145,7 @@ def boards() -> Image.Image:
     panels = tuple(PlacedPanel(np.eye(3), np.array([x_m, 0.0, 0.0])) for x_m in stack.x_m)
     lens = phone(random=random, width_px=800, height_px=600)
     pose = camera_from_stack(np.array([0.44, -0.26, 0.07]), towards_m=np.array([0.0, -0.06, 0.0]))
-    scene = Scene(stack, panels, board_layers(stack)[..., 0])
+    scene = Scene(stack, panels, boards_of(stack))
     return Image.fromarray(
         photograph(scene, lens, pose, Exposure(electrons=1e6, read_noise=0.0), random=random, rays=camera_rays(lens))
     )

@@ -53,7 +53,7 @@ def walk(path: Path, said: list[str]) -> Walk:
 
 def stand(at: Walk, place: np.ndarray, *, start_ns: int = 0) -> None:
     for number in range(15):
-        at.see(start_ns + number * STEP_NS, eyes_at(place), serial="A1")
+        at.see(start_ns + number * STEP_NS, eyes_at(place), "A1")
 
 
 def test_enter_takes_a_viewpoint_and_goes_to_the_next(tmp_path: Path) -> None:
@@ -74,7 +74,7 @@ def test_restless_eyes_are_not_taken(tmp_path: Path) -> None:
     said: list[str] = []
     person = walk(tmp_path / "pairs.csv", said)
     for number in range(15):
-        person.see(number * STEP_NS, eyes_at(np.array([0.5, 0.01 * number, 0.1])), serial="")
+        person.see(number * STEP_NS, eyes_at(np.array([0.5, 0.01 * number, 0.1])), "")
     person.press(Key.ACCEPT)
     assert "hold still" in said[-1]
     assert not (tmp_path / "pairs.csv").exists()
@@ -138,7 +138,7 @@ def stand_long(at: Walk, place: np.ndarray, *, start_s: float, drift_m: float = 
     for number in range(60):
         moved = np.array([0.0, drift_m * number / 60, 0.0])
         at.see(round(start_s * NS_PER_S) + number * STEP_NS, eyes_at(place + moved, noise_m=noise_m, random=random),
-               serial="A1")  # fmt: skip
+               "A1")  # fmt: skip
 
 
 def test_who_holds_still_at_the_viewpoint_is_taken_without_a_key(tmp_path: Path) -> None:
