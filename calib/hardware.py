@@ -219,6 +219,7 @@ class SimulatedHardware(SetupHardware):
         self.grey_gammas = GREY_GAMMA + self._random.uniform(-1, 1, stack.count) * GREY_SPREAD
         self._stack, self._say = stack, say
         self._seen_ns = 0  # when the newest sample was taken
+        self._next_ns = 0  # when the next one comes, by the clock
         self._here: tuple[str, Any] = ("", np.zeros(3))
         self._waiting = 0  # samples that need no waiting for
 
@@ -270,14 +271,12 @@ class SimulatedHardware(SetupHardware):
         if self._here[0] != standing_at.name:
             self._here = (standing_at.name, self._random.normal(scale=STANDING_M, size=3))
             self._waiting = ARRIVED
-        now_ns = self._clock.now_ns()
         if self._waiting:
             self._waiting -= 1
-            self._seen_ns = max(self._seen_ns + SENSOR_NS, now_ns - self._waiting * SENSOR_NS)
-        elif now_ns >= self._seen_ns + SENSOR_NS:
-            self._seen_ns = now_ns
-        else:
+        elif self._clock.now_ns() < self._next_ns:
             return None
+        self._next_ns = self._clock.now_ns() + SENSOR_NS
+        self._seen_ns += SENSOR_NS  # evenly, however busy the machine is
         eyes_m = standing_at.eyes_m() + self._here[1]
         to_sensor = demo_sensor_from_stack()
         seen = eyes_m @ to_sensor[:3, :3].T + to_sensor[:3, 3]
