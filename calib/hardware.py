@@ -255,7 +255,7 @@ class SimulatedHardware(SetupHardware):
             poses = by_hand(PHOTOGRAPHS, stack, random=self._random)
         else:
             lens = smaller(phone(random=self._random), GREY_SIZE)
-            exposure = Exposure(dark=0.004, gain=0.85, samples=2)
+            exposure = Exposure(dark=0.004, gain=0.85, samples=3)
             places = np.array(GREY_PLACES) * stack.width_m
             poses = [camera_from_stack(place, towards_m=np.zeros(3)) for place in places]
         say(f"(simulated: {len(poses)} photographs by hand, with a phone)")

@@ -34,7 +34,7 @@ def photographs(curve: Callable[..., Any], *, count: int = 2, **changes: float) 
     layers[PANEL] = np.rint(255 * curve(grey_chart(STACK, PANEL) / 255)).astype(np.uint8)
     scene = Scene(STACK, tuple(ideal_panel(STACK, index) for index in range(3)), layers)
     lens = smaller(phone(random=random), 0.7)
-    exposure = Exposure(**({"dark": 0.004, "gain": 0.85, "samples": 2} | changes))
+    exposure = Exposure(**({"dark": 0.004, "gain": 0.85, "samples": 3} | changes))
     places = np.array([[0.75, 0.0, 0.0], [0.8, 0.1, 0.05], [0.8, -0.1, 0.0]])[:count]
     rays = camera_rays(lens)
     return [
