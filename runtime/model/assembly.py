@@ -9,7 +9,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from runtime.model.pyramid_level import NEUTRAL
+from runtime.model.reprojection import NEUTRAL
 from runtime.model.transfer import SUBCODE, phase_codes, pre_emphasised
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack

@@ -13,20 +13,19 @@ from runtime.model.assembly import ArrayAssembly
 from runtime.model.channels import without_alpha
 from runtime.model.compiled.fade import fade_codes
 from runtime.model.compiled.joint import INTENSITY, JointState, rays_of
-from runtime.model.compiled.level import CompiledLevel
+from runtime.model.compiled.level import Level
 from runtime.model.compiled.wanted import fill_targets
 from runtime.model.contract import Contract, Step
 from runtime.model.job import Picture
-from runtime.model.pyramid_level import CENTRE, EYES, NEUTRAL, OUTER, PyramidLevel
+from runtime.model.reprojection import CENTRE, EYES, NEUTRAL, OUTER
 from runtime.model.resample import buffer, resample
-from runtime.model.rows import RowPool
 from runtime.model.steps import Problem, reductions
 from runtime.model.transfer import SUBCODE, phase_codes
 from runtime.model.wanted import Pictures
 from runtime.model.workspace import Workspace
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
-from runtime.records import I16, U8
+from runtime.records import F32, I16, U8
 from runtime.support.gl import DrawnPicture
 
 
@@ -37,12 +36,8 @@ class CpuBackend:
     context: object = None
     fade_codes = staticmethod(fade_codes)
 
-    def __init__(self, *, level: type[PyramidLevel] | None = None) -> None:
-        """level: what does corrections; None: compiled kernels."""
-        self._level = level or CompiledLevel
-
     def state(self, contract: Contract, stack: PanelStack, *, threads: int) -> CpuState:
-        return CpuState(contract, stack, threads=threads, level=self._level)
+        return CpuState(contract, stack, threads=threads)
 
     def assembly(self, stack: PanelStack) -> ArrayAssembly:
         return ArrayAssembly(stack)
@@ -54,9 +49,8 @@ class CpuBackend:
 class CpuState:
     """A `SolverState`."""
 
-    def __init__(self, contract: Contract, stack: PanelStack, *, threads: int, level: type[PyramidLevel]) -> None:
-        self._contract, self._size, self._level = contract, stack, level
-        self._rows = RowPool(threads, width_px=stack.width_px)
+    def __init__(self, contract: Contract, stack: PanelStack, *, threads: int) -> None:
+        self._contract, self._size, self._threads = contract, stack, max(1, threads)
         self._workspaces: dict[int, Workspace] = {}
         self._joint: dict[int, JointState] = {}
         self._stepped: JointState | None = None
@@ -68,7 +62,7 @@ class CpuState:
         if problem.channels not in self._workspaces:
             needed = reductions(self._contract)
             self._workspaces[problem.channels] = Workspace(
-                self._size, needed, level=self._level, rows=self._rows, channels=problem.channels
+                self._size, needed, threads=self._threads, channels=problem.channels
             )
         self._workspace = self._workspaces[problem.channels]
         self._workspace.crop(problem.boxes, problem.stack)
@@ -77,12 +71,10 @@ class CpuState:
 
         contract, levels = self._contract, self._workspace.levels
         self._pictures = Pictures(arrays, box, problem.channels, contract.emphasis, phase_codes(contract.branch))
-        fill_targets(self._pictures, [levels[reduction].target for reduction in sorted(levels)], rows=self._rows)
+        fill_targets(self._pictures, [levels[reduction].target for reduction in sorted(levels)], threads=self._threads)
         for level in levels.values():
             level.slope_floor = self._contract.slope_floor
-            level.set_eye_sigma(
-                problem.eyes_m, eye_sigma_mm=problem.eye_sigma_mm, least_px=self._contract.least_spread_px
-            )
+            level.set_eyes(problem.eyes_m, eye_sigma_mm=problem.eye_sigma_mm, least_px=contract.least_spread_px)
         return nullcontext()
 
     def network_pictures(self) -> tuple[I16, I16]:
@@ -92,7 +84,7 @@ class CpuState:
         pair = next(known, None)
         if pair is None:
             pair = tuple(np.empty(size[::-1] + tail, np.int16) for _ in EYES)
-            fill_targets(self._pictures, [pair], rows=self._rows)
+            fill_targets(self._pictures, [pair], threads=self._threads)
         left, right = pair
         half = (right - left) >> 1
         residuals = self._workspace.chain_buffers(problem.frame)
@@ -107,28 +99,23 @@ class CpuState:
         level.set_panel(panel, codes, matrix, columns=problem.answer_columns, shown=shown)
 
     def project(self, reduction: int, panels: Sequence[int]) -> None:
-        self._workspace.levels[reduction].project(panels, self._problem.eyes_m)
+        self._workspace.levels[reduction].project(panels)
 
     def correct(self, reduction: int, panel: int, *, size: float, shown: bool) -> None:
-        level, problem = self._workspace.levels[reduction], self._problem
-        fading = None
-        if problem.fade is not None:
-            width_px, height_px = level.size
-            matrix = problem.centre_from(level.rasters[CENTRE].plane_from_raster())
-            fading = problem.fade.softening(matrix, rows=height_px, columns=width_px)
-        level.step(panel, problem.eyes_m, size=size, shown=shown, fading=fading)
+        level = self._workspace.levels[reduction]
+        level.step(panel, size=size, shown=shown, fading=self._fading(level))
 
     def start_joint(self) -> None:
         level, problem = self._workspace.levels[1], self._problem
         joint = self._joint.get(problem.channels)
         if joint is None:
             sizes = np.array([(self._size.height_px, self._size.width_px)] * 4)
-            joint = JointState(sizes, channels=problem.channels, threads=self._rows.threads)
+            joint = JointState(sizes, channels=problem.channels, threads=self._threads)
             self._joint[problem.channels] = joint
         rasters = (*level.rasters, level.rasters[CENTRE])  # rays go through the centre panel's pixels
         joint.sizes = np.array([(raster.height_px, raster.width_px) for raster in rasters])
         level.spread = {}
-        level.project(OUTER, problem.eyes_m)
+        level.project(OUTER)
         level.show(self._layers, problem.boxes)
         for n, box in enumerate(problem.boxes):
             codes = without_alpha(np.ascontiguousarray(self._layers[n][box.slices]), problem.channels)
@@ -136,7 +123,7 @@ class CpuState:
         asked = [buffer(*level.size[::-1], channels=problem.channels) for _ in EYES]
         intensities = (np.arange(256) * INTENSITY).astype(np.int16)
         width, height = level.size
-        fill_targets(replace(self._pictures, table=intensities), [asked], rows=self._rows)
+        fill_targets(replace(self._pictures, table=intensities), [asked], threads=self._threads)
         for image, numbers in zip(asked, joint.targets, strict=True):
             numbers[:height, : width * problem.channels] = image.reshape(height, -1)
         joint.start()
@@ -145,14 +132,11 @@ class CpuState:
     def joint(self, step: Step) -> None:
         problem, joint = self._problem, self._stepped
         assert joint is not None
-        fade = None
-        if problem.fade is not None:
-            width_px, height_px = self._workspace.levels[1].size
-            matrix = problem.centre_from(self._workspace.levels[1].rasters[CENTRE].plane_from_raster())
-            softening = problem.fade.softening(matrix, rows=height_px, columns=width_px)
+        fade, fading = None, self._fading(self._workspace.levels[1])
+        if fading is not None:
             columns = np.zeros(joint.panels.shape[2], np.float32)
-            columns[: width_px * problem.channels] = np.repeat(softening.columns, problem.channels)
-            fade = columns, softening.rows
+            columns[: fading[0].size * problem.channels] = np.repeat(fading[0], problem.channels)
+            fade = columns, fading[1]
         rays = rays_of(problem.rays(step.places), joint.sizes)
         joint.step(rays, size=step.size, momentum=step.momentum, floor=step.floor, fade=fade)
 
@@ -168,11 +152,20 @@ class CpuState:
         if self._stepped is None:
             self._workspace.levels[1].show(self._layers, boxes)
         else:
-            self._workspace.levels[1].show_panels(self._stepped.last, self._layers, boxes)
+            self._workspace.levels[1].show_panels(dict(enumerate(self._stepped.last)), self._layers, boxes)
         return self._layers
 
     def close(self) -> None:
-        self._rows.close()
+        self._workspaces, self._joint = {}, {}
+
+    def _fading(self, level: Level) -> tuple[F32, F32] | None:
+        """How residuals end within a part of larger panels, along a level's columns and rows; None: not at all."""
+        fade = self._problem.fade
+        if fade is None:
+            return None
+        matrix = self._problem.centre_from(level.rasters[CENTRE].plane_from_raster())
+        width_px, height_px = level.size
+        return fade.ray_weights(matrix, rows=height_px, columns=width_px)
 
 
 def _fill(numbers: I16, codes: U8, unit: float) -> None:

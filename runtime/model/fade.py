@@ -61,13 +61,14 @@ class Fade:
             below = below * np.clip(inside / over_px, 0.0, 1.0).astype(np.float32)
         return np.asarray(right * below)[..., None]
 
-    def softening(self, centre_from_raster: F64, *, rows: int, columns: int) -> Softening:
-        """How corrections on a raster of the centre panel end: none must drive the panels beyond their edges."""
+    def ray_weights(self, centre_from_raster: F64, *, rows: int, columns: int) -> tuple[F32, F32]:
+        """(columns,) and (rows,) from 0 to 1: what residuals of rays through a raster of the centre panel are
+        multiplied with. None must drive the panels beyond their edges."""
         m = centre_from_raster
         u = m[0, 0] * (np.arange(columns) + 0.5) + m[0, 2]
         v = m[1, 1] * (np.arange(rows) + 0.5) + m[1, 2]
         along, down = (over_px * CORRECTED_SHARE for over_px in self.over_px)
-        return Softening(_softening(self._across(u, along), columns), _softening(self._down(v, down), rows))
+        return _least(self._across(u, along), columns), _least(self._down(v, down), rows)
 
     def _across(self, u: F64, over_px: float) -> list[tuple[F64, float]]:
         """How far inside the left and right edge columns are, and over how much the edge fades."""
@@ -80,40 +81,9 @@ class Fade:
         return [(inside, over_px) for fades, inside in sides if fades and over_px > 0]
 
 
-@dataclass(frozen=True, slots=True)
-class Softening:
-    """How corrections end towards the edges of a part: what their residual is multiplied with, in whole `QUARTERS`."""
-
-    columns: F32  # (columns,) 0 to 1
-    rows: F32  # (rows,)
-
-    def soften(self, residual: Sequence[I16]) -> None:
-        """Take back what the eyes lack there: (rows, columns[, 3]) per eye, in place."""
-        for image in residual:
-            columns, weights = _weakened(self.columns)
-            _scale(image[:, columns], weights[None])
-            rows, weights = _weakened(self.rows)
-            _scale(image[rows], weights[:, None])
-
-
-def _softening(edges: Sequence[tuple[F64, float]], count: int) -> F32:
-    """(count,): what the nearest of some edges leaves."""
+def _least(edges: Sequence[tuple[F64, float]], count: int) -> F32:
+    """(count,): what the nearest of some edges leaves, in whole `QUARTERS`."""
     weights = np.ones(count)
     for inside, over_px in edges:
         weights = np.minimum(weights, np.clip(np.rint(inside / over_px * QUARTERS), 0, QUARTERS) / QUARTERS)
     return weights.astype(np.float32)
-
-
-def _weakened(weights: F32) -> tuple[slice, I16]:
-    """The rows or columns that are weakened, and their weights in `QUARTERS`."""
-    (faded,) = np.nonzero(weights < 1)
-    part = slice(int(faded[0]), int(faded[-1]) + 1) if faded.size else slice(0, 0)
-    return part, np.rint(weights[part] * QUARTERS).astype(np.int16)
-
-
-def _scale(image: I16, weights: I16) -> None:
-    """In place. weights: (1, columns) or (rows, 1), in `QUARTERS`."""
-    if image.ndim == 3:
-        weights = np.repeat(weights[..., None], image.shape[2], axis=2)  # else numpy's innermost loop has three turns
-    np.multiply(image, weights, out=image)
-    np.right_shift(image, 2, out=image)

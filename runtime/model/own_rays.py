@@ -13,9 +13,9 @@ import numpy as np
 
 from runtime.model.channels import without_alpha
 from runtime.model.compiled.joint import FULL, INTENSITY, JointState, rays_of
-from runtime.model.compiled.sampling import TILE
+from runtime.model.compiled.loops import TILE
 from runtime.model.contract import Step
-from runtime.model.pyramid_level import CENTRE, reprojection
+from runtime.model.reprojection import CENTRE, reprojection
 from runtime.model.steps import PLACES
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack

@@ -18,7 +18,7 @@ from runtime.model.chain import ChainFrame, ColumnLaw
 from runtime.model.contract import Contract, Places, Step
 from runtime.model.fade import Fade, FadeCodes
 from runtime.model.job import Picture
-from runtime.model.pyramid_level import CENTRE, FRONT, OUTER, REAR, coarser, reprojection
+from runtime.model.reprojection import CENTRE, FRONT, OUTER, REAR, coarser, reprojection
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen

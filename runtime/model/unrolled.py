@@ -19,7 +19,7 @@ from runtime.model.contract import Step
 from runtime.model.cpu import CpuBackend
 from runtime.model.fade import Fade
 from runtime.model.job import Job, Picture
-from runtime.model.pyramid_level import CENTRE, FRONT, REAR, START
+from runtime.model.reprojection import CENTRE, FRONT, REAR, START
 from runtime.model.session import ModelSession
 from runtime.model.steps import Answer, Problem, SolverBackend, SolverState, run_steps
 from runtime.model.timing import Stopwatch

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import cv2
 
 from runtime.model.channels import without_alpha
-from runtime.model.rows import RowPool
 from runtime.model.transfer import pre_emphasised
 from runtime.optics.rect import PixelRect
 from runtime.records import I16, U8
+from runtime.support.threads import at_once
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class Pictures:
     table: I16  # (256,) what is asked for each code: its phase sum
 
 
-def fill_targets(pictures: Pictures, pairs: Sequence[Sequence[I16]], *, rows: RowPool) -> None:
+def fill_targets(pictures: Pictures, pairs: Sequence[Sequence[I16]]) -> None:
     """Phase sums at the size of pairs of images (h, w[, 3]), left and right, averaged as codes: into them."""
 
     def sharpened(picture: U8) -> U8:
@@ -37,6 +37,6 @@ def fill_targets(pictures: Pictures, pairs: Sequence[Sequence[I16]], *, rows: Ro
         same = picture.shape[1::-1] == size
         cv2.LUT(picture if same else cv2.resize(picture, size, interpolation=cv2.INTER_AREA), pictures.table, dst=image)
 
-    sharp = rows.map(sharpened, pictures.arrays)
+    sharp = at_once(sharpened, pictures.arrays)
     for pair in pairs:
-        rows.map(fill, list(zip(sharp, pair, strict=True)))
+        at_once(fill, list(zip(sharp, pair, strict=True)))

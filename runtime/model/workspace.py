@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from runtime.model.chain import ChainFrame
-from runtime.model.pyramid_level import PyramidLevel
+from runtime.model.compiled.level import Level
 from runtime.model.resample import buffer
-from runtime.model.rows import RowPool
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import I16
@@ -21,12 +20,11 @@ class Workspace:
         stack: PanelStack,
         reductions: Collection[int],
         *,
-        level: type[PyramidLevel],
-        rows: RowPool,
+        threads: int,
         channels: int,
     ) -> None:
         self._channels = channels
-        self.levels = {r: level(stack, reduction=r, rows=rows, channels=channels) for r in reductions}
+        self.levels = {r: Level(stack, reduction=r, threads=threads, channels=channels) for r in reductions}
         self._cropped: tuple[tuple[PixelRect, ...], PanelStack] | None = None
         self._chain: tuple[tuple[int, int], tuple[I16, I16]] | None = None
 

@@ -27,8 +27,12 @@ def at_once(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Resul
 def on_rows(work: Callable[[int, int], None], first: int, last: int) -> None:
     """`work(first, last)` on as many rows for each of OpenCV's threads."""
     threads = max(1, cv2.getNumThreads())
-    bounds = [first + (last - first) * k // threads for k in range(threads + 1)]
-    at_once(lambda rows: work(*rows), list(pairwise(bounds)))
+    at_once(lambda rows: work(first + rows[0], first + rows[1]), shares(last - first, threads))
+
+
+def shares(count: int, threads: int) -> list[tuple[int, int]]:
+    """As many rows for each thread: the first, and the first beyond."""
+    return list(pairwise([count * k // threads for k in range(threads + 1)]))
 
 
 @cache

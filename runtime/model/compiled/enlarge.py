@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from runtime.model.compiled.sampling import PASS, U
+from runtime.model.compiled.loops import PASS, U
 
 # Keys' kernel, a = -0.75, for pixels a quarter beyond the second of four; mirrored for three quarters.
 NEAR, FAR = (-0.10546875, 0.87890625, 0.26171875, -0.03515625), (-0.03515625, 0.26171875, 0.87890625, -0.10546875)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from runtime.model.compiled.sampling import PASS
+from runtime.model.compiled.loops import PASS
 
 
 @njit(**PASS)

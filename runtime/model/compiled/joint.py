@@ -25,15 +25,14 @@ there, and write where the step before last lay.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from llvmlite import ir
-from numba import njit, types
-from numba.extending import intrinsic
+from numba import njit
 from numpy.typing import NDArray
 
-from runtime.model.compiled.sampling import OPTIONS, PASS, PIECE, TILE, U, _everywhere, _loaded
+from runtime.model.compiled.along import new_layout, sample, sum_where, work_row, work_tiles
+from runtime.model.compiled.loops import PASS, PIECE, TILE, U
 from runtime.records import F32, F64
 from runtime.support.threads import at_once
 
@@ -42,169 +41,7 @@ FULL = 4080.0  # a panel's whole range in sixteenths of a code
 INTENSITY = 64.0  # of a target's code, in 16 bits
 SLOPED = 16384.0  # of a ring's G and W
 MARGIN = 2 * PIECE  # numbers behind an image that whole pieces may read
-RUN = 192  # numbers of a row whose height in an image counts as a line
 NEAR_PX = 0.5  # a ray counts that crosses every panel so far inside its edge
-_VECTOR = ir.VectorType(ir.FloatType(), PIECE)
-
-
-@intrinsic
-def _add_piece(typing, row, source, step, weight, slope, before, at, out, start):
-    """out[start + k] = before[at + k] + what lies between row[source + k] and row[source + k + step], `PIECE` numbers
-    at once."""
-    signature = types.void(
-        row, types.uint64, types.uint64, types.float32, types.float32, before, types.uint64, out, types.uint64
-    )
-
-    def generate(context, builder, signature, arguments):
-        row, source, step, weight, slope, before, at, out, start = arguments
-        kinds, fast = signature.args, ["contract"]
-        pixels = builder.select(
-            builder.icmp_unsigned("==", step, ir.Constant(ir.IntType(64), 3)),
-            ir.Constant(_VECTOR, [float(k // 3) for k in range(PIECE)]),
-            ir.Constant(_VECTOR, [float(k) for k in range(PIECE)]),
-        )
-        here = _loaded(context, builder, kinds[0], row, source)
-        beside = _loaded(context, builder, kinds[0], row, builder.add(source, step))
-        grown = builder.fmul(pixels, _everywhere(builder, slope), flags=fast)
-        share = builder.fadd(grown, _everywhere(builder, weight), flags=fast)
-        between = builder.fmul(builder.fsub(beside, here, flags=fast), share, flags=fast)
-        sums = builder.fadd(_loaded(context, builder, kinds[5], before, at), here, flags=fast)
-        place = builder.gep(context.make_array(kinds[7])(context, builder, out).data, [start])
-        result = builder.fadd(sums, between, flags=fast)
-        builder.store(result, builder.bitcast(place, ir.PointerType(_VECTOR)), align=4)
-        return context.get_dummy_value()
-
-    return signature, generate
-
-
-class Layout(NamedTuple):
-    """How the tiles of a row lie in images: kept from row to row, as it changes only where panels are tilted."""
-
-    keys: Any  # (images, tiles, 3) float64: scale, shift and bend that it was laid for
-    spans: Any  # (images, tiles, 3) int32: first pixel within the image, first beyond, pieces
-    starts: Any  # (images, tiles, pieces) int32, numbers in the tile
-    sources: Any  # (images, tiles, pieces) int32, numbers in the image
-    weights: Any  # (images, tiles, pieces, 2) float32, of the right neighbour at a piece's first pixel, and its growth
-
-
-@njit(**OPTIONS)
-def _lay(scale, bend, shift, pixels, width, near, channels, n, tile, layout):  # pragma: no cover
-    """Where pixels 0 to `pixels` of a tile lie in a row of `width`, centres at integers: pixel k at shift + scale·k +
-    bend·k·(k - pixels + 1)."""
-    layout.keys[n, tile, 0], layout.keys[n, tile, 1], layout.keys[n, tile, 2] = scale, shift, bend
-    low, high, ends = near - 0.5, width - 0.5 - near, pixels - 1
-    longest, count, k, first = PIECE // channels, 0, 0, 0
-    grows = scale - 1.0 if abs(scale - 1.0) > 1e-6 else 1e-6
-    runs = 1.0 / grows  # pixels until the source is one further beside, but for a parabola's slight bend
-    while k < pixels and shift + k * (scale + bend * (k - ends)) < low:
-        k += 1
-    first = k
-    while k < pixels:
-        x = shift + k * (scale + bend * (k - ends))
-        if x > high:
-            break
-        left = min(max(int(x), 0), max(width - 2, 0))
-        share = min(max(x - left, 0.0), 1.0)
-        length = longest
-        length = min(length, int(((1.0 if grows > 0.0 else 0.0) - share) * runs) + 1)
-        layout.starts[n, tile, count], layout.sources[n, tile, count] = k * channels, left * channels
-        local = scale + bend * (2 * k + length - 1 - ends)
-        layout.weights[n, tile, count, 0], layout.weights[n, tile, count, 1] = share, local - 1.0
-        count, k = count + 1, k + length
-    last = min(k, pixels)
-    while last > first and shift + (last - 1) * (scale + bend * (last - 1 - ends)) > high:
-        last -= 1
-    layout.spans[n, tile, 0], layout.spans[n, tile, 1], layout.spans[n, tile, 2] = first, last, count
-
-
-@njit(**OPTIONS)
-def _sample(
-    before, image, ring, height, width, near, matrix, v, tile, pixels, channels, n, layout, row, out
-):  # pragma: no cover
-    """out = before + bilinear samples of an image (ring rows, numbers), whose row r is at r % ring, for the pixels of a
-    tile of row v; the pixels that lie within it. matrix (3, 3): the image's pixels from the tile's raster's, centres at
-    halves; along a tile a parabola stands for it."""
-    a, ends, y = tile * (TILE // channels) + 0.5, max(pixels - 1, 1), v + 0.5
-    weight = 1.0 / (matrix[2, 0] * a + matrix[2, 1] * y + matrix[2, 2])
-    xa = (matrix[0, 0] * a + matrix[0, 1] * y + matrix[0, 2]) * weight - 0.5
-    ya = (matrix[1, 0] * a + matrix[1, 1] * y + matrix[1, 2]) * weight - 0.5
-    a += 0.5 * ends
-    weight = 1.0 / (matrix[2, 0] * a + matrix[2, 1] * y + matrix[2, 2])
-    xm = (matrix[0, 0] * a + matrix[0, 1] * y + matrix[0, 2]) * weight - 0.5
-    ym = (matrix[1, 0] * a + matrix[1, 1] * y + matrix[1, 2]) * weight - 0.5
-    a += 0.5 * ends
-    weight = 1.0 / (matrix[2, 0] * a + matrix[2, 1] * y + matrix[2, 2])
-    xb = (matrix[0, 0] * a + matrix[0, 1] * y + matrix[0, 2]) * weight - 0.5
-    yb = (matrix[1, 0] * a + matrix[1, 1] * y + matrix[1, 2]) * weight - 0.5
-    scale, bend = (xb - xa) / ends, 2.0 * (xa + xb - 2.0 * xm) / (ends * ends)
-    low, high = near - 0.5, height - 0.5 - near
-    if min(ya, yb) < low or max(ya, yb) > high or not scale > 0.05:
-        return 0, 0
-    if abs(bend) * ends < 1e-7:
-        bend = 0.0
-    if layout.keys[n, tile, 0] != scale or layout.keys[n, tile, 1] != xa or layout.keys[n, tile, 2] != bend:
-        _lay(scale, bend, xa, pixels, width, near, channels, n, tile, layout)
-    first, last, count = layout.spans[n, tile, 0], layout.spans[n, tile, 1], layout.spans[n, tile, 2]
-    if count == 0:
-        return 0, 0
-    source = layout.sources[n, tile, 0]
-    numbers = layout.sources[n, tile, count - 1] + PIECE + channels - source
-    if ya == yb and ym == ya:
-        top = min(int(max(ya, 0.0)), max(height - 2, 0))
-        upper, lower, down = U(top % ring), U(min(top + 1, height - 1) % ring), np.float32(max(ya - top, 0.0))
-        begin = U(source)
-        for k in range((numbers + PIECE - 1) // PIECE * PIECE):
-            x0, x1 = np.float32(image[upper, U(k) + begin]), np.float32(image[lower, U(k) + begin])
-            row[U(k)] = x0 + (x1 - x0) * down
-    else:
-        # Rows are blended run by run: a run ends where the row above changes.
-        fall, sag = (yb - ya) / ends, 2.0 * (ya + yb - 2.0 * ym) / (ends * ends)
-        at, none, one = 0, np.float32(0), np.float32(1)
-        while at < numbers:
-            k = first + at / (channels * scale)
-            here = min(max(ya + k * (fall + sag * (k - ends)), 0.0), height - 1.0)
-            slope = (fall + sag * (2.0 * k - ends)) / (channels * scale)
-            top = min(int(here), max(height - 2, 0))
-            length = min(numbers - at, RUN)
-            if slope > 1e-9:
-                length = min(length, int((top + 1 - here) / slope) + 1)
-            elif slope < -1e-9:
-                length = min(length, int((top - here) / slope) + 1)
-            upper, lower = U(top % ring), U(min(top + 1, height - 1) % ring)
-            weight, grows, begin, to = np.float32(here - top), np.float32(slope), U(at + source), U(at)
-            for k in range((length + PIECE - 1) // PIECE * PIECE):  # the next run writes over what is too much
-                x0, x1 = np.float32(image[upper, U(k) + begin]), np.float32(image[lower, U(k) + begin])
-                row[U(k) + to] = x0 + (x1 - x0) * min(max(weight + grows * np.float32(k), none), one)
-            at += length
-    for piece in range(count):
-        start = U(layout.starts[n, tile, U(piece)])
-        _add_piece(
-            row,
-            U(layout.sources[n, tile, U(piece)] - source),
-            U(channels),
-            layout.weights[n, tile, U(piece), 0],
-            layout.weights[n, tile, U(piece), 1],
-            before,
-            start,
-            out,
-            start,
-        )
-    return first, last
-
-
-@njit(**OPTIONS)
-def _sum_where(
-    before, image, ring, height, width, matrix, v, tile, pixels, channels, n, layout, row, out
-):  # pragma: no cover
-    """As `_sample`, and `before` alone for the pixels that lie beside the image."""
-    none = 0.0
-    first, last = _sample(
-        before, image, ring, height, width, none, matrix, v, tile, pixels, channels, n, layout, row, out
-    )
-    for k in range(first * channels):
-        out[U(k)] = before[U(k)]
-    for k in range(last * channels, pixels * channels):
-        out[U(k)] = before[U(k)]
 
 
 @njit(**PASS)
@@ -257,7 +94,7 @@ def move_rows(
                 pixels = min(size_of_tile, width - begin)
                 first, last = 0, pixels
                 sums, other = tiles[1], tiles[2]
-                low, high = _sample(
+                low, high = sample(
                     tiles[0],
                     panels[0],
                     sizes[0, 0],
@@ -275,7 +112,7 @@ def move_rows(
                     sums,
                 )
                 first, last = max(first, low), min(last, high)
-                low, high = _sample(
+                low, high = sample(
                     sums,
                     panels[2],
                     sizes[2, 0],
@@ -298,7 +135,7 @@ def move_rows(
                     for k in range(pixels * channels):
                         sums[U(k)] = other[U(k)] + np.float32(panels[CENTRE, U(r), U(k) + offset])
                 else:
-                    low, high = _sample(
+                    low, high = sample(
                         other,
                         panels[1],
                         sizes[1, 0],
@@ -362,35 +199,39 @@ def move_rows(
                             a, b = (3, 5) if e % 2 == 0 else (5, 3)
                             place = back[e, n]
                             index = 3 * e + n
-                            _sum_where(
+                            sum_where(
                                 tiles[a],
                                 ring[e, 0],
                                 ring_rows,
                                 height,
                                 width,
+                                none,
                                 place,
                                 q,
                                 tile,
                                 pixels,
                                 channels,
                                 index,
+                                none,
                                 back_layout,
                                 row,
                                 tiles[b],
                             )
                             a, b = (4, 6) if e % 2 == 0 else (6, 4)
-                            _sum_where(
+                            sum_where(
                                 tiles[a],
                                 ring[e, 1],
                                 ring_rows,
                                 height,
                                 width,
+                                none,
                                 place,
                                 q,
                                 tile,
                                 pixels,
                                 channels,
                                 index,
+                                none,
                                 back_layout,
                                 row,
                                 tiles[b],
@@ -458,19 +299,10 @@ class JointState:
         height = int(self.sizes[3, 0])
         count, threads = len(rays.seen), self.threads
         ring_rows = int((rays.needs[..., 1] - rays.needs[..., 0]).max()) + 2
-        tiles_a_row = -(-self._columns // (TILE // self.channels))
         same = bool(np.array_equal(rays.seen[:, CENTRE], np.broadcast_to(np.eye(3), (count, 3, 3))))
         numbers = self._columns * self.channels + MARGIN
         columns, rows = fade if fade is not None else (np.ones(numbers, np.float32), np.ones(height, np.float32))
         scale = float(np.abs(np.concatenate([rays.seen, rays.back])[..., 0, 0]).max())
-
-        def layout() -> Layout:
-            spans = (3 * count, tiles_a_row)
-            pieces = (*spans, TILE // self.channels)
-            return Layout(
-                np.full((*spans, 3), np.nan), np.zeros((*spans, 3), np.int32), np.zeros(pieces, np.int32),
-                np.zeros(pieces, np.int32), np.zeros((*pieces, 2), np.float32),
-            )  # fmt: skip
 
         def share(index: int) -> None:
             first, end = height * index // threads, height * (index + 1) // threads
@@ -488,9 +320,8 @@ class JointState:
             move_rows(
                 self.panels, self._moved, self.last, self.sizes, self.targets, rays.seen, rays.back, same, rays.needs,
                 columns, rows, size, momentum, floor, self.channels, begin, end, of,
-                np.zeros((count, 2, ring_rows, numbers), np.int16), layout(), layout(),
-                np.zeros(int(TILE * max(1.0, scale) * 1.2) + 4 * PIECE, np.float32),
-                np.zeros((7, TILE + 4 * PIECE), np.float32),
+                np.zeros((count, 2, ring_rows, numbers), np.int16),
+                *(new_layout(3 * count, self._columns, self.channels) for _ in range(2)), work_row(scale), work_tiles(),
             )  # fmt: skip
 
         at_once(share, range(threads))

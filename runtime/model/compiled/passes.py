@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from runtime.model.compiled.sampling import OPTIONS, PASS, TILE, U, lack
+from runtime.model.compiled.along import EDGE_PX, sum_where
+from runtime.model.compiled.loops import OPTIONS, PASS, TILE, U
 
-STRIP_ROWS = 16  # of a panel, that are corrected together
 WHOLE = 4096  # of a weight, in 16 bits
 
 
@@ -23,7 +23,7 @@ def _weigh(wanted, row, begin, count, floor, full, weights):  # pragma: no cover
 
 @njit(**OPTIONS)
 def _best(left, right, weights, weighed, most, count, best):  # pragma: no cover
-    """The centre panel that leaves both eyes least."""
+    """The centre panel that leaves both eyes least, where left and right lack so much."""
     none, half = np.float32(0), np.float32(0.5)
     if weighed:
         for k in range(count):
@@ -37,29 +37,34 @@ def _best(left, right, weights, weighed, most, count, best):  # pragma: no cover
 
 
 @njit(**OPTIONS)
-def _rows_before(back, side, first, last, height):  # pragma: no cover
-    """The centre panel's rows, first and beyond, that an eye sees a panel's rows first to last through; none: 0, 0."""
-    begin, end = height, 0
-    for v in range(first, last):
-        if back.rows[side, v] >= 0:
-            begin, end = min(begin, back.rows[side, v]), max(end, back.rows[side, v] + 2)
-    return (begin, min(end, height)) if begin < end else (0, 0)
+def _lacks(
+    panels, sizes, target, matrices, v, tile, pixels, channels, index, start, layout, row, tiles, out
+):  # pragma: no cover
+    """What an eye lacks of a target (rows, numbers) on row v of a tile of the centre panel, beside two outer panels
+    (rows, numbers) of sizes (rows, pixels). matrices: (2, 3, 3) theirs from the centre's pixels; index: of the first's
+    in the layout; out: (numbers,); tiles: (2, numbers), the first all zeros."""
+    begin, line = U(tile * (TILE // channels) * channels), U(v)
+    for n in range(2):
+        height, width = sizes[n, 0], sizes[n, 1]
+        sum_where(
+            tiles[n], panels[n], height, height, width, -EDGE_PX, matrices[n], v, tile, pixels, channels, index + n,
+            start, layout, row, tiles[1] if n == 0 else out,
+        )  # fmt: skip
+    for k in range(pixels * channels):
+        out[U(k)] = np.float32(target[line, U(k) + begin]) - out[U(k)]
 
 
 @njit(**PASS)
 def correct(
-    this,
-    other,
-    other_moved,
-    this_width,
-    other_width,
-    this_first,
+    panels,
+    moved,
+    sizes,
     unsure,
     out,
-    left_wanted,
-    right_wanted,
+    targets,
     seen,
     back,
+    needs,
     size,
     floor,
     low,
@@ -67,114 +72,93 @@ def correct(
     shown,
     fade_columns,
     fade_rows,
-    share,
-    shares,
+    first,
+    last,
     channels,
     start,
     full,
     step,
+    seen_layout,
+    back_layout,
     row,
-    scratch,
-    residual,
+    tiles,
+    ring,
 ):  # pragma: no cover
-    """One correction of every `shares`-th strip of a panel's rows, from strip `share` on.
+    """One correction of an outer panel's rows first to last.
 
-    this, other: the panel to be corrected and the other one, (rows, numbers) int16, of which so many numbers a row
-    count, as the eyes see them in the mean; other_moved: what is left of the other for an eye that is off by as much
-    again (used where `unsure`). out: `this` and `size` times what both eyes lack, between low and high; a
-    ray weighs as much as the slope of sin² there, and `floor` at least. wanted: (rows,
-    numbers) int16. seen: `Samplings` of the rear panel on the centre one for the left and the right eye, and of the
-    front one; this_first: the first of this panel's. back: of the centre panel on this, for each eye. fade_columns
-    (numbers,), fade_rows (rows,): what the residual is multiplied with. residual: (4, rows, numbers) int16, row:
-    `work_row`, scratch: `work_tiles`, to work in.
+    panels: the panel to be corrected and the other one, (rows, numbers) int16, as the eyes see them in the mean; moved:
+    what is left of the other for an eye that is off by as much again (used where `unsure`). sizes (3, 2): rows and
+    pixels of this panel, of the other, and of the centre one. out: this panel and `size` times what both eyes lack,
+    between low and high; a ray weighs as much as the slope of sin² there, and `floor` at least. targets: two of (rows,
+    numbers) int16. seen: (2, 2, 3, 3), for each eye, this panel's and the other's pixels from the centre's; back:
+    (2, 3, 3) the centre's from this panel's. needs: (rows, 2) first and last of the centre's rows that either eye sees
+    a row of this panel through. fade_columns (numbers,), fade_rows (rows,): what the residual is multiplied with.
+    seen_layout, back_layout, row, tiles (10, numbers), ring (4, rows, numbers) int16: to work in.
     """
-    height, width = back.rows.shape[1], back.starts.shape[1] * channels
-    centre_height, centre_width = seen.rows.shape[1], seen.starts.shape[1] * channels
-    size_of_tile = TILE // channels * channels
-    part, even, left, right, moved = scratch[0:1], scratch[1:2], scratch[2], scratch[3], scratch[4:6]
+    size_of_tile, ring_rows = TILE // channels, ring.shape[1]
+    height, width = sizes[2, 0], sizes[2, 1]
     none, one, most, half = np.float32(0), np.float32(1), np.float32(full), np.float32(0.5)
-    codes, weight_whole, weights = one / step, np.float32(WHOLE), scratch[6:8]
+    codes, whole, weights = one / step, np.float32(WHOLE), tiles[6:8]
     for k in range(TILE):
         weights[0, U(k)] = one
         weights[1, U(k)] = one
-    for v0 in range(share * STRIP_ROWS, height, shares * STRIP_ROWS):
-        v1 = min(v0 + STRIP_ROWS, height)
-        # Each eye sees the strip before rows of its own: those of a head that is rolled lie far apart.
-        l0, l1 = _rows_before(back, 0, v0, v1, centre_height)
-        r0, r1 = _rows_before(back, 1, v0, v1, centre_height)
-        for r in range(min(l0, r0), max(l1, r1)):
-            for_left, for_right = l0 <= r < l1, r0 <= r < r1
-            if not (for_left or for_right):
-                continue
-            for tile in range(seen.tiles.shape[1] - 1):
-                count = min(size_of_tile, centre_width - tile * size_of_tile)
-                at = tile * size_of_tile
+    done = needs[first, 0]
+    for q in range(first, last):
+        for r in range(max(done, needs[q, 0]), needs[q, 1] + 1):
+            line, down = U(r % ring_rows), fade_rows[U(r)]
+            for tile in range((width + size_of_tile - 1) // size_of_tile):
+                begin = U(tile * size_of_tile * channels)
+                pixels = min(size_of_tile, width - tile * size_of_tile)
+                count = pixels * channels
                 for side in range(2):
-                    wanted, lacks = (left_wanted, left) if side == 0 else (right_wanted, right)
-                    a, b = this_first + side, 2 - this_first + side
-                    lack(wanted, r, at, this, 0, this_width, a, r, tile, count, seen, channels, start, row, part[0])
-                    lack(part, 0, 0, other, 0, other_width, b, r, tile, count, seen, channels, start, row, lacks)
+                    _lacks(
+                        panels, sizes, targets[side], seen[side], r, tile, pixels, channels, 2 * side, start,
+                        seen_layout, row, tiles, tiles[2 + side],
+                    )  # fmt: skip
                     if unsure:
-                        lack(
-                            part,
-                            0,
-                            0,
-                            other_moved,
-                            0,
-                            other_width,
-                            b,
-                            r,
-                            tile,
-                            count,
-                            seen,
-                            channels,
-                            start,
-                            row,
-                            moved[side],
-                        )
-                begin, down = U(at), fade_rows[U(r)]
+                        _lacks(
+                            (panels[0], moved), sizes, targets[side], seen[side], r, tile, pixels, channels, 2 * side,
+                            start, seen_layout, row, tiles, tiles[4 + side],
+                        )  # fmt: skip
                 if floor < one:
-                    _weigh(left_wanted, U(r), begin, count, floor, most, weights[0])
-                    _weigh(right_wanted, U(r), begin, count, floor, most, weights[1])
-                _best(left, right, weights, floor < one, most, count, part[0])
-                lefts, rights = (moved[0], moved[1]) if unsure else (left, right)
+                    _weigh(targets[0], U(r), begin, count, floor, most, weights[0])
+                    _weigh(targets[1], U(r), begin, count, floor, most, weights[1])
+                best = tiles[8]
+                _best(tiles[2], tiles[3], weights, floor < one, most, count, best)
                 for side in range(2):
-                    if not (for_left if side == 0 else for_right):
-                        continue
-                    lacks, kept, line = (
-                        (lefts, residual[0], U(r - l0)) if side == 0 else (rights, residual[1], U(r - r0))
-                    )
+                    lacks = tiles[(4 if unsure else 2) + side]
                     for k in range(count):
                         weight = fade_columns[U(k) + begin] * down * weights[U(side), U(k)]
-                        kept[line, U(k) + begin] = np.int16(np.int32((lacks[U(k)] - part[0, U(k)]) * weight))
+                        ring[U(side), line, U(k) + begin] = np.int16(np.int32((lacks[U(k)] - best[U(k)]) * weight))
                     if floor < one:
-                        kept = residual[2] if side == 0 else residual[3]
                         for k in range(count):
-                            kept[line, U(k) + begin] = np.int16(np.int32(weights[U(side), U(k)] * weight_whole))
-        for v in range(v0, v1):
-            for tile in range(back.tiles.shape[1] - 1):
-                count = min(size_of_tile, width - tile * size_of_tile)
-                begin, down = U(tile * size_of_tile), U(v)
-                lack(even, 0, 0, residual[0], l0, centre_width, 0, v, tile, count, back, channels, none, row, part[0])
-                lack(part, 0, 0, residual[1], r0, centre_width, 1, v, tile, count, back, channels, none, row, left)
-                if floor < one:
-                    for side in range(2):
-                        before, sums, seen_weights, begun = (
-                            (even, part[0], residual[2], l0) if side == 0 else (part, right, residual[3], r0)
-                        )
-                        tile_of = (centre_width, side, v, tile, count, back, channels, weight_whole, row, sums)
-                        lack(before, 0, 0, seen_weights, begun, *tile_of)
-                    for k in range(count):
-                        left[U(k)] *= np.float32(-2) * weight_whole / right[U(k)]
-                if shown:
-                    for k in range(count):
-                        code = min(max(np.float32(this[down, U(k) + begin]) - left[U(k)] * size, low), high)
-                        shown_code = np.int32(code * codes + half)
-                        out[down, U(k) + begin] = np.int16(np.int32(np.float32(shown_code) * step))
-                else:
-                    for k in range(count):
-                        code = min(max(np.float32(this[down, U(k) + begin]) - left[U(k)] * size, low), high)
-                        out[down, U(k) + begin] = np.int16(np.int32(code + (half if code >= none else -half)))
+                            ring[U(2 + side), line, U(k) + begin] = np.int16(np.int32(weights[U(side), U(k)] * whole))
+        done = max(done, needs[q, 1] + 1)
+        for tile in range((sizes[0, 1] + size_of_tile - 1) // size_of_tile):
+            begin, at = U(tile * size_of_tile * channels), U(q)
+            pixels = min(size_of_tile, sizes[0, 1] - tile * size_of_tile)
+            count, lacked, weight = pixels * channels, tiles[3], tiles[5]
+            for side in range(2):
+                sum_where(
+                    tiles[2 * side], ring[side], ring_rows, height, width, -EDGE_PX, back[side], q, tile, pixels,
+                    channels, side, none, back_layout, row, tiles[2 + side],
+                )  # fmt: skip
+            if floor < one:
+                for side in range(2):
+                    sum_where(
+                        tiles[4 * side], ring[2 + side], ring_rows, height, width, -EDGE_PX, back[side], q, tile,
+                        pixels, channels, side, whole, back_layout, row, tiles[4 + side],
+                    )  # fmt: skip
+                for k in range(count):
+                    lacked[U(k)] *= np.float32(2) * whole / weight[U(k)]
+            if shown:
+                for k in range(count):
+                    code = min(max(np.float32(panels[0][at, U(k) + begin]) + lacked[U(k)] * size, low), high)
+                    out[at, U(k) + begin] = np.int16(np.int32(np.float32(np.int32(code * codes + half)) * step))
+            else:
+                for k in range(count):
+                    code = min(max(np.float32(panels[0][at, U(k) + begin]) + lacked[U(k)] * size, low), high)
+                    out[at, U(k) + begin] = np.int16(np.int32(code + (half if code >= none else -half)))
 
 
 @njit(**PASS)
@@ -242,58 +226,42 @@ def blur(
 
 @njit(**PASS)
 def close_centre(
-    rear,
-    front,
-    rear_width,
-    front_width,
-    left_wanted,
-    right_wanted,
-    seen,
-    layer,
-    v0,
-    u0,
-    first,
-    last,
-    channels,
-    start,
-    full,
-    step,
-    floor,
-    row,
-    scratch,
+    panels, sizes, targets, seen, layer, v0, u0, first, last, channels, start, full, step, floor, layout, row, tiles
 ):  # pragma: no cover
     """The centre panel's rows first to last that are best for the outer ones, in 8-bit codes.
 
-    layer: (rows, pixels) uint32, RGBA, in which they begin at pixel u0 of row v0.
+    panels: rear and front, (rows, numbers) int16; sizes (3, 2): rows and pixels of both and of the centre panel; seen:
+    (2, 2, 3, 3), for each eye, their pixels from the centre's. layer: (rows, pixels) uint32, RGBA, in which they begin
+    at pixel u0 of row v0. layout, row, tiles: to work in.
     """
-    width = seen.starts.shape[1] * channels
-    size_of_tile = TILE // channels * channels
-    part, left, right = scratch[0:1], scratch[2], scratch[3]
-    share, half, weights = np.float32(1) / step, np.float32(0.5), scratch[6:8]
+    width, size_of_tile = sizes[2, 1], TILE // channels
+    share, half, one, weights = np.float32(1) / step, np.float32(0.5), np.float32(1), tiles[6:8]
     for v in range(first, last):
-        for tile in range(seen.tiles.shape[1] - 1):
-            at = tile * size_of_tile
-            count = min(size_of_tile, width - at)
+        for tile in range((width + size_of_tile - 1) // size_of_tile):
+            pixels = min(size_of_tile, width - tile * size_of_tile)
+            count, begin = pixels * channels, U(tile * size_of_tile * channels)
             for side in range(2):
-                wanted, lacks = (left_wanted, left) if side == 0 else (right_wanted, right)
-                lack(wanted, v, at, rear, 0, rear_width, side, v, tile, count, seen, channels, start, row, part[0])
-                lack(part, 0, 0, front, 0, front_width, side + 2, v, tile, count, seen, channels, start, row, lacks)
-            if floor < np.float32(1):
-                _weigh(left_wanted, U(v), U(at), count, floor, full, weights[0])
-                _weigh(right_wanted, U(v), U(at), count, floor, full, weights[1])
-            _best(left, right, weights, floor < np.float32(1), full, count, part[0])
+                _lacks(
+                    panels, sizes, targets[side], seen[side], v, tile, pixels, channels, 2 * side, start, layout, row,
+                    tiles, tiles[2 + side],
+                )  # fmt: skip
+            if floor < one:
+                _weigh(targets[0], U(v), begin, count, floor, full, weights[0])
+                _weigh(targets[1], U(v), begin, count, floor, full, weights[1])
+            best = tiles[8]
+            _best(tiles[2], tiles[3], weights, floor < one, full, count, best)
             for k in range(count):
-                left[U(k)] = part[0, U(k)] * share + half
-            row_out, begin = U(v + v0), U(u0 + at // channels)
+                best[U(k)] = best[U(k)] * share + half
+            row_out, to = U(v + v0), U(u0 + tile * size_of_tile)
             if channels == 3:
-                for u in range(count // 3):
+                for u in range(pixels):
                     k = U(3) * U(u)
-                    red, green, blue = np.int32(left[k]), np.int32(left[k + U(1)]), np.int32(left[k + U(2)])
-                    layer[row_out, U(u) + begin] = _pixel(red, green, blue)
+                    red, green, blue = np.int32(best[k]), np.int32(best[k + U(1)]), np.int32(best[k + U(2)])
+                    layer[row_out, U(u) + to] = _pixel(red, green, blue)
             else:
-                for u in range(count):
-                    code = np.int32(left[U(u)])
-                    layer[row_out, U(u) + begin] = _pixel(code, code, code)
+                for u in range(pixels):
+                    code = np.int32(best[U(u)])
+                    layer[row_out, U(u) + to] = _pixel(code, code, code)
 
 
 @njit(**OPTIONS)

@@ -7,7 +7,7 @@ from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 
-from runtime.model.compiled.sampling import CHANNELS, OPTIONS, U
+from runtime.model.compiled.loops import CHANNELS, OPTIONS, U
 
 LEAST_WEIGHT = np.float32(1e-6)  # of a homography: what is nearer to the eye's own plane is taken for behind it
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from numba import njit
 
-from runtime.model.compiled.sampling import PASS
+from runtime.model.compiled.loops import PASS
 
 
 @njit(**PASS)

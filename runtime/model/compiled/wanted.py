@@ -8,10 +8,10 @@ import numpy as np
 from numba import njit
 
 from runtime.model import wanted as plain
-from runtime.model.compiled.sampling import CHANNELS, PASS, U, numbers_of
-from runtime.model.rows import RowPool
+from runtime.model.compiled.loops import CHANNELS, PASS, U, numbers_of
 from runtime.model.wanted import Pictures
 from runtime.records import I16
+from runtime.support.threads import at_once, shares
 
 MARGIN = CHANNELS  # numbers: a pixel to either side
 
@@ -69,7 +69,7 @@ def want(
                     halved[line, U(u)] = table[pairs[U(u) * U(2 * CHANNELS)]]
 
 
-def fill_targets(pictures: Pictures, pairs: Sequence[Sequence[I16]], *, rows: RowPool) -> None:
+def fill_targets(pictures: Pictures, pairs: Sequence[Sequence[I16]], *, threads: int) -> None:
     """As `runtime.model.wanted.fill_targets`; other sizes than every pixel and every second are left to it."""
     height, width = pictures.box.height_px, pictures.box.width_px
     full, *rest = pairs
@@ -77,19 +77,19 @@ def fill_targets(pictures: Pictures, pairs: Sequence[Sequence[I16]], *, rows: Ro
         (2 * half[0].shape[0], 2 * half[0].shape[1]) == (height, width) for half in rest
     )
     if not fits or len(rest) > 1:
-        plain.fill_targets(pictures, pairs, rows=rows)
+        plain.fill_targets(pictures, pairs)
         return
     halves = rest[0] if rest else [np.empty((0, 0), np.int16) for _ in full]
     sources = [np.ascontiguousarray(array).reshape(array.shape[0], -1) for array in pictures.arrays]
     place = pictures.box.v0, pictures.box.u0, height, width, pictures.table.reshape(-1), pictures.emphasis
     numbers = width * CHANNELS
 
-    def work(index: int, of: int) -> None:
-        first, last = (height * part // of // 2 * 2 if part < of else height for part in (index, index + 1))
+    def work(part: tuple[int, int]) -> None:
+        first, last = part[0] // 2 * 2, height if part[1] == height else part[1] // 2 * 2
         row, codes = np.zeros(numbers + 2 * MARGIN, np.float32), np.zeros((2, numbers), np.uint8)
         pairs_of_codes = np.zeros(numbers, np.uint16)
         for source, wanted, half in zip(sources, full, halves, strict=True):
             images = numbers_of(wanted), numbers_of(half) if rest else half
             want(source, *place, *images, pictures.channels, first, last, row, codes, pairs_of_codes)
 
-    rows.split(height * numbers, work)
+    at_once(work, shares(height, threads))

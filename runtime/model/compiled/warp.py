@@ -14,8 +14,8 @@ from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 
+from runtime.model.compiled.loops import CHANNELS, OPTIONS, PASS, U
 from runtime.model.compiled.pixels import LEAST_WEIGHT, locate, sample_pixels
-from runtime.model.compiled.sampling import CHANNELS, OPTIONS, PASS, U
 from runtime.records import F64, U8
 from runtime.support.threads import on_rows
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from runtime.model.assembly import ArrayAssembly, Placed, Rest, Shared, centre_codes
 from runtime.model.gl.programs import Image, Passes
-from runtime.model.pyramid_level import NEUTRAL
+from runtime.model.reprojection import NEUTRAL
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import U8, Layers

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from runtime.model.gl.programs import Image, Passes
-from runtime.model.pyramid_level import CENTRE, FRONT, REAR, START
+from runtime.model.reprojection import CENTRE, FRONT, REAR, START
 from runtime.records import F64
 
 EYES = ("left", "right")

@@ -26,7 +26,7 @@ from runtime.model.gl.assembly import left_in
 from runtime.model.gl.joint import RAYS, GlJoint
 from runtime.model.gl.programs import Image, Passes
 from runtime.model.job import Picture
-from runtime.model.pyramid_level import CENTRE, FRONT, NEUTRAL, OUTER, REAR, START, reprojection, spreads
+from runtime.model.reprojection import CENTRE, FRONT, NEUTRAL, OUTER, REAR, START, reprojection, spreads
 from runtime.model.steps import Problem, reductions
 from runtime.model.transfer import phase_codes
 from runtime.optics.stack import PanelStack, PlaneRaster
