@@ -17,7 +17,8 @@ from runtime.model.compiled.loops import OPTIONS, PIECE, TILE, VECTOR, U, everyw
 from runtime.records import F32
 
 EDGE_PX = 1e-3  # a place on an image's very edge is within, however it was rounded
-RUN = 192  # numbers of a row whose height in an image counts as a line
+MAX_DRIFT_PX = 1 / 16  # of a row from the one that its pieces were laid for; their weights follow it
+RUN = 480  # numbers of a row whose height in an image counts as a line
 
 
 @intrinsic
@@ -121,8 +122,11 @@ def sample(
         return 0, 0
     if abs(bend) * ends < 1e-7:
         bend = 0.0
-    if layout.keys[n, tile, 0] != scale or layout.keys[n, tile, 1] != xa or layout.keys[n, tile, 2] != bend:
+    shift, grown = xa - layout.keys[n, tile, 1], scale - layout.keys[n, tile, 0]
+    bent = abs(bend - layout.keys[n, tile, 2]) * ends * ends
+    if not abs(shift) + abs(grown) * ends + bent <= MAX_DRIFT_PX:  # of the first row, nothing is laid
         _lay(scale, bend, xa, pixels, width, near, channels, n, tile, layout)
+        shift, grown = 0.0, 0.0
     first, last, count = layout.spans[n, tile, 0], layout.spans[n, tile, 1], layout.spans[n, tile, 2]
     if count == 0:
         return 0, 0
@@ -155,14 +159,16 @@ def sample(
                 x0, x1 = np.float32(image[upper, U(k) + begin]), np.float32(image[lower, U(k) + begin])
                 row[U(k) + to] = x0 + (x1 - x0) * min(max(weight + grows * np.float32(k), none), one)
             at += length
+    along, growth = np.float32(grown / channels), np.float32(grown)
     for piece in range(count):
         start = U(layout.starts[n, tile, U(piece)])
+        drifted = np.float32(shift) + along * np.float32(start)
         _add_piece(
             row,
             U(layout.sources[n, tile, U(piece)] - source),
             U(channels),
-            layout.weights[n, tile, U(piece), 0],
-            layout.weights[n, tile, U(piece), 1],
+            layout.weights[n, tile, U(piece), 0] + drifted,
+            layout.weights[n, tile, U(piece), 1] + growth,
             before,
             start,
             out,
