@@ -11,7 +11,6 @@ import numpy as np
 
 from runtime.model.assembly import ArrayAssembly
 from runtime.model.channels import without_alpha
-from runtime.model.compiled.fade import fade_codes
 from runtime.model.compiled.joint import INTENSITY, JointState, rays_of
 from runtime.model.compiled.level import Level
 from runtime.model.compiled.wanted import fill_targets
@@ -34,7 +33,6 @@ class CpuBackend:
 
     name = "cpu"
     context: object = None
-    fade_codes = staticmethod(fade_codes)
 
     def state(self, contract: Contract, stack: PanelStack, *, threads: int) -> CpuState:
         return CpuState(contract, stack, threads=threads)

@@ -7,26 +7,17 @@ the energy altogether.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
 from runtime.optics.rect import PixelRect
-from runtime.records import F32, F64, I16
+from runtime.records import F32, F64
 
 QUARTERS = 4  # the finest steps in which 16 bits hold any phase that an eye can lack
 CORRECTED_SHARE = 1 / 6  # of the fade, in which corrections fade too: they mend the error of the wave's own
-
-
-FadeCodes = Callable[[I16, F32, int, int], None]
-
-
-def fade_codes(codes: I16, weights: F32, start: int, channels: int) -> None:
-    """codes (rows, numbers) towards `start`, as far as weights (rows or 1, pixels) are below 1; in place."""
-    each = np.repeat(weights, channels, axis=1)  # else numpy's innermost loop has three turns
-    codes[...] = codes * each + (start * (1 - each) + np.float32(0.5))  # rounded
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,10 +15,11 @@ import numpy as np
 
 from runtime.model.assembly import Assembly
 from runtime.model.chain import ChainFrame, ColumnLaw
+from runtime.model.compiled.fade import fade_codes
 from runtime.model.contract import Contract, Places, Step
-from runtime.model.fade import Fade, FadeCodes
+from runtime.model.fade import Fade
 from runtime.model.job import Picture
-from runtime.model.reprojection import CENTRE, FRONT, OUTER, REAR, coarser, reprojection
+from runtime.model.reprojection import CENTRE, FRONT, OUTER, REAR, START, coarser, reprojection
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen
@@ -73,9 +74,8 @@ class Problem:
         law = self.frame.columns
         return ColumnLaw(law.bend, law.middle + self.frame.cell_px)
 
-    def faded(self, panels: Answer, *, start: int, fade_codes: FadeCodes) -> Answer:
-        """The network's answer that ends, at `start`, within a part of the panels; in place. fade_codes: the
-        backend's."""
+    def faded(self, panels: Answer) -> Answer:
+        """The network's answer that ends within a part of the panels; in place."""
         if self.fade is None:
             return panels
         frame, first = self.frame, next(iter(panels.values()))
@@ -86,7 +86,7 @@ class Problem:
             self.centre_from(plane_from_wave), rows=rows, columns=columns, law=self.answer_columns
         )
         ends, channels = weights[..., 0], first.size // (rows * columns)
-        at_once(lambda panel: fade_codes(panel.reshape(rows, -1), ends, start, channels), list(panels.values()))
+        at_once(lambda panel: fade_codes(panel.reshape(rows, -1), ends, START, channels), list(panels.values()))
         return panels
 
     def rays(self, places: Places) -> F64:
@@ -159,10 +159,6 @@ class SolverBackend(Protocol):
 
     name: str  # as `model.backend` calls it
     context: object  # of OpenGL, whose textures it reads; None: it reads arrays
-
-    @property
-    def fade_codes(self) -> FadeCodes:
-        """What ends the network's answer, which is an array, within a part of the panels (`fade.fade_codes`)."""
 
     def state(self, contract: Contract, stack: PanelStack, *, threads: int) -> SolverState:
         """For a model and stacks of this one's size. Raises InputError where that does not fit."""

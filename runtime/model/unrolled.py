@@ -19,7 +19,7 @@ from runtime.model.contract import Step
 from runtime.model.cpu import CpuBackend
 from runtime.model.fade import Fade
 from runtime.model.job import Job, Picture
-from runtime.model.reprojection import CENTRE, FRONT, REAR, START
+from runtime.model.reprojection import CENTRE, FRONT, REAR
 from runtime.model.session import ModelSession
 from runtime.model.steps import Answer, Problem, SolverBackend, SolverState, run_steps
 from runtime.model.timing import Stopwatch
@@ -185,4 +185,4 @@ class UnrolledPredictor(Predictor):
         watch.lap("inference")
         tail = residuals[0].shape[2:]
         panels = {n: answer[name].reshape(frame.rows, -1, *tail) for n, name in ((REAR, "rear"), (FRONT, "front"))}
-        return problem.faded(panels, start=START, fade_codes=self._backend.fade_codes)
+        return problem.faded(panels)

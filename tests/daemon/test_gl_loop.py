@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import runtime.model.cpu
-import runtime.model.pyramid_level
 from runtime.clock import NS_PER_S, MonotonicClock
 from runtime.config import OutputSettings, Settings
 from runtime.daemon.solver_parts import SolverMaker
@@ -27,7 +25,7 @@ from runtime.records import PanelFrame, SolveRequest
 from runtime.support.gl import offscreen_context
 from runtime.support.gl_sharing import LayerTextures
 from runtime.support.memory import give_back
-from tests.model.exact import exact_resample
+from tests.model.plain_level import hold_exactly
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 240, 136)
 SMALL = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 128, 72)
@@ -42,9 +40,7 @@ def maker_of(model: str, backend: str, scene: str, stack: PanelStack, **more: An
 
 @pytest.mark.parametrize("scene", ["demo", "texture", "grey", "thin"])
 def test_pictures_in_textures_are_solved_as_pictures_in_arrays_are(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (runtime.model.cpu, runtime.model.pyramid_level):
-        monkeypatch.setattr(module, "resample", exact_resample)
-    monkeypatch.setattr(runtime.model.cpu, "CompiledLevel", runtime.model.pyramid_level.PyramidLevel)
+    hold_exactly(monkeypatch)
     eyes_m = np.array([[0.6, -0.031, 0.05], [0.6, 0.031, 0.05]])
     request = SolveRequest(0, eyes_m, "predicted", 0.001, flat_wanted=False)
     layers = []

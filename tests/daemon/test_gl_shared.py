@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from runtime.model.gl.state import GlState
-from runtime.model.pyramid_level import NEUTRAL
+from runtime.model.reprojection import NEUTRAL
 from runtime.optics.alignment import shown_layers
 from runtime.records import Solution
 from runtime.support.gl_sharing import LayerTextures, lies_in

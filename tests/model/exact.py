@@ -18,7 +18,7 @@ def exact_resample(
     *,
     image_from_result: F64,
     out: NDArray[Any],
-    outside: int = 0,
+    outside: float = 0,
     cubic: bool = False,
     image_columns: ColumnLaw = EVEN_COLUMNS,
     result_columns: ColumnLaw = EVEN_COLUMNS,

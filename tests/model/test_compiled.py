@@ -1,8 +1,7 @@
-"""Compiled corrections do what OpenCV's do where those sample by the definition: code for code, and no byte beside."""
+"""Compiled corrections do what the definition says (`plain_level`): code for code, and no byte beside."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,25 +11,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import runtime.model.pyramid_level
+import runtime.model.workspace
 from runtime.config import ModelSettings
 from runtime.evaluation.displayed import displayed, expected_db
 from runtime.model import compiled
-from runtime.model.compiled import passes, sampling, warp
+from runtime.model.compiled import along, passes, warp
 from runtime.model.compiled.fade import fade_codes
-from runtime.model.compiled.level import CompiledLevel, warm_up
+from runtime.model.compiled.level import Level, warm_up
+from runtime.model.compiled.loops import TILE
 from runtime.model.compiled.unseen import extrapolate_rows
-from runtime.model.cpu import CpuBackend
-from runtime.model.fade import Softening
 from runtime.model.predictor import SHIPPED, load_predictor
-from runtime.model.pyramid_level import CENTRE, EYES, FRONT, OUTER, REAR, PyramidLevel
-from runtime.model.rows import RowPool
+from runtime.model.reprojection import CENTRE, FRONT, OUTER, REAR
 from runtime.model.still import solve_still
 from runtime.model.transfer import FULL, SUBCODE
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, Tilt
-from runtime.records import F64, U8
+from runtime.records import F32, F64, U8
 from tests.model.exact import exact_resample
+from tests.model.plain_level import PlainLevel
 from tests.model.scenes import FOV_DEG, card_scene, eyes
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 200, 112)
@@ -52,34 +50,40 @@ POSES = {
 }
 
 
+TILT = Tilt(((0.001, 0.012, -0.006), (0.0, 0.0, 0.0), (-0.002, 0.004, 0.015)), (1.0, 0.1, -0.05))
+
+
 @pytest.fixture(params=[1, 3], ids=["one thread", "three threads"])
-def rows(request: pytest.FixtureRequest) -> Iterator[RowPool]:
-    pool = RowPool(request.param, width_px=200)
-    yield pool
-    pool.close()
+def threads(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr("runtime.model.compiled.level.WORTH_A_THREAD", 0)
+    return int(request.param)
 
 
-def filled(kind: type[PyramidLevel], rows: RowPool, stack: PanelStack, *, boxes: str, channels: int) -> PyramidLevel:
+def filled(kind: type[Level], threads: int, stack: PanelStack, *, boxes: str, channels: int) -> Level:
     """A level with outer panels and pictures of smooth noise, the same for every kind."""
-    level = kind(stack, reduction=1, rows=rows, channels=channels)
+    level = kind(stack, reduction=1, threads=threads, channels=channels)
     level.crop(BOXES[boxes], stack)
     noise = np.random.default_rng(5)
     for image in (*(level.outer[n] for n in OUTER), *level.target):
-        most = 2 * FULL if any(image is wanted for wanted in level.target) else FULL
+        most = 2 * FULL if any(image is target for target in level.target) else FULL
         coarse = noise.integers(0, most, (image.shape[0] // 4 + 2, image.shape[1] // 4 + 2, *image.shape[2:]))
         fine = coarse.repeat(4, 0).repeat(4, 1)[: image.shape[0], : image.shape[1]]
         image[...] = (fine + np.roll(fine, 2, 0) + np.roll(fine, 2, 1)) // 3
     return level
 
 
-def solved(level: PyramidLevel, pair: F64, *, sigma_mm: float, fading: Softening | None = None) -> U8:
+def both(threads: int, stack: PanelStack = STACK, *, boxes: str = "whole", channels: int = 3) -> list[Level]:
+    return [filled(kind, threads, stack, boxes=boxes, channels=channels) for kind in (PlainLevel, Level)]
+
+
+def solved(level: Level, pair: F64, *, sigma_mm: float = 0.0, fading: tuple[F32, F32] | None = None) -> U8:
     """Layers after three corrections, of which two are shown."""
     boxes = BOXES["whole"] if level.size == (200, 112) else BOXES["parts"]
-    level.set_eye_sigma(pair, eye_sigma_mm=sigma_mm)
-    level.project(OUTER, pair)
+    level.set_eyes(pair, eye_sigma_mm=sigma_mm)
+    level.project(OUTER)
     for panel, shown in ((FRONT, False), (REAR, True), (FRONT, True)):
-        level.step(panel, pair, size=0.75, shown=shown, fading=fading)
-        level.project((panel,), pair)
+        level.step(panel, size=0.75, shown=shown, fading=fading)
+        level.project((panel,))
     layers = np.full((3, 112, 200, 4), 255, np.uint8)
     level.show(layers, boxes)
     return layers
@@ -89,20 +93,12 @@ def within_one(first: U8, second: U8) -> float:
     return float((np.abs(first.astype(np.int16) - second) <= 1).mean())
 
 
-@pytest.fixture
-def exactly(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runtime.model.pyramid_level, "resample", exact_resample)
-
-
-@pytest.mark.usefixtures("exactly")
 @pytest.mark.parametrize("boxes", BOXES)
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("pose", POSES)
-def test_codes_are_those_of_exact_sampling(pose: str, channels: int, boxes: str, rows: RowPool) -> None:
-    kinds = (PyramidLevel, CompiledLevel)
-    levels = [filled(kind, rows, STACK, boxes=boxes, channels=channels) for kind in kinds]
-    wanted, found = (solved(level, POSES[pose], sigma_mm=0.0) for level in levels)
-    assert within_one(wanted, found) >= WITHIN_ONE
+def test_codes_are_those_of_the_definition(pose: str, channels: int, boxes: str, threads: int) -> None:
+    expected, found = (solved(level, POSES[pose]) for level in both(threads, boxes=boxes, channels=channels))
+    assert within_one(expected, found) >= WITHIN_ONE
     assert (found[..., 3] == 255).all()
     beside = np.ones((3, 112, 200), bool)
     for n, box in enumerate(BOXES[boxes]):
@@ -110,30 +106,44 @@ def test_codes_are_those_of_exact_sampling(pose: str, channels: int, boxes: str,
     assert (found[beside] == 255).all()
 
 
-@pytest.mark.usefixtures("exactly")
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("pose", ["straight", "rolled", "one eye for both"])
+def test_codes_on_tilted_panels_are_those_of_the_definition(pose: str, channels: int, threads: int) -> None:
+    """Where rays cross every panel. Pieces that are laid for a row serve others, a sixteenth of a pixel off at most."""
+    expected, found = (
+        solved(level, POSES[pose]) for level in both(threads, replace(STACK, tilt=TILT), channels=channels)
+    )
+    inner = np.s_[:, 24:-24, 24:-24]
+    assert within_one(expected[inner], found[inner]) >= 0.994
+    assert np.abs(expected[inner].astype(np.int16) - found[inner]).max() <= 8
+    even = solved(filled(Level, threads, STACK, boxes="whole", channels=channels), POSES[pose])
+    assert within_one(even, found) < 0.9
+
+
 @pytest.mark.parametrize("floor", [0.25, 1.0])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_a_rolled_heads_eyes_see_a_strip_through_rows_that_lie_far_apart(
-    channels: int, floor: float, rows: RowPool
+    channels: int, floor: float, threads: int
 ) -> None:
     """More rows apart than one eye's share of the residual has: they were written behind its end."""
-    stack = PanelStack(0.2592, 0.1458, (-0.15, 0.0, 0.15), 200, 112)
-    levels = [filled(kind, rows, stack, boxes="whole", channels=channels) for kind in (PyramidLevel, CompiledLevel)]
+    levels = both(threads, PanelStack(0.2592, 0.1458, (-0.15, 0.0, 0.15), 200, 112), channels=channels)
     for level in levels:
         level.slope_floor = floor
-    wanted, found = (solved(level, eyes(0.25, roll_deg=40), sigma_mm=0.0) for level in levels)
-    assert within_one(wanted, found) >= WITHIN_ONE
+    expected, found = (solved(level, eyes(0.25, roll_deg=40)) for level in levels)
+    assert within_one(expected, found) >= WITHIN_ONE
 
 
 @pytest.mark.parametrize("sigma_mm", [0.0, 2.0, 6.0, 50.0])
 @pytest.mark.parametrize("name", SHIPPED)
-def test_the_eyes_see_no_less_however_unsure_they_are(name: str, sigma_mm: float) -> None:
+def test_the_eyes_see_no_less_however_unsure_they_are(
+    name: str, sigma_mm: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What is blurred before it is sampled here is blurred after it there: not the same codes, but the same quality."""
     pair, found = eyes(0.6, 0.05, 0.03), []
     pictures = tuple(card_scene(eye) for eye in pair)
-    for level in (PyramidLevel, CompiledLevel):
+    for level in (PlainLevel, Level):
+        monkeypatch.setattr(runtime.model.workspace, "Level", level)
         predictor = load_predictor(name, CARDS, ModelSettings(threads=1))
-        predictor.set_backend(CpuBackend(level=level))
         made = solve_still(*pictures, eyes_m=pair, fov_deg=FOV_DEG, predictor=predictor, eye_sigma_mm=sigma_mm).layers
         views = displayed(made, pictures, CARDS, eyes_m=pair, fov_deg=FOV_DEG, similarity=False)
         how: Any = {"eyes_m": pair, "fov_deg": FOV_DEG, "sigmas_mm": (sigma_mm,)}
@@ -142,37 +152,26 @@ def test_the_eyes_see_no_less_however_unsure_they_are(name: str, sigma_mm: float
     assert found[1] - found[0] >= LEAST_DB
 
 
-@pytest.mark.usefixtures("exactly")
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("pose", ["straight", "near", "far beside"])
-def test_rays_are_weighed_alike(pose: str, channels: int, rows: RowPool) -> None:
-    levels = [filled(kind, rows, STACK, boxes="parts", channels=channels) for kind in (PyramidLevel, CompiledLevel)]
+def test_rays_are_weighed_alike(pose: str, channels: int, threads: int) -> None:
+    levels = both(threads, boxes="parts", channels=channels)
     for level in levels:
         level.slope_floor = 0.25
-    wanted, found = (solved(level, POSES[pose], sigma_mm=0.0) for level in levels)
-    assert within_one(wanted, found) >= WITHIN_ONE
-    even = solved(filled(CompiledLevel, rows, STACK, boxes="parts", channels=channels), POSES[pose], sigma_mm=0.0)
+    expected, found = (solved(level, POSES[pose]) for level in levels)
+    assert within_one(expected, found) >= WITHIN_ONE
+    even = solved(filled(Level, threads, STACK, boxes="parts", channels=channels), POSES[pose])
     assert within_one(even, found) < 0.99
 
 
-@pytest.mark.usefixtures("exactly")
-def test_corrections_fade_out_alike(rows: RowPool) -> None:
+def test_corrections_fade_out_alike(threads: int) -> None:
     columns, down = np.linspace(0, 1, 200, dtype=np.float32), np.ones(112, np.float32)
     down[:20] = 0.25
-    fading = Softening(np.rint(columns * 4) / np.float32(4), down)
-    levels = [filled(kind, rows, STACK, boxes="whole", channels=3) for kind in (PyramidLevel, CompiledLevel)]
-    wanted, found = (solved(level, eyes(0.6), sigma_mm=0.0, fading=fading) for level in levels)
-    # OpenCV's way rounds to whole sixteenths at every edge.
-    assert (np.abs(wanted.astype(np.int16) - found) <= 2).mean() >= WITHIN_ONE
-    whole = solved(filled(CompiledLevel, rows, STACK, boxes="whole", channels=3), eyes(0.6), sigma_mm=0.0)
+    fading = np.rint(columns * 4) / np.float32(4), down
+    expected, found = (solved(level, eyes(0.6), fading=fading) for level in both(threads))
+    assert (np.abs(expected.astype(np.int16) - found) <= 2).mean() >= WITHIN_ONE
+    whole = solved(filled(Level, threads, STACK, boxes="whole", channels=3), eyes(0.6))
     assert within_one(whole, found) < 0.9
-
-
-def test_tilted_panels_are_left_to_opencv(rows: RowPool) -> None:
-    tilt = Tilt(((0.001, 0.012, -0.006), (0.0, 0.0, 0.0), (-0.002, 0.004, 0.015)), (1.0, 0.1, -0.05))
-    stack = replace(STACK, tilt=tilt)
-    levels = [filled(kind, rows, stack, boxes="whole", channels=3) for kind in (PyramidLevel, CompiledLevel)]
-    assert (solved(levels[0], eyes(0.6), sigma_mm=0.0) == solved(levels[1], eyes(0.6), sigma_mm=0.0)).all()
 
 
 @settings(max_examples=60, deadline=None)
@@ -190,64 +189,50 @@ def test_samples_are_those_of_the_definition_wherever_the_rasters_are(
     source: tuple[int, int],
     channels: int,
 ) -> None:
-    """Through a correction of nothing but one eye's residual: the sampling of the residual alone is left."""
     matrix = np.array([[scale[0], 0.0, shift[0]], [0.0, scale[1], shift[1]], [0.0, 0.0, 1.0]])
     image = np.random.default_rng(1).integers(-4000, 4000, (*source, channels)).astype(np.int16)
-    held = np.zeros((source[0] + 3, source[1] * channels + sampling.SLACK + 4 * channels), np.int16)
+    held = np.zeros((source[0] + 3, (source[1] + 4) * channels + along.PIECE * 4), np.int16)
     held[: source[0], : source[1] * channels] = image.reshape(source[0], -1)
-    at = sampling.samplings([matrix], height=size[0], width=size[1], sizes=[source], channels=channels)
     found = np.zeros((size[0], size[1] * channels))
-    row, tiles = sampling.work_row(4.0), sampling.work_tiles()
-    step = sampling.TILE // channels * channels
+    row, tiles, layout = along.work_row(4.0), along.work_tiles(), along.new_layout(1, size[1], channels)
+    step = TILE // channels
     for v in range(size[0]):
-        for tile in range(at.tiles.shape[1] - 1):
-            count = min(step, size[1] * channels - tile * step)
-            line = tiles[2]
-            numbers = (count, at, channels, np.float32(7), row, line)
-            sampling.lack(tiles[1:2], 0, 0, held, 0, source[1] * channels, 0, v, tile, *numbers)
-            found[v, tile * step : tile * step + count] = -line[:count]
-    wanted = np.zeros((*size, channels))
-    exact_resample(image, image_from_result=matrix, out=wanted, outside=7)
-    assert np.abs(found.reshape(wanted.shape) - wanted).max() < 0.51 + 8000 * 2e-4
+        for tile in range(-(-size[1] // step)):
+            pixels, to = min(step, size[1] - tile * step), tile * step * channels
+            place = held, source[0], source[0], source[1], -along.EDGE_PX, matrix, v, tile, pixels, channels, 0
+            along.sum_where(tiles[0], *place, np.float32(7), layout, row, tiles[1])
+            found[v, to : to + pixels * channels] = tiles[1, : pixels * channels]
+    expected = np.zeros((*size, channels))
+    exact_resample(image, image_from_result=matrix, out=expected, outside=7)
+    assert np.abs(found.reshape(expected.shape) - expected).max() < 0.51 + 8000 * 2e-4
 
 
-def test_nothing_is_written_beside_the_images(rows: RowPool) -> None:
-    level = filled(CompiledLevel, rows, STACK, boxes="parts", channels=3)
-    assert isinstance(level, CompiledLevel)
-    images = {
-        "outer": level._whole["outer", FRONT, 0],
-        "spare": level._spare,
-        "moved": level._moved,
-        **{f"mean {n}": image for n, image in level._means.items()},
-        **{f"wanted {side}": level._whole["wanted", CENTRE, side] for side in EYES},
-    }
-    inside = {"outer": FRONT, "spare": FRONT, "moved": REAR, **{f"mean {n}": n for n in OUTER}}
-    for name, image in images.items():
-        panel = inside.get(name, CENTRE)
-        height, width = level.rasters[panel].height_px, level.rasters[panel].width_px
-        if name in {"spare", "moved"}:  # for whichever panel
-            height, width = 96, 160
+def test_nothing_is_written_beside_the_images(threads: int) -> None:
+    level = filled(Level, threads, STACK, boxes="parts", channels=3)
+    sizes = {}
+    for (name, n), image in level._whole.items():
+        panel = {"target": CENTRE, "spare": FRONT, "moved": REAR}.get(name, n)
+        shared = name in {"outer", "spare", "moved"}  # for whichever panel
+        raster = level.rasters[panel]
+        sizes[id(image)] = height, width = (96, 160) if shared else (raster.height_px, raster.width_px)
         image.base[height:] = -77
         image.base[:, width:] = -77
     for sigma_mm in (0.0, 30.0):
         solved(level, eyes(0.6), sigma_mm=sigma_mm)
-    for name, image in images.items():
-        panel = inside.get(name, CENTRE)
-        height, width = level.rasters[panel].height_px, level.rasters[panel].width_px
-        if name in {"outer", "spare", "moved"}:
-            height, width = 96, 160
+    for name, image in level._whole.items():
+        height, width = sizes[id(image)]
         assert (image.base[height:] == -77).all(), name
         assert (image.base[:, width:] == -77).all(), name
 
 
-def test_what_was_compiled_at_the_start_serves_every_case(rows: RowPool) -> None:
+def test_what_was_compiled_at_the_start_serves_every_case(threads: int) -> None:
     warm_up()
     kernels = (passes.correct, passes.blur, passes.close_centre, passes.show, warp.warp, extrapolate_rows, fade_codes)
     for boxes in BOXES:
         for channels in (1, 3):
-            level = filled(CompiledLevel, rows, STACK, boxes=boxes, channels=channels)
+            level = filled(Level, threads, STACK, boxes=boxes, channels=channels)
             for sigma_mm in (0.0, 30.0):
-                fading = Softening(np.ones(level.size[0], np.float32), np.ones(level.size[1], np.float32))
+                fading = np.ones(level.size[0], np.float32), np.ones(level.size[1], np.float32)
                 solved(level, POSES["rolled"], sigma_mm=sigma_mm, fading=fading)
     assert [len(function.signatures) for function in kernels] == [1] * len(kernels)
 
@@ -311,8 +296,8 @@ def test_compiled_code_is_kept_by_what_it_follows_from(monkeypatch: pytest.Monke
     assert elsewhere is not None and elsewhere.name == folder.name and not elsewhere.is_relative_to("/proc")
 
 
-def test_shown_codes_are_whole(rows: RowPool) -> None:
+def test_shown_codes_are_whole(threads: int) -> None:
     for sigma_mm in (0.0, 30.0):
-        level = filled(CompiledLevel, rows, STACK, boxes="whole", channels=3)
+        level = filled(Level, threads, STACK, boxes="whole", channels=3)
         solved(level, eyes(0.6), sigma_mm=sigma_mm)
         assert all((level.outer[n] % SUBCODE == 0).all() and level.outer[n].max() <= FULL for n in OUTER)

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import runtime.model.cpu
-import runtime.model.pyramid_level
 from runtime.config import ModelSettings
 from runtime.errors import ContextLost, InputError, MissingPart
 from runtime.evaluation.displayed import displayed, expected_db
@@ -22,7 +20,6 @@ from runtime.model.gl.backend import GlBackend
 from runtime.model.gl.programs import Account
 from runtime.model.job import Job, Part
 from runtime.model.predictor import SHIPPED, Predictor, load_predictor
-from runtime.model.pyramid_level import PyramidLevel
 from runtime.model.still import solve_still
 from runtime.model.trim import Savings, Scene, trim
 from runtime.model.unrolled import UnrolledPredictor
@@ -30,7 +27,7 @@ from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.records import F64, U8
 from runtime.support.gl import offscreen_context
-from tests.model.exact import exact_resample
+from tests.model.plain_level import hold_exactly
 from tests.model.scenes import FOV_DEG, card_scene, eyes
 from tests.model_export.stills import random_still
 
@@ -73,9 +70,7 @@ def gl(made: tuple[Any, GlBackend]) -> Iterator[GlBackend]:
 @pytest.fixture
 def exactly(monkeypatch: pytest.MonkeyPatch) -> None:
     """The processor's steps sample by the definition: its own sampling is off by up to a twelfth of a pixel."""
-    for module in (runtime.model.cpu, runtime.model.pyramid_level):
-        monkeypatch.setattr(module, "resample", exact_resample)
-    monkeypatch.setattr(runtime.model.cpu, "CompiledLevel", PyramidLevel)
+    hold_exactly(monkeypatch)
 
 
 def both(name: str, stack: PanelStack, gl: GlBackend) -> tuple[UnrolledPredictor, UnrolledPredictor]:
@@ -189,7 +184,8 @@ def test_codes_on_tilted_panels(pose: str, sigma_mm: float, gl: GlBackend, monke
     # The tilt is felt; by pictures that are driven for beside their edge too: else outer panels are even there.
     monkeypatch.setattr(still, "extrapolate_border", lambda *_, **__: None)
     flat, tilted = (both("balanced", panels, gl)[1] for panels in (STACK, stack))
-    assert within_one(*(layers_of(p, pictures, pair, sigma_mm=sigma_mm) for p in (flat, tilted))) < 0.9
+    if sigma_mm < UNSURE_MM:  # eyes that are so unsure leave the outer panels nearly even
+        assert within_one(*(layers_of(p, pictures, pair, sigma_mm=sigma_mm) for p in (flat, tilted))) < 0.9
 
 
 @pytest.mark.usefixtures("exactly")
@@ -285,9 +281,7 @@ def test_at_1920x1080(name: str, gl: GlBackend, monkeypatch: pytest.MonkeyPatch)
         for layers in (layers_of(predictor, pictures, pair, refined=True) for predictor in (cpu, opengl))
     ]
     assert abs(shown_db[1] - shown_db[0]) <= 0.05
-    for module in (runtime.model.cpu, runtime.model.pyramid_level):
-        monkeypatch.setattr(module, "resample", exact_resample)
-    monkeypatch.setattr(runtime.model.cpu, "CompiledLevel", PyramidLevel)
+    hold_exactly(monkeypatch)
     cpu.set_backend(CpuBackend())
     assert within_one(layers_of(cpu, pictures, pair), found) >= WITHIN_ONE
 

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import runtime.model.cpu
-import runtime.model.pyramid_level
 from runtime.config import ModelSettings
 from runtime.content.procedural import ProceduralSource
 from runtime.errors import ContextLost
@@ -20,7 +18,7 @@ from runtime.model.gl.backend import GlBackend
 from runtime.model.gl.programs import Account
 from runtime.model.job import Job
 from runtime.model.predictor import Predictor, load_predictor
-from runtime.model.pyramid_level import NEUTRAL
+from runtime.model.reprojection import NEUTRAL
 from runtime.model.trim import Scene, trim
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
@@ -28,7 +26,7 @@ from runtime.plan.drawing import drawn_for, raster_views
 from runtime.records import F64, U8
 from runtime.support.gl import offscreen_context
 from runtime.support.gl_sharing import LayerPool, LayerTextures, ShareGroup
-from tests.model.exact import exact_resample
+from tests.model.plain_level import hold_exactly
 from tests.model.scenes import eyes
 from tests.support.left_in_textures import written
 
@@ -65,9 +63,7 @@ def pool(made: tuple[Any, ShareGroup, GlBackend], gl: GlBackend) -> LayerPool:
 @pytest.fixture
 def exactly(monkeypatch: pytest.MonkeyPatch) -> None:
     """OpenCV's steps sample by the definition."""
-    for module in (runtime.model.cpu, runtime.model.pyramid_level):
-        monkeypatch.setattr(module, "resample", exact_resample)
-    monkeypatch.setattr(runtime.model.cpu, "CompiledLevel", runtime.model.pyramid_level.PyramidLevel)
+    hold_exactly(monkeypatch)
 
 
 def noise(width_px: int, height_px: int, *, count: int | None = None, seed: int = 0) -> U8:

@@ -13,7 +13,7 @@ from runtime.model.compiled.joint import FULL, INTENSITY, JointState, rays_of
 from runtime.model.contract import Step
 from runtime.model.own_rays import refined
 from runtime.model.predictor import load_predictor
-from runtime.model.pyramid_level import CENTRE, reprojection
+from runtime.model.reprojection import CENTRE, reprojection
 from runtime.model.still import solve_still
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, Tilt

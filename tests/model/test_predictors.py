@@ -9,7 +9,7 @@ from runtime.config import ModelSettings
 from runtime.errors import EyesNotServed, ModelFailure
 from runtime.model.job import Job
 from runtime.model.predictor import load_predictor
-from runtime.model.pyramid_level import NEUTRAL
+from runtime.model.reprojection import NEUTRAL
 from runtime.model.sart import SartPredictor
 from runtime.model.still import solve_still
 from runtime.model.visible import visible_boxes

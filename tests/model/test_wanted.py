@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from runtime.model import wanted
 from runtime.model.compiled import wanted as compiled
 from runtime.model.resample import buffer
-from runtime.model.rows import RowPool
 from runtime.model.transfer import phase_codes
 from runtime.optics.rect import PixelRect
 from runtime.records import I16
@@ -39,14 +40,12 @@ def test_compiled_phase_sums_are_those_of_opencv(
     if channels == 1:
         noise[..., 1:] = noise[..., :1]
     pictures = wanted.Pictures(list(noise), BOXES[box], channels, emphasis, phase_codes(2))
-    rows, found = RowPool(threads, width_px=64), []
-    rows.split = lambda _, work: [work(index, threads) for index in range(threads)]  # type: ignore[method-assign,assignment,misc]
-    for fill in (wanted.fill_targets, compiled.fill_targets):
+    found = []
+    for fill in (wanted.fill_targets, partial(compiled.fill_targets, threads=threads)):
         pairs = [images(BOXES[box], reduction=reduction, channels=channels) for reduction in reductions]
-        fill(pictures, pairs, rows=rows)
+        fill(pictures, pairs)
         found.append([image.copy() for pair in pairs for image in pair])
     for theirs, ours in zip(*found, strict=True):
         # A code exactly between two may be rounded either way, which is worth a step of the table.
         assert np.count_nonzero(theirs != ours) <= max(4, 0.005 * ours.size)
         assert np.abs(theirs.astype(int) - ours).max() <= 300
-    rows.close()

@@ -77,8 +77,9 @@ def _lay(scale, bend, shift, pixels, width, near, channels, n, tile, layout):  #
         x = shift + k * (scale + bend * (k - ends))
         if x > high:
             break
-        left = min(max(int(x), 0), max(width - 2, 0))
-        share = min(max(x - left, 0.0), 1.0)
+        within = min(max(x, 0.0), width - 1.0)
+        left = min(int(within), max(width - 2, 0))
+        share = within - left
         if x < 0.0 or x > width - 1.0:  # an edge goes on
             length = 1
         else:
@@ -118,7 +119,7 @@ def sample(
     beside = min(ya, yb) < low or max(ya, yb) > high
     if near <= 0.0:  # a tile that an edge cuts goes on as that edge does
         beside = max(ya, yb) < low or min(ya, yb) > high
-    if beside or not scale > 0.05:
+    if beside or not scale > 0.01:
         return 0, 0
     if abs(bend) * ends < 1e-7:
         bend = 0.0

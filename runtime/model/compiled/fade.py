@@ -10,7 +10,7 @@ from runtime.model.compiled.loops import PASS
 
 @njit(**PASS)
 def fade_codes(codes, weights, start, channels):  # pragma: no cover
-    """As `runtime.model.fade.fade_codes`."""
+    """codes (rows, numbers) towards `start`, as far as weights (rows or 1, pixels) are below 1; in place."""
     one, half, end = np.float32(1), np.float32(0.5), np.float32(start)
     for v in range(codes.shape[0]):
         row = min(v, weights.shape[0] - 1)

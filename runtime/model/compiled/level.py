@@ -112,7 +112,7 @@ class Level:
         resample(
             codes, image_from_result=codes_from_raster, out=outer, outside=START, cubic=True, image_columns=columns
         )
-        _clamp_and_quantise(outer, shown=shown)
+        clamp_and_quantise(outer, shown=shown)
 
     def upsample(self, coarser: Level, *, shown: bool) -> None:
         """Take the outer panels over from a coarser raster of the same boxes."""
@@ -122,7 +122,7 @@ class Level:
                 self._enlarge(image, fine, shown=shown)
             else:
                 cv2.resize(image, fine.shape[1::-1], dst=fine, interpolation=cv2.INTER_CUBIC)
-                _clamp_and_quantise(fine, shown=shown)
+                clamp_and_quantise(fine, shown=shown)
 
     def show(self, layers: U8, boxes: Sequence[PixelRect]) -> None:
         """All panels in 8-bit codes, the centre closed, into layers (N, H, W, 4), each within its box."""
@@ -278,7 +278,7 @@ def _taps(sigma_px: float) -> F32:
     return np.asarray(weights / (2 * weights.sum() - weights[0]), np.float32)
 
 
-def _clamp_and_quantise(codes: I16, *, shown: bool) -> None:
+def clamp_and_quantise(codes: I16, *, shown: bool) -> None:
     """Keep within the panel's range, in place; what will be shown is rounded to what 8 bits can show.
 
     Rounded any earlier, corrections of less than half a code would be lost.

@@ -7,7 +7,6 @@ from typing import Any
 
 from runtime.model.assembly import ArrayAssembly, Assembly
 from runtime.model.contract import Contract
-from runtime.model.fade import fade_codes
 from runtime.model.gl.assembly import GlAssembly
 from runtime.model.gl.programs import Passes
 from runtime.model.gl.state import GlState, check_size
@@ -20,7 +19,6 @@ class GlBackend:
     """Used on one thread, on which its context is current."""
 
     name = "gl"
-    fade_codes = staticmethod(fade_codes)
 
     def __init__(self, context: Any, stack: PanelStack, *, group: ShareGroup | None = None) -> None:
         """context: the content's, or one of the backend's own; whoever made it releases it. group: of a context that

@@ -1,0 +1,125 @@
+"""Corrections by the definition, on whole images: what the compiled ones and OpenGL are held to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import ceil
+
+import cv2
+import numpy as np
+import pytest
+
+import runtime.model.compiled.level
+import runtime.model.cpu
+import runtime.model.workspace
+from runtime.model.compiled.level import Level, clamp_and_quantise
+from runtime.model.reprojection import CENTRE, EYES, FRONT, OUTER, REAR, START, reprojection
+from runtime.model.transfer import FULL, SUBCODE
+from runtime.optics.rect import PixelRect
+from runtime.records import F32, F64, I16, U8
+from tests.model.exact import exact_resample
+
+WHOLE = 1 << 14  # of a weight, in whole numbers
+EDGE = 1e-5  # of an image: a place on its very edge is within
+
+
+class PlainLevel(Level):
+    """A `Level` whose corrections and closing are slow and plain."""
+
+    def set_eyes(self, eyes_m: F64, *, eye_sigma_mm: float = 0.0, least_px: float = 0.5) -> None:
+        super().set_eyes(eyes_m, eye_sigma_mm=eye_sigma_mm, least_px=least_px)
+        self._eyes_m = eyes_m
+
+    def project(self, panels: Sequence[int]) -> None:
+        """It looks anew in every step."""
+
+    def step(self, panel: int, *, size: float, shown: bool, fading: tuple[F32, F32] | None = None) -> None:
+        other = REAR if panel == FRONT else FRONT
+        weights = self._weights()
+        residual = []
+        for side, lacks in enumerate(self._lacks()):
+            best = self._best(weights)
+            left = lacks - (np.floor(best) if self.slope_floor == 1 else best)
+            if self.spread:
+                seen = self._seen(other, side)
+                left = left + seen - self._blurred(seen, panel, twice=True)
+            for line in fading or ():
+                left = np.floor(left * (line[None, :, None] if len(line) == left.shape[1] else line[:, None, None]))
+            residual.append(np.rint(weights[side] * left))
+        back = [self._between(image, side, of=CENTRE, on=panel, outside=0) for side, image in enumerate(residual)]
+        held = [np.rint(image * WHOLE) for image in weights]
+        weighed = [self._between(image, side, of=CENTRE, on=panel, outside=WHOLE) for side, image in enumerate(held)]
+        change = np.rint((back[0] + back[1]) * 2 * WHOLE / (weighed[0] + weighed[1]))
+        outer = self._image(self.outer[panel])
+        if self.spread:
+            noise = outer - self._blurred(self._blurred(outer, panel), panel)
+            change = self._blurred(change, panel) - 2 * noise
+        if self.slope_floor == 1:  # whole numbers of eighths
+            change = np.floor(change / 8) * 8
+        codes = np.clip(outer + np.clip(size * change, -FULL, FULL), 0, FULL)
+        codes = np.floor(codes / SUBCODE + 0.5) * SUBCODE if shown else np.rint(codes)
+        self.outer[panel][...] = codes.reshape(self.outer[panel].shape)
+
+    def _enlarge(self, image: I16, fine: I16, *, shown: bool) -> None:
+        cv2.resize(image, fine.shape[1::-1], dst=fine, interpolation=cv2.INTER_CUBIC)
+        clamp_and_quantise(fine, shown=shown)
+
+    def show(self, layers: U8, boxes: Sequence[PixelRect]) -> None:
+        outer = {n: np.ascontiguousarray(self.outer[n]) for n in OUTER}
+        self.show_panels({n: codes.reshape(codes.shape[0], -1) for n, codes in outer.items()}, layers, boxes)
+        layers[CENTRE][boxes[CENTRE].slices] = 255
+        layers[CENTRE][boxes[CENTRE].slices][..., :3] = np.floor(self._best(self._weights()) / SUBCODE + 0.5)
+
+    def _best(self, weights: Sequence[F64]) -> F64:
+        """The centre panel that leaves both eyes least."""
+        left, right = self._lacks()
+        total = (weights[0] * left + weights[1] * right) / (weights[0] + weights[1])
+        return np.asarray(np.clip(total, 0, FULL), np.float64)
+
+    def _lacks(self) -> list[F64]:
+        """What the outer panels leave each eye to be filled."""
+        return [self._image(self.target[side]) - self._seen(REAR, side) - self._seen(FRONT, side) for side in EYES]
+
+    def _weights(self) -> list[F64]:
+        """Of both eyes' rays: the slope of sin² at the phase sums that are to be seen, 1 at its steepest."""
+        part = [np.mod(self._image(image) / FULL, 1) for image in self.target]
+        return [self.slope_floor + (1 - self.slope_floor) * 4 * one * (1 - one) for one in part]
+
+    def _seen(self, panel: int, side: int) -> F64:
+        """How an eye sees an outer panel through the centre panel's pixels, in the mean."""
+        blurred = self._blurred(self._image(self.outer[panel]), panel)
+        return self._between(blurred, side, of=panel, on=CENTRE, outside=START)
+
+    def _between(self, image: F64, side: int, *, of: int, on: int, outside: float) -> F64:
+        raster = self.rasters[on]
+        out = np.empty((raster.height_px, raster.width_px, image.shape[2]))
+        matrix = reprojection(self._stack, self.rasters, self._eyes_m[side], of=of, on=on)
+        exact_resample(image, image_from_result=matrix, out=out)
+        v, u = np.mgrid[0 : raster.height_px, 0 : raster.width_px] + 0.5
+        x, y, w = (row[0] * u + row[1] * v + row[2] for row in matrix)
+        beyond = (np.abs(x / w / image.shape[1] - 0.5) > 0.5 + EDGE) | (
+            np.abs(y / w / image.shape[0] - 0.5) > 0.5 + EDGE
+        )
+        out[beyond] = outside
+        return out
+
+    def _blurred(self, image: F64, panel: int, *, twice: bool = False) -> F64:
+        """What is left of an image in the mean over where the eyes may be, as an outer panel's pixels move."""
+        if panel not in self.spread:
+            return image
+        u, v = (s * np.sqrt(2.0) if twice else s for s in self.spread[panel])
+        size = 2 * ceil(3 * max(u, v)) + 1
+        blurred = cv2.GaussianBlur(image, (size, size), sigmaX=u, sigmaY=v, borderType=cv2.BORDER_REPLICATE)
+        return np.asarray(np.rint(blurred), np.float64).reshape(image.shape)
+
+    @staticmethod
+    def _image(codes: I16) -> F64:
+        """(h, w, channels)."""
+        return codes.astype(np.float64).reshape(*codes.shape[:2], -1)
+
+
+def hold_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the processor sample by the definition: its own sampling is off by up to a twelfth of a pixel."""
+    for module in (runtime.model.cpu, runtime.model.compiled.level):
+        monkeypatch.setattr(module, "resample", exact_resample)
+    monkeypatch.setattr(runtime.model.workspace, "Level", PlainLevel)
