@@ -14,7 +14,7 @@ from calib.store import save
 from runtime.config import load_settings
 from runtime.errors import InputError
 from runtime.records import F64
-from runtime.support import foreign
+from runtime.support import untrusted_input
 from runtime.support.artifacts import write_text
 
 if TYPE_CHECKING:
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 def read_document(config: Path) -> TOMLDocument:
     """A configuration; an empty one where the file is not there yet. Raises InputError."""
-    if not foreign.is_there(config):
+    if not untrusted_input.is_there(config):
         return tomlkit.document()
     load_settings(config)
     try:
-        return tomlkit.parse(foreign.read_text(config))
+        return tomlkit.parse(untrusted_input.read_text(config))
     except ParseError as error:
         raise InputError(config, "", f"malformed: {error}") from None
 

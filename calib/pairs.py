@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict
 from calib.tables import Number, read_table, validated_rows
 from runtime.errors import InputError
 from runtime.records import F64
-from runtime.support import foreign
+from runtime.support import untrusted_input
 from runtime.support.artifacts import write_text
 
 MAX_PAIRS = 1_000_000
@@ -98,7 +98,7 @@ class PairsFile:
         """Resume an existing file or begin one. Raises InputError where it exists and holds no pairs."""
         self.path = path
         self.rows: list[PairRow] = []
-        if foreign.is_there(path):
+        if untrusted_input.is_there(path):
             self.rows = validated_rows(read_table(path), PairRow)
 
     @property

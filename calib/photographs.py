@@ -10,7 +10,7 @@ import numpy as np
 
 from runtime.errors import InputError
 from runtime.records import U8
-from runtime.support import foreign
+from runtime.support import untrusted_input
 from runtime.support.picture_header import is_cut_off, picture_size
 
 MAX_BYTES = 512 << 20
@@ -21,7 +21,7 @@ SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 
 def photographs(folder: Path) -> Iterator[tuple[str, U8]]:
     """The photographs (h, w) of a folder with their names, in the order of these. Raises InputError."""
-    if not foreign.is_there(folder, folder=True):
+    if not untrusted_input.is_there(folder, folder=True):
         raise InputError(folder, "", "is not a folder of photographs")
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
     if not found:
@@ -34,7 +34,7 @@ def photographs(folder: Path) -> Iterator[tuple[str, U8]]:
 
 def read_photograph(path: Path) -> U8:
     """(h, w) grey, as the camera saw it: a note to turn it is not heeded. Raises InputError."""
-    data = foreign.read_bytes(path, most_bytes=MAX_BYTES)
+    data = untrusted_input.read_bytes(path, most_bytes=MAX_BYTES)
     try:
         width, height = picture_size(data)
     except ValueError:

@@ -10,7 +10,7 @@ import tomlkit
 from calib.config_file import read_document
 from runtime.config import NAMES_OR_PATHS, PATHS, load_settings
 from runtime.errors import InputError
-from runtime.support import foreign
+from runtime.support import untrusted_input
 from runtime.support.artifacts import OutputFolder, write_bytes, write_text
 
 MAX_BYTES = 64 << 20
@@ -33,12 +33,12 @@ def gather(config: Path, out: Path) -> list[str]:
         if value and key in document.get(section, {}):
             document[section][key] = value
     if settings.calibration.file:
-        copies[CALIBRATION] = foreign.read_bytes(settings.calibration.file, most_bytes=MAX_BYTES)
+        copies[CALIBRATION] = untrusted_input.read_bytes(settings.calibration.file, most_bytes=MAX_BYTES)
         document["calibration"]["file"] = CALIBRATION
     for number, panel in enumerate(settings.output.panels):
         if panel.lut:
             name = f"panel-{number}.csv"
-            copies[name] = foreign.read_bytes(panel.lut, most_bytes=MAX_BYTES)
+            copies[name] = untrusted_input.read_bytes(panel.lut, most_bytes=MAX_BYTES)
             document["output"]["panels"][number]["lut"] = name
     with OutputFolder(out) as folder:
         for name, data in copies.items():

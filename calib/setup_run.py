@@ -13,7 +13,7 @@ from calib.setup_steps import STEPS, Setup, Step, Stopped
 from runtime.config import load_settings
 from runtime.errors import InputError, PhasestackError
 from runtime.report.page import Page, section_of
-from runtime.support import foreign
+from runtime.support import untrusted_input
 from runtime.support.artifacts import write_json, write_text
 
 MAX_PROGRESS_BYTES = 4 << 20
@@ -26,10 +26,10 @@ def progress_path(config: Path) -> Path:
 
 def read_progress(path: Path) -> dict[str, Any]:
     """The figures of the steps that are done, by name. Raises InputError."""
-    if not foreign.is_there(path):
+    if not untrusted_input.is_there(path):
         return {}
     try:
-        found = foreign.read_json(path, most_bytes=MAX_PROGRESS_BYTES)
+        found = untrusted_input.read_json(path, most_bytes=MAX_PROGRESS_BYTES)
         done = {step.name: dict(found["done"][step.name]) for step in STEPS if step.name in found["done"]}
     except (InputError, KeyError, TypeError, ValueError):
         raise InputError(path, "done", "is not what setup wrote: remove the file to begin anew") from None
@@ -44,7 +44,7 @@ def run_setup(
     def say(text: str) -> None:
         typer.echo(text, err=to_stderr)
 
-    settings = load_settings(config if foreign.is_there(config) else None)
+    settings = load_settings(config if untrusted_input.is_there(config) else None)
     done = read_progress(progress_path(config))
     keys = TerminalKeys()
     hardware = (

@@ -24,7 +24,7 @@ from calib.viewpoints import IPD_M
 from runtime.config import Settings, load_settings
 from runtime.errors import InputError
 from runtime.sensor.registry import driver_names
-from runtime.support import foreign
+from runtime.support import untrusted_input
 
 Figures = dict[str, Any]
 MIN_PAIRS = 9
@@ -48,7 +48,7 @@ class Setup:
     @property
     def settings(self) -> Settings:
         """The configuration as it is now."""
-        return load_settings(self.config if foreign.is_there(self.config) else None)
+        return load_settings(self.config if untrusted_input.is_there(self.config) else None)
 
     def ask(self, question: str, keys: str, *, before: str = "") -> Key:
         """The key that answers a question, asked in the terminal and on the panels. before: what went wrong.

@@ -13,7 +13,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import AfterValidator, BaseModel, BeforeValidator, TypeAdapter, ValidationError
 
 from runtime.errors import InputError
-from runtime.support import foreign
+from runtime.support import untrusted_input
 
 M = TypeVar("M", bound=BaseModel)
 MAX_LISTED = 3  # mistakes that a refusal spells out
@@ -46,9 +46,9 @@ class Table:
 
 def read_table(path: Path) -> Table:
     """A CSV with a header, or JSON: a list of objects, or `{"pairs": [...]}`. Raises InputError."""
-    text = foreign.read_text(path)
+    text = untrusted_input.read_text(path)
     if path.suffix.lower() == ".json":
-        value = foreign.parsed_json(text, source=path)
+        value = untrusted_input.parsed_json(text, source=path)
         items = value.get("pairs") if isinstance(value, dict) else value
         if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
             raise InputError(path, "pairs", "must be a list of objects")
@@ -88,4 +88,4 @@ def _problem(error: Any) -> str:
     if error["type"] == "missing":
         return "is missing"
     text = str(error["msg"]).removeprefix("Value error, ") if error["type"] == "value_error" else "is not a number"
-    return f"{text}: {foreign.shown(error['input'])}"
+    return f"{text}: {untrusted_input.shown(error['input'])}"

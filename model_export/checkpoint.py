@@ -16,7 +16,7 @@ from model_export.network import SpectralSolver
 from model_export.recipe import Recipe
 from runtime.config import validated
 from runtime.errors import InputError
-from runtime.support import foreign
+from runtime.support import untrusted_input
 from runtime.support.artifacts import write_bytes
 
 FILE_BYTES_MAX = 4 << 30
@@ -31,7 +31,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     Plain values, tensors, and the `args` of an argparse command line, which is a table of plain values again: the
     published code saves its own. Nothing else is made, and no code of the file is run.
     """
-    data = foreign.read_bytes(path, most_bytes=FILE_BYTES_MAX)
+    data = untrusted_input.read_bytes(path, most_bytes=FILE_BYTES_MAX)
     try:
         with torch.serialization.safe_globals([argparse.Namespace]):
             table: dict[str, Any] = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)

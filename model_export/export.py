@@ -23,7 +23,7 @@ from model_export.validate import Reference, Report, check_model
 from runtime.errors import InputError
 from runtime.model.contract import Contract
 from runtime.model.predictor import SHIPPED
-from runtime.support import foreign
+from runtime.support import untrusted_input
 from runtime.support.artifacts import write_bytes
 
 
@@ -113,7 +113,7 @@ def eyereal_model(request: ExportRequest) -> tuple[bytes, nn.Module]:
     """The published network with a checkpoint's weights, or untrained ones."""
     if request.checkpoint is not None:
         net = load_eyereal(request.checkpoint)
-        origin = hashlib.sha256(foreign.read_bytes(request.checkpoint, most_bytes=FILE_BYTES_MAX))
+        origin = hashlib.sha256(untrusted_input.read_bytes(request.checkpoint, most_bytes=FILE_BYTES_MAX))
     else:
         torch.manual_seed(request.random_init or 0)
         net = EyeRealNet().eval()

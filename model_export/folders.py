@@ -18,7 +18,7 @@ from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_raster
 from runtime.records import U8
-from runtime.support import foreign
+from runtime.support import untrusted_input
 from runtime.support.artifacts import read_image
 
 PANELS = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 1920, 1080)
@@ -35,7 +35,7 @@ def folder_pairs(folders: Sequence[Path], *, scene: str, width_px: int, height_p
     stack = chosen.stack(PanelStack(PANELS.width_m, PANELS.height_m, PANELS.x_m, width_px, height_px))
     result = []
     for folder in folders:
-        if not foreign.is_there(folder, folder=True):
+        if not untrusted_input.is_there(folder, folder=True):
             raise InputError(folder, "", "is not a folder")
         result += [_loaded(pair, stack) for pair in read_folder(folder, chosen)]
     return result

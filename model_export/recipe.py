@@ -13,7 +13,7 @@ from runtime.config import Section, validated
 from runtime.errors import InputError
 from runtime.model.contract import LEAST_SPREAD_PX, LeastSpread, Refining, SlopeFloor, Steps, TrainedFor
 from runtime.model.predictor import SHIPPED
-from runtime.support import foreign
+from runtime.support import untrusted_input
 
 RECIPES = Path(__file__).parent / "recipes"
 DESIGN_RANGE = TrainedFor(
@@ -90,7 +90,7 @@ def recipe_path(name: str) -> Path:
 def read_recipe(name: str) -> Recipe:
     """A recipe by name or file. Raises InputError."""
     path = recipe_path(name)
-    table = foreign.read_json(path)
+    table = untrusted_input.read_json(path)
     if not isinstance(table, dict):
         raise InputError(path, "", "must be one JSON object")
     return validated(Recipe, table, source=path)

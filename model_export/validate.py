@@ -20,7 +20,7 @@ from runtime.errors import InputError
 from runtime.model.contract import VERSION, Contract, parse_contract
 from runtime.model.transfer import FULL
 from runtime.report.page import in_columns
-from runtime.support import foreign
+from runtime.support import untrusted_input
 from runtime.support.progress import tracked
 
 FILE_BYTES_MAX = 4 << 30
@@ -68,7 +68,7 @@ Reference = Callable[[Feeds], Sequence[np.ndarray]]
 
 def validate_file(path: Path) -> Report:
     """Checks of a file. Raises InputError: no ONNX model, or no contract that we know."""
-    return check_model(foreign.read_bytes(path, most_bytes=FILE_BYTES_MAX), source=str(path))
+    return check_model(untrusted_input.read_bytes(path, most_bytes=FILE_BYTES_MAX), source=str(path))
 
 
 def check_model(data: bytes, *, source: str, reference: Reference | None = None) -> Report:

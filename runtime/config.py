@@ -24,7 +24,7 @@ from pydantic import (
 
 from runtime.errors import InputError, one_line
 from runtime.optics.stack import PanelStack, Tilt
-from runtime.support import foreign
+from runtime.support import untrusted_input
 from runtime.support.live import LIVE
 from runtime.support.plausible import check_text, nearest, socket_path, within
 from runtime.support.plugins import is_plugin
@@ -479,9 +479,9 @@ def changed(settings: Settings, section: str, values: dict[str, Any], *, source:
 
 def read_table(path: Path) -> dict[str, Any]:
     """A TOML or JSON file as a table. Raises InputError, naming the file and the line of the mistake."""
-    text = foreign.read_text(path, most_bytes=TABLE_BYTES_MAX)
+    text = untrusted_input.read_text(path, most_bytes=TABLE_BYTES_MAX)
     if path.suffix.lower() == ".json":
-        table = foreign.parsed_json(text, source=path)
+        table = untrusted_input.parsed_json(text, source=path)
     else:
         try:
             table = tomllib.loads(text)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-PART_CHARACTERS_MAX = 300  # of a message: a foreign name must not fill the screen, nor forge a line of the log
+PART_CHARACTERS_MAX = 300  # of a message: an untrusted name must not fill the screen, nor forge a line of the log
 PROBLEM_CHARACTERS_MAX = 1500  # of what is wrong with a file, all its fields together
 
 

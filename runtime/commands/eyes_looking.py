@@ -21,7 +21,7 @@ from runtime.eyes.pupils import Pupils
 from runtime.records import U8, EyePoints, SensorFrame
 from runtime.sensor.recording import Recording
 from runtime.sensor.registry import open_sensor
-from runtime.support import foreign
+from runtime.support import untrusted_input
 from runtime.support.artifacts import OutputFolder, png_bytes, read_image
 from runtime.support.library_lines import held_back
 
@@ -106,7 +106,7 @@ def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
 
 def _filmed(path: Path, rate_hz: float) -> Iterator[SensorFrame]:
     """Raises InputError for what is no film."""
-    foreign.open_regular(path).close()
+    untrusted_input.open_regular(path).close()
     with held_back():  # what FFmpeg and OpenCV say of it is one line of ours
         capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:

@@ -86,7 +86,7 @@ def _refuse_target(out: Path, *, motion: bool, force: bool) -> None:
     A motion may replace a motion, which is made again from its seed; a viewer is not.
     """
     from runtime.sensor.recording import Recording
-    from runtime.support.foreign import checked_path
+    from runtime.support.untrusted_input import checked_path
 
     checked_path(out, source="record", field="--out")
     if out.suffix.lower() != SUFFIX:

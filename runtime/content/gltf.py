@@ -23,7 +23,7 @@ from runtime.content.shapes import I32, Shape
 from runtime.content.triangles import Part
 from runtime.errors import InputError, one_line
 from runtime.records import F32, F64, U8
-from runtime.support import foreign, progress
+from runtime.support import progress, untrusted_input
 from runtime.support.picture_header import check_picture
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -60,7 +60,7 @@ def load_gltf(path: Path, data: bytes, *, animation: str = "") -> tuple[list[Par
     text, binary = data, b""
     if path.suffix.lower() == ".glb" or data[:4] == b"glTF":
         text, binary = _chunks(path, data)
-    table = foreign.parsed_json(text, source=path, most_depth=LIMITS.depth)
+    table = untrusted_input.parsed_json(text, source=path, most_depth=LIMITS.depth)
     try:
         return _Reader(path, table, binary).scene(animation)
     except (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError) as error:
@@ -87,12 +87,14 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
 def file_of(uri: str, *, source: Path, field: str) -> Path:
     """The file beside `source` that a URI names. Raises InputError."""
     if "://" in uri or uri.startswith("data:"):
-        raise InputError(source, field, f"{foreign.shown(uri)}: only files beside this one are read")
-    name = foreign.checked_path(unquote(uri), source=source, field=field)
+        raise InputError(source, field, f"{untrusted_input.shown(uri)}: only files beside this one are read")
+    name = untrusted_input.checked_path(unquote(uri), source=source, field=field)
     if name.is_absolute():
-        raise InputError(source, field, f"{foreign.shown(uri)} is an absolute path; files beside this one are read")
+        raise InputError(
+            source, field, f"{untrusted_input.shown(uri)} is an absolute path; files beside this one are read"
+        )
     if not (source.parent / name).exists():
-        raise InputError(source, field, f"{foreign.shown(str(name), most=200)} is not there")
+        raise InputError(source, field, f"{untrusted_input.shown(str(name), most=200)} is not there")
     return source.parent / name
 
 
@@ -108,7 +110,7 @@ class _Reader:
     def scene(self, animation: str) -> tuple[list[Part], Rig]:
         for name in self._table.get("extensionsRequired", []):
             if name not in UNDERSTOOD:
-                raise InputError(self._path, "extensionsRequired", f"{foreign.shown(name)} is not understood")
+                raise InputError(self._path, "extensionsRequired", f"{untrusted_input.shown(name)} is not understood")
         tables = self._table.get("nodes", [])
         nodes, order = self._nodes(tables)
         bones = [table["joints"] for table in self._table.get("skins", [])]
@@ -133,7 +135,7 @@ class _Reader:
         return [part for part, _ in placed], rig
 
     def _within(self, count: int, most: int, field: str) -> None:
-        foreign.within(count, most, source=self._path, field=field)
+        untrusted_input.within(count, most, source=self._path, field=field)
 
     def _at(self, key: str, index: Any) -> Table:
         """The object of a list that an index names."""
@@ -149,7 +151,7 @@ class _Reader:
             return None
         if not uri.startswith("data:"):
             name = file_of(uri, source=self._path, field=field)
-            return foreign.read_bytes(name, most_bytes=LIMITS.file_bytes, source=self._path, field=field)
+            return untrusted_input.read_bytes(name, most_bytes=LIMITS.file_bytes, source=self._path, field=field)
         head, mark, coded = uri.partition("base64,")
         return base64.b64decode(coded) if mark else unquote(head).encode()
 
@@ -352,7 +354,7 @@ class _Reader:
         names = [str(table.get("name", "")) for table in tables]
         numbers = [str(number) for number in range(len(tables))]
         if animation and animation not in (*names, *numbers):
-            known = ", ".join(foreign.shown(name) for name in names[:8])
+            known = ", ".join(untrusted_input.shown(name) for name in names[:8])
             raise InputError("content", "animation", f"{animation!r} is none of the {len(tables)} of the file: {known}")
         table = tables[names.index(animation) if animation in names else numbers.index(animation or "0")]
         made = [
@@ -376,14 +378,14 @@ class _Reader:
 def _index(value: Any) -> int:
     """A whole number from 0 up: lists take negative ones."""
     if not isinstance(value, int) or not 0 <= value < 1 << 40:
-        raise ValueError(f"{foreign.shown(value)} is no index, count or size")
+        raise ValueError(f"{untrusted_input.shown(value)} is no index, count or size")
     return value
 
 
 def _row(values: Any, count: int) -> F64:
     row = np.asarray(values, dtype=np.float64)
     if row.shape != (count,) or not (np.abs(row) <= 1e15).all():
-        raise ValueError(f"{foreign.shown(values)} must be {count} numbers")
+        raise ValueError(f"{untrusted_input.shown(values)} must be {count} numbers")
     return row
 
 

@@ -22,7 +22,7 @@ from runtime.content.shapes import Shape
 from runtime.content.triangles import DrawnPart, Part, TriangleSource
 from runtime.errors import InputError, one_line
 from runtime.records import F32, F64, U8
-from runtime.support import foreign, progress
+from runtime.support import progress, untrusted_input
 from runtime.support.picture_header import check_picture
 
 log = logging.getLogger("phasestack.content")
@@ -61,7 +61,7 @@ def load_mesh(path: Path, *, animation: str = "") -> MeshData:
     animation: which one of a glTF plays; empty: the first.
     """
     progress.tell(f"reading {path.name}", 0)
-    data = foreign.read_bytes(path, most_bytes=LIMITS.file_bytes)
+    data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     if path.suffix.lower() in GLTF:
         return _boxed(path, *load_gltf(path, data, animation=animation))
     _check_counts(path, data)
@@ -69,7 +69,7 @@ def load_mesh(path: Path, *, animation: str = "") -> MeshData:
     with np.errstate(all="ignore"):  # coordinates beyond any scene overflow; they are refused below
         parts = [_part(mesh, path, pictures) for mesh in _loaded(path, data)]
     triangles = sum(len(part.shape.triangles) for part in parts)
-    foreign.within(triangles, LIMITS.triangles, source=path, field="faces")
+    untrusted_input.within(triangles, LIMITS.triangles, source=path, field="faces")
     return _boxed(path, parts, Rig((Node(),), (0,), (Binding(0),) * len(parts)))
 
 
@@ -115,7 +115,7 @@ def _check_counts(path: Path, data: bytes) -> None:
         promised = data.count(b"facet normal") if text else (len(data) - STL_HEAD) // STL_FACET
     elif suffix == ".obj":
         promised = data.count(b"\nf ")
-    foreign.within(promised, LIMITS.triangles, source=path, field="faces")
+    untrusted_input.within(promised, LIMITS.triangles, source=path, field="faces")
 
 
 def _loaded(path: Path, data: bytes) -> list[Any]:
@@ -133,9 +133,9 @@ def _loaded(path: Path, data: bytes) -> list[Any]:
         def get(self, name: str) -> bytes:
             try:
                 beside = file_of(name, source=path, field="texture")
-                found = foreign.read_bytes(beside, most_bytes=LIMITS.file_bytes, source=path, field="texture")
+                found = untrusted_input.read_bytes(beside, most_bytes=LIMITS.file_bytes, source=path, field="texture")
                 if not name.lower().endswith(".mtl"):
-                    check_picture(found, source=path, field="texture", name=foreign.shown(name))
+                    check_picture(found, source=path, field="texture", name=untrusted_input.shown(name))
             except InputError as error:
                 if name.lower().endswith(".mtl"):
                     log.warning("%s: is drawn grey without its materials (%s)", path, error.problem)

@@ -21,7 +21,7 @@ from runtime.content.placing import SceneFile
 from runtime.errors import ContentFailure, InputError
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import U8
-from runtime.support import foreign, progress
+from runtime.support import progress, untrusted_input
 from runtime.support.artifacts import read_image
 from runtime.support.picture_header import check_size, size_of_file
 
@@ -177,7 +177,7 @@ class Video(Frames):
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        foreign.open_regular(path).close()
+        untrusted_input.open_regular(path).close()
         self._capture = _opened(path)
         if not self._capture.isOpened():
             raise InputError(path, "", "is not a video that can be decoded")

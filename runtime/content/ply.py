@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from runtime.config import LIMITS
 from runtime.errors import InputError, one_line
-from runtime.support import foreign
+from runtime.support import untrusted_input
 
 Table = NDArray[Any]
 
@@ -49,7 +49,7 @@ class Header:
 
 def read_header(path: Path) -> Header:
     """Raises InputError: no header, or counts that are over a limit or more than the file has bytes."""
-    with foreign.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
+    with untrusted_input.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         head = file.read(LONGEST_HEADER)
         size = file.seek(0, 2)
     text, mark, _ = head.partition(b"end_header")
@@ -62,8 +62,8 @@ def read_header(path: Path) -> Header:
             case ["format", name, _] if name in ORDERS:
                 order = name
             case ["element", name, number]:
-                field = f"element {foreign.shown(name)}"
-                counts[name] = foreign.whole_from_text(number, least=0, most=1 << 62, source=path, field=field)
+                field = f"element {untrusted_input.shown(name)}"
+                counts[name] = untrusted_input.whole_from_text(number, least=0, most=1 << 62, source=path, field=field)
             case ["property", "list", _, _, name]:
                 fields += [(name, "list")] if [*counts][-1:] == ["vertex"] else []
             case ["property", kind, name] if kind in TYPES:
@@ -71,14 +71,14 @@ def read_header(path: Path) -> Header:
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case _:
-                raise InputError(path, "header", f"not understood: {foreign.shown(line.strip())}")
+                raise InputError(path, "header", f"not understood: {untrusted_input.shown(line.strip())}")
     if not order or not fields or len({name for name, _ in fields}) < len(fields):
         raise InputError(path, "vertex", "the header has no format, no vertices, or one of their properties twice")
     header = Header(path, order, counts, tuple(fields), newline + 1, size)
     for name, count in counts.items():
-        field, kind = f"element {foreign.shown(name)}", header.kind
+        field, kind = f"element {untrusted_input.shown(name)}", header.kind
         most = getattr(LIMITS, kind) * (3 if kind == "triangles" and name == "vertex" else 1)
-        foreign.within(count, most, source=path, field=field)
+        untrusted_input.within(count, most, source=path, field=field)
         if count > size:  # the shortest has a byte
             raise InputError(path, field, f"the file is cut off: {count:,} are promised in {size:,} bytes")
     return header
@@ -93,7 +93,7 @@ def read_vertices(header: Header) -> Table:
     held = (header.size - header.starts_at) // dtype.itemsize
     if header.order != "ascii" and held < count:
         raise InputError(path, "vertex", f"the file is cut off: {count} are promised and {max(held, 0)} there")
-    with foreign.open_regular(path) as file:
+    with untrusted_input.open_regular(path) as file:
         file.seek(header.starts_at)
         if header.order != "ascii":
             return np.frombuffer(file.read(count * dtype.itemsize), dtype)

@@ -19,7 +19,7 @@ from runtime.content.scenes import SCENES
 from runtime.errors import InputError, PhasestackError
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
-from runtime.support import foreign, progress
+from runtime.support import progress, untrusted_input
 from runtime.support.crash import written
 from runtime.support.live import is_live
 from runtime.support.plausible import nearest
@@ -71,7 +71,7 @@ def _prepared(file: SceneFile) -> Opener:
         return stream.prepare(file)
     if is_plugin(name):
         return _plugin(name, file)
-    if not foreign.checked_path(name, source="content", field="scene").exists():
+    if not untrusted_input.checked_path(name, source="content", field="scene").exists():
         presets = preset_names()
         meant = nearest(name, (*SCENES, *presets))
         some = f"built in: {', '.join(SCENES)}; {len(presets)} presets, such as lego_bulldozer"
@@ -83,7 +83,7 @@ def _prepared(file: SceneFile) -> Opener:
 def _from_path(file: SceneFile) -> Opener:
     """By what a path's name and first bytes say."""
     path = file.path
-    foreign.checked_path(path, source="content", field="file")
+    untrusted_input.checked_path(path, source="content", field="file")
     if not path.exists():
         raise InputError(path, "", "is not there")
     progress.tell(f"loading {path.name}", 0)

@@ -28,7 +28,7 @@ from runtime.content.pictures import CONTAINERS, Layout, ScreenSource, layout_of
 from runtime.content.placing import SceneFile
 from runtime.errors import ContentFailure, InputError, MissingPart, one_line
 from runtime.records import U8
-from runtime.support import foreign
+from runtime.support import untrusted_input
 from runtime.support.live import LIVE
 from runtime.support.picture_header import check_size
 
@@ -55,14 +55,16 @@ class Target:
         self.url = name.removeprefix(LIVE)
         scheme = self.url.partition("://")[0].lower() if "://" in self.url else ""
         if scheme and scheme not in PROTOCOLS:
-            raise InputError("content", "scene", f"{foreign.shown(scheme)}:// is none of {', '.join(PROTOCOLS)}")
+            raise InputError(
+                "content", "scene", f"{untrusted_input.shown(scheme)}:// is none of {', '.join(PROTOCOLS)}"
+            )
         self.is_device = re.fullmatch(r"/dev/video\d+", self.url) is not None
         self.is_file = not scheme and not self.is_device
         # A password must not be in the status, nor in a log.
         self.shown = re.sub(r"//[^/@]*@", "//", self.url)
         self.path = Path(re.sub(r"[?#].*", "", self.url) if scheme else self.url)
         if self.is_file:
-            with foreign.open_regular(self.url):
+            with untrusted_input.open_regular(self.url):
                 pass
 
     def options(self, given: dict[str, str]) -> dict[str, str]:

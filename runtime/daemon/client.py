@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from runtime.errors import InputError, TransientError
-from runtime.support import foreign
+from runtime.support import untrusted_input
 
 # Where the daemon listens without a configuration: `ServiceSettings().socket`, without loading all settings.
 DEFAULT_SOCKET = "/run/phasestack/status.sock"
@@ -38,9 +38,9 @@ def configured_socket(config: Path | None) -> str:
     if config is None:
         return DEFAULT_SOCKET
     try:
-        text = foreign.read_text(config)
+        text = untrusted_input.read_text(config)
         is_json = config.suffix.lower() == ".json"
-        table: Any = foreign.parsed_json(text, source=config) if is_json else tomllib.loads(text)
+        table: Any = untrusted_input.parsed_json(text, source=config) if is_json else tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(config, "", f"malformed: {error}") from None
     service = table.get("service", {}) if isinstance(table, dict) else {}

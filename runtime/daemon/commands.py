@@ -6,7 +6,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
-from runtime.support.foreign import shown
+from runtime.support.untrusted_input import shown
 
 Name = Literal["scene", "playlist", "next", "place", "model", "pause", "resume", "flat", "reload", "blackbox"]
 NAMES: tuple[Name, ...] = get_args(Name)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from runtime.errors import InputError
-from runtime.support import foreign
+from runtime.support import untrusted_input
 from runtime.support.live import LIVE, is_live
 from runtime.support.plausible import nearest
 from runtime.support.plugins import is_plugin
@@ -118,7 +118,7 @@ def _problems(settings: Settings) -> Problems:
         try:
             load_calibration(Path(settings.calibration.file))
         except InputError as error:
-            if foreign.is_there(settings.calibration.file):
+            if untrusted_input.is_there(settings.calibration.file):
                 yield "calibration.file", str(error)
     if content.scene not in scene_names() and not (is_live(content.scene) or is_plugin(content.scene)):
         yield from _known_or_there("content.scene", content.scene, scene_names())
@@ -138,7 +138,7 @@ def _problems(settings: Settings) -> Problems:
 
 
 def _there(field: str, path: str) -> Problems:
-    if not path or not foreign.is_there(Path(path)):
+    if not path or not untrusted_input.is_there(Path(path)):
         yield field, f"{path!r} is not there"
 
 

@@ -18,7 +18,7 @@ from runtime.eyes.motions import MOTIONS, observe, path_of, true_eyes
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.recording import RecordingLimits, recording_to
 from runtime.sensor.recording_format import RecordingHeader
-from runtime.support.foreign import real, whole
+from runtime.support.untrusted_input import real, whole
 
 SECONDS, RATE_HZ, NOISE_MM = 12.0, 30.0, 3.0
 SECONDS_MAX, NOISE_MAX_MM = 3600.0, 100.0

@@ -20,7 +20,7 @@ from runtime.errors import InputError
 from runtime.eyes.networks import resampled
 from runtime.eyes.pupils import PupilFinder, Pupils
 from runtime.records import F64, U8
-from runtime.support import foreign, progress
+from runtime.support import progress, untrusted_input
 from runtime.support.artifacts import read_image
 
 EYE_DISTANCE_M = 0.063
@@ -47,7 +47,7 @@ class Face:
 def read_faces(folder: Path) -> list[Face]:
     """Raises InputError, naming the file and the field."""
     path, faces = folder / "truth.json", []
-    rows = foreign.read_json(path)
+    rows = untrusted_input.read_json(path)
     if not isinstance(rows, list) or not rows:
         raise InputError(path, "", "must be a list of faces")
     for number, row in enumerate(rows):

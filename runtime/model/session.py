@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from runtime.errors import InputError, MissingPart, ModelFailure
 from runtime.model.contract import Contract, parse_contract
 from runtime.model.onnx_bytes import digest, has_external_data
-from runtime.support import foreign
+from runtime.support import untrusted_input
 from runtime.support.onnx_runtime import onnxruntime
 
 FILE_BYTES_MAX = 1 << 30
@@ -138,7 +138,7 @@ def told_nodes(names: tuple[str, ...]) -> tuple[str, str]:
 
 
 def _checked(path: Path, sha256: str) -> bytes:
-    data = foreign.read_bytes(path, most_bytes=FILE_BYTES_MAX)
+    data = untrusted_input.read_bytes(path, most_bytes=FILE_BYTES_MAX)
     if sha256 and hashlib.sha256(data).hexdigest() != sha256:
         raise InputError(path, "", "is not the model that was shipped (SHA-256 differs): install phasestack again")
     try:

@@ -26,7 +26,7 @@ from runtime.errors import InputError
 from runtime.page.daemon import LOOKED_UP_AGAIN_S, Daemon
 from runtime.page.token import cookie_of, same
 from runtime.support.artifacts import to_json
-from runtime.support.foreign import parsed_json
+from runtime.support.untrusted_input import parsed_json
 
 COOKIE = "phasestack"
 BODY_MAX_BYTES = 65536

@@ -10,7 +10,7 @@ import numpy as np
 
 from runtime.errors import InputError
 from runtime.records import F32
-from runtime.support import foreign
+from runtime.support import untrusted_input
 
 ENTRIES = 256
 COLUMNS = ("phase", "red", "green", "blue")
@@ -23,7 +23,7 @@ def measured_curve(path: Path) -> F32:
     Raises InputError, naming the file and the row or column.
     """
     try:
-        with io.StringIO(foreign.read_text(path), newline="") as file:
+        with io.StringIO(untrusted_input.read_text(path), newline="") as file:
             rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
     except csv.Error as error:
         raise InputError(path, "", f"malformed: {error}") from None

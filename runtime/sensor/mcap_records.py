@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from runtime.errors import InputError
-from runtime.support.foreign import MIB
+from runtime.support.untrusted_input import MIB
 
 
 class Damaged(ValueError):

@@ -19,7 +19,7 @@ from runtime.records import Intrinsics, SensorFrame
 from runtime.sensor import recording_format as fmt
 from runtime.sensor.mcap_records import mcap_records
 from runtime.sensor.recording_format import RecordingHeader
-from runtime.support import foreign, progress
+from runtime.support import progress, untrusted_input
 
 CHUNK_BYTES = 4096  # some 20 eye samples
 MESSAGE_OVERHEAD_BYTES = 64
@@ -174,7 +174,7 @@ class Recording:
         return is_whole
 
     def _opened(self) -> IO[bytes]:
-        return foreign.open_regular(self.path, most_bytes=round(self._limits.file_mib * foreign.MIB))
+        return untrusted_input.open_regular(self.path, most_bytes=round(self._limits.file_mib * untrusted_input.MIB))
 
     def _read_header(self) -> RecordingHeader:
         for topic, record in self._records():
@@ -205,7 +205,9 @@ class Recording:
 
     def _to_the_break(self, file: IO[bytes]) -> Iterator[Any]:
         try:
-            yield from mcap_records(file, source=self.path, max_bytes=round(self._limits.chunk_mib * foreign.MIB))
+            yield from mcap_records(
+                file, source=self.path, max_bytes=round(self._limits.chunk_mib * untrusted_input.MIB)
+            )
         except InputError:
             raise
         except OSError as error:

@@ -9,7 +9,7 @@ from typing import IO, Any
 
 from runtime.config import LIMITS
 from runtime.errors import InputError
-from runtime.support import foreign
+from runtime.support import untrusted_input
 
 PNG = b"\x89PNG\r\n\x1a\n"
 CHUNK_BYTES = 12  # of a PNG's part without what it holds: length, kind, checksum
@@ -89,7 +89,7 @@ def check_picture(coded: bytes, *, source: str | Path, field: str, name: str) ->
 
 def read_coded(path: Path) -> bytes:
     """A picture file's bytes, undecoded; refused by its header where it has too many pixels. Raises InputError."""
-    data = foreign.read_bytes(path, most_bytes=LIMITS.file_bytes)
+    data = untrusted_input.read_bytes(path, most_bytes=LIMITS.file_bytes)
     try:
         width, height = picture_size(data)
     except ValueError:
@@ -100,7 +100,7 @@ def read_coded(path: Path) -> bytes:
 
 def size_of_file(path: Path) -> tuple[int, int]:
     """Width and height as a decoder shows them, from the file's beginning. Raises InputError."""
-    with foreign.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
+    with untrusted_input.open_regular(path, most_bytes=LIMITS.file_bytes) as file:
         try:
             width, height = picture_size(file, turned=True)
         except ValueError:

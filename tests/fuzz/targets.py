@@ -49,7 +49,7 @@ from runtime.sensor.eye_packets import EyePacket, PacketReader, encode
 from runtime.sensor.recording import RecordingWriter
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import ReplayDriver
-from runtime.support.foreign import parsed_json
+from runtime.support.untrusted_input import parsed_json
 from tests.content.gltf_files import bending_bar, growing_square, moving_square
 from tests.content.test_hostile import PNG_URI, gltf, textured
 from tests.panels.edids import block

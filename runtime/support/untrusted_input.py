@@ -1,6 +1,6 @@
 """What comes from outside (paths, files, JSON, numbers), read in one place and within limits.
 
-Every reader of foreign bytes stands on this. What is wrong is an InputError, one line that names the file and the
+Every reader of untrusted bytes stands on this. What is wrong is an InputError, one line that names the file and the
 field; what is over a limit is told with its figure and the limit.
 """
 
@@ -211,7 +211,7 @@ def within(count: int | float, most: int | float, *, source: str | Path, field: 
 
 
 def shown(value: Any, *, most: int = 40) -> str:
-    """A foreign value, printable and short."""
+    """An untrusted value, printable and short."""
     if isinstance(value, int) and value.bit_length() > 256:
         return f"a number of some {int(value.bit_length() * 0.30103) + 1} digits"
     text = value if isinstance(value, str) else repr(value)

@@ -15,8 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runtime.errors import InputError
-from runtime.support import foreign
-from runtime.support.foreign import parsed_json, real, whole, whole_from_text
+from runtime.support import untrusted_input
+from runtime.support.untrusted_input import parsed_json, real, whole, whole_from_text
 
 HANG_S = 20  # on a busy machine; what hangs takes minutes, or for ever
 
@@ -46,7 +46,7 @@ def test_only_regular_files_are_read_and_opening_never_waits(tmp_path: Path, kin
     elif kind != "gone":
         path = Path("/dev") / kind
     start = time.monotonic()
-    line = refused(foreign.read_bytes, path, most_bytes=1000)
+    line = refused(untrusted_input.read_bytes, path, most_bytes=1000)
     assert time.monotonic() - start < HANG_S
     told = {"fifo": "is a FIFO", "folder": "is a folder", "gone": "No such file", "loop": "symbolic links"}
     told["status"] = "is the kernel's own"
@@ -55,29 +55,31 @@ def test_only_regular_files_are_read_and_opening_never_waits(tmp_path: Path, kin
 
 def test_a_file_is_read_up_to_its_limit_and_refused_beyond_with_both_figures(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"x" * 1000)
-    assert foreign.read_bytes(tmp_path / "a", most_bytes=1000) == b"x" * 1000
-    assert "has 1000 bytes; at most 999 bytes" in refused(foreign.read_bytes, tmp_path / "a", most_bytes=999)
+    assert untrusted_input.read_bytes(tmp_path / "a", most_bytes=1000) == b"x" * 1000
+    assert "has 1000 bytes; at most 999 bytes" in refused(untrusted_input.read_bytes, tmp_path / "a", most_bytes=999)
 
 
 def test_whether_something_is_there_is_asked_of_names_that_can_be(tmp_path: Path) -> None:
-    assert foreign.is_there(tmp_path, folder=True) and foreign.is_there(tmp_path)
-    assert not foreign.is_there(tmp_path / "gone") and not foreign.is_there(tmp_path / "gone", folder=True)
+    assert untrusted_input.is_there(tmp_path, folder=True) and untrusted_input.is_there(tmp_path)
+    assert not untrusted_input.is_there(tmp_path / "gone") and not untrusted_input.is_there(
+        tmp_path / "gone", folder=True
+    )
     for name in ("x" * 5000, "a\0b", "/".join(["d" * 200] * 40), "y" * 300):
         with pytest.raises(InputError):
-            foreign.is_there(tmp_path / name)
+            untrusted_input.is_there(tmp_path / name)
 
 
 @pytest.mark.parametrize("path", ["a\0b", "x" * 5000, "y" * 300, "é" * 200, "/".join(["z" * 200] * 30)])
 def test_what_can_be_no_path_is_refused_by_who_gave_it(path: str) -> None:
-    line = refused(foreign.checked_path, path, source="a.toml", field="content.file")
+    line = refused(untrusted_input.checked_path, path, source="a.toml", field="content.file")
     assert line.startswith("a.toml: content.file: ")
 
 
 def test_text_is_utf_8_with_or_without_a_mark(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"\xef\xbb\xbfx")
-    assert foreign.read_text(tmp_path / "a") == "x"
+    assert untrusted_input.read_text(tmp_path / "a") == "x"
     (tmp_path / "a").write_bytes(b"ab\xffc")
-    assert "is not UTF-8 at byte 2" in refused(foreign.read_text, tmp_path / "a")
+    assert "is not UTF-8 at byte 2" in refused(untrusted_input.read_text, tmp_path / "a")
 
 
 json_values = st.recursive(
