@@ -180,7 +180,7 @@ def soak(rounds: int, *, warm: int, growth_max: float) -> None:
             print(f"{number + 1 - warm:5} rounds {seconds:6.0f} s, {kept_mib} MiB kept, {Usage.now()}", flush=True)
         run.check_black_box()
         # What a change left to be released in the background may be on its way; a leak stays.
-        eventually(lambda: Usage.now().threads <= before.threads)
+        eventually(lambda: (now := Usage.now()).threads <= before.threads and now.files <= before.files)
         after = Usage.now()
     assert after.resident_mib <= before.resident_mib * (1.0 + growth_max), (before, after)
     assert after.files <= before.files and after.threads <= before.threads, (before, after)

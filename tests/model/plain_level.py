@@ -20,7 +20,6 @@ from runtime.records import F32, F64, I16, U8
 from tests.model.exact import exact_resample
 
 WHOLE = 1 << 14  # of a weight, in whole numbers
-EDGE = 1e-5  # of an image: a place on its very edge is within
 
 
 class PlainLevel(Level):
@@ -94,13 +93,7 @@ class PlainLevel(Level):
         raster = self.rasters[on]
         out = np.empty((raster.height_px, raster.width_px, image.shape[2]))
         matrix = reprojection(self._stack, self.rasters, self._eyes_m[side], of=of, on=on)
-        exact_resample(image, image_from_result=matrix, out=out)
-        v, u = np.mgrid[0 : raster.height_px, 0 : raster.width_px] + 0.5
-        x, y, w = (row[0] * u + row[1] * v + row[2] for row in matrix)
-        beyond = (np.abs(x / w / image.shape[1] - 0.5) > 0.5 + EDGE) | (
-            np.abs(y / w / image.shape[0] - 0.5) > 0.5 + EDGE
-        )
-        out[beyond] = outside
+        exact_resample(image, image_from_result=matrix, out=out, outside=outside)
         return out
 
     def _blurred(self, image: F64, panel: int, *, twice: bool = False) -> F64:

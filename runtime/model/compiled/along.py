@@ -16,6 +16,7 @@ from numba.extending import intrinsic
 from runtime.model.compiled.loops import OPTIONS, PASS, PIECE, TILE, VECTOR, U, everywhere, loaded
 from runtime.records import F32
 
+ANYWHERE_PX = -1e6  # as `near`: an image's edges go on
 EDGE_PX = 1e-3  # a place on an image's very edge is within, however it was rounded
 MAX_DRIFT_PX = 1 / 16  # of a row from the one that its pieces were laid for; their weights follow it
 RUN = 480  # numbers of a row whose height in an image counts as a line
@@ -146,11 +147,15 @@ def sample(
         at, none, one = 0, np.float32(0), np.float32(1)
         while at < numbers:
             k = first + at / (channels * scale)
-            here = min(max(ya + k * (fall + sag * (k - ends)), 0.0), height - 1.0)
+            here = ya + k * (fall + sag * (k - ends))
             slope = (fall + sag * (2.0 * k - ends)) / (channels * scale)
-            top = min(int(here), max(height - 2, 0))
-            length = min(numbers - at, RUN)
-            if slope > 1e-9:
+            length, top = min(numbers - at, RUN), min(int(max(here, 0.0)), max(height - 2, 0))
+            if here < 0.0 or here > height - 1.0:  # an edge goes on, until the row crosses it
+                edge = 0.0 if here < 0.0 else height - 1.0
+                if (edge - here) * slope > 0.0:
+                    length = min(length, int((edge - here) / slope) + 1)
+                here, slope = edge, 0.0
+            elif slope > 1e-9:
                 length = min(length, int((top + 1 - here) / slope) + 1)
             elif slope < -1e-9:
                 length = min(length, int((top - here) / slope) + 1)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
-from runtime.model.compiled.along import new_layout, work_row, work_tiles
+from runtime.model.compiled.along import ANYWHERE_PX, EDGE_PX, new_layout, work_row, work_tiles
 from runtime.model.compiled.enlarge import enlarge
 from runtime.model.compiled.fade import fade_codes
 from runtime.model.compiled.joint import JointState, rays_of
@@ -36,6 +36,7 @@ LEAST_TAP = 1e-3  # of a blur's middle one: what weighs less is left out
 MAX_TAPS = int(MAX_SPREAD_PX * sqrt(2) * sqrt(2 * log(1 / LEAST_TAP))) + 2  # pixels to either side
 FARTHEST = 32000.0  # what 16 bits hold of a panel's mean and half of what both eyes lack
 MARGIN = 4 * PIECE  # numbers behind a row that whole pieces may touch
+SMALL_PX = 8  # of a raster, either way
 WORTH_A_THREAD = 384 * 1024  # numbers; an image of fewer is done before another thread has woken
 
 
@@ -134,7 +135,7 @@ class Level:
         def close(first: int, last: int) -> None:
             place = pixels, box.v0, box.u0, first, last
             work = new_layout(4, self.size[0], self._channels), work_row(self._scale), work_tiles()
-            close_centre(panels, sizes, targets, seen, *place, *constants, *work)
+            close_centre(panels, sizes, self._near, targets, seen, *place, *constants, *work)
 
         self._on_rows(CENTRE, close)
         self.show_panels({n: numbers_of(self.outer[n]) for n in OUTER}, layers, boxes)
@@ -163,6 +164,7 @@ class Level:
             tuple(numbers_of(self._mean(n)) for n in (panel, other)),
             numbers_of(self._whole["moved", 0]),
             self._sizes[[panel, other, CENTRE]],
+            self._near,
             panel in self.spread,
             numbers_of(self._whole["spare", 0]),
             tuple(map(numbers_of, self.target)),
@@ -222,6 +224,12 @@ class Level:
     def _mean(self, panel: int) -> I16:
         """An outer panel as eyes see it that may be unsure."""
         return self._whole["mean", panel] if panel in self.spread else self.outer[panel]
+
+    @property
+    def _near(self) -> float:
+        """How images end: what lies beside them is even, but where rasters are sheared, or so small that they end
+        before a panel does, their edges go on."""
+        return ANYWHERE_PX if self._stack.tilt is not None or min(self.size) < SMALL_PX else -EDGE_PX
 
     @property
     def _scale(self) -> float:

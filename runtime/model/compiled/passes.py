@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from runtime.model.compiled.along import EDGE_PX, sum_where
+from runtime.model.compiled.along import sum_where
 from runtime.model.compiled.loops import OPTIONS, PASS, TILE, U
 
 WHOLE = 4096  # of a weight, in 16 bits
@@ -38,7 +38,7 @@ def _best(left, right, weights, weighed, most, count, best):  # pragma: no cover
 
 @njit(**PASS)
 def _lacks(
-    panels, sizes, target, matrices, v, tile, pixels, channels, index, start, layout, row, tiles, out
+    panels, sizes, near, target, matrices, v, tile, pixels, channels, index, start, layout, row, tiles, out
 ):  # pragma: no cover
     """What an eye lacks of a target (rows, numbers) on row v of a tile of the centre panel, beside two outer panels
     (rows, numbers) of sizes (rows, pixels). matrices: (2, 3, 3) theirs from the centre's pixels; index: of the first's
@@ -47,7 +47,7 @@ def _lacks(
     for n in range(2):
         height, width = sizes[n, 0], sizes[n, 1]
         sum_where(
-            tiles[n], panels[n], height, height, width, -EDGE_PX, matrices[n], v, tile, pixels, channels, index + n,
+            tiles[n], panels[n], height, height, width, near, matrices[n], v, tile, pixels, channels, index + n,
             start, layout, row, tiles[1] if n == 0 else out,
         )  # fmt: skip
     for k in range(pixels * channels):
@@ -59,6 +59,7 @@ def correct(
     panels,
     moved,
     sizes,
+    near,
     unsure,
     out,
     targets,
@@ -88,12 +89,13 @@ def correct(
 
     panels: the panel to be corrected and the other one, (rows, numbers) int16, as the eyes see them in the mean; moved:
     what is left of the other for an eye that is off by as much again (used where `unsure`). sizes (3, 2): rows and
-    pixels of this panel, of the other, and of the centre one. out: this panel and `size` times what both eyes lack,
-    between low and high; a ray weighs as much as the slope of sin² there, and `floor` at least. targets: two of (rows,
-    numbers) int16. seen: (2, 2, 3, 3), for each eye, this panel's and the other's pixels from the centre's; back:
-    (2, 3, 3) the centre's from this panel's. needs: (rows, 2) first and last of the centre's rows that either eye sees
-    a row of this panel through. fade_columns (numbers,), fade_rows (rows,): what the residual is multiplied with.
-    seen_layout, back_layout, row, tiles (10, numbers), ring (4, rows, numbers) int16: to work in.
+    pixels of this panel, of the other, and of the centre one; near: how images end (`along.sample`). out: this panel
+    and `size` times what both eyes lack, between low and high; a ray weighs as much as the slope of sin² there, and
+    `floor` at least. targets: two of (rows, numbers) int16. seen: (2, 2, 3, 3), for each eye, this panel's and the
+    other's pixels from the centre's; back: (2, 3, 3) the centre's from this panel's. needs: (rows, 2) first and last of
+    the centre's rows that either eye sees a row of this panel through. fade_columns (numbers,), fade_rows (rows,): what
+    the residual is multiplied with. seen_layout, back_layout, row, tiles (10, numbers), ring (4, rows, numbers) int16:
+    to work in.
     """
     size_of_tile, ring_rows = TILE // channels, ring.shape[1]
     height, width = sizes[2, 0], sizes[2, 1]
@@ -112,13 +114,13 @@ def correct(
                 count = pixels * channels
                 for side in range(2):
                     _lacks(
-                        panels, sizes, targets[side], seen[side], r, tile, pixels, channels, 2 * side, start,
+                        panels, sizes, near, targets[side], seen[side], r, tile, pixels, channels, 2 * side, start,
                         seen_layout, row, tiles, tiles[2 + side],
                     )  # fmt: skip
                     if unsure:
                         _lacks(
-                            (panels[0], moved), sizes, targets[side], seen[side], r, tile, pixels, channels, 2 * side,
-                            start, seen_layout, row, tiles, tiles[4 + side],
+                            (panels[0], moved), sizes, near, targets[side], seen[side], r, tile, pixels, channels,
+                            2 * side, start, seen_layout, row, tiles, tiles[4 + side],
                         )  # fmt: skip
                 if floor < one:
                     _weigh(targets[0], U(r), begin, count, floor, most, weights[0])
@@ -140,13 +142,13 @@ def correct(
             count, lacked, weight = pixels * channels, tiles[3], tiles[5]
             for side in range(2):
                 sum_where(
-                    tiles[2 * side], ring[side], ring_rows, height, width, -EDGE_PX, back[side], q, tile, pixels,
+                    tiles[2 * side], ring[side], ring_rows, height, width, near, back[side], q, tile, pixels,
                     channels, side, none, back_layout, row, tiles[2 + side],
                 )  # fmt: skip
             if floor < one:
                 for side in range(2):
                     sum_where(
-                        tiles[4 * side], ring[2 + side], ring_rows, height, width, -EDGE_PX, back[side], q, tile,
+                        tiles[4 * side], ring[2 + side], ring_rows, height, width, near, back[side], q, tile,
                         pixels, channels, side, whole, back_layout, row, tiles[4 + side],
                     )  # fmt: skip
                 for k in range(count):
@@ -226,7 +228,24 @@ def blur(
 
 @njit(**PASS)
 def close_centre(
-    panels, sizes, targets, seen, layer, v0, u0, first, last, channels, start, full, step, floor, layout, row, tiles
+    panels,
+    sizes,
+    near,
+    targets,
+    seen,
+    layer,
+    v0,
+    u0,
+    first,
+    last,
+    channels,
+    start,
+    full,
+    step,
+    floor,
+    layout,
+    row,
+    tiles,
 ):  # pragma: no cover
     """The centre panel's rows first to last that are best for the outer ones, in 8-bit codes.
 
@@ -242,8 +261,8 @@ def close_centre(
             count, begin = pixels * channels, U(tile * size_of_tile * channels)
             for side in range(2):
                 _lacks(
-                    panels, sizes, targets[side], seen[side], v, tile, pixels, channels, 2 * side, start, layout, row,
-                    tiles, tiles[2 + side],
+                    panels, sizes, near, targets[side], seen[side], v, tile, pixels, channels, 2 * side, start, layout,
+                    row, tiles, tiles[2 + side],
                 )  # fmt: skip
             if floor < one:
                 _weigh(targets[0], U(v), begin, count, floor, full, weights[0])

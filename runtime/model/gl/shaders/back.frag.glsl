@@ -16,7 +16,7 @@ out STORED joined;
 #ifdef SLOPED
 Weighed lacked(IMAGE image, IMAGE half_blurred, sampler2D wanted, mat3 centre_from_here) {
     vec2 place = moved(centre_from_here, gl_FragCoord.xy);
-    if (beside(place, size)) return BESIDE;
+    if (beside(place, size) && !sheared(centre_from_here)) return BESIDE;
     vec2 low = floor(place - 0.5), weight = place - 0.5 - low;
     vec4 mean[4];
     blurred_down_around(half_blurred, ivec2(low), mean);
@@ -32,7 +32,7 @@ Weighed lacked(IMAGE image, IMAGE half_blurred, sampler2D wanted, mat3 centre_fr
 #else
 vec4 lacked(IMAGE image, IMAGE half_blurred, mat3 centre_from_here) {
     vec2 place = moved(centre_from_here, gl_FragCoord.xy);
-    if (beside(place, size)) return vec4(0.0);
+    if (beside(place, size) && !sheared(centre_from_here)) return vec4(0.0);
     return vec4(bilinear(image, size, place)) - blurred_down_at(half_blurred, place);
 }
 #endif

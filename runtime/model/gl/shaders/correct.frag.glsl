@@ -15,7 +15,7 @@ out STORED corrected;
 #ifdef SLOPED
 Weighed lacked(IMAGE image, sampler2D wanted, mat3 centre_from_here) {
     vec2 place = moved(centre_from_here, gl_FragCoord.xy);
-    if (beside(place, size)) return BESIDE;
+    if (beside(place, size) && !sheared(centre_from_here)) return BESIDE;
     vec2 low = floor(place - 0.5), weight = place - 0.5 - low;
     Weighed sum = Weighed(vec4(0.0), vec4(0.0));
     for (int down = 0; down < 2; down++)

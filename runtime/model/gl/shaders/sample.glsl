@@ -74,8 +74,9 @@ bool sheared(mat3 matrix) {
     return matrix[1].x != 0.0 || matrix[0].y != 0.0 || matrix[0].z != 0.0 || matrix[1].z != 0.0;
 }
 
-// What a ray meets that leaves an image is even: nobody sees it, for it does not cross every panel.
+// What a ray meets that leaves an image is even, or where that is sheared its repeated edge: nobody sees it, for it
+// does not cross every panel.
 ivec4 crossed(SOURCE image, ivec2 size, mat3 image_from_here, vec2 at) {
     vec2 place = moved(image_from_here, at);
-    return beside(place, size) ? ivec4(0) : bilinear(image, size, place);
+    return beside(place, size) && !sheared(image_from_here) ? ivec4(0) : bilinear(image, size, place);
 }
