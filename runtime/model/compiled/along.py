@@ -13,7 +13,7 @@ from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 
-from runtime.model.compiled.loops import OPTIONS, PASS, PIECE, TILE, VECTOR, U, everywhere, loaded
+from runtime.model.compiled.loops import OPTIONS, PIECE, TILE, VECTOR, U, everywhere, loaded
 from runtime.records import F32
 
 ANYWHERE_PX = -1e6  # as `near`: an image's edges go on
@@ -96,7 +96,7 @@ def _lay(scale, bend, shift, pixels, width, near, channels, n, tile, layout):  #
     layout.spans[n, tile, 0], layout.spans[n, tile, 1], layout.spans[n, tile, 2] = first, last, count
 
 
-@njit(**PASS)
+@njit(**OPTIONS)
 def sample(
     before, image, ring, height, width, near, matrix, v, tile, pixels, channels, n, layout, row, out
 ):  # pragma: no cover
@@ -183,7 +183,7 @@ def sample(
     return first, last
 
 
-@njit(**PASS)
+@njit(**OPTIONS)
 def sum_where(
     before, image, ring, height, width, near, matrix, v, tile, pixels, channels, n, outside, layout, row, out
 ):  # pragma: no cover

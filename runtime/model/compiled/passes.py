@@ -36,7 +36,7 @@ def _best(left, right, weights, weighed, most, count, best):  # pragma: no cover
             best[U(k)] = min(max((left[U(k)] + right[U(k)]) * half, none), most)
 
 
-@njit(**PASS)
+@njit(**OPTIONS)
 def _lacks(
     panels, sizes, near, target, matrices, v, tile, pixels, channels, index, start, layout, row, tiles, out
 ):  # pragma: no cover
