@@ -34,11 +34,10 @@ class PlainLevel(Level):
 
     def step(self, panel: int, *, size: float, shown: bool, fading: tuple[F32, F32] | None = None) -> None:
         other = REAR if panel == FRONT else FRONT
-        weights = self._weights()
-        residual = []
-        for side, lacks in enumerate(self._lacks()):
-            best = self._best(weights)
-            left = lacks - (np.floor(best) if self.slope_floor == 1 else best)
+        weights, lacks, residual = self._weights(), self._lacks(), []
+        best = _best(lacks, weights)
+        for side in EYES:
+            left = lacks[side] - (np.floor(best) if self.slope_floor == 1 else best)
             if self.spread:
                 seen = self._seen(other, side)
                 left = left + seen - self._blurred(seen, panel, twice=True)
@@ -67,13 +66,7 @@ class PlainLevel(Level):
         outer = {n: np.ascontiguousarray(self.outer[n]) for n in OUTER}
         self.show_panels({n: codes.reshape(codes.shape[0], -1) for n, codes in outer.items()}, layers, boxes)
         layers[CENTRE][boxes[CENTRE].slices] = 255
-        layers[CENTRE][boxes[CENTRE].slices][..., :3] = np.floor(self._best(self._weights()) / SUBCODE + 0.5)
-
-    def _best(self, weights: Sequence[F64]) -> F64:
-        """The centre panel that leaves both eyes least."""
-        left, right = self._lacks()
-        total = (weights[0] * left + weights[1] * right) / (weights[0] + weights[1])
-        return np.asarray(np.clip(total, 0, FULL), np.float64)
+        layers[CENTRE][boxes[CENTRE].slices][..., :3] = np.floor(_best(self._lacks(), self._weights()) / SUBCODE + 0.5)
 
     def _lacks(self) -> list[F64]:
         """What the outer panels leave each eye to be filled."""
@@ -109,6 +102,12 @@ class PlainLevel(Level):
     def _image(codes: I16) -> F64:
         """(h, w, channels)."""
         return codes.astype(np.float64).reshape(*codes.shape[:2], -1)
+
+
+def _best(lacks: Sequence[F64], weights: Sequence[F64]) -> F64:
+    """The centre panel that leaves both eyes least."""
+    total = sum(weight * lack for weight, lack in zip(weights, lacks, strict=True)) / (weights[0] + weights[1])
+    return np.asarray(np.clip(total, 0, FULL), np.float64)
 
 
 def hold_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
