@@ -284,8 +284,9 @@ def _where(account: RefreshAccount) -> tuple[str, ...]:
     if account.solution_age_ms is None:
         return (line,)
     moved_mm = 1000 * float(np.linalg.norm((account.eyes_m - account.solved_for_m).mean(axis=0)))
-    age = f"{moved_mm:.0f} mm in the {account.solution_age_ms:.0f} ms since the instant that the layers were solved for"
-    return line, f"They have moved {age}; the outer panels were shifted along"
+    after = f"{abs(account.solution_age_ms):.0f} ms {'before' if account.solution_age_ms < 0 else 'after'}"
+    solved = f"This is {after} the instant that the layers were solved for, {moved_mm:.0f} mm from there"
+    return line, f"{solved}; the outer panels were shifted along"
 
 
 def _has_picture(refresh: Refresh) -> bool:
