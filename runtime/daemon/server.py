@@ -149,7 +149,7 @@ class StatusServer:
 
     async def _end(self) -> None:
         self._server.close()
-        for _ in range(4):  # who has just come in is served by then, and is told too
+        for _ in range(16):  # who has just come in is served by then, and is told too
             await asyncio.sleep(0)
         clients = asyncio.all_tasks() - {asyncio.current_task()}
         for client in clients:

@@ -163,7 +163,11 @@ def test_without_a_daemon_the_client_says_what_to_do(path: Path) -> None:
 def connected(path: Path) -> socket.socket:
     client = socket.socket(socket.AF_UNIX)
     client.settimeout(20)
-    client.connect(str(path))
+    try:
+        client.connect(str(path))
+    except OSError:  # so many wait that the next is turned away at once
+        client.close()
+        raise
     return client
 
 
