@@ -196,46 +196,26 @@ def move_rows(
                             total[U(k)] = none
                             weight[U(k)] = none
                         for e in range(rays):  # an even number
-                            a, b = (3, 5) if e % 2 == 0 else (5, 3)
-                            place = back[e, n]
-                            index = 3 * e + n
-                            sum_where(
-                                tiles[a],
-                                ring[e, 0],
-                                ring_rows,
-                                height,
-                                width,
-                                0.0,
-                                place,
-                                q,
-                                tile,
-                                pixels,
-                                channels,
-                                index,
-                                none,
-                                back_layout,
-                                row,
-                                tiles[b],
-                            )
-                            a, b = (4, 6) if e % 2 == 0 else (6, 4)
-                            sum_where(
-                                tiles[a],
-                                ring[e, 1],
-                                ring_rows,
-                                height,
-                                width,
-                                0.0,
-                                place,
-                                q,
-                                tile,
-                                pixels,
-                                channels,
-                                index,
-                                none,
-                                back_layout,
-                                row,
-                                tiles[b],
-                            )
+                            for part in range(2):  # what is wrong, and its weight
+                                a, b = (3 + part, 5 + part) if e % 2 == 0 else (5 + part, 3 + part)
+                                sum_where(
+                                    tiles[a],
+                                    ring[e, part],
+                                    ring_rows,
+                                    height,
+                                    width,
+                                    0.0,
+                                    back[e, n],
+                                    q,
+                                    tile,
+                                    pixels,
+                                    channels,
+                                    3 * e + n,
+                                    none,
+                                    back_layout,
+                                    row,
+                                    tiles[b],
+                                )
                     for k in range(pixels * channels):
                         change = size * total[U(k)] / max(weight[U(k)], least)
                         now = min(max(np.float32(panels[U(n), line, U(k) + offset]) - change, none), full)
