@@ -31,7 +31,6 @@ from runtime.daemon.client import ask
 from runtime.daemon.names import scene_names
 from runtime.errors import SensorLost
 from runtime.page.daemon import LOOKED_UP_AGAIN_S, Daemon
-from runtime.page.thumbnails import Thumbnails
 from tests.daemon.rig import TRACKING
 from tests.daemon.test_changes import Served
 from tests.waiting import eventually
@@ -68,7 +67,7 @@ class Soak:
         self._folder = folder
         self.recorder = Recorder(folder / "boxes", minutes=KEPT_MIN)
         self.served = Served(folder, recorder=self.recorder, late_s=60.0, abandon_s=600.0, **SETTINGS)
-        self.page = Daemon(lambda: (self.served.server.path,), Thumbnails(folder))
+        self.page = Daemon(lambda: (self.served.server.path,))
         self.without_a_panel = 0
 
     def __enter__(self) -> Soak:

@@ -42,7 +42,6 @@ def page(
 
     from runtime.commands.status import sockets
     from runtime.page.daemon import Daemon
-    from runtime.page.thumbnails import Thumbnails
     from runtime.page.token import token_of
     from runtime.support.folders import state_folder
     from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
@@ -52,7 +51,7 @@ def page(
     path = token_file or state_folder() / "page-token"
     token = token_of(path)
     listening = _listening(host, port)
-    daemon = Daemon(lambda: sockets(config, socket), Thumbnails(path.parent / "thumbnails"))
+    daemon = Daemon(lambda: sockets(config, socket))
     app = application(daemon, token, any_host=not _is_loopback(host))
     settings = uvicorn.Config(
         app,

@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 from runtime.support.untrusted_input import shown
 
-Name = Literal["scene", "playlist", "next", "place", "model", "pause", "resume", "flat", "reload", "blackbox"]
+Name = Literal["scene", "next", "place", "model", "pause", "resume", "flat", "reload", "blackbox"]
 NAMES: tuple[Name, ...] = get_args(Name)
 PLACING = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # of `place`: settings of [content]
 
@@ -22,7 +22,7 @@ class Command:
     """
 
     name: Name
-    value: Any = None  # scene, model: str; place: settings, {} for the configured ones; playlist: scenes and seconds
+    value: Any = None  # scene, model: str; place: settings, {} for the configured ones
     answer: Future[dict[str, Any]] = field(default_factory=Future)
 
     def take(self) -> bool:
@@ -47,8 +47,6 @@ def parse(request: Any) -> Command:
         raise ValueError(f"command: unknown; one of status, {', '.join(NAMES)}")
     if name in ("scene", "model") and not (isinstance(value, str) and value):
         raise ValueError(f"value: {name} wants a name")
-    if name == "playlist" and not isinstance(value, list):
-        raise ValueError("value: playlist wants a list of scenes with their seconds")
     if name == "place":
         value = value if value is not None else {}
         if not isinstance(value, dict):
@@ -56,4 +54,4 @@ def parse(request: Any) -> Command:
         for key in value:
             if key not in PLACING:
                 raise ValueError(f"value.{shown(key)}: place knows {', '.join(PLACING)}")
-    return Command(name, value if name in ("scene", "model", "place", "playlist") else None)
+    return Command(name, value if name in ("scene", "model", "place") else None)

@@ -19,7 +19,7 @@ from runtime.daemon.build import Host, Run, RunOptions
 from runtime.daemon.commands import PLACING, Command
 from runtime.daemon.drive import drive
 from runtime.daemon.metrics import Metrics
-from runtime.daemon.names import check_recording, scene_from_here
+from runtime.daemon.names import check_recording
 from runtime.daemon.notify import Notifier
 from runtime.daemon.reconfigure import Reconfiguration
 from runtime.daemon.server import StatusServer, open_status_server
@@ -28,7 +28,6 @@ from runtime.errors import InputError, PanelLost, PhasestackError, Stopped
 from runtime.frame.presenter import Presenter
 from runtime.records import RefreshAccount, State
 from runtime.support import logs
-from runtime.support.artifacts import write_json
 from runtime.support.folders import state_folder
 from runtime.support.transient import retry_advised
 
@@ -164,8 +163,6 @@ class Daemon(Host):
                 self._reload(presenter, command)
             case "scene":
                 self._show(presenter, command.value, command)
-            case "playlist":
-                self._show(presenter, str(_written_playlist(command.value)), command)
             case "place":
                 self._place(presenter, command)
             case "next":
@@ -265,16 +262,6 @@ class Daemon(Host):
             command.refuse(problem)
         else:
             command.done(**status.holds(presenter))
-
-
-def _written_playlist(shows: list[Any]) -> Path:
-    """The operator's list as a file, which `content.scene` can name for good, and whose reader checks it."""
-    for show in shows:
-        if isinstance(show, dict) and isinstance(show.get("scene"), str):
-            show["scene"] = scene_from_here(show["scene"])
-    path = state_folder() / "playlist.json"
-    write_json(path, {"show": shows})
-    return path
 
 
 @retry_advised()

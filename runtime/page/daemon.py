@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from runtime.daemon.client import NotRunning, ask
-from runtime.page.thumbnails import Thumbnails
 
 LOOKED_UP_AGAIN_S = {"status": 0.2, "pictures": 0.3, "log": 0.5, "about": 2.0}
-PICTURES_NEW_S = 2.0  # less than a scene is shown before its picture is kept
 LOOKED_UP_WITHIN_S = 3.0
 TOLD_WITHIN_S = 70.0  # a scene or a model is loaded first
 
@@ -20,9 +18,9 @@ TOLD_WITHIN_S = 70.0  # a scene or a model is loaded first
 class Daemon:
     """Any thread may ask."""
 
-    def __init__(self, sockets: Callable[[], tuple[Path, ...]], thumbnails: Thumbnails) -> None:
+    def __init__(self, sockets: Callable[[], tuple[Path, ...]]) -> None:
         """sockets: where it may listen."""
-        self._sockets, self.thumbnails = sockets, thumbnails
+        self._sockets = sockets
         self._locks = {name: threading.Lock() for name in LOOKED_UP_AGAIN_S}
         self._answers: dict[str, tuple[float, dict[str, Any]]] = {}
 
@@ -33,18 +31,8 @@ class Daemon:
             if time.monotonic() - asked_s < LOOKED_UP_AGAIN_S[name]:
                 return answer
             answer = self._asked({"command": name}, timeout_s=LOOKED_UP_WITHIN_S)
-            if name == "about" and answer.get("ok"):
-                answer["pictured"] = [scene for scene in answer.get("scenes", ()) if self.thumbnails.jpeg(scene)]
             self._answers[name] = time.monotonic(), answer
-        if name == "status" and answer.get("ok"):
-            self._note(answer)
         return answer
-
-    def _note(self, status: dict[str, Any]) -> None:
-        """The pictures that were told shortly before this status may be of the scene that it names."""
-        asked_s, pictures = self._answers.get("pictures", (float("-inf"), {}))
-        if pictures.get("ok") and time.monotonic() - asked_s < PICTURES_NEW_S:
-            self.thumbnails.note(status, pictures)
 
     def tell(self, command: str, value: Any) -> dict[str, Any]:
         """One wish; what became of it."""

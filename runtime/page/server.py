@@ -80,12 +80,6 @@ def application(daemon: Daemon, token: str, *, any_host: bool) -> Starlette:
         answer = await run_in_threadpool(daemon.look_up, name)
         return Answer(answer, 200 if answer.get("ok") else 503)
 
-    async def thumbnail(request: Request) -> Response:
-        jpeg = await run_in_threadpool(daemon.thumbnails.jpeg, request.query_params.get("scene", ""))
-        if jpeg is None:
-            return Response(status_code=404)
-        return Response(jpeg, media_type="image/jpeg")
-
     async def do(request: Request) -> Response:
         try:
             asked = parsed_json(await _body(request), source="the request")
@@ -122,7 +116,6 @@ def application(daemon: Daemon, token: str, *, any_host: bool) -> Starlette:
         Route("/logout", guarded(logout), methods=["POST"]),
         Route("/do", guarded(do), methods=["POST"]),
         Route("/now/{name}", guarded(look_up), methods=["GET"]),
-        Route("/thumbnail", guarded(thumbnail), methods=["GET"]),
         Route("/{name}", guarded(asset), methods=["GET"]),
     ]
     app = Starlette(routes=routes)

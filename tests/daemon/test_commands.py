@@ -112,5 +112,5 @@ def test_every_command_arrives(
 
 
 def test_a_refusal_is_bad_input(server: StatusServer) -> None:
-    with pytest.raises(InputError, match="playlist wants a list"):
-        ctl.tell({"command": "playlist", "value": 1e8}, None, server.path)
+    with pytest.raises(InputError, match="place wants an object"):
+        ctl.tell({"command": "place", "value": 1e8}, None, server.path)

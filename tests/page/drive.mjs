@@ -1,4 +1,4 @@
-// Drives the page in Debian's Chromium: NODE_PATH=... node drive.mjs ORIGIN TOKEN FOLDER, with playwright-core and
+// Drives the page in Debian's Chromium: NODE_PATH=... node drive.mjs ORIGIN TOKEN FOLDER PLAYLIST, with playwright-core and
 // axe-core under NODE_PATH. Prints a line of JSON for each thing tried; on the line "kill" or "start" its parent ends
 // or starts the daemon and answers with a line on stdin.
 import { createRequire } from "node:module";
@@ -8,7 +8,7 @@ import { createInterface } from "node:readline";
 const find = createRequire(process.env.NODE_PATH + "/x");
 const { chromium } = find("playwright-core");
 const axe = readFileSync(find.resolve("axe-core/axe.min.js"), "utf8");
-const [, , origin, token, folder] = process.argv;
+const [, , origin, token, folder, playlist] = process.argv;
 const lines = createInterface({ input: process.stdin })[Symbol.asyncIterator]();
 const say = (what, value) => console.log(JSON.stringify({ what, value }));
 const parent = async (wish) => { say(wish, null); await lines.next(); };
@@ -98,12 +98,7 @@ say("scenes to choose from", await page.evaluate(() => document.querySelectorAll
 await page.fill("#scene", "demo");
 await page.click("#scene-form button");
 say("scene back", (await told("scene: done")) && (await statusIs((s) => s.scene === "demo")));
-// Scenes by their pictures, a playlist, the model, the place.
-say("thumbnails", await until(() => page.evaluate(() =>
-  [...document.querySelectorAll("#picker img")].filter((i) => i.complete && i.naturalWidth > 100).length >= 5)));
-await page.click('#picker button[data-scene="sparse"]');
-say("a scene by its picture", (await told("scene: done")) && (await statusIs((s) => s.scene === "sparse")) &&
-  (await until(async () => (await page.getAttribute('#picker button[data-scene="sparse"]', "aria-pressed")) === "true")));
+// The place, the model, a playlist.
 await page.fill("#p-right", "60");
 say("moved at once", (await statusIs((s) => Math.abs(s.placing.offset_m[1] - 0.06) < 1e-9)) &&
   (await until(async () => (await page.textContent("#placed")).includes("place: done"))));
@@ -120,17 +115,14 @@ say("another model", (await told("model: done")) && (await statusIs((s) => s.mod
 await page.fill("#model", "fast");
 await page.click("#model-form button");
 say("the model back", (await told("model: done")) && (await statusIs((s) => s.model.startsWith("fast"))));
-await page.fill("#seconds", "300");
-for (const scene of ["thin", "grey"]) {
-  await page.fill("#scene", scene);
-  await page.click("#list-add");
-}
-await page.click("#list-show");
-say("a playlist", (await told("playlist: done")) && (await statusIs((s) => s.playlist && s.playlist.entries.length === 2 && s.content.includes("thin (1 of 2)"))) &&
+await page.fill("#scene", playlist);
+await page.click("#scene-form button");
+say("a playlist", (await told("scene: done")) && (await statusIs((s) => s.playlist && s.playlist.entries.length === 2 && s.content.includes("thin (1 of 2)"))) &&
   (await until(async () => (await page.textContent("#list-told")).includes("1 of 2"))));
 await page.click("[data-command=next]");
 say("the next one", (await told("next: done")) && (await statusIs((s) => s.content.includes("grey (2 of 2)"))));
-await page.click('#picker button[data-scene="demo"]');
+await page.fill("#scene", "demo");
+await page.click("#scene-form button");
 say("from a playlist to a scene", (await told("scene: done")) && (await statusIs((s) => s.scene === "demo" && !s.playlist)));
 await page.click("[data-command=blackbox]");
 say("black box", (await told("blackbox: done: /")) && (await page.textContent("#told")).endsWith(".mcap"));

@@ -18,17 +18,14 @@ import pytest
 from runtime.clock import MonotonicClock
 from runtime.daemon.server import StatusServer
 from runtime.errors import InputError
-from runtime.page import thumbnails
 from runtime.page.daemon import Daemon
 from runtime.page.server import application
-from runtime.page.thumbnails import Thumbnails
 from runtime.page.token import cookie_of, token_of
 from tests.page.rig import ROOT, Page, page_of, short_folder
 from tests.waiting import eventually
 
 PATHS = (
     "/",
-    "/thumbnail?scene=demo",
     "/page.js",
     "/page.css",
     "/now/status",
@@ -106,7 +103,7 @@ def test_a_get_does_nothing(page: Page, loop: Loop, path: str) -> None:
 def test_with_the_token_it_tells_what_the_daemon_tells(page: Page, loop: Loop) -> None:
     assert eventually(lambda: page.look_up("status").get("secret") == "of the daemon")
     assert eventually(lambda: page.look_up("pictures").get("frame") == 7)
-    assert eventually(lambda: page.look_up("about").get("pictured") == ["demo"]), "what is asked for a picture has one"
+    assert eventually(lambda: page.look_up("about").get("scenes") == ["demo"])
     assert page.look_up("other") == {"ok": False, "error": "there is no such thing to look up"}
 
 
@@ -140,7 +137,7 @@ def test_who_goes_away_while_asking_makes_no_error(tmp_path: Path, path: str) ->
     sent: list[Any] = []
 
     async def asked() -> None:
-        app = application(Daemon(lambda: (tmp_path / "s.sock",), Thumbnails(tmp_path)), "t" * 40, any_host=False)
+        app = application(Daemon(lambda: (tmp_path / "s.sock",)), "t" * 40, any_host=False)
         host = b"localhost:8717"
         headers = [(b"host", host), (b"origin", b"http://" + host), (b"authorization", b"Bearer " + b"t" * 40)]
         scope = {"type": "http", "method": "POST", "path": path, "headers": headers, "query_string": b""}
@@ -227,36 +224,6 @@ def test_bad_options_are_one_line_and_exit_2(tmp_path: Path, options: list[str],
     command = [sys.executable, "-m", "runtime.cli", "page", "--token-file", str(tmp_path / "t"), "--port", "0"]
     done = subprocess.run([*command, *options], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2 and field in done.stderr and done.stderr.count("\n") == 1
-
-
-def test_built_in_scenes_have_a_picture_and_others_the_one_that_was_seen(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from runtime.content.scenes import SCENES
-
-    kept = Thumbnails(tmp_path / "deep" / "folder")
-    for name in SCENES:
-        assert (kept.jpeg(name) or b"").startswith(b"\xff\xd8")
-    for name in ("/srv/robot.glb", "../../etc/passwd", "", "a" * 5000, "\ud800"):
-        assert kept.jpeg(name) is None
-    told = {"jpegs": {"seen-left": "/9j/"}}
-    status = {"scene": "/srv/robot.glb", "content": "robot"}
-    kept.note(status, told)
-    assert kept.jpeg("/srv/robot.glb") is None  # the pictures may still be of the scene before
-    monkeypatch.setattr(thumbnails, "SETTLED_S", 0.0)
-    kept.note({**status, "loading": "x"}, told)
-    assert kept.jpeg("/srv/robot.glb") is None
-    kept.note(status, told)
-    kept.note(status, told)
-    assert kept.jpeg("/srv/robot.glb") == b"\xff\xd8\xff"
-    kept.note({**status, "scene": "other"}, {"jpegs": {"seen-left": "no base64!"}})
-    assert kept.jpeg("other") is None
-
-
-def test_a_picture_is_given_with_the_token_alone(page: Page, loop: Loop) -> None:
-    code, headers, body = page.ask("GET", "/thumbnail?scene=demo", **page.bearer)
-    assert (code, headers["content-type"]) == (200, "image/jpeg") and body.startswith(b"\xff\xd8")
-    assert page.ask("GET", "/thumbnail?scene=never-seen", **page.bearer)[0] == 404
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")

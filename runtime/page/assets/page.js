@@ -213,95 +213,11 @@ function pictures(answer) {
 
 const short = (name) => name.split("/").filter(Boolean).pop() ?? name;
 
-function picker(names, pictured) {
-  const box = $("picker");
-  const key = JSON.stringify([names, [...pictured]]);
-  if (box.dataset.key === key) return;
-  box.dataset.key = key;
-  box.replaceChildren(...names.map((name) => {
-    const button = html("button", "", { scene: name });
-    button.type = "button";
-    button.setAttribute("aria-pressed", "false");
-    button.title = name;
-    const image = pictured.has(name) ? document.createElement("img") : html("span", "not seen yet");
-    if (pictured.has(name)) {
-      image.alt = "";
-      image.loading = "lazy";
-      image.src = `/thumbnail?scene=${encodeURIComponent(name)}`;
-    } else {
-      image.className = "none";
-    }
-    button.append(image, html("span", short(name)));
-    button.addEventListener("click", async () => {
-      delete $("scene").dataset.touched;
-      await tell(button, "scene", name, $("scene-told"));
-    });
-    return button;
-  }));
-}
-
-function scenes(status) {
-  for (const button of $("picker").children) {
-    button.setAttribute("aria-pressed", String(button.dataset.scene === status.scene));
-  }
-}
-
-let own = []; // the playlist that is being put together
-let shown = null; // the one that the daemon shows
-
-function drawList() {
-  const entries = own.length ? own : shown?.entries ?? [];
-  const key = JSON.stringify([entries, own.length ? -1 : shown?.index]);
-  if ($("list").dataset.key === key) return;
-  $("list").dataset.key = key;
-  $("list").replaceChildren(...entries.map((entry, index) => {
-    const line = html("li");
-    line.append(html("span", `${short(entry.scene)}, ${entry.seconds} s`));
-    if (own.length) {
-      const remove = html("button", "Remove");
-      remove.type = "button";
-      remove.className = "quiet";
-      remove.setAttribute("aria-label", `Remove ${short(entry.scene)}`);
-      remove.addEventListener("click", () => {
-        own.splice(index, 1);
-        drawList();
-        ($("list").querySelector("button") ?? $("list-add")).focus();
-      });
-      line.append(remove);
-    } else if (index === shown?.index) {
-      line.setAttribute("aria-current", "true");
-    }
-    return line;
-  }));
-}
-
 function playlist(told) {
-  shown = told ?? null;
-  drawList();
-  const left = shown?.left_s === null || shown?.left_s === undefined ? "it stays" : `for ${number(shown.left_s, 0)} s more`;
-  const now = shown ? `shown: ${shown.index + 1} of ${shown.entries.length}, ${left}` : "none is shown";
-  setText($("list-told"), own.length ? `${now}; below: a new one, not shown yet` : now);
+  const left = told?.left_s === null || told?.left_s === undefined ? "it stays" : `for ${number(told.left_s, 0)} s more`;
+  setText($("list-told"), told ? `Playlist: ${told.index + 1} of ${told.entries.length} (${short(told.entries[told.index].scene)}), ${left}` : "");
+  $("next").hidden = !told;
 }
-
-$("list-add").addEventListener("click", () => {
-  const scene = $("scene").value.trim();
-  if (!scene || !$("seconds").reportValidity()) return;
-  own.push({ scene, seconds: Number($("seconds").value) });
-  playlist(shown);
-});
-$("list-clear").addEventListener("click", () => {
-  own = [];
-  playlist(shown);
-});
-$("list-form").addEventListener("submit", async (event) => {
-  event.preventDefault();
-  if (!own.length) {
-    $("list-answer").dataset.kind = "bad";
-    setText($("list-answer"), "playlist: add a scene first");
-    return;
-  }
-  if (await tell($("list-show"), "playlist", own, $("list-answer"))) own = [];
-});
 
 // Where the scene stands: sent as it is changed.
 
@@ -386,7 +302,6 @@ function show(status) {
   }
   $("content-problem").hidden = !status.content_problem;
   setText($("content-problem"), status.content_problem ?? "");
-  scenes(status);
   playlist(status.playlist);
   placing(status.placing);
   plot(status);
@@ -437,7 +352,6 @@ every(ABOUT_MS, async () => {
       return option;
     }));
   }
-  picker(answer.scenes ?? [], new Set(answer.pictured ?? []));
 });
 
 // Telling.
@@ -471,7 +385,7 @@ async function tell(button, command, value = null, where = $("told")) {
 }
 
 for (const button of document.querySelectorAll("[data-command]")) {
-  button.addEventListener("click", () => tell(button, button.dataset.command, null, $(button.dataset.command === "next" ? "list-answer" : "told")));
+  button.addEventListener("click", () => tell(button, button.dataset.command, null, $(button.dataset.command === "next" ? "scene-told" : "told")));
 }
 for (const id of ["scene", "model"]) $(id).addEventListener("input", () => ($(id).dataset.touched = "yes"));
 $("scene-form").addEventListener("submit", async (event) => {
