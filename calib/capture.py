@@ -10,10 +10,9 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.records import F64, EyePoints
 
-WINDOW_S = 0.5  # a pair is the median over so long
+WINDOW_NS = NS_PER_S // 2  # a pair is the median over so long
 MAX_SPREAD_M = 0.010  # eyes that moved or scattered by more meanwhile make no pair
 MIN_SAMPLES = 5
-FILLED = 0.9  # of a window's length
 MIN_CONFIDENCE = 0.3
 MAD_TO_SIGMA = 1.4826
 
@@ -35,10 +34,9 @@ def midpoint(eyes: EyePoints | None) -> F64 | None:
 
 
 class EyeWindow:
-    """The samples of the last `window_s` before the newest one."""
+    """The samples of the last half second before the newest one."""
 
-    def __init__(self, window_s: float = WINDOW_S) -> None:
-        self._length_ns = round(window_s * NS_PER_S)
+    def __init__(self) -> None:
         self._samples: deque[tuple[int, F64]] = deque()  # instant, middle of the eyes
 
     def add(self, capture_ns: int, eyes: EyePoints | None) -> None:
@@ -46,23 +44,12 @@ class EyeWindow:
         middle = midpoint(eyes)
         if middle is not None:
             self._samples.append((capture_ns, middle))
-        while self._samples and self._samples[0][0] <= capture_ns - self._length_ns:
+        while self._samples and self._samples[0][0] <= capture_ns - WINDOW_NS:
             self._samples.popleft()
 
     def clear(self) -> None:
         """Forget all: what was seen before does not belong to what comes."""
         self._samples.clear()
-
-    def still(self, drift_m: float) -> bool:
-        """Whether the whole window is filled, and the middles of its two halves lie no farther apart than this."""
-        if len(self._samples) < 2 * MIN_SAMPLES:
-            return False
-        if self._samples[-1][0] - self._samples[0][0] < FILLED * self._length_ns:
-            return False
-        points = np.array([point for _, point in self._samples])
-        half = len(points) // 2
-        drift = np.median(points[half:], axis=0) - np.median(points[:half], axis=0)
-        return float(np.linalg.norm(drift)) <= drift_m
 
     def measure(self) -> Midpoint | None:
         """Median and spread; None with fewer than `MIN_SAMPLES` samples."""

@@ -6,6 +6,7 @@ Layers for both eyes at once: at the viewpoint the lines fuse, single and clean;
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -91,11 +92,11 @@ class Drawer:
             self._predictor = None
 
 
-def make_charts(out: Path, viewpoints: Sequence[Viewpoint], drawer: Drawer) -> dict[str, Any]:
+def make_charts(out: Path, viewpoints: Sequence[Viewpoint], settings: Settings) -> dict[str, Any]:
     """Write a PNG for each panel and viewpoint, `charts.json`, and what an eye sees at the first viewpoint and 3 cm
     beside it. Raises InputError, MissingPart."""
     charts = []
-    with OutputFolder(out) as folder:
+    with OutputFolder(out) as folder, closing(Drawer(settings)) as drawer:
         for name, aside_m in (("fused", 0.0), ("unfused", UNFUSED_M)):
             write_png(folder.staging / f"reference-{name}.png", drawer.seen(viewpoints[0], aside_m=aside_m))
         for viewpoint in tracked("charts", viewpoints):

@@ -61,7 +61,7 @@ def panels(
         _report(summary, text, as_json)
         return
     from calib.board import boards
-    from calib.display import grey_layers, open_display, show_pages
+    from calib.display import grey_layers, open_display, show_until_key
     from calib.registration_run import write_boards
 
     stack = settings.stack.stack()
@@ -69,8 +69,7 @@ def panels(
         summary = write_boards(out, stack)
         _report(summary, f"{len(summary['files'])} boards in {out}", as_json)
     if show:
-        layers = grey_layers(boards(stack))
-        show_pages(open_display(settings), ["the boards of all panels"], lambda page: layers)
+        show_until_key(open_display(settings), grey_layers(boards(stack)), "the boards of all panels")
 
 
 @app.command()
@@ -114,7 +113,7 @@ def grey(
             measured = photographed_series(photographs(photos), stack, panel=panel, source=str(photos))
         _report(*fit_lut(out, measured, source=source), as_json)
         return
-    from calib.display import alone, open_display, show_pages
+    from calib.display import alone, open_display, show_until_key
     from calib.grey_chart import grey_chart
     from runtime.support.artifacts import write_png
 
@@ -123,14 +122,13 @@ def grey(
         write_png(out, chart)
         _report({"file": str(out)}, str(out), as_json)
     if show:
-        layers = alone(chart, stack, index=panel)
-        show_pages(open_display(settings, grey_curve=False), [f"the chart of panel {panel}"], lambda page: layers)
+        display = open_display(settings, grey_curve=False)
+        show_until_key(display, alone(chart, stack, index=panel), f"the chart of panel {panel}")
 
 
 @app.command()
 def charts(
-    out: Annotated[Path | None, typer.Option(help="folder for the charts")] = None,
-    show: Annotated[bool, typer.Option("--show", help="show them on the panels, one after the other")] = False,
+    out: Annotated[Path, typer.Option(help="folder for the charts")],
     viewpoint: Annotated[list[str] | None, typer.Option(help="only this one, as R40-phi70-theta80; repeatable")] = None,
     config: ConfigOption = None,
     as_json: JsonOption = False,
@@ -139,23 +137,12 @@ def charts(
 
     Example: phasestack calibrate charts --out charts --viewpoint R50-phi80-theta90
     """
-    if out is None and not show:
-        raise InputError("calibrate charts", "--out", "is missing (or give --show)")
-    from calib.charts import Drawer, make_charts
-    from calib.display import open_display, show_pages
+    from calib.charts import make_charts
 
     settings = _settings(config)
     chosen = _viewpoints(viewpoint, settings)
-    drawer = Drawer(settings)
-    try:
-        if out is not None:
-            summary = make_charts(out, chosen, drawer)
-            _report(summary, f"{summary['files']} files for {len(chosen)} viewpoints in {out}", as_json)
-        if show:
-            display = open_display(settings, registered=True)
-            show_pages(display, [v.name for v in chosen], lambda number: drawer.layers(chosen[number]))
-    finally:
-        drawer.close()
+    summary = make_charts(out, chosen, settings)
+    _report(summary, f"{summary['files']} files for {len(chosen)} viewpoints in {out}", as_json)
 
 
 @app.command()
@@ -169,7 +156,7 @@ def capture(
     """Pair each chart's viewpoint with where the sensor sees the eyes. Every accepted pair is on disk at once.
 
     Live: at each chart move until the lines fuse, then press Enter (n: next, p: previous, u: undo, q: stop); after
-    three places that are not on a line it says where to go, and holding still there is enough.
+    three places that are not on a line it says where to go.
     A recording must know its true eyes, as the demo does.
 
     Example: phasestack calibrate capture --config /etc/phasestack/phasestack.toml --show --out pairs.csv

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from textwrap import wrap
 
 import cv2
@@ -71,27 +71,14 @@ def open_display(settings: Settings, *, registered: bool = False, grey_curve: bo
     return PanelDisplay(open_panels(output, stack, MonotonicClock(), offscreen_context()))
 
 
-def show_pages(display: PanelDisplay, titles: Sequence[str], draw: Callable[[int], U8]) -> None:
-    """Page after page, as keys say, until the last one is accepted, or q.
-
-    draw: the (N, H, W, 4) layers of a page by its number. Closes the display. Raises PanelLost.
-    """
-    keys, clock, number, shown = TerminalKeys(), MonotonicClock(), 0, -1
+def show_until_key(display: PanelDisplay, layers: U8, title: str) -> None:
+    """(N, H, W, 4) layers until Enter or q. Closes the display. Raises PanelLost."""
+    keys, clock = TerminalKeys(), MonotonicClock()
     try:
-        while number < len(titles):
-            if number != shown:
-                shown = number
-                display.show(draw(number))
-                typer.echo(f"{titles[number]}  (Enter, n: next, p: previous, q: stop)", err=True)
-            key = keys.poll() or display.key()
-            if key is Key.QUIT:
-                return
-            if key in (Key.ACCEPT, Key.NEXT, Key.RIGHT):
-                number += 1
-            elif key in (Key.PREVIOUS, Key.LEFT):
-                number = max(0, number - 1)
-            else:
-                clock.sleep_until_ns(clock.now_ns() + POLL_NS)
+        display.show(layers)
+        typer.echo(f"{title}  (Enter or q: done)", err=True)
+        while (keys.poll() or display.key()) not in (Key.ACCEPT, Key.QUIT):
+            clock.sleep_until_ns(clock.now_ns() + POLL_NS)
     finally:
         display.close()
         keys.close()

@@ -18,12 +18,8 @@ from runtime.records import F64, EyePoints
 if TYPE_CHECKING:
     from calib.charts import ChartDisplay
 
-HERE = "here: till the lines fuse; then hold still, or Enter"
+HERE = "here: till the lines fuse; then Enter"
 GUIDE_NS = NS_PER_S // 2  # between two words of guidance
-HOLD_S = 1.5  # eyes that were still for so long are taken without a key
-MAX_DRIFT_M = 0.005  # of still eyes meanwhile: noise and breath
-REACH_M = 0.06  # of the viewpoint, by the pairs so far: nearer, holding still means that the lines fuse
-MOVED_M = 0.02  # since the last pair or its undoing: a person who has not moved does not mean this viewpoint
 MIN_PAIRS = 3  # that show roughly where the camera stands
 MIN_WIDTH_M = 0.02  # of these across their longest direction: nearly a line leaves the turn about it open
 NEAR_M = 0.015  # nearer than this the lines themselves are the better guide
@@ -74,8 +70,7 @@ class Walk:
         """chart: None: the person follows the charts elsewhere."""
         self._file, self._say, self._chart = file, say, chart
         self._left = [v for v in viewpoints if v.name not in file.viewpoints]
-        self._window, self._held = EyeWindow(), EyeWindow(HOLD_S)
-        self._before_m: F64 | None = None  # where the eyes were when this viewpoint came up, frame `sensor`
+        self._window = EyeWindow()
         self._index = 0
         self._serial = ""
         self._accepted = 0
@@ -102,10 +97,7 @@ class Walk:
             return
         self._serial = serial
         self._window.add(capture_ns, eyes)
-        self._held.add(capture_ns, eyes)
-        if self._holds_still():
-            self._accept(self._held, how="held still, ")
-        if capture_ns - self._guided_ns >= GUIDE_NS and not self.finished:
+        if capture_ns - self._guided_ns >= GUIDE_NS:
             self._say_way(capture_ns)
 
     def press(self, key: Key | None) -> None:
@@ -116,7 +108,7 @@ class Walk:
             case Key.QUIT:
                 self.finished = True
             case Key.ACCEPT:
-                self._accept(self._window)
+                self._accept()
             case Key.UNDO:
                 self._undo()
             case Key.NEXT | Key.RIGHT:
@@ -134,20 +126,8 @@ class Walk:
             "skipped": [viewpoint.name for viewpoint in self._left if viewpoint.name not in names],
         }
 
-    def _holds_still(self) -> bool:
-        """Whether a person stands about where they should, has come there, and does not move any more."""
-        if self._rough is None or not self._held.still(MAX_DRIFT_M):
-            return False
-        seen = self._held.measure()
-        if seen is None or seen.spread_m > MAX_SPREAD_M:
-            return False
-        if self._before_m is not None and np.linalg.norm(seen.midpoint_m - self._before_m) < MOVED_M:
-            return False
-        off_m = self._rough.points(seen.midpoint_m[None])[0] - self.current.midpoint_m
-        return float(np.linalg.norm(off_m)) <= REACH_M
-
-    def _accept(self, window: EyeWindow, *, how: str = "") -> None:
-        viewpoint, seen = self.current, window.measure()
+    def _accept(self) -> None:
+        viewpoint, seen = self.current, self._window.measure()
         if seen is None:
             self._say(f"{viewpoint.name}: not taken: the sensor sees no pair of eyes")
             return
@@ -160,7 +140,7 @@ class Walk:
         )
         self._accepted += 1
         self._rough = rough_similarity(*points_of(self._file.rows))
-        self._say(f"{viewpoint.name}: {how}taken, spread {spread} mm, {len(self._file)} pairs in all")
+        self._say(f"{viewpoint.name}: taken, spread {spread} mm, {len(self._file)} pairs in all")
         if self._index + 1 == len(self._left):
             self.finished = True
         else:
@@ -175,7 +155,7 @@ class Walk:
         self._accepted = max(0, self._accepted - 1)
         self._say(f"{name}: taken back, {len(self._file)} pairs in all")
         places = [viewpoint.name for viewpoint in self._left]
-        self._forget()
+        self._window.clear()
         if name in places:
             self._go(places.index(name) - self._index)
 
@@ -197,25 +177,16 @@ class Walk:
         index = min(max(self._index + step, 0), len(self._left) - 1)
         if index != self._index:
             self._index = index
-            self._forget()
+            self._window.clear()
             self._announce()
-
-    def _forget(self) -> None:
-        """What was seen so far does not belong to the viewpoint that comes."""
-        seen = self._window.measure()
-        if seen is not None:
-            self._before_m = seen.midpoint_m
-        self._window.clear()
-        self._held.clear()
 
     def _announce(self) -> None:
         viewpoint = self.current
         x, y, z = viewpoint.midpoint_m
-        hold = ", or hold still" if self._rough is not None else ""
         self._say(
             f"{viewpoint.name} ({self._index + 1} of {len(self._left)}): {x * 100:.0f} cm before the display, "
             f"{abs(y) * 100:.0f} cm to its {'right' if y > 0 else 'left'}, {z * 100:.0f} cm up; "
-            f"Enter: fused{hold}, n: next, p: previous, u: undo, q: stop"
+            f"Enter: fused, n: next, p: previous, u: undo, q: stop"
         )
         if self._chart is not None:
             self._chart.show(viewpoint)

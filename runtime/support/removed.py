@@ -89,6 +89,7 @@ REMOVED_COMMANDS: dict[str, str] = {
     "calibrate panels grey-chart": "`calibrate grey --panel N --show`",
     "calibrate capture --marks": "capture from the live sensor; recordings that know their true eyes need no marks",
     "calibrate capture --again": "undo (u) takes a pair back; without its row it is asked for again",
+    "calibrate charts --show": "`calibrate capture --show` shows each chart on the panels",
     "calibrate charts --kind": "charts are for both eyes at once",
     "calibrate charts --check": "`reference-fused.png` shows what an eye sees",
     "calibrate solve --rollback": "past versions are beside the file: copy the one you want, as calibration.1.toml",

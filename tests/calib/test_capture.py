@@ -38,7 +38,7 @@ def eyes_at(stack_m: np.ndarray, *, noise_m: float = 0.0, random: np.random.Gene
 
 
 def test_the_median_over_the_window_ignores_a_wild_sample() -> None:
-    window = EyeWindow(0.5)
+    window = EyeWindow()
     place = np.array([0.5, 0.0, 0.1])
     for number in range(15):
         window.add(number * STEP_NS, eyes_at(place + (5.0 if number == 7 else 0.0)))
@@ -120,58 +120,6 @@ def test_after_three_pairs_a_person_is_told_where_to_go(tmp_path: Path) -> None:
     assert said[-1] == "7 cm to the right, 3 cm nearer"
     stand(person, wanted, start_ns=12 * NS_PER_S)
     assert said[-1].startswith("here")
-
-
-def guided(tmp_path: Path, said: list[str]) -> Walk:
-    """A walk whose first three pairs tell where the camera stands; the fourth viewpoint is shown."""
-    chosen = [grid()[number] for number in (0, 2, 6, 13, 20)]
-    person = Walk(PairsFile(tmp_path / "p.csv"), chosen, say=said.append)
-    for number, viewpoint in enumerate(chosen[:3]):
-        stand(person, viewpoint.midpoint_m, start_ns=number * NS_PER_S)
-        person.press(Key.ACCEPT)
-    return person
-
-
-def stand_long(at: Walk, place: np.ndarray, *, start_s: float, drift_m: float = 0.0, noise_m: float = 0.002) -> None:
-    """Two seconds at a place, from which the eyes wander by so much to the right."""
-    random = np.random.default_rng(0)
-    for number in range(60):
-        moved = np.array([0.0, drift_m * number / 60, 0.0])
-        at.see(round(start_s * NS_PER_S) + number * STEP_NS, eyes_at(place + moved, noise_m=noise_m, random=random),
-               "A1")  # fmt: skip
-
-
-def test_who_holds_still_at_the_viewpoint_is_taken_without_a_key(tmp_path: Path) -> None:
-    said: list[str] = []
-    person = guided(tmp_path, said)
-    stand_long(person, grid()[13].midpoint_m, start_s=10)
-    assert any(text.startswith(f"{grid()[13].name}: held still, taken") for text in said)
-    pairs = read_pairs(tmp_path / "p.csv")
-    assert len(pairs) == 4
-    np.testing.assert_allclose(pairs.sensor_m[3], eyes_at(grid()[13].midpoint_m).eyes_m.mean(0), atol=0.002)
-    assert person.current.name == grid()[20].name
-
-
-@pytest.mark.parametrize(("aside_m", "how"), [(0.0, {"drift_m": 0.05}), (0.0, {"noise_m": 0.02}), (0.1, {})], ids=str)
-def test_who_moves_or_scatters_or_stands_elsewhere_is_not_taken(
-    tmp_path: Path, aside_m: float, how: dict[str, float]
-) -> None:
-    person = guided(tmp_path, [])
-    stand_long(person, grid()[13].midpoint_m + np.array([0.0, aside_m, 0.0]), start_s=10, **how)
-    assert len(read_pairs(tmp_path / "p.csv")) == 3
-
-
-def test_what_was_undone_is_not_taken_again_before_the_person_has_moved(tmp_path: Path) -> None:
-    said: list[str] = []
-    person = guided(tmp_path, said)
-    place = grid()[13].midpoint_m
-    stand_long(person, place, start_s=10)
-    person.press(Key.UNDO)
-    assert person.current.name == grid()[13].name
-    stand_long(person, place, start_s=20)
-    assert len(read_pairs(tmp_path / "p.csv")) == 3
-    stand_long(person, place + np.array([0.0, 0.03, 0.0]), start_s=30)
-    assert len(read_pairs(tmp_path / "p.csv")) == 4
 
 
 def recording(path: Path, places: list[np.ndarray], *, true: bool) -> Path:

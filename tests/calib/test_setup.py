@@ -150,7 +150,7 @@ def sent_through(layers: np.ndarray, settings: Settings, hardware: SimulatedHard
     """(N, h, w, 3) codes of the phases that the simulated panels turn to for layers, by their configured curves."""
     found = np.empty_like(layers)
     for index, panel in enumerate(settings.output.panels):
-        greys = np.rint(255 * (lut.measured_curve(Path(panel.lut)) if curves else lut.identity()))[:, 0] / 255
+        greys = np.rint(255 * (lut.curve(lut=panel.lut if curves else "", gamma=1.0)))[:, 0] / 255
         found[index] = np.rint(255 * hardware.phase_of(index, greys)).astype(np.uint8)[layers[index]]
     return found
 
