@@ -28,7 +28,7 @@ from runtime.support import untrusted_input
 from runtime.support.live import LIVE
 from runtime.support.plausible import check_text, nearest, socket_path, within
 from runtime.support.plugins import is_plugin
-from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, RECORD_MOST_S
+from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
 from runtime.support.removed import REMOVED_SETTINGS
 
 TABLE_BYTES_MAX = 4 << 20
@@ -52,7 +52,6 @@ PIXEL_ASPECT_TOLERANCE = 0.03
 LEAST_GAP_M = 1e-5
 PANELS_MOST = 8  # of a stack
 
-Positive = Annotated[float, Field(gt=0, le=MOST)]
 NonNegative = Annotated[float, Field(ge=0, le=MOST)]
 Unit = Annotated[float, Field(ge=0, le=1)]
 SocketPath = Annotated[str, AfterValidator(socket_path)]
@@ -146,10 +145,6 @@ class SensorSettings(Section):
     fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
         0.0, description="horizontal field of view of a camera that does not tell (usb-camera never does); 0: unknown"
     )
-    record_max_s: Annotated[float, within(0.01, RECORD_MOST_S, "s")] = Field(
-        600.0, description="`record` stops after this"
-    )
-    record_max_mib: Positive = Field(2048.0, description="`record` stops before its file is larger")
     fixed_eyes_m: tuple[tuple[Place, Place, Place], tuple[Place, Place, Place]] | None = Field(
         None, description="driver `fixed`: left and right eye in the stack frame; no sensor is opened"
     )
@@ -293,7 +288,6 @@ class PanelSettings(Section):
 
     edid_serial: str = Field("", description="monitor by EDID serial (first choice)")
     connector: str = Field("", description="monitor by connector name, as HDMI-1 (second choice)")
-    index: Annotated[int, Field(ge=-1)] = Field(-1, description="monitor by explicit index (last choice); -1: none")
     rotation_deg: Literal[0, 90, 180, 270] = Field(0, description="how the panel is mounted, counter-clockwise")
     mirror: Literal["none", "horizontal", "vertical"] = Field("none", description="mirroring, before rotation")
     homography: tuple[tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry], tuple[Entry, Entry, Entry]] = Field(
@@ -309,9 +303,7 @@ class PanelSettings(Section):
         """What names one monitor for both; empty where they can be two. Monitors may share their EDID serial."""
         if self.connector and self.connector == other.connector:
             return f"connector {self.connector}"
-        if self.index >= 0 and self.index == other.index:
-            return f"index {self.index}"
-        alone = not (self.connector or other.connector or self.index >= 0 or other.index >= 0)
+        alone = not (self.connector or other.connector)
         if alone and self.edid_serial and self.edid_serial == other.edid_serial:
             return f"edid_serial {self.edid_serial}"
         return ""
@@ -405,17 +397,12 @@ LIMITS = LimitSettings()  # the same for every display; tests lower them
 
 
 class ServiceSettings(Section):
-    """The daemon's socket, metrics and logs."""
+    """The daemon's socket, metrics and black box."""
 
     socket: SocketPath = Field("/run/phasestack/status.sock", description="status and control socket")
-    group: str = Field("phasestack", description="group that may use the socket")
     metrics_port: Annotated[int, Field(ge=0, le=65535)] = Field(0, description="Prometheus on loopback; 0: off")
-    log_format: Literal["text", "json"] = Field("text", description="log lines for people or for machines")
     blackbox_minutes: Annotated[float, within(0.0, 60.0, "min")] = Field(
         2.0, description="what the black box keeps in memory, to be written at a fault or by `ctl blackbox`; 0: none"
-    )
-    blackbox_folder: str = Field(
-        "", description="where black boxes are written; empty: `blackbox` in the service's or the person's state folder"
     )
 
 
@@ -431,7 +418,7 @@ class Settings(Section):
     output: OutputSettings = Field(default_factory=OutputSettings, description="panels")
     loop: LoopSettings = Field(default_factory=LoopSettings, description="pacing")
     plan: PlanSettings = Field(default_factory=PlanSettings, description="what is left out")
-    service: ServiceSettings = Field(default_factory=ServiceSettings, description="socket, metrics, logs")
+    service: ServiceSettings = Field(default_factory=ServiceSettings, description="socket, metrics, black box")
 
     @property
     def limits(self) -> LimitSettings:
@@ -531,7 +518,7 @@ def _fields(model: type[BaseModel], place: tuple[int | str, ...]) -> list[str]:
 # What is always a path, and what is one where it has a slash or a suffix: a bare word is a name (`demo`, `balanced`).
 PATHS = (
     ("sensor", "openni2_folder"), ("calibration", "file"), ("content", "file"),
-    ("content", "library"), ("service", "socket"), ("service", "blackbox_folder"),
+    ("content", "library"), ("service", "socket"),
 )  # fmt: skip
 NAMES_OR_PATHS = (("content", "scene"), ("model", "name"))
 

@@ -59,7 +59,6 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
             "output.panels.2",
             "is bound to the monitor of panels.0",
         ),
-        ("[[output.panels]]\nindex = 0\n" * 3, "output.panels.1", "is bound to the monitor of panels.0 (index 0)"),
         ('[[output.panels]]\nedid_serial = "A"\n' * 3, "output.panels.1", "(edid_serial A)"),
         ('[service]\nsocket = ""', "service.socket", "names no file"),
         ('[service]\nsocket = "/"', "service.socket", "names no file"),

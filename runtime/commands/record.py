@@ -30,7 +30,8 @@ def record(
     config: Annotated[Path | None, typer.Option(help="TOML file; see `phasestack config`")] = None,
     images: Annotated[bool, typer.Option("--images", help="colour and depth as well: shows faces")] = False,
     seconds: Annotated[
-        float | None, number(0.1, RECORD_MOST_S, "s", help="stop after this long; else Ctrl-C, with --motion 12 s")
+        float | None,
+        number(0.1, RECORD_MOST_S, "s", help="stop after this long; default: 600 s or Ctrl-C, with --motion 12 s"),
     ] = None,
     motion: Annotated[
         str | None, typer.Option(help="no sensor, but a head that moves: still, lean, nod, walk or stop-and-go")
@@ -40,12 +41,6 @@ def record(
     noise_mm: Annotated[
         float | None, number(0, 100, "mm", help="with --motion: the sensor's noise, standard deviation an axis")
     ] = None,
-    force: Annotated[
-        bool,
-        typer.Option(
-            "--force", help="replace a recording of the same name; one of --motion may always replace its like"
-        ),
-    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="what was recorded as one JSON object on stdout")] = False,
 ) -> None:
     """Record eye positions with their times; pictures only with --images. Ctrl-C ends a recording properly.
@@ -56,7 +51,7 @@ def record(
 
     Example: phasestack record --motion walk --seed 3 --rate-hz 60 --out walk.mcap
     """
-    _refuse_target(out, motion=motion is not None, force=force)
+    _refuse_target(out, motion=motion is not None)
     made = {"seed": seed, "rate_hz": rate_hz, "noise_mm": noise_mm}
     meaningless = {"config": config, "images": images or None} if motion is not None else made
     for name, value in meaningless.items():
@@ -72,7 +67,7 @@ def record(
     else:
         from runtime.config import load_settings
 
-        summary = record_to(out, load_settings(config), images=images, seconds=seconds, quiet=as_json)
+        summary = record_to(out, load_settings(config), images=images, seconds=seconds)
     if as_json:
         typer.echo(json.dumps(summary))
     else:
@@ -80,7 +75,7 @@ def record(
         typer.echo(f"{out}: {length}, {_contents(summary)} ({summary['stopped']})")
 
 
-def _refuse_target(out: Path, *, motion: bool, force: bool) -> None:
+def _refuse_target(out: Path, *, motion: bool) -> None:
     """Raises InputError for a name that is not a recording's, or one that is taken.
 
     A motion may replace a motion, which is made again from its seed; a viewer is not.
@@ -93,14 +88,14 @@ def _refuse_target(out: Path, *, motion: bool, force: bool) -> None:
         raise InputError(out, "--out", f"must end in {SUFFIX}: recordings are MCAP files")
     if out.is_dir():
         raise InputError(out, "--out", "is a folder")
-    if force or not (out.exists() or out.is_symlink()):
+    if not (out.exists() or out.is_symlink()):
         return
     try:
         if motion and Recording(out).header.driver == "motion":
             return
     except InputError:  # something else has the name
         pass
-    raise InputError(out, "--out", "is there already: take another name, or --force to replace it")
+    raise InputError(out, "--out", "is there already: take another name, or delete it")
 
 
 def _contents(summary: dict[str, Any]) -> str:
@@ -117,12 +112,9 @@ def _contents(summary: dict[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | None, quiet: bool) -> dict[str, Any]:
+def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | None) -> dict[str, Any]:
     """Record until the time is up, a limit is reached, the source ends or Ctrl-C. Raises FatalError, InputError."""
     from dataclasses import replace
-
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
 
     from runtime.clock import NS_PER_S, MonotonicClock
     from runtime.eyes.detect import EyeFinder
@@ -131,19 +123,17 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
     from runtime.sensor.recording_format import RecordingHeader
     from runtime.sensor.registry import open_sensor
     from runtime.sensor.worker import SensorWorker
+    from runtime.support import progress
 
     clock, s = MonotonicClock(), settings.sensor
     worker = SensorWorker(
         lambda: DetectingDriver(open_sensor(s, clock), lambda: EyeFinder(settings).find, keep_images=images), s, clock
     )
-    limits = RecordingLimits(min(seconds or s.record_max_s, s.record_max_s), round(s.record_max_mib * (1 << 20)))
-    stopped = "the time is up" if limits.max_s == seconds else "the limit sensor.record_max_s is reached"
+    limits, stopped = RecordingLimits(seconds) if seconds else RecordingLimits(), "the time is up"
     writer, first_ns, so_far_s = None, 0, 0.0
     holds: dict[str, None] = {}
-    columns = (TextColumn("recording"), BarColumn(), TextColumn("{task.fields[note]}"))
     with ExitStack() as cleanup:
-        shown = Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True)
-        task = cleanup.enter_context(shown).add_task("recording", total=seconds, note="")
+        cleanup.callback(progress.tell, "", 0)
         cleanup.callback(worker.close)
         worker.start()
         try:
@@ -162,11 +152,11 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
                 kept = frame if images else replace(frame, colour=None, depth_mm=None)
                 if not writer.write(kept):
                     if frame.capture_ns - first_ns <= limits.max_s * NS_PER_S:
-                        stopped = "the limit sensor.record_max_mib is reached"
+                        stopped = "it would be larger than 2 GiB"
                     break
                 so_far_s = (frame.capture_ns - first_ns) / NS_PER_S
                 holds |= dict.fromkeys(_streams(kept))
-                shown.update(task, completed=so_far_s, note=f"{writer.count} samples, {so_far_s:.1f} s")
+                progress.tell(f"recording: {writer.count} samples, seconds", round(so_far_s), round(limits.max_s))
             else:
                 if worker.state in OVER:
                     stopped = worker.reason

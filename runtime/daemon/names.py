@@ -131,7 +131,7 @@ def _problems(settings: Settings) -> Problems:
     for number, panel in enumerate(output.panels):
         if panel.lut:
             yield from _there(f"output.panels.{number}.lut", panel.lut)
-        if output.kind != "offscreen" and not (panel.edid_serial or panel.connector or panel.index >= 0):
+        if output.kind != "offscreen" and not (panel.edid_serial or panel.connector):
             yield f"output.panels.{number}", "names no monitor: set edid_serial or connector"
     if output.kind != "offscreen" and not output.panels:
         yield "output.panels", f"{output.kind} need one table a panel that names its monitor (phasestack identify)"

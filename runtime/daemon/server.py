@@ -33,6 +33,7 @@ from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
 
 log = logging.getLogger("phasestack.service")
 
+GROUP = "phasestack"  # that may use the socket
 LINE_MAX_BYTES = 65536
 BACKLOG = 64
 CLIENTS_MAX = 64
@@ -56,7 +57,7 @@ class StatusServer:
     `status` still answers, and says for how long no turn was completed.
     """
 
-    def __init__(self, path: Path, *, group: str, clock: Clock) -> None:
+    def __init__(self, path: Path, *, clock: Clock) -> None:
         """Raises SocketInUse where the socket belongs to a running daemon, InputError where it can't be made."""
         self.path = path
         self.commands: queue.SimpleQueue[Command] = queue.SimpleQueue()
@@ -83,9 +84,9 @@ class StatusServer:
         except OSError as error:
             raise InputError("service", "socket", f"{path} can't be made ({error.strerror or error})") from error
         try:
-            os.chown(path, -1, grp.getgrnam(group).gr_gid)
+            os.chown(path, -1, grp.getgrnam(GROUP).gr_gid)
         except (KeyError, PermissionError):
-            log.info("the status socket is this user's alone: group %s is not there or not ours", group)
+            log.info("the status socket is this user's alone: group %s is not there or not ours", GROUP)
         self._thread: threading.Thread | None = threading.Thread(target=self._run, name="status", daemon=True)
         self._thread.start()
 
@@ -283,7 +284,7 @@ def open_status_server(settings: ServiceSettings, *, clock: Clock, supervised: b
     if own is not None and path == Path(DEFAULT_SOCKET) and not _may_write(path.parent):
         path = own
     try:
-        return StatusServer(path, group=settings.group, clock=clock)
+        return StatusServer(path, clock=clock)
     except (InputError, SocketInUse) as error:
         if supervised:
             raise

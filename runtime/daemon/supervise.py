@@ -273,7 +273,7 @@ def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> di
     settings = read_settings()
     check_recording(settings, source="run")  # before seconds go into content and models
     service, clock = settings.service, MonotonicClock()
-    logs.configure(service)
+    logs.configure()
     with ExitStack() as cleanup:
         signals = cleanup.enter_context(Signals())
         notifier = Notifier(clock)
@@ -281,8 +281,7 @@ def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> di
         server = recorder = None
         if not options.max_speed:
             server = open_status_server(service, clock=clock, supervised=notifier.supervised)
-            folder = Path(service.blackbox_folder or state_folder() / "blackbox")
-            recorder = cleanup.enter_context(Recorder(folder, minutes=service.blackbox_minutes))
+            recorder = cleanup.enter_context(Recorder(state_folder() / "blackbox", minutes=service.blackbox_minutes))
         if server is not None:
             cleanup.callback(server.close)
         metrics = _metrics(service.metrics_port, cleanup)

@@ -1,4 +1,4 @@
-"""Which monitor is which panel: by EDID serial, else connector, else explicit index, never by a guess; and whether
+"""Which monitor is which panel: by EDID serial, else connector, never by a guess; and whether
 their modes fit the stack: phases must reach the panel's pixels as they are, at one rate."""
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Monitor:
 
 
 def in_order(monitors: Sequence[Monitor]) -> tuple[Monitor, ...]:
-    """The order that an index counts in: from left to right, then from top to bottom."""
+    """From left to right, then from top to bottom."""
     return tuple(sorted(monitors, key=lambda monitor: (monitor.x_px, monitor.y_px, monitor.connector)))
 
 
@@ -84,9 +84,6 @@ def _find(number: int, panel: PanelSettings, monitors: tuple[Monitor, ...]) -> M
     if panel.connector:
         wanted.append(f"connector {panel.connector}")
         left = [monitor for monitor in left if monitor.connector == panel.connector]
-    if panel.index >= 0:
-        wanted.append(f"index {panel.index}")
-        left = [monitor for monitor in left if monitors[panel.index : panel.index + 1] == (monitor,)]
     if not wanted:
         raise InputError(
             "output", f"panels.{number}", "names no monitor: set edid_serial or connector (`phasestack identify`)"

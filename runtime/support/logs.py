@@ -1,4 +1,4 @@
-"""Log lines for people, for journald and for machines.
+"""Log lines for people and for journald.
 
 A fault that repeats does not flood them, a message can't forge a line, and who logs never waits for who reads.
 """
@@ -6,19 +6,17 @@ A fault that repeats does not flood them, a message can't forge a line, and who 
 from __future__ import annotations
 
 import copy
-import json
 import logging
 import os
 import queue
 import sys
 import time
 from collections.abc import Mapping
-from datetime import UTC, datetime
+from datetime import datetime
 from logging.handlers import QueueHandler, QueueListener
 from typing import Any, TextIO
 
 from runtime.clock import NS_PER_S, Clock, MonotonicClock
-from runtime.config import ServiceSettings
 from runtime.errors import one_line
 from runtime.support.crash import written
 
@@ -54,21 +52,6 @@ class TextFormat(logging.Formatter):
             return PRIORITY.get(record.levelno, "<6>") + text
         when = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
         return f"{when} {record.levelname.lower():7} {text}"
-
-
-class JsonFormat(logging.Formatter):
-    """One JSON object a line: time, level, logger, message."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        line = {
-            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
-            "level": record.levelname.lower(),
-            "logger": record.name,
-            "message": _message(record),
-        }
-        if problem := _exception(record):
-            line["exception"] = problem
-        return json.dumps(line)
 
 
 def _message(record: logging.LogRecord) -> str:
@@ -176,17 +159,16 @@ class QueuedLines(QueueHandler):
 
 
 def configure(
-    settings: ServiceSettings,
     *,
     stream: TextIO | None = None,
     clock: Clock | None = None,
     environment: Mapping[str, str] = os.environ,
 ) -> None:
-    """Send every log line of ours to a stream (stderr), in the configured form. Calling it again replaces."""
+    """Send every log line of ours to a stream (stderr). Calling it again replaces."""
     for old in logging.getLogger(ROOTS[0]).handlers[:]:
         if isinstance(old, QueuedLines):
             old.close()
-    form = JsonFormat() if settings.log_format == "json" else TextFormat(journald="JOURNAL_STREAM" in environment)
+    form = TextFormat(journald="JOURNAL_STREAM" in environment)
     handler = QueuedLines(os.dup((stream or sys.stderr).fileno()), form)  # whatever becomes of the number
     handler.addFilter(RateLimit(clock or MonotonicClock()))
     for name in ROOTS:

@@ -35,7 +35,7 @@ class Served:
 
     def __init__(self, folder: Path, *, recorder: Any = None, **changes: Any) -> None:
         self.config = folder / "phasestack.toml"
-        self.server = StatusServer(folder / "status.sock", group="root", clock=MonotonicClock())
+        self.server = StatusServer(folder / "status.sock", clock=MonotonicClock())
         self.daemon = Daemon(
             self.read_settings,
             signals=Signals(),

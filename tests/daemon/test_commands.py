@@ -33,7 +33,7 @@ def clock() -> Any:
 
 @pytest.fixture
 def server(tmp_path: Path, clock: Any) -> Any:
-    made = StatusServer(tmp_path / "status.sock", group="root", clock=clock)
+    made = StatusServer(tmp_path / "status.sock", clock=clock)
     made.publish(lambda: ACCOUNT)
     yield made
     made.close()

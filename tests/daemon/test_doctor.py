@@ -85,7 +85,7 @@ def test_a_real_sensor_with_the_demos_calibration_is_a_failure(tmp_path: Path) -
 )
 def test_a_running_daemon_is_asked_how_it_is(tmp_path: Path, account: Any, seconds: int, state: str) -> None:
     clock = SimulatedClock()
-    server = StatusServer(tmp_path / "status.sock", group="root", clock=clock)
+    server = StatusServer(tmp_path / "status.sock", clock=clock)
     server.publish(lambda: account)
     clock.advance_ns(seconds * NS_PER_S)
     try:

@@ -42,8 +42,9 @@ def clock() -> SimulatedClock:
 
 
 @pytest.fixture
-def server(path: Path, clock: SimulatedClock) -> Iterator[StatusServer]:
-    made = StatusServer(path, group=OWN_GROUP, clock=clock)
+def server(path: Path, clock: SimulatedClock, monkeypatch: pytest.MonkeyPatch) -> Iterator[StatusServer]:
+    monkeypatch.setattr("runtime.daemon.server.GROUP", OWN_GROUP)
+    made = StatusServer(path, clock=clock)
     yield made
     made.close()
 
@@ -111,7 +112,7 @@ def test_a_second_daemon_is_refused_and_told_who_has_it(
     server: StatusServer, path: Path, clock: SimulatedClock
 ) -> None:
     with pytest.raises(SocketInUse, match=f"in use by another phasestack .pid {os.getpid()}"):
-        StatusServer(path, group=OWN_GROUP, clock=clock)
+        StatusServer(path, clock=clock)
     assert status(path)["ok"]
 
 
@@ -120,7 +121,7 @@ def test_the_socket_of_a_daemon_that_crashed_is_taken_over(path: Path, clock: Si
     dead = socket.socket(socket.AF_UNIX)
     dead.bind(str(path))
     dead.close()
-    server = StatusServer(path, group=OWN_GROUP, clock=clock)
+    server = StatusServer(path, clock=clock)
     assert status(path)["ok"]
     server.close()
     server.close()
@@ -137,7 +138,7 @@ def test_somebody_elses_file_is_neither_removed_nor_followed(
     if is_link:
         path.symlink_to(precious)
     with pytest.raises(InputError, match="not a socket"):
-        StatusServer(path, group=OWN_GROUP, clock=clock)
+        StatusServer(path, clock=clock)
     assert precious.read_text() == "precious" and path.is_symlink() == is_link
 
 
@@ -234,7 +235,7 @@ def test_tricklers_lock_out_nobody(server: StatusServer, path: Path) -> None:
 @pytest.fixture
 def hasty(path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[StatusServer]:
     monkeypatch.setattr(server_module, "REQUEST_S", 0.3)
-    made = StatusServer(path, group=OWN_GROUP, clock=SimulatedClock())
+    made = StatusServer(path, clock=SimulatedClock())
     yield made
     made.close()
 

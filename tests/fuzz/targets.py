@@ -310,7 +310,7 @@ def requests() -> list[bytes]:
 
 @cache
 def server() -> StatusServer:
-    return StatusServer(Path(tempfile.mkdtemp(prefix="phasestack-fuzz-")) / "s", group="", clock=MonotonicClock())
+    return StatusServer(Path(tempfile.mkdtemp(prefix="phasestack-fuzz-")) / "s", clock=MonotonicClock())
 
 
 def request(data: bytes, folder: Path) -> None:

@@ -31,7 +31,6 @@ backend = "opencv"
 rate_hz = 60.0
 [service]
 socket = "s.sock"
-blackbox_folder = "boxes"
 """
 
 

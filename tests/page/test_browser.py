@@ -42,7 +42,7 @@ class RunningDaemon:
 
     def start(self) -> None:
         command = [sys.executable, "-c", PATIENT, "run", "--config", str(self._folder / "d.toml"), "--headless"]
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "STATE_DIRECTORY": str(self._folder)}
         with (self._folder / "log").open("ab") as log:
             self._process = subprocess.Popen(
                 [*command, "--json"], cwd=ROOT, env=environment, stdout=subprocess.DEVNULL, stderr=log

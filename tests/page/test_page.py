@@ -39,7 +39,7 @@ class Loop:
     """A daemon's socket and a loop that does what it is told; `told` remembers."""
 
     def __init__(self, path: Path) -> None:
-        self.server = StatusServer(path, group="nobody", clock=MonotonicClock())
+        self.server = StatusServer(path, clock=MonotonicClock())
         self.server.publish(lambda: {"state": "tracking", "secret": "of the daemon"})  # pragma: allowlist secret
         self.server.lookups["pictures"] = lambda: {"frame": 7, "jpegs": {}}
         self.server.lookups["log"] = lambda: {"lines": [], "states": []}

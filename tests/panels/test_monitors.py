@@ -1,4 +1,4 @@
-"""Panels are bound to monitors by EDID serial, then connector, then explicit index; never by a guess. A monitor must
+"""Panels are bound to monitors by EDID serial, then connector; never by a guess. A monitor must
 show the stack's own pixels, and all panels at one rate: else phases are rescaled, or frames torn."""
 
 from __future__ import annotations
@@ -36,10 +36,6 @@ def test_a_serial_finds_its_monitor_wherever_it_is_plugged_in(there: Any) -> Non
 
 def test_a_connector_serves_where_no_serial_is_named() -> None:
     assert bind([PanelSettings(connector="DP-2")], [LEFT, MIDDLE]) == (MIDDLE,)
-
-
-def test_an_index_counts_from_the_left() -> None:
-    assert bind([PanelSettings(index=2), PanelSettings(index=0)], [RIGHT, LEFT, MIDDLE]) == (RIGHT, LEFT)
 
 
 def test_a_missing_serial_is_not_made_up_for_by_its_connector() -> None:

@@ -41,13 +41,8 @@ def test_a_recording_of_the_demo_has_its_samples(tmp_path: Path) -> None:
 
 
 def test_a_source_that_ends_ends_the_recording(tmp_path: Path) -> None:
-    summary = record_to(tmp_path / "a.mcap", settings(start_s=9.6), images=False, seconds=30, quiet=True)
+    summary = record_to(tmp_path / "a.mcap", settings(start_s=9.6), images=False, seconds=30)
     assert "no more samples" in summary["stopped"] and summary["samples"] >= 10
-
-
-def test_a_limit_in_the_settings_is_kept_and_told(tmp_path: Path) -> None:
-    summary = record_to(tmp_path / "a.mcap", settings(record_max_s=0.3), images=False, seconds=None, quiet=True)
-    assert "record_max_s" in summary["stopped"] and summary["seconds"] <= 0.3
 
 
 def test_ctrl_c_ends_it_properly(tmp_path: Path) -> None:
@@ -65,7 +60,7 @@ def test_ctrl_c_ends_it_properly(tmp_path: Path) -> None:
 def test_a_sensor_that_gives_nothing_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("runtime.commands.record.FIRST_SAMPLE_S", 0.3)
     with pytest.raises(FatalError, match="usb-eyes"):
-        record_to(tmp_path / "a.mcap", settings(driver="usb-eyes"), images=False, seconds=1, quiet=True)
+        record_to(tmp_path / "a.mcap", settings(driver="usb-eyes"), images=False, seconds=1)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -79,7 +74,7 @@ def test_pictures_are_kept_only_with_images(tmp_path: Path) -> None:
     write_oni(tmp_path / "v.oni", np.repeat(depth[None], 12, 0), np.repeat(colour[None], 12, 0), fov_rad=fov)
     source = settings(driver="openni2", source=str(tmp_path / "v.oni"), loop=True)
     for images in (False, True):
-        record_to(tmp_path / "a.mcap", source, images=images, seconds=0.8, quiet=True)
+        record_to(tmp_path / "a.mcap", source, images=images, seconds=0.8)
         frames = list(Recording(tmp_path / "a.mcap").samples())
         assert all((f.depth_mm is not None) == images for f in frames)
         assert any(f.colour is not None for f in frames) == images
@@ -87,7 +82,7 @@ def test_pictures_are_kept_only_with_images(tmp_path: Path) -> None:
         assert np.median(found) == pytest.approx(IPD_M, abs=0.004)
 
 
-def test_a_motion_replaces_a_motion_and_no_viewer_and_a_sensor_replaces_nothing_unless_told(tmp_path: Path) -> None:
+def test_a_motion_replaces_a_motion_and_no_viewer_and_a_sensor_replaces_nothing(tmp_path: Path) -> None:
     """Seen: a sensor's recording was gone after `record --motion` to the same name, without a word."""
     out = tmp_path / "a.mcap"
     motion, sensor = ["--motion", "still", "--seconds", "1"], ["--seconds", "0.5"]
@@ -98,14 +93,14 @@ def test_a_motion_replaces_a_motion_and_no_viewer_and_a_sensor_replaces_nothing_
         answer = CliRunner().invoke(app, [*arguments, "--out", str(out)])
         if answer.exit_code == 0:
             return out.read_bytes() != before
-        assert isinstance(answer.exception, InputError) and "--force" in str(answer.exception)
+        assert isinstance(answer.exception, InputError) and "take another name" in str(answer.exception)
         assert out.read_bytes() == before
         return False
 
     assert made(*motion) and not made(*sensor)
     assert made(*motion, "--seed", "5")  # it is made again from its seed
     out.unlink()
-    assert made(*sensor) and not made(*motion) and made(*motion, "--force")
+    assert made(*sensor) and not made(*motion)
     out.write_bytes(b"something else")
     assert not made(*motion)
 
