@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -47,31 +47,17 @@ def bench(
 @app.command()
 def eyes(
     folder: Annotated[Path, typer.Argument(help="pictures of faces and truth.json: file, left, right, px; yaw_deg")],
-    chain: Annotated[
-        bool, typer.Option("--chain", help="instead, what a viewer sees of the whole chain, dB: some minutes")
-    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
 ) -> None:
     """How well pupils are found and followed: simulated cameras look at faces whose pupils are known.
 
     Example: phasestack bench eyes faces
-
-    Example: phasestack bench eyes faces --chain
     """
     from runtime.eyes import benchmark
     from runtime.support.artifacts import to_json
 
-    told: str
-    measured: dict[str, Any]
-    if chain:
-        from runtime.report import eye_chain
-
-        rows = eye_chain.measure(folder)
-        measured, told = {"chain": rows}, eye_chain.told(rows)
-    else:
-        measured = benchmark.measure(folder)
-        told = benchmark.told(measured)
-    print(to_json(measured) if as_json else told)
+    measured = benchmark.measure(folder)
+    print(to_json(measured) if as_json else benchmark.told(measured))
 
 
 @app.command()

@@ -68,15 +68,14 @@ class Watched:
             self.lights.append(Light(frame, layers, drawn, info["solved_for_m"], info["true_eyes_m"]))
 
 
-def simulated_run(settings: Settings, *, scale: float, keep_light: int = 0, quality: bool = False) -> Watched:
-    """The daemon's own loop on a recording, on the simulated clock, to its end.
+def simulated_run(settings: Settings, *, scale: float, keep_light: int) -> Watched:
+    """The daemon's own loop on a recording, on the simulated clock, to its end; keep_light: refreshes between lights.
 
-    keep_light: refreshes from one to the next, 0: none; quality: the summary has the run's own decibels.
     Raises FatalError.
     """
     watched = Watched()
     with ExitStack() as cleanup:
-        options = RunOptions(max_speed=True, measure=quality, scale=scale, keep_light=keep_light)
+        options = RunOptions(max_speed=True, measure=False, scale=scale, keep_light=keep_light)
         run = build_run(settings, options, cleanup, output=watched)
         run.presenter.run()
         run.observer.finish()

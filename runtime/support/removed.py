@@ -71,6 +71,7 @@ REMOVED_COMMANDS: dict[str, str] = {
     "report --fresh": "take it out: nothing is kept; the page grows while it is measured",
     "bench robust": "`report --pairs DIR` measures pairs of your own",
     "bench passes": "nothing: it was a developer's count of OpenGL passes",
+    "bench eyes --chain": "`bench eyes FOLDER` says in mm how far off the eyes are; `run --out` measures dB",
     "bench --backend": "`solve --backend gl --repeat 20` times a backend",
     "solve --config": "take it out: the defaults hold; --backend and --no-plan are options",
     "demo --model": "`run --replay demo --headless --max-speed --model NAME --out DIR`",
