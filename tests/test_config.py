@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -13,12 +12,12 @@ import pytest
 
 from runtime.commands.app import app
 from runtime.config import Settings, load_settings, load_stack, with_options
-from runtime.daemon.names import check_names, scene_from_here, scene_names
+from runtime.daemon.names import scene_from_here, scene_names
 from runtime.errors import InputError
 from runtime.support import cache
 from runtime.support.artifacts import write_png
 from runtime.support.removed import REMOVED_COMMANDS, removed_command
-from tests.test_cli import phasestack, refusal
+from tests.test_cli import phasestack
 
 
 def loaded(folder: Path, text: str) -> Settings:
@@ -152,51 +151,6 @@ def test_paths_are_relative_to_the_file_and_names_stay_names(tmp_path: Path, mon
     assert (names.content.scene, names.model.name, names.sensor.source) == ("demo", "fast", "demo")
     serial = loaded(folder, '[sensor]\ndriver = "openni2"\nsource = "1d27/0601@1/5"\n')
     assert serial.sensor.source == "1d27/0601@1/5", "a device's URI is no path"
-
-
-def test_a_file_beside_the_configuration_is_found_from_any_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from runtime.eyes.calibration import DEMO_FILE
-
-    shutil.copy(DEMO_FILE, tmp_path / "calibration.toml")
-    config = tmp_path / "phasestack.toml"
-    config.write_text('[calibration]\nfile = "calibration.toml"\n')
-    monkeypatch.chdir("/")
-    app(["config", "--check", str(config)], standalone_mode=False)
-    assert capsys.readouterr().out == f"{config}: valid\n"
-
-
-@pytest.mark.parametrize(
-    ("text", "field", "said"),
-    [
-        ('[sensor]\ndriver = "openni"', "sensor.driver", "did you mean openni2?"),
-        ('[sensor]\ndriver = "crystal-ball"', "sensor.driver", "known: replay, fixed, openni2, usb-eyes"),
-        ('[sensor]\nsource = "missing.mcap"', "sensor.source", "is not there"),
-        ('[calibration]\nfile = "missing.toml"', "calibration.file", "is not there"),
-        ('[content]\nscene = "lego_buldozer"', "content.scene", "did you mean lego_bulldozer?"),
-        ('[content]\nscene = "missing.glb"', "content.scene", "is not there"),
-        ('[content]\nfile = "missing.ply"', "content.file", "is not there"),
-        ('[model]\nname = "balancd"', "model.name", "did you mean balanced?"),
-        ('[model]\nname = "missing.onnx"', "model.name", "is not there"),
-        ('[[output.panels]]\nlut = "missing.csv"\n' * 3, "output.panels.0.lut", "is not there"),
-        ('[output]\nkind = "windows"', "output.panels", "one table a panel"),
-        ('[output]\nkind = "span"\n' + "[[output.panels]]\n" * 3, "output.panels.0", "names no monitor"),
-    ],
-)
-def test_check_knows_every_name_and_looks_for_every_file(tmp_path: Path, text: str, field: str, said: str) -> None:
-    settings = loaded(tmp_path, text)
-    with pytest.raises(InputError) as told:
-        check_names(settings, source="a.toml")
-    assert str(told.value).startswith(f"a.toml: {field}: ")
-    assert said in str(told.value)
-
-
-def test_check_names_the_file(tmp_path: Path) -> None:
-    config = tmp_path / "phasestack.toml"
-    config.write_text('[model]\nname = "balancd"\n')
-    told = refusal("config", "--check", config)
-    assert told == f"{config}: model.name: nobody knows 'balancd': did you mean balanced?"
 
 
 @pytest.mark.parametrize("given", [{"scene": "s" * 5000}, {"replay": "a\0b"}, {"model": "m" * 300}])

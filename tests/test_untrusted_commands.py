@@ -51,7 +51,7 @@ def folder(tmp_path: Path) -> Path:
         ("plan --config {folder}/deep.json", "deep.json: JSON is nested deeper than 64"),
         ("calibrate solve --pairs {folder}/fifo.csv --out {out}/a.toml", "fifo.csv: is a FIFO"),
         ("calibrate solve --pairs {folder}/deep.json --out {out}/a.toml", "deep.json: JSON is nested deeper than 64"),
-        ("config --check {folder}/fifo.toml", "fifo.toml: is a FIFO"),
+        ("doctor --config {folder}/fifo.toml", "fifo.toml: is a FIFO"),
         ("status --config {folder}/fifo.toml", "fifo.toml: is a FIFO"),
         ("calibrate panels --photos {long} --out {out}", "File name too long"),
         ("calibrate capture --replay demo --out {long}.csv", "File name too long"),

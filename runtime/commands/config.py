@@ -3,37 +3,20 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 
-def config(
-    check: Annotated[
-        Path | None, typer.Option(help="a configuration to check instead of printing: values, names and files")
-    ] = None,
-) -> None:
+def config() -> None:
     """Print a complete configuration: every setting, its default and what it means. It is valid TOML.
 
-    Paths in a configuration are relative to its folder. --check refuses values that make no sense, names that nobody
-    knows and files that are not there.
+    Paths in a configuration are relative to its folder. `phasestack doctor --config FILE` checks one.
 
     Example: phasestack config > phasestack.toml
-
-    Example: phasestack config --check phasestack.toml
     """
-    from runtime.config import load_settings
+    from runtime.config import Settings
 
-    settings = load_settings(check)
-    if check is not None:
-        from runtime.daemon.names import check_names
-
-        check_names(settings, source=check)
-        typer.echo(f"{check}: valid")
-    else:
-        print("# Paths are relative to this file's folder.")
-        typer.echo("\n".join(_lines(type(settings), settings, "")))
+    print("# Paths are relative to this file's folder.")
+    print("\n".join(_lines(Settings, Settings(), "")))
 
 
 def _lines(model: Any, values: Any, prefix: str) -> list[str]:

@@ -17,7 +17,7 @@ def doctor(
     config: Annotated[Path | None, typer.Option(help="configuration to check; without one, the defaults")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
 ) -> None:
-    """Check sensor, permissions, OpenGL, monitors and their binding, model, calibration and the service.
+    """Check settings, sensor, permissions, OpenGL, monitors and their binding, scene, model, calibration, the service.
 
     What is only unusual is a warning. Exits with 1 where a check fails.
 

@@ -160,14 +160,12 @@ def monitors(settings: Settings) -> Iterator[Row]:
         yield Row("panels", "warn", difference, "set them to the same mode")
 
 
-def eyes(settings: Settings) -> Iterator[Row]:
-    """The networks that find eyes load and run, and see nobody in an empty picture."""
-    import numpy as np
+def content(settings: Settings) -> Iterator[Row]:
+    """The scene is there and can be read."""
+    from runtime.content.registry import prepare_content
 
-    from runtime.eyes.pupils import find_eyes
-
-    nobody = find_eyes(np.zeros((480, 640, 3), np.uint8)) is None
-    yield Row("eyes", "ok" if nobody else "fail", "eyes are found by networks that run here")
+    prepare_content(settings.content, settings.stack.stack())
+    yield Row("content", "ok", settings.content.scene)
 
 
 def model(settings: Settings) -> Iterator[Row]:
@@ -252,7 +250,7 @@ CHECKS: dict[str, Check] = {
     "usb": usb,
     "sensor": sensor,
     "calibration": calibration,
-    "eyes": eyes,
+    "content": content,
     "model": model,
     "service": service,
 }

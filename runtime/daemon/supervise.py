@@ -19,7 +19,6 @@ from runtime.daemon.build import Host, Run, RunOptions
 from runtime.daemon.commands import PLACING, Command
 from runtime.daemon.drive import drive
 from runtime.daemon.metrics import Metrics
-from runtime.daemon.names import check_recording
 from runtime.daemon.notify import Notifier
 from runtime.daemon.reconfigure import Reconfiguration
 from runtime.daemon.server import StatusServer, open_status_server
@@ -271,7 +270,6 @@ def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> di
     Raises FatalError where the configuration or a file is wrong, TransientError where starting again may help.
     """
     settings = read_settings()
-    check_recording(settings, source="run")  # before seconds go into content and models
     service, clock = settings.service, MonotonicClock()
     logs.configure()
     with ExitStack() as cleanup:

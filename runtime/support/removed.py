@@ -110,6 +110,7 @@ REMOVED_COMMANDS: dict[str, str] = {
     "export --base-width": "take it out: a checkpoint tells its own width",
     "report --compare": "take it out: it compares, but with --quick",
     "report --no-compare": "`report --quick` leaves the published network out",
+    "config --check": "`doctor --config FILE` checks values, names and files, and tries what they name",
     "config --json": "`config` prints TOML",
     "setup --device": "photographs in the folder --photos",
 }

@@ -55,8 +55,8 @@ def test_monitors_without_an_x_server_fail_with_a_remedy(tmp_path: Path) -> None
             {"sensor": "unknown", "calibration": "missing.toml", "model": "missing.onnx"},
         ),
         (
-            '[sensor]\nsource = "missing.mcap"\n[model]\nprovider = "tensorrt"',
-            {"sensor": "missing.mcap", "model": "tensorrt"},
+            '[sensor]\nsource = "missing.mcap"\n[model]\nprovider = "tensorrt"\n[content]\nscene = "lego_buldozer"',
+            {"sensor": "missing.mcap", "model": "tensorrt", "content": "did you mean lego_bulldozer?"},
         ),
     ],
 )
