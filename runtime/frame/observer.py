@@ -23,7 +23,7 @@ from runtime.frame.presenter import Refresh
 from runtime.frame.solver_host import SolverHost
 from runtime.frame.truth import TrueEyes
 from runtime.optics.alignment import shown_layers
-from runtime.optics.carried import carried_quality, light_psnrs_db
+from runtime.optics.carried import carried_db, light_psnrs_db
 from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import retina_pictures
@@ -235,15 +235,12 @@ class RunObserver:
             return None
         stack, fov_deg, solved_for_m = self._stack, self._fov_deg, account.solved_for_m
 
-        def seen(name: str, eyes_m: F64) -> tuple[EyeViews, float]:
-            """From where the eyes are: against their own truth, and the carried quality, dB."""
-            carried = carried_quality(
-                layers, drawn["solved"], stack, solved_for_m=solved_for_m, eyes_m=eyes_m, fov_deg=fov_deg
-            )
-            return displayed(layers, drawn[name], stack, eyes_m=eyes_m, fov_deg=fov_deg), carried.psnr_db
+        def seen_db(of: str, *, solved_for_m: F64, eyes_m: F64) -> float:
+            """One ray a pixel, against the pictures of some eyes."""
+            return carried_db(layers, drawn[of], stack, solved_for_m=solved_for_m, eyes_m=eyes_m, fov_deg=fov_deg)
 
         try:
-            views, carried_db = seen("used", account.eyes_m)
+            views = displayed(layers, drawn["used"], stack, eyes_m=account.eyes_m, fov_deg=fov_deg)
             light = light_psnrs_db(
                 layers,
                 drawn["solved"],
@@ -255,11 +252,11 @@ class RunObserver:
                 step=LIGHT_STEP,
             )
             moment = Moment(layers, views, light[PUPIL_SIGMA_MM], _where(account))
-            quality = views.quality
-            values = [moment.light_db, quality.psnr_db, quality.ssim, carried_db]
+            values = [moment.light_db, views.quality.psnr_db, views.quality.ssim]
+            values.append(seen_db("solved", solved_for_m=solved_for_m, eyes_m=account.eyes_m))
             if true_m is not None:
-                true_views, true_carried_db = seen("true", true_m)
-                values += [true_views.quality.psnr_db, true_carried_db]
+                values.append(seen_db("true", solved_for_m=true_m, eyes_m=true_m))
+                values.append(seen_db("solved", solved_for_m=solved_for_m, eyes_m=true_m))
             return Measured(moment, dict(zip(FIGURES, values, strict=False)))
         except ValueError as error:
             log.info("quality: not measured here (%s)", error)

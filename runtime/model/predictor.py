@@ -6,7 +6,7 @@ from importlib import resources
 from pathlib import Path
 
 from runtime.config import ModelSettings
-from runtime.errors import FatalError, InputError
+from runtime.errors import InputError
 from runtime.model.allocator import keep_freed_memory
 from runtime.model.base import Prediction, Predictor
 from runtime.optics.stack import PanelStack
@@ -62,14 +62,8 @@ def load_predictor(name: str, stack: PanelStack, settings: ModelSettings | None 
     if session.contract.input_frame == "chain":
         if not stack.is_evenly_spaced:
             raise InputError(path, "contract.panels", "needs evenly spaced panels; use the model sart")
-        from runtime.model.compiled import KEPT_IN
-        from runtime.model.compiled.level import warm_up
         from runtime.model.unrolled import UnrolledPredictor
 
-        try:
-            warm_up()  # compiled or loaded before the first frame
-        except OSError as error:
-            raise FatalError(f"compiled kernels can't be kept in {KEPT_IN}: {error}") from None
         return UnrolledPredictor(session, stack, threads=settings.threads)
     from runtime.model.network import NetworkPredictor
 

@@ -49,6 +49,12 @@ class UnrolledPredictor(Predictor):
         self._states: dict[tuple[int, int], SolverState] = {}  # by the size of what is solved
         self._assemblies: dict[tuple[int, int], Assembly] = {}
 
+    def warm_up(self, eyes_m: F64) -> None:
+        from runtime.model.compiled.level import warm_up  # noqa: PLC0415 - other backends need none
+
+        warm_up()  # whatever a later eye, scene or setting needs
+        super().warm_up(eyes_m)
+
     @property
     def backend(self) -> str:  # type: ignore[override]
         return self._backend.name

@@ -91,19 +91,19 @@ def _mix(a: F32, b: F32, weight: F32) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """The rays of an eye's image that looks at the stack's origin: all, or every so-manieth of every such row."""
+    """The rays of an eye's image that looks at the stack's origin."""
 
     from_stack: F64  # (3, 4) `image_from_stack`
     u: F64  # (w,) columns
     v: F64  # (h, 1) rows
 
     @classmethod
-    def of_eye(cls, eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float, step: int = 1) -> Rays:
+    def of_eye(cls, eye_m: ArrayLike, *, width_px: int, height_px: int, fov_deg: float) -> Rays:
         """Of an eye (3,), frame `stack`, whose image is so many pixels large and `fov_deg` wide."""
         return cls(
             image_from_stack(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg),
-            np.arange(0, width_px, step, dtype=np.float64) + 0.5,
-            (np.arange(0, height_px, step, dtype=np.float64) + 0.5)[:, None],
+            np.arange(width_px, dtype=np.float64) + 0.5,
+            (np.arange(height_px, dtype=np.float64) + 0.5)[:, None],
         )
 
     @property
@@ -157,17 +157,16 @@ def seen_by(
     fov_deg: float,
     width_px: int | None = None,
     height_px: int | None = None,
-    step: int = 1,
 ) -> Retina:
     """What a pinhole eye sees (EyeReal supplement, (6), (7)): panel values summed along each ray, then sin².
 
     layers: (N, H, W, 3 or 4), rear to front, uint8 code values or float in [0, 1]; a fourth channel is ignored.
-    The image has the layers' size unless told; step: only every so-manieth ray of every so-manieth row of it.
+    The image has the layers' size unless told.
     Raises ValueError for an eye that is not before every panel.
     """
     eye = checked_eye(eye_m, stack)
     width, height = width_px or layers.shape[2], height_px or layers.shape[1]
-    rays = Rays.of_eye(eye, width_px=width, height_px=height, fov_deg=fov_deg, step=step)
+    rays = Rays.of_eye(eye, width_px=width, height_px=height, fov_deg=fov_deg)
     panels = [(stack.panel(index), _moved(stack, index, eye)) for index in range(stack.count)]
     return through_layers(
         layers, lambda rows: (rays.on(panel, rows, moved=m) for panel, m in panels), rays.toward_panels(), stack

@@ -27,11 +27,11 @@ from runtime.config import Settings, load_settings
 from runtime.errors import InputError
 from runtime.eyes.calibration import load_calibration
 from runtime.eyes.demo_geometry import demo_stack_from_sensor
-from runtime.optics.carried import CarriedView
 from runtime.optics.quality import psnr_db
 from runtime.panels import lut
 from runtime.support.artifacts import read_image
 from tests.calib.photo_scenes import in_frame_of
+from tests.optics.carried_rays import seen_along
 
 STACK = Settings().stack.stack()
 SetUp = tuple[Path, subprocess.CompletedProcess[str], SimulatedHardware]
@@ -131,20 +131,6 @@ def corrected(layers: np.ndarray, true_from_ideal: list[np.ndarray]) -> np.ndarr
     return np.stack(shown)
 
 
-class TrueStackView(CarriedView):
-    """What an eye sees along the carried rays through panels that truly stand elsewhere."""
-
-    def __init__(self, nominal_m: Any, stack: Any, panels: Any, **view: Any) -> None:
-        super().__init__(nominal_m, stack, **view)
-        self._panels = panels
-
-    def _positions(self, true_m: Any, rows: Any) -> Any:
-        for index, (u, v) in enumerate(super()._positions(true_m, rows)):
-            matrix = true_from_ideal_seen(self._panels[index], true_m, self._stack, index)
-            places = through(matrix, np.column_stack([u.ravel(), v.ravel()]))
-            yield places[:, 0].reshape(u.shape), places[:, 1].reshape(v.shape)
-
-
 def sent_through(layers: np.ndarray, settings: Settings, hardware: SimulatedHardware, *, curves: bool) -> np.ndarray:
     """(N, h, w, 3) codes of the phases that the simulated panels turn to for layers, by their configured curves."""
     found = np.empty_like(layers)
@@ -172,11 +158,15 @@ def carried_db(
     errors = []
     for side, name in enumerate(("left", "right")):
         drawn = read_image(light / f"drawn-{name}.png")
-        view = TrueStackView(
-            told["solved_for_m"][side], stack, panels, width_px=drawn.shape[1], height_px=drawn.shape[0],
-            fov_deg=told["fov"],
+        true_m = np.array(told["eyes_m"][side])
+
+        def truly(index: int, places: np.ndarray, true_m: np.ndarray = true_m) -> Any:
+            return through(true_from_ideal_seen(panels[index], true_m, stack, index), places)
+
+        seen = seen_along(
+            told["solved_for_m"][side], true_m, layers, stack, width_px=drawn.shape[1], height_px=drawn.shape[0],
+            fov_deg=told["fov"], moved=truly,
         )  # fmt: skip
-        seen = view.seen_from(told["eyes_m"][side], layers)
         errors.append(((seen.image - drawn / np.float32(255))[seen.mask] ** 2).ravel())
     return psnr_db(float(np.concatenate(errors).mean()))
 

@@ -17,7 +17,7 @@ import pytest
 from runtime.evaluation import contact_sheet, run_output
 from runtime.evaluation.displayed import displayed
 from runtime.evaluation.run_output import RunOutput
-from runtime.optics.carried import carried_quality
+from runtime.optics.carried import carried_db
 from runtime.optics.stack import PanelStack
 from runtime.records import State
 from runtime.support.artifacts import OutputFolder, read_image
@@ -63,7 +63,7 @@ def test_a_light_holds_what_is_needed_to_judge_it_without_the_run(tmp_path: Path
     told = json.loads((folder / "light.json").read_text())
     again = np.stack([read_image(folder / f"layer-{n}.png") for n in range(3)])
     np.testing.assert_array_equal(again, layers[..., :3])
-    judged = carried_quality(
+    judged = carried_db(
         again,
         [read_image(folder / f"drawn-{eye}.png") for eye in ("left", "right")],
         STACK,
@@ -71,8 +71,8 @@ def test_a_light_holds_what_is_needed_to_judge_it_without_the_run(tmp_path: Path
         eyes_m=told["true_eyes_m"],
         fov_deg=told["fov"],
     )
-    here = carried_quality(layers, drawn, STACK, solved_for_m=EYES, eyes_m=info["true_eyes_m"], fov_deg=40.0)
-    assert judged.psnr_db == pytest.approx(here.psnr_db, abs=1e-9)
+    here = carried_db(layers, drawn, STACK, solved_for_m=EYES, eyes_m=info["true_eyes_m"], fov_deg=40.0)
+    assert judged == pytest.approx(here, abs=1e-9)
 
 
 def test_the_last_frame_leaves_its_layers_and_what_the_eyes_see(tmp_path: Path) -> None:

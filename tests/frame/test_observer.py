@@ -18,7 +18,7 @@ from runtime.frame.presenter import Refresh
 from runtime.frame.solver_host import Task
 from runtime.model.predictor import Predictor
 from runtime.optics.alignment import align, shown_layers
-from runtime.optics.carried import carried_quality
+from runtime.optics.carried import carried_db
 from runtime.plan.drawing import drawn_for, retina_pictures
 from runtime.records import PanelFrame, RefreshAccount, SensorFrame, Solution, State
 from runtime.support.background import wait_for_all
@@ -179,7 +179,7 @@ def test_quality_is_of_what_the_panels_show_at_the_eyes_used_and_at_the_true_one
         wanted = retina_pictures(content, eyes_m, SMALL, time_ns=0, **how)
         exact = displayed(layers, wanted, SMALL, eyes_m=eyes_m, **how).quality.psnr_db
         drawn = retina_pictures(content, EYES, SMALL, time_ns=0, **how)
-        return exact, carried_quality(layers, drawn, SMALL, solved_for_m=EYES, eyes_m=eyes_m, **how).psnr_db
+        return exact, carried_db(layers, drawn, SMALL, solved_for_m=EYES, eyes_m=eyes_m, **how)
 
     summary = observer.means.summary()
     assert (summary["psnr_db"], summary["carried_db"]) == pytest.approx(psnr(used), abs=0.001)

@@ -44,9 +44,10 @@ def test_the_judgement_is_that_of_the_optics(pair: StillPair) -> None:
     assert seen.light_db["1"] != pytest.approx(seen.expected_db["1"], abs=0.01)
     for distance in ("2mm", "6mm"):
         own = [view for view in pair.off if f"{view.mm:g}mm" == distance]
-        alone = [seen_by(view.eye_m, layers, STACK, fov_deg=pair.fov_deg, step=3) for view in own]
+        alone = [seen_by(view.eye_m, layers, STACK, fov_deg=pair.fov_deg) for view in own]
+        part = (slice(None, None, 3),) * 2
         values = [
-            quality([r.image], [intensities(v.image, 3)], [r.mask], similarity=False).psnr_db
+            quality([r.image[part]], [intensities(v.image)[part]], [r.mask[part]], similarity=False).psnr_db
             for r, v in zip(alone, own, strict=True)
         ]
         assert found.psnr_db_off_eye[distance] == pytest.approx(np.mean(values), abs=2e-3)

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 from contextlib import suppress
 from importlib import metadata, resources
 from pathlib import Path
 
+# Before its import. The highest level compiles a fifth longer, and nothing runs faster by it.
+os.environ.setdefault("NUMBA_OPT", "2")
 import numba
 
 from runtime.support.cache import digest, user_cache
 
 log = logging.getLogger("phasestack.model")
+ROOM = 32 << 20  # bytes free, where compiled code is kept: it takes three MiB
 
 
 def _kept() -> Path | None:
@@ -21,8 +25,8 @@ def _kept() -> Path | None:
     folder = user_cache("compiled") / digest(sources, metadata.version("numba"))
     with suppress(OSError):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    if os.access(folder, os.W_OK):
-        return folder
+        if os.access(folder, os.W_OK) and shutil.disk_usage(folder).free > ROOM:
+            return folder
     log.warning("compiled kernels can't be kept in %s: every start compiles them anew", folder)
     return None
 

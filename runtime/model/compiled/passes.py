@@ -104,7 +104,7 @@ def correct(
     for k in range(TILE):
         weights[0, U(k)] = one
         weights[1, U(k)] = one
-    done = needs[first, 0]
+    outer, done = (panels, (panels[0], moved)), needs[first, 0]
     for q in range(first, last):
         for r in range(max(done, needs[q, 0]), needs[q, 1] + 1):
             line, down = U(r % ring_rows), fade_rows[U(r)]
@@ -113,14 +113,10 @@ def correct(
                 pixels = min(size_of_tile, width - tile * size_of_tile)
                 count = pixels * channels
                 for side in range(2):
-                    _lacks(
-                        panels, sizes, near, targets[side], seen[side], r, tile, pixels, channels, 2 * side, start,
-                        seen_layout, row, tiles, tiles[2 + side],
-                    )  # fmt: skip
-                    if unsure:
+                    for part in range(2 if unsure else 1):
                         _lacks(
-                            (panels[0], moved), sizes, near, targets[side], seen[side], r, tile, pixels, channels,
-                            2 * side, start, seen_layout, row, tiles, tiles[4 + side],
+                            outer[part], sizes, near, targets[side], seen[side], r, tile, pixels, channels, 2 * side,
+                            start, seen_layout, row, tiles, tiles[2 + 2 * part + side],
                         )  # fmt: skip
                 if floor < one:
                     _weigh(targets[0], U(r), begin, count, floor, most, weights[0])
@@ -140,17 +136,14 @@ def correct(
             begin, at = U(tile * size_of_tile * channels), U(q)
             pixels = min(size_of_tile, sizes[0, 1] - tile * size_of_tile)
             count, lacked, weight = pixels * channels, tiles[3], tiles[5]
-            for side in range(2):
-                sum_where(
-                    tiles[2 * side], ring[side], ring_rows, height, width, near, back[side], q, tile, pixels,
-                    channels, side, none, back_layout, row, tiles[2 + side],
-                )  # fmt: skip
-            if floor < one:
+            for part in range(2 if floor < one else 1):  # residuals, and what they weigh
                 for side in range(2):
                     sum_where(
-                        tiles[4 * side], ring[2 + side], ring_rows, height, width, near, back[side], q, tile,
-                        pixels, channels, side, whole, back_layout, row, tiles[4 + side],
+                        tiles[side * (2 + 2 * part)], ring[2 * part + side], ring_rows, height, width, near,
+                        back[side], q, tile, pixels, channels, side, whole if part else none, back_layout, row,
+                        tiles[2 + 2 * part + side],
                     )  # fmt: skip
+            if floor < one:
                 for k in range(count):
                     lacked[U(k)] *= np.float32(2) * whole / weight[U(k)]
             if shown:
