@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from calib.capture import midpoint
-from calib.hardware import SetupHardware, eye_finder
+from calib.hardware import SetupHardware
 from calib.pairs import PairRow, PairsFile
 from calib.viewpoints import grid
 from calib.walk import Walk
 from runtime.clock import NS_PER_S, SimulatedClock
 from runtime.config import Settings
-from runtime.errors import EndOfRecording, InputError
-from runtime.records import SensorFrame
-from runtime.sensor.base import SteppedSensor
+from runtime.errors import InputError
+from runtime.eyes.detect import EyeFinder
 from runtime.sensor.registry import open_sensor
+from runtime.sensor.samples import RecordedSamples
 
 
 def capture_live(
@@ -45,33 +47,20 @@ def capture_live(
 
 def capture_recording(out: Path, settings: Settings, *, source: str) -> dict[str, Any]:
     """A pair for every sample of a recording that knows its true eyes. Raises InputError."""
-    chosen = settings.sensor.model_copy(update={"driver": "replay", "source": source, "loop": False, "start_s": 0.0})
-    driver = open_sensor(chosen, SimulatedClock())
-    if not isinstance(driver, SteppedSensor):
-        raise InputError(source, "", "cannot be replayed sample by sample")
+    chosen = settings.sensor.model_copy(update={"driver": "replay", "source": source, "loop": False})
+    samples = RecordedSamples(open_sensor(chosen, SimulatedClock()), lambda: EyeFinder(settings).find)
     file, pairs, known = PairsFile(out), [], False
-    with driver:
-        if driver.capabilities.in_stack_frame:
-            raise InputError(source, "", "its eyes are in the stack's frame already: there is nothing to calibrate")
-        find = eye_finder(driver, settings)
-        for frame in _all_samples(driver):
+    with closing(samples):
+        for frame in samples.arrived(sys.maxsize):
             if frame.true_eyes_m is None:
                 continue
             known = True
-            middle = midpoint(find(frame))
+            middle = midpoint(frame.eyes)
             if middle is not None:
                 name = f"at {frame.capture_ns / NS_PER_S:.3f} s"
-                pairs.append(PairRow.of(middle, frame.true_eyes_m.mean(axis=0), name, serial=driver.serial))
+                pairs.append(PairRow.of(middle, frame.true_eyes_m.mean(axis=0), name, serial=samples.serial))
     if not pairs:
         why = "gives no pair: no usable eyes" if known else "does not know where the eyes truly were"
         raise InputError(source, "", f"{why}: capture from the live sensor")
     file.accept(*pairs)
     return {"file": str(out), "pairs": len(file), "accepted": len(pairs)}
-
-
-def _all_samples(driver: SteppedSensor) -> Iterator[SensorFrame]:
-    while True:
-        try:
-            yield driver.next_sample()
-        except EndOfRecording:
-            return

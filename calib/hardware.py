@@ -27,7 +27,7 @@ from runtime.optics.malus import phase_from_intensity
 from runtime.optics.stack import PanelStack
 from runtime.panels.card import identity_card
 from runtime.panels.monitors import Monitor
-from runtime.records import F64, U8, EyePoints, SensorFrame
+from runtime.records import F64, U8, EyePoints
 from runtime.sensor.registry import open_sensor
 from runtime.sensor.worker import OPEN_TIMEOUT_S, SensorWorker
 
@@ -37,14 +37,6 @@ Named = tuple[str, U8]  # a photograph (h, w), and what to call it
 Sample = tuple[int, EyePoints | None, str]  # when it was taken, eyes in frame `sensor`, the sensor's serial
 POLL_NS = 20 * NS_PER_MS
 CARD_CHARACTERS = 32  # of a line on a card
-
-
-def eye_finder(driver: Any, settings: Settings) -> Callable[[SensorFrame], EyePoints | None]:
-    """Eyes of a frame in frame `sensor`: the sensor's own, or found in its images."""
-    if driver.capabilities.eye_points:
-        return lambda frame: frame.eyes
-    finder = EyeFinder(settings)
-    return lambda frame: frame.eyes if frame.eyes is not None else finder.find(frame)
 
 
 class SetupHardware:
@@ -60,7 +52,6 @@ class SetupHardware:
         self._bound: Any = None  # the output settings that words are shown on
         self._cards: tuple[list[U8], tuple[Monitor, ...]] = ([], ())
         self._worker: SensorWorker | None = None
-        self._find: Any = None
 
     def poll(self) -> Key | None:
         """A key that was pressed in the terminal or on a panel's window, which stays alive by being asked."""
@@ -130,7 +121,12 @@ class SetupHardware:
         """Start the sensor and wait for it; returns what it is. Raises InputError."""
         self._stop_sensor()
         open_sensor(settings.sensor, self._clock)  # refuses unknown names before anything starts
-        worker = SensorWorker(lambda: open_sensor(settings.sensor, self._clock), settings.sensor, self._clock)
+        worker = SensorWorker(
+            lambda: open_sensor(settings.sensor, self._clock),
+            settings.sensor,
+            self._clock,
+            lambda: EyeFinder(settings).find,
+        )
         worker.start()
         self._worker = worker
         until_ns = self._clock.now_ns() + round(OPEN_TIMEOUT_S * NS_PER_S)
@@ -145,7 +141,6 @@ class SetupHardware:
         if worker.capabilities.in_stack_frame:
             self._stop_sensor()
             raise InputError("sensor", "driver", "its eyes are in the stack's frame already: nothing to calibrate")
-        self._find = eye_finder(worker, settings)
         return f"{settings.sensor.driver} {worker.serial}".strip()
 
     def sample(self, standing_at: Viewpoint) -> Sample | None:
@@ -158,7 +153,7 @@ class SetupHardware:
         if self._worker.error is not None:
             raise self._worker.error
         frames = self._worker.take()
-        return (frames[-1].capture_ns, self._find(frames[-1]), self._worker.serial) if frames else None
+        return (frames[-1].capture_ns, frames[-1].eyes, self._worker.serial) if frames else None
 
     def chart(self, settings: Settings) -> ChartDisplay | None:
         """What shows charts and captions while capturing; None: nobody sees any."""

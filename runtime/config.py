@@ -136,9 +136,6 @@ class SensorSettings(Section):
         0.5, description="without a new sample for this long the sensor counts as stalled"
     )
     loop: bool = Field(False, description="driver `replay`: begin again at the end")
-    start_s: Annotated[float, within(0.0, 604_800.0, "s")] = Field(
-        0.0, description="driver `replay`: begin this far into the recording"
-    )
     openni2_folder: str = Field(
         "", description="driver `openni2`: folder of libOpenNI2.so and OpenNI2/Drivers; empty: the system's"
     )

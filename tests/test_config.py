@@ -44,7 +44,6 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         ("[calibration]\nviewing_m = [400, 600]", "calibration.viewing_m.0", "did you mean millimetres (0.4)?"),
         ("[content]\npicture_rate_hz = 1e-300", "content.picture_rate_hz", "may be 0.01 to 1000 Hz"),
         ("[tracker]\nhold_s = 500", "tracker.hold_s", "did you mean milliseconds (0.5)?"),
-        ("[sensor]\nstart_s = 1e300", "sensor.start_s", "beyond"),
         ("[sensor]\nfixed_eyes_m = [[600, -31, 0], [600, 31, 0]]", "sensor.fixed_eyes_m.0.0", "millimetres (0.6)"),
         ("[content]\ndepth_m = [-50, 50]", "content.depth_m.0", "did you mean millimetres (-0.05)?"),
         ("[loop]\nrate_hz = 60000", "loop.rate_hz", "may be 1 to 1000 Hz"),

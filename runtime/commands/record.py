@@ -114,11 +114,8 @@ def _contents(summary: dict[str, Any]) -> str:
 
 def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | None) -> dict[str, Any]:
     """Record until the time is up, a limit is reached, the source ends or Ctrl-C. Raises FatalError, InputError."""
-    from dataclasses import replace
-
     from runtime.clock import NS_PER_S, MonotonicClock
     from runtime.eyes.detect import EyeFinder
-    from runtime.sensor.detecting import DetectingDriver
     from runtime.sensor.recording import RecordingLimits, recording_to
     from runtime.sensor.recording_format import RecordingHeader
     from runtime.sensor.registry import open_sensor
@@ -126,9 +123,7 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
     from runtime.support import progress
 
     clock, s = MonotonicClock(), settings.sensor
-    worker = SensorWorker(
-        lambda: DetectingDriver(open_sensor(s, clock), lambda: EyeFinder(settings).find, keep_images=images), s, clock
-    )
+    worker = SensorWorker(lambda: open_sensor(s, clock), s, clock, lambda: EyeFinder(settings).find, keep_images=images)
     limits, stopped = RecordingLimits(seconds) if seconds else RecordingLimits(), "the time is up"
     writer, first_ns, so_far_s = None, 0, 0.0
     holds: dict[str, None] = {}
@@ -149,13 +144,12 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
                         truth=frame.true_eyes_m is not None,
                     )
                     writer = cleanup.enter_context(recording_to(out, header, limits=limits))
-                kept = frame if images else replace(frame, colour=None, depth_mm=None)
-                if not writer.write(kept):
+                if not writer.write(frame):
                     if frame.capture_ns - first_ns <= limits.max_s * NS_PER_S:
                         stopped = "it would be larger than 2 GiB"
                     break
                 so_far_s = (frame.capture_ns - first_ns) / NS_PER_S
-                holds |= dict.fromkeys(_streams(kept))
+                holds |= dict.fromkeys(_streams(frame))
                 progress.tell(f"recording: {writer.count} samples, seconds", round(so_far_s), round(limits.max_s))
             else:
                 if worker.state in OVER:

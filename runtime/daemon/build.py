@@ -30,14 +30,12 @@ from runtime.panels.registry import open_panels
 from runtime.plan.savings import Saving
 from runtime.records import RefreshAccount
 from runtime.sensor.base import Sensor
-from runtime.sensor.detecting import DetectingDriver
 from runtime.sensor.registry import open_sensor
-from runtime.sensor.samples import RecordedSamples, Samples
+from runtime.sensor.samples import FindEyes, RecordedSamples, Samples
 from runtime.sensor.worker import SensorWorker
 from runtime.support.gl import offscreen_context
 from runtime.support.memory import gc_frozen
 from runtime.support.priority import PRESENTER_NICENESS, niceness
-from runtime.support.progress import listening
 
 log = logging.getLogger("phasestack.build")
 
@@ -144,19 +142,15 @@ def build_run(
         log.warning("%s", warning)
 
     def make_driver() -> Sensor:
-        latency_ms = settings.loop.sensor_latency_ms
-        driver = open_sensor(settings.sensor, clock, latency_ms=latency_ms)
-        return DetectingDriver(driver, lambda: EyeFinder(settings).find)
+        return open_sensor(settings.sensor, clock, latency_ms=settings.loop.sensor_latency_ms)
 
-    def keep_on(what: str, done: int, total: int | None) -> None:
-        if not host.starting("reading the recording"):
-            raise Stopped("told to stop while starting")
+    def make_find() -> FindEyes:
+        return EyeFinder(settings).find
 
     driver = make_driver()
     samples: Samples
     if simulated:
-        with listening(keep_on):  # a recording may be long to skip through
-            samples = RecordedSamples(driver)
+        samples = RecordedSamples(driver, make_find)
         cleanup.callback(samples.close)
     context = offscreen_context()
     cleanup.callback(context.release)
@@ -172,7 +166,7 @@ def build_run(
         solver = thread = SolverThread(maker, clock, first_cost_ns=total_ns(stage_ms))
         cleanup.callback(solver.close)
         thread.wait_ready(lambda: host.starting("loading content and model"), max_s=settings.limits.start_s)
-        samples = worker = SensorWorker(make_driver, settings.sensor, clock)
+        samples = worker = SensorWorker(make_driver, settings.sensor, clock, make_find)
         cleanup.callback(worker.close)
         worker.start()
     if maker.run is None:

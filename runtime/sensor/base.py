@@ -97,21 +97,16 @@ class SteppedSensor(Sensor):
 
     @abstractmethod
     def peek(self) -> SensorFrame | None:
-        """What `next_sample` will deliver, or None where nothing is left. Its eyes may not be searched for yet.
-
-        Raises SensorLost.
-        """
+        """What `next_sample` will deliver, or None where nothing is left. Raises SensorLost."""
 
     @abstractmethod
     def available_ns(self, frame: SensorFrame) -> int:
         """When a sample arrives, on the run's clock: the caller lets its clock pass until then."""
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
-        frame = self._first_due(timeout_s)
-        now_ns = self._clock.now_ns()
-        while self._is_due(now_ns):
-            frame, self.skipped = self.next_sample(), self.skipped + 1
-        return frame
+        *overtaken, newest = self.read_arrived(timeout_s)
+        self.skipped += len(overtaken)
+        return newest
 
     def read_arrived(self, timeout_s: float) -> list[SensorFrame]:
         frames = [self._first_due(timeout_s)]

@@ -13,19 +13,18 @@ from pathlib import Path
 from typing import IO, Any
 
 from runtime.clock import NS_PER_S
-from runtime.config import LimitSettings
+from runtime.config import LIMITS
 from runtime.errors import InputError
 from runtime.records import Intrinsics, SensorFrame
 from runtime.sensor import recording_format as fmt
 from runtime.sensor.mcap_records import mcap_records
 from runtime.sensor.recording_format import RecordingHeader
-from runtime.support import progress, untrusted_input
+from runtime.support import untrusted_input
 
 CHUNK_BYTES = 4096  # some 20 eye samples
 MESSAGE_OVERHEAD_BYTES = 64
 INDEX_BYTES_PER_CHUNK = 256
 SUMMARY_BYTES = 10_000  # with the schemas
-TELL_EVERY = 1024
 MAGIC = b"\x89MCAP0\r\n"
 
 log = logging.getLogger(__name__)
@@ -150,9 +149,9 @@ def recording_to(
 class Recording:
     """An opened recording. Samples are read as they are asked for: images do not pile up in memory."""
 
-    def __init__(self, path: Path, *, limits: LimitSettings | None = None) -> None:
+    def __init__(self, path: Path) -> None:
         """Reads the header and the first sample. Raises InputError, naming the file."""
-        self.path, self._limits = path, limits or LimitSettings()
+        self.path = path
         self.is_whole = self._ends_well()
         self.header = self._read_header()
         first = next(self.samples(), None)
@@ -174,7 +173,7 @@ class Recording:
         return is_whole
 
     def _opened(self) -> IO[bytes]:
-        return untrusted_input.open_regular(self.path, most_bytes=round(self._limits.file_mib * untrusted_input.MIB))
+        return untrusted_input.open_regular(self.path, most_bytes=LIMITS.file_bytes)
 
     def _read_header(self) -> RecordingHeader:
         for topic, record in self._records():
@@ -193,9 +192,7 @@ class Recording:
 
         topics: dict[int, str] = {}
         with self._opened() as file:
-            for number, record in enumerate(self._to_the_break(file), start=1):
-                if number % TELL_EVERY == 0:
-                    progress.tell(f"{self.path.name}: records read", number)
+            for record in self._to_the_break(file):
                 if isinstance(record, Channel):
                     topics[record.id] = record.topic
                 elif isinstance(record, Message):
@@ -205,9 +202,7 @@ class Recording:
 
     def _to_the_break(self, file: IO[bytes]) -> Iterator[Any]:
         try:
-            yield from mcap_records(
-                file, source=self.path, max_bytes=round(self._limits.chunk_mib * untrusted_input.MIB)
-            )
+            yield from mcap_records(file, source=self.path, max_bytes=round(LIMITS.chunk_mib * untrusted_input.MIB))
         except InputError:
             raise
         except OSError as error:
@@ -237,7 +232,7 @@ class Recording:
                         parts = {}
                     stamp_ns = at_ns
                 if topic == fmt.COLOUR_TOPIC:
-                    parts["colour"] = fmt.colour_from_message(message.data, max_pixels=self._limits.pixels)
+                    parts["colour"] = fmt.colour_from_message(message.data, max_pixels=LIMITS.pixels)
                 elif topic == fmt.DEPTH_TOPIC:
                     parts["depth_mm"] = fmt.depth_from_message(message.data)
                 elif topic == fmt.CALIBRATION_TOPIC:

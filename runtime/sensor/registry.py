@@ -16,8 +16,7 @@ from runtime.support.plugins import is_plugin, plugin_class
 def _replay(settings: SensorSettings, clock: Clock, latency_ms: float) -> Sensor:
     from runtime.sensor.replay import ReplayDriver
 
-    s = settings
-    return ReplayDriver(s.source, clock, loop=s.loop, start_s=s.start_s, latency_ms=latency_ms)
+    return ReplayDriver(settings.source, clock, loop=settings.loop, latency_ms=latency_ms)
 
 
 def _device(name: str) -> Callable[[SensorSettings, Clock, float], Sensor]:

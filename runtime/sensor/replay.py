@@ -10,7 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
-from runtime.config import LimitSettings
+from runtime.config import LIMITS
 from runtime.errors import EndOfRecording, InputError, SensorLost
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, SteppedSensor
@@ -44,20 +44,11 @@ class ReplayDriver(SteppedSensor):
         clock: Clock,
         *,
         loop: bool = False,
-        start_s: float = 0.0,
         latency_ms: float = 0.0,
-        limits: LimitSettings | None = None,
     ) -> None:
-        """source: a recording's path, or `demo`. latency_ms: from a sample's capture to its arrival.
-
-        Raises InputError for a start beyond the longest recording.
-        """
-        self._limits = limits or LimitSettings()
-        if not 0 <= start_s <= self._limits.recording_s:
-            problem = f"is {start_s:g}; a recording has at most {self._limits.recording_s:g} s"
-            raise InputError("sensor", "start_s", problem)
+        """source: a recording's path, or `demo`. latency_ms: from a sample's capture to its arrival."""
         self.path = demo_recording_path() if source == "demo" else Path(source)
-        self._clock, self._loop, self._start_ns = clock, loop, round(start_s * NS_PER_S)
+        self._clock, self._loop = clock, loop
         self._latency_ns = round(latency_ms * NS_PER_MS)
         self.capabilities = Capabilities(eye_points=True, may_pause=True)
         self._frames: Iterator[SensorFrame] | None = None
@@ -69,33 +60,28 @@ class ReplayDriver(SteppedSensor):
         return self._refused
 
     def open(self) -> None:
-        """Raises InputError where the file is not a recording, or ends before the start that was asked for."""
-        recording = Recording(self.path, limits=self._limits)
+        """Raises InputError where the file is not a recording."""
+        recording = Recording(self.path)
         header = recording.header
         self.serial = header.serial
         self.capabilities = Capabilities(header.colour, header.depth, header.eye_points, may_pause=True)
         self._refused = Counter()
         self._frames = self._shifted(recording)
         self._next = next(self._frames, None)
-        if self._next is None:
-            self.close()
-            raise InputError(self.path, "start", "the recording ends before the time to start at")
 
     def _ordered(self, recording: Recording) -> Iterator[SensorFrame]:
-        """Samples from the start on, each later than the one before it. Raises InputError for too long a recording."""
-        start_ns = recording.first.capture_ns + self._start_ns
+        """Samples, each later than the one before it. Raises InputError for too long a recording."""
         last_ns = -1
         for number, frame in enumerate(recording.samples()):
             if frame.capture_ns <= last_ns:
                 self._refuse(OLDER if frame.capture_ns < last_ns else SAME_INSTANT, frame)
                 continue
-            if frame.capture_ns - recording.first.capture_ns > self._limits.recording_s * NS_PER_S:
-                seconds = (frame.capture_ns - recording.first.capture_ns) / NS_PER_S
-                problem = f"sample {number} is {seconds:.6g} s after the first; at most {self._limits.recording_s:g}"
+            seconds = (frame.capture_ns - recording.first.capture_ns) / NS_PER_S
+            if seconds > LIMITS.recording_s:
+                problem = f"sample {number} is {seconds:.6g} s after the first; at most {LIMITS.recording_s:g}"
                 raise InputError(self.path, "capture_ns", problem)
             last_ns = frame.capture_ns
-            if frame.capture_ns >= start_ns:
-                yield frame
+            yield frame
 
     def _refuse(self, reason: str, frame: SensorFrame) -> None:
         if not self._refused[reason]:
@@ -110,7 +96,6 @@ class ReplayDriver(SteppedSensor):
             delivered = 0
             for frame in self._ordered(recording):
                 if delivered == 0 and is_first_round:
-                    # Skipping to the start takes time: the run's clock is read when the first sample is at hand.
                     shift_ns = self._clock.now_ns() - frame.capture_ns
                 elif delivered == 0:
                     shift_ns = last_ns + interval_ns - frame.capture_ns

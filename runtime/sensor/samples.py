@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 from runtime.clock import NS_PER_S
 from runtime.errors import EndOfRecording, InputError
-from runtime.records import SensorFrame
+from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.base import Sensor, SteppedSensor
 
+FindEyes = Callable[[SensorFrame], EyePoints | None]
 AHEAD_NS = NS_PER_S // 10  # more than from a sample to the display time of a refresh that used it
 
 
@@ -37,16 +39,32 @@ class Samples(ABC):
         """Let the sensor go. May be called twice."""
 
 
+def finder(sensor: Sensor, make_find: Callable[[], FindEyes] | None) -> FindEyes | None:
+    """What finds eyes in the pictures of an open sensor; None where it delivers eyes itself."""
+    return None if sensor.capabilities.eye_points or make_find is None else make_find()
+
+
+def searched(frame: SensorFrame, find: FindEyes | None, *, keep_images: bool = False) -> SensorFrame:
+    """A sample with the eyes in its pictures, which go then unless they are asked for."""
+    if find is not None:
+        frame = replace(frame, eyes=find(frame))
+    return frame if keep_images else replace(frame, colour=None, depth_mm=None)
+
+
 class RecordedSamples(Samples):
     """A recording on the simulated clock: each sample arrives at its capture plus the configured latency."""
 
-    def __init__(self, driver: Sensor) -> None:
-        """Raises InputError where the driver can't be stepped, or the recording can't be read."""
+    def __init__(self, driver: Sensor, make_find: Callable[[], FindEyes] | None = None) -> None:
+        """make_find: what finds eyes, made where the recording holds pictures alone.
+
+        Raises InputError where the driver can't be stepped, or the recording can't be read.
+        """
         if not isinstance(driver, SteppedSensor):
             raise InputError("run", "--max-speed", f"needs a recording, not the sensor {driver.name}")
         self._driver = driver
         self.stale_inputs = 0
         driver.open()
+        self._find = finder(driver, make_find)
         self.serial, self.refused_inputs = driver.serial, driver.refused
 
     def arrived(self, now_ns: int) -> list[SensorFrame]:
@@ -65,7 +83,7 @@ class RecordedSamples(Samples):
     def _next_while(self, holds: Callable[[SensorFrame], bool]) -> list[SensorFrame]:
         frames = []
         while (following := self._driver.peek()) is not None and holds(following):
-            frames.append(self._driver.next_sample())
+            frames.append(searched(self._driver.next_sample(), self._find))
         return frames
 
     def close(self) -> None:

@@ -15,7 +15,7 @@ from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
 from runtime.sensor.device_clock import DeviceClock
-from runtime.sensor.samples import Samples
+from runtime.sensor.samples import FindEyes, Samples, finder, searched
 from runtime.support.transient import is_retryable
 
 TIMEOUTS_TO_REOPEN = 2
@@ -58,9 +58,18 @@ class _Attempt:
 class SensorWorker(Samples):
     """Runs a driver in a thread of its own. No method blocks, `close` but for its time-out."""
 
-    def __init__(self, make_driver: Callable[[], Sensor], settings: SensorSettings, clock: Clock) -> None:
-        """make_driver: an unopened driver, a fresh one at each call."""
+    def __init__(
+        self,
+        make_driver: Callable[[], Sensor],
+        settings: SensorSettings,
+        clock: Clock,
+        make_find: Callable[[], FindEyes] | None = None,
+        *,
+        keep_images: bool = False,
+    ) -> None:
+        """make_driver: an unopened driver, a fresh one at each call; make_find: what finds eyes, where it has none."""
         self._make, self._settings, self._clock = make_driver, settings, clock
+        self._make_find, self._keep_images = make_find, keep_images
         self._lock, self._watching = threading.Lock(), threading.Lock()
         self._queue: deque[SensorFrame] = deque()
         self._attempt: _Attempt | None = None
@@ -223,6 +232,7 @@ class SensorWorker(Samples):
         timeouts = 0
         if attempt.abandoned.is_set():
             return
+        find = finder(driver, self._make_find)
         with self._lock:
             self._driver, self.serial = driver, driver.serial
         while not attempt.abandoned.is_set():
@@ -237,10 +247,13 @@ class SensorWorker(Samples):
                 if timeouts >= TIMEOUTS_TO_REOPEN:
                     raise SensorLost(f"nothing new for {timeouts * s.timeout_s:g} s") from error
                 continue
+            overtaken = 0 if find is None else len(frames) - 1  # a search takes a camera's period: only the newest
+            frames = [searched(frame, find, keep_images=self._keep_images) for frame in frames[overtaken:]]
             attempt.received, timeouts = attempt.received + 1, 0
             with self._lock:
                 if attempt.abandoned.is_set():
                     return
+                self._skipped += overtaken
                 for frame in frames:
                     self._keep(self._dated(frame, attempt))
             if self._state is not SensorState.RUNNING:

@@ -41,6 +41,7 @@ REMOVED_SETTINGS: dict[str, str] = {
     "tracker.ipd_min_m": "take the line out: eyes are 50 to 78 mm apart, or no person's",
     "tracker.ipd_max_m": "take the line out: eyes are 50 to 78 mm apart, or no person's",
     "tracker.blend_s": "take the line out: the picture goes flat, and comes back, in 0.3 s",
+    "sensor.start_s": "take the line out: a recording is played from its beginning",
     "sensor.reopen_backoff_s": "take the line out: a lost sensor is reopened after 0.25 s, then every 0.5 s",
     "sensor.reopen_backoff_max_s": "take the line out: a lost sensor is reopened after 0.25 s, then every 0.5 s",
     "sensor.open_timeout_s": "take the line out: opening is given up, and tried anew, after 10 s",

@@ -13,6 +13,7 @@ from typer.testing import CliRunner, Result
 
 from runtime.commands.eyes import eyes as command
 from runtime.errors import InputError
+from runtime.evaluation.motion_recording import write_motion
 from runtime.eyes.benchmark import measure, told
 from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
@@ -91,7 +92,8 @@ def test_without_a_file_the_sensor_is_looked_at(tmp_path: Path) -> None:
     assert done.exit_code == 0 and row["eyes_px"] is None and len(row["eyes_m"]) == 2
     assert row["reason"] == "this sensor delivers eyes and no pictures"
     config = tmp_path / "end.toml"
-    config.write_text("[sensor]\nstart_s = 9.0\n")  # the built-in recording ends after ten seconds
+    write_motion(tmp_path / "second.mcap", "still", seconds=1.0)
+    config.write_text('[sensor]\nsource = "second.mcap"\n')
     live = eyes("--config", config)
     assert live.exit_code == 0 and "left eye" in live.stdout
 

@@ -26,7 +26,7 @@ from calib.grey import fit_series, read_series
 from calib.pairs import read_pairs
 from calib.setup_run import read_progress
 from runtime.clock import MonotonicClock, SimulatedClock
-from runtime.config import LIMITS, ContentSettings, Settings, load_settings, load_stack
+from runtime.config import ContentSettings, Settings, load_settings, load_stack
 from runtime.content.gaussians import load_gaussians
 from runtime.content.mesh import load_mesh
 from runtime.content.pictures import open_frames
@@ -105,7 +105,7 @@ def recordings() -> list[bytes]:
 
 
 def recording(path: Path) -> object:
-    driver = ReplayDriver(str(path), SimulatedClock(), limits=LIMITS)
+    driver = ReplayDriver(str(path), SimulatedClock())
     driver.open()
     return len(taken_until(driver, 1 << 62))
 

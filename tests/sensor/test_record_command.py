@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 from runtime.commands.record import record, record_to
 from runtime.config import Settings, validated
 from runtime.errors import FatalError, InputError
+from runtime.evaluation.motion_recording import write_motion
 from runtime.sensor.recording import Recording
 
 app = typer.Typer()
@@ -41,7 +42,9 @@ def test_a_recording_of_the_demo_has_its_samples(tmp_path: Path) -> None:
 
 
 def test_a_source_that_ends_ends_the_recording(tmp_path: Path) -> None:
-    summary = record_to(tmp_path / "a.mcap", settings(start_s=9.6), images=False, seconds=30)
+    write_motion(tmp_path / "m.mcap", "still", seconds=1.0)
+    source = settings(source=str(tmp_path / "m.mcap"))
+    summary = record_to(tmp_path / "a.mcap", source, images=False, seconds=30)
     assert "no more samples" in summary["stopped"] and summary["samples"] >= 10
 
 

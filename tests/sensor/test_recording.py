@@ -285,34 +285,6 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - base) >> 10)
         assert "bomb.mcap" in told
 
 
-def test_a_stop_is_heard_while_messages_are_skipped(tmp_path: Path) -> None:
-    from mcap.writer import Writer
-
-    from runtime.support.progress import listening
-
-    path, count = tmp_path / "long.mcap", 20_000
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        writer.add_metadata("phasestack.recording", EYES_ONLY.metadata())
-        channel = writer.register_channel("/else", "json", writer.register_schema("s", "jsonschema", b"{}"))
-        for k in range(count):
-            writer.add_message(channel, k, b"{}", k)
-        writer.finish()
-    told = []
-
-    def listener(what: str, done: int, total: None) -> None:
-        told.append(done)
-        if done >= 3000:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt), listening(listener):
-        Recording(path)
-    assert told[-1] < 5000
-    with pytest.raises(InputError, match="no whole sample"):
-        Recording(path)
-
-
 def test_two_recorders_into_one_file_are_one_too_many(tmp_path: Path) -> None:
     path = tmp_path / "o.mcap"
     code = f"from pathlib import Path; from tests.sensor.test_recording import second; second(Path({str(path)!r}))"

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
-from runtime.config import LimitSettings, SensorSettings
+from runtime.config import LIMITS, SensorSettings
 from runtime.errors import EndOfRecording, InputError
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.recording import recording_to
@@ -129,10 +129,11 @@ def test_a_looped_recording_of_equal_times_leaves_no_thread_behind(tmp_path: Pat
     assert [frame.sequence for frame, _ in got[:3]] == [1, 2, 3]
 
 
-def test_a_recording_longer_than_the_limit_is_refused_with_both_figures(tmp_path: Path) -> None:
-    driver = ReplayDriver(
-        str(recorded(tmp_path / "a.mcap", [0.0, 1.0, 500.0])), SimulatedClock(), limits=LimitSettings(recording_s=60)
-    )
+def test_a_recording_longer_than_the_limit_is_refused_with_both_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(LIMITS, "recording_s", 60)
+    driver = ReplayDriver(str(recorded(tmp_path / "a.mcap", [0.0, 1.0, 500.0])), SimulatedClock())
     with pytest.raises(InputError, match=r"500 s.*60"):
         driver.open()
         taken_until(driver, 10**15)

@@ -12,8 +12,8 @@ from runtime.clock import MonotonicClock
 from runtime.config import SensorSettings, Settings
 from runtime.errors import InputError, SensorLost
 from runtime.eyes.detect import EyeFinder
-from runtime.sensor.detecting import DetectingDriver
 from runtime.sensor.registry import open_sensor
+from runtime.sensor.samples import searched
 from tests.eyes.scene import camera, scene
 
 PLACE = np.array([0.05, 0.0, 0.7])
@@ -37,10 +37,11 @@ def settings(source: str) -> SensorSettings:
 def test_eyes_before_a_camera_without_depth_are_in_their_direction_with_a_sigma_along_it(film: str) -> None:
     sensor = settings(film)
     driver = open_sensor(sensor, MonotonicClock())
-    with DetectingDriver(driver, lambda: EyeFinder(Settings(sensor=sensor)).find) as detecting:
-        frames = [detecting.read_newest(1.0) for _ in range(5)]
+    find = EyeFinder(Settings(sensor=sensor)).find
+    with driver:
+        frames = [searched(driver.read_newest(1.0), find) for _ in range(5)]
         with pytest.raises(SensorLost, match="no more pictures"):
-            detecting.read_newest(1.0)
+            driver.read_newest(1.0)
     assert [frame.sequence for frame in frames] == [1, 2, 3, 4, 5]
     middle = frames[-1].eyes.eyes_m.mean(axis=0)
     sigma = np.sqrt(np.diag(frames[-1].eyes.covariance_m2))
