@@ -12,7 +12,6 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
 from typing import Any
 
 INTERRUPTED, BAD_INPUT, OWN_ERROR, MAY_PASS, NOBODY_READS = 130, 2, 70, 75, 141
@@ -31,11 +30,11 @@ def run_guarded(*, interrupts_leave: bool) -> None:
         watch_threads()
         with listening(ShownProgress(sys.stderr)):
             code = _code_of(app, output)
+        _interrupts_leave(interrupts_leave)
     except BaseException as error:
-        code = _ended(_reported, error, output)
-    code = _ended(_flushed, code, output)
-    if interrupts_leave:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt now would find the interpreter half taken down
+        _interrupts_leave(interrupts_leave)
+        code = _reported(error, output)
+    code = _flushed(code, output)
     if _has_hung_thread():  # taking down what a library's own thread still runs in would end in an abort
         from runtime.support import logs
 
@@ -44,12 +43,10 @@ def run_guarded(*, interrupts_leave: bool) -> None:
     sys.exit(code)
 
 
-def _ended(step: Callable[..., int], *arguments: object) -> int:
-    """The exit code of one of the last steps, which a second interrupt may fall into."""
-    try:
-        return step(*arguments)
-    except KeyboardInterrupt:
-        return INTERRUPTED
+def _interrupts_leave(wanted: bool) -> None:
+    """From now on a second interrupt finds nothing to unwind: it ends the process at once."""
+    if wanted:
+        signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
 
 
 def _has_hung_thread() -> bool:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 from typing import Any
-from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
-from prometheus_client import CollectorRegistry, Counter, Enum, Histogram, make_wsgi_app
+from prometheus_client import CollectorRegistry, Counter, Enum, Histogram, start_http_server
 
 from runtime.clock import NS_PER_MS
 from runtime.errors import InputError
@@ -15,20 +13,6 @@ from runtime.records import RefreshAccount, State
 LOOPBACK = "127.0.0.1"
 BUCKETS_MS = (0.1, 0.25, 0.5, 1, 2, 4, 8, 12, 16, 20, 25, 33, 50, 75, 100, 150, 250, 500, 1000)
 BUCKETS_MM = (0.1, 0.2, 0.5, 1, 1.5, 2, 3, 4, 6, 8, 12, 20)
-
-
-class _OneAtATime(WSGIServer):
-    """A crowd of clients takes none of the descriptors that the display needs, as a thread for each would."""
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Who does not ask in time is sent away without a word in the log."""
-
-
-class _Hasty(WSGIRequestHandler):
-    timeout = 1.0  # seconds, for a request to come
-
-    def log_message(self, format: str, *args: Any) -> None:
-        """Scrapes are no news."""
 
 
 class Metrics:
@@ -87,12 +71,10 @@ class Metrics:
 
     def serve(self, port: int) -> None:
         """Answer on loopback, on a thread of its own. Raises InputError where the port is taken."""
-        app = make_wsgi_app(self.registry)
         try:
-            self._server = make_server(LOOPBACK, port, app, server_class=_OneAtATime, handler_class=_Hasty)
+            self._server, _ = start_http_server(port, LOOPBACK, self.registry)
         except OSError as error:
             raise InputError("service", "metrics_port", f"{port} can't be used ({error.strerror})") from error
-        threading.Thread(target=self._server.serve_forever, name="metrics", daemon=True).start()
 
     def close(self) -> None:
         """Stop answering. May be called twice."""

@@ -45,8 +45,6 @@ def _report(error: BaseException) -> str:
 
 def _folders() -> Iterator[Path]:
     """Where such a file belongs, the best place first."""
-    if os.environ.get("LOGS_DIRECTORY"):
-        yield Path(os.environ["LOGS_DIRECTORY"].split(":")[0])
     yield state_folder()
     yield Path(tempfile.gettempdir())
 

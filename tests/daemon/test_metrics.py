@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import socket
 import urllib.request
 from contextlib import ExitStack
@@ -80,18 +79,6 @@ def test_nothing_is_told_that_was_not_measured(metrics: Metrics) -> None:
     for name in ("solution_age_milliseconds", "eye_sigma_millimetres", "photon_latency_milliseconds"):
         assert told[f"phasestack_{name}_count"] == 0
     assert not [name for name in told if "psnr" in name or "fps" in name or "per_second" in name]
-
-
-def test_who_asks_for_nothing_takes_no_descriptors_and_scrapes_are_answered(metrics: Metrics) -> None:
-    port = free_port()
-    metrics.serve(port)
-    before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
-    crowd = [socket.create_connection((LOOPBACK, port), timeout=20) for _ in range(3)]
-    crowd[0].sendall(b"GET /me")
-    assert 'phasestack_state{phasestack_state="starting"}' in scraped(port)
-    assert len(os.listdir("/proc/self/fd")) <= before + len(crowd) + 2  # noqa: PTH208
-    for client in crowd:
-        client.close()
 
 
 def test_a_port_that_is_taken_costs_the_figures_and_not_the_display(metrics: Metrics) -> None:

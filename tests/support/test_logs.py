@@ -187,7 +187,7 @@ def test_journald_gets_a_priority_and_no_time(file: File) -> None:
 def test_a_traceback_is_in_a_file_that_the_line_names(
     file: File, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("LOGS_DIRECTORY", str(tmp_path / "logs"))
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "logs"))
     configured(file.stream)
     try:
         raise ValueError("boom")
