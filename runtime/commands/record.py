@@ -116,7 +116,7 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
     """Record until the time is up, a limit is reached, the source ends or Ctrl-C. Raises FatalError, InputError."""
     from runtime.clock import NS_PER_S, MonotonicClock
     from runtime.eyes.detect import EyeFinder
-    from runtime.sensor.recording import RecordingLimits, recording_to
+    from runtime.sensor.recording import MAX_S, recording_to
     from runtime.sensor.recording_format import RecordingHeader
     from runtime.sensor.registry import open_sensor
     from runtime.sensor.worker import SensorWorker
@@ -124,7 +124,7 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
 
     clock, s = MonotonicClock(), settings.sensor
     worker = SensorWorker(lambda: open_sensor(s, clock), s, clock, lambda: EyeFinder(settings).find, keep_images=images)
-    limits, stopped = RecordingLimits(seconds) if seconds else RecordingLimits(), "the time is up"
+    max_s, stopped = seconds or MAX_S, "the time is up"
     writer, first_ns, so_far_s = None, 0, 0.0
     holds: dict[str, None] = {}
     with ExitStack() as cleanup:
@@ -132,7 +132,7 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
         cleanup.callback(worker.close)
         worker.start()
         try:
-            for frame in _samples(worker, limits.max_s):
+            for frame in _samples(worker, max_s):
                 if writer is None:
                     first_ns, has = frame.capture_ns, worker.capabilities
                     pictures = has if images else None
@@ -143,14 +143,14 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
                         depth=pictures is not None and pictures.depth,
                         truth=frame.true_eyes_m is not None,
                     )
-                    writer = cleanup.enter_context(recording_to(out, header, limits=limits))
+                    writer = cleanup.enter_context(recording_to(out, header, max_s=max_s))
                 if not writer.write(frame):
-                    if frame.capture_ns - first_ns <= limits.max_s * NS_PER_S:
+                    if frame.capture_ns - first_ns <= max_s * NS_PER_S:
                         stopped = "it would be larger than 2 GiB"
                     break
                 so_far_s = (frame.capture_ns - first_ns) / NS_PER_S
                 holds |= dict.fromkeys(_streams(frame))
-                progress.tell(f"recording: {writer.count} samples, seconds", round(so_far_s), round(limits.max_s))
+                progress.tell(f"recording: {writer.count} samples, seconds", round(so_far_s), round(max_s))
             else:
                 if worker.state in OVER:
                     stopped = worker.reason

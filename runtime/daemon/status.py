@@ -60,7 +60,7 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
         # What was solved for an instant after this light has no age yet.
         "solution_age_now_ms": None if account.solution_age_ms is None else max(0.0, account.solution_age_ms),
         "photon_now_ms": (account.photon_ns - account.capture_ns) / NS_PER_MS if account.capture_ns else None,
-        "rejected_samples": {**presenter.viewer.refused, **presenter.samples.refused_inputs},
+        "rejected_samples": dict(presenter.viewer.refused),
         "sensor_hz": presenter.viewer.rate_hz if "sensor" not in presenter.missing else None,
         "log_lines_lost": logs.lost(),
         **stats.rates_now(),

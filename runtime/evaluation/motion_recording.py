@@ -16,7 +16,7 @@ from runtime.errors import InputError
 from runtime.eyes.demo_geometry import demo_sensor_from_stack
 from runtime.eyes.motions import MOTIONS, observe, path_of, true_eyes
 from runtime.records import EyePoints, SensorFrame
-from runtime.sensor.recording import RecordingLimits, recording_to
+from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.support.untrusted_input import real, whole
 
@@ -50,7 +50,7 @@ def write_motion(
     truth = true_eyes(motion, np.array([o.capture_ns for o in observed]) / NS_PER_S, path=way)
     sensor_from_stack = demo_sensor_from_stack()
     header = RecordingHeader(driver="motion", serial="demo", truth=True)
-    with recording_to(path, header, limits=RecordingLimits(max_s=2 * SECONDS_MAX)) as writer:
+    with recording_to(path, header, max_s=2 * SECONDS_MAX) as writer:
         for number, (seen, eyes) in enumerate(zip(observed, truth, strict=True), start=1):
             points = None
             if seen.points is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import ClassVar, Self
@@ -63,11 +62,6 @@ class Sensor(ABC):
         Raises as `read_newest` does. A driver that keeps only the newest answers with that one.
         """
         return [self.read_newest(timeout_s)]
-
-    @property
-    def refused(self) -> Mapping[str, int]:
-        """Samples that arrived and are none, counted by reason."""
-        return {}
 
     @abstractmethod
     def close(self) -> None:

@@ -37,17 +37,6 @@ class EyePacket(NamedTuple):
     points: EyePoints | None
 
 
-def encode(packet: EyePacket) -> bytes:
-    """The reference encoder. Raises struct.error for a sequence or time that does not fit."""
-    flags, numbers = 0, [0.0] * 8
-    if packet.points is not None:
-        flags = HAS_FACE
-        flags |= {"": 0, "left": COMPLETED_LEFT, "right": COMPLETED_RIGHT}[packet.points.completed]
-        numbers = [*(packet.points.eyes_m.ravel() / M_PER_MM), *packet.points.confidence]
-    body = LAYOUT.pack(MAGIC, VERSION, flags, PACKET_BYTES, packet.sequence, packet.device_time_us, *numbers)
-    return body + CRC.pack(zlib.crc32(body))
-
-
 def _decode(data: bytes) -> EyePacket | None:
     """PACKET_BYTES that begin with the magic as a packet; None where it is not one."""
     magic, version, flags, length, sequence, time_us, *numbers = LAYOUT.unpack_from(data)

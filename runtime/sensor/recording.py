@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -25,17 +24,10 @@ CHUNK_BYTES = 4096  # some 20 eye samples
 MESSAGE_OVERHEAD_BYTES = 64
 INDEX_BYTES_PER_CHUNK = 256
 SUMMARY_BYTES = 10_000  # with the schemas
+MAX_S, MAX_BYTES = 600.0, 2 << 30  # a recording ends before it is longer or larger
 MAGIC = b"\x89MCAP0\r\n"
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class RecordingLimits:
-    """A recording ends before it is longer or larger than this."""
-
-    max_s: float = 600.0
-    max_bytes: int = 2 << 30
 
 
 class RecordingWriter:
@@ -46,13 +38,13 @@ class RecordingWriter:
         file: IO[bytes],
         header: RecordingHeader,
         *,
-        limits: RecordingLimits | None = None,
+        max_s: float = MAX_S,
         on_first: Callable[[], object] = lambda: None,
     ) -> None:
         """on_first: called when the first sample is written."""
         from mcap.writer import CompressionType, IndexType, Writer
 
-        self._file, self._limits, self._on_first = file, limits or RecordingLimits(), on_first
+        self._file, self._max_ns, self._on_first = file, round(max_s * NS_PER_S), on_first
         self._images, self._eye_points = header.colour or header.depth, header.eye_points or header.truth
         # Eye points alone are so few that plain bytes, the same with every version of a library, are worth more.
         compression = CompressionType.LZ4 if self._images else CompressionType.NONE
@@ -88,7 +80,7 @@ class RecordingWriter:
         size = sum(len(data) + MESSAGE_OVERHEAD_BYTES for _, data in messages)
         indices = INDEX_BYTES_PER_CHUNK * (self._chunks + len(messages))
         total = self._file.tell() + CHUNK_BYTES + size + SUMMARY_BYTES + indices
-        if at - first_ns > self._limits.max_s * NS_PER_S or total > self._limits.max_bytes:
+        if at - first_ns > self._max_ns or total > MAX_BYTES:
             return False
         for topic, data in messages:
             before = self._file.tell()
@@ -108,31 +100,23 @@ class RecordingWriter:
 
 
 @contextmanager
-def recording_to(
-    path: Path, header: RecordingHeader, *, limits: RecordingLimits | None = None
-) -> Iterator[RecordingWriter]:
+def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -> Iterator[RecordingWriter]:
     """A writer whose file appears under its name with the first sample, and is kept from then on.
 
     Until then an older file of that name stays; what a crash leaves is readable up to its last whole chunk.
-    One with pictures is its owner's alone. Raises InputError where it can't be written, or another process writes it.
+    One with pictures is its owner's alone. Raises InputError where it can't be written.
     """
     part = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_file():
-            with path.open("rb") as present:
-                fcntl.flock(present, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        file = os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600), "wb")
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until it is closed, under either name
-        file.truncate()
+        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC
+        file = os.fdopen(os.open(part, flags, 0o600), "wb")
         os.fchmod(file.fileno(), 0o600 if header.colour or header.depth else 0o644)  # a face is private
-    except BlockingIOError:
-        raise InputError(path, "", "is being recorded by another process") from None
     except OSError as error:
         raise InputError(path, "", f"cannot be written ({error.strerror})") from None
     try:
         with file:
-            writer = RecordingWriter(file, header, limits=limits, on_first=lambda: part.replace(path))
+            writer = RecordingWriter(file, header, max_s=max_s, on_first=lambda: part.replace(path))
             try:
                 yield writer
             finally:

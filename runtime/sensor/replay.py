@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -17,7 +16,6 @@ from runtime.sensor.base import Capabilities, SteppedSensor
 from runtime.sensor.recording import Recording
 
 ROUND_INTERVAL_MIN_NS = NS_PER_S // 240  # between the rounds of a looped recording: the fastest sensor's period
-OLDER, SAME_INSTANT = "older than the sample before", "of the same instant as the sample before"
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +29,7 @@ class ReplayDriver(SteppedSensor):
     """Recorded times are shifted on to the run's clock: the first sample is captured at `open`.
 
     Any rate and any gap is played as it was recorded. A sample that is no later than the one before it is not
-    delivered; `refused` counts them by reason, and the first is logged.
+    delivered, and the first one is logged.
 
     A sample arrives at its capture and the latency.
     """
@@ -53,11 +51,6 @@ class ReplayDriver(SteppedSensor):
         self.capabilities = Capabilities(eye_points=True, may_pause=True)
         self._frames: Iterator[SensorFrame] | None = None
         self._next: SensorFrame | None = None
-        self._refused: Counter[str] = Counter()
-
-    @property
-    def refused(self) -> Mapping[str, int]:
-        return self._refused
 
     def open(self) -> None:
         """Raises InputError where the file is not a recording."""
@@ -65,16 +58,17 @@ class ReplayDriver(SteppedSensor):
         header = recording.header
         self.serial = header.serial
         self.capabilities = Capabilities(header.colour, header.depth, header.eye_points, may_pause=True)
-        self._refused = Counter()
         self._frames = self._shifted(recording)
         self._next = next(self._frames, None)
 
     def _ordered(self, recording: Recording) -> Iterator[SensorFrame]:
         """Samples, each later than the one before it. Raises InputError for too long a recording."""
-        last_ns = -1
+        last_ns, told = -1, False
         for number, frame in enumerate(recording.samples()):
             if frame.capture_ns <= last_ns:
-                self._refuse(OLDER if frame.capture_ns < last_ns else SAME_INSTANT, frame)
+                if not told:
+                    log.warning("%s: samples no later than the one before are left out: %d", self.path, frame.sequence)
+                told = True
                 continue
             seconds = (frame.capture_ns - recording.first.capture_ns) / NS_PER_S
             if seconds > LIMITS.recording_s:
@@ -82,11 +76,6 @@ class ReplayDriver(SteppedSensor):
                 raise InputError(self.path, "capture_ns", problem)
             last_ns = frame.capture_ns
             yield frame
-
-    def _refuse(self, reason: str, frame: SensorFrame) -> None:
-        if not self._refused[reason]:
-            log.warning("%s: sample %d is %s: such samples are left out", self.path, frame.sequence, reason)
-        self._refused[reason] += 1
 
     def _shifted(self, recording: Recording) -> Iterator[SensorFrame]:
         """Samples on the run's clock; when looped, the next round follows at the recording's own interval."""

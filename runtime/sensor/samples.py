@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 from runtime.clock import NS_PER_S
@@ -19,7 +19,6 @@ class Samples(ABC):
     """The presenter's view of the sensor; nothing here waits or lets time pass."""
 
     stale_inputs: int  # samples that a newer one overtook before they were looked at
-    refused_inputs: Mapping[str, int]  # samples that arrived and are none, by reason, as the driver says
     serial: str  # the sensor's, where it is known
 
     @abstractmethod
@@ -65,7 +64,7 @@ class RecordedSamples(Samples):
         self.stale_inputs = 0
         driver.open()
         self._find = finder(driver, make_find)
-        self.serial, self.refused_inputs = driver.serial, driver.refused
+        self.serial = driver.serial
 
     def arrived(self, now_ns: int) -> list[SensorFrame]:
         if self._driver.peek() is None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 from enum import StrEnum
 
@@ -76,7 +76,6 @@ class SensorWorker(Samples):
         self._hung: list[_Attempt] = []
         self._state, self.reason = SensorState.STOPPED, ""
         self._skipped = 0  # samples that a newer one overtook, but those that the driver at hand counts
-        self._refused: Counter[str] = Counter()
         self._driver: Sensor | None = None
         self.serial = ""  # of the device, once it was open; it is reopened by this
         self.error: FatalError | None = None
@@ -128,10 +127,6 @@ class SensorWorker(Samples):
         return self._skipped + (self._driver.skipped if self._driver else 0)
 
     @property
-    def refused_inputs(self) -> Mapping[str, int]:  # type: ignore[override]
-        return self._refused + Counter(self._driver.refused) if self._driver else self._refused
-
-    @property
     def capabilities(self) -> Capabilities | None:
         """Of the driver, once it was open."""
         return self._driver.capabilities if self._driver else None
@@ -176,11 +171,10 @@ class SensorWorker(Samples):
                 self._state, self.reason = state, reason
 
     def _account(self, driver: Sensor | None) -> None:
-        """Keep a driver's counts when it goes."""
+        """Keep a driver's count when it goes."""
         with self._lock:
             if driver is not None and driver is self._driver:
                 self._skipped += driver.skipped
-                self._refused.update(driver.refused)
                 self._driver = None
 
     def _allow(self, attempt: _Attempt, limit_s: float) -> None:

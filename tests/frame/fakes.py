@@ -49,7 +49,7 @@ class FakeSamples(Samples):
 
     def __init__(self) -> None:
         self.waiting: list[SensorFrame] = []
-        self.stale_inputs, self.refused_inputs, self.serial = 0, {}, "F-1"
+        self.stale_inputs, self.serial = 0, "F-1"
         self.why = ""  # why there is no sensor
         self.ends_ns: int | None = None
         self._sequence = 0

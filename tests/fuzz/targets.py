@@ -45,7 +45,7 @@ from runtime.optics.stack import PanelStack
 from runtime.panels.edid import parse
 from runtime.panels.lut import measured_curve
 from runtime.records import EyePoints, Intrinsics, SensorFrame
-from runtime.sensor.eye_packets import EyePacket, PacketReader, encode
+from runtime.sensor.eye_packets import EyePacket, PacketReader
 from runtime.sensor.recording import RecordingWriter
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import ReplayDriver
@@ -53,6 +53,7 @@ from runtime.support.untrusted_input import parsed_json
 from tests.content.gltf_files import bending_bar, growing_square, moving_square
 from tests.content.test_hostile import PNG_URI, gltf, textured
 from tests.panels.edids import block
+from tests.sensor.fake_usb import encode
 from tests.sensor.taken import taken_until
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 64, 36)

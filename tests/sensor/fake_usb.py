@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import time
+import zlib
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,7 +16,18 @@ import usb.backend
 from usb.core import USBError, USBTimeoutError
 
 from runtime.records import EyePoints
-from runtime.sensor.eye_packets import EyePacket, encode
+from runtime.sensor.eye_packets import (
+    COMPLETED_LEFT,
+    COMPLETED_RIGHT,
+    CRC,
+    HAS_FACE,
+    LAYOUT,
+    M_PER_MM,
+    MAGIC,
+    PACKET_BYTES,
+    VERSION,
+    EyePacket,
+)
 
 EYE_TRACKER = (0x1209, 0x0001)
 KINECT_V2 = (0x045E, 0x02D8)
@@ -24,6 +36,17 @@ KINECT_V2 = (0x045E, 0x02D8)
 def packet(sequence: int, *, time_us: int = 0, x_m: float = 0.0, face: bool = True) -> EyePacket:
     eyes = np.array([[x_m + 0.031, 0.0, 0.6], [x_m - 0.031, 0.0, 0.6]])
     return EyePacket(sequence, time_us, EyePoints(eyes, np.array([0.9, 0.8])) if face else None)
+
+
+def encode(packet: EyePacket) -> bytes:
+    """A packet as a tracker sends it."""
+    flags, numbers = 0, [0.0] * 8
+    if packet.points is not None:
+        flags = HAS_FACE
+        flags |= {"": 0, "left": COMPLETED_LEFT, "right": COMPLETED_RIGHT}[packet.points.completed]
+        numbers = [*(packet.points.eyes_m.ravel() / M_PER_MM), *packet.points.confidence]
+    body = LAYOUT.pack(MAGIC, VERSION, flags, PACKET_BYTES, packet.sequence, packet.device_time_us, *numbers)
+    return body + CRC.pack(zlib.crc32(body))
 
 
 @dataclass(eq=False)

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runtime.records import EyePoints
-from runtime.sensor.eye_packets import MAGIC, PACKET_BYTES, EyePacket, PacketReader, encode
-from tests.sensor.fake_usb import packet
+from runtime.sensor.eye_packets import MAGIC, PACKET_BYTES, EyePacket, PacketReader
+from tests.sensor.fake_usb import encode, packet
 
 coordinates = st.floats(-5, 5, width=32)
 

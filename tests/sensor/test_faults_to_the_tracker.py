@@ -14,10 +14,10 @@ from runtime.clock import MonotonicClock
 from runtime.config import SensorSettings
 from runtime.eyes.calibration import load_calibration
 from runtime.eyes.tracker import Tracker
-from runtime.sensor.eye_packets import EyePacket, encode
+from runtime.sensor.eye_packets import EyePacket
 from runtime.sensor.usb_eyes import UsbEyesDriver
 from runtime.sensor.worker import SensorWorker
-from tests.sensor.fake_usb import FakeDevice, FakeUsb, packet
+from tests.sensor.fake_usb import FakeDevice, FakeUsb, encode, packet
 
 SETTINGS = SensorSettings(driver="usb-eyes", source="", timeout_s=0.1)
 PERIOD_S = 0.01

@@ -11,11 +11,10 @@ import pytest
 from runtime.clock import MonotonicClock
 from runtime.config import SensorSettings
 from runtime.errors import SensorLost
-from runtime.sensor.eye_packets import encode
 from runtime.sensor.usb_devices import UDEV_RULE
 from runtime.sensor.usb_eyes import UsbEyesDriver
 from runtime.sensor.worker import SensorWorker
-from tests.sensor.fake_usb import FakeDevice, FakeUsb, Ticking, packet
+from tests.sensor.fake_usb import FakeDevice, FakeUsb, Ticking, encode, packet
 from tests.waiting import eventually
 
 SETTINGS = SensorSettings(driver="usb-eyes", source="", timeout_s=0.1)
