@@ -175,10 +175,10 @@ def test_a_scene_for_the_daemon_is_absolute_and_a_name_stays_a_name(
 
 def test_every_wrong_field_of_a_file_is_told_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError) as told:
-        loaded(tmp_path, '[stack]\nwidth_m = 518.4\n[model]\ntransfer = "code"\n[loop]\nrate_hz = 0\nzebra = 1\n')
+        loaded(tmp_path, '[stack]\nwidth_m = 518.4\n[content]\nup = "z"\n[loop]\nrate_hz = 0\nzebra = 1\n')
     parts = str(told.value).split("; ")
     assert parts[0].startswith(f"{tmp_path}/phasestack.toml: stack.width_m: ")
-    assert "model.transfer: is no setting any more: take the line out: nothing ever read it" in parts
+    assert any(part.startswith("content.up: is no setting any more: set content.axes") for part in parts)
     assert any(part.startswith("loop.rate_hz: ") for part in parts) and "loop.zebra: is no setting" in parts
 
 

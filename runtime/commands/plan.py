@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from runtime.support.options import blame_option, number, place
+from runtime.support.options import blame_option, number
 
 
 def plan(
@@ -16,7 +16,6 @@ def plan(
     scene: Annotated[str | None, typer.Option(help="a preset's name, a built-in scene, a file or folder")] = None,
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
     scale: Annotated[float, number(0.05, 2.0, help="panel resolution, times the configured one")] = 1.0,
-    eyes: Annotated[tuple[float, float, float] | None, place(help="between the eyes, metres, frame `stack`")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
 ) -> None:
     """What this scene leaves out, why, what each saving saves and what it costs, measured here.
@@ -29,7 +28,7 @@ def plan(
 
     status = Console(stderr=True, quiet=as_json).status("measuring with and without the plan")
     with blame_option("plan", scene=scene, model=model), status:
-        result = plan_for(config, scene=scene, model=model, scale=scale, middle_m=eyes)
+        result = plan_for(config, scene=scene, model=model, scale=scale)
     if as_json:
         typer.echo(json.dumps(result))
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -53,29 +54,67 @@ def sockets(config: Path | None, socket: Path | None) -> tuple[Path, ...]:
     return candidates(configured_socket(config))
 
 
+STEERED = {
+    "paused": "the picture is frozen until `phasestack ctl resume`",
+    "flat_asked": "the flat picture, until `phasestack ctl resume`",
+}
+# Lines of figures: title, what the daemon calls it, how it is written. What was not measured is left out.
+FIGURES = (
+    ("now", "fps_now", "{:.1f} refreshes/s"),
+    ("now", "solutions_per_s_now", "{:.1f} solutions/s"),
+    ("rate", "fps", "{:.1f} frames/s"),
+    ("refreshes", "frames", "{}"),
+    ("refreshes", "presented", "{} presented"),
+    ("refreshes", "dropped", "{} dropped"),
+    ("refreshes", "missed_blanks", "{} blanks missed"),
+    ("solution", "solution_age_now_ms", "{:.0f} ms old at its light"),
+    ("sensor", "sensor_hz", "{:.1f} samples/s"),
+    ("sensor", "stale_inputs", "{} skipped"),
+    ("log", "log_lines_lost", "{} lines were lost: they could not be written"),
+)
+NAMED = ("scene", "content", "content_problem", "loading", "refused", "model", "provider", "panels")
+TIMES = {
+    "photon_ms": "capture to light",
+    "solution_age_ms": "solution's age",
+    "interval_ms": "between frames",
+    "overhead_ms": "overhead",
+    "skew_ms": "skew",
+    "stage_ms": "stage",
+}
+
+
 def describe(answer: dict[str, Any]) -> Iterator[str]:
     """The answer as lines for people; what the daemon did not say, or did not measure, is left out."""
     yield row("state", answer.get("state", "unknown"), answer.get("reason", ""))
     for part, why in dict(answer.get("missing") or {}).items():
         yield row(f"  missing {part}", why)
-    if answer.get("paused"):
-        yield row("paused", "the picture is frozen until `phasestack ctl resume`")
-    if answer.get("flat_asked"):
-        yield row("flat", "asked for, until `phasestack ctl resume`")
+    for name, meaning in STEERED.items():
+        if answer.get(name):
+            yield row(name.partition("_")[0], meaning)
     if "uptime_s" in answer:
-        yield row("up", duration(float(answer["uptime_s"])), f"pid {answer.get('pid', '?')}")
-    yield from rates(answer)
-    for name in ("scene", "content", "content_problem", "loading", "refused", "model", "provider", "panels"):
+        yield row("up", str(timedelta(seconds=round(float(answer["uptime_s"])))), f"pid {answer.get('pid', '?')}")
+    figures: dict[str, list[str]] = {}
+    for title, name, form in FIGURES:
+        if answer.get(name) is not None and (answer[name] or title != "log"):
+            figures.setdefault(title, []).append(form.format(answer[name]))
+    for title, said in figures.items():
+        yield row(title, ", ".join(said))
+    for name in NAMED:
         if answer.get(name) and (name != "content" or answer["content"] != answer.get("scene")):
             yield row(name, str(answer[name]))
-    yield from eyes(answer)
-    for name in ("photon_ms", "solution_age_ms", "interval_ms", "overhead_ms", "skew_ms", "stage_ms"):
-        if text := timings(answer.get(name), "ms"):
-            yield row(TOLD_AS.get(name, name.removesuffix("_ms")), text)
+    if answer.get("eyes_m"):
+        places = "  ".join(f"({x:.3f}, {y:.3f}, {z:.3f})" for x, y, z in answer["eyes_m"])
+        sigma_mm = answer.get("eye_sigma_now_mm")
+        sure = "" if sigma_mm is None else f", to {float(sigma_mm):.2f} mm (one standard deviation)"
+        yield row("eyes", f"{places} m", f"{answer.get('eyes_label', '')}{sure}")
+    refused = [f"{count} {why}" for why, count in dict(answer.get("rejected_samples") or {}).items() if count]
+    if refused:
+        yield row("rejected", ", ".join(refused), "samples")
+    for name, title in TIMES.items():
+        if text := timings(answer.get(name)):
+            yield row(title, text)
     for part, count in dict(answer.get("faults") or {}).items():
         yield row(f"faults {part}", str(count))
-    if answer.get("log_lines_lost"):
-        yield row("log", f"{answer['log_lines_lost']} lines were lost: they could not be written")
     for item in answer.get("plan") or ():
         yield row("left out", str(item.get("what", "")), str(item.get("why", "")))
 
@@ -96,44 +135,6 @@ def holds(answer: dict[str, Any]) -> str:
 
 
 UNMOVED = {"scale": 1.0, "offset_m": [0.0] * 3, "rotation_deg": [0.0] * 3, "turntable_per_min": 0.0}
-TOLD_AS = {"photon_ms": "capture to light", "solution_age_ms": "solution's age", "interval_ms": "between frames"}
-
-
-def rates(answer: dict[str, Any]) -> Iterator[str]:
-    """Refreshes and solutions a second, now and since the start."""
-    now = [
-        f"{float(answer[name]):.1f} {what}/s"
-        for name, what in (("fps_now", "refreshes"), ("solutions_per_s_now", "solutions"))
-        if answer.get(name) is not None
-    ]
-    if now:
-        yield row("now", ", ".join(now))
-    counts = [
-        f"{answer[name]} {name.replace('_', ' ')}"
-        for name in ("frames", "presented", "dropped", "missed_blanks", "stale_inputs")
-        if answer.get(name) is not None
-    ]
-    if answer.get("fps") is not None:
-        yield row("rate", f"{float(answer['fps']):.1f} frames/s", ", ".join(counts))
-    elif counts:
-        yield row("refreshes", ", ".join(counts))
-
-
-def eyes(answer: dict[str, Any]) -> Iterator[str]:
-    """Where they are, how that is known and how sure it is; what the sensor brings and what of it is refused."""
-    if answer.get("eyes_m"):
-        left, right = answer["eyes_m"]
-        text = "  ".join(f"({x:.3f}, {y:.3f}, {z:.3f})" for x, y, z in (left, right))
-        label, sigma_mm = str(answer.get("eyes_label", "")), answer.get("eye_sigma_now_mm")
-        sure = "" if sigma_mm is None else f"to {float(sigma_mm):.2f} mm (one standard deviation)"
-        yield row("eyes", f"{text} m", ", ".join(filter(None, (label, sure))))
-    if answer.get("solution_age_now_ms") is not None:
-        yield row("solution", f"{float(answer['solution_age_now_ms']):.0f} ms old at its light")
-    if answer.get("sensor_hz") is not None:
-        yield row("sensor", f"{float(answer['sensor_hz']):.1f} samples/s")
-    refused = {why: count for why, count in dict(answer.get("rejected_samples") or {}).items() if count}
-    if refused:
-        yield row("rejected", ", ".join(f"{count} {why}" for why, count in refused.items()), "samples")
 
 
 def row(name: str, value: str, remark: str = "") -> str:
@@ -141,23 +142,12 @@ def row(name: str, value: str, remark: str = "") -> str:
     return one_line(f"{name:16} {value}" + (f"  ({remark})" if remark else ""), most=2000)
 
 
-def timings(value: Any, unit: str) -> str:
-    """A number, or quantiles, or quantiles per stage, on one line; empty where nothing was measured."""
+def timings(value: Any) -> str:
+    """A number, or quantiles, or the medians of stages, on one line; empty where nothing was measured."""
     if value is None:
         return ""
     if not isinstance(value, dict):
-        return f"{float(value):.2f} {unit}"
-    stages = {
-        name: part["p50"] for name, part in value.items() if isinstance(part, dict) and part.get("p50") is not None
-    }
-    if stages:
-        return ", ".join(f"{name} {p50:.2f}" for name, p50 in stages.items()) + f" {unit} (median)"
-    plain = {name: part for name, part in value.items() if isinstance(part, (int, float))}
-    return ", ".join(f"{name} {part:.2f}" for name, part in plain.items()) + f" {unit}" if plain else ""
-
-
-def duration(seconds: float) -> str:
-    """Hours, minutes and seconds, without leading zeros' noise."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes:02} min" if hours else f"{minutes} min {rest:02} s" if minutes else f"{rest} s"
+        return f"{float(value):.2f} ms"
+    medians = {name: part.get("p50") if isinstance(part, dict) else part for name, part in value.items()}
+    known = [f"{name} {float(part):.2f}" for name, part in medians.items() if part is not None]
+    return ", ".join(known) + " ms" if known else ""

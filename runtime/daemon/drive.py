@@ -74,22 +74,13 @@ def print_summary(summary: dict[str, Any], out: Path | None) -> None:
         table.add_row("light", f"{summary['light_db']:.2f} dB of a pupil at the eyes used: the figure to quote")
     if summary["psnr_db"] is not None:
         quality = f"{summary['psnr_db']:.2f} dB, SSIM {summary['ssim']:.4f} at the eyes used"
-        if summary["psnr_db_true_eyes"] is not None:
-            quality += f"; {summary['psnr_db_true_eyes']:.2f} dB at the true eyes"
-        table.add_row("one ray a pixel", f"{quality} ({summary['quality_frames']} refreshes)")
-        carried = f"{summary['carried_db']:.2f} dB at the eyes used"
-        if summary["carried_db_true_eyes"] is not None:
-            carried += f"; {summary['carried_db_true_eyes']:.2f} dB at the true eyes"
-        table.add_row("carried", f"{carried} (ghosts and fringes, without a late picture's parallax)")
+        table.add_row("one ray a pixel", f"{quality} ({summary['quality_frames']} refreshes); more in summary.json")
     if summary["photon_ms"] is not None:
         table.add_row(f"capture to light{how}", f"{summary['photon_ms']['p50']:.1f} ms (p50)")
     stages = {name: values for name, values in summary["stage_ms"].items() if values and values["max"] > 0.05}
     table.add_row(
         f"stages, ms{how}", ", ".join(f"{name} {values['p50']:.1f}" for name, values in stages.items()) + " (p50)"
     )
-    overhead = summary["overhead_ms"]
-    if overhead:
-        table.add_row(f"overhead, ms{how}", f"{overhead['p50']:.2f} (p50), {overhead['p99']:.2f} (p99)")
     table.add_row("states, s", ", ".join(f"{state} {seconds:.1f}" for state, seconds in summary["states"].items()))
     for item in summary["plan"]:
         table.add_row("left out", f"{item['what']}: {item['why']}")

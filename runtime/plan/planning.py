@@ -33,7 +33,6 @@ def plan_for(
     scene: str | None,
     model: str | None,
     scale: float,
-    middle_m: tuple[float, float, float] | None,
 ) -> dict[str, Any]:
     """Measure and plan one scene; everything that `phasestack plan` prints. Raises PhasestackError."""
     settings = with_options(load_settings(config), scene=scene, model=model)
@@ -42,13 +41,9 @@ def plan_for(
     stack = replace(
         stack, width_px=max(16, round(stack.width_px * scale)), height_px=max(16, round(stack.height_px * scale))
     )
-    middle = np.array(MIDDLE_M if middle_m is None else middle_m)
-    half = np.array([0.0, HALF_IPD_M, 0.0])
-    eyes_m = np.array([middle - half, middle + half])
-    where = "plan: --eyes"
-    if settings.sensor.fixed_eyes_m is not None and middle_m is None:
-        eyes_m, where = np.array(settings.sensor.fixed_eyes_m), "sensor.fixed_eyes_m"
-    _check_viewer(eyes_m, stack, fov_deg=settings.content.fov_deg, source=where)
+    middle, half = np.array(MIDDLE_M), np.array([0.0, HALF_IPD_M, 0.0])
+    eyes_m = np.array(settings.sensor.fixed_eyes_m or [middle - half, middle + half])
+    _check_viewer(eyes_m, stack, fov_deg=settings.content.fov_deg)
     with ExitStack() as cleanup:
         context = offscreen_context()
         cleanup.callback(context.release)
@@ -82,13 +77,15 @@ def plan_for(
         }
 
 
-def _check_viewer(eyes_m: F64, stack: PanelStack, *, fov_deg: float, source: str) -> None:
-    """Raise InputError, naming the option, for eyes (2, 3) from which nothing of the display can be seen."""
+def _check_viewer(eyes_m: F64, stack: PanelStack, *, fov_deg: float) -> None:
+    """Raise InputError for eyes (2, 3) from which nothing of the display can be seen."""
     nearest_m = float(eyes_m[:, 0].min())
     if nearest_m <= max(stack.x_m):
-        raise InputError(source, "", f"x = {nearest_m:g} m : not in front of the panels (x > {max(stack.x_m):g} m)")
+        raise InputError(
+            "sensor.fixed_eyes_m", "", f"x = {nearest_m:g} m : not in front of the panels (x > {max(stack.x_m):g} m)"
+        )
     # Few pixels tell as much: the same rays at a coarser raster.
     coarse = replace(stack, width_px=64, height_px=36)
     blank = np.zeros((stack.count, coarse.height_px, coarse.width_px, 3), np.uint8)
     if not any(seen_by(eye_m, blank, coarse, fov_deg=fov_deg).mask.any() for eye_m in eyes_m):
-        raise InputError(source, "", "nothing of the display can be seen from there")
+        raise InputError("sensor.fixed_eyes_m", "", "nothing of the display can be seen from there")
