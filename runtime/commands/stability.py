@@ -32,7 +32,6 @@ def stability(
 
     from rich.console import Console
 
-    from runtime.commands.solving import checked_eyes
     from runtime.report.machine import describe
     from runtime.report.stability import suite
     from runtime.report.stability.limits import load_limits, recorded
@@ -42,7 +41,7 @@ def stability(
 
     started = time.perf_counter()
     limits = load_limits()
-    trials = list(suite.every_trial(_fits(), checked_eyes, full=full))
+    trials = list(suite.every_trial(_fits(), full=full))
     with progress_bar("stability") as tell:
         cases = suite.run(trials, limits=limits, progress=tell)
     if record is not None:

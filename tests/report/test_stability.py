@@ -55,7 +55,7 @@ def test_the_long_cases_pass_too(tmp_path: Path) -> None:
 def test_json_plots_and_page_lie_in_the_folder(record: tuple[dict, Path]) -> None:
     found, out = record
     assert json.loads((out / "stability.json").read_text())["cases"] == found["cases"]
-    assert (out / "heat-map.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "stiffness.png").read_bytes().startswith(b"\x89PNG")
     page = (out / "index.html").read_text()
     assert found["machine"]["processor"] in page
     assert "://" not in page, "the page must need nothing from elsewhere"
@@ -77,7 +77,7 @@ def test_a_failing_case_makes_the_command_exit_with_1(tmp_path: Path, monkeypatc
         return pose
 
     monkeypatch.setattr(poses, "stack_from_eye", bent)
-    monkeypatch.setattr(suite, "every_trial", lambda fits, check, full: poses.trials())
+    monkeypatch.setattr(suite, "every_trial", lambda fits, full: poses.trials())
     done = command("--out", str(tmp_path))
     assert done.exit_code == 1
     assert "FAILS eye pose" in done.output
@@ -91,7 +91,7 @@ def test_a_case_that_crashes_fails_by_its_name_and_the_others_go_on(
     def crashes() -> Answer:
         raise ZeroDivisionError("somewhere deep inside")
 
-    def trials(fits: object, check: object, full: bool) -> list[Trial]:
+    def trials(fits: object, full: bool) -> list[Trial]:
         good = Trial("solve", "a good one", lambda: Answer(0.0, 1.0), measure="of the wanted")
         bad = Trial("solve", "a bad one", crashes, measure="of the wanted", floor=0.0)
         return [bad, good]

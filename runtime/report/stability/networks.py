@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 
@@ -20,8 +20,6 @@ from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 from runtime.report.pairs import eyes_at
-from runtime.report.stability import exact
-from runtime.report.stability.retina import EDGE_PX, traced
 from runtime.report.stability.solve import Method, Problem
 from runtime.report.stability.trial import EPS32, Answer, Trial, refusal
 
@@ -30,12 +28,7 @@ STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
 FOV_DEG = 40.0
 MODELS = ("fast", "balanced", "best")
 PLACES = ((0.7, 15.0), (0.9, -25.0), (0.45, 10.0), (1.5, -35.0))  # metres, degrees: besides from straight ahead
-FROM = ", from "  # a case's name and its place
-
-RAYS = 150  # of each eye, traced
 FLOOR = 0.0005  # an eighth of a code: what another processor's rounding may move
-
-Check = Callable[[tuple[float, ...], tuple[float, ...], PanelStack], object]  # left and right eye; raises
 
 
 @lru_cache(maxsize=4)
@@ -118,68 +111,6 @@ def stressed(model: str, images: Sequence[U8], eyes_m: F64, stack: PanelStack = 
     return Answer(math.sqrt(squared_error(layers, images, eyes_m, stack)), 1.0)
 
 
-def scored(model: str) -> Answer:
-    """What the other cases take for seen of a model's layers, against rays traced to 50 digits."""
-    images, eyes = pictures("coloured stripes, shifted by a third"), eyes_at(distance_m=0.6)
-    layers = predicted(model, images, eyes, STACK)
-    height, width = images[0].shape[:2]
-    random, error, counted = np.random.default_rng(11), 0.0, 0
-    for eye in eyes:
-        retina = seen_by(eye, layers, STACK, width_px=width, height_px=height, fov_deg=FOV_DEG)
-        seen, mask = retina.image, retina.mask
-        place = exact.vector(eye)
-        for row, column in zip(random.integers(0, height, RAYS), random.integers(0, width, RAYS), strict=True):
-            truth, inside = traced(place, STACK, layers, int(column), int(row), size=(width, height))
-            if abs(inside) > EDGE_PX and bool(mask[row, column]) != (inside > 0):
-                return Answer(1.0, 0.0, note=f"ray {column}, {row} counts and should not, or the other way round")
-            if inside > EDGE_PX and mask[row, column]:
-                error, counted = max(error, *map(exact.distance, seen[row, column], truth)), counted + 1
-    return Answer(error, 8 * EPS32 * width * STACK.count, note=f"{counted} rays")
-
-
-def repeatable(model: str) -> Answer:
-    """The same picture twice, with another in between: no state may be left behind."""
-    eyes = eyes_at(distance_m=0.6)
-    noise, flat = pictures("noise, another for each eye"), pictures("all white")
-    found = [predicted(model, images, eyes, STACK).astype(int) for images in (noise, flat, noise)]
-    if np.array_equal(found[0], found[1]):
-        return Answer(255.0, 0.0, note="white looks like noise")
-    return Answer(float(np.abs(found[0] - found[2]).max()), 0.0)
-
-
-def threads(model: str) -> Answer:
-    """One thread against two: the order of sums may move a panel value by a grey level, no more."""
-    eyes, images = eyes_at(distance_m=0.6), pictures("noise, another for each eye")
-    predictor = load_predictor(model, STACK, ModelSettings(threads=2))
-    two = np.array(solve_still(images[0], images[1], eyes_m=eyes, fov_deg=FOV_DEG, predictor=predictor).layers)
-    predictor.close()
-    one = predicted(model, images, eyes, STACK)
-    return Answer(float(np.abs(one.astype(int) - two[..., :3]).max()), 1.0)
-
-
-def tiny_error(model: str, value: float) -> Answer:
-    """An eye error of subnormal size: the answer must be that of none."""
-    predictor, images = ready(model, STACK), pictures("noise, another for each eye")
-    found = []
-    for sigma_mm in (0.0, value):
-        done = solve_still(
-            images[0], images[1], eyes_m=eyes_at(distance_m=0.6), fov_deg=FOV_DEG, predictor=predictor,
-            eye_sigma_mm=sigma_mm,
-        )  # fmt: skip
-        found.append(done.layers[..., :3].astype(int))
-    return Answer(float(np.abs(found[0] - found[1]).max()), 0.0)
-
-
-def poisoned(model: str, value: float) -> U8:
-    """A network whose tolerance input is not a number: what it answers isn't either."""
-    predictor = load_predictor(model, STACK, ModelSettings(threads=1))
-    images = pictures("lines one pixel wide")
-    done = solve_still(
-        images[0], images[1], eyes_m=eyes_at(distance_m=0.6), fov_deg=FOV_DEG, predictor=predictor, eye_sigma_mm=value
-    )
-    return done.layers
-
-
 def modes(cells: int) -> Answer:
     """The chains' singular vectors in closed form, float32: the difference and the mean put together again."""
     v, shifted, s, u_transposed = (part.astype(np.float64) for part in chain_modes(cells))
@@ -213,43 +144,19 @@ def solver(model: str) -> Method:
     return solve
 
 
-def picture_trials(*, full: bool = False) -> Iterator[Trial]:
-    """Every case of what a model makes of two pictures; `full`: on every pose for each model, and on 4K panels."""
+def trials(*, full: bool = False) -> Iterator[Trial]:
+    """Every case of the networks; `full`: every pose for each model, and 4K panels."""
     for model in MODELS:
         for kind, (distance_m, angle_deg) in zip(KINDS, itertools.cycle(PLACES), strict=False):
+            where = f", from {distance_m:g} m, {angle_deg:g} degrees"
             for place, eyes in (
                 ("", eyes_at(distance_m=0.6)),
-                (f"{FROM}{distance_m:g} m, {angle_deg:g} degrees", eyes_at(distance_m=distance_m, angle_deg=angle_deg)),
+                (where, eyes_at(distance_m=distance_m, angle_deg=angle_deg)),
             ):
                 run = partial(stressed, model, pictures(kind), eyes)
                 yield Trial(STAGE, f"{model}: {kind}{place}", run, measure="intensity", floor=FLOOR)
-        run = partial(scored, model)
-        yield Trial(STAGE, f"{model}: what is seen of its layers", run, measure="intensity")
-        yield Trial(STAGE, f"{model}: the same picture twice", partial(repeatable, model), measure="grey levels")
     for model in MODELS if full else ("balanced",):
         yield from _poses(model, full=full)
-
-
-def trials(check: Check, *, full: bool = False) -> Iterator[Trial]:
-    """Every case of the networks; `full` tries every size of network on every pose, and 4K panels.
-
-    `check` is what eyes must pass before a network sees them.
-    """
-    yield from picture_trials(full=full)
-    for model in MODELS:
-        yield Trial(STAGE, f"{model}: one thread and two", partial(threads, model), measure="grey levels")
-        yield Trial(STAGE, f"{model}: a subnormal eye error", partial(tiny_error, model, 1e-40), measure="grey levels")
-        yield refusal(STAGE, f"{model}: NaN in", partial(poisoned, model, math.nan))
-    for name, left, right in (
-        ("eyes at one place", (0.6, 0.0, 0.0), (0.6, 0.0, 0.0)),
-        ("eyes 4.9 mm apart", (0.6, 0.0, 0.0), (0.6, 0.0049, 0.0)),
-        ("an eye behind the panels", (-0.6, -0.03, 0.0), (0.6, 0.03, 0.0)),
-        ("an eye between the panels", (0.6, -0.03, 0.0), (0.03, 0.03, 0.0)),
-        ("an eye in the front panel's plane", (0.06, -0.03, 0.0), (0.06, 0.03, 0.0)),
-        ("an eye at NaN", (0.6, -0.03, 0.0), (math.nan, 0.03, 0.0)),
-        ("an eye infinitely far", (0.6, -0.03, 0.0), (math.inf, 0.03, 0.0)),
-    ):
-        yield refusal(STAGE, f"before the network: {name}", partial(check, left, right, STACK))
     aside = eyes_at(distance_m=3.0, angle_deg=85.0)
     yield refusal(
         STAGE,

@@ -1,4 +1,4 @@
-"""The stability page: what was tried, how it ended, and how many digits there were to spare."""
+"""The stability page: what was tried, and how it ended."""
 
 from __future__ import annotations
 
@@ -9,12 +9,6 @@ from runtime.report.page import Figure, Page, Section, Table, Tile
 from runtime.report.plots import drawing, png
 from runtime.report.stability.trial import Case
 
-COLUMNS = 30
-SPARE = (  # digits at least, colour, name
-    (4.0, "#123f63", "over 4 digits"), (2.0, "#1c6f7d", "2 to 4"), (1.0, "#5aa98a", "1 to 2"),
-    (0.5, "#a9cfb0", "half to 1"), (-math.inf, "#f0c24b", "under half a digit"),
-)  # fmt: skip
-REFUSED, FAILS = "#d7dce6", "#c0322b"
 ABOUT = {
     "eye pose": "Where an eye is and how its head is turned: on and near the vertical axis, in, between and behind "
     "the panels, from 1e-200 to 1e200 m (EyeReal supplement, (10)-(14)).",
@@ -36,47 +30,9 @@ ABOUT = {
 }
 
 
-def colour_of(case: Case) -> str:
-    """By the decimal digits between the error and its tolerance."""
-    if not case.passed:
-        return FAILS
-    if not math.isfinite(case.forward_error):
-        return REFUSED
-    spare = math.log10(max(case.tolerance, 1e-18) / max(case.forward_error, 1e-18)) if case.forward_error else math.inf
-    return next(colour for least, colour, _ in SPARE if spare >= least)
-
-
 def stages_of(cases: Sequence[Case]) -> list[str]:
     """Each stage once, in the order of its first case."""
     return list(dict.fromkeys(case.stage for case in cases))
-
-
-def heat_map(cases: Sequence[Case]) -> Figure:
-    """A square a case, row by row within its stage."""
-    rows: list[tuple[str, list[Case]]] = []
-    for stage in stages_of(cases):
-        own = [case for case in cases if case.stage == stage]
-        rows += [(stage if not start else "", own[start : start + COLUMNS]) for start in range(0, len(own), COLUMNS)]
-    with drawing(9.6, 0.9 + 0.29 * len(rows)) as figure:
-        from matplotlib.patches import Patch, Rectangle
-
-        axes = figure.add_subplot()
-        for y, (_, own) in enumerate(rows):
-            for x, case in enumerate(own):
-                axes.add_patch(Rectangle((x, y), 0.9, 0.86, facecolor=colour_of(case), linewidth=0))
-                mark = "×" if not case.passed else "!" if case.behaviour == "warns" else ""
-                axes.text(x + 0.45, y + 0.45, mark, ha="center", va="center", color="white", fontsize=8.5)
-        axes.set(xlim=(0, COLUMNS), ylim=(len(rows), 0), xticks=[])
-        axes.set_yticks([y + 0.45 for y in range(len(rows))], [name for name, _ in rows])
-        axes.grid(visible=False)
-        axes.tick_params(length=0)
-        for side in ("left", "bottom"):
-            axes.spines[side].set_visible(False)
-        named = [*((colour, f"{name} to spare") for _, colour, name in SPARE), (REFUSED, "refuses, as it must")]
-        handles = [Patch(color=colour, label=name) for colour, name in (*named, (FAILS, "× fails"))]
-        figure.legend(handles=handles, loc="outside lower left", ncols=4, fontsize=8.5)
-    text = "Every case a square: how far its error stays below its tolerance. ! answers with a warning."
-    return Figure("heat-map", png(figure), text)
 
 
 def stiffness_plot(cases: Sequence[Case]) -> Figure:
@@ -138,7 +94,7 @@ def stability_page(cases: Sequence[Case], *, machine: dict[str, str], seconds: f
             "digits or a closed form. The tolerance is stated before the case runs: a small multiple of the rounding "
             "of the input times the condition of the problem, or what was recorded of the case and 5%.",
         ],
-        [heat_map(cases), *([stiffness_plot(cases)] if "solve" in stages else [])],
+        [stiffness_plot(cases)] if "solve" in stages else [],
         [] if not failed else [Table(headings, [row(c) for c in failed], "What fails", ["bad"] * len(failed))],
     )
     sections = [summary]

@@ -43,34 +43,6 @@ def single(branch: Literal[1, 2]) -> Answer:
     return Answer(error, EPS32 * 64, 16.0, back, note="the last code before white is the hardest")
 
 
-def quantised(bits: int, panels: int) -> Answer:
-    """Panel values rounded to a panel's grey levels: what is told of them, before and after, against 50 digits.
-
-    The answer is what rounding costs at most; where the code tells another cost than 50 digits do, it is that far off.
-    """
-    values = np.random.default_rng(8).random((128, panels))
-    levels = 2**bits - 1
-    rounded = np.rint(values * levels) / levels
-    meant, shown = (intensity_from_phase(part.sum(axis=1)) for part in (values, rounded))
-    worst, wrong = 0.0, 0.0
-    for number, (row, grey) in enumerate(zip(values, rounded, strict=True)):
-        truth = exact.jones_intensity(row), exact.jones_intensity(grey)
-        worst = max(worst, float(abs(truth[0] - truth[1])))
-        wrong = max(wrong, exact.distance(meant[number], truth[0]), exact.distance(shown[number], truth[1]))
-    bound = panels * math.pi / 4 / levels
-    if wrong > 16 * EPS64 * panels:
-        return Answer(1.0, bound, panels * math.pi / 2, note=f"told intensities are off by {wrong:.2g}")
-    return Answer(worst, bound, panels * math.pi / 2, 0.5 / levels)
-
-
-def across_a_branch(total: float) -> Answer:
-    """Just below and just above a phase sum at which the branch changes the intensity must not jump."""
-    below, above = (float(intensity_from_phase(np.array(total + side * 1e-9))) for side in (-1, 1))
-    truth = [exact.mp.sin((exact.mpf(total) + exact.mpf(side * 1e-9)) * exact.mp.pi / 2) ** 2 for side in (-1, 1)]
-    error = max(exact.distance(below, truth[0]), exact.distance(above, truth[1]))
-    return Answer(error, 4 * EPS64 * max(total, 1.0), max(total, 1.0))
-
-
 def product(values: Sequence[float]) -> Answer:
     """sin² of the summed phase, and the product of the panels' Jones matrices, both against 50 digits."""
     truth = exact.jones_intensity(values)
@@ -92,12 +64,6 @@ def trials() -> Iterator[Trial]:
                 measure="phase",
             )
         yield Trial(PHASE, f"branch {branch}, float32, all 8-bit codes", partial(single, branch), measure="phase")
-    for bits in (8, 10, 16):
-        for panels in (2, 3, 4):
-            run = partial(quantised, bits, panels)
-            yield Trial(PHASE, f"{panels} panels of {bits} bits", run, measure="intensity")
-    for total in (0.0, 1.0, 2.0, 3.0):
-        yield Trial(PHASE, f"sum across {total:g}", partial(across_a_branch, total), measure="intensity")
     rng = np.random.default_rng(5)
     for panels in range(1, 9):
         yield Trial(JONES, f"{panels} panels", partial(product, rng.random(panels).tolist()), measure="intensity")

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from runtime.optics.light import squared_error
-from runtime.optics.quality import psnr_db, quality
+from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.records import U8
 from runtime.report.stability import exact
-from runtime.report.stability.trial import EPS32, EPS64, Answer, Trial, refusal
+from runtime.report.stability.trial import EPS32, Answer, Trial, refusal
 
 STAGE = "retina"
 SIZE = (32, 18)  # of the pictures and panels: every ray of a small picture is traced
@@ -150,12 +150,6 @@ def lit(nominal: Any, true: Any, layers: U8, column: int, row: int, rays: int) -
     return [s / rays**2 for s in sums], inside, edge
 
 
-def decibels(squared: float) -> Answer:
-    """-10·log10 of a mean squared error, down to where nothing is left of it."""
-    truth = -10 * exact.mp.log10(exact.mpf(squared))
-    return Answer(exact.distance(psnr_db(squared), truth), 16 * EPS64 * max(abs(float(truth)), 1.0))
-
-
 def trials() -> Iterator[Trial]:
     """Every case of what eyes see."""
     two = PanelStack(0.5184, 0.2916, (-0.02, 0.03), *SIZE)
@@ -184,8 +178,6 @@ def trials() -> Iterator[Trial]:
     ):
         true = [[x, y + moved_m, z] for x, y, z in eyes]
         yield Trial(STAGE, f"light {name} the eyes, {kind}", partial(light, eyes, true, kind), measure="squared error")
-    for squared in (1.0, 0.5, 1e-3, 1e-6, 1e-10):
-        yield Trial(STAGE, f"PSNR of a squared error of {squared:g}", partial(decibels, squared), measure="dB")
     layers = layers_of("noise", THREE)
 
     def nobody() -> object:

@@ -17,14 +17,13 @@ from runtime.report.stability import (
     uncertainty,
 )
 from runtime.report.stability.calibration import Fit
-from runtime.report.stability.networks import Check
 from runtime.report.stability.trial import Answer, Case, Trial, settle
 
 SOLVERS = (*networks.MODELS, "sart")
 
 
-def every_trial(fits: Mapping[str, Fit], check: Check, *, full: bool) -> Iterator[Trial]:
-    """What there is to try. `fits` are the calibration's solvers by rule, `check` the check of eyes before a network.
+def every_trial(fits: Mapping[str, Fit], *, full: bool) -> Iterator[Trial]:
+    """What there is to try. `fits` are the calibration's solvers by rule.
 
     A stage whose cases can't be made is one case, which fails.
     """
@@ -35,7 +34,7 @@ def every_trial(fits: Mapping[str, Fit], check: Check, *, full: bool) -> Iterato
         phases.PHASE: phases.trials,
         retina.STAGE: retina.trials,
         solve.STAGE: partial(solve.trials, methods),
-        networks.STAGE: partial(networks.trials, check, full=full),
+        networks.STAGE: partial(networks.trials, full=full),
         uncertainty.STAGE: uncertainty.trials,
         tracking.STAGE: partial(tracking.trials, full=full),
         calibration.STAGE: partial(calibration.trials, fits),

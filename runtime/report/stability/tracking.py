@@ -119,22 +119,6 @@ def after(steps_ns: list[int], ask_ns: int, *, settings: TrackerSettings | None 
     return Answer(error, 1.0, note=f"label {estimate.label}")
 
 
-def nonsense(eyes_m: F64, capture_ns: int) -> Answer:
-    """One bad sample among good ones of a moving head must change nothing, and the head is where it is."""
-    trackers = Tracker(), Tracker()
-    head, ask_ns = Head(31 * FRAME_NS), 30 * FRAME_NS + FRAME_NS // 2
-    for index in range(30):
-        for tracker in trackers:
-            capture = (index + 1) * FRAME_NS
-            tracker.update(EyePoints(head.eyes_m(capture), np.ones(2)), capture_ns=capture)
-    trackers[1].update(EyePoints(eyes_m, np.ones(2)), capture_ns=capture_ns)
-    one, other = (tracker.at(ask_ns).eyes_m for tracker in trackers)
-    assert one is not None and other is not None
-    if not np.array_equal(one, other):
-        return Answer(math.inf, 0.02, note="the bad sample moved the eyes")
-    return Answer(float(np.abs(one - head.eyes_m(ask_ns)).max()), 0.02)
-
-
 def trials(*, full: bool = False) -> Iterator[Trial]:
     """Every case of the tracker; `full` adds the long one."""
     for updates in (10_000, *((1_000_000,) if full else ())):
@@ -170,13 +154,3 @@ def trials(*, full: bool = False) -> Iterator[Trial]:
         settings = TrackerSettings().model_copy(update=values)
         run = partial(after, usual, 60_000_000, settings=settings)
         yield Trial(STAGE, f"stiff gains: {name}", run, measure="m", floor=FLOOR_M)
-    later = 30 * FRAME_NS + FRAME_NS // 4
-    for name, eyes, when in (
-        ("NaN", np.full((2, 3), np.nan), later),
-        ("infinitely far", np.full((2, 3), np.inf), later),
-        ("both eyes at one place", np.repeat(EYES_M[:1], 2, axis=0), later),
-        ("1e300 m away", EYES_M + 1e300, later),
-        ("late by a frame", EYES_M + 0.01, 29 * FRAME_NS),
-    ):
-        run = partial(nonsense, eyes, when)
-        yield Trial(STAGE, f"one bad sample: {name}", run, measure="m", floor=FLOOR_M)

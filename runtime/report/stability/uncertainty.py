@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from functools import partial
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from runtime.report.stability.trial import Answer, Trial, refusal
 STAGE = "unsure eyes"
 SIGMAS_MM = (0.0, 1e-6, 0.1, 1.0, 2.0, 4.0, 10.0, 50.0)
 ROWS, PANEL_CODE = 8, 1 / 255
-MOST_LEFT = 0.1  # of the mean square drive of sure eyes, for 50 columns of doubt
 DRIVEN_MOST = ((1.0, 0.97), (50.0, 0.5))  # from so many millimetres on, of the drive of sure eyes, at most
 LEAST_SURE = 0.05  # of the outer panels' mean drive for two points
 
@@ -73,42 +71,6 @@ def unsure(model: str, sigma_columns: float) -> Answer:
     )
 
 
-def small(model: str, rows_or_columns: str) -> Answer:
-    """One cell, or one chain's worth of difference: finite, in the box, nothing where nothing is wanted."""
-    cell = loaded(model).session.contract.cell_px
-    cells = 1 if rows_or_columns == "one cell" else 9
-    need = np.zeros((ROWS, cells * 2 * cell))
-    need[:, :: 2 * cell] = 0.2
-    panels = answer_of(model, need, (0.1, 0.1, 0.3))
-    even = answer_of(model, 0 * need, (0.1, 0.1, 0.3))
-    if np.abs(panels - even).max() < PANEL_CODE:
-        return Answer(1.0, 0.0, note="what is wanted changes nothing")
-    inside = float(max(panels.max() - 1, -panels.min(), 0.0))
-    return Answer(max(inside, float(np.abs(even - 0.5).max())), 1 / FULL)
-
-
-def clipped(model: str) -> Answer:
-    """A difference that no panel can show: every value in the range, the way to it taken as far as it goes."""
-    cell = loaded(model).session.contract.cell_px
-    need = np.full((ROWS, 40 * 2 * cell), 0.5)
-    rear, front = answer_of(model, need, (0.0, 0.0, 0.0))
-    outside = float(max(front.max() - 1, -front.min(), rear.max() - 1, -rear.min(), 0.0))
-    reached = float(np.ptp(front))  # a ramp as long as the raster fills the range and stays
-    return Answer(outside + max(0.98 - reached, 0.0), 1 / FULL, note=f"range used {reached:.3f}")
-
-
-def monotone(model: str) -> Answer:
-    """The surer the eyes, the stronger the drive: never more for more doubt, and next to none for nothing but doubt."""
-    random = np.random.default_rng(5)
-    cell = loaded(model).session.contract.cell_px
-    need = random.uniform(-0.1, 0.1, (ROWS, 24 * 2 * cell))
-    doubts = (0.0, 0.1, 0.3, 1.0, 5.0, 50.0)
-    drives = [float(np.square(answer_of(model, need, (doubt, doubt, 0.3)) - 0.5).mean()) for doubt in doubts]
-    rises = max(b - a for a, b in pairwise(drives))
-    left = max(drives[-1] - MOST_LEFT * drives[0], 0.0) if drives[0] > 0.0 else 1.0
-    return Answer(max(rises, left, 0.0), 1e-6, note=" ".join(f"{drive:.2g}" for drive in drives))
-
-
 def whole(model: str, sigma_mm: float) -> Answer:
     """A whole prediction of eyes that disagree everywhere: the outer panels nearer to even, the less is known."""
     driven, sure = (
@@ -137,10 +99,6 @@ def trials() -> Iterator[Trial]:
                 partial(unsure, model, columns),
                 measure="phase",
             )
-        for what in ("one cell", "one chain"):
-            yield Trial(STAGE, f"{model}: {what}", partial(small, model, what), measure="phase")
-        yield Trial(STAGE, f"{model}: all clipped", partial(clipped, model), measure="phase")
-        yield Trial(STAGE, f"{model}: doubt from nothing to 50 columns", partial(monotone, model), measure="phase²")
     for sigma_mm in SIGMAS_MM:
         yield Trial(
             STAGE,
