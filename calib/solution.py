@@ -7,16 +7,19 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from calib.robust import fit_robust
-from calib.scale_prior import posterior_scale
 from calib.similarity import Similarity, fit
 from runtime.eyes.calibration import position_jacobian
 from runtime.records import F64
 
 Method = Literal["seed", "least-squares", "inverse", "robust", "fixed-scale"]
 METHODS: tuple[Method, ...] = get_args(Method)
-SCALE_SIGMA = 0.02  # by how much the metre of a sensor is off that is not exact
+EXACT_SHARE = 0.8  # of sensors have our metre exactly, for all that pairs can tell
+SCALE_SIGMA = 0.02  # by so much, or more, the metre of the others is off: as likely by 4 to 8% as by 8 to 16%
+FARTHEST = np.log(10.0)  # not by more than a factor of ten: what their prior is normalised for
+MIN_SIGMA = 1e-12  # of the scale's logarithm: exact pairs
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,10 +141,25 @@ def solve(sensor_m: F64, stack_m: F64, *, method: Method, known_scale: float = 1
     )
 
 
+def posterior_scale(fitted: F64 | float, *, sigma: float, freedom: int) -> tuple[F64, F64]:
+    """What is believed of the logarithm of a scale (...), and its standard deviation: two hypotheses, weighed (Bayes).
+
+    The pairs tell a fitted logarithm with an error estimated by so many degrees of freedom: Student's likelihood. The
+    answer is the mean of both hypotheses' (0, and the fitted one) by their probabilities: no cliff between them, and a
+    sensor that is off by a tenth is not pulled back.
+    """
+    sigma = max(sigma, MIN_SIGMA)
+    exact = EXACT_SHARE * student.pdf(fitted / sigma, freedom) / sigma
+    # The prior of the others is flat over the likelihood, nearly: its density at the fitted place serves.
+    off = (1 - EXACT_SHARE) / (2 * np.log1p(FARTHEST / SCALE_SIGMA)) / (SCALE_SIGMA + np.abs(fitted))
+    chance = exact / (exact + off)
+    return (1 - chance) * fitted, np.sqrt((1 - chance) * (sigma**2 + chance * np.square(fitted)))
+
+
 def solve_default(sensor_m: F64, stack_m: F64) -> Solution:
     """The method that has the least error at the eye for pairs like these (tests/calib/test_methods.py).
 
-    `robust` where pairs are grossly wrong; else `fixed-scale` at the posterior mean of the scale (`scale_prior`):
+    `robust` where pairs are grossly wrong; else `fixed-scale` at the posterior mean of the scale:
     1 unless the pairs show another. Raises `similarity.Degenerate`.
     """
     robust = solve(sensor_m, stack_m, method="robust")
@@ -150,10 +168,8 @@ def solve_default(sensor_m: F64, stack_m: F64) -> Solution:
         return replace(robust, reason=f"{rejected} of {len(sensor_m)} pairs do not agree with the others")
     inverse = solve(sensor_m, stack_m, method="inverse")
     fitted = float(inverse.similarity.scale)
-    believed = posterior_scale(
-        np.log(fitted), sigma=inverse.scale_sigma, freedom=3 * len(sensor_m) - 7, prior_sigma=SCALE_SIGMA
-    )
-    scale, sigma = float(np.exp(believed.log_scale)), float(believed.sigma)
+    mean, spread = posterior_scale(np.log(fitted), sigma=inverse.scale_sigma, freedom=3 * len(sensor_m) - 7)
+    scale, sigma = float(np.exp(mean)), float(spread)
     found = solve(
         sensor_m,
         stack_m,
