@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,6 +14,7 @@ from runtime.commands.app import app
 from runtime.config import Settings, load_settings, load_stack, with_options
 from runtime.daemon.names import scene_from_here, scene_names
 from runtime.errors import InputError
+from runtime.support import cache
 from runtime.support.artifacts import write_png
 from runtime.support.removed import REMOVED_COMMANDS, removed_command
 from tests.test_cli import phasestack
@@ -187,3 +190,16 @@ def test_a_command_or_option_that_is_gone_says_what_took_its_place() -> None:
     done = phasestack("run", "--config", "a.toml", "--budget-ms=16")
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.count("\n") == 1 and "is gone: " in done.stderr and "model.budget_ms" in done.stderr
+
+
+def test_a_cache_that_can_not_be_written_is_told_once_and_kept_elsewhere(tmp_path: Path, monkeypatch: Any) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    told: list[str] = []
+    monkeypatch.setattr(cache.log, "warning", lambda text, *what: told.append(text % what))
+    assert [cache.user_cache(name).parent for name in "ab"] == [tmp_path / f"phasestack-{os.geteuid()}"] * 2
+    assert len(told) == 1 and "can't be written" in told[0]
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file" / "other"))
+    (tmp_path / f"phasestack-{os.geteuid()}").chmod(0o755)
+    assert cache.user_cache("a").is_relative_to(tmp_path / "file"), "what others may write is not loaded"

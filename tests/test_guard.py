@@ -154,7 +154,9 @@ main()
 """
 
 
-@pytest.mark.parametrize("module", ["runtime.commands.guard", "typer"])
+@pytest.mark.parametrize(
+    "module", ["runtime.commands.guard", "typer", "runtime.commands.app", "runtime.daemon.supervise", "numpy"]
+)
 def test_an_interrupt_that_python_would_drop_while_a_module_is_imported_ends_the_command(module: str) -> None:
     """Seen: `run` went on for ever, for Python drops what is raised while it releases a module's lock."""
     replay = ["run", "--replay", "demo", "--headless", "--max-speed", "--frames", "1", "--scale", "0.1"]

@@ -40,11 +40,14 @@ def run(
 
     Example: phasestack run --replay demo --headless --max-speed --frames 30 --out out/run
     """
-    from runtime.config import Settings, load_settings, with_options
-    from runtime.daemon.build import RunOptions
-    from runtime.daemon.drive import print_summary
-    from runtime.daemon.supervise import run_daemon
-    from runtime.errors import InputError
+    from runtime.support.interrupts import imports_end_at_once
+
+    with imports_end_at_once():
+        from runtime.config import Settings, load_settings, with_options
+        from runtime.daemon.build import RunOptions
+        from runtime.daemon.drive import print_summary
+        from runtime.daemon.supervise import run_daemon
+        from runtime.errors import InputError
 
     if keep_light and out is None:
         raise InputError("run", "--keep-light", "needs --out")

@@ -1,7 +1,7 @@
 """The status and control socket: JSON lines over a local socket of mode 0660, answered alongside the loop.
 
 Whoever trickles, hangs or comes in crowds holds up nobody: a request has so long to arrive, an answer so long to be
-read, and where all places are taken the next client is sent away.
+read, and where all places are taken the client that has waited longest for a whole request goes.
 """
 
 from __future__ import annotations
@@ -66,6 +66,7 @@ class StatusServer:
         self._started_ns = clock.now_ns()
         self._snapshot: tuple[int, Callable[[], dict[str, Any]]] = (self._started_ns, dict)
         self._clients: set[asyncio.Task[None]] = set()
+        self._reading: dict[asyncio.Task[None], None] = {}  # who waits for a whole request, the longest first
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with _locked(path.parent):  # of two that start at once the second finds the first listening
@@ -163,10 +164,9 @@ class StatusServer:
         assert task is not None
         writer.transport.set_write_buffer_limits(high=0)  # `drain` waits until all of an answer is on its way
         try:
-            if len(self._clients) >= CLIENTS_MAX:
-                raise _Refusal("too many clients")
+            self._make_room()
             self._clients.add(task)
-            while line := await self._request(reader):
+            while line := await self._request(task, reader):
                 await self._reply(line, writer)
         except _Refusal as error:
             self._send(writer, {"ok": False, "error": str(error)})
@@ -180,8 +180,19 @@ class StatusServer:
                 writer.transport.abort()
             writer.close()
 
-    async def _request(self, reader: StreamReader) -> bytes:
+    def _make_room(self) -> None:
+        """Send away who has waited longest for a whole request; raises _Refusal where all are being answered."""
+        if len(self._clients) >= CLIENTS_MAX:
+            longest = next(iter(self._reading), None)
+            if longest is None:
+                raise _Refusal("too many clients")
+            self._reading.pop(longest)
+            self._clients.discard(longest)  # at once: many may come before it runs again
+            longest.cancel("too many clients")
+
+    async def _request(self, task: asyncio.Task[None], reader: StreamReader) -> bytes:
         """The next line; what there is of it where nothing more will come."""
+        self._reading[task] = None
         try:
             async with asyncio.timeout(REQUEST_S):
                 return await reader.readuntil(b"\n")
@@ -191,6 +202,8 @@ class StatusServer:
             raise _Refusal("the request is too long") from None
         except TimeoutError:
             raise _Refusal("the request did not come in time") from None
+        finally:
+            self._reading.pop(task, None)
 
     async def _reply(self, line: bytes, writer: StreamWriter) -> None:
         try:

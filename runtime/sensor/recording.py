@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import logging
 import os
@@ -104,14 +105,20 @@ def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -
     """A writer whose file appears under its name with the first sample, and is kept from then on.
 
     Until then an older file of that name stays; what a crash leaves is readable up to its last whole chunk.
-    One with pictures is its owner's alone. Raises InputError where it can't be written.
+    One with pictures is its owner's alone. Raises InputError where it can't be written, or another process writes it.
     """
     part = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC
-        file = os.fdopen(os.open(part, flags, 0o600), "wb")
+        if path.is_file():
+            with path.open("rb") as present:
+                fcntl.flock(present, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        file = os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600), "wb")
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until it is closed, under either name
+        file.truncate()
         os.fchmod(file.fileno(), 0o600 if header.colour or header.depth else 0o644)  # a face is private
+    except BlockingIOError:
+        raise InputError(path, "", "is being recorded by another process") from None
     except OSError as error:
         raise InputError(path, "", f"cannot be written ({error.strerror})") from None
     try:

@@ -9,6 +9,7 @@ import socket
 import stat
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -94,14 +95,15 @@ def test_a_request_without_end_is_cut_off(server: StatusServer, path: Path) -> N
         assert b"too long" in client.makefile("rb").readline()
 
 
-def test_where_all_places_are_taken_the_next_one_is_sent_away(server: StatusServer, path: Path) -> None:
+def test_where_all_places_are_taken_the_one_that_has_waited_longest_goes(server: StatusServer, path: Path) -> None:
     crowd = [connected(path) for _ in range(server_module.CLIENTS_MAX)]
     for client in crowd:
         client.sendall(b'{"command": "status"}\n')
         assert b"true" in client.makefile("rb").readline()
-    assert "too many" in status(path)["error"]
-    crowd.pop().close()
-    assert eventually(lambda: status(path)["ok"])
+    assert status(path)["ok"]
+    assert b"too many" in crowd[0].recv(1000)
+    crowd[-1].sendall(b'{"command": "status"}\n')
+    assert b"true" in crowd[-1].makefile("rb").readline()
     for client in crowd:
         client.close()
 
@@ -193,6 +195,41 @@ def test_when_the_daemon_stops_who_waits_is_told_and_nothing_is_done_later(serve
 
 
 # Crowds
+
+
+def test_tricklers_lock_out_nobody(server: StatusServer, path: Path) -> None:
+    """More of them than there are places, each sending a byte now and then, and coming again when it is sent away."""
+    stop = threading.Event()
+    sent = [0]
+
+    def trickle() -> None:
+        while not stop.is_set():
+            try:
+                with connected(path) as client:
+                    while not stop.is_set():
+                        client.sendall(b"x")
+                        sent[0] += 1
+                        stop.wait(0.05)
+            except OSError:
+                stop.wait(0.01)
+
+    threads = [threading.Thread(target=trickle) for _ in range(server_module.CLIENTS_MAX + 16)]
+    for thread in threads:
+        thread.start()
+    try:
+        assert eventually(lambda: sent[0] > 3 * len(threads), within_s=20)
+        assert all(ask([path], STATUS)["ok"] for _ in range(20))
+        with ThreadPoolExecutor(1) as pool:
+            asked = pool.submit(ask, [path], {"command": "reload"})
+            command = server.commands.get(timeout=60)
+            command.take()
+            command.done()
+            assert asked.result(timeout=60) == {"ok": True}
+        assert server.connections <= server_module.CLIENTS_MAX
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
 
 
 @pytest.fixture

@@ -288,6 +288,24 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - base) >> 10)
         assert "bomb.mcap" in told
 
 
+def test_two_recorders_into_one_file_are_one_too_many(tmp_path: Path) -> None:
+    path = tmp_path / "o.mcap"
+    code = f"from pathlib import Path; from tests.sensor.test_recording import second; second(Path({str(path)!r}))"
+    with recording_to(path, RecordingHeader("test")) as writer:
+        for _ in range(2):  # before the file has its name, and after
+            ran = subprocess.run(
+                [sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[2]
+            )
+            assert "is being recorded by another process" in ran.stderr
+            assert writer.write(SensorFrame(writer.count + 1, writer.count * 10**7))
+    assert len(list(Recording(path).samples())) == 2
+
+
+def second(path: Path) -> None:
+    with recording_to(path, RecordingHeader("second")):
+        pass
+
+
 @pytest.mark.parametrize(("colour", "mode"), [(False, 0o644), (True, 0o600)])
 def test_recordings_with_pictures_are_their_owner_s_alone(tmp_path: Path, colour: bool, mode: int) -> None:
     with recording_to(tmp_path / "o.mcap", RecordingHeader("test", colour=colour)) as writer:
