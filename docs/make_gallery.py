@@ -55,8 +55,7 @@ figures:
 * *carried*: what eyes that are elsewhere by now see, against the picture that the layers were solved for.
 * *time*: of a whole solution, from two decoded pictures to 8-bit layers; p50 and p99. Every method runs in a process
   of its own, whose peak is its memory. Times hold for one machine and hour: compare ratios.
-* The published network (`eyereal`) is timed with untrained weights where torch is installed; with trained ones, as
-  `--model FILE.onnx`, it has a picture too.
+* The published network (`eyereal`), exported from its checkpoint, is compared as `--model FILE.onnx`.
 
 `bench compare` divides times by a yardstick of the same run, does not compare them where the machine was busy, and
 exits with 1 where a model got slower by more than the noise, lost 0.1 dB or took 15% more memory.

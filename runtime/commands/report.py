@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-
-if TYPE_CHECKING:
-    from runtime.report.methods import Method
 
 
 def report(
@@ -22,7 +19,7 @@ def report(
     """Measure light against run time, in one run on this machine, and write a page of it. Takes minutes.
 
     The page is there with the first figure and grows: open it, or stop when it shows enough. The published network is
-    compared with untrained weights (time and memory only); with its own as `--model FILE.onnx`.
+    compared as `--model FILE.onnx`, once `phasestack export` has made it of its checkpoint.
 
     Example: phasestack report --pairs my-pairs --out report
     """
@@ -43,7 +40,6 @@ def report(
                 models=model or [],
                 quick=quick,
                 command=" ".join(parts),
-                published=(lambda width_px, height_px: []) if quick else _published,
                 progress=tell,
             )
     except KeyboardInterrupt:
@@ -56,37 +52,8 @@ def report(
     for result in sorted(record["methods"], key=lambda r: r["ms_p50"]):
         size = f"{result['width_px']}x{result['height_px']}"
         light = result["light_db"].get("1", float("nan"))
-        shown = f"light {light:6.2f} dB, one ray {result['psnr_db']:6.2f} dB"
         console.print(
             f"{result['name']:18}{size:>11}{result['ms_p50']:10.1f} ms   "
-            f"{shown if result['trained'] else 'untrained: no picture':36}{result['memory_mib']:7.0f} MiB"
+            f"light {light:6.2f} dB, one ray {result['psnr_db']:6.2f} dB {result['memory_mib']:7.0f} MiB"
         )
     console.print(f"see {out / 'index.html'}; light, of eyes sure to 1 mm, is the figure to quote")
-
-
-def _published(width_px: int, height_px: int) -> list[Method]:
-    """The published network, made once and kept; none without torch, or where it can't be made, which is told."""
-    import importlib.metadata
-    import importlib.util
-
-    if any(importlib.util.find_spec(name) is None for name in ("torch", "onnx")):
-        return []
-    import model_export
-    from model_export import yardstick
-    from runtime.errors import FatalError, InputError
-    from runtime.report.methods import Method, check_models
-    from runtime.report.worker import apart
-    from runtime.support.cache import digest, user_cache
-
-    sources = [Path(model_export.__file__).parent / name for name in ("eyereal.py", "onnx_files.py", "yardstick.py")]
-    versions = [importlib.metadata.version(name) for name in ("torch", "onnx", "onnxruntime")]
-    path = user_cache("models") / digest(sources, versions) / f"eyereal-{width_px}x{height_px}.onnx"
-    try:
-        check_models([str(path)])
-    except InputError:  # not there, or damaged
-        try:
-            apart(yardstick.write_eyereal, path, width_px=width_px, height_px=height_px)
-        except FatalError as error:
-            typer.echo(f"phasestack: eyereal is left out: {error}", err=True)
-            return []
-    return [Method("eyereal", "network", str(path), trained=False)]

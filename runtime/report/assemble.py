@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
-from itertools import islice
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -24,8 +23,6 @@ from runtime.report.worker import apart
 REWRITTEN_EVERY_S = 10.0
 QUOTE = "light_db of eyes sure to 1 mm: what both eyes make of the panels' pixels"
 Progress = Callable[[str], None]
-Published = Callable[[int, int], Sequence[Method]]  # the published network for panels so wide and high
-Batch = tuple[Sequence[Method], Iterable[StillPair]]
 
 
 class GrowingPage:
@@ -67,12 +64,8 @@ class GrowingPage:
 
 
 def _tiles(methods: Sequence[dict[str, Any]]) -> list[Tile]:
-    shown = [m for m in methods if m["kind"] == "network" and m["trained"] and QUOTED in m["light_db"]]
-    tiles = [Tile(f"{method['light_db'][QUOTED]:.1f} dB", f"light, {method['name']}") for method in shown]
-    ms = {method["name"]: method["ms_p50"] for method in methods}
-    if {"eyereal", "balanced"} <= ms.keys():
-        tiles.append(Tile(f"1/{ms['eyereal'] / ms['balanced']:.0f}", "of the published network's time, balanced"))
-    return tiles
+    shown = [m for m in methods if m["kind"] == "network" and QUOTED in m["light_db"]]
+    return [Tile(f"{method['light_db'][QUOTED]:.1f} dB", f"light, {method['name']}") for method in shown]
 
 
 def whole_report(
@@ -83,7 +76,6 @@ def whole_report(
     models: Sequence[str] = (),
     quick: bool = False,
     command: str = "phasestack report",
-    published: Published = lambda width_px, height_px: [],
     progress: Progress = lambda name: None,
 ) -> dict[str, Any]:
     """Measure everything into a folder; answers report.json's object. `quick`: quarter-size panels, fewer references.
@@ -99,15 +91,10 @@ def whole_report(
     methods = shipped_and_references(models, quick=quick)
     for size, own in _by_size(cases).items():
         title = f"{len(own)} case file{'s' if len(own) > 1 else ''}, {size}"
-        _frontier(page, [(methods, own)], title=title, name=f"cases-{size}", key="methods")
-
-    def on_scenes() -> Iterable[Batch]:
-        yield methods, procedural_pairs(stack)
-        page.doing("the published network")
-        yield published(stack.width_px, stack.height_px), islice(procedural_pairs(stack), 1)
+        _frontier(page, methods, own, title=title, name=f"cases-{size}", key="methods")
 
     key = "methods_on_built_in_scenes" if cases else "methods"
-    _frontier(page, on_scenes(), title="built-in scenes", name="scenes", key=key)
+    _frontier(page, methods, procedural_pairs(stack), title="built-in scenes", name="scenes", key=key)
     _moving(page, quick=quick)
     if with_focal:
         _focal(page)
@@ -122,7 +109,9 @@ def _by_size(cases: Sequence[StillPair]) -> dict[str, list[StillPair]]:
     return groups
 
 
-def _frontier(page: GrowingPage, batches: Iterable[Batch], *, title: str, name: str, key: str) -> None:
+def _frontier(
+    page: GrowingPage, methods: Sequence[Method], pairs: Iterable[StillPair], *, title: str, name: str, key: str
+) -> None:
     """One section of pairs that share a resolution; `key`: of the record that its methods are added to."""
     title = f"Error against run time: {title}"
     page.doing(f"{title}: drawing")
@@ -131,12 +120,11 @@ def _frontier(page: GrowingPage, batches: Iterable[Batch], *, title: str, name: 
     def section() -> Section:
         return frontier_section(list(results.values()), title=title, name=name)
 
-    for methods, pairs in batches:
-        for done, result in measure(methods, pairs):
-            page.doing(f"{title}: {done} is done")
-            results[result.name] = result
-            page.record[key] = before + [one.record() for one in results.values()]
-            page.put(name, section)
+    for done, result in measure(methods, pairs):
+        page.doing(f"{title}: {done} is done")
+        results[result.name] = result
+        page.record[key] = before + [one.record() for one in results.values()]
+        page.put(name, section)
     page.put(name, section, last=True)
 
 

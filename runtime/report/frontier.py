@@ -71,7 +71,6 @@ class MethodResult:
     ssim: float
     worst_eye_psnr_db: float  # least of all eyes and pairs
     psnr_db_off_eye: dict[str, float]
-    trained: bool = True  # where not, the picture is nobody's: time, memory and sizes count, the error does not
     pairs: list[PairResult] = field(default_factory=list)
 
     @property
@@ -87,13 +86,13 @@ class MethodResult:
 def measure(
     methods: Sequence[Method], pairs: Iterable[StillPair], *, threads: int = 2
 ) -> Iterator[tuple[str, MethodResult]]:
-    """Every method on every pair, pair by pair; one without training on the first alone. Pairs share a resolution.
+    """Every method on every pair, pair by pair. Pairs share a resolution.
 
     Yields what was measured last, and its method's result so far. Raises FatalError where one fails.
     """
     found: dict[str, list[PairResult]] = {method.name: [] for method in methods}
-    for number, pair in enumerate(pairs):
-        for method in methods if number == 0 else [method for method in methods if method.trained]:
+    for pair in pairs:
+        for method in methods:
             run = apart(run_method, method, replace(pair, off=()), threads)
             found[method.name].append(pair_result(pair, run))
             yield f"{method.name}, {pair.name}", _together(method, pair, run, found[method.name])
@@ -167,7 +166,6 @@ def _together(method: Method, pair: StillPair, run: MethodRun, pairs: list[PairR
         ssim=float(np.mean([one.ssim for one in seen])),
         worst_eye_psnr_db=min(min(one.eye_psnr_db) for one in seen),
         psnr_db_off_eye=_means([one.psnr_db_off_eye for one in pairs]),
-        trained=method.trained,
         pairs=list(pairs),
     )
 
@@ -180,9 +178,9 @@ def _means(tables: Sequence[Any]) -> dict[str, float]:
 
 
 def pareto(results: Sequence[MethodResult]) -> list[MethodResult]:
-    """Those that nothing else beats in both time and light, fastest first; the untrained have no picture."""
+    """Those that nothing else beats in both time and light, fastest first."""
     front: list[MethodResult] = []
-    for result in sorted((r for r in results if r.trained), key=lambda r: (r.ms_p50, -r.quoted_db)):
+    for result in sorted(results, key=lambda r: (r.ms_p50, -r.quoted_db)):
         if not front or result.quoted_db > front[-1].quoted_db:
             front.append(result)
     return front

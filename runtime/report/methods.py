@@ -26,7 +26,6 @@ class Method:
     kind: Kind
     source: str  # what `load_predictor` takes
     iterations: int = 0  # of SART
-    trained: bool = True  # where not, time and memory are the network's, its picture is nobody's
 
     def opened(self, stack: PanelStack, *, threads: int) -> Predictor:
         """Ready for pairs on a stack. Raises InputError, MissingPart."""

@@ -64,7 +64,7 @@ REMOVED_COMMANDS: dict[str, str] = {
     "calibrate report --pairs": "`calibrate solve` writes the pairs into its file",
     "identify --ask": "`setup`: its first step asks which monitor is which panel",
     "setup --again": "p goes a step back; every step can be done again",
-    "report --no-compare": "`report --quick` leaves the published network out",
+    "report --no-compare": "take it out: the published network is compared only where `--model FILE.onnx` names it",
     "config --check": "`doctor --config FILE` checks values, names and files, and tries what they name",
     "config --json": "`config` prints TOML",
     "setup --device": "photographs in the folder --photos",

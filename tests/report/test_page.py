@@ -100,16 +100,3 @@ def test_texts_are_escaped() -> None:
     for raw in ("<b>title", "<i>", "<x>", "<y>", "<k>", "<v>", "<script>\n</td>"):
         assert raw not in html
     assert "&lt;script&gt;" in html
-
-
-def test_an_untrained_network_has_a_time_and_no_error() -> None:
-    untrained = replace(method("eyereal", "network", 10, 99), trained=False)
-    results = [method("fast", "network", 20, 36), untrained, method("SART-10", "iterative", 900, 40)]
-    section = frontier_page.frontier_section(results, title="Frontier", name="test")
-    (table,) = section.tables
-    rows = {row[0]: dict(zip(table.headings, row, strict=True)) for row in table.rows}
-    assert rows["eyereal"]["p50 ms"] == "10.0"
-    assert rows["eyereal"]["light 1 mm dB"] == rows["eyereal"]["2mm beside"] == ""
-    assert rows["fast"]["light 1 mm dB"] == "36"
-    assert dict(zip(rows, table.styles, strict=True)) == {"eyereal": "", "fast": "good", "SART-10": "good"}
-    assert any("untrained" in text for text in section.text)

@@ -10,16 +10,10 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from runtime.commands.report import _published, report
+from runtime.commands.report import report
 from runtime.errors import InputError
-from runtime.optics.stack import PanelStack
 from runtime.report.assemble import whole_report
-from runtime.report.frontier import measure, pareto
-from runtime.report.methods import Method
-from runtime.report.pairs import Painter, eyes_at
 from tests.report.test_pairs import case_folder
-
-STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 192, 108)
 
 
 def command(*arguments: str) -> Any:
@@ -61,27 +55,6 @@ def test_a_report_that_is_stopped_is_a_page_with_what_was_measured(
     assert record["complete"] is False and record["methods"][0]["light_db"]["1"] > 10
     page = (tmp_path / "out" / "index.html").read_text()
     assert "Not finished" in page and page.count("data:image/png;base64,") == 1
-
-
-@pytest.mark.slow
-def test_what_is_made_to_compare_with_is_kept_and_made_anew_where_it_is_damaged(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("torch")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    methods = _published(STACK.width_px, STACK.height_px)
-    assert [m.name for m in methods] == ["eyereal"]
-    (file,) = tmp_path.rglob("*.onnx")
-    made = file.stat().st_mtime_ns
-    assert _published(STACK.width_px, STACK.height_px) == methods and file.stat().st_mtime_ns == made
-    file.write_bytes(file.read_bytes()[:1000])
-    assert _published(STACK.width_px, STACK.height_px) == methods and file.stat().st_size > 1000
-    with Painter("demo", STACK) as painter:
-        pair = painter.pair("one", eyes_at(distance_m=0.6), STACK, off_mm=())
-    both = [*methods, Method("balanced", "network", "balanced")]
-    results = [result for _, result in measure(both, [pair], threads=1)]
-    assert not results[0].trained
-    assert [r.name for r in pareto(results)] == ["balanced"]
 
 
 @pytest.mark.slow
