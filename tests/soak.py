@@ -67,7 +67,7 @@ class Soak:
         self._folder = folder
         self.recorder = Recorder(folder / "boxes", minutes=KEPT_MIN)
         self.served = Served(folder, recorder=self.recorder, late_s=60.0, abandon_s=600.0, **SETTINGS)
-        self.page = Daemon(lambda: (self.served.server.path,))
+        self.page = Daemon((self.served.server.path,))
         self.without_a_panel = 0
 
     def __enter__(self) -> Soak:

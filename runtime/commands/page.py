@@ -47,11 +47,11 @@ def page(
     from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
 
     set_niceness(BACKGROUND_NICENESS)  # the display comes first; its threads are started after this
-    sockets(config, socket)  # a bad configuration is told now
+    places = sockets(config, socket)
     path = token_file or state_folder() / "page-token"
     token = token_of(path)
     listening = _listening(host, port)
-    daemon = Daemon(lambda: sockets(config, socket))
+    daemon = Daemon(places)
     app = application(daemon, token, any_host=not _is_loopback(host))
     settings = uvicorn.Config(
         app,

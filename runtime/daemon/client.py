@@ -6,13 +6,11 @@ import contextlib
 import json
 import os
 import socket
-import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from runtime.errors import InputError, TransientError
-from runtime.support import untrusted_input
+from runtime.errors import TransientError
 
 # Where the daemon listens without a configuration: `ServiceSettings().socket`, without loading all settings.
 DEFAULT_SOCKET = "/run/phasestack/status.sock"
@@ -31,23 +29,12 @@ def candidates(configured: str) -> tuple[Path, ...]:
 
 
 def configured_socket(config: Path | None) -> str:
-    """The socket that a configuration names. Nothing else of it is looked at: a client is started quickly.
-
-    Raises InputError, naming the file and the field.
-    """
+    """The socket that a configuration names. Raises InputError, naming the file and the field."""
     if config is None:
-        return DEFAULT_SOCKET
-    try:
-        text = untrusted_input.read_text(config)
-        is_json = config.suffix.lower() == ".json"
-        table: Any = untrusted_input.parsed_json(text, source=config) if is_json else tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(config, "", f"malformed: {error}") from None
-    service = table.get("service", {}) if isinstance(table, dict) else {}
-    socket = service.get("socket", DEFAULT_SOCKET) if isinstance(service, dict) else DEFAULT_SOCKET
-    if not isinstance(socket, str) or not socket or "\0" in socket:
-        raise InputError(config, "service.socket", "names no file")
-    return str(config.absolute().parent / socket)
+        return DEFAULT_SOCKET  # without loading all that settings need: a client is started quickly
+    from runtime.config import load_settings
+
+    return load_settings(config).service.socket
 
 
 class NotRunning(TransientError):

@@ -112,4 +112,4 @@ class Reconfiguration:
 
 def _model_part(settings: Settings) -> Any:
     """All that decides which predictor there is, but what is asked anew for every solution."""
-    return settings.model.model_copy(update={"budget_ms": 0.0, "eye_sigma_mm": "auto", "pupil_mm": 4.0})
+    return settings.model.model_copy(update={"budget_ms": 0.0, "eye_sigma_mm": "auto"})

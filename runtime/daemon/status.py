@@ -90,7 +90,8 @@ def pictures(run: Run | None) -> dict[str, Any]:
     if run is None or refresh is None:
         return {"frame": None, "jpegs": {}}
     try:
-        jpegs = pictures_of(refresh, run.presenter.stack)
+        fov_deg = run.presenter.run_cell.state.settings.content.fov_deg
+        jpegs = pictures_of(refresh, run.presenter.stack, fov_deg=fov_deg)
     except ContextLost:  # its layers were in textures: the next refresh has others
         jpegs = {}
     return {"frame": refresh.account.frame, "jpegs": {name: b64encode(jpeg).decode() for name, jpeg in jpegs.items()}}

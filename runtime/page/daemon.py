@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ TOLD_WITHIN_S = 70.0  # a scene or a model is loaded first
 class Daemon:
     """Any thread may ask."""
 
-    def __init__(self, sockets: Callable[[], tuple[Path, ...]]) -> None:
+    def __init__(self, sockets: tuple[Path, ...]) -> None:
         """sockets: where it may listen."""
         self._sockets = sockets
         self._locks = {name: threading.Lock() for name in LOOKED_UP_AGAIN_S}
@@ -40,6 +39,6 @@ class Daemon:
 
     def _asked(self, request: dict[str, Any], *, timeout_s: float) -> dict[str, Any]:
         try:
-            return ask(self._sockets(), request, timeout_s=timeout_s)
+            return ask(self._sockets, request, timeout_s=timeout_s)
         except NotRunning as error:
             return {"ok": False, "running": False, "error": str(error)}

@@ -11,7 +11,6 @@ import json
 import math
 import os
 import stat
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
@@ -156,20 +155,15 @@ def whole(
     most: int,
     source: str | Path = "",
     field: str = "",
-    problem: Callable[[str], Exception] | None = None,
 ) -> int:
-    """A whole number within bounds from JSON: an int, or a float without a fraction. Raises InputError.
-
-    problem: makes another exception of the message.
-    """
-    refuse = problem or (lambda text: InputError(source, field, text))
+    """A whole number within bounds from JSON: an int, or a float without a fraction. Raises InputError."""
     # Infinity has no fraction, and is no whole number either.
     is_float = isinstance(value, float) and math.isfinite(value) and value.is_integer()
     if not is_float and (isinstance(value, bool) or not isinstance(value, int)):
-        raise refuse(f"is not a whole number: {shown(value)}")
+        raise InputError(source, field, f"is not a whole number: {shown(value)}")
     number = int(value)
     if not least <= number <= most:
-        raise refuse(f"is {shown(value)}; must be {least} to {most}")
+        raise InputError(source, field, f"is {shown(value)}; must be {least} to {most}")
     return number
 
 
@@ -192,15 +186,13 @@ def real(
     most: float,
     source: str | Path = "",
     field: str = "",
-    problem: Callable[[str], Exception] | None = None,
 ) -> float:
-    """A finite number within bounds, from JSON. Raises InputError, or what `problem` makes."""
-    refuse = problem or (lambda text: InputError(source, field, text))
+    """A finite number within bounds, from JSON. Raises InputError."""
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if not is_number or (isinstance(value, float) and not math.isfinite(value)):
-        raise refuse(f"is not a finite number: {shown(value)}")
+        raise InputError(source, field, f"is not a finite number: {shown(value)}")
     if not least <= value <= most:
-        raise refuse(f"is {shown(value)}; must be {least:g} to {most:g}")
+        raise InputError(source, field, f"is {shown(value)}; must be {least:g} to {most:g}")
     return float(value)
 
 

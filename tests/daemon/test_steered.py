@@ -6,8 +6,10 @@ import json
 import os
 import subprocess
 import sys
+from base64 import b64decode
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -97,3 +99,14 @@ def test_the_library_is_offered_with_the_scenes(tmp_path: Path) -> None:
         offered = [Path(name).name for name in about(served.run)["scenes"] if name.startswith(str(library))]
         assert offered == ["a.ply", "b.glb", "film_sbs.mp4", "lego", "list.toml"]
         assert about(served.run)["models"][:2] == ("fast", "balanced")
+
+
+def test_the_page_gets_small_pictures_of_the_layers_and_of_what_each_eye_sees(tmp_path: Path) -> None:
+    with Served(tmp_path, content={"scene": "sparse"}) as served:
+        layers_of(served)
+        told = served.asked("pictures")
+        jpegs = {
+            name: cv2.imdecode(np.frombuffer(b64decode(text), np.uint8), 1) for name, text in told["jpegs"].items()
+        }
+        assert set(jpegs) == {"layer-0", "layer-1", "layer-2", "seen-left", "seen-right"}
+        assert jpegs["seen-left"].std() > 20 and len({picture.shape for picture in jpegs.values()}) == 1

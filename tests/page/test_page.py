@@ -137,7 +137,7 @@ def test_who_goes_away_while_asking_makes_no_error(tmp_path: Path, path: str) ->
     sent: list[Any] = []
 
     async def asked() -> None:
-        app = application(Daemon(lambda: (tmp_path / "s.sock",)), "t" * 40, any_host=False)
+        app = application(Daemon((tmp_path / "s.sock",)), "t" * 40, any_host=False)
         host = b"localhost:8717"
         headers = [(b"host", host), (b"origin", b"http://" + host), (b"authorization", b"Bearer " + b"t" * 40)]
         scope = {"type": "http", "method": "POST", "path": path, "headers": headers, "query_string": b""}
