@@ -4,20 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from runtime.errors import MissingPart
-
-
-class EyeOrder(StrEnum):
-    """Which eye's picture an `eyereal` checkpoint takes first."""
-
-    LEFT_RIGHT = "left-right"
-    RIGHT_LEFT = "right-left"
 
 
 def require(*modules: str) -> None:
@@ -46,10 +38,19 @@ def train(
     Example: phasestack train --recipe balanced --out out/balanced
     """
     require("torch")
-    from model_export.train import TrainRequest, run_training
+    from model_export.train import run_training
 
-    request = TrainRequest(out, recipe, tuple(data or ()), scene, iterations, seed, device, threads, resume)
-    result = run_training(request)
+    result = run_training(
+        out,
+        recipe,
+        data=data or (),
+        scene=scene,
+        iterations=iterations,
+        seed=seed,
+        device=device,
+        threads=threads,
+        resume=resume,
+    )
     if as_json:
         typer.echo(json.dumps(result))
     else:
@@ -68,7 +69,9 @@ def export(
     random_init: Annotated[int | None, typer.Option(min=0, help="untrained weights of this seed")] = None,
     width: Annotated[int, typer.Option(help="panels' width in pixels")] = 1920,
     height: Annotated[int, typer.Option(help="panels' height in pixels")] = 1080,
-    eye_order: Annotated[EyeOrder, typer.Option(help="eyereal: the eye that its data had first")] = EyeOrder.LEFT_RIGHT,
+    eye_order: Annotated[
+        Literal["left-right", "right-left"], typer.Option(help="eyereal: the eye that its data had first")
+    ] = "left-right",
     as_json: Annotated[bool, typer.Option("--json", help="the checks as one object on stdout")] = False,
 ) -> None:
     """Write a model as ONNX with its contract, after checking it against torch; one that fails isn't written.
@@ -79,18 +82,17 @@ def export(
     Example: phasestack export --arch eyereal --checkpoint published.pth --out eyereal.onnx
     """
     require("torch", "onnx")
-    from model_export.export import ExportRequest, export_model
+    from model_export.export import export_model
 
-    request = ExportRequest(
-        arch=arch,
-        out=out,
+    report = export_model(
+        arch,
+        out,
         checkpoint=checkpoint,
         random_init=random_init,
         width_px=width,
         height_px=height,
-        eye_order=eye_order.value,
+        eye_order=eye_order,
     )
-    report = export_model(request)
     typer.echo(report.json() if as_json else report.table())
     if not report.passed:
         typer.echo(f"{out}: not written: a check failed", err=True)

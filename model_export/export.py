@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -26,27 +25,37 @@ from runtime.model.predictor import SHIPPED
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_bytes
 
-
-@dataclass(frozen=True, slots=True)
-class ExportRequest:
-    """The command line of `export`."""
-
-    arch: str
-    out: Path
-    checkpoint: Path | None = None
-    random_init: int | None = None
-    width_px: int = 1920
-    height_px: int = 1080
-    eye_order: Literal["left-right", "right-left"] = "left-right"
+EyeOrder = Literal["left-right", "right-left"]
 
 
-def export_model(request: ExportRequest) -> Report:
+def export_model(
+    arch: str,
+    out: Path,
+    *,
+    checkpoint: Path | None = None,
+    random_init: int | None = None,
+    width_px: int = 1920,
+    height_px: int = 1080,
+    eye_order: EyeOrder = "left-right",
+) -> Report:
     """Make, check, and write where every check passed. Raises InputError."""
-    _check_request(request)
-    data, module = eyereal_model(request) if request.arch == "eyereal" else spectral_model(request)
-    report = check_model(data, source=str(request.out), reference=in_torch(module))
+    if arch not in (*SHIPPED, "eyereal"):
+        raise InputError("export", "--arch", f"{arch!r} is neither {', '.join(SHIPPED)} nor eyereal")
+    if checkpoint is not None and random_init is not None:
+        raise InputError("export", "--random-init", "and --checkpoint exclude one another")
+    if arch == "eyereal" and checkpoint is None and random_init is None:
+        raise InputError("export", "--checkpoint", "or --random-init is needed: eyereal's weights aren't shipped")
+    for option, value in (("--width", width_px), ("--height", height_px)):
+        if value < LEAST_PX or value > 8192 or value % 2:
+            raise InputError("export", option, f"{value} must be an even number from {LEAST_PX} to 8192")
+    if arch == "eyereal":
+        size = {"width_px": width_px, "height_px": height_px}
+        data, module = eyereal_model(checkpoint, random_init=random_init, eye_order=eye_order, **size)
+    else:
+        data, module = spectral_model(arch, checkpoint=checkpoint, random_init=random_init)
+    report = check_model(data, source=str(out), reference=in_torch(module))
     if report.passed:
-        write_bytes(request.out, data)
+        write_bytes(out, data)
     return report
 
 
@@ -61,17 +70,18 @@ def in_torch(module: nn.Module) -> Reference:
     return run
 
 
-def spectral_model(request: ExportRequest) -> tuple[bytes, nn.Module]:
+def spectral_model(
+    name: str, *, checkpoint: Path | None = None, random_init: int | None = None
+) -> tuple[bytes, nn.Module]:
     """One of the shipped family: its recipe's weights, a checkpoint's, or untrained ones."""
-    recipe = read_recipe(request.arch)
-    if request.checkpoint is not None:
-        net, recipe = load_spectral(request.checkpoint, name=request.arch)
-    elif request.random_init is not None:
-        training = recipe.training.model_copy(update={"seed": request.random_init})
-        recipe = recipe.model_copy(update={"weights": None, "training": training})
-        net = solver_of(recipe, source=request.arch)
+    recipe = read_recipe(name)
+    if checkpoint is not None:
+        net, recipe = load_spectral(checkpoint, name=name)
     else:
-        net = solver_of(recipe, source=request.arch)
+        if random_init is not None:
+            training = recipe.training.model_copy(update={"seed": random_init})
+            recipe = recipe.model_copy(update={"weights": None, "training": training})
+        net = solver_of(recipe, source=name)
     trained = recipe.weights is not None
     return spectral_file(net, recipe, trained=trained), net
 
@@ -109,16 +119,23 @@ def spectral_file(net: SpectralSolver, recipe: Recipe, *, trained: bool = True) 
     return with_contract(data, contract)
 
 
-def eyereal_model(request: ExportRequest) -> tuple[bytes, nn.Module]:
+def eyereal_model(
+    checkpoint: Path | None,
+    *,
+    random_init: int | None = None,
+    width_px: int,
+    height_px: int,
+    eye_order: EyeOrder = "left-right",
+) -> tuple[bytes, nn.Module]:
     """The published network with a checkpoint's weights, or untrained ones."""
-    if request.checkpoint is not None:
-        net = load_eyereal(request.checkpoint)
-        origin = hashlib.sha256(untrusted_input.read_bytes(request.checkpoint, most_bytes=FILE_BYTES_MAX))
+    if checkpoint is not None:
+        net = load_eyereal(checkpoint)
+        origin = hashlib.sha256(untrusted_input.read_bytes(checkpoint, most_bytes=FILE_BYTES_MAX))
     else:
-        torch.manual_seed(request.random_init or 0)
+        torch.manual_seed(random_init or 0)
         net = EyeRealNet().eval()
-        origin = hashlib.sha256(f"eyereal 32 random {request.random_init}".encode())
-    data = eyereal_bytes(net, width_px=request.width_px, height_px=request.height_px)
+        origin = hashlib.sha256(f"eyereal 32 random {random_init}".encode())
+    data = eyereal_bytes(net, width_px=width_px, height_px=height_px)
     contract = Contract(
         version=2,
         arch="eyereal",
@@ -128,15 +145,15 @@ def eyereal_model(request: ExportRequest) -> tuple[bytes, nn.Module]:
         input_frame="panel",
         input_value="intensity",
         layout="NCHW",
-        eye_order=request.eye_order,
+        eye_order=eye_order,
         output="panels",
         branch=1,
         value_range=(-OFFSET, 1 - OFFSET),
         trained_for=None,  # a checkpoint does not tell what it was trained on
         picture_fov_deg=PICTURE_FOV_DEG,
         recipe_sha256=origin.hexdigest(),
-        width_px=request.width_px,
-        height_px=request.height_px,
+        width_px=width_px,
+        height_px=height_px,
         inputs=ports((eyereal.INPUT,)),
         outputs=ports((eyereal.OUTPUT,)),
         parameters=_parameters(net),
@@ -146,15 +163,3 @@ def eyereal_model(request: ExportRequest) -> tuple[bytes, nn.Module]:
 
 def _parameters(net: nn.Module) -> int:
     return sum(parameter.numel() for parameter in net.parameters())
-
-
-def _check_request(request: ExportRequest) -> None:
-    if request.arch not in (*SHIPPED, "eyereal"):
-        raise InputError("export", "--arch", f"{request.arch!r} is neither {', '.join(SHIPPED)} nor eyereal")
-    if request.checkpoint is not None and request.random_init is not None:
-        raise InputError("export", "--random-init", "and --checkpoint exclude one another")
-    if request.arch == "eyereal" and request.checkpoint is None and request.random_init is None:
-        raise InputError("export", "--checkpoint", "or --random-init is needed: eyereal's weights aren't shipped")
-    for option, value in (("--width", request.width_px), ("--height", request.height_px)):
-        if value < LEAST_PX or value > 8192 or value % 2:
-            raise InputError("export", option, f"{value} must be an even number from {LEAST_PX} to 8192")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -31,37 +31,32 @@ FLOOR = 1e-6  # of the squared error in the loss: beyond 60 dB nothing is gained
 GRADIENT_MAX = 5.0
 
 
-@dataclass(frozen=True, slots=True)
-class TrainRequest:
-    """The command line of `train`."""
-
-    out: Path
-    recipe: str
-    data: tuple[Path, ...]
-    scene: str
-    iterations: int | None
-    seed: int | None
-    device: str
-    threads: int
-    resume: bool
-
-
-def run_training(request: TrainRequest) -> dict[str, Any]:
+def run_training(
+    out: Path,
+    recipe_name: str,
+    *,
+    data: Sequence[Path] = (),
+    scene: str = "lego_bulldozer",
+    iterations: int | None = None,
+    seed: int | None = None,
+    device: str = "auto",
+    threads: int = 2,
+    resume: bool = False,
+) -> dict[str, Any]:
     """Train, write checkpoint, recipe and curves. Raises InputError."""
-    recipe = read_recipe(request.recipe)
-    asked = {name: getattr(request, name) for name in ("iterations", "seed") if getattr(request, name) is not None}
+    recipe = read_recipe(recipe_name)
+    asked = {name: value for name, value in (("iterations", iterations), ("seed", seed)) if value is not None}
     training = recipe.training.model_copy(update=asked)
     recipe = recipe.model_copy(update={"training": training})
-    torch.set_num_threads(request.threads)
-    device = chosen_device(request.device)
-    model = solver_of(recipe, source=request.recipe).to(device)
+    torch.set_num_threads(threads)
+    model = solver_of(recipe, source=recipe_name).to(chosen_device(device))
     optimiser = torch.optim.Adam(model.parameters(), lr=training.learning_rate)
     size = {"width_px": training.width_px, "height_px": training.height_px}
-    own = folder_pairs(request.data, scene=request.scene, **size)
+    own = folder_pairs(data, scene=scene, **size)
     held_out = held_out_pairs(training.validation_pairs, **size)
-    path = request.out / "checkpoint.pth"
-    data = {"scene": request.scene if own else "", "pairs": len(own)}
-    first, points, before_s = _resumed(path, model, optimiser, recipe, data) if request.resume else (0, [], 0.0)
+    path = out / "checkpoint.pth"
+    trained_with = {"scene": scene if own else "", "pairs": len(own)}
+    first, points, before_s = _resumed(path, model, optimiser, recipe, trained_with) if resume else (0, [], 0.0)
     start = time.monotonic()
     if not points:
         points = [Point(0, math.nan, *validate(model, held_out, recipe))]
@@ -81,7 +76,7 @@ def run_training(request: TrainRequest) -> dict[str, Any]:
                 points.append(Point(done, float(np.mean(losses)), *validate(model, held_out, recipe)))
                 losses = []
                 seconds = before_s + time.monotonic() - start
-                _save(request.out, model, optimiser, recipe, done, points, seconds, data)
+                _save(out, model, optimiser, recipe, done, points, seconds, trained_with)
     seconds = before_s + time.monotonic() - start
     last = points[-1]
     return {
@@ -212,19 +207,8 @@ def _resumed(
         raise InputError(path, "iteration", f"{iteration!r} is no number of steps")
     try:
         fill(model, table["model"], source=path, arch=recipe.name)
-        _check_optimiser(table["optimiser"], optimiser)
         optimiser.load_state_dict(table["optimiser"])
         points = [Point(int(row[0]), *row[1:]) for row in table["points"]]
         return iteration, points, float(table["seconds"])
     except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, IndexError) as error:
         raise InputError(path, "", f"is no checkpoint that a training can be resumed from ({error})") from None
-
-
-def _check_optimiser(held: dict[str, Any], optimiser: torch.optim.Optimizer) -> None:
-    """Raise ValueError where the optimiser's saved state is not of these parameters: it would be broadcast to them."""
-    parameters = [parameter for group in optimiser.param_groups for parameter in group["params"]]
-    for number, state in held["state"].items():
-        for name, value in state.items():
-            whole = isinstance(value, Tensor) and value.shape == parameters[number].shape
-            if not whole and not (name == "step" and (not isinstance(value, Tensor) or value.numel() == 1)):
-                raise ValueError(f"optimiser.state.{number}.{name} is not of the parameter's shape")

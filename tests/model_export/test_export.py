@@ -14,7 +14,7 @@ from onnx import numpy_helper  # noqa: E402
 from typer.testing import CliRunner  # noqa: E402
 
 from model_export.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
-from model_export.export import ExportRequest, export_model, in_torch  # noqa: E402
+from model_export.export import export_model, in_torch  # noqa: E402
 from model_export.eyereal import EyeRealNet  # noqa: E402
 from model_export.network import SpectralSolver  # noqa: E402
 from model_export.onnx_files import with_contract  # noqa: E402
@@ -39,8 +39,8 @@ def layers_of(path: Path) -> np.ndarray:
     return solve_still(picture, picture, eyes_m=EYES, fov_deg=40.0, predictor=predictor).layers.copy()
 
 
-def narrow_eyereal(tmp_path: Path, **options: object) -> ExportRequest:
-    """The published network, narrow, with weights and statistics that aren't trivial."""
+def narrow_eyereal(tmp_path: Path) -> Path:
+    """A checkpoint of the published network, narrow, with weights and statistics that aren't trivial."""
     torch.manual_seed(1)
     net = EyeRealNet(4)
     with torch.no_grad():
@@ -48,8 +48,15 @@ def narrow_eyereal(tmp_path: Path, **options: object) -> ExportRequest:
         net.subnets.out_conv[0].weight *= 4
     path = tmp_path / "published.pth"
     save_checkpoint(path, {"model": net.state_dict()})
-    size = {"width_px": 192, "height_px": 108}
-    return ExportRequest("eyereal", tmp_path / "eyereal.onnx", checkpoint=path, **{**size, **options})  # type: ignore[arg-type]
+    return path
+
+
+def exported(checkpoint: Path, **options: Any) -> Path:
+    """The ONNX file of a checkpoint."""
+    out = checkpoint.with_suffix(".onnx")
+    report = export_model("eyereal", out, checkpoint=checkpoint, width_px=192, height_px=108, **options)
+    assert report.passed, report.table()
+    return out
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -72,21 +79,17 @@ def test_shipped_models_pass_validation(name: str) -> None:
 
 
 def test_the_published_network_is_exported_and_served(tmp_path: Path) -> None:
-    request = narrow_eyereal(tmp_path)
-    report = export_model(request)
-    assert report.passed, report.table()
-    again = validate_file(request.out)
+    path = exported(narrow_eyereal(tmp_path))
+    again = validate_file(path)
     assert again.passed, again.table()
-    assert layers_of(request.out)[..., :3].std() > 0
+    assert layers_of(path)[..., :3].std() > 0
 
 
 def test_the_eye_that_the_data_had_first_gets_the_first_channels(tmp_path: Path) -> None:
     pictures = np.random.default_rng(9).integers(0, 256, (2, 108, 192, 3), dtype=np.uint8)
     layers = {}
     for order in ("left-right", "right-left"):
-        request = narrow_eyereal(tmp_path, eye_order=order)
-        export_model(request)
-        predictor = load_predictor(str(request.out), STACK)
+        predictor = load_predictor(str(exported(narrow_eyereal(tmp_path), eye_order=order)), STACK)
         rgba = [[np.dstack([p, p[..., :1]])] * 3 for p in pictures]
         layers[order] = predictor.solve(Job(rgba, EYES)).layers.copy()
         layers[f"{order} swapped"] = predictor.solve(Job(rgba[::-1], EYES[::-1])).layers.copy()
@@ -95,14 +98,12 @@ def test_the_eye_that_the_data_had_first_gets_the_first_channels(tmp_path: Path)
 
 
 def test_a_file_whose_weights_were_changed_differs_from_the_torch_it_came_from(tmp_path: Path) -> None:
-    request = narrow_eyereal(tmp_path)
-    export_model(request)
-    model = onnx.load(request.out)
+    checkpoint = narrow_eyereal(tmp_path)
+    model = onnx.load(exported(checkpoint))
     kernel = model.graph.initializer[0]
     kernel.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(kernel) * 3 + 1, kernel.name))
-    assert request.checkpoint is not None
     net = EyeRealNet(4)
-    net.load_state_dict(load_checkpoint(request.checkpoint)["model"])
+    net.load_state_dict(load_checkpoint(checkpoint)["model"])
     assert not check_model(model.SerializeToString(), source="changed", reference=in_torch(net.eval())).passed
 
 
@@ -135,10 +136,10 @@ def test_a_model_that_answers_nan_fails(tmp_path: Path) -> None:
         ({"checkpoint": Path("absent.pth")}, "cannot be read"),
     ],
 )
-def test_what_cannot_be_exported_is_refused_in_one_line(tmp_path: Path, options: dict[str, object], field: str) -> None:
+def test_what_cannot_be_exported_is_refused_in_one_line(tmp_path: Path, options: dict[str, Any], field: str) -> None:
     out = tmp_path / "new" / "model.onnx"
     with pytest.raises(InputError, match=field):
-        export_model(ExportRequest(**{"arch": "fast", "out": out, **options}))  # type: ignore[arg-type]
+        export_model(**{"arch": "fast", "out": out, **options})
     assert not out.parent.exists()
 
 

@@ -15,7 +15,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 from model_export.checkpoint import load_eyereal, load_spectral  # noqa: E402
-from model_export.export import ExportRequest, eyereal_model, spectral_model  # noqa: E402
+from model_export.export import eyereal_model, spectral_model  # noqa: E402
 from model_export.eyereal import EyeRealNet  # noqa: E402
 from model_export.recipe import read_recipe  # noqa: E402
 from runtime.content.eyereal import Pair, read_folder  # noqa: E402
@@ -150,7 +150,7 @@ def test_a_checkpoint_that_becomes_a_fifo_is_refused(tmp_path: Path, monkeypatch
     os.mkfifo(path)
     monkeypatch.setattr("model_export.export.load_eyereal", lambda checkpoint: None)
     with pytest.raises(InputError, match=r"a\.pth: is a FIFO"):
-        eyereal_model(ExportRequest(arch="eyereal", out=tmp_path / "a.onnx", checkpoint=path))
+        eyereal_model(path, width_px=64, height_px=64)
 
 
 # ---- what the official code does and feeds
@@ -185,16 +185,13 @@ def pair_of(folder: Path, place: str) -> Pair:
 
 
 def predictor_of(official: Path, folder: Path) -> NetworkPredictor:
-    request = ExportRequest(
-        "eyereal", folder / "eyereal.onnx", checkpoint=official, width_px=SIZE[0], height_px=SIZE[1],
-        eye_order="right-left",
-    )  # fmt: skip
-    request.out.write_bytes(eyereal_model(request)[0])
+    path = folder / "eyereal.onnx"
+    path.write_bytes(eyereal_model(official, width_px=SIZE[0], height_px=SIZE[1], eye_order="right-left")[0])
     chosen = preset("lego_bulldozer", "published-code")
     stack = chosen.stack(PanelStack(1.0, 1.0, (-1.0, 0.0, 1.0), *SIZE))
     # The published code's panels have square pixels, whatever their shape.
     stack = PanelStack(stack.width_m, stack.width_m * SIZE[1] / SIZE[0], stack.x_m, *SIZE)
-    return NetworkPredictor(ModelSession(request.out, threads=1), stack, source=request.out)
+    return NetworkPredictor(ModelSession(path, threads=1), stack, source=path)
 
 
 @pytest.mark.parametrize("place", EYES)
@@ -237,7 +234,7 @@ def test_pictures_of_another_view_are_black_beside_the_network_s_own_40_degrees(
     predictor.close()
 
 
-def test_an_export_says_what_it_was_trained_for_only_where_that_is_known(official: Path, tmp_path: Path) -> None:
+def test_an_export_says_what_it_was_trained_for_only_where_that_is_known(official: Path) -> None:
     def trained_for(data: bytes) -> object:
         import onnx
 
@@ -245,12 +242,10 @@ def test_an_export_says_what_it_was_trained_for_only_where_that_is_known(officia
         return parse_contract({item.key: item.value for item in model.metadata_props}, source="x").trained_for
 
     size = {"width_px": 64, "height_px": 40}
-    checkpoint = ExportRequest("eyereal", tmp_path / "a.onnx", checkpoint=official, **size)
-    random = ExportRequest("eyereal", tmp_path / "a.onnx", random_init=1, **size)
-    assert trained_for(eyereal_model(checkpoint)[0]) is None
-    assert trained_for(eyereal_model(random)[0]) is None
-    assert trained_for(spectral_model(ExportRequest("fast", tmp_path / "a.onnx", random_init=1))[0]) is None
-    known = trained_for(spectral_model(ExportRequest("fast", tmp_path / "a.onnx"))[0]) is not None
+    assert trained_for(eyereal_model(official, **size)[0]) is None
+    assert trained_for(eyereal_model(None, random_init=1, **size)[0]) is None
+    assert trained_for(spectral_model("fast", random_init=1)[0]) is None
+    known = trained_for(spectral_model("fast")[0]) is not None
     assert known == (read_recipe("fast").weights is not None), (
         "a recipe without trained weights was trained for nothing"
     )
