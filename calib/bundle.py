@@ -45,14 +45,11 @@ class Bundle:
 
     panels: tuple[PlacedPanel, ...]  # rear to front, frame of the reference panel
     reference: int
-    focal_px: float  # of the photographs
     places_m: F64  # (P, 3) where the camera stood, frame `stack`
     covariance: F64  # (6(N-1), 6(N-1)) small turn about its middle (rad) and shift (m) of every panel but the reference
     sigma_px: float  # of one coordinate of a saddle in a photograph
-    residual_px: F64  # (K, 2)
     used: NDArray[np.bool_]  # (K,) not left out as an outlier
     photograph: Any  # (K,) index
-    panel: Any  # (K,) index
 
     def sigma_of(self, derived: Any) -> F64:
         """(...) standard deviation of a function of the panels that answers an array, to first order."""
@@ -257,14 +254,11 @@ def adjust(seen: Sequence[SeenMarks], stack: PanelStack, *, reference: int) -> B
     return Bundle(
         panels=tuple(map(PlacedPanel, state.turns, state.middles_m)),
         reference=reference,
-        focal_px=float(state.lens[0]),
         places_m=np.asarray(np.linalg.inv(state.poses)[:, :3, 3], dtype=np.float64),
         covariance=_covariance(problem, state, used, sigma=sigma)[LENS : problem.poses_from, LENS : problem.poses_from],
         sigma_px=sigma,
-        residual_px=residual,
         used=used,
         photograph=problem.photograph,
-        panel=problem.panel,
     )
 
 

@@ -35,8 +35,7 @@ class Registration:
     """Where the panels are, and how that is known."""
 
     bundle: Bundle
-    stack: PanelStack  # the geometry to configure: true distances, or even ones near them, and tilts
-    true_x_m: F64  # (N,)
+    stack: PanelStack  # the geometry to configure: true distances, and tilts
     gap_sigma_m: F64  # (N-1,)
     homographies: F64  # (N, 3, 3) true pixels from ideal ones of `stack`
     corners_px: F64  # (N, 4, 2) displacement of the corners (0, 0), (W, 0), (W, H), (0, H)
@@ -63,17 +62,9 @@ def homographies(panels: Sequence[PlacedPanel], stack: PanelStack, eye_m: F64) -
     return np.stack([true_from_ideal_seen(panel, eye_m, stack, index) for index, panel in enumerate(panels)])
 
 
-def evenly_spaced(x_m: Sequence[float], *, reference: int) -> tuple[float, ...]:
-    """The even distances nearest to a stack's, the reference panel kept: what the shipped networks serve."""
-    steps, origin_m = np.arange(len(x_m)) - reference, x_m[reference]
-    gap_m = (steps * (np.array(x_m) - origin_m)).sum() / (steps**2).sum()
-    return tuple((origin_m + gap_m * steps).tolist())
-
-
-def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64, even: bool) -> PanelStack:
+def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64) -> PanelStack:
     """The geometry to configure for panels that stand so: distances, and tilts with homographies for an eye (3,).
 
-    even: where the shipped networks serve no gaps that differ so much, the even ones near them.
     Raises Undetermined where the panels do not stand in order.
     """
     x_m = tuple(panel.axis_x_m for panel in panels)
@@ -81,14 +72,11 @@ def geometry_of(panels: Sequence[PlacedPanel], stack: PanelStack, *, eye_m: F64,
         raise Undetermined("the panels do not stand one before the other in the order of the configuration")
     depth = tuple((0.0, float(right), float(up)) for right, up in (panel.slope + 0.0 for panel in panels))
     x, y, z = (float(value) for value in eye_m)
-    found = replace(stack, x_m=x_m, tilt=Tilt(depth, (x, y, z)))
-    if even and not found.is_evenly_spaced:
-        return replace(found, x_m=evenly_spaced(x_m, reference=stack.count // 2))
-    return found
+    return replace(stack, x_m=x_m, tilt=Tilt(depth, (x, y, z)))
 
 
-def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m: F64, even: bool) -> Registration:
-    """Fit and judge; even: as in `geometry_of`. Raises Undetermined, saying what is wrong."""
+def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m: F64) -> Registration:
+    """Fit and judge. Raises Undetermined, saying what is wrong."""
     reference = stack.count // 2
     left_out = {s.name: s.fault for s in seen if s.fault}
     left_out |= _other_sizes([s for s in seen if not s.fault])
@@ -106,7 +94,7 @@ def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m:
         raise Undetermined(
             f"the photographs do not show one rigid stack: points are {bundle.sigma_px:.1f} px off on average"
         )
-    model = geometry_of(bundle.panels, stack, eye_m=eye_m, even=even)
+    model = geometry_of(bundle.panels, stack, eye_m=eye_m)
     _refuse_implausible(bundle, stack)
     corners = corner_pixels(stack)
 
@@ -128,7 +116,6 @@ def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m:
     return Registration(
         bundle=bundle,
         stack=model,
-        true_x_m=np.array([panel.axis_x_m for panel in bundle.panels]),
         gap_sigma_m=bundle.sigma_of(lambda panels: np.diff([panel.axis_x_m for panel in panels])),
         homographies=homographies(bundle.panels, model, eye_m),
         corners_px=moved(bundle.panels),

@@ -25,7 +25,6 @@ from runtime.support.artifacts import OutputFolder, write_json, write_png, write
 from runtime.support.progress import status_line
 
 NOTED_TILT_DEG = 0.3
-EVEN_MODELS = ("fast", "balanced", "best")  # networks for evenly spaced panels
 
 
 def write_boards(out: Path, stack: PanelStack) -> dict[str, Any]:
@@ -54,9 +53,8 @@ def register_photos(
             say(name)
             seen.append(find_marks(picture, stack, name=name))
     eye_m = viewing_place_m(settings.calibration)
-    even = settings.model.name in EVEN_MODELS and stack.count == 3
     try:
-        found = register_photographs(seen, stack, eye_m=eye_m, even=even)
+        found = register_photographs(seen, stack, eye_m=eye_m)
     except Undetermined as problem:
         raise InputError(source, "photographs", str(problem)) from None
     summary = registration_summary(found) | {"source": source}
@@ -90,24 +88,17 @@ def registration_summary(found: Registration) -> dict[str, Any]:
     panels = [
         {
             "x_m": stack.x_m[index],
-            "true_x_m": found.true_x_m[index],
             "tilt_deg": tilt_deg[index],  # by how much its right edge, and its top edge, come towards the viewer
             "turn_deg": np.degrees(np.arctan2(rows[index, 2], rows[index, 1])),  # counter-clockwise, in its own plane
             "homography": found.homographies[index],
             "corner_off_px": np.linalg.norm(found.corners_px[index], axis=1).max(),
             "sigma_px": found.sigma_panel_px[index],
-            "residual_px": panel_residual_px(found, index),
         }
         for index in range(stack.count)
     ]
-    gap_m = np.diff(found.true_x_m)
     notes = list(found.notes)
-    if not np.allclose(found.true_x_m, stack.x_m, atol=5e-5):
-        notes.append(
-            f"the gaps are {' and '.join(f'{gap * 1e3:.2f}' for gap in gap_m)} mm; even ones of "
-            f"{(stack.x_m[1] - stack.x_m[0]) * 1e3:.2f} mm are written, since the shipped networks serve "
-            f"none that differ by more than {100 * UNEVEN_MOST:.0f}% (with the model sart the true ones are written)"
-        )
+    if not stack.is_evenly_spaced:
+        notes.append(f"the gaps differ by more than {100 * UNEVEN_MOST:.0f}%: the model sart serves them, no network")
     worst_deg = float(np.abs(tilt_deg).max())
     if worst_deg > NOTED_TILT_DEG:
         notes.append(
@@ -117,7 +108,7 @@ def registration_summary(found: Registration) -> dict[str, Any]:
     return {
         "reference": bundle.reference,
         "eye_m": found.eye_m,
-        "gap_m": gap_m,
+        "gap_m": np.diff(stack.x_m),
         "gap_sigma_m": found.gap_sigma_m,
         "points": int(bundle.used.sum()),
         "outliers": int((~bundle.used).sum()),
@@ -128,27 +119,15 @@ def registration_summary(found: Registration) -> dict[str, Any]:
     }
 
 
-def panel_residual_px(found: Registration, index: int) -> float:
-    """RMS distance of a panel's points from the fit, in pixels of the panel (a photograph's pixel spans some)."""
-    bundle = found.bundle
-    mine = (bundle.panel == index) & bundle.used
-    if not mine.any():
-        return 0.0
-    distance_m = np.linalg.norm(bundle.places_m - bundle.panels[index].centre_m, axis=1)[bundle.photograph[mine]]
-    span = distance_m / bundle.focal_px / (found.stack.width_m / found.stack.width_px)
-    return float(np.sqrt(((bundle.residual_px[mine] * span[:, None]) ** 2).sum(1).mean()))
-
-
 def summary_text(summary: dict[str, Any]) -> str:
     """What the command prints."""
-    rows = [["panel", "x (mm)", "true x (mm)", "turned (°)", "tilt right, up (°)", "corner off (px)", "± (px)",
-             "residual (px)"]]  # fmt: skip
+    rows = [["panel", "x (mm)", "turned (°)", "tilt right, up (°)", "corner off (px)", "± (px)"]]
     for index, panel in enumerate(summary["panels"]):
         rows.append([
             str(index) + (", the reference" if index == summary["reference"] else ""),
-            f"{panel['x_m'] * 1e3:+.2f}", f"{panel['true_x_m'] * 1e3:+.2f}", f"{panel['turn_deg']:+.3f}",
+            f"{panel['x_m'] * 1e3:+.2f}", f"{panel['turn_deg']:+.3f}",
             "{:+.2f}, {:+.2f}".format(*panel["tilt_deg"]), f"{panel['corner_off_px']:.2f}",
-            f"{panel['sigma_px']:.3f}", f"{panel['residual_px']:.3f}",
+            f"{panel['sigma_px']:.3f}",
         ])  # fmt: skip
     pairs = zip(summary["gap_m"] * 1e3, summary["gap_sigma_m"] * 1e3, strict=True)
     gaps = ", ".join(f"{gap:.2f} ± {sigma:.2f}" for gap, sigma in pairs)

@@ -43,8 +43,7 @@ def write_report(file: Path, out: Path, *, stack: PanelStack, viewing: Calibrati
     points = _stored_points(table.get("data"), calibration, source=file)
     summary = _summary(calibration, points, viewing_volume_m(viewing))
     sections = [
-        section_of("Numbers", _numbers(calibration, summary)),
-        section_of("stack_from_sensor", _matrix(calibration)),
+        section_of("Numbers", _numbers(summary)),
         Section("Pictures", figures=_pictures(calibration, points, stack)),
     ]
     notes = [*calibration.warnings]
@@ -110,7 +109,7 @@ def _summary(calibration: Calibration, points: Points | None, volume_m: F64) -> 
     return found
 
 
-def _numbers(calibration: Calibration, summary: dict[str, Any]) -> list[list[str]]:
+def _numbers(summary: dict[str, Any]) -> list[list[str]]:
     names = {
         "sensor_serial": "sensor",
         "rejected": "rejected as outliers",
@@ -124,11 +123,6 @@ def _numbers(calibration: Calibration, summary: dict[str, Any]) -> list[list[str
     }
     rows = [["", ""]]
     rows += [[names.get(key, key), _shown(value)] for key, value in summary.items() if value not in (None, "")]
-    if calibration.covariance is not None:
-        sigma = np.sqrt(np.diag(calibration.covariance))
-        rows.append(["uncertainty of the rotation about x, y, z (degrees)", _shown(np.degrees(sigma[:3]).tolist())])
-        rows.append(["uncertainty of the shift along x, y, z (mm)", _shown((sigma[3:6] * 1e3).tolist())])
-        rows.append(["uncertainty of the scale", f"{sigma[6]:.2g}" if sigma[6] else "fixed"])
     return rows
 
 
@@ -136,13 +130,6 @@ def _shown(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(f"{item:.3g}" for item in value)
     return f"{value:.5g}" if isinstance(value, float) else str(value)
-
-
-def _matrix(calibration: Calibration) -> list[list[str]]:
-    return [["", "sensor x", "sensor y", "sensor z", "1"]] + [
-        [f"stack {name}", *[f"{value:.6f}" for value in row]]
-        for name, row in zip("xyz", calibration.stack_from_sensor[:3].tolist(), strict=True)
-    ]
 
 
 def _point_rows(points: Points) -> list[list[str]]:

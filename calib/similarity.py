@@ -107,7 +107,7 @@ def extents(points_m: F64) -> F64:
 def rotation_rounding_rad(*, second_extent_m: float, magnitude_m: float) -> float:
     """By how much rounding can turn a fit of points of that second extent and largest coordinate, radians.
 
-    Measured against 50-digit arithmetic: tests/calib/test_similarity_numerics.py.
+    Measured against 50-digit arithmetic: `phasestack stability`.
     """
     return float(np.inf) if second_extent_m == 0.0 else 4 * EPSILON * magnitude_m / second_extent_m
 

@@ -42,7 +42,7 @@ def errors_of(found: Registration, truth: tuple[PlacedPanel, ...]) -> Errors:
     matrices, corners = homographies(true, stack, found.eye_m), corner_pixels(stack)
     moving = [index for index in range(stack.count) if index != reference]
     off = np.stack([through(found.homographies[i], corners) - through(matrices[i], corners) for i in moving])
-    gap_m = np.diff(found.true_x_m) - np.diff([panel.axis_x_m for panel in true])
+    gap_m = np.diff(found.stack.x_m) - np.diff([panel.axis_x_m for panel in true])
     inside = np.concatenate([
         np.abs(gap_m) <= HALF_WIDTH_95 * found.gap_sigma_m,
         (np.abs(off) <= HALF_WIDTH_95 * found.corner_sigma_px[moving]).ravel(),
@@ -105,11 +105,11 @@ def photographed(
     noise_px: float,
     random: np.random.Generator,
     poses: list[np.ndarray] | None = None,
-) -> tuple[list[SeenMarks], Lens]:
+) -> list[SeenMarks]:
     """Points of `count` photographs by hand, with one phone."""
     lens = phone(random=random)
     chosen = by_hand(count, stack, random=random) if poses is None else poses
     return [
         points_of(stack, panels, lens, pose, name=f"{number + 1}.jpg", noise_px=noise_px, random=random)
         for number, pose in enumerate(chosen)
-    ], lens
+    ]
