@@ -14,7 +14,7 @@ from calib.display import PanelDisplay, grey_layers, message_layers, open_displa
 from calib.keys import Key
 from calib.photographs import photographs
 from calib.placed import PlacedPanel, misplaced
-from calib.simulator import Exposure, Scene, by_hand, camera_from_stack, camera_rays, phone, photograph, smaller
+from calib.simulator import Exposure, Scene, by_hand, camera_from_stack, camera_rays, phone, photograph
 from calib.viewpoints import Viewpoint
 from runtime.clock import NS_PER_MS, NS_PER_S, MonotonicClock
 from runtime.commands.identify import alone as card_alone
@@ -246,10 +246,10 @@ class SimulatedHardware(SetupHardware):
         phases = np.stack([turn[picture] for turn, picture in zip(turned, pictures, strict=True)])
         scene = Scene(stack, self.true_panels, phases)
         if panel is None:
-            lens, exposure = smaller(phone(random=self._random), BOARD_SIZE), Exposure()
+            lens, exposure = phone(random=self._random, size=BOARD_SIZE), Exposure()
             poses = by_hand(PHOTOGRAPHS, stack, random=self._random)
         else:
-            lens = smaller(phone(random=self._random), GREY_SIZE)
+            lens = phone(random=self._random, size=GREY_SIZE)
             exposure = Exposure(dark=0.004, gain=0.85, samples=3)
             places = np.array(GREY_PLACES) * stack.width_m
             poses = [camera_from_stack(place, towards_m=np.zeros(3)) for place in places]

@@ -9,7 +9,7 @@ picture has a tone curve, eight bits and JPEG's losses.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -21,6 +21,12 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 
 APERTURE_PX = 0.5  # of the sensor's pixels, on the panels: standard deviation
+BLUR_PX = 0.7  # standard deviation: lens, focus and the sensor's own pixels
+ELECTRONS, READ_NOISE = 4000.0, 0.003  # at full scale: shot noise; of full scale
+VIGNETTING = 0.3  # loss of light in the corners
+GRID = 0.05  # depth to which the grid between a panel's pixels still modulates the light that is sampled
+GAMMA = 2.2  # of the camera's tone curve
+JPEG_QUALITY = 92
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +37,7 @@ class Lens:
     height_px: int
     focal_px: float
     centre_px: tuple[float, float]
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1 k2 p1 p2 k3
+    distortion: tuple[float, float, float, float, float]  # k1 k2 p1 p2 k3
 
     @property
     def matrix(self) -> F64:
@@ -45,15 +51,8 @@ class Lens:
 class Exposure:
     """How a photograph comes out."""
 
-    blur_px: float = 0.7  # standard deviation: lens, focus and the sensor's own pixels
     gain: float = 0.8  # of full scale, white in the middle of the picture
     dark: float = 0.01  # light through crossed polarizers, of full scale
-    electrons: float = 4000.0  # at full scale: shot noise
-    read_noise: float = 0.003  # of full scale
-    vignetting: float = 0.3  # loss of light in the corners
-    grid: float = 0.05  # depth to which the grid between a panel's pixels still modulates the light that is sampled
-    gamma: float = 2.2  # of the camera's tone curve
-    jpeg_quality: int = 92  # 0: not compressed
     samples: int = 1  # by as many, of what a pixel of the sensor sees; 1: one, of softened layers (quick)
 
 
@@ -66,13 +65,18 @@ class Scene:
     layers: U8  # (N, H, W) phases of one channel, 255 is a phase of 1
 
 
-def phone(*, random: np.random.Generator, width_px: int = 4000, height_px: int = 3000) -> Lens:
-    """A phone's main camera, one of many: 26 to 28 mm equivalent, a few per cent of distortion."""
-    focal = width_px * random.uniform(0.72, 0.80)
-    centre = (width_px / 2 + random.normal() * 0.004 * width_px, height_px / 2 + random.normal() * 0.004 * width_px)
+def phone(*, random: np.random.Generator, size: float = 1.0) -> Lens:
+    """A phone's main camera, one of many: 26 to 28 mm equivalent, a few per cent of distortion, 12 megapixels.
+
+    size: so much of their width and height.
+    """
+    width, height = 4000, 3000
+    focal = width * random.uniform(0.72, 0.80)
+    u, v = (np.array([width, height]) / 2 + random.normal(size=2) * 0.004 * width + 0.5) * size - 0.5
     k1, k2 = random.uniform(-0.06, 0.10), random.uniform(-0.12, 0.05)
     p1, p2 = random.normal(scale=4e-4, size=2)
-    return Lens(width_px, height_px, focal, centre, (k1, k2, float(p1), float(p2), float(random.uniform(-0.02, 0.04))))
+    distortion = (k1, k2, float(p1), float(p2), float(random.uniform(-0.02, 0.04)))
+    return Lens(round(width * size), round(height * size), focal * size, (float(u), float(v)), distortion)
 
 
 def camera_from_stack(place_m: F64, *, towards_m: F64, roll_rad: float = 0.0) -> F64:
@@ -144,8 +148,7 @@ def photograph(
     for across in steps:
         for down in steps:
             light += _light(scene, layers, pose, exposure, x + across, y + down) / np.float32(count**2)
-    if exposure.blur_px:
-        light = np.asarray(cv2.GaussianBlur(light, (0, 0), exposure.blur_px), np.float32)
+    light = np.asarray(cv2.GaussianBlur(light, (0, 0), BLUR_PX), np.float32)
     return _developed(light, lens, exposure, random)
 
 
@@ -159,8 +162,7 @@ def _light(scene: Scene, layers: Sequence[U8], pose: F64, exposure: Exposure, x:
         u, v = crossing(scene, index, pose, x, y)
         total += cv2.remap(layers[index], u - np.float32(0.5), v - np.float32(0.5), kind).astype(np.float32)
         inside &= (u > 0) & (u < scene.stack.width_px) & (v > 0) & (v < scene.stack.height_px)
-        if exposure.grid:
-            passes *= _grid(u, exposure.grid) * _grid(v, exposure.grid)
+        passes *= _grid(u) * _grid(v)
     light = exposure.dark + intensity_from_phase(total * np.float32(1 / 255)) * passes
     return np.asarray(light * inside, dtype=np.float32)
 
@@ -178,35 +180,22 @@ def crossing(scene: Scene, index: int, pose: F64, x: F32, y: F32) -> tuple[F32, 
     return (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / weight, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / weight
 
 
-def _grid(position: F32, depth: float) -> F32:
+def _grid(position: F32) -> F32:
     """Light that a panel's pixels let through along one axis: least between two pixels."""
-    found: F32 = np.float32(1 - depth / 2) - np.float32(depth / 2) * np.cos(np.float32(2 * np.pi) * position)
+    found: F32 = np.float32(1 - GRID / 2) - np.float32(GRID / 2) * np.cos(np.float32(2 * np.pi) * position)
     return found
 
 
 def _developed(light: F32, lens: Lens, exposure: Exposure, random: np.random.Generator) -> U8:
     u = (np.arange(lens.width_px, dtype=np.float32) - lens.centre_px[0]) / lens.width_px
     v = (np.arange(lens.height_px, dtype=np.float32) - lens.centre_px[1])[:, None] / lens.width_px
-    corners = 1 - np.float32(exposure.vignetting * 2.56) * (u * u + v * v)
+    corners = 1 - np.float32(VIGNETTING * 2.56) * (u * u + v * v)
     light = np.asarray(light * (np.float32(exposure.gain) * corners), dtype=np.float32)
     noise = random.standard_normal(light.shape, dtype=np.float32)
-    spread = np.sqrt(np.maximum(light, 0) / np.float32(exposure.electrons) + np.float32(exposure.read_noise**2))
+    spread = np.sqrt(np.maximum(light, 0) / np.float32(ELECTRONS) + np.float32(READ_NOISE**2))
     light = light + noise * spread.astype(np.float32)
     # The tone curve by table: a power of twelve million numbers takes longer than all else.
-    codes = np.rint(255 * np.linspace(0, 1, 4096) ** (1 / exposure.gamma)).astype(np.uint8)
+    codes = np.rint(255 * np.linspace(0, 1, 4096) ** (1 / GAMMA)).astype(np.uint8)
     picture = codes[(np.clip(light, 0.0, 1.0) * 4095).astype(np.int32)]
-    if exposure.jpeg_quality:
-        coded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, exposure.jpeg_quality])[1]
-        picture = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE))
-    return picture
-
-
-def smaller(lens: Lens, factor: float) -> Lens:
-    """The same lens with fewer picture elements."""
-    return replace(
-        lens,
-        width_px=round(lens.width_px * factor),
-        height_px=round(lens.height_px * factor),
-        focal_px=lens.focal_px * factor,
-        centre_px=((lens.centre_px[0] + 0.5) * factor - 0.5, (lens.centre_px[1] + 0.5) * factor - 0.5),
-    )
+    coded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
+    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE))

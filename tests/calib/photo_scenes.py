@@ -12,7 +12,7 @@ from calib.board import board, marks
 from calib.detect_marks import SeenMarks
 from calib.placed import PlacedPanel, corner_pixels, stack_from_pixels, through
 from calib.registration import Registration, homographies
-from calib.simulator import Exposure, Lens, Scene, by_hand, camera_rays, phone, photograph, smaller
+from calib.simulator import Exposure, Lens, Scene, by_hand, camera_rays, phone, photograph
 from runtime.optics.stack import PanelStack
 
 PHONE_MEGAPIXELS = 12.0
@@ -63,7 +63,7 @@ def simulated_photographs(
 ) -> list[np.ndarray]:
     """`count` photographs (h, w) by hand of the boards on a stack, with one phone of many."""
     layers = np.stack([board(stack, index) for index in range(stack.count)])
-    lens = smaller(phone(random=random), float(np.sqrt(megapixels / PHONE_MEGAPIXELS)))
+    lens = phone(random=random, size=float(np.sqrt(megapixels / PHONE_MEGAPIXELS)))
     scene, rays = Scene(stack, truth, layers), camera_rays(lens)
     poses = by_hand(count, stack, random=random)
     return [photograph(scene, lens, pose, Exposure(), random=random, rays=rays) for pose in poses]

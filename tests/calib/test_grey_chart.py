@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from calib.commands import app
 from calib.grey_chart import grey_chart, histograms, measure
 from calib.placed import ideal_panel
-from calib.simulator import Exposure, Scene, camera_from_stack, camera_rays, phone, photograph, smaller
+from calib.simulator import Exposure, Scene, camera_from_stack, camera_rays, phone, photograph
 from runtime.config import StackGeometry
 from runtime.panels.lut import measured_curve
 
@@ -33,7 +33,7 @@ def photographs(curve: Callable[..., Any], *, count: int = 2, **changes: float) 
     layers = np.zeros((3, STACK.height_px, STACK.width_px), np.uint8)
     layers[PANEL] = np.rint(255 * curve(grey_chart(STACK, PANEL) / 255)).astype(np.uint8)
     scene = Scene(STACK, tuple(ideal_panel(STACK, index) for index in range(3)), layers)
-    lens = smaller(phone(random=random), 0.7)
+    lens = phone(random=random, size=0.7)
     exposure = Exposure(**({"dark": 0.004, "gain": 0.85, "samples": 3} | changes))
     places = np.array([[0.75, 0.0, 0.0], [0.8, 0.1, 0.05], [0.8, -0.1, 0.0]])[:count]
     rays = camera_rays(lens)
