@@ -20,7 +20,7 @@ def require(*modules: str) -> None:
 
 
 def train(
-    out: Annotated[Path, typer.Option(help="folder for checkpoint.pth, recipe.json, validation.csv and .png")],
+    out: Annotated[Path, typer.Option(help="folder for checkpoint.pth, recipe.json and validation.csv")],
     recipe: Annotated[str, typer.Option(help="fast, balanced, best or a recipe file (JSON)")] = "balanced",
     data: Annotated[
         list[Path] | None, typer.Option(help="folder of pairs named as the official data set; may be repeated")
@@ -28,8 +28,7 @@ def train(
     scene: Annotated[str, typer.Option(help="preset that the folders' coordinates belong to")] = "lego_bulldozer",
     iterations: Annotated[int | None, typer.Option(min=1, help="steps of the optimiser; without: the recipe's")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="of data and weights; without: the recipe's")] = None,
-    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1 ..; auto: a GPU where there is one")] = "auto",
-    threads: Annotated[int, typer.Option(min=1, help="torch's threads on the CPU")] = 2,
+    threads: Annotated[int, typer.Option(min=1, help="torch's threads")] = 2,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="the result as one object on stdout")] = False,
 ) -> None:
@@ -47,7 +46,6 @@ def train(
         scene=scene,
         iterations=iterations,
         seed=seed,
-        device=device,
         threads=threads,
         resume=resume,
     )

@@ -42,7 +42,7 @@ class Sight:
         return columns, rows, own
 
 
-def sight_of(pair: TrainingPair, recipe: Recipe, *, device: torch.device) -> Sight:
+def sight_of(pair: TrainingPair, recipe: Recipe) -> Sight:
     """Raises ValueError where the eyes have no horizontal separation."""
     frame = chain_frame(pair.eyes_m, pair.stack, cell_px=recipe.cell_px, reduction=recipe.reduction)
     height, width = pair.images[0].shape[:2]
@@ -67,12 +67,10 @@ def sight_of(pair: TrainingPair, recipe: Recipe, *, device: torch.device) -> Sig
     modes = [torch.from_numpy(part) for part in chain_modes(frame.cells)]
     doubt = torch.from_numpy(frame.eye_sigma_px(pair.stack, eye_sigma_mm=pair.eye_sigma_mm))
     left, right = (
-        torch.from_numpy(through(image, frame.middle_m).astype(np.float32) / FULL).permute(2, 0, 1).to(device)
-        for image in phases
+        torch.from_numpy(through(image, frame.middle_m).astype(np.float32) / FULL).permute(2, 0, 1) for image in phases
     )
     inside = _inside(reduced, frame, pair.stack.x_m[CENTRE], size)
-    feeds = tuple(part.to(device) for part in (*seen, *modes, doubt))
-    return Sight(feeds, (left, right), torch.from_numpy(inside).to(device), recipe.cell_px)
+    return Sight((*seen, *modes, doubt), (left, right), torch.from_numpy(inside), recipe.cell_px)
 
 
 def displayed_mse(net: SpectralSolver, sight: Sight) -> tuple[Tensor, Tensor]:
@@ -107,8 +105,8 @@ def _outer(rear: Tensor, front: Tensor, sight: Sight, side: int, place: tuple[fl
 
 def _shifted(panel: Tensor, columns: float, rows: float, size: tuple[int, int]) -> Tensor:
     """(C, h, w) bilinear samples so many columns to the right and rows below."""
-    u = (torch.arange(size[1], device=panel.device) + columns + 0.5) * (2 / panel.shape[2]) - 1
-    v = (torch.arange(size[0], device=panel.device) + rows + 0.5) * (2 / panel.shape[1]) - 1
+    u = (torch.arange(size[1]) + columns + 0.5) * (2 / panel.shape[2]) - 1
+    v = (torch.arange(size[0]) + rows + 0.5) * (2 / panel.shape[1]) - 1
     grid = torch.stack([u.expand(size), v[:, None].expand(size)], dim=-1)[None]
     return functional.grid_sample(panel[None], grid, padding_mode="border", align_corners=False)[0]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from model_export.checkpoint import fill, load_checkpoint, plain_weights, save_checkpoint, solver_of
-from model_export.curves import Point, write_curves
 from model_export.data import TrainingPair, endless_pairs
 from model_export.folders import folder_pairs, mixed
 from model_export.network import SpectralSolver
@@ -29,6 +28,18 @@ HELD_OUT_SEED = 9_000_001  # of the validation pairs: no training seed reaches i
 PAIRS_A_STEP = 2
 FLOOR = 1e-6  # of the squared error in the loss: beyond 60 dB nothing is gained
 GRADIENT_MAX = 5.0
+COLUMNS = ("iteration", "training_loss_db", "held_out_exact_db", "held_out_expected_db", "held_out_loss_db")
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """What was measured after some steps, in the order of COLUMNS."""
+
+    iteration: int
+    training_loss_db: float  # mean since the last point; NaN before the first step
+    exact_db: float  # displayed PSNR at the eyes, mean over held-out pairs
+    expected_db: float  # over each pair's uncertainty, of those that have one
+    loss_db: float  # minus what is expected, of all pairs: lower is better
 
 
 def run_training(
@@ -39,17 +50,16 @@ def run_training(
     scene: str = "lego_bulldozer",
     iterations: int | None = None,
     seed: int | None = None,
-    device: str = "auto",
     threads: int = 2,
     resume: bool = False,
 ) -> dict[str, Any]:
-    """Train, write checkpoint, recipe and curves. Raises InputError."""
+    """Train, write checkpoint, recipe and curve. Raises InputError."""
     recipe = read_recipe(recipe_name)
     asked = {name: value for name, value in (("iterations", iterations), ("seed", seed)) if value is not None}
     training = recipe.training.model_copy(update=asked)
     recipe = recipe.model_copy(update={"training": training})
     torch.set_num_threads(threads)
-    model = solver_of(recipe, source=recipe_name).to(chosen_device(device))
+    model = solver_of(recipe, source=recipe_name)
     optimiser = torch.optim.Adam(model.parameters(), lr=training.learning_rate)
     size = {"width_px": training.width_px, "height_px": training.height_px}
     own = folder_pairs(data, scene=scene, **size)
@@ -93,7 +103,7 @@ def run_training(
 
 def pair_loss(model: SpectralSolver, pair: TrainingPair, recipe: Recipe) -> Tensor:
     """Displayed error in dB, expected over the eyes' uncertainty."""
-    _, expected = displayed_mse(model, sight_of(pair, recipe, device=model.log_floor.device))
+    _, expected = displayed_mse(model, sight_of(pair, recipe))
     return 10 * torch.log10(expected + FLOOR)
 
 
@@ -108,7 +118,7 @@ def validate(model: SpectralSolver, pairs: Sequence[TrainingPair], recipe: Recip
     """Mean dB at the eyes, mean dB expected (of the pairs with unsure eyes), and mean loss."""
     exact_db, expected_db, losses = [], [], []
     for pair in pairs:
-        errors = displayed_mse(model, sight_of(pair, recipe, device=model.log_floor.device))
+        errors = displayed_mse(model, sight_of(pair, recipe))
         exact, expected = (-10 * math.log10(float(error) + FLOOR) for error in errors)
         exact_db.append(exact)
         if pair.eye_sigma_mm > 0:
@@ -144,21 +154,6 @@ def _step(
     return total / used if used else math.nan
 
 
-def chosen_device(name: str) -> torch.device:
-    """`auto`: a GPU where there is one. Raises InputError for what isn't there."""
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        device = torch.device("meta")
-    if device.type not in {"cpu", "cuda"}:
-        raise InputError("train", "--device", f"{name!r} is neither auto, cpu nor cuda")
-    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise InputError("train", "--device", f"{name} isn't there: torch sees {torch.cuda.device_count()} GPUs")
-    return device
-
-
 def _save(
     out: Path,
     model: SpectralSolver,
@@ -174,7 +169,7 @@ def _save(
     save_checkpoint(
         out / "checkpoint.pth",
         {
-            "model": {key: value.cpu() for key, value in model.state_dict().items()},
+            "model": model.state_dict(),
             "recipe": found.model_copy(update={"weights": None}).model_dump(mode="json"),
             "optimiser": optimiser.state_dict(),
             "iteration": iteration,
@@ -183,7 +178,8 @@ def _save(
             "data": data,
         },
     )
-    write_curves(out, points, name=recipe.name)
+    lines = [",".join("" if math.isnan(x) else f"{x:.6g}" for x in astuple(point)) for point in points]
+    write_text(out / "validation.csv", "\n".join([",".join(COLUMNS), *lines]) + "\n")
 
 
 def _resumed(

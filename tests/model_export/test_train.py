@@ -91,7 +91,7 @@ def test_the_raster_s_own_sight_is_what_eyes_see_of_panels_that_are_drawn_on_it(
     smooth = tuple(cv2.GaussianBlur(picture, (0, 0), 3.0) for picture in pair.images)
     pair = replace(pair, images=smooth, eye_sigma_mm=4.0)
     with torch.no_grad():
-        sight = sight_of(pair, recipe, device=torch.device("cpu"))
+        sight = sight_of(pair, recipe)
         ours = displayed_mse(net, sight)
     predictor = load_predictor("balanced", pair.stack, ModelSettings(threads=1))
     session = predictor.session  # type: ignore[attr-defined]
@@ -148,7 +148,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def trained(
     out: Path, recipe: Path, *, iterations: int | None = None, resume: bool = False, data: tuple[Path, ...] = ()
 ) -> Recipe:
-    run_training(out, str(recipe), data=data, iterations=iterations, device="cpu", threads=1, resume=resume)
+    run_training(out, str(recipe), data=data, iterations=iterations, threads=1, resume=resume)
     return Recipe.model_validate_json((out / "recipe.json").read_text())
 
 
@@ -176,7 +176,6 @@ def test_training_is_the_same_twice_and_leaves_its_files(
     assert recipe.steps == first.steps and recipe.weights == first.weights
     rows = (folder / "validation.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in rows] == ["iteration", "0", "2", "4"]
-    assert (folder / "validation.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("pairs", [0, 3])  # three: so that where the row of them stands matters
@@ -242,7 +241,7 @@ def test_a_checkpoint_that_nothing_can_be_resumed_from_is_one_line(
 def test_resuming_something_else_is_refused(tmp_path: Path, begun: Path) -> None:
     shutil.copytree(begun, tmp_path / "a")
     with pytest.raises(InputError, match="was trained as fast"):
-        run_training(tmp_path / "a", "balanced", device="cpu", threads=1, resume=True)
+        run_training(tmp_path / "a", "balanced", threads=1, resume=True)
 
 
 def test_half_a_pair_is_refused_before_anything_is_written(tmp_path: Path, tiny: Path) -> None:
