@@ -22,17 +22,13 @@ def require(*modules: str) -> None:
 def train(
     out: Annotated[Path, typer.Option(help="folder for checkpoint.pth, recipe.json and validation.csv")],
     recipe: Annotated[str, typer.Option(help="fast, balanced, best or a recipe file (JSON)")] = "balanced",
-    data: Annotated[
-        list[Path] | None, typer.Option(help="folder of pairs named as the official data set; may be repeated")
-    ] = None,
-    scene: Annotated[str, typer.Option(help="preset that the folders' coordinates belong to")] = "lego_bulldozer",
     iterations: Annotated[int | None, typer.Option(min=1, help="steps of the optimiser; without: the recipe's")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="of data and weights; without: the recipe's")] = None,
     threads: Annotated[int, typer.Option(min=1, help="torch's threads")] = 2,
     resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="the result as one object on stdout")] = False,
 ) -> None:
-    """Train a model on endless procedural pairs (and on folders of your own).
+    """Train a model on endless procedural pairs.
 
     Example: phasestack train --recipe balanced --out out/balanced
     """
@@ -42,8 +38,6 @@ def train(
     result = run_training(
         out,
         recipe,
-        data=data or (),
-        scene=scene,
         iterations=iterations,
         seed=seed,
         threads=threads,

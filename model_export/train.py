@@ -15,7 +15,6 @@ from torch import Tensor
 
 from model_export.checkpoint import fill, load_checkpoint, plain_weights, save_checkpoint, solver_of
 from model_export.data import TrainingPair, endless_pairs
-from model_export.folders import folder_pairs, mixed
 from model_export.network import SpectralSolver
 from model_export.recipe import Recipe, read_recipe
 from model_export.sight import displayed_mse, sight_of
@@ -46,8 +45,6 @@ def run_training(
     out: Path,
     recipe_name: str,
     *,
-    data: Sequence[Path] = (),
-    scene: str = "lego_bulldozer",
     iterations: int | None = None,
     seed: int | None = None,
     threads: int = 2,
@@ -62,19 +59,14 @@ def run_training(
     model = solver_of(recipe, source=recipe_name)
     optimiser = torch.optim.Adam(model.parameters(), lr=training.learning_rate)
     size = {"width_px": training.width_px, "height_px": training.height_px}
-    own = folder_pairs(data, scene=scene, **size)
     held_out = held_out_pairs(training.validation_pairs, **size)
     path = out / "checkpoint.pth"
-    trained_with = {"scene": scene if own else "", "pairs": len(own)}
-    first, points, before_s = _resumed(path, model, optimiser, recipe, trained_with) if resume else (0, [], 0.0)
+    first, points, before_s = _resumed(path, model, optimiser, recipe) if resume else (0, [], 0.0)
     start = time.monotonic()
     if not points:
         points = [Point(0, math.nan, *validate(model, held_out, recipe))]
-    # With folders, every other pair is one of theirs.
     taken = first * PAIRS_A_STEP
-    own_taken = taken // 2 if own else 0
-    procedural = endless_pairs(training.seed, first=taken - own_taken, eye_sigma_mm=training.eye_sigma_mm, **size)
-    stream = mixed(procedural, own, first=own_taken)
+    stream = endless_pairs(training.seed, first=taken, eye_sigma_mm=training.eye_sigma_mm, **size)
     losses: list[float] = []
     with progress_bar(f"training {recipe.name}") as progress:
         for iteration in range(first, training.iterations):
@@ -86,7 +78,7 @@ def run_training(
                 points.append(Point(done, float(np.mean(losses)), *validate(model, held_out, recipe)))
                 losses = []
                 seconds = before_s + time.monotonic() - start
-                _save(out, model, optimiser, recipe, done, points, seconds, trained_with)
+                _save(out, model, optimiser, recipe, done, points, seconds)
     seconds = before_s + time.monotonic() - start
     last = points[-1]
     return {
@@ -162,7 +154,6 @@ def _save(
     iteration: int,
     points: Sequence[Point],
     seconds: float,
-    data: dict[str, Any],
 ) -> None:
     found = recipe.model_copy(update={"weights": plain_weights(model)})
     write_text(out / "recipe.json", found.text())
@@ -175,7 +166,6 @@ def _save(
             "iteration": iteration,
             "points": [list(astuple(point)) for point in points],
             "seconds": seconds,
-            "data": data,
         },
     )
     lines = [",".join("" if math.isnan(x) else f"{x:.6g}" for x in astuple(point)) for point in points]
@@ -183,21 +173,15 @@ def _save(
 
 
 def _resumed(
-    path: Path, model: SpectralSolver, optimiser: torch.optim.Optimizer, recipe: Recipe, data: dict[str, Any]
+    path: Path, model: SpectralSolver, optimiser: torch.optim.Optimizer, recipe: Recipe
 ) -> tuple[int, list[Point], float]:
-    """(iteration, curve, seconds) that a checkpoint had reached; fills model and optimiser. Raises InputError.
-
-    data: the scene and number of the folders' pairs; what was trained with others would be no continuation.
-    """
+    """(iteration, curve, seconds) that a checkpoint had reached; fills model and optimiser. Raises InputError."""
     table = load_checkpoint(path)
     held = validated(Recipe, table.get("recipe") or {}, source=f"{path}: recipe")
     if (held.name, [s.kind for s in held.steps]) != (recipe.name, [s.kind for s in recipe.steps]):
         raise InputError(path, "recipe", f"was trained as {held.name}, which is not this recipe")
     if held.training.seed != recipe.training.seed:
         raise InputError(path, "recipe.training.seed", f"{held.training.seed}, but {recipe.training.seed} is asked for")
-    if table.get("data", data) != data:
-        asked, had = (f"{item['pairs']} pairs of --data" for item in (data, table["data"]))
-        raise InputError(path, "data", f"was trained with {had} ({table['data']['scene']}), not with {asked}")
     iteration = table.get("iteration")
     if not isinstance(iteration, int) or isinstance(iteration, bool) or iteration < 0:
         raise InputError(path, "iteration", f"{iteration!r} is no number of steps")

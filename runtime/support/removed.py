@@ -43,6 +43,9 @@ REMOVED_COMMANDS: dict[str, str] = {
     "demo --scale": "`run --replay demo --headless --max-speed --scale F --out DIR`",
     "run --record": "`ctl blackbox` writes the last minutes, `record` the sensor, `run --out` every refresh",
     "run --record-images": "`record --images`",
+    **dict.fromkeys(
+        ("train --data", "train --scene"), "take it out: 6 to 18 numbers are trained, on endless pairs that are drawn"
+    ),
     "train --device": "take it out: 6 to 18 numbers are trained, on the processor",
     "export --precision": "models are exported in 32 bits, which is what ships and what is measured",
     "export --dynamic": "export each size with --width and --height",

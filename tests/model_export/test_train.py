@@ -27,7 +27,6 @@ from runtime.model.resample import target_from_source  # noqa: E402
 from runtime.optics.retina import sample_bilinear  # noqa: E402
 from runtime.optics.stack import PanelStack  # noqa: E402
 from runtime.optics.views import raster_from_stack  # noqa: E402
-from runtime.support.artifacts import write_png  # noqa: E402
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
 EYES = np.array([[0.7, -0.0315, 0.02], [0.7, 0.0315, 0.02]])
@@ -145,10 +144,8 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def trained(
-    out: Path, recipe: Path, *, iterations: int | None = None, resume: bool = False, data: tuple[Path, ...] = ()
-) -> Recipe:
-    run_training(out, str(recipe), data=data, iterations=iterations, threads=1, resume=resume)
+def trained(out: Path, recipe: Path, *, iterations: int | None = None, resume: bool = False) -> Recipe:
+    run_training(out, str(recipe), iterations=iterations, threads=1, resume=resume)
     return Recipe.model_validate_json((out / "recipe.json").read_text())
 
 
@@ -178,12 +175,9 @@ def test_training_is_the_same_twice_and_leaves_its_files(
     assert [row.split(",")[0] for row in rows] == ["iteration", "0", "2", "4"]
 
 
-@pytest.mark.parametrize("pairs", [0, 3])  # three: so that where the row of them stands matters
 def test_a_training_that_was_cut_off_and_resumed_ends_as_if_nothing_had_happened(
-    tmp_path: Path, tiny: Path, whole: tuple[Path, Recipe], monkeypatch: pytest.MonkeyPatch, pairs: int
+    tmp_path: Path, tiny: Path, whole: tuple[Path, Recipe], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    data = (folder_of_pairs(tmp_path / "data", pairs),) if pairs else ()
-    uncut = trained(tmp_path / "whole", tiny, data=data) if pairs else whole[1]
     with monkeypatch.context() as patch:
 
         def save_and_stop(*arguments: object) -> None:
@@ -193,25 +187,10 @@ def test_a_training_that_was_cut_off_and_resumed_ends_as_if_nothing_had_happened
         save = training._save
         patch.setattr(training, "_save", save_and_stop)
         with pytest.raises(KeyboardInterrupt):
-            trained(tmp_path / "cut", tiny, data=data)
+            trained(tmp_path / "cut", tiny)
     assert torch.load(tmp_path / "cut" / "checkpoint.pth", weights_only=True)["iteration"] == 2
-    assert trained(tmp_path / "cut", tiny, resume=True, data=data).weights == uncut.weights
-    if pairs:
-        with pytest.raises(InputError, match=r"data: was trained with 3 pairs of --data .*, not with 0 pairs"):
-            trained(tmp_path / "cut", tiny, resume=True)
-    else:
-        assert (tmp_path / "cut" / "validation.csv").read_text() == (whole[0] / "validation.csv").read_text()
-
-
-def folder_of_pairs(folder: Path, count: int) -> Path:
-    """Pairs as the data set names them, of noise."""
-    folder.mkdir()
-    random = np.random.default_rng(3)
-    for number in range(count):
-        for half, y in ((1, -0.263), (0, 0.237)):
-            picture = random.integers(0, 256, (90, 160, 3), dtype=np.uint8)
-            write_png(folder / f"pair{number}_x6.486_y{y}_z2.004_{half}.png", picture)
-    return folder
+    assert trained(tmp_path / "cut", tiny, resume=True).weights == whole[1].weights
+    assert (tmp_path / "cut" / "validation.csv").read_text() == (whole[0] / "validation.csv").read_text()
 
 
 NOBODY = {"state": {99: {"step": 1.0, "exp_avg": torch.zeros(1)}}, "param_groups": []}
@@ -242,12 +221,3 @@ def test_resuming_something_else_is_refused(tmp_path: Path, begun: Path) -> None
     shutil.copytree(begun, tmp_path / "a")
     with pytest.raises(InputError, match="was trained as fast"):
         run_training(tmp_path / "a", "balanced", threads=1, resume=True)
-
-
-def test_half_a_pair_is_refused_before_anything_is_written(tmp_path: Path, tiny: Path) -> None:
-    folder = tmp_path / "data"
-    folder.mkdir()
-    (folder / "pair0_x6.486_y-0.263_z2.004_1.jpg").write_bytes(b"x")
-    with pytest.raises(InputError, match="pair0"):
-        trained(tmp_path / "out", tiny, data=(folder,))
-    assert not (tmp_path / "out").exists()
