@@ -40,11 +40,4 @@ KNOWN_DEVICES: tuple[KnownDevice, ...] = (
     KnownDevice(0x8086, 0x0B5B, "Intel RealSense D405", "", True, NO_DRIVER),
     KnownDevice(0x1209, 0x0001, "phasestack eye tracker (pid.codes test number)", "usb-eyes"),
 )
-
-
-def known_device(vendor_id: int, product_id: int) -> KnownDevice | None:
-    """The table's entry for a device, or None."""
-    for device in KNOWN_DEVICES:
-        if (device.vendor_id, device.product_id) == (vendor_id, product_id):
-            return device
-    return None
+BY_ID = {(device.vendor_id, device.product_id): device for device in KNOWN_DEVICES}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from runtime.errors import MissingPart, SensorLost
-from runtime.sensor.known_devices import KnownDevice, known_device
+from runtime.sensor.known_devices import BY_ID, KnownDevice
 
 UDEV_RULE = "70-phasestack-sensors.rules"
 SPEEDS = {1: "low speed (1.5 Mbit/s)", 2: "full speed (12 Mbit/s)", 3: "high speed, USB 2 (480 Mbit/s)"}
@@ -78,7 +78,7 @@ def find_devices(backend: Any = None) -> list[UsbDevice]:
 
     try:
         devices: Iterable[Any] = usb.core.find(find_all=True, backend=backend)
-        pairs = [(device, known_device(device.idVendor, device.idProduct)) for device in devices]
+        pairs = [(device, BY_ID.get((device.idVendor, device.idProduct))) for device in devices]
     except usb.core.NoBackendError:
         raise MissingPart("libusb is not installed (Debian: apt install libusb-1.0-0)") from None
     except usb.core.USBError as error:

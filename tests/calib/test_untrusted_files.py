@@ -53,10 +53,3 @@ def test_a_fifo_is_refused(name: str, tmp_path: Path) -> None:
     assert "a.toml" in told
     assert "FIFO" in told or "is not what setup wrote" in told
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.toml"]
-
-
-@pytest.mark.parametrize("name", [name for name in READERS if name not in ("photograph", "calibration that is kept")])
-def test_what_is_no_text_is_refused(name: str, tmp_path: Path) -> None:
-    path = tmp_path / "a.toml"
-    path.write_bytes(b"\xff\xfe\x00" * 50)
-    assert "a.toml" in answer_of(READERS[name], path)
