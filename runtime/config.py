@@ -312,7 +312,6 @@ class OutputSettings(Section):
     kind: Literal["offscreen", "windows", "span"] = Field(
         "offscreen", description="EGL, one window a panel, or one window"
     )
-    vsync: bool = Field(True, description="wait for the vertical blank")
     panels: tuple[PanelSettings, ...] = Field(
         (), max_length=PANELS_MOST, description="one table a panel, rear to front"
     )

@@ -165,7 +165,7 @@ def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
         x, y = np.rint((np.asarray(point) * scale - 0.5) * (1 << bits)).astype(int)
         return int(x), int(y)
 
-    lines = [f"nobody: {row['reason']}"]
+    line = f"nobody: {row['reason']}"
     if pupils is not None:
         for point in pupils.mesh_px[RIGID, :2]:
             cv2.circle(canvas, place(point), 1 << bits, WHITE, -1, cv2.LINE_AA, bits)
@@ -175,16 +175,9 @@ def drawn(picture: U8, pupils: Pupils | None, row: Row) -> U8:
             for off in ((1, 0), (0, 1)):
                 arm = np.array(off) * pupils.iris_px / 6
                 cv2.line(canvas, place(eye - arm), place(eye + arm), GREEN, 1, cv2.LINE_AA, bits)
-        hidden = f" ({pupils.hidden} eye)" if pupils.hidden else ""
-        lines = [f"{row['seen']}{hidden}, sigma {row['sigma_px']:.2f} px"]
-        if row["eyes_m"] is not None and row["sigma_mm"] is not None:
-            lines.append(f"{np.mean(row['eyes_m'], axis=0)[2]:.3f} m, sigma {np.round(row['sigma_mm'], 1)} mm")
-        elif row["reason"]:
-            lines.append(row["reason"])
-    lines.append(f"{row['ms']:.1f} ms")
-    for number, line in enumerate(lines):
-        for colour, width in ((0, 0, 0), 3), (RED if pupils is None else GREEN, 1):
-            cv2.putText(canvas, line, (8, 20 + 18 * number), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, width, cv2.LINE_AA)
+        line = f"{row['seen']}, sigma {row['sigma_px']:.2f} px {row['reason']}"
+    for colour, width in ((0, 0, 0), 3), (RED if pupils is None else GREEN, 1):
+        cv2.putText(canvas, line, (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, width, cv2.LINE_AA)
     return canvas
 
 

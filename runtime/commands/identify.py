@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from runtime.support.options import number
-
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -24,7 +22,6 @@ def identify(
     panel: Annotated[
         int | None, typer.Option(min=0, help="show this panel (or monitor) alone; default: one after the other")
     ] = None,
-    seconds: Annotated[float, number(0, 86_400, "s", help="how long; 0: until q")] = 0.0,
 ) -> None:
     """Show a panel its index, its monitor, an arrow that should point up, colour bars and its edges.
 
@@ -52,7 +49,7 @@ def identify(
         _check_panel(panel, len(cards))
         order = list(range(len(cards))) if panel is None else [panel]
         windows = WindowKeys(panels)
-        _hold(panels, cards, order, seconds, lambda: keys.poll() or windows.poll())
+        _hold(panels, cards, order, lambda: keys.poll() or windows.poll())
     finally:
         keys.close()
         panels.close()
@@ -131,7 +128,7 @@ def every_monitor() -> tuple[PanelSink, list[U8], tuple[Monitor, ...]]:
     return panels, cards, monitors
 
 
-def _hold(panels: PanelSink, cards: list[U8], order: list[int], seconds: float, poll: Callable[[], Key | None]) -> None:
+def _hold(panels: PanelSink, cards: list[U8], order: list[int], poll: Callable[[], Key | None]) -> None:
     """Show cards again and again, so that closed windows and lost monitors come back; keys go on to the next."""
     import time
 
@@ -139,13 +136,12 @@ def _hold(panels: PanelSink, cards: list[U8], order: list[int], seconds: float, 
     from runtime.errors import PanelLost
     from runtime.records import PanelFrame
 
-    deadline = time.monotonic() + seconds if seconds else float("inf")
     lost, place, number = "", 0, 0
     frame = PanelFrame(number, alone(cards, order[place]), number)
     if len(order) > 1:
         typer.echo("one panel at a time (Enter, n: the next; p: the one before; q: done)")
     try:
-        while time.monotonic() < deadline:
+        while True:
             try:
                 panels.present(frame)
                 lost = ""

@@ -15,7 +15,6 @@ class Edid:
     """Who made a monitor and which one it is. Serials are empty where the maker gave none."""
 
     maker: str  # three letters
-    product: int
     serial: str  # the serial as text, or else the number of the header; unique only together with the model
     name: str
 
@@ -30,7 +29,6 @@ def parse(data: bytes) -> Edid | None:
     number = int.from_bytes(block[12:16], "little")
     return Edid(
         maker=maker,
-        product=int.from_bytes(block[10:12], "little"),
         # 0 and 0x01010101 are what makers write who did not give a number.
         serial=_text(block, SERIAL_TAG) or (str(number) if number not in (0, 0x01010101) else ""),
         name=_text(block, NAME_TAG),

@@ -33,4 +33,4 @@ def open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, conte
         return WindowPanels(settings, panels, stack, clock, context)
     from runtime.panels.offscreen import OffscreenPanels
 
-    return OffscreenPanels(context, clock=clock, width_px=stack.width_px, height_px=stack.height_px, panels=panels)
+    return OffscreenPanels(context, clock=clock, size_px=(stack.width_px, stack.height_px), panels=panels)

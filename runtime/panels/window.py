@@ -138,7 +138,7 @@ class WindowPanels(PanelSink):
             frame.number,
             swapped_ns[-1],
             (swapped_ns[-1] - swapped_ns[0]) / NS_PER_MS,
-            vblank_ns=swapped_ns[0] if self._settings.vsync else None,
+            vblank_ns=swapped_ns[0],
         )
 
     def _draw(self, surface: Surface, spots: list[Spot], textures: FrameTextures, frame: PanelFrame) -> None:
@@ -188,7 +188,7 @@ class WindowPanels(PanelSink):
                 window = display.fullscreen_window(self.monitors[number], title=f"panel {number}")
             spots = [self._spot(window, place, panel) for panel in panels]
             self._surfaces[Surface(window, place, panels)] = spots
-            glfw.swap_interval(1 if self._settings.vsync and number == 0 else 0)
+            glfw.swap_interval(1 if number == 0 else 0)
         glfw.poll_events()
         self._watch = PlacementWatch(display, self.monitors, tuple(self._surfaces), self._clock)
 

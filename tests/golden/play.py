@@ -6,6 +6,7 @@ import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from runtime.frame.presenter import Presenter, Refresh
 from runtime.optics.alignment import scale_and_shift, shown_layers
 from runtime.records import U8, SensorFrame
 from tests.golden.cases import Case
+from tests.panels.drawn import DrawnPanels
 
 DIGITS = 7  # of what is stored: a tenth of a micrometre, a tenth of the least tolerance
 
@@ -70,8 +72,8 @@ class Collector:
             told["layer_std"] = codes.std(axis=(1, 2)).round(3)
         self.refreshes.append(told)
         if account.frame in self._case.pictures:
-            panels: Any = self._presenter.panels
-            self.panels[account.frame] = np.stack(panels.read_back())[..., :3]
+            assert isinstance(self._presenter.panels, DrawnPanels)
+            self.panels[account.frame] = np.stack(self._presenter.panels.read_back())[..., :3]
             self.light[account.frame] = shown_layers(frame)[..., :3].copy()
 
 
@@ -97,7 +99,8 @@ def play(case: Case, out: Path) -> Played:
     runs: list[Run] = []
     operator = Operator(case, runs)
     operator.recorder = collector
-    summary = drive(settings, RunOptions(max_speed=True, measure=True, out=out), operator)
+    with patch("runtime.panels.offscreen.OffscreenPanels", DrawnPanels):
+        summary = drive(settings, RunOptions(max_speed=True, measure=True, out=out), operator)
     lines = [json.loads(line) for line in (out / "frames.jsonl").read_text(encoding="utf-8").splitlines()]
     refreshes = [line | told for line, told in zip(lines, collector.refreshes, strict=True)]
     for line in refreshes:

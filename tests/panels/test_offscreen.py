@@ -16,11 +16,11 @@ from runtime.config import OutputSettings, PanelSettings
 from runtime.errors import InputError, PanelLost
 from runtime.optics.alignment import align, shown_layers
 from runtime.optics.stack import PanelStack
-from runtime.panels.offscreen import OffscreenPanels
 from runtime.panels.registry import open_panels
 from runtime.records import Layers, PanelFrame
 from runtime.support.gl import offscreen_context
 from runtime.support.gl_sharing import ShareGroup
+from tests.panels.drawn import DrawnPanels
 from tests.support.left_in_textures import on_a_thread_of_its_own
 
 WIDTH, HEIGHT = 48, 32
@@ -32,9 +32,8 @@ def layers() -> NDArray[np.uint8]:
     return np.random.default_rng(7).integers(0, 256, (3, HEIGHT, WIDTH, 4), dtype=np.uint8)
 
 
-def offscreen(context: moderngl.Context, stack: PanelStack, *panels: PanelSettings) -> OffscreenPanels:
-    size = {"width_px": stack.width_px, "height_px": stack.height_px}
-    return OffscreenPanels(context, clock=SimulatedClock(), **size, panels=panels)
+def offscreen(context: moderngl.Context, stack: PanelStack, *panels: PanelSettings) -> DrawnPanels:
+    return DrawnPanels(context, clock=SimulatedClock(), size_px=(stack.width_px, stack.height_px), panels=panels)
 
 
 def shown(context: moderngl.Context, layers: NDArray[np.uint8], *panels: PanelSettings) -> list[NDArray[np.uint8]]:
@@ -127,8 +126,8 @@ def smooth(seed: int) -> np.ndarray:
 
 
 @pytest.fixture
-def sink(context: moderngl.Context) -> Iterator[OffscreenPanels]:
-    made = open_panels(OutputSettings(), STACK, SimulatedClock(), context)
+def sink(context: moderngl.Context) -> Iterator[DrawnPanels]:
+    made = offscreen(context, STACK, *(PanelSettings(),) * STACK.count)
     yield made
     made.close()
 
@@ -142,7 +141,7 @@ def codes(pictures: NDArray[np.uint8] | tuple[NDArray[np.uint8], NDArray[np.uint
     "step_m", [(0.0, 0.004, 0.0), (0.01, 0.016, 0.008), (-0.3, -0.1, 0.05), (1.0, 0.9, -0.2), (0.0, 9.0, 0.0)]
 )
 def test_the_shader_shows_what_its_reference_says(
-    sink: OffscreenPanels, step_m: tuple[float, float, float], flatness: float
+    sink: DrawnPanels, step_m: tuple[float, float, float], flatness: float
 ) -> None:
     matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array(step_m)).solved_from_shown
     frame = PanelFrame(1, smooth(1), 1, matrices, smooth(2), 1, flatness)
@@ -152,7 +151,7 @@ def test_the_shader_shows_what_its_reference_says(
     assert (difference <= 1).mean() >= 0.999
 
 
-def test_a_panel_that_needs_no_alignment_is_fetched_to_the_bit_beside_those_that_do(sink: OffscreenPanels) -> None:
+def test_a_panel_that_needs_no_alignment_is_fetched_to_the_bit_beside_those_that_do(sink: DrawnPanels) -> None:
     frame = PanelFrame(1, smooth(1), 1, align(STACK, solved_for_m=HEAD, eyes_m=HEAD * 1.01).solved_from_shown)
     sink.present(frame)
     assert np.array_equal(codes(sink.read_back())[1], codes(frame.solved)[1])
@@ -202,7 +201,7 @@ def test_a_gamma_is_applied_to_what_is_aligned_and_mixed(context: moderngl.Conte
 
 
 def test_a_solution_is_uploaded_once_however_often_it_is_aligned_and_shown(
-    sink: OffscreenPanels, monkeypatch: pytest.MonkeyPatch
+    sink: DrawnPanels, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written: list[Layers] = []
     assert sink._textures is not None
@@ -226,7 +225,7 @@ def test_a_solution_is_uploaded_once_however_often_it_is_aligned_and_shown(
     assert [id(layers) for layers in written[2:]] == [id(other)]
 
 
-def test_a_new_solution_is_shown_where_only_its_version_tells_it_from_the_old(sink: OffscreenPanels) -> None:
+def test_a_new_solution_is_shown_where_only_its_version_tells_it_from_the_old(sink: DrawnPanels) -> None:
     for version in (1, 2):
         sink.present(PanelFrame(version, smooth(version), version))
         assert np.array_equal(codes(sink.read_back()), codes(smooth(version)))
@@ -242,9 +241,7 @@ def test_a_new_solution_is_shown_where_only_its_version_tells_it_from_the_old(si
         (PanelFrame(1, smooth(1), 0, (np.eye(3),) * 2), "aligns 2 panels of 3"),
     ],
 )
-def test_a_frame_that_does_not_fit_is_a_mistake_of_the_caller(
-    sink: OffscreenPanels, frame: PanelFrame, says: str
-) -> None:
+def test_a_frame_that_does_not_fit_is_a_mistake_of_the_caller(sink: DrawnPanels, frame: PanelFrame, says: str) -> None:
     with pytest.raises(ValueError, match=says):
         sink.present(frame)
 
@@ -274,7 +271,7 @@ def test_a_lost_context_is_a_lost_panel_not_a_crash(context: moderngl.Context, l
 
 
 def test_layers_that_another_thread_left_in_textures_are_shown_as_arrays_are(
-    sink: OffscreenPanels, monkeypatch: pytest.MonkeyPatch
+    sink: DrawnPanels, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frame = aligned(smooth(1), smooth(2))
     sink.present(frame)
@@ -287,7 +284,7 @@ def test_layers_that_another_thread_left_in_textures_are_shown_as_arrays_are(
         assert np.array_equal(one, other)
 
 
-def test_layers_of_another_group_are_uploaded(sink: OffscreenPanels, context: moderngl.Context) -> None:
+def test_layers_of_another_group_are_uploaded(sink: DrawnPanels, context: moderngl.Context) -> None:
     frame = aligned(smooth(1), smooth(2))
     sink.present(frame)
     expected = sink.read_back()

@@ -165,13 +165,6 @@ def test_the_pacer_is_told_when_the_blank_was_and_how_often_one_comes(opened: Ca
     assert sink.present(moved(1), unchanged=True).vblank_ns is None  # nothing was swapped
 
 
-def test_without_vsync_nothing_is_known_of_blanks(x: XServer, context: moderngl.Context) -> None:
-    settings = OutputSettings(kind="windows", panels=BY_CONNECTOR, vsync=False)
-    sink = open_panels(settings, STACK, MonotonicClock(), context)
-    assert sink.present(moved(0)).vblank_ns is None
-    sink.close()
-
-
 def test_a_fault_while_drawing_leaves_the_new_frame_on_no_panel(
     x: XServer, opened: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

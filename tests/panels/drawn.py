@@ -1,0 +1,62 @@
+"""Offscreen panels that draw what their monitors would be sent, by the presentation shader, and read it back."""
+
+from __future__ import annotations
+
+import moderngl
+import numpy as np
+
+from runtime.clock import Clock
+from runtime.config import PanelSettings
+from runtime.errors import PanelLost
+from runtime.panels.offscreen import OffscreenPanels
+from runtime.panels.presentation import Painter
+from runtime.records import U8
+
+
+class DrawnPanels(OffscreenPanels):
+    """The same sink; `read_back` uploads what is not there yet, and draws."""
+
+    def __init__(
+        self, context: moderngl.Context, *, clock: Clock, size_px: tuple[int, int], panels: tuple[PanelSettings, ...]
+    ) -> None:
+        super().__init__(context, clock=clock, size_px=size_px, panels=panels)
+        self._context = context
+        self._painters: list[Painter] = []
+        self._targets: list[moderngl.Framebuffer] = []
+        for settings in panels:
+            screen = size_px[::-1] if settings.rotation_deg in (90, 270) else size_px
+            self._painters.append(Painter(context, settings, screen_px=screen, layer_px=size_px))
+            self._targets.append(context.framebuffer([context.texture(screen, 4)]))
+
+    def read_back(self) -> tuple[U8, ...]:
+        """The monitors' pictures of the last frame, rear to front: (h, w, 4) RGBA each, top row first."""
+        assert self._frame is not None
+        pictures = []
+        try:
+            self._textures.upload(self._frame)
+            for index, (target, painter) in enumerate(zip(self._targets, self._painters, strict=True)):
+                target.use()
+                painter.draw(self._textures, self._frame, index)
+                width, height = target.size
+                bottom_up = np.frombuffer(target.read(components=4), np.uint8).reshape(height, width, 4)
+                pictures.append(np.ascontiguousarray(bottom_up[::-1]))
+            fault = self._context.error
+        except Exception as error:
+            raise PanelLost(f"{error}") from error
+        if fault != "GL_NO_ERROR":
+            raise PanelLost(fault)
+        return tuple(pictures)
+
+    def close(self) -> None:
+        if self._painters:
+            # moderngl binds the last framebuffer again on later calls: it must not be one that is no more.
+            self._context.detect_framebuffer(0).use()
+        for painter in self._painters:
+            painter.release()
+        for target in self._targets:
+            for attachment in target.color_attachments:
+                attachment.release()
+            target.release()
+        self._textures.release()
+        self._painters, self._targets = [], []
+        super().close()
