@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import monotonic
 from typing import Annotated, Any, Literal
 
 import cv2
@@ -25,7 +23,6 @@ WORSE_DB = 0.1  # more than rounding and the order of threads can change
 SLOWER = 0.15  # at least; more where the runs themselves scatter more
 MORE_MEMORY = 0.15
 UNSTEADY = 1.3  # times the least yardstick: the machine's speed changed by more than a difference that counts
-OTHERS_CORES = 0.5
 SCATTERS = 3.0  # of the medians' own scatter before a difference counts
 
 
@@ -53,7 +50,6 @@ class RegressionFile(BaseModel):
     version: Literal[2]
     yardstick_ms: PositiveFloat
     yardsticks_ms: Annotated[list[PositiveFloat], Field(min_length=1)]  # over the whole measurement
-    others_cores: float | None = None  # that other programs took meanwhile, on average
     methods: list[Entry]
 
     def too_busy(self) -> str:
@@ -61,8 +57,6 @@ class RegressionFile(BaseModel):
         least, most = min(self.yardsticks_ms), max(self.yardsticks_ms)
         if most > UNSTEADY * least:
             return f"the same work took {least:.1f} to {most:.1f} ms while it was measured"
-        if self.others_cores is not None and self.others_cores > OTHERS_CORES:
-            return f"other programs took {self.others_cores:.1f} cores while it was measured"
         return ""
 
 
@@ -102,7 +96,6 @@ def measured(
 ) -> dict[str, Any]:
     """The regression file's content. Takes about a minute."""
     yardsticks, entries = [yardstick_ms()], []
-    begin_s, others_s = monotonic(), _others_s()
     methods = [Method(name, "network", name) for name in models]
     for width, height in sizes:
         stack = replace(StackGeometry().stack(), width_px=width, height_px=height)
@@ -117,7 +110,6 @@ def measured(
         "machine": describe(),
         "yardstick_ms": float(np.median(yardsticks)),
         "yardsticks_ms": yardsticks,
-        "others_cores": round(max(0.0, (_others_s() - others_s) / (monotonic() - begin_s)), 3),
         "methods": entries,
     }
 
@@ -126,12 +118,6 @@ def _entry(result: MethodResult) -> dict[str, Any]:
     record = result.record()
     del record["pairs"]
     return record | {"scatter": scatter(result.pairs[0].run_ms)}
-
-
-def _others_s() -> float:
-    """What other programs than this and its children took of all cores together, since the machine was started."""
-    user, nice, system, _, _, irq, soft = map(int, Path("/proc/stat").read_text(encoding="ascii").split()[1:8])
-    return (user + nice + system + irq + soft) / os.sysconf("SC_CLK_TCK") - sum(os.times()[:4])
 
 
 @dataclass(frozen=True, slots=True)
