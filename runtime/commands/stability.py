@@ -34,18 +34,14 @@ def stability(
 
     from runtime.report.machine import describe
     from runtime.report.stability import suite
-    from runtime.report.stability.limits import load_limits, recorded
     from runtime.report.stability.page import stability_page, stages_of
-    from runtime.support.artifacts import to_json, write_text
+    from runtime.support.artifacts import to_json
     from runtime.support.progress import progress_bar
 
     started = time.perf_counter()
-    limits = load_limits()
     trials = list(suite.every_trial(_fits(), full=full))
     with progress_bar("stability") as tell:
-        cases = suite.run(trials, limits=limits, progress=tell)
-    if record is not None:
-        write_text(record, recorded(trials, cases, limits))
+        cases = suite.run(trials, record=record, progress=tell)
     seconds = time.perf_counter() - started
     failed = [case for case in cases if not case.passed]
     machine = describe()

@@ -39,36 +39,6 @@ def cloud(*, aspect: float = 1.0, size_m: float = 0.3, count: int = 27) -> F64:
     return np.random.default_rng(11).uniform(-1, 1, (count, 3)) * [size_m, size_m * aspect, size_m * aspect]
 
 
-def recovered(
-    fit: Fit,
-    sensor_m: F64,
-    *,
-    scale: float = 1.0,
-    offset_m: tuple[float, float, float] = (0.1, -0.4, 0.3),
-    quaternion: tuple[int, int, int, int] = QUATERNION,
-) -> Answer:
-    """Noise-free pairs, rounded to doubles once: the turn, scale and shift that are missing from the fit.
-
-    The condition is how far the points reach from the origin over the second largest of their extents: that much
-    a relative error of the coordinates, rounding included, can turn the fit.
-    """
-    truth = rotation(quaternion)
-    rows = [
-        [exact.mpf(scale) * x for x in line] + [exact.mpf(shift)] for line, shift in zip(truth, offset_m, strict=True)
-    ]
-    stack_m = np.array([[float(x) for x in placed(rows, p)] for p in sensor_m])
-    matrix = fit(sensor_m, stack_m)
-    found = matrix[:3, :3]
-    size = float(np.cbrt(np.linalg.det(found)))
-    wrong = max(exact.distance(found[i, j] / size, truth[i][j]) for i in range(3) for j in range(3))
-    fits = max(abs(size / scale - 1), wrong, carried_off(matrix, sensor_m, stack_m))
-    condition = max(
-        float(np.abs(points).max() / (np.linalg.svd(points - points.mean(0), compute_uv=False)[1] / len(points) ** 0.5))
-        for points in (sensor_m, stack_m)
-    )
-    return Answer(fits, 16 * EPS64 * condition, condition, fits / condition)
-
-
 def placed(rows: Sequence[Sequence[Any]], point: F64) -> list[Any]:
     """(3,) where a transform (3 or 4, 4) puts a point, exactly."""
     x, y, z = exact.vector(point)
@@ -78,13 +48,6 @@ def placed(rows: Sequence[Sequence[Any]], point: F64) -> list[Any]:
 def exactly(matrix: F64) -> list[list[Any]]:
     """A matrix of exact numbers."""
     return [[exact.mpf(float(value)) for value in row] for row in matrix]
-
-
-def carried_off(matrix: F64, sensor_m: F64, stack_m: F64) -> float:
-    """How far a fit carries its own points from where they belong, of the largest coordinate."""
-    places = [placed(exactly(matrix), p) for p in sensor_m]
-    off = max(exact.distance(w[i], place[i]) for place, w in zip(places, stack_m, strict=True) for i in range(3))
-    return off / float(np.abs(stack_m).max())
 
 
 def exact_similarity(sensor_m: F64, stack_m: F64, rule: str) -> list[list[Any]]:
@@ -117,76 +80,86 @@ def exact_similarity(sensor_m: F64, stack_m: F64, rule: str) -> list[list[Any]]:
     ]
 
 
-def noisy(
-    fit: Fit, rule: str, *, noise_m: float, aspect: float = 1.0, scale: float = 1.0, wrong: int = 0, seed: int = 1
+def fitted(
+    fit: Fit,
+    rule: str,
+    true_m: F64,
+    *,
+    noise_m: float = 0.0,
+    scale: float = 1.0,
+    offset_m: tuple[float, float, float] = (0.1, -0.4, 0.3),
+    quaternion: tuple[int, int, int, int] = QUATERNION,
+    wrong: int = 0,
 ) -> Answer:
-    """Pairs with noise on the sensor's side, turned and shifted: the rule's own optimum, in closed form.
+    """Points turned, scaled and shifted, with noise on the sensor's side: the rule's own optimum, in closed form.
 
-    wrong: so many pairs are decimetres off, and `rule` is what the others must be fitted by.
+    wrong: so many pairs are decimetres off, and `rule` is what the others must be fitted by. The condition is how far
+    the points reach from the origin over the second largest of their extents: that much a relative error of the
+    coordinates, rounding included, can turn the fit. Without noise its turn and scale are compared as well.
     """
-    random = np.random.default_rng(seed)
-    true_m = cloud(aspect=aspect)
-    turn = np.array([[float(x) for x in row] for row in rotation(QUATERNION)])
-    stack_m = scale * true_m @ turn.T + [0.1, -0.4, 0.3]
+    random = np.random.default_rng(1)
+    turn = np.array([[float(x) for x in row] for row in rotation(quaternion)])
+    stack_m = scale * true_m @ turn.T + offset_m
     sensor_m = true_m + random.normal(0, noise_m, true_m.shape)
     good = np.arange(len(true_m)) >= wrong
     sensor_m[~good] += random.choice([-1.0, 1.0], (wrong, 3)) * random.uniform(0.1, 0.5, (wrong, 3))
-    truth = exact_similarity(sensor_m[good], stack_m[good], rule)
     found = fit(sensor_m, stack_m)
     if found.shape != (4, 4) or not np.array_equal(found[3], [0, 0, 0, 1]):
         return Answer(math.nan, 0.0, note="no transform")
+    truth = exact_similarity(sensor_m[good], stack_m[good], rule)
     places = [(placed(exactly(found), p), placed(truth, p)) for p in sensor_m[good]]
     error = max(float(abs(ours - theirs)) for pair in places for ours, theirs in zip(*pair, strict=True))
-    size = float(np.abs(stack_m).max())
-    extents = [np.linalg.svd(p[good] - p[good].mean(0), compute_uv=False)[1] for p in (sensor_m, stack_m)]
+    error /= float(np.abs(stack_m).max())
+    if not noise_m:
+        size = exact.mp.sqrt(sum(x * x for x in truth[0][:3]))
+        turned = max(exact.distance(found[i, j] / scale, truth[i][j] / size) for i in range(3) for j in range(3))
+        error = max(error, turned)
     condition = max(
-        float(np.abs(p).max() / e * len(p) ** 0.5) for p, e in zip((sensor_m, stack_m), extents, strict=True)
+        float(np.abs(p).max() / np.linalg.svd(p[good] - p[good].mean(0), compute_uv=False)[1] * len(p) ** 0.5)
+        for p in (sensor_m, stack_m)
     )
-    return Answer(error / size, 64 * EPS64 * condition, condition, error / size / condition)
+    return Answer(error, (64 if noise_m else 16) * EPS64 * condition, condition, error / condition)
 
 
 def trials(fits: Mapping[str, Fit]) -> Iterator[Trial]:
     """Every case of the calibration; `fits`: the solvers under trial by their rule: seed, least-squares, inverse,
     fixed-scale (at 1) and robust."""
     for rule, solver in fits.items():
-        by = "inverse" if rule == "robust" else rule
+        run = partial(fitted, solver, "inverse" if rule == "robust" else rule)
         for millimetres in (0.1, 3, 30):
-            run = partial(noisy, solver, by, noise_m=millimetres / 1000)
-            yield Trial(STAGE, f"{rule}: {millimetres:g} mm of noise", run, measure="of the size")
-        run = partial(noisy, solver, by, noise_m=1e-5, aspect=0.01)
-        yield Trial(STAGE, f"{rule}: noise on thin points", run, measure="of the size")
+            noisy = partial(run, cloud(), noise_m=millimetres / 1000)
+            yield Trial(STAGE, f"{rule}: {millimetres:g} mm of noise", noisy, measure="of the size")
+        thin = partial(run, cloud(aspect=0.01), noise_m=1e-5)
+        yield Trial(STAGE, f"{rule}: noise on thin points", thin, measure="of the size")
         if rule != "fixed-scale":
-            run = partial(noisy, solver, by, noise_m=0.003, scale=1000.0)
-            yield Trial(STAGE, f"{rule}: noise, units mixed", run, measure="of the size")
+            mixed = partial(run, cloud(), noise_m=0.003, scale=1000.0)
+            yield Trial(STAGE, f"{rule}: noise, units mixed", mixed, measure="of the size")
     if "robust" in fits:
         for count in (1, 5):
-            run = partial(noisy, fits["robust"], "inverse", noise_m=0.003, wrong=count)
+            run = partial(fitted, fits["robust"], "inverse", cloud(), noise_m=0.003, wrong=count)
             yield Trial(STAGE, f"robust: {count} of 27 pairs decimetres off", run, measure="of the size")
-    fit = fits[LEAST_SQUARES]
-    for power in (0, 1, 3, 5, 7):
-        run = partial(recovered, fit, cloud(aspect=10.0**-power))
-        yield Trial(STAGE, f"points 1e-{power} as wide as long", run, measure="rad")
-    for metres in (1e2, 1e4, 1e6):
-        run = partial(recovered, fit, cloud() + metres)
-        yield Trial(STAGE, f"points {metres:g} m from the origin", run, measure="rad")
-    for size_m in (1e-9, 1e-3, 1e3, 1e150):
-        run = partial(recovered, fit, cloud(size_m=size_m), offset_m=(size_m, -size_m, 2 * size_m))
-        yield Trial(STAGE, f"points within {size_m:g} m", run, measure="rad")
-    for scale in (1e-3, 1e3):
-        yield Trial(
-            STAGE, f"scale {scale:g} (units mixed)", partial(recovered, fit, cloud(), scale=scale), measure="rad"
-        )
-    for name, quaternion in (("half a turn", HALF_TURN), ("no turn", (1, 0, 0, 0))):
-        yield Trial(STAGE, name, partial(recovered, fit, cloud(), quaternion=quaternion), measure="rad")
-    yield Trial(STAGE, "three pairs", partial(recovered, fit, cloud(count=3)), measure="rad")
-    yield Trial(STAGE, "all points in one plane", partial(recovered, fit, cloud() * [1, 1, 0]), measure="rad")
-    line = cloud(aspect=0.0)
+    fit = partial(fitted, fits[LEAST_SQUARES], LEAST_SQUARES)
+    cases: dict[str, Callable[[], Answer]] = {
+        **{f"points 1e-{power} as wide as long": partial(fit, cloud(aspect=10.0**-power)) for power in (0, 1, 3, 5, 7)},
+        **{f"points {metres:g} m from the origin": partial(fit, cloud() + metres) for metres in (1e2, 1e4, 1e6)},
+        **{
+            f"points within {size:g} m": partial(fit, cloud(size_m=size), offset_m=(size, -size, 2 * size))
+            for size in (1e-9, 1e-3, 1e3, 1e150)
+        },
+        **{f"scale {scale:g} (units mixed)": partial(fit, cloud(), scale=scale) for scale in (1e-3, 1e3)},
+        "half a turn": partial(fit, cloud(), quaternion=HALF_TURN),
+        "no turn": partial(fit, cloud(), quaternion=(1, 0, 0, 0)),
+        "three pairs": partial(fit, cloud(count=3)),
+        "all points in one plane": partial(fit, cloud() * [1, 1, 0]),
+    }
+    for name, case in cases.items():
+        yield Trial(STAGE, name, case, measure="rad")
     for name, points in (
         ("two pairs", cloud(count=2)),
         ("points at one place", np.repeat(cloud(count=1), 9, axis=0)),
-        ("points on a line", line),
+        ("points on a line", cloud(aspect=0.0)),
         ("points 1e-12 as wide as long", cloud(aspect=1e-12)),
         ("points 1e12 m from the origin", cloud() + 1e12),
         ("a point at NaN", np.where(np.arange(27)[:, None] == 5, np.nan, cloud())),
     ):
-        yield refusal(STAGE, name, partial(recovered, fit, points))
+        yield refusal(STAGE, name, partial(fit, points))

@@ -9,26 +9,6 @@ from runtime.report.page import Figure, Page, Section, Table, Tile
 from runtime.report.plots import drawing, png
 from runtime.report.stability.trial import Case
 
-ABOUT = {
-    "eye pose": "Where an eye is and how its head is turned: on and near the vertical axis, in, between and behind "
-    "the panels, from 1e-200 to 1e200 m (EyeReal supplement, (10)-(14)).",
-    "RPU": "The mapping from an eye's image to a panel, against rays traced with 50 digits: up to 89.99 degrees, "
-    "down to 1e-11 m from a panel's plane, panels from a micrometre to a thousand kilometres (equations (40)-(47)).",
-    "phase": "From intensity to phase and back. The arcsine's slope is infinite at white, so the phase there loses "
-    "half its digits; the intensity, which is what is seen, loses none (EyeReal supplement, (1)-(7)).",
-    "Jones optics": "sin² of the summed phase against the product of the panels' Jones matrices.",
-    "retina": "What eyes see, and PSNR, against a tracer of 50 digits: every ray of small pictures.",
-    "solve": "The stiff part of the two-eye problem is the lowest frequency of the difference between the eyes. "
-    "Its condition grows as 1/gap², and values between 0 and 1 can show only so much of it: the note says what no "
-    "panel values can do better, by exact least squares. A method may be no worse than recorded by more than 5%.",
-    "tracker": "The filter against a Kalman filter of 50 digits; an evenly moving head at time steps from 0 to a day, "
-    "gains from stiff to lax, and single samples of nonsense.",
-    "calibration": "The similarity from pairs that hardly determine it, and from noisy ones by every rule, against "
-    "closed forms of 50 digits. Where rounding alone could turn the result by more than a microradian it must refuse.",
-    "network": "The shipped networks on pictures and poses that they were not trained for: no worse than recorded by "
-    "more than 5%.",
-}
-
 
 def stages_of(cases: Sequence[Case]) -> list[str]:
     """Each stage once, in the order of its first case."""
@@ -102,7 +82,7 @@ def stability_page(cases: Sequence[Case], *, machine: dict[str, str], seconds: f
         own = [case for case in cases if case.stage == stage]
         styles = ["" if case.passed else "bad" for case in own]
         table = Table(headings, [row(case) for case in own], styles=styles, folded=True)
-        sections.append(Section(stage[0].upper() + stage[1:], [ABOUT.get(stage, "")], tables=[table]))
+        sections.append(Section(stage[0].upper() + stage[1:], tables=[table]))
     tiles = [
         Tile(str(len(cases)), "cases"),
         Tile(str(len(stages)), "stages"),

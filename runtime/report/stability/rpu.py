@@ -12,8 +12,6 @@ import numpy as np
 from runtime.optics.retina import panel_positions
 from runtime.optics.rpu import (
     corners_in_front,
-    image_from_panel_four_points,
-    panel_corners_px,
     panel_from_image,
 )
 from runtime.optics.stack import PanelStack
@@ -117,33 +115,6 @@ def single_precision(width_px: int, height_px: int, degrees: float) -> Answer:
     return Answer(error, EPS32 * width_px / 2, note=f"{counted} rays")
 
 
-def seen_error(h: F64, e: Any, *, index: int = 2) -> float:
-    """How far H puts points of a panel from where 50 digits see them, of the largest image coordinate."""
-    error, size = 0.0, 1.0
-    for a, b in PROBES:
-        truth = exact.image_position(e, place(STACK, index, a, b), **VIEW)
-        found = mapped(h, a * SIZE[0], b * SIZE[1])
-        error = max(error, exact.distance(found[0], truth[0]), exact.distance(found[1], truth[1]))
-        size = max(size, abs(float(truth[0])), abs(float(truth[1])))
-    return error / size
-
-
-def four_points(degrees: float) -> Answer:
-    """The corrected closed form from the images of four corners: points between them, against rays of 50 digits."""
-    e = exact.vector(at_angle(degrees))
-    places = [place(STACK, 2, a, b) for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))]
-    corners = np.array([[float(c) for c in exact.image_position(e, point, **VIEW)] for point in places])
-    h = image_from_panel_four_points(corners, width_px=1920, height_px=1080)
-    back = np.column_stack([panel_corners_px(STACK.panel(2)), np.ones(4)]) @ h.T
-    backward = float(np.abs(back[:, :2] / back[:, 2:] - corners).max() / np.abs(corners).max())
-    # Of the eight linear equations (44), each row scaled to its size, as rounding sees them.
-    rows = []
-    for (j, k), (x, y) in zip(panel_corners_px(STACK.panel(2)) / SIZE, corners / np.abs(corners).max(), strict=True):
-        rows += [[j, k, 1, 0, 0, 0, -j * x, -k * x], [0, 0, 0, j, k, 1, -j * y, -k * y]]
-    condition = float(np.linalg.cond(np.array(rows)))
-    return Answer(seen_error(h, e), 16 * EPS64 * condition, condition, backward)
-
-
 def trials() -> Iterator[Trial]:
     """Every RPU case."""
     for degrees in (0.0, 45.0, 70.0, 80.0, 85.0):
@@ -170,5 +141,3 @@ def trials() -> Iterator[Trial]:
         for degrees in (0.0, 70.0):
             run = partial(single_precision, width_px, height_px, degrees)
             yield Trial(STAGE, f"float32 maps, {width_px}x{height_px}, {degrees:g} degrees", run, measure="px")
-    for degrees in (0.0, 45.0, 70.0, 80.0):
-        yield Trial(STAGE, f"four-point closed form, {degrees:g} degrees", partial(four_points, degrees))

@@ -1,9 +1,17 @@
-"""All trials of all stages, run one after the other."""
+"""All trials of all stages, run one after the other.
+
+Cases of what a model or a filter makes of a hard problem have no closed form for how good it can be: they are held to
+what was recorded, `limits.json`. `phasestack stability --full --record FILE` writes it anew; whoever changes a model or
+the tracker does, and says in the commit what became worse.
+"""
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
+from pathlib import Path
 
 from runtime.report.stability import (
     calibration,
@@ -18,6 +26,9 @@ from runtime.report.stability import (
 )
 from runtime.report.stability.calibration import Fit
 from runtime.report.stability.trial import Answer, Case, Trial, settle
+from runtime.support.artifacts import write_text
+
+LIMITS = Path(__file__).with_name("limits.json")  # forward errors by `stage: case`
 
 SOLVERS = (*networks.MODELS, "sart")
 
@@ -51,14 +62,19 @@ def _raise(error: Exception) -> Answer:
 
 
 def run(
-    trials: list[Trial],
-    *,
-    limits: Mapping[str, float],
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    trials: list[Trial], *, record: Path | None = None, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> list[Case]:
-    """Settle every trial, telling how far it is."""
+    """Settle every trial, telling how far it is. record: a file for limits; those of what isn't tried stay."""
+    limits: dict[str, float] = json.loads(LIMITS.read_text(encoding="utf-8"))
     cases = []
     for index, trial in enumerate(trials):
         cases.append(settle(trial, limit=limits.get(trial.key)))
         progress(index + 1, len(trials))
+    if record is not None:
+        new = {
+            trial.key: float(f"{case.forward_error:.4g}")
+            for trial, case in zip(trials, cases, strict=True)
+            if trial.floor is not None and math.isfinite(case.forward_error)
+        }
+        write_text(record, json.dumps(dict(sorted((limits | new).items())), indent=0) + "\n")
     return cases

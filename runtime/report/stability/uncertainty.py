@@ -10,18 +10,14 @@ from typing import Any
 import numpy as np
 
 from runtime.model.chain import chain_modes
-from runtime.model.job import Job
 from runtime.model.transfer import FULL
 from runtime.model.unrolled import UnrolledPredictor
-from runtime.records import F64, U8
+from runtime.records import F64
 from runtime.report.stability.networks import MODELS, STACK, ready
-from runtime.report.stability.trial import Answer, Trial, refusal
+from runtime.report.stability.trial import Answer, Trial
 
 STAGE = "unsure eyes"
-SIGMAS_MM = (0.0, 1e-6, 0.1, 1.0, 2.0, 4.0, 10.0, 50.0)
 ROWS, PANEL_CODE = 8, 1 / 255
-DRIVEN_MOST = ((1.0, 0.97), (50.0, 0.5))  # from so many millimetres on, of the drive of sure eyes, at most
-LEAST_SURE = 0.05  # of the outer panels' mean drive for two points
 
 
 def loaded(model: str) -> UnrolledPredictor:
@@ -71,24 +67,6 @@ def unsure(model: str, sigma_columns: float) -> Answer:
     )
 
 
-def whole(model: str, sigma_mm: float) -> Answer:
-    """A whole prediction of eyes that disagree everywhere: the outer panels nearer to even, the less is known."""
-    driven, sure = (
-        float(np.abs(layers_of(model, sigma)[[0, 2]].astype(float) - 128).mean() / 255) for sigma in (sigma_mm, 0.0)
-    )
-    most = sure * min((share for least_mm, share in DRIVEN_MOST if sigma_mm >= least_mm), default=1.0)
-    note = f"outer panels {driven:.3f} from even, for two points {sure:.3f}"
-    return Answer(max(driven - most, LEAST_SURE - sure, 0.0), 0.001, note=note)
-
-
-def layers_of(model: str, sigma_mm: float, separation_m: float = 0.062) -> U8:
-    """(3, h, w, 3) what a model shows to eyes that disagree everywhere."""
-    random = np.random.default_rng(3)
-    images = [[random.integers(0, 256, (108, 192, 4), dtype=np.uint8)] for _ in range(2)]
-    eyes = np.array([[0.6, -separation_m / 2, 0.0], [0.6, separation_m / 2, 0.0]])
-    return loaded(model).solve(Job(images, eyes, eye_sigma_mm=sigma_mm)).layers[..., :3].copy()
-
-
 def trials() -> Iterator[Trial]:
     """What there is to try."""
     for model in MODELS:
@@ -99,13 +77,3 @@ def trials() -> Iterator[Trial]:
                 partial(unsure, model, columns),
                 measure="phase",
             )
-    for sigma_mm in SIGMAS_MM:
-        yield Trial(
-            STAGE,
-            f"balanced: eyes off by {sigma_mm:g} mm",
-            partial(whole, "balanced", sigma_mm),
-            measure="phase",
-        )
-    for name, sigma_mm in (("NaN", math.nan), ("infinite", math.inf)):
-        yield refusal(STAGE, f"balanced: {name} doubt", partial(layers_of, "balanced", sigma_mm))
-    yield refusal(STAGE, "balanced: separation vanishes", partial(layers_of, "balanced", 1.0, 1e-15))
