@@ -416,11 +416,6 @@ class Settings(Section):
     plan: PlanSettings = Field(default_factory=PlanSettings, description="what is left out")
     service: ServiceSettings = Field(default_factory=ServiceSettings, description="socket, metrics, black box")
 
-    @property
-    def limits(self) -> LimitSettings:
-        """Of files."""
-        return LIMITS
-
     @model_validator(mode="after")
     def _agree(self) -> Settings:
         self.stack.check_pixels()

@@ -10,15 +10,12 @@ import typer
 if TYPE_CHECKING:
     import socket as sockets_
 
-DEFAULT_PORT = 8717
+LOOPBACK, DEFAULT_PORT = "127.0.0.1", 8717
 
 
 def page(
     config: Annotated[Path | None, typer.Option(help="configuration of the daemon: says where its socket is")] = None,
     socket: Annotated[Path | None, typer.Option(help="the daemon's socket, whatever the configuration says")] = None,
-    host: Annotated[
-        str, typer.Option(help="address to listen on; anything but loopback lets others try")
-    ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any that is free")] = DEFAULT_PORT,
     token_file: Annotated[
         Path | None, typer.Option(help="file with the token, made where there is none; default: in the state folder")
@@ -50,9 +47,9 @@ def page(
     places = sockets(config, socket)
     path = token_file or state_folder() / "page-token"
     token = token_of(path)
-    listening = _listening(host, port)
+    listening = _listening(port)
     daemon = Daemon(places)
-    app = application(daemon, token, any_host=not _is_loopback(host))
+    app = application(daemon, token)
     settings = uvicorn.Config(
         app,
         log_level="warning",
@@ -62,29 +59,17 @@ def page(
         timeout_graceful_shutdown=2,
         limit_concurrency=64,
     )
-    name = f"[{host}]" if ":" in host else host
-    typer.echo(f"the page is at http://{name}:{listening.getsockname()[1]}/ - its token is in {path}", err=True)
+    typer.echo(f"the page is at http://{LOOPBACK}:{listening.getsockname()[1]}/ - its token is in {path}", err=True)
     uvicorn.Server(settings).run(sockets=[listening])
 
 
-def _is_loopback(host: str) -> bool:
-    import ipaddress
-
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
-def _listening(host: str, port: int) -> sockets_.socket:
-    """A bound socket. Raises InputError where the address is taken or none of this machine's."""
+def _listening(port: int) -> sockets_.socket:
+    """A bound socket on loopback. Raises InputError where the port is taken."""
     import socket as sockets_
 
     from runtime.errors import InputError
 
     try:
-        family = sockets_.getaddrinfo(host, port, type=sockets_.SOCK_STREAM)[0][0]
-        return sockets_.create_server((host, port), family=family)
-    except (OSError, UnicodeError) as error:
-        problem = getattr(error, "strerror", None) or error
-        raise InputError("page", "--host, --port", f"{host} port {port}: can't be listened on ({problem})") from None
+        return sockets_.create_server((LOOPBACK, port))
+    except OSError as error:
+        raise InputError("page", "--port", f"{port}: can't be listened on ({error.strerror})") from None

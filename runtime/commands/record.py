@@ -72,7 +72,7 @@ def record(
         typer.echo(json.dumps(summary))
     else:
         length = f"{summary['samples']} samples, {summary['seconds']:.1f} s"
-        typer.echo(f"{out}: {length}, {_contents(summary)} ({summary['stopped']})")
+        typer.echo(f"{out}: {length}, {', '.join(summary['holds'])} ({summary['stopped']})")
 
 
 def _refuse_target(out: Path, *, motion: bool) -> None:
@@ -96,20 +96,6 @@ def _refuse_target(out: Path, *, motion: bool) -> None:
     except InputError:  # something else has the name
         pass
     raise InputError(out, "--out", "is there already: take another name, or delete it")
-
-
-def _contents(summary: dict[str, Any]) -> str:
-    """What a recording holds, in words."""
-    holds = summary["holds"]
-    pictures = [name for name in ("colour", "depth") if name in holds]
-    parts = ["eye positions"] if "eyes" in holds else ["no eye positions"]
-    if "true eyes" in holds:
-        parts.append("the true eyes")
-    if pictures:
-        parts.append(f"{' and '.join(pictures)} pictures of whoever was there")
-    elif summary.get("images_asked"):
-        parts.append("no pictures (this sensor delivers none)")
-    return ", ".join(parts)
 
 
 def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | None) -> dict[str, Any]:
@@ -162,7 +148,7 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
             why = worker.reason or "nothing came"
             raise worker.error or FatalError(f"sensor {s.driver}: no sample ({worker.state}: {why})")
     told = {"file": str(out), "samples": writer.count, "seconds": so_far_s, "stopped": stopped}
-    return told | {"holds": list(holds), "images_asked": images, "skipped": worker.stale_inputs}
+    return told | {"holds": list(holds), "skipped": worker.stale_inputs}
 
 
 def _streams(frame: SensorFrame) -> list[str]:

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock, SimulatedClock
-from runtime.config import Settings
+from runtime.config import LIMITS, Settings
 from runtime.daemon.solver_parts import RunningSolver, SolverMaker
 from runtime.errors import PanelLost, Stopped
 from runtime.eyes.calibration import load_calibration
@@ -165,7 +165,7 @@ def build_run(
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         solver = thread = SolverThread(maker, clock, first_cost_ns=total_ns(stage_ms))
         cleanup.callback(solver.close)
-        thread.wait_ready(lambda: host.starting("loading content and model"), max_s=settings.limits.start_s)
+        thread.wait_ready(lambda: host.starting("loading content and model"), max_s=LIMITS.start_s)
         samples = worker = SensorWorker(make_driver, settings.sensor, clock, make_find)
         cleanup.callback(worker.close)
         worker.start()

@@ -46,8 +46,8 @@ class TooLong(ValueError):
     """A request's body."""
 
 
-def application(daemon: Daemon, token: str, *, any_host: bool) -> Starlette:
-    """The application; any_host: it is reached by names that are not this machine's own."""
+def application(daemon: Daemon, token: str) -> Starlette:
+    """The application, on loopback: by another name than this machine's own nobody reaches it."""
     cookie = cookie_of(token)
 
     def permitted(request: Request) -> bool:
@@ -119,15 +119,15 @@ def application(daemon: Daemon, token: str, *, any_host: bool) -> Starlette:
         Route("/{name}", guarded(asset), methods=["GET"]),
     ]
     app = Starlette(routes=routes)
-    app.add_middleware(_Guard, any_host=any_host)
+    app.add_middleware(_Guard)
     return app
 
 
 class _Guard:
     """For every request: whose page it comes from, by which name, and what the answer may load."""
 
-    def __init__(self, app: Any, *, any_host: bool) -> None:
-        self._app, self._any_host = app, any_host
+    def __init__(self, app: Any) -> None:
+        self._app = app
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         if scope["type"] != "http":
@@ -149,8 +149,8 @@ class _Guard:
     def _refused(self, request: Request) -> str:
         host = request.headers.get("host", "")
         # A name that another site has made to lead here is none of ours.
-        if not self._any_host and _name(host) not in ("localhost", "127.0.0.1", "::1"):
-            return "not by this name: open http://localhost, or start it with --host"
+        if _name(host) not in ("localhost", "127.0.0.1", "::1"):
+            return "not by this name: open http://localhost"
         if request.method in ("GET", "HEAD"):
             return ""
         origin = request.headers.get("origin")

@@ -66,6 +66,7 @@ REMOVED_COMMANDS: dict[str, str] = {
     "calibrate solve --stack-unit": "pairs are in metres",
     "calibrate solve --serial": "a column `sensor_serial` in the pairs",
     "calibrate report --pairs": "`calibrate solve` writes the pairs into its file",
+    "page --host": "`ssh -L 8717:localhost:8717`, or a proxy on the display's machine",
     "identify --seconds": "q ends it",
     "identify --ask": "`setup`: its first step asks which monitor is which panel",
     "setup --again": "p goes a step back; every step can be done again",
