@@ -44,8 +44,7 @@ class Problem:
 
     def __init__(self, *, gap_m: float, ipd_m: float, distance_m: float) -> None:
         self.stack = PanelStack(WIDTH_M, HEIGHT_M, (-gap_m, 0.0, gap_m), WIDTH_PX, HEIGHT_PX)
-        self.distance_m = gap_m + distance_m
-        self.ipd_m = ipd_m
+        self.gap_m, self.ipd_m, self.distance_m = self.geometry = (gap_m, ipd_m, gap_m + distance_m)
         self.eyes_m = np.array([[self.distance_m, side * ipd_m / 2, 0.0] for side in (-1, 1)])
         self.fov_deg = math.degrees(2 * math.atan(WIDTH_M / 2 / self.distance_m))
         difference, common = waves([(1, AMPLITUDE), *FINER]), waves(COMMON)
@@ -57,34 +56,22 @@ class Problem:
             for target in self.targets
         ]
 
-    def parallax_m(self, x_m: float) -> float:
-        """Half of what an eye's step to the other moves a panel by, on the centre panel, metres."""
-        return self.ipd_m / 2 * x_m / (self.distance_m - x_m)
-
     def condition(self) -> float:
         """Largest over smallest eigenvalue for that wave; the smallest would lose digits in doubles."""
         k = 2 * exact.mp.pi / exact.mpf(WIDTH_M)
-        c = 1 + sum(
-            exact.mp.exp(2j * k * exact.mpf(self.parallax_m(x))) for x in (self.stack.x_m[0], self.stack.x_m[2])
-        )
+        parallaxes_m = [self.ipd_m / 2 * x_m / (self.distance_m - x_m) for x_m in (-self.gap_m, self.gap_m)]
+        c = 1 + sum(exact.mp.exp(2j * k * exact.mpf(parallax_m)) for parallax_m in parallaxes_m)
         return float((3 + abs(c)) / (3 - abs(c)))
 
     def left_over(self, layers: F32) -> float:
         """RMS of what is missing of the wanted phases over both eyes, relative to how they vary: 1 for flat grey."""
         flat = np.asarray(layers, np.float64).mean(axis=-1).reshape(self.stack.count * HEIGHT_PX * WIDTH_PX)
         missing, whole = 0.0, 0.0
-        for side, (matrix, columns) in enumerate(exact_operator(*self._geometry())):
+        for side, (matrix, columns) in enumerate(exact_operator(*self.geometry)):
             target = self.targets[side][columns]
             missing += float(((matrix @ flat - target) ** 2).sum())
             whole += float(((target - 1.5) ** 2).sum())
         return math.sqrt(missing / whole)
-
-    def optimum(self) -> float:
-        """What is left of it at least, by any values from 0 to 1 that are the same in every row, as the wanted are."""
-        return _optimum(*self._geometry())
-
-    def _geometry(self) -> tuple[float, float, float]:
-        return self.stack.x_m[2], self.ipd_m, self.distance_m
 
 
 @lru_cache(maxsize=64)
@@ -130,7 +117,8 @@ def _mirrored(index: int) -> int:
 
 
 @lru_cache(maxsize=64)
-def _optimum(gap_m: float, ipd_m: float, distance_m: float) -> float:
+def optimum(gap_m: float, ipd_m: float, distance_m: float) -> float:
+    """What is left of it at least, by any values from 0 to 1 that are the same in every row, as the wanted are."""
     problem = Problem(gap_m=gap_m, ipd_m=ipd_m, distance_m=distance_m - gap_m)
     parts = exact_operator(gap_m, ipd_m, distance_m)
     half = [len(columns) // 2 for _, columns in parts]  # the other half is its mirror image, and wants the same
@@ -144,7 +132,7 @@ def _optimum(gap_m: float, ipd_m: float, distance_m: float) -> float:
 def converges(method: Method, gap_m: float, ipd_m: float, distance_m: float) -> Answer:
     """What a method leaves of what is wanted, against the least that any panel values leave."""
     problem = Problem(gap_m=gap_m, ipd_m=ipd_m, distance_m=distance_m)
-    left, least = problem.left_over(method(problem)), problem.optimum()
+    left, least = problem.left_over(method(problem)), optimum(*problem.geometry)
     note = f"no panel values leave less than {least:.3g}"
     if left < 0.98 * least - FLOOR:
         return Answer(math.nan, 1.0, problem.condition(), note=f"{left:.3g} is impossible: {note}")

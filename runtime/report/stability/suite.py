@@ -22,7 +22,6 @@ from runtime.report.stability import (
     rpu,
     solve,
     tracking,
-    uncertainty,
 )
 from runtime.report.stability.calibration import Fit
 from runtime.report.stability.trial import Answer, Case, Trial, settle
@@ -46,7 +45,6 @@ def every_trial(fits: Mapping[str, Fit], *, full: bool) -> Iterator[Trial]:
         retina.STAGE: retina.trials,
         solve.STAGE: partial(solve.trials, methods),
         networks.STAGE: partial(networks.trials, full=full),
-        uncertainty.STAGE: uncertainty.trials,
         tracking.STAGE: partial(tracking.trials, full=full),
         calibration.STAGE: partial(calibration.trials, fits),
     }
