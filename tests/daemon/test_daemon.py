@@ -152,7 +152,7 @@ def test_a_hangup_during_the_start_is_a_reload_that_comes_when_it_can(
     assert "Traceback" not in errors
 
 
-def test_an_operator_steers_it_and_every_line_of_its_log_is_one_object(started: Callable[..., Any]) -> None:
+def test_an_operator_steers_it(started: Callable[..., Any]) -> None:
     daemon = started()
     assert daemon.hears("READY=1")
     assert ask([daemon.socket], {"command": "flat"})["ok"]

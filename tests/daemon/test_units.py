@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from runtime.config import ServiceSettings, load_settings
+from runtime.daemon.server import GROUP
 from runtime.sensor.known_devices import KNOWN_DEVICES
 
 ROOT = Path(__file__).parents[2]
@@ -92,7 +93,7 @@ def test_the_socket_of_the_defaults_lies_in_the_units_runtime_folder() -> None:
     settings = ServiceSettings()
     unit_keys = keys("phasestack.service")
     assert Path(settings.socket).parent == Path("/run") / unit_keys["RuntimeDirectory"][0]
-    assert settings.group == unit_keys["Group"][0]
+    assert unit_keys["Group"] == [GROUP]
 
 
 def test_the_daemon_finds_the_kiosks_x_server() -> None:
