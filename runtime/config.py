@@ -296,15 +296,6 @@ class PanelSettings(Section):
         1.0, description="where there is no LUT: grey = phase^(1/gamma)"
     )
 
-    def same_monitor(self, other: PanelSettings) -> str:
-        """What names one monitor for both; empty where they can be two. Monitors may share their EDID serial."""
-        if self.connector and self.connector == other.connector:
-            return f"connector {self.connector}"
-        alone = not (self.connector or other.connector)
-        if alone and self.edid_serial and self.edid_serial == other.edid_serial:
-            return f"edid_serial {self.edid_serial}"
-        return ""
-
 
 class OutputSettings(Section):
     """How layers leave the machine."""
@@ -318,14 +309,6 @@ class OutputSettings(Section):
     allow_rescaling: bool = Field(
         False, description="let a monitor whose mode has other pixels than the stack rescale the phases"
     )
-
-    @model_validator(mode="after")
-    def _each_its_own_monitor(self) -> OutputSettings:
-        for number, panel in enumerate(self.panels):
-            for before, other in enumerate(self.panels[:number]):
-                if shared := panel.same_monitor(other):
-                    raise ValueError(f"panels.{number}: is bound to the monitor of panels.{before} ({shared})")
-        return self
 
 
 class LoopSettings(Section):

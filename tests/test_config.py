@@ -52,12 +52,6 @@ PANEL = '[[output.panels]]\nconnector = "DP-{}"\n'
         ("[[output.panels]]\nhomography = [[1, 0, 0], [0, 1, 0]]", "output.panels.0.homography.2", "required"),
         (PANEL.format(1), "output.panels", "has 1 of 3 tables"),
         (PANEL.format(1) + PANEL.format(2), "output.panels", "has 2 of 3 tables"),
-        (
-            PANEL.format(1) + PANEL.format(2) + PANEL.format(1),
-            "output.panels.2",
-            "is bound to the monitor of panels.0",
-        ),
-        ('[[output.panels]]\nedid_serial = "A"\n' * 3, "output.panels.1", "(edid_serial A)"),
         ('[service]\nsocket = ""', "service.socket", "names no file"),
         ('[service]\nsocket = "/"', "service.socket", "names no file"),
         (f'[service]\nsocket = "/tmp/{"s" * 120}"', "service.socket", "too long for a socket"),
@@ -116,11 +110,6 @@ def test_what_config_prints_is_a_configuration_and_says_where_paths_start(
     printed = capsys.readouterr().out
     assert printed.startswith("# Paths are relative to this file's folder.\n")
     assert loaded(tmp_path, printed) == Settings()
-
-
-def test_one_serial_on_two_monitors_is_told_apart_by_connector(tmp_path: Path) -> None:
-    text = "".join(f'[[output.panels]]\nedid_serial = "A"\nconnector = "DP-{n}"\n' for n in range(3))
-    assert len(loaded(tmp_path, text).output.panels) == 3
 
 
 def test_paths_are_relative_to_the_file_and_names_stay_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

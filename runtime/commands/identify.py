@@ -38,28 +38,20 @@ def identify(
     from runtime.errors import InputError, PanelLost
 
     settings = load_settings(config)
-    if settings.output.panels:
-        _check_panel(panel, len(settings.output.panels))
     try:
         panels, cards = _bound(settings) if settings.output.panels else every_monitor()[:2]
     except PanelLost as error:
         raise InputError("output", "panels", str(error)) from None
     keys = TerminalKeys(quit_at_end=False)
     try:
-        _check_panel(panel, len(cards))
+        if panel is not None and panel >= len(cards):
+            raise InputError("identify", "--panel", f"must be 0 to {len(cards) - 1}")
         order = list(range(len(cards))) if panel is None else [panel]
         windows = WindowKeys(panels)
         _hold(panels, cards, order, lambda: keys.poll() or windows.poll())
     finally:
         keys.close()
         panels.close()
-
-
-def _check_panel(panel: int | None, count: int) -> None:
-    from runtime.errors import InputError
-
-    if panel is not None and panel >= count:
-        raise InputError("identify", "--panel", f"must be 0 to {count - 1}")
 
 
 def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:

@@ -171,7 +171,8 @@ def test_the_mounting_that_is_answered_shows_the_card_upright(rotation_deg: int,
     assert mounting_of(arrow, mirrored=mirror == "horizontal") == (rotation_deg, mirror)
 
 
-def test_a_panel_that_is_none_is_refused(config: Path) -> None:
+@pytest.mark.windows
+def test_a_panel_that_is_none_is_refused(x: XServer, config: Path) -> None:
     assert isinstance(invoke(identify, "--config", config, "--panel", "3").exception, InputError)
 
 
