@@ -10,14 +10,12 @@ from typing import Any
 
 from runtime.config import StackGeometry
 from runtime.report import focal, moving
-from runtime.report.focal_page import focal_section
-from runtime.report.frontier import QUOTED, MethodResult, measure
-from runtime.report.frontier_page import frontier_section
+from runtime.report.frontier import MethodResult, measure
 from runtime.report.machine import describe
 from runtime.report.methods import Method, check_models, shipped_and_references
-from runtime.report.moving_page import moving_section
-from runtime.report.page import Page, Section, Tile
+from runtime.report.page import Page, Section
 from runtime.report.pairs import StillPair, procedural_pairs, read_pairs
+from runtime.report.sections import focal_section, frontier_section, moving_section
 from runtime.report.worker import apart
 
 REWRITTEN_EVERY_S = 10.0
@@ -56,16 +54,10 @@ class GrowingPage:
         doing = self.record.get("measuring")
         notes = [f"Not finished: it grows while it is measured. The last that was known: {doing}."] if doing else []
         sections, machine = list(self._sections.values()), self.record["machine"]
-        tiles = _tiles(self.record.get("methods", []))
         lead = "Light, of eyes sure to 1 mm, is the figure to quote; higher is better."
-        page = Page("Error against run time", lead, sections, machine, self._command, tiles, notes)
+        page = Page("Error against run time", lead, sections, machine, self._command, notes)
         page.write(self._out, record="report.json", data=self.record)
         self._written_s = monotonic()
-
-
-def _tiles(methods: Sequence[dict[str, Any]]) -> list[Tile]:
-    shown = [m for m in methods if m["kind"] == "network" and QUOTED in m["light_db"]]
-    return [Tile(f"{method['light_db'][QUOTED]:.1f} dB", f"light, {method['name']}") for method in shown]
 
 
 def whole_report(
@@ -147,7 +139,6 @@ def _focal(page: GrowingPage) -> None:
         )
     page.record["focal"] = {
         "model": stack.model,
-        "slices": [{"plane_m": s.plane_m, "psnr_db": s.psnr_db} for s in stack.slices],
         "cards": [asdict(card) for card in stack.cards],
     }
     page.put("focal", lambda: focal_section(stack), last=True)

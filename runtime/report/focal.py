@@ -19,7 +19,6 @@ from runtime.content.scenes import Scene, Thing
 from runtime.model.job import Job
 from runtime.model.predictor import load_predictor
 from runtime.optics.carried import intensities
-from runtime.optics.quality import psnr_db
 from runtime.optics.retina import Rays, Retina, average, pupil_points, through_layers
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_camera, raster_from_stack, stack_from_eye
@@ -42,7 +41,6 @@ class Slice:
     plane_m: float  # x of the place in focus, straight ahead
     shown: F32  # (h, w, 3) through the layers
     true: F32  # (h, w, 3) as the scene itself would look
-    psnr_db: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,12 +122,9 @@ def focal_stack(
     for index, plane_m in enumerate(PLANES_M):
         focus_m = float((np.array([plane_m, 0.0, 0.0]) - eye) @ gaze)
         matrices = [projection(eye, point, focus_m=focus_m) for point in points]
-        retinas = [seen_through(matrix, layers, stack) for matrix in matrices]
+        seen = [seen_through(matrix, layers, stack).image for matrix in matrices]
         drawn = [painter.draw(eye, matrix, width_px=WIDTH_PX, height_px=HEIGHT_PX) for matrix in matrices]
-        shown, true = average([r.image for r in retinas]), average([intensities(picture) for picture in drawn])
-        mask = np.logical_and.reduce([r.mask for r in retinas])
-        error = float(np.square(shown[mask] - true[mask], dtype=np.float64).mean())
-        slices.append(Slice(plane_m, shown, true, psnr_db(error)))
+        slices.append(Slice(plane_m, average(seen), average([intensities(picture) for picture in drawn])))
         progress(index + 1, len(PLANES_M))
     away = [math.dist((x, 0.0, 0.0), eye) for x in PLANES_M]
     cards = tuple(

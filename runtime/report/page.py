@@ -59,15 +59,6 @@ class Section:
 
 
 @dataclass(frozen=True, slots=True)
-class Tile:
-    """One large number at the head of the page."""
-
-    value: str
-    label: str
-    style: str = ""
-
-
-@dataclass(frozen=True, slots=True)
 class Page:
     """A whole page."""
 
@@ -76,7 +67,6 @@ class Page:
     sections: Sequence[Section]
     machine: Mapping[str, str] = field(default_factory=dict)
     command: str = ""  # that makes this page again; empty: nothing is said of it
-    tiles: Sequence[Tile] = ()
     notes: Sequence[str] = ()  # what to beware of
 
     def html(self) -> str:

@@ -12,12 +12,11 @@ from pathlib import Path
 import pytest
 
 from runtime.evaluation.solved import PairQuality
-from runtime.report import frontier_page
 from runtime.report.frontier import MethodResult, PairResult
 from runtime.report.machine import describe
 from runtime.report.moving import Moving
-from runtime.report.moving_page import moving_section
-from runtime.report.page import Page, Section, Table, Tile
+from runtime.report.page import Page, Section, Table
+from runtime.report.sections import frontier_section, moving_section
 from runtime.report.stability.page import stability_page
 from runtime.report.stability.trial import Answer, Trial, settle
 
@@ -54,10 +53,10 @@ def report_page() -> Page:
         for solver_ms in (33.0, 150.0)
     ]
     sections = [
-        frontier_page.frontier_section(methods, title="Frontier", name="test"),
+        frontier_section(methods, title="Frontier", name="test"),
         moving_section(moving),
     ]
-    return Page("Error against run time", "A lead.", sections, describe(), "phasestack report", [Tile("1", "x")])
+    return Page("Error against run time", "A lead.", sections, describe(), "phasestack report")
 
 
 def small_stability_page() -> Page:

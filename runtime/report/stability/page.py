@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from runtime.report.page import Figure, Page, Section, Table, Tile
+from runtime.report.page import Figure, Page, Section, Table
 from runtime.report.plots import drawing, png
 from runtime.report.stability.trial import Case
 
@@ -62,7 +62,7 @@ def stability_page(cases: Sequence[Case], *, machine: dict[str, str], seconds: f
     refused = sum(case.behaviour == "refuses" for case in cases)
     stages = stages_of(cases)
     lead = (
-        f"All {len(cases)} stiff and extreme cases behave as stated."
+        f"All {len(cases)} stiff and extreme cases behave as stated, in {seconds:.0f} s; {refused} are refused."
         if not failed
         else f"{len(failed)} of {len(cases)} stiff and extreme cases fail: {', '.join(c.name for c in failed[:5])}."
     )
@@ -83,11 +83,4 @@ def stability_page(cases: Sequence[Case], *, machine: dict[str, str], seconds: f
         styles = ["" if case.passed else "bad" for case in own]
         table = Table(headings, [row(case) for case in own], styles=styles, folded=True)
         sections.append(Section(stage[0].upper() + stage[1:], tables=[table]))
-    tiles = [
-        Tile(str(len(cases)), "cases"),
-        Tile(str(len(stages)), "stages"),
-        Tile(str(len(failed)), "fail", "bad" if failed else "good"),
-        Tile(str(refused), "refused, in one line"),
-        Tile(f"{seconds:.0f} s", "for all of them"),
-    ]
-    return Page("Numerical stability", lead, sections, machine, command, tiles)
+    return Page("Numerical stability", lead, sections, machine, command)

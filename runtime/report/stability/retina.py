@@ -15,7 +15,7 @@ from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.records import U8
 from runtime.report.stability import exact
-from runtime.report.stability.trial import EPS32, Answer, Trial, refusal
+from runtime.report.stability.trial import EPS32, Answer, Trial
 
 STAGE = "retina"
 SIZE = (32, 18)  # of the pictures and panels: every ray of a small picture is traced
@@ -178,11 +178,3 @@ def trials() -> Iterator[Trial]:
     ):
         true = [[x, y + moved_m, z] for x, y, z in eyes]
         yield Trial(STAGE, f"light {name} the eyes, {kind}", partial(light, eyes, true, kind), measure="squared error")
-    layers = layers_of("noise", THREE)
-
-    def nobody() -> object:
-        away = seen_by([0.07, 30.0, 0.0], layers, THREE, fov_deg=FOV_DEG)
-        return quality([away.image], [away.image], [away.mask])
-
-    yield refusal(STAGE, "PSNR where no ray crosses every panel", nobody)
-    yield refusal(STAGE, "an eye behind the panels", partial(seen_by, [-0.5, 0, 0], layers, THREE, fov_deg=FOV_DEG))

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from runtime.clock import NS_PER_S
-from runtime.config import TrackerSettings
 from runtime.eyes import imm
 from runtime.eyes.tracker import Tracker
 from runtime.records import F64, EyePoints
@@ -100,12 +99,12 @@ def still(updates: int) -> Answer:
     return Answer(float(np.abs(found - came.eyes_m(30 * FRAME_NS)).max()), 1e-9, float(updates))
 
 
-def after(steps_ns: list[int], ask_ns: int, *, settings: TrackerSettings | None = None, lost: bool = False) -> Answer:
+def after(steps_ns: list[int], ask_ns: int, *, lost: bool = False) -> Answer:
     """A head that moves evenly, sampled at odd intervals and asked for at an odd time: where it is then.
 
     lost: it was not seen for so long that nobody can know; then an answer is the mistake.
     """
-    tracker = Tracker(settings) if settings else Tracker()
+    tracker = Tracker()
     now, head = 0, Head(sum(map(abs, steps_ns)) + ask_ns)
     tracker.update(EyePoints(head.eyes_m(now), np.ones(2)), capture_ns=now)
     for step in steps_ns:
@@ -147,10 +146,3 @@ def trials(*, full: bool = False) -> Iterator[Trial]:
     ):
         run = partial(after, steps, ask, lost=ask == hour)
         yield Trial(STAGE, name, run, measure="m", floor=None if ask == hour else FLOOR_M)
-    for name, values in (
-        ("sensor noise 1 nm", {"noise_m": 1e-9}),
-        ("sensor noise 1 m", {"noise_m": 1.0}),
-    ):
-        settings = TrackerSettings().model_copy(update=values)
-        run = partial(after, usual, 60_000_000, settings=settings)
-        yield Trial(STAGE, f"stiff gains: {name}", run, measure="m", floor=FLOOR_M)

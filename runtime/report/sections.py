@@ -1,0 +1,144 @@
+"""The report's sections: light against run time, what a moving viewer sees, and focal parallax."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from runtime.report.focal import CARDS_M, DISTANCE_M, PUPIL_M, FocalStack
+from runtime.report.frontier import MethodResult, pareto
+from runtime.report.moving import Moving
+from runtime.report.page import Figure, Section, Table
+from runtime.report.plots import COLOURS, drawing, png
+
+KINDS = {"network": ("o", COLOURS[0]), "iterative": ("s", COLOURS[1])}
+NAMES = ("behind the panels", "in the middle panel", "before the panels")
+
+
+def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) -> Section:
+    """The plot and the table of one resolution's methods, as far as they are measured."""
+    pairs = "; ".join(pair.pair for pair in results[0].pairs)
+    text = [
+        f"Every method on {pairs}, in one run. Light, the figure to quote: what both eyes make of the panels' pixels, "
+        "which are even boxes, for eyes that are sure to 1 mm: a pupil. One ray a pixel, sampled bilinearly, is "
+        "what published evaluations measure. The time is that of a whole solution, from two decoded pictures to 8-bit "
+        "layers. Each method runs in a process of its own; its memory is that process's peak.",
+    ]
+    return Section(title, text, [frontier_plot(results, name=f"frontier-{name}")], [method_table(results)])
+
+
+def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
+    """A curve for each kind of method, more steps to the right."""
+    beside: Any = {"textcoords": "offset points", "fontsize": 8.5}
+    with drawing(9.6, 5.0) as figure:
+        axes = figure.add_subplot()
+        for kind, (marker, colour) in KINDS.items():
+            dots = sorted((r for r in results if r.kind == kind), key=lambda r: r.ms_p50)
+            if dots:
+                places = [(r.ms_p50, r.quoted_db) for r in dots]
+                axes.plot(*zip(*places, strict=True), marker=marker, markersize=7, color=colour, label=kind)
+            for result in dots:  # up and to the left of a curve that rises
+                axes.annotate(result.name, (result.ms_p50, result.quoted_db), xytext=(-5, 6), ha="right", **beside)
+        axes.set(xscale="log", xlabel="median time of a whole solution, ms", ylabel="light, dB (a pupil)")
+        axes.margins(x=0.1, y=0.15)
+        axes.set_title("Light against run time: up and to the left is better")
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter("")
+        axes.legend()
+    return Figure(name, png(figure), "Times hold for this machine and this hour: compare their ratios.")
+
+
+def method_table(results: Sequence[MethodResult]) -> Table:
+    """The numbers, fastest first; times also as multiples of the fastest method's."""
+    ordered = sorted(results, key=lambda r: r.ms_p50)
+    front = {result.name for result in pareto(results)}
+    beside = list(dict.fromkeys(key for result in results for key in result.psnr_db_off_eye))
+    headings = ["method", "× fastest", "p50 ms", "p99 ms", "MiB", "parameters", "light 1 mm dB", "0 mm", "2 mm"]
+    headings += ["one ray dB", "SSIM", "worst eye", *(f"{key} beside" for key in beside)]
+    rows = []
+    for r in ordered:
+        seen = [r.light_db.get(key) for key in ("1", "0", "2")] + [r.psnr_db, r.ssim, r.worst_eye_psnr_db]
+        seen += [r.psnr_db_off_eye.get(key) for key in beside]
+        told = ["" if value is None else f"{value:.4g}" for value in seen]
+        times = [f"{r.ms_p50 / ordered[0].ms_p50:.1f}", f"{r.ms_p50:.1f}", f"{r.ms_p99:.1f}"]
+        rows.append([r.name, *times, f"{r.memory_mib:.0f}", f"{r.parameters:,}", *told])
+    size = f"{ordered[0].width_px}x{ordered[0].height_px}"
+    styles = ["good" if r.name in front else "" for r in ordered]
+    return Table(headings, rows, f"Panels of {size}. Marked: what nothing beats in both time and light.", styles)
+
+
+def moving_section(found: Sequence[Moving]) -> Section:
+    """Light at the true eyes for every motion and solver, as far as measured, with the tracker's error."""
+    text = [
+        "A solution takes longer than a refresh, and a head does not wait for it: at every refresh the outer panels "
+        "are shifted and scaled to where the eyes are when its light leaves. The dB are what the eyes see from where "
+        "they truly are, against the picture that the layers were solved for. These are the daemon's own runs on the "
+        "simulated clock: refreshes, solver and sensor take the times that are written here, which are configured, not "
+        "measured; heads at 0.6 m, 30 samples a second, 3 mm of noise, outliers and dropouts.",
+    ]
+    headings = ["motion", "solver ms", "light dB", "tracker off p50 mm", "p95 mm", "since solved p50 mm"]
+    rows = [
+        [one.motion, f"{one.solver_ms:g}", f"{one.light_db:.1f}"]
+        + [f"{mm:.1f}" for mm in (*one.tracker_mm, one.behind_mm)]
+        for one in found
+    ]
+    return Section("What a moving viewer sees", text, [moving_plot(found)], [Table(headings, rows)])
+
+
+def moving_plot(found: Sequence[Moving]) -> Figure:
+    """A group of bars a motion, a bar a solver."""
+    motions, times = (list(dict.fromkeys(getattr(one, name) for one in found)) for name in ("motion", "solver_ms"))
+    with drawing(9.6, 3.6) as figure:
+        axes = figure.add_subplot()
+        for index, (time, colour) in enumerate(zip(times, COLOURS, strict=False)):
+            own = {one.motion: one.light_db for one in found if one.solver_ms == time}
+            x = np.arange(len(motions)) + (index - (len(times) - 1) / 2) * 0.3
+            bars = axes.bar(x, [own.get(motion, 0.0) for motion in motions], width=0.28, color=colour)
+            bars.set_label(f"solver of {time:g} ms")
+            axes.bar_label(bars, fmt="%.1f", fontsize=8.5)
+        axes.set_xticks(range(len(motions)), motions)
+        axes.set(ylabel="light at the true eyes, dB")
+        axes.grid(visible=False, axis="x")
+        axes.margins(y=0.2)
+        axes.legend(ncols=len(times))
+    return Figure("moving-viewer", png(figure), "Means of the lights of each run after its first second.")
+
+
+def focal_section(stack: FocalStack) -> Section:
+    """The whole section."""
+    headings = ["card", "lines of sight meet at, mm", "sharpest through the layers, mm", "sharpest in truth, mm"]
+    rows = []
+    for name, card in zip(NAMES, stack.cards, strict=True):
+        places_m = (card.card_m, card.sharpest_shown_m, card.sharpest_true_m)
+        conflict = abs(1 / card.card_m - 1 / card.sharpest_shown_m)
+        rows.append([name, *(f"{1000 * place:.0f}" for place in places_m), f"{conflict:.3f}"])
+    text = [
+        f"Three cards, 5 cm behind, in and 4.5 cm before the middle panel, seen from {DISTANCE_M:g} m by a pupil of "
+        f"{1000 * PUPIL_M:g} mm. The layers ({stack.model}) are solved for two pinhole eyes only; what the rest of the "
+        "pupil sees nobody asked for. On a flat panel every card is sharpest in the panel's plane, wherever it seems "
+        "to stand.",
+    ]
+    caption = (
+        "Vergence against accommodation, from the right eye: up to 0.3 dioptres are commonly taken as comfortable."
+    )
+    table = Table([*headings, "conflict, dioptres"], rows, caption)
+    return Section("Focal parallax", text, [slice_picture(stack)], [table])
+
+
+def slice_picture(stack: FocalStack) -> Figure:
+    """Shown above true, focused behind, in the middle and before."""
+    chosen = [min(stack.slices, key=lambda s: abs(s.plane_m - x)) for x in CARDS_M]
+    with drawing(9.6, 3.1) as figure:
+        axes = figure.subplots(2, 3)
+        for column, s in enumerate(chosen):
+            for row, image in enumerate((s.shown, s.true)):
+                axes[row, column].imshow(np.clip(image, 0, 1), interpolation="nearest")
+                axes[row, column].set(xticks=[], yticks=[])
+                axes[row, column].grid(visible=False)
+            axes[0, column].set_title(f"focused {NAMES[column]}", fontsize=10)
+        axes[0, 0].set_ylabel("through the layers")
+        axes[1, 0].set_ylabel("true")
+    text = "From left to right the eye's lens focuses on the card behind, in and before the middle panel."
+    return Figure("focal-slices", png(figure), text)
