@@ -85,17 +85,6 @@ def pictures(kind: str, stack: PanelStack = STACK) -> list[U8]:
         for c, colour in enumerate((230, 60, 140)):
             left[:, :, c] = np.where(np.arange(width) % 24 < 12, colour, 128)
         right = np.roll(left, 8, axis=1)
-    elif kind == "a coloured card before waves":
-        left, right = smooth(stack)
-        for image, shift in ((left, 3), (right, -3)):
-            image[height // 4 : height // 2, width // 3 + shift : width // 2 + shift] = (220, 90, 40)
-    elif kind == "waves six columns apart":
-        left = smooth(stack)[0]
-        right = np.roll(left, 6, axis=1)
-    elif kind == "dots, elsewhere for each eye":
-        left[:], right[:] = 128, 128
-        left[::12, 4::16], right[::12, 8::16] = (250, 200, 0), (250, 200, 0)
-        left[6::12, 10::16], right[6::12, 14::16] = (0, 30, 90), (0, 30, 90)
     return [left, right]
 
 
@@ -103,8 +92,7 @@ KINDS = (
     "all black", "all white", "checkerboard of single pixels", "lines one pixel wide",
     "black for one eye, white for the other", "noise, another for each eye",
     "a step with a disparity of a third of the width", "codes 0 and 1 in turn",
-    "coloured stripes, shifted by a third", "a coloured card before waves", "waves six columns apart",
-    "dots, elsewhere for each eye",
+    "coloured stripes, shifted by a third",
 )  # fmt: skip
 
 
