@@ -81,8 +81,8 @@ def page(report: dict[str, Any]) -> str:
     size = f"{methods[0]['width_px']}x{methods[0]['height_px']}"
     rows = [
         [method["name"], f"{method['ms_p50'] / quickest:.1f}", f"{method['ms_p50']:.0f}", f"{method['memory_mib']:.0f}"]
-        + [_number(method["light_db"].get(key) if method["trained"] else None) for key in ("0", "1", "2")]
-        + [_number(method["psnr_db"] if method["trained"] else None)]
+        + [_number(method["light_db"].get(key)) for key in ("0", "1", "2")]
+        + [_number(method["psnr_db"])]
         for method in methods
     ]
     moving = [
@@ -142,11 +142,11 @@ def boards() -> Image.Image:
     """The boards of three panels as a phone sees them from the left."""
     stack, random = StackGeometry().stack(), np.random.default_rng(0)
     panels = tuple(PlacedPanel(np.eye(3), np.array([x_m, 0.0, 0.0])) for x_m in stack.x_m)
-    lens = phone(random=random, width_px=800, height_px=600)
+    lens = phone(random=random, size=0.2)
     pose = camera_from_stack(np.array([0.44, -0.26, 0.07]), towards_m=np.array([0.0, -0.06, 0.0]))
     scene = Scene(stack, panels, boards_of(stack))
     return Image.fromarray(
-        photograph(scene, lens, pose, Exposure(electrons=1e6, read_noise=0.0), random=random, rays=camera_rays(lens))
+        photograph(scene, lens, pose, Exposure(), random=random, rays=camera_rays(lens))
     )
 
 
