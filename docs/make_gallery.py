@@ -145,9 +145,7 @@ def boards() -> Image.Image:
     lens = phone(random=random, size=0.2)
     pose = camera_from_stack(np.array([0.44, -0.26, 0.07]), towards_m=np.array([0.0, -0.06, 0.0]))
     scene = Scene(stack, panels, boards_of(stack))
-    return Image.fromarray(
-        photograph(scene, lens, pose, Exposure(), random=random, rays=camera_rays(lens))
-    )
+    return Image.fromarray(photograph(scene, lens, pose, Exposure(), random=random, rays=camera_rays(lens)))
 
 
 def smaller(source: Path, name: str) -> bytes:
