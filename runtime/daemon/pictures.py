@@ -30,7 +30,10 @@ def pictures_of(refresh: Refresh, stack: PanelStack, *, fov_deg: float) -> dict[
     width = min(WIDTH_PX, stack.width_px)
     small = replace(stack, width_px=width, height_px=max(1, round(width * stack.height_px / stack.width_px)))
     size = small.width_px, small.height_px
-    layers = np.stack([cv2.resize(layer, size, interpolation=cv2.INTER_AREA) for layer in pixels_of(shown)])
+    part = slice(None, None, max(1, stack.width_px // (2 * width)))  # twice as fine: averaging all pixels takes 15 ms
+    parts = (np.ascontiguousarray(layer[part, part]) for layer in pixels_of(shown))
+    resized = [cv2.resize(layer, size, interpolation=cv2.INTER_AREA) for layer in parts]
+    layers: U8 = np.stack(resized).astype(np.uint8, copy=False)
     found = {f"layer-{n}": _jpeg(layer) for n, layer in enumerate(layers)}
     for name, eye_m in zip(("seen-left", "seen-right"), () if eyes_m is None else eyes_m, strict=False):
         if eye_m[0] > max(stack.x_m):
