@@ -129,17 +129,6 @@ def stl(folder: Path) -> Made:
     return mesh(folder, ".stl")
 
 
-def points(folder: Path) -> Made:
-    """A cloud of coloured points."""
-    import trimesh
-
-    u, v = np.random.default_rng(0).random((2, 60_000)) * 2 * np.pi
-    cloud = np.column_stack([0.35 * np.sin(v), (1 + 0.35 * np.cos(v)) * np.cos(u), (1 + 0.35 * np.cos(v)) * np.sin(u)])
-    colours = np.column_stack([127 + 120 * np.cos(u), 127 + 120 * np.sin(u), 127 + 120 * np.cos(v), 255 + 0 * u])
-    trimesh.PointCloud(cloud, colors=colours.astype(np.uint8)).export(folder / "ring.ply")
-    return str(folder / "ring.ply"), "axes = '+z +x'\nrotation_deg = [0, 25, 20]"
-
-
 def splats(folder: Path) -> Made:
     """A ring of Gaussians, in the reference implementation's PLY."""
     rng = np.random.default_rng(0)
@@ -231,7 +220,7 @@ def placed(folder: Path) -> Made:
 
 KINDS: dict[str, Callable[[Path], Made]] = {
     "picture": picture, "side-by-side": side_by_side, "half-side-by-side": half_side_by_side, "quilt": quilt,
-    "rgbd": rgbd, "film": film, "live": live, "obj": obj, "stl": stl, "points": points, "splats": splats,
+    "rgbd": rgbd, "film": film, "live": live, "obj": obj, "stl": stl, "splats": splats,
     "gltf": gltf, "playlist": playlist, "data-set": data_set, "placed": placed,
 }  # fmt: skip
 

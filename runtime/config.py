@@ -220,7 +220,7 @@ class ContentSettings(Section):
     fit: bool = Field(True, description="scale and centre a mesh or splat without a preset to the display")
     axes: Annotated[str, Field(pattern=r"^(auto|[+-][xyz] [+-][xyz])$")] = Field(
         "auto",
-        description="the axes of a mesh, points or splats that are up and towards the viewer, as `+z -y`; auto: glTF's "
+        description="the axes of a mesh or splats that are up and towards the viewer, as `+z -y`; auto: glTF's "
         "own, else guessed from the extent",
     )
     animation: str = Field(
@@ -360,7 +360,6 @@ class LimitSettings:
     splats: int = 3_000_000
     instances: int = 2000  # times that meshes stand in a glTF scene
     nodes: int = 5000  # of a glTF scene that moves, bones among them
-    points: int = 5_000_000  # of a cloud
     depth: int = 64  # how deep JSON or a glTF scene may nest
     load_s: float = 120.0  # loading of one piece of content is given up after this
     start_s: float = 600.0  # a start is given up where content and model are not ready after this

@@ -1,4 +1,4 @@
-"""The vertices of a PLY file as a table, for splats and point clouds; what its header promises, for meshes too.
+"""The vertices of a PLY file as a table, for splats; what its header promises, for meshes too.
 
 Ours, because plyfile's licence is the GPL, and trimesh gives out no properties but its own.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.config import LIMITS
-from runtime.errors import InputError, one_line
+from runtime.errors import InputError
 from runtime.support import untrusted_input
 
 Table = NDArray[Any]
@@ -41,10 +41,8 @@ class Header:
 
     @property
     def kind(self) -> str:
-        """`splats`, `points` or `triangles`: the limit that holds for it."""
-        if SPLAT_MARKS & {name for name, _ in self.fields}:
-            return "splats"
-        return "triangles" if self.counts.get("face") or self.counts.get("tristrips") else "points"
+        """`splats` or `triangles`: the limit that holds for it."""
+        return "splats" if SPLAT_MARKS & {name for name, _ in self.fields} else "triangles"
 
 
 def read_header(path: Path) -> Header:
@@ -85,27 +83,16 @@ def read_header(path: Path) -> Header:
 
 
 def read_vertices(header: Header) -> Table:
-    """A structured array with a field for each property. Raises InputError: truncated, lists among them."""
+    """A structured array with a field for each property. Raises InputError: truncated, text, lists among them."""
     path, count = header.path, header.counts["vertex"]
     if next(iter(header.counts)) != "vertex" or "list" in {kind for _, kind in header.fields}:
         raise InputError(path, "vertex", "must stand first, with one number a property")
+    if header.order == "ascii":
+        raise InputError(path, "format", "is ascii; splats are read from binary files")
     dtype = np.dtype([(name, ORDERS[header.order] + kind) for name, kind in header.fields])
     held = (header.size - header.starts_at) // dtype.itemsize
-    if header.order != "ascii" and held < count:
+    if held < count:
         raise InputError(path, "vertex", f"the file is cut off: {count} are promised and {max(held, 0)} there")
     with untrusted_input.open_regular(path) as file:
         file.seek(header.starts_at)
-        if header.order != "ascii":
-            return np.frombuffer(file.read(count * dtype.itemsize), dtype)
-        try:
-            values = np.loadtxt(file, dtype=np.float64, ndmin=2, max_rows=count, encoding="ascii") if count else None
-        except ValueError as error:
-            raise InputError(path, "vertex", f"malformed: {one_line(str(error), most=120)}") from None
-    table = np.empty(count, dtype)
-    if values is not None and values.shape != (count, len(header.fields)):
-        raise InputError(
-            path, "vertex", f"{count} lines of {len(header.fields)} numbers are promised, not {values.shape}"
-        )
-    for column, (name, _) in enumerate(header.fields):
-        table[name] = values[:, column] if values is not None else 0
-    return table
+        return np.frombuffer(file.read(count * dtype.itemsize), dtype)

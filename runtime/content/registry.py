@@ -100,14 +100,9 @@ def _from_path(file: SceneFile) -> Opener:
 
         return mesh.prepare(file)
     elif suffix == ".ply":
-        from runtime.content import mesh, points, splat
+        from runtime.content import mesh, splat
 
-        kinds: dict[str, Callable[[SceneFile], Opener]] = {
-            "triangles": mesh.prepare,
-            "splats": splat.prepare,
-            "points": points.prepare,
-        }
-        return kinds[read_header(path).kind](file)
+        return splat.prepare(file) if read_header(path).kind == "splats" else mesh.prepare(file)
     from runtime.content import pictures, rgbd
 
     is_rgbd = pictures.layout_of(path, file.settings).kind == "rgbd"

@@ -171,6 +171,8 @@ def test_an_obj_without_its_materials_is_grey_and_a_line_says_so(
     assert f"{path}: is drawn grey without its materials (" in caplog.text
 
 
+CLOUD = "ply\nformat ascii 1.0\nelement vertex 1\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+CLOUD += "end_header\n0 0 0\n"
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 
 
@@ -186,6 +188,7 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         ("a.stl", "\0" * 80 + "\7\0\0\0" + "\0" * 60, "faces: there are none"),
         ("a.stl", "solid x\n" + "facet normal 0 0 1\n" * 50, "faces: 50 is over the limit of 20"),
         ("a.stl", "", "faces: there are none"),
+        ("a.ply", CLOUD, "faces: there are none"),
         ("a.stl", "\0" * 84, "faces: there are none"),
         *(
             (f"a{suffix}", data, "")

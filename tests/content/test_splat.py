@@ -173,15 +173,13 @@ def test_what_is_missing_or_absurd_is_told(tmp_path: Path, name: str, value: flo
         loaded(written(tmp_path, table))
 
 
-@pytest.mark.parametrize("order", ["<", ">", "text"])
+@pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("kind", ["f4", "f8"])
 def test_every_ply_format_gives_the_same_splats(tmp_path: Path, order: str, kind: str) -> None:
     table = splat_table(30).astype([(name, kind) for name in splat_table(1).dtype.names or ()])
     element = PlyElement.describe(table, "vertex")
     path = tmp_path / "scene.ply"
-    PlyData(
-        [element], text=order == "text", byte_order="=" if order == "text" else order, comments=["made here"]
-    ).write(path)
+    PlyData([element], byte_order=order, comments=["made here"]).write(path)
     wanted, found = loaded(written(tmp_path, splat_table(30), "plain.ply")), loaded(path)
     for name in ("centres", "covariances", "opacities", "harmonics"):
         assert getattr(found, name) == pytest.approx(getattr(wanted, name), rel=1e-4, abs=1e-6)
@@ -225,7 +223,7 @@ def edited(folder: Path, old: bytes, new: bytes, cut: int = 0) -> Path:
         (b"property float nx", b"property words nx", 0, "header: not understood: property words nx"),
         (b"end_header", b"comment", 0, "header: no whole PLY header"),
         (b"format binary_little_endian 1.0\n", b"", 0, "vertex: the header has no format"),
-        (b"format binary_little_endian", b"format ascii", 0, "vertex: malformed"),
+        (b"format binary_little_endian", b"format ascii", 0, "format: is ascii"),
     ],
 )
 def test_a_broken_file_is_one_line(tmp_path: Path, old: bytes, new: bytes, cut: int, told: str) -> None:

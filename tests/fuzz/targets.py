@@ -32,7 +32,6 @@ from runtime.content.mesh import load_mesh
 from runtime.content.pictures import open_frames
 from runtime.content.playlist import read_playlist
 from runtime.content.ply import read_header
-from runtime.content.points import load_points
 from runtime.content.stream import Reader
 from runtime.content.stream import Target as Live
 from runtime.content.triangles import DrawnPart
@@ -256,23 +255,14 @@ def mesh(path: Path) -> object:
     return [DrawnPart(part) for part in data.parts], data.rig.posed([part.shape for part in data.parts], 0.377)
 
 
-def points(count: int, names: list[str], kind: str) -> list[bytes]:
-    """A PLY of random points, binary and as text."""
-    values = np.random.default_rng(2).normal(size=(count, len(names))).astype("<f4")
-    head = f"ply\nformat {{}} 1.0\nelement vertex {count}\n"
-    head += "".join(f"property {kind} {name}\n" for name in names) + "end_header\n"
-    text = "\n".join(" ".join(f"{value:.4f}" for value in row) for row in values)
-    binary = values.astype({"float": "<f4", "double": "<f8"}[kind]).tobytes()
-    return [head.format("binary_little_endian").encode() + binary, (head.format("ascii") + text + "\n").encode()]
+def splats() -> list[bytes]:
+    """A PLY of random splats."""
+    values = np.random.default_rng(2).normal(size=(20, len(SPLAT))).astype("<f4")
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 20\n"
+    return [(head + "".join(f"property float {name}\n" for name in SPLAT) + "end_header\n").encode() + values.tobytes()]
 
 
-def cloud() -> bytes:
-    random = np.random.default_rng(3)
-    colours = random.integers(0, 256, (30, 4), dtype=np.uint8)
-    return bytes(trimesh.PointCloud(random.normal(size=(30, 3)), colors=colours).export(file_type="ply"))
-
-
-SPLAT = ["f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
+SPLAT = [*"xyz", *(f"f_dc_{k}" for k in range(3)), "opacity", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
 PLAYLIST = """
 repeat = false
 show = [
@@ -344,14 +334,7 @@ TARGETS: dict[str, Target] = {
     "ply": Target(lambda: [box("ply", encoding=form) for form in ("binary", "ascii")], file("a.ply", mesh)),
     "rig": Target(rigs, file("a.gltf", mesh)),
     "stl": Target(lambda: [box("stl"), box("stl_ascii")], file("a.stl", mesh)),
-    "cloud": Target(
-        lambda: [cloud(), *points(2, [*"xyz"], "double")],
-        file("a.ply", lambda path: load_points(read_header(path))),
-    ),
-    "splat": Target(
-        lambda: points(20, [*"xyz", *SPLAT], "float"),
-        file("a.ply", lambda path: load_gaussians(read_header(path))),
-    ),
+    "splat": Target(splats, file("a.ply", lambda path: load_gaussians(read_header(path)))),
     "playlist": Target(
         lambda: [PLAYLIST.encode(), b'{"show": [{"scene": "flat", "seconds": 3}]}'],
         file("a.toml", lambda path: read_playlist(path, ContentSettings()), json_marks=b"{"),
