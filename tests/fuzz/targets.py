@@ -262,7 +262,8 @@ def splats() -> list[bytes]:
     return [(head + "".join(f"property float {name}\n" for name in SPLAT) + "end_header\n").encode() + values.tobytes()]
 
 
-SPLAT = [*"xyz", *(f"f_dc_{k}" for k in range(3)), "opacity", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
+PLACE, LOOK = ["x", "y", "z", "opacity"], ["f_dc_0", "f_dc_1", "f_dc_2"]
+SPLAT = [*PLACE, *LOOK, *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
 PLAYLIST = """
 repeat = false
 show = [
