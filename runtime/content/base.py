@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import BaseModel
 
 from runtime.config import Section
-from runtime.errors import ContentFailure
 from runtime.optics.rect import PixelRect
 from runtime.records import F64, U8
 
@@ -85,13 +84,6 @@ class ContentSource(ABC):
         """A number that changes when what `render` draws for the same view may have changed; 0 for ever if static."""
         return time_ns if self.info.moving else 0
 
-    def is_empty(self, view: View, *, time_ns: int) -> bool:
-        """True where the eye sees nothing of it in the view; False too where that can't be known yet."""
-        try:
-            return not self.render(view, time_ns=time_ns)[..., 3].any()
-        except ContentFailure:
-            return False
-
     def describe(self, *, time_ns: int) -> dict[str, Any] | None:
         """Of a playlist: its entries, which one is shown, for how long still. None: it is none."""
         return None
@@ -137,10 +129,6 @@ class ForwardingSource(ContentSource):
     def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
         source, view, time_ns = self.asked(view, time_ns)
         return source.extent(view, time_ns=time_ns)
-
-    def is_empty(self, view: View, *, time_ns: int) -> bool:
-        source, view, time_ns = self.asked(view, time_ns)
-        return source.is_empty(view, time_ns=time_ns)
 
     def close(self) -> None:
         self.source.close()

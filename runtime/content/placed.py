@@ -15,16 +15,10 @@ from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings
 from runtime.content.base import ContentInfo, ContentSource, ForwardingSource, View
 from runtime.content.presets import rotation_matrix
-from runtime.errors import InputError
-from runtime.optics.stack import PanelStack
-from runtime.optics.views import raster_from_stack
 from runtime.records import F64
 
 FIELDS = ("scale", "offset_m", "rotation_deg", "turntable_per_min")  # of ContentSettings
 NS_PER_MIN = 60 * NS_PER_S
-LOOKED_FROM_M = ((0.6, 0.0, 0.0), (0.57, -0.2, 0.05), (0.57, 0.2, 0.05))  # whether anything is seen
-LOOKED_PX = (192, 108)
-LOOKED_TURNS = 6  # places of a turntable
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,46 +67,12 @@ def placing_of(settings: ContentSettings) -> Placing:
     return Placing(settings.scale, settings.offset_m, settings.rotation_deg, settings.turntable_per_min)
 
 
-def placed_source(source: ContentSource, placing: Placing, stack: PanelStack, *, time_ns: int = 0) -> ContentSource:
-    """The source at its place; one that was placed before is placed anew. For the thread with the GL context.
-
-    Raises InputError, naming the field, where nothing of it would be seen; the source is closed only if it is new.
-    """
-    inner = source
+def placed_source(source: ContentSource, placing: Placing, *, time_ns: int = 0) -> ContentSource:
+    """The source at its place; one that was placed before is placed anew."""
     if isinstance(source, PlacedSource):
-        inner, placing = source.source, placing.after(source.placing, time_ns)
-    if placing.stands_as_it_is:
-        return inner
-    result = PlacedSource(inner, placing)
-    if _nothing_is_seen(result, stack, time_ns):
-        refusal = _refusal(inner.info.name, placing, stack)
-        if inner is source:
-            inner.close()
-        raise refusal
-    return result
-
-
-def _nothing_is_seen(source: PlacedSource, stack: PanelStack, time_ns: int) -> bool:
-    """Drawn small, from the middle and either side, and at some turns of a turntable."""
-    width, height = LOOKED_PX
-    raster = replace(stack, width_px=width, height_px=height).panel(stack.count // 2)
-    turntable = source.placing.turntable_per_min
-    period_ns = NS_PER_MIN / abs(turntable) if turntable else 0.0
-    times_ns = [time_ns + round(period_ns * turn / LOOKED_TURNS) for turn in range(LOOKED_TURNS if turntable else 1)]
-    views = [View(np.array(eye), 0, raster_from_stack(np.array(eye), raster), width, height) for eye in LOOKED_FROM_M]
-    return all(source.is_empty(view, time_ns=time) for time in times_ns for view in views)
-
-
-def _refusal(name: str, placing: Placing, stack: PanelStack) -> InputError:
-    """Names the field that is most likely wrong."""
-    field = "offset_m" if any(placing.offset_m) else "rotation_deg" if placing.scale == 1.0 else "scale"
-    field = "scale" if placing.scale < 0.1 else field
-    return InputError(
-        "content",
-        field,
-        f"leaves nothing of `{name}` to be seen: {placing.scale:g} times its size, at {placing.offset_m} m, where "
-        f"the display is {stack.width_m:.2f} m wide and {stack.height_m:.2f} m high",
-    )
+        placing = placing.after(source.placing, time_ns)
+        source = source.source
+    return source if placing.stands_as_it_is else PlacedSource(source, placing)
 
 
 class PlacedSource(ForwardingSource):

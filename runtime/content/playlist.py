@@ -129,9 +129,6 @@ class PlaylistSource(ForwardingSource):
         since_ns = self._turn_to(time_ns)
         return (self._number << 64) + self.source.revision(time_ns=since_ns)
 
-    def is_empty(self, view: View, *, time_ns: int) -> bool:
-        return all(source.is_empty(view, time_ns=0) for source in self._sources)
-
     def close(self) -> None:
         for source in self._sources:
             source.close()

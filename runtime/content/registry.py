@@ -53,7 +53,7 @@ def prepare_content(settings: ContentSettings, stack: PanelStack) -> Opener:
 
 def _placed(file: SceneFile) -> Opener:
     opener, placing = _prepared(file), placing_of(file.settings)
-    return lambda context: placed_source(opener(context), placing, file.stack)
+    return lambda context: placed_source(opener(context), placing)
 
 
 def _prepared(file: SceneFile) -> Opener:

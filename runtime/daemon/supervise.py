@@ -178,21 +178,17 @@ class Daemon(Host):
         self._begin(presenter, command, self._configured, chosen, reload_content=True)
 
     def _place(self, presenter: Presenter, command: Command) -> None:
-        """Move the scene: settings and content change together, once the solver has seen that something is visible."""
+        """Move the scene: settings and content change together, on the solver's thread."""
         values = command.value or status.placing_in(self._configured)
         changed(presenter.run_cell.state.settings, "content", values, source="place")
 
         def place(parts: Any) -> bool:
             state, now_ns = parts.run.state, presenter.clock.now_ns()
             settings = changed(state.settings, "content", values, source="place")
-            try:
-                source = placed_source(state.content, placing_of(settings.content), presenter.stack, time_ns=now_ns)
-            except PhasestackError as error:
-                self._answer(presenter, command, str(error))
-            else:
-                parts.run.replace(settings=settings, content=source)
-                self._chosen = self._chosen | {("content", key): value for key, value in values.items()}
-                self._answer(presenter, command, "")
+            source = placed_source(state.content, placing_of(settings.content), time_ns=now_ns)
+            parts.run.replace(settings=settings, content=source)
+            self._chosen = self._chosen | {("content", key): value for key, value in values.items()}
+            self._answer(presenter, command, "")
             return True
 
         presenter.solver.do(place)

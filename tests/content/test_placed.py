@@ -13,7 +13,6 @@ from runtime.config import ContentSettings
 from runtime.content.camera import project
 from runtime.content.placed import PlacedSource, Placing, placed_source
 from runtime.content.registry import open_content
-from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import write_png
 from tests.content.conftest import panel_view
@@ -71,7 +70,7 @@ def test_a_turntable_turns_by_the_clock_and_goes_on_where_its_speed_is_changed(c
     assert (pictures[0] == pictures[2]).all()  # six turns a minute
     assert source.revision(time_ns=1) != source.revision(time_ns=2)
     now_ns = 7 * NS_PER_S + 3 * 60 * NS_PER_S
-    faster = placed_source(source, Placing(turntable_per_min=-30), stack, time_ns=now_ns)
+    faster = placed_source(source, Placing(turntable_per_min=-30), time_ns=now_ns)
     assert isinstance(faster, PlacedSource)
     assert np.allclose(faster.placing.rotation(now_ns), source.placing.rotation(now_ns))
     assert not np.allclose(faster.placing.rotation(now_ns + NS_PER_S), source.placing.rotation(now_ns + NS_PER_S))
@@ -100,18 +99,3 @@ def test_a_picture_turned_edge_on_is_the_background_and_no_error(tmp_path: Path,
     source = open_content(ContentSettings(scene=str(tmp_path / "a.png")), stack, context)
     turned = PlacedSource(source, Placing(rotation_deg=(0, 0, 90)))
     assert (turned.render(panel_view((0.6, 0, 0), stack.panel(1)), time_ns=0) == (31, 31, 31, 0)).all()
-
-
-@pytest.mark.parametrize(
-    ("settings", "field"),
-    [
-        ({"offset_m": (0.0, 0.0, 2.0)}, "offset_m"),
-        ({"offset_m": (1.5, 0.0, 0.0)}, "offset_m"),
-        ({"scale": 0.001}, "scale"),
-    ],
-)
-def test_placing_that_leaves_nothing_to_be_seen_is_told_with_its_field(
-    context: Any, stack: PanelStack, settings: dict[str, Any], field: str
-) -> None:
-    with pytest.raises(InputError, match=rf"^content: {field}: leaves nothing of `sparse` to be seen: "):
-        open_content(ContentSettings(scene="sparse", **settings), stack, context)

@@ -97,7 +97,6 @@ def test_an_entry_has_settings_and_a_place_of_its_own_within_the_lists(
         (("scene = 'other.toml'\nseconds = 1",), "show[0].scene: another list is no scene"),
         (("scene = 'red.png'\nseconds = 1\nscael = 2",), "show[0].scael: is no setting: did you mean scale?"),
         (("scene = 'red.png'\nseconds = 1\nscale = 'x'",), "show[0].scale: "),
-        (("scene = 'red.png'\nseconds = 1\noffset_m = [0, 9, 0]",), "show[0]: content: offset_m: leaves nothing"),
         ((), "show: "),
         (("scene = 'red.png'\nseconds = 1",) * 65, "show: "),
     ],
