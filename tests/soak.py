@@ -142,7 +142,10 @@ class Soak:
         """What it kept: every refresh of its time, up to the last, and the states that they were in."""
         from mcap.reader import make_reader
 
-        rig = self.served.rig
+        rig, full_s = self.served.rig, 60 * KEPT_MIN
+        # A look at a busy run's pictures can outlast what the box keeps, and no refresh goes on meanwhile: fill it.
+        began_ns = rig.presenter.clock.now_ns()
+        rig.refresh_until(lambda: rig.presenter.clock.now_ns() - began_ns > full_s * NS_PER_S)
         answer = self.served.asked("blackbox")
         last = rig.presenter.last.account.frame
         with Path(answer["file"]).open("rb") as file:
@@ -150,7 +153,7 @@ class Soak:
         frames = [refresh["frame"] for refresh in told]
         assert frames == list(range(frames[0], frames[-1] + 1)) and frames[-1] <= last
         kept_s = (told[-1]["present_ns"] - told[0]["present_ns"]) / NS_PER_S
-        assert 0.5 * 60 * KEPT_MIN < kept_s <= 60 * KEPT_MIN + 0.1
+        assert 0.9 * full_s < kept_s <= full_s + 0.1
         assert {refresh["state"] for refresh in told} <= {"tracking", "holding", "flat", "degraded"}
 
 
