@@ -109,9 +109,10 @@ for _name, _meaning in PLAIN.items():
 
 def tell(request: dict[str, Any], config: Path | None, socket: Path | None) -> None:
     """Send one request; prints what holds now. Exits with 1 where no daemon answers, 2 where it refuses."""
-    from runtime.commands.status import holds, sockets
+    from runtime.commands.status import sockets
     from runtime.daemon.client import NotRunning, ask
     from runtime.errors import InputError
+    from runtime.support.figures import lines_of
 
     try:
         answer = ask(sockets(config, socket), request, timeout_s=ANSWERS_WITHIN_S)
@@ -120,4 +121,5 @@ def tell(request: dict[str, Any], config: Path | None, socket: Path | None) -> N
         raise typer.Exit(1) from None
     if not answer.get("ok"):
         raise InputError(f"ctl {request['command']}", "", str(answer.get("error", "refused")))
-    typer.echo(answer.get("note") or answer.get("file") or holds(answer))
+    answer.pop("ok")
+    typer.echo(answer.get("note") or answer.get("file") or "\n".join(lines_of(answer)))

@@ -7,9 +7,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
 from runtime.config import Settings
 from runtime.daemon.build import Host, RunOptions, build_run
 from runtime.evaluation.run_output import RunOutput
@@ -17,6 +14,7 @@ from runtime.optics.alignment import shown_layers
 from runtime.records import RefreshAccount
 from runtime.support import progress
 from runtime.support.background import wait_for_all
+from runtime.support.figures import lines_of
 
 JOBS_END_WITHIN_S = 3.0  # what is still loading at the end
 
@@ -56,34 +54,10 @@ def drive(
 
 
 def print_summary(summary: dict[str, Any], out: Path | None) -> None:
-    """One screen for a person."""
-    console = Console()
-    table = Table(title="phasestack", show_header=False, title_justify="left")
-    presented = f"{summary['presented']} of {summary['frames']} presented, {summary['dropped']} dropped"
-    table.add_row("refreshes", f"{presented}; {summary['inferences']} solutions")
-    how = ", as configured" if summary["configured"] else ""
-    rates = f"{summary['seconds']:.1f} s"
-    if summary["fps"] is not None:
-        rates += f", {summary['fps']:.1f} refreshes/s, {summary['solutions_per_s']:.1f} solutions/s"
-    if how:
-        rates += f" on the simulated clock; it took {summary['machine_s']:.1f} s"
-    table.add_row(f"time{how}", rates)
-    table.add_row("scene", summary["scene"])
-    table.add_row("model", f"{summary['model']} on {summary['provider']}, {summary['backend']}")
+    """For a person: what summary.json holds, and which figure of it to quote."""
+    for line in lines_of(summary):
+        print(line)
     if summary["light_db"] is not None:
-        table.add_row("light", f"{summary['light_db']:.2f} dB of a pupil at the eyes used: the figure to quote")
-    if summary["psnr_db"] is not None:
-        quality = f"{summary['psnr_db']:.2f} dB, SSIM {summary['ssim']:.4f} at the eyes used"
-        table.add_row("one ray a pixel", f"{quality} ({summary['quality_frames']} refreshes); more in summary.json")
-    if summary["photon_ms"] is not None:
-        table.add_row(f"capture to light{how}", f"{summary['photon_ms']['p50']:.1f} ms (p50)")
-    stages = {name: values for name, values in summary["stage_ms"].items() if values and values["max"] > 0.05}
-    table.add_row(
-        f"stages, ms{how}", ", ".join(f"{name} {values['p50']:.1f}" for name, values in stages.items()) + " (p50)"
-    )
-    table.add_row("states, s", ", ".join(f"{state} {seconds:.1f}" for state, seconds in summary["states"].items()))
-    for item in summary["plan"]:
-        table.add_row("left out", f"{item['what']}: {item['why']}")
+        print("light_db, of a pupil at the eyes used, is the figure to quote")
     if out is not None:
-        table.add_row("files", f"{out}/contact-sheet.png and more")
-    console.print(table)
+        print(f"see {out}/contact-sheet.png")
