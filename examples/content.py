@@ -205,8 +205,8 @@ def playlist(folder: Path) -> Made:
 
 
 def data_set(folder: Path) -> Made:
-    """A pair as the published data set names it, in a folder of any name."""
-    pairs = folder / "pairs"
+    """A pair as the published data set names it, in a folder that names its scene."""
+    pairs = folder / "lego_bulldozer"
     pairs.mkdir(exist_ok=True)
     for half, y, shift in ((1, -0.263, -20), (0, 0.237, 20)):
         ball_and_ground(960, 540, eye_x=shift)[0].save(pairs / f"pair0_x6.486_y{y}_z2.004_{half}.png")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 from runtime.content.base import WHITE, ContentInfo, ContentSource, View
 from runtime.content.images import WarpedPicture, image_from_view, rgba_from_rgb
 from runtime.content.placing import SceneFile
-from runtime.content.presets import Preset, Reading, preset, preset_names
+from runtime.content.presets import Preset, preset, preset_names
 from runtime.errors import ContentFailure, InputError
 from runtime.optics.views import image_from_stack
 from runtime.records import F64, U8
@@ -23,8 +23,6 @@ from runtime.support.artifacts import read_image
 NUMBER = r"(-?(?:\d+\.?\d*|\.\d+))"
 NAME = re.compile(rf"pair(\d+)_x{NUMBER}_y{NUMBER}_z{NUMBER}_([01]|left|right)\.(?:jpg|jpeg|png)$", re.IGNORECASE)
 KEPT = 4  # pairs in memory
-USUAL_SEPARATION_M, SEPARATION_DIFFERS_M = 0.06, 0.006
-NEAREST_M, FARTHEST_M = 0.1, 2.0  # of viewers
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,44 +82,16 @@ def read_folder(folder: Path, preset: Preset) -> tuple[Pair, ...]:
     return tuple(pairs)
 
 
-def fitting_presets(folder: Path, presets: Iterable[Preset]) -> list[Preset]:
-    """Those whose scale and axes make people of a folder's eyes, the likeliest first.
-
-    A person's eyes are some 60 mm apart, side by side, before the display: a scale and axes that are not the folder's
-    own put them elsewhere.
-    """
-    found = []
-    for candidate in presets:
-        try:
-            eyes_m = np.stack([pair.eyes_m for pair in read_folder(folder, candidate)])
-        except InputError:
-            continue
-        apart_m = eyes_m[:, 1] - eyes_m[:, 0]
-        separation_m = np.linalg.norm(apart_m, axis=1)
-        across = np.abs(apart_m[:, 1]) / separation_m
-        distance_m = np.linalg.norm(eyes_m.mean(1), axis=1)
-        apart = abs(float(np.median(separation_m)) - USUAL_SEPARATION_M)
-        if apart <= SEPARATION_DIFFERS_M and across.min() > 0.7 and NEAREST_M < distance_m.min() < FARTHEST_M:
-            found.append((round(apart, 4), candidate))
-    return [candidate for _, candidate in sorted(found, key=lambda item: item[0])]
-
-
 def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
-    """Read a folder as the preset that was chosen, or that its name holds, or that its eyes fit. Raises InputError."""
+    """Read a folder as the preset that was chosen, or that its name holds. Raises InputError."""
     path, settings = file.path, file.settings
+    name = next((name for name in preset_names() if name in path.resolve().name), "")
+    if file.preset is not None:
+        name = file.preset.name
+    if not name:
+        raise InputError(path, "name", "names no preset: set content.scene to one and content.file to the folder")
     # The data set was drawn by the published code: its scale holds in every reading.
-    reading: Reading = "published-code" if settings.reading == "seed" else settings.reading
-    chosen = file.preset.name if file.preset else ""
-    chosen = chosen or next((name for name in preset_names() if name in path.resolve().name), "")
-    name = chosen
-    if not chosen:
-        fitting = fitting_presets(path, (preset(known, reading) for known in preset_names()))
-        if not fitting:
-            problem = "names no preset, and its eyes fit none: set content.scene to one and content.file to the folder"
-            raise InputError(path, "name", problem)
-        chosen = fitting[0].name
-        name = f"{path.resolve().name} (read as {chosen}, which its eyes fit)"
-    pairs = read_folder(path, preset(chosen, reading))
+    pairs = read_folder(path, preset(name, "published-code"))
     source = EyeRealSource(pairs, fov_deg=settings.fov_deg, background=settings.background or WHITE, name=name)
     return lambda context: source
 

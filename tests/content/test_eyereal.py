@@ -127,23 +127,17 @@ def test_a_folder_without_pairs_and_a_truncated_picture_are_told(tmp_path: Path)
         EyeRealSource(read_folder(tmp_path, LEGO), fov_deg=40, background=(1, 1, 1), name="lego")
 
 
-def test_a_folder_of_any_name_is_read_as_the_preset_that_its_eyes_fit(
+def test_a_folder_is_read_as_the_preset_that_its_name_holds_or_told_what_to_set(
     tmp_path: Path, context: Any, stack: PanelStack
 ) -> None:
-    folder = tmp_path / "from-the-net"
-    folder.mkdir()
-    write_pair(folder, context, stack)
-    source = open_content(ContentSettings(scene=str(folder)), stack, context)
-    assert source.info.name.startswith("from-the-net (read as ") and "which its eyes fit" in source.info.name
-    known = EyeRealSource(read_folder(folder, LEGO), fov_deg=40, background=(1, 1, 1), name="lego")
+    named, other = tmp_path / "lego_bulldozer-test", tmp_path / "from-the-net"
+    named.mkdir()
+    write_pair(named, context, stack)
+    source = open_content(ContentSettings(scene=str(named)), stack, context)
+    known = EyeRealSource(read_folder(named, LEGO), fov_deg=40, background=(1, 1, 1), name="lego")
     view = panel_view((0.78, 0.0, 0.24), stack.panel(1))
+    assert source.info.name == "lego_bulldozer"
     assert (source.render(view, time_ns=0) == known.render(view, time_ns=0)).all()
-
-
-def test_a_folder_whose_eyes_fit_no_scene_is_told_what_to_set(tmp_path: Path, context: Any, stack: PanelStack) -> None:
-    folder = tmp_path / "from-the-net"
-    folder.mkdir()
-    for half, y in ((0, -400.0), (1, 400.0)):
-        write_png(folder / f"pair0_x9000.0_y{y}_z0.0_{half}.png", np.zeros((4, 4, 3), np.uint8))
-    with pytest.raises(InputError, match=r"from-the-net: name: names no preset, and its eyes fit none: set content"):
-        open_content(ContentSettings(scene=str(folder)), stack, context)
+    named.rename(other)
+    with pytest.raises(InputError, match=r"from-the-net: name: names no preset: set content.scene"):
+        open_content(ContentSettings(scene=str(other)), stack, context)

@@ -187,10 +187,8 @@ def pair_of(folder: Path, place: str) -> Pair:
 def predictor_of(official: Path, folder: Path) -> NetworkPredictor:
     path = folder / "eyereal.onnx"
     path.write_bytes(eyereal_model(official, width_px=SIZE[0], height_px=SIZE[1], eye_order="right-left")[0])
-    chosen = preset("lego_bulldozer", "published-code")
-    stack = chosen.stack(PanelStack(1.0, 1.0, (-1.0, 0.0, 1.0), *SIZE))
-    # The published code's panels have square pixels, whatever their shape.
-    stack = PanelStack(stack.width_m, stack.width_m * SIZE[1] / SIZE[0], stack.x_m, *SIZE)
+    # The published code's panels of lego_bulldozer: with square pixels, whatever their shape.
+    stack = PanelStack(0.5184, 0.5184 * SIZE[1] / SIZE[0], (-0.06, 0.0, 0.06), *SIZE)
     return NetworkPredictor(ModelSession(path, threads=1), stack, source=path)
 
 
