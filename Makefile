@@ -11,7 +11,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 NIGHTLY := out/nightly
 
-.PHONY: demo test test-slow golden lint types secrets coverage nightly package bench fuzz soak install uninstall system eye-models gallery hashes clean
+.PHONY: demo test test-slow golden lint types secrets coverage nightly package bench fuzz soak install uninstall system eye-models models gallery hashes clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/phasestack demo $(DEMO_ARGS)
@@ -75,6 +75,11 @@ uninstall:
 # The networks that find eyes anew from their publishers' files, beside those that are shipped.
 eye-models:
 	sh docs/make_eye_models.sh out/eye-models
+
+# The models that ship anew from their recipes, the same bytes with the pinned torch and onnx.
+models: $(VENV)/.test
+	for name in fast balanced best; do $(BIN)/phasestack export --arch $$name --out runtime/model/data/$$name.onnx || exit 1; done
+	cd runtime/model/data && sha256sum balanced.onnx best.onnx fast.onnx > SHA256SUMS
 
 # docs/performance.md and the pages' pictures from the commands (minutes).
 gallery: $(VENV)/.test

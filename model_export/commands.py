@@ -24,8 +24,6 @@ def train(
     recipe: Annotated[str, typer.Option(help="fast, balanced, best or a recipe file (JSON)")] = "balanced",
     iterations: Annotated[int | None, typer.Option(min=1, help="steps of the optimiser; without: the recipe's")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="of data and weights; without: the recipe's")] = None,
-    threads: Annotated[int, typer.Option(min=1, help="torch's threads")] = 2,
-    resume: Annotated[bool, typer.Option("--resume", help="go on from the checkpoint in --out")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="the result as one object on stdout")] = False,
 ) -> None:
     """Train a model on endless procedural pairs.
@@ -35,14 +33,7 @@ def train(
     require("torch")
     from model_export.train import run_training
 
-    result = run_training(
-        out,
-        recipe,
-        iterations=iterations,
-        seed=seed,
-        threads=threads,
-        resume=resume,
-    )
+    result = run_training(out, recipe, iterations=iterations, seed=seed)
     if as_json:
         typer.echo(json.dumps(result))
     else:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from model_export.scene import draw, random_scene
-from model_export.textures import Random
+from model_export.scene import Random, draw, random_scene
 from runtime.optics.stack import PanelStack
-from runtime.optics.views import stack_from_eye
+from runtime.optics.views import raster_from_stack, stack_from_eye
 from runtime.records import F64, U8
 
 PITCH_WIDTH_M = 0.5184  # of the prototype's panels
@@ -91,16 +91,15 @@ def random_pair(
     scene = random_scene(random, stack, eyes.mean(axis=0))
     low, high = eye_sigma_mm
     sigma_mm = low if random.random() < 0.25 else random.uniform(low, high)
-    left, right = (draw(scene, eye, stack.panel(CENTRE)) for eye in eyes)
+    projections = [raster_from_stack(eye, stack.panel(CENTRE)) for eye in eyes]
+    left, right = (draw(scene, projection, width_px=width_px, height_px=height_px) for projection in projections)
     return TrainingPair(stack, eyes, (left, right), sigma_mm)
 
 
 def endless_pairs(
-    seed: int, *, first: int = 0, width_px: int, height_px: int, eye_sigma_mm: tuple[float, float]
+    seed: int, *, width_px: int, height_px: int, eye_sigma_mm: tuple[float, float]
 ) -> Iterator[TrainingPair]:
-    """Pairs number `first` and on: each is made from (seed, number) alone, so any can be resumed at."""
-    number = first
-    while True:
+    """The pairs of a seed, one after the other: each is made from (seed, number) alone."""
+    for number in itertools.count():
         random = np.random.default_rng([seed, number])
         yield random_pair(random, width_px=width_px, height_px=height_px, eye_sigma_mm=eye_sigma_mm)
-        number += 1

@@ -73,7 +73,7 @@ def in_torch(module: nn.Module) -> Reference:
 def spectral_model(
     name: str, *, checkpoint: Path | None = None, random_init: int | None = None
 ) -> tuple[bytes, nn.Module]:
-    """One of the shipped family: its recipe's weights, a checkpoint's, or untrained ones."""
+    """One of the shipped family: as it ships, or with a checkpoint's weights or untrained ones."""
     recipe = read_recipe(name)
     if checkpoint is not None:
         net, recipe = load_spectral(checkpoint, name=name)
@@ -82,8 +82,7 @@ def spectral_model(
             training = recipe.training.model_copy(update={"seed": random_init})
             recipe = recipe.model_copy(update={"weights": None, "training": training})
         net = solver_of(recipe, source=name)
-    trained = recipe.weights is not None
-    return spectral_file(net, recipe, trained=trained), net
+    return spectral_file(net, recipe, trained=random_init is None), net
 
 
 def spectral_file(net: SpectralSolver, recipe: Recipe, *, trained: bool = True) -> bytes:

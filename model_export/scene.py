@@ -1,20 +1,19 @@
-"""Scenes of textured planes with exact geometry, drawn from any eye straight into a raster."""
+"""Scenes of textured cards with exact geometry, drawn from any eye straight into a raster."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from model_export.textures import BACKDROPS, OBJECTS, Random, glint
-from runtime.optics.stack import PanelStack, PlaneRaster
-from runtime.optics.views import image_from_stack, raster_from_stack
+from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8
 
 FINER = 2  # drawn so many times finer and averaged: edges and details are not jagged
-TEXELS_MAX = 768
+TEXELS = (24, 768)  # of a texture's side
+Random = np.random.Generator
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,38 +29,25 @@ class Plane:
 Scene = tuple[Plane, ...]
 
 
-def draw(scene: Scene, eye_m: F64, raster: PlaneRaster) -> U8:
-    """(h, w, 3) what an eye sees of a scene through each pixel of a raster.
+def draw(scene: Scene, projection: F64, *, width_px: int, height_px: int) -> U8:
+    """(h, w, 3) a scene through a 3x4 projection, frame `stack` to pixels.
 
     The nearest plane wins, by its exact depth in every pixel; half-transparent edges let through what was drawn
     before. What lies behind the eye is not seen.
     """
-    width, height = raster.width_px * FINER, raster.height_px * FINER
-    finer = PlaneRaster(
-        raster.x_m, raster.left_m, raster.top_m, raster.pitch_u_m / FINER, raster.pitch_v_m / FINER, width, height
-    )
-    return _drawn(scene, raster_from_stack(eye_m, finer), width, height)
-
-
-def view(scene: Scene, eye_m: F64, *, width_px: int, height_px: int, fov_deg: float) -> U8:
-    """(h, w, 3) the picture of an eye that looks at the stack's origin, of a horizontal field of view."""
     width, height = width_px * FINER, height_px * FINER
-    projection = image_from_stack(eye_m, width_px=width, height_px=height, fov_deg=fov_deg)
-    return _drawn(scene, projection, width, height)
-
-
-def _drawn(scene: Scene, projection: F64, width: int, height: int) -> U8:
-    """A scene through a 3x4 projection (frame `stack` to pixels FINER times as fine as the result's)."""
     picture = np.zeros((height, width, 3), np.float32)
     nearness = np.zeros((height, width), np.float32)  # 1 over the distance: what lies behind the eye has less
     for plane in scene:
-        on_raster = projection @ np.vstack(
-            [np.column_stack([plane.across_m, plane.down_m, plane.corner_m]), [0.0, 0.0, 1.0]]
+        on_raster = (
+            np.diag([FINER, FINER, 1.0])
+            @ projection
+            @ np.vstack([np.column_stack([plane.across_m, plane.down_m, plane.corner_m]), [0.0, 0.0, 1.0]])
         )
         part = _part(on_raster, width, height)
         if part is not None:
             _draw_plane(plane.texture, on_raster, part, picture, nearness)
-    smaller = cv2.resize(picture, (width // FINER, height // FINER), interpolation=cv2.INTER_AREA)
+    smaller = cv2.resize(picture, (width_px, height_px), interpolation=cv2.INTER_AREA)
     return np.clip(np.rint(smaller), 0, 255).astype(np.uint8)
 
 
@@ -86,7 +72,7 @@ def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], 
     height, width = texture.shape[:2]
     texels = raster_from_plane @ np.diag([1 / width, 1 / height, 1.0])
     # OpenCV puts pixel centres at integers.
-    shifted = shift(-0.5 - left, -0.5 - top) @ texels @ shift(0.5, 0.5)
+    shifted = _shift(-0.5 - left, -0.5 - top) @ texels @ _shift(0.5, 0.5)
     drawn = cv2.warpPerspective(texture, shifted, (columns.stop - left, rows.stop - top), flags=cv2.INTER_LINEAR)
     inverse = np.linalg.inv(raster_from_plane)
     u, v = np.arange(left, columns.stop) + 0.5, np.arange(top, rows.stop)[:, None] + 0.5
@@ -98,113 +84,71 @@ def _draw_plane(texture: U8, raster_from_plane: F64, part: tuple[slice, slice], 
     np.copyto(nearness[part], near, where=alpha > 0.5)
 
 
-def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
-    """A backdrop, objects at many depths around the panels, and highlights, for a viewer about `middle_m`."""
-    gap_m = stack.x_m[-1] - stack.x_m[1]
-    distance_m = middle_m[0] - stack.x_m[1]
-    deep_m = gap_m * math.exp(random.uniform(math.log(0.3), math.log(6.0)))
-    rear_m, front_m = -deep_m, min(deep_m, 0.35 * distance_m)
-    pixel_m = stack.width_m / stack.width_px / FINER
-    planes = [_backdrop(random, stack, middle_m, rear_m * random.uniform(1.0, 1.3), pixel_m)]
-    for _ in range(int(random.integers(3, 12))):
-        x_m = random.uniform(rear_m, front_m)
-        size_m = stack.width_m * math.exp(random.uniform(math.log(0.06), math.log(0.6)))
-        size_m = min(size_m, 0.8 * (distance_m - x_m))
-        place = _behind(random, stack, middle_m, x_m)
-        if random.random() < 0.2:
-            planes += _box(random, place, size_m / 2, front_m, pixel_m)
-        else:
-            slant = random.uniform(0, 1.2) if random.random() < 0.5 else random.uniform(0, 0.2)
-            planes.append(_card(random, place, size_m, slant, front_m, pixel_m))
-        if random.random() < 0.25:
-            # A mirrored lamp lies behind its surface, but is seen through it: drawn last, just before it.
-            planes.append(_highlight(random, place + np.array([2e-3 * gap_m, 0, 0]), size_m / 4, pixel_m))
-    contrast, level = (1.0, 0.0) if random.random() < 0.4 else (random.uniform(0.15, 0.8), random.uniform(-0.25, 0.25))
-    softer = [replace(plane, texture=_softened(plane.texture, contrast, level)) for plane in planes]
-    return tuple(sorted(softer, key=lambda plane: float(_centre(plane)[0])))
-
-
-def _softened(texture: U8, contrast: float, level: float) -> U8:
-    """Less contrast, and brighter or darker: most of the world is not saturated."""
-    table = np.clip(np.rint((np.arange(256) - 127.5) * contrast + 127.5 + 255 * level), 0, 255).astype(np.uint8)
-    result = texture.copy()
-    result[..., :3] = table[texture[..., :3]]
-    return result
-
-
-def _centre(plane: Plane) -> F64:
-    return np.asarray(plane.corner_m + (plane.across_m + plane.down_m) / 2)
-
-
-def _behind(random: Random, stack: PanelStack, middle_m: F64, x_m: float) -> F64:
-    """A place at depth x that is seen through somewhere on the centre panel."""
-    on_panel = np.array([stack.x_m[1], *(random.uniform(-0.5, 0.5, 2) * (stack.width_m, stack.height_m))])
-    t = (x_m - on_panel[0]) / (middle_m[0] - on_panel[0])
-    return np.asarray(on_panel + t * (middle_m - on_panel))
-
-
-def _texels(length_m: float, pixel_m: float, random: Random) -> int:
-    """As many as the raster has pixels there, or fewer: more would only flicker."""
-    return int(np.clip(length_m / pixel_m * random.uniform(0.3, 1.0), 24, TEXELS_MAX))
-
-
-def _backdrop(random: Random, stack: PanelStack, middle_m: F64, x_m: float, pixel_m: float) -> Plane:
-    t = (x_m - stack.x_m[1]) / (middle_m[0] - stack.x_m[1])
-    half = 0.75 * (1 - t) * np.array([stack.width_m, stack.height_m])
-    centre = middle_m[1:] * t
-    texture = random.choice(BACKDROPS)(  # type: ignore[arg-type]
-        random, _texels(2 * half[0], pixel_m, random), _texels(2 * half[1], pixel_m, random)
-    )
-    tilt = random.uniform(-0.3, 0.3, 2) * (random.random() < 0.4)
-    across, down = np.array([tilt[0] * half[0], 2 * half[0], 0.0]), np.array([tilt[1] * half[1], 0.0, -2 * half[1]])
-    corner = np.array([x_m, *centre]) - across / 2 - down / 2
-    # A tilted backdrop must stay behind the panels' front.
-    corner[0] = min(corner[0], x_m)
-    return Plane(texture, corner, across, down)
-
-
-def _card(random: Random, place_m: F64, size_m: float, slant: float, front_m: float, pixel_m: float) -> Plane:
-    heading, turn, aspect = random.uniform(0, 2 * math.pi), random.uniform(0, 2 * math.pi), random.uniform(0.4, 1.0)
-    normal = np.array([math.cos(slant), math.sin(slant) * math.cos(heading), math.sin(slant) * math.sin(heading)])
-    side = np.cross([0.0, 0.0, 1.0], normal)
-    side = side / np.linalg.norm(side)
-    up = np.cross(normal, side)
-    if random.random() < 0.5:  # as many things in the world stand upright
-        turn = 0.0
-    across = (math.cos(turn) * side + math.sin(turn) * up) * size_m
-    down = (math.sin(turn) * side - math.cos(turn) * up) * size_m * aspect
-    corner = place_m - across / 2 - down / 2
-    corner[0] -= max(0.0, _front_of(corner, across, down) - max(front_m, place_m[0]))
-    kind = random.choice(OBJECTS)  # type: ignore[arg-type]
-    return Plane(
-        kind(random, _texels(size_m, pixel_m, random), _texels(size_m * aspect, pixel_m, random)), corner, across, down
-    )
-
-
-def _front_of(corner: F64, across: F64, down: F64) -> float:
-    return float(corner[0] + max(across[0], 0) + max(down[0], 0))
-
-
-def _box(random: Random, place_m: F64, size_m: float, front_m: float, pixel_m: float) -> list[Plane]:
-    """The six faces of a cube that stands upright."""
-    turn = random.uniform(0, math.pi / 2)
-    a = np.array([math.cos(turn), math.sin(turn), 0.0]) * size_m
-    b = np.array([-math.sin(turn), math.cos(turn), 0.0]) * size_m
-    c = np.array([0.0, 0.0, -size_m])
-    start = place_m - (a + b + c) / 2
-    start[0] -= max(0.0, start[0] + a[0] + max(b[0], 0) - max(front_m, place_m[0]))
-    kind = random.choice(OBJECTS[:5])  # type: ignore[arg-type]
-    texels = _texels(size_m, pixel_m, random)
-    faces = ((start, a, c), (start + b, a, c), (start, b, c), (start + a, b, c), (start, a, b), (start + c, a, b))
-    return [Plane(kind(random, texels, texels), *face) for face in faces]
-
-
-def _highlight(random: Random, place_m: F64, size_m: float, pixel_m: float) -> Plane:
-    texels = _texels(size_m, pixel_m, random)
-    across, down = np.array([0.0, size_m, 0.0]), np.array([0.0, 0.0, -size_m])
-    return Plane(glint(random, texels, texels), place_m - across / 2 - down / 2, across, down)
-
-
-def shift(right: float, down: float) -> F64:
+def _shift(right: float, down: float) -> F64:
     """(3, 3) of pixels."""
     return np.array([[1.0, 0.0, right], [0.0, 1.0, down], [0.0, 0.0, 1.0]])
+
+
+def random_scene(random: Random, stack: PanelStack, middle_m: F64) -> Scene:
+    """A backdrop, and cards at many depths around the panels, many of them slanted, for a viewer about `middle_m`."""
+    centre_m = stack.x_m[1]
+    distance_m = middle_m[0] - centre_m
+    deep_m = (stack.x_m[-1] - centre_m) * math.exp(random.uniform(math.log(0.3), math.log(6.0)))
+    rear_m, front_m = -deep_m, min(deep_m, 0.35 * distance_m)
+    panel_m, pixel_m = np.array([stack.width_m, stack.height_m]), stack.width_m / stack.width_px / FINER
+    # Most of the world is not saturated.
+    contrast, level = (1.0, 0.0) if random.random() < 0.4 else (random.uniform(0.15, 0.8), random.uniform(-0.25, 0.25))
+    tones = np.clip(np.rint((np.arange(256) - 127.5) * contrast + 127.5 + 255 * level), 0, 255).astype(np.uint8)
+
+    def card(x_m: float, size_m: F64, aside: F64, *, slant: float, see_through: bool) -> Plane:
+        """aside: where on the centre panel its middle is seen, of the panel's size."""
+        share = (x_m - centre_m) / distance_m
+        middle = aside * panel_m * (1 - share) + middle_m[1:] * share
+        turns = random.uniform(-slant, slant, 2)
+        across = size_m[0] * np.array([math.sin(turns[0]), math.cos(turns[0]), 0.0])
+        down = size_m[1] * np.array([math.sin(turns[1]), 0.0, -math.cos(turns[1])])
+        corner = np.array([x_m, *middle]) - across / 2 - down / 2
+        corner[0] -= max(0.0, corner[0] + max(across[0], 0) + max(down[0], 0) - max(front_m, x_m))
+        width, height = np.clip(size_m / pixel_m * random.uniform(0.3, 1.0), *TEXELS).astype(int).tolist()
+        return Plane(_texture(random, width, height, tones, see_through=see_through), corner, across, down)
+
+    backdrop_m = rear_m * random.uniform(1.0, 1.3)
+    size_m = 1.5 * (1 - (backdrop_m - centre_m) / distance_m) * panel_m
+    planes = [card(backdrop_m, size_m, np.zeros(2), slant=0.3, see_through=False)]
+    for x_m in np.sort(random.uniform(rear_m, front_m, int(random.integers(3, 12)))).tolist():
+        wide_m = stack.width_m * math.exp(random.uniform(math.log(0.06), math.log(0.6)))
+        wide_m = min(wide_m, 0.8 * (distance_m - x_m))
+        size_m = wide_m * np.array([1.0, random.uniform(0.4, 1.0)])
+        slant, see_through = random.choice([0.2, 1.2]), random.random() < 0.3
+        planes.append(card(x_m, size_m, random.uniform(-0.5, 0.5, 2), slant=slant, see_through=see_through))
+    return tuple(planes)
+
+
+def _texture(random: Random, width: int, height: int, tones: U8, *, see_through: bool) -> U8:
+    """(height, width, 4) noise whose power falls with frequency, or discs and boxes; see_through: lines of it alone."""
+    picture = np.full((height, width, 4), 255, np.uint8)
+    if random.random() < 0.5:
+        fu, fv = np.fft.rfftfreq(width), np.fft.fftfreq(height)[:, None]
+        gain = 1 / np.maximum(np.hypot(fu, fv), 1 / max(width, height)) ** random.uniform(0.3, 2.0)
+        phases = np.exp(2j * np.pi * random.random((3, height, width // 2 + 1)))
+        waves = np.fft.irfft2(gain * phases, s=(height, width)).transpose(1, 2, 0)
+        waves *= random.uniform(0.08, 0.35) / (waves.std() + 1e-9)
+        grey = random.random()
+        waves = random.random(3) * 0.5 + 0.25 + grey * waves.mean(axis=-1, keepdims=True) + (1 - grey) * waves
+        picture[..., :3] = np.clip(np.rint(255 * waves), 0, 255)
+    else:
+        for _ in range(int(random.integers(10, 60))):
+            colour = [int(c) for c in np.clip(random.integers(-60, 316, 3), 0, 255)] + [255]
+            place, size = random.integers((width, height)), int(max(width, height) * 0.3 * random.random() ** 2) + 1
+            if random.random() < 0.5:
+                cv2.circle(picture, place.tolist(), size, colour, -1, cv2.LINE_AA)
+            else:
+                cv2.rectangle(picture, place.tolist(), (place + size).tolist(), colour, -1)
+    if see_through:
+        lines = np.zeros((height, width), np.uint8)
+        for _ in range(int(random.integers(3, 25))):
+            start, end = random.integers((width, height), size=(2, 2)).tolist()
+            cv2.line(lines, start, end, 255, int(random.integers(1, 4)), cv2.LINE_AA)
+        picture[..., 3] = lines
+    picture[..., :3] = tones[picture[..., :3]]
+    return picture

@@ -40,9 +40,9 @@ def stress_pictures(height: int, width: int) -> dict[str, tuple[F32, F32]]:
     }
 
 
-def ordinary_pictures(height: int, width: int, *, number: int = 0) -> tuple[F32, F32]:
+def ordinary_pictures(height: int, width: int) -> tuple[F32, F32]:
     """(h, w, 3) for each eye: a procedural pair of that size."""
-    pair = next(endless_pairs(77, first=number, width_px=width, height_px=height, eye_sigma_mm=(0.0, 0.0)))
+    pair = next(endless_pairs(77, width_px=width, height_px=height, eye_sigma_mm=(0.0, 0.0)))
     left, right = (image.astype(np.float32) / np.float32(255) for image in pair.images)
     return left, right
 

@@ -13,13 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model_export.checkpoint import fill, load_checkpoint, plain_weights, save_checkpoint, solver_of
+from model_export.checkpoint import plain_weights, save_checkpoint, solver_of
 from model_export.data import TrainingPair, endless_pairs
 from model_export.network import SpectralSolver
 from model_export.recipe import Recipe, read_recipe
 from model_export.sight import displayed_mse, sight_of
-from runtime.config import validated
-from runtime.errors import InputError
 from runtime.support.artifacts import write_text
 from runtime.support.progress import progress_bar
 
@@ -47,29 +45,22 @@ def run_training(
     *,
     iterations: int | None = None,
     seed: int | None = None,
-    threads: int = 2,
-    resume: bool = False,
 ) -> dict[str, Any]:
     """Train, write checkpoint, recipe and curve. Raises InputError."""
     recipe = read_recipe(recipe_name)
     asked = {name: value for name, value in (("iterations", iterations), ("seed", seed)) if value is not None}
     training = recipe.training.model_copy(update=asked)
     recipe = recipe.model_copy(update={"training": training})
-    torch.set_num_threads(threads)
     model = solver_of(recipe, source=recipe_name)
     optimiser = torch.optim.Adam(model.parameters(), lr=training.learning_rate)
     size = {"width_px": training.width_px, "height_px": training.height_px}
     held_out = held_out_pairs(training.validation_pairs, **size)
-    path = out / "checkpoint.pth"
-    first, points, before_s = _resumed(path, model, optimiser, recipe) if resume else (0, [], 0.0)
     start = time.monotonic()
-    if not points:
-        points = [Point(0, math.nan, *validate(model, held_out, recipe))]
-    taken = first * PAIRS_A_STEP
-    stream = endless_pairs(training.seed, first=taken, eye_sigma_mm=training.eye_sigma_mm, **size)
+    points = [Point(0, math.nan, *validate(model, held_out, recipe))]
+    stream = endless_pairs(training.seed, eye_sigma_mm=training.eye_sigma_mm, **size)
     losses: list[float] = []
     with progress_bar(f"training {recipe.name}") as progress:
-        for iteration in range(first, training.iterations):
+        for iteration in range(training.iterations):
             optimiser.param_groups[0]["lr"] = training.learning_rate * _annealed(iteration / training.iterations)
             losses.append(_step(model, optimiser, stream, recipe))
             done = iteration + 1
@@ -77,19 +68,17 @@ def run_training(
             if done % training.validate_every == 0 or done == training.iterations:
                 points.append(Point(done, float(np.mean(losses)), *validate(model, held_out, recipe)))
                 losses = []
-                seconds = before_s + time.monotonic() - start
-                _save(out, model, optimiser, recipe, done, points, seconds)
-    seconds = before_s + time.monotonic() - start
+                _save(out, model, recipe, points)
     last = points[-1]
     return {
         "name": recipe.name,
         "iterations": last.iteration,
-        "seconds": round(seconds, 1),
+        "seconds": round(time.monotonic() - start, 1),
         "start_db": round(points[0].exact_db, 3),
         "held_out_db": round(last.exact_db, 3),
         "start_expected_db": round(points[0].expected_db, 3),
         "held_out_expected_db": round(last.expected_db, 3),
-        "checkpoint": str(path),
+        "checkpoint": str(out / "checkpoint.pth"),
     }
 
 
@@ -146,49 +135,10 @@ def _step(
     return total / used if used else math.nan
 
 
-def _save(
-    out: Path,
-    model: SpectralSolver,
-    optimiser: torch.optim.Optimizer,
-    recipe: Recipe,
-    iteration: int,
-    points: Sequence[Point],
-    seconds: float,
-) -> None:
+def _save(out: Path, model: SpectralSolver, recipe: Recipe, points: Sequence[Point]) -> None:
     found = recipe.model_copy(update={"weights": plain_weights(model)})
     write_text(out / "recipe.json", found.text())
-    save_checkpoint(
-        out / "checkpoint.pth",
-        {
-            "model": model.state_dict(),
-            "recipe": found.model_copy(update={"weights": None}).model_dump(mode="json"),
-            "optimiser": optimiser.state_dict(),
-            "iteration": iteration,
-            "points": [list(astuple(point)) for point in points],
-            "seconds": seconds,
-        },
-    )
+    plain = found.model_copy(update={"weights": None}).model_dump(mode="json")
+    save_checkpoint(out / "checkpoint.pth", {"model": model.state_dict(), "recipe": plain})
     lines = [",".join("" if math.isnan(x) else f"{x:.6g}" for x in astuple(point)) for point in points]
     write_text(out / "validation.csv", "\n".join([",".join(COLUMNS), *lines]) + "\n")
-
-
-def _resumed(
-    path: Path, model: SpectralSolver, optimiser: torch.optim.Optimizer, recipe: Recipe
-) -> tuple[int, list[Point], float]:
-    """(iteration, curve, seconds) that a checkpoint had reached; fills model and optimiser. Raises InputError."""
-    table = load_checkpoint(path)
-    held = validated(Recipe, table.get("recipe") or {}, source=f"{path}: recipe")
-    if (held.name, [s.kind for s in held.steps]) != (recipe.name, [s.kind for s in recipe.steps]):
-        raise InputError(path, "recipe", f"was trained as {held.name}, which is not this recipe")
-    if held.training.seed != recipe.training.seed:
-        raise InputError(path, "recipe.training.seed", f"{held.training.seed}, but {recipe.training.seed} is asked for")
-    iteration = table.get("iteration")
-    if not isinstance(iteration, int) or isinstance(iteration, bool) or iteration < 0:
-        raise InputError(path, "iteration", f"{iteration!r} is no number of steps")
-    try:
-        fill(model, table["model"], source=path, arch=recipe.name)
-        optimiser.load_state_dict(table["optimiser"])
-        points = [Point(int(row[0]), *row[1:]) for row in table["points"]]
-        return iteration, points, float(table["seconds"])
-    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, IndexError) as error:
-        raise InputError(path, "", f"is no checkpoint that a training can be resumed from ({error})") from None

@@ -46,6 +46,8 @@ REMOVED_COMMANDS: dict[str, str] = {
     **dict.fromkeys(
         ("train --data", "train --scene"), "take it out: 6 to 18 numbers are trained, on endless pairs that are drawn"
     ),
+    "train --resume": "take it out: a training begins anew",
+    "train --threads": "OMP_NUM_THREADS in the environment",
     "train --device": "take it out: 6 to 18 numbers are trained, on the processor",
     "export --precision": "models are exported in 32 bits, which is what ships and what is measured",
     "export --dynamic": "export each size with --width and --height",

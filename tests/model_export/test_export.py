@@ -14,12 +14,11 @@ from onnx import numpy_helper  # noqa: E402
 from typer.testing import CliRunner  # noqa: E402
 
 from model_export.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
-from model_export.export import export_model, in_torch  # noqa: E402
+from model_export.export import export_model, in_torch, spectral_model  # noqa: E402
 from model_export.eyereal import EyeRealNet  # noqa: E402
 from model_export.network import SpectralSolver  # noqa: E402
 from model_export.onnx_files import with_contract  # noqa: E402
 from model_export.recipe import read_recipe  # noqa: E402
-from model_export.ship import shipped_bytes  # noqa: E402
 from model_export.validate import check_model, validate_file  # noqa: E402
 from runtime.commands.app import app  # noqa: E402
 from runtime.errors import InputError  # noqa: E402
@@ -63,7 +62,7 @@ def exported(checkpoint: Path, **options: Any) -> Path:
 def test_shipped_models_are_remade_from_their_recipes_to_the_byte(name: str) -> None:
     path = model_path(name)
     assert path is not None
-    shipped, made = path.read_bytes(), shipped_bytes(name)
+    shipped, made = path.read_bytes(), spectral_model(name)[0]
     # Another version of torch may arrange the file differently; the numbers must not move.
     if onnx.load_from_string(shipped).producer_version == onnx.load_from_string(made).producer_version:
         assert made == shipped
@@ -148,7 +147,7 @@ def test_validate_refuses_what_is_not_ours(tmp_path: Path) -> None:
     path.write_bytes(b"nonsense")
     with pytest.raises(InputError, match="is no ONNX model"):
         validate_file(path)
-    model = onnx.load_from_string(shipped_bytes("fast"))
+    model = onnx.load_from_string(spectral_model("fast")[0])
     del model.metadata_props[:]
     path.write_bytes(model.SerializeToString())
     with pytest.raises(InputError, match="carries no contract"):

@@ -1,9 +1,8 @@
-"""Training: exact geometry of the data, a loss that agrees with the runtime's rays, determinism and resuming."""
+"""Training: exact geometry of the data, a loss that agrees with the runtime's rays, and determinism."""
 
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,15 +11,13 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
-import model_export.train as training  # noqa: E402
 from model_export.checkpoint import load_spectral, solver_of  # noqa: E402
 from model_export.data import TrainingPair, endless_pairs  # noqa: E402
 from model_export.recipe import Recipe, read_recipe  # noqa: E402
-from model_export.scene import Plane, draw  # noqa: E402
+from model_export.scene import Plane, Scene, draw  # noqa: E402
 from model_export.sight import displayed_mse, sight_of  # noqa: E402
 from model_export.train import pair_loss, run_training  # noqa: E402
 from runtime.config import ModelSettings  # noqa: E402
-from runtime.errors import InputError  # noqa: E402
 from runtime.model.job import Job  # noqa: E402
 from runtime.model.predictor import load_predictor  # noqa: E402
 from runtime.model.resample import target_from_source  # noqa: E402
@@ -38,13 +35,17 @@ def first_pairs(count: int, *, seed: int = 1, **size: int) -> list[TrainingPair]
     return [pair for pair, _ in zip(stream, range(count), strict=False)]
 
 
+def drawn(scene: Scene, eye: np.ndarray) -> np.ndarray:
+    return draw(scene, raster_from_stack(eye, STACK.panel(1)), width_px=480, height_px=270)
+
+
 # A texture is drawn twice as fine as the raster and averaged: its edges are true to about a tenth of a pixel.
 def test_a_plane_is_drawn_where_the_projection_puts_it() -> None:
     white = np.full((40, 40, 4), 255, np.uint8)
     centre = np.array([-0.1, 0.05, -0.03])
     plane = Plane(white, centre - [0, 0.01, -0.01], np.array([0, 0.02, 0.0]), np.array([0, 0, -0.02]))
     for eye in EYES:
-        picture = draw((plane,), eye, STACK.panel(1)).mean(axis=2)
+        picture = drawn((plane,), eye).mean(axis=2)
         v_px, u_px = np.mgrid[0:270, 0:480] + 0.5
         u, v, w = raster_from_stack(eye, STACK.panel(1)) @ [*centre, 1.0]
         assert (u_px * picture).sum() / picture.sum() == pytest.approx(u / w, abs=0.12)
@@ -59,13 +60,12 @@ def test_the_nearer_plane_hides_the_farther_whatever_their_order() -> None:
 
     near, far = plane(0.1, 200), plane(-0.2, 50)
     for scene in ((near, far), (far, near)):
-        assert draw(scene, EYES[0], STACK.panel(1))[135, 240].tolist() == [200, 200, 200]
+        assert drawn(scene, EYES[0])[135, 240].tolist() == [200, 200, 200]
 
 
 def test_pairs_depend_on_seed_and_number_alone() -> None:
     whole = first_pairs(4)
-    rest = endless_pairs(1, first=2, eye_sigma_mm=(0.0, 4.0), **SMALL)
-    again = next(rest)
+    again = first_pairs(3)[2]
     assert np.array_equal(again.images[1], whole[2].images[1]) and np.array_equal(again.eyes_m, whole[2].eyes_m)
     assert not np.array_equal(first_pairs(1, seed=2)[0].images[0], whole[0].images[0])
 
@@ -133,91 +133,26 @@ def test_what_is_learned_gets_gradients_and_steps_down_the_loss() -> None:
         assert pair_loss(model, pair, recipe) < loss
 
 
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def tiny(tmp_path: Path) -> Path:
     """A recipe that trains in seconds."""
     table = json.loads(read_recipe("fast").text())
     table.pop("weights", None)
     table["training"] |= SMALL | {"iterations": 4, "validate_every": 2, "validation_pairs": 2}
-    path = tmp_path_factory.mktemp("recipe") / "tiny.json"
+    path = tmp_path / "tiny.json"
     path.write_text(json.dumps(table))
     return path
 
 
-def trained(out: Path, recipe: Path, *, iterations: int | None = None, resume: bool = False) -> Recipe:
-    run_training(out, str(recipe), iterations=iterations, threads=1, resume=resume)
+def trained(out: Path, recipe: Path) -> Recipe:
+    run_training(out, str(recipe))
     return Recipe.model_validate_json((out / "recipe.json").read_text())
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory, tiny: Path) -> tuple[Path, Recipe]:
-    """A training from its beginning to its end: the folder that it left, and its recipe."""
-    folder = tmp_path_factory.mktemp("whole") / "a"
-    return folder, trained(folder, tiny)
-
-
-@pytest.fixture(scope="module")
-def begun(tmp_path_factory: pytest.TempPathFactory, tiny: Path) -> Path:
-    """A training of one step; for tests to copy."""
-    folder = tmp_path_factory.mktemp("begun") / "a"
-    trained(folder, tiny, iterations=1)
-    return folder
-
-
-def test_training_is_the_same_twice_and_leaves_its_files(
-    tmp_path: Path, tiny: Path, whole: tuple[Path, Recipe]
-) -> None:
-    folder, first = whole
+def test_training_is_the_same_twice_and_leaves_its_files(tmp_path: Path, tiny: Path) -> None:
+    first = trained(tmp_path / "a", tiny)
     assert trained(tmp_path / "b", tiny).weights == first.weights
-    _, recipe = load_spectral(folder / "checkpoint.pth", name="fast")
+    _, recipe = load_spectral(tmp_path / "a" / "checkpoint.pth", name="fast")
     assert recipe.steps == first.steps and recipe.weights == first.weights
-    rows = (folder / "validation.csv").read_text().splitlines()
+    rows = (tmp_path / "a" / "validation.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in rows] == ["iteration", "0", "2", "4"]
-
-
-def test_a_training_that_was_cut_off_and_resumed_ends_as_if_nothing_had_happened(
-    tmp_path: Path, tiny: Path, whole: tuple[Path, Recipe], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patch:
-
-        def save_and_stop(*arguments: object) -> None:
-            save(*arguments)
-            raise KeyboardInterrupt
-
-        save = training._save
-        patch.setattr(training, "_save", save_and_stop)
-        with pytest.raises(KeyboardInterrupt):
-            trained(tmp_path / "cut", tiny)
-    assert torch.load(tmp_path / "cut" / "checkpoint.pth", weights_only=True)["iteration"] == 2
-    assert trained(tmp_path / "cut", tiny, resume=True).weights == whole[1].weights
-    assert (tmp_path / "cut" / "validation.csv").read_text() == (whole[0] / "validation.csv").read_text()
-
-
-NOBODY = {"state": {99: {"step": 1.0, "exp_avg": torch.zeros(1)}}, "param_groups": []}
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"iteration": -5}, "iteration: -5 is no number of steps"),
-        ({"iteration": "many"}, "iteration: 'many' is no number of steps"),
-        ({"optimiser": {}}, "is no checkpoint that a training can be resumed from"),
-        ({"optimiser": NOBODY}, "is no checkpoint that a training can be resumed from"),
-        ({"optimiser": [1, 2]}, "is no checkpoint that a training can be resumed from"),
-        ({"points": [[1]]}, "is no checkpoint that a training can be resumed from"),
-    ],
-)
-def test_a_checkpoint_that_nothing_can_be_resumed_from_is_one_line(
-    tmp_path: Path, tiny: Path, begun: Path, change: dict[str, object], said: str
-) -> None:
-    shutil.copytree(begun, tmp_path / "a")
-    path = tmp_path / "a" / "checkpoint.pth"
-    torch.save(torch.load(path, weights_only=True) | change, path)
-    with pytest.raises(InputError, match=said):
-        trained(tmp_path / "a", tiny, resume=True)
-
-
-def test_resuming_something_else_is_refused(tmp_path: Path, begun: Path) -> None:
-    shutil.copytree(begun, tmp_path / "a")
-    with pytest.raises(InputError, match="was trained as fast"):
-        run_training(tmp_path / "a", "balanced", threads=1, resume=True)
