@@ -7,7 +7,7 @@ names), 75 what may pass, 130 Ctrl-C, 141 nobody reads what is printed.
 from __future__ import annotations
 
 import contextlib
-import io
+import errno
 import os
 import signal
 import sys
@@ -19,7 +19,7 @@ INTERRUPTED, BAD_INPUT, OWN_ERROR, MAY_PASS, NOBODY_READS = 130, 2, 70, 75, 141
 
 def run_guarded(*, interrupts_leave: bool) -> None:
     """Run the command that the arguments name; never returns. interrupts_leave: until now (`cli`); then they raise."""
-    output = _fill_standard_descriptors()
+    _fill_standard_descriptors()
     try:
         from runtime.commands.app import app
         from runtime.support.crash import watch_threads
@@ -29,12 +29,12 @@ def run_guarded(*, interrupts_leave: bool) -> None:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         watch_threads()
         with listening(ShownProgress(sys.stderr)):
-            code = _code_of(app, output)
+            code = _code_of(app)
         _interrupts_leave(interrupts_leave)
     except BaseException as error:
         _interrupts_leave(interrupts_leave)
-        code = _reported(error, output)
-    code = _flushed(code, output)
+        code = _reported(error)
+    code = _flushed(code)
     if _has_hung_thread():  # taking down what a library's own thread still runs in would end in an abort
         from runtime.support import logs
 
@@ -54,7 +54,7 @@ def _has_hung_thread() -> bool:
     return any(thread.name.startswith(("solver-", "job ")) for thread in threading.enumerate())
 
 
-def _code_of(app: Any, output: _Output) -> int:
+def _code_of(app: Any) -> int:
     from runtime.support.removed import removed_command
 
     if gone := removed_command(sys.argv[1:]):
@@ -63,8 +63,8 @@ def _code_of(app: Any, output: _Output) -> int:
     try:
         app()
     except SystemExit as error:
-        if isinstance(error.__context__, BrokenPipeError):  # typer ends any of them so, a socket's too
-            return _reported(error.__context__, output)
+        if isinstance(error.__context__, BrokenPipeError):  # typer ends them so
+            return NOBODY_READS
         if isinstance(error.code, str):
             _say(error.code)
             return 1
@@ -72,16 +72,16 @@ def _code_of(app: Any, output: _Output) -> int:
     return 0
 
 
-def _reported(error: BaseException, output: _Output) -> int:
+def _reported(error: BaseException) -> int:
     """The exit code of what a command was ended by, told in one line."""
     from runtime.errors import PhasestackError, TransientError, one_line
 
     if _is_interrupt(error):
         return INTERRUPTED
-    if isinstance(error, OSError) and error is output.problem:
-        if isinstance(error, BrokenPipeError):
-            return NOBODY_READS
-        _say(f"phasestack: stdout: cannot be written ({error.strerror})")
+    if isinstance(error, BrokenPipeError):
+        return NOBODY_READS
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        _say(f"phasestack: {error.filename or 'output'}: cannot be written ({error.strerror})")
         return BAD_INPUT
     if isinstance(error, PhasestackError):
         _say(f"phasestack: {one_line(str(error), most=2000)}")
@@ -107,47 +107,21 @@ def _say(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
 
-class _Output(io.FileIO):
-    """Standard output that remembers why it could not be written: a full disk, or a reader that went away."""
-
-    problem: OSError | None = None
-
-    def write(self, data: Any) -> int:
-        try:
-            return super().write(data)
-        except OSError as error:
-            self.problem = error
-            raise
-
-
-def _flushed(code: int, output: _Output) -> int:
+def _flushed(code: int) -> int:
     """The exit code once all that was printed is out: Python's own last flush would tell a failure in a traceback."""
-    for stream in (sys.stdout, sys.stderr):
-        try:
-            stream.flush()
-        except (OSError, ValueError) as error:
-            problem = output.problem if stream is sys.stdout else error
-            code = code or _reported(problem or error, output)
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, stream.fileno())
-            os.close(nowhere)
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        code = code or _reported(error)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     return code
 
 
-def _fill_standard_descriptors() -> _Output:
-    """Where stdin, stdout or stderr is closed, it leads nowhere: no file that is opened later takes its place.
-
-    Answers what is below the new `sys.stdout`.
-    """
+def _fill_standard_descriptors() -> None:
+    """Where stdin, stdout or stderr is closed, it leads nowhere: no file that is opened later takes its place."""
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(number, True)
-    os.close(number)
-    output = _Output(1, "wb", closefd=False)
-    sys.stdout = io.TextIOWrapper(
-        io.BufferedWriter(output),
-        encoding=getattr(sys.stdout, "encoding", "utf-8"),
-        errors="backslashreplace",
-        line_buffering=output.isatty(),
-    )
-    sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115, PTH123 - for the whole process
-    return output
+    for name in ("stdout", "stderr"):
+        stream: Any = getattr(sys, name) or os.fdopen(number, "w", encoding="utf-8", closefd=False)
+        stream.reconfigure(errors="backslashreplace")  # a file's name need not be UTF-8
+        setattr(sys, name, stream)
