@@ -6,24 +6,11 @@ import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from runtime.errors import PhasestackError, TransientError
+from runtime.errors import TransientError
 
 # The system has none left, or its hardware failed this once.
 PASSING = frozenset(
     (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.ENOBUFS, errno.EINTR)
-)
-# The same in the words of libraries that raise exceptions of their own.
-WORDS = (
-    "too many open files",
-    "cannot allocate memory",
-    "failed to map segment",  # of a library, where memory is limited
-    "failed to allocate memory",
-    "bad_alloc",
-    "out of memory",
-    "input/output error",
-    "no space left on device",
-    "can't start new thread",
-    "resource temporarily unavailable",
 )
 
 
@@ -48,27 +35,8 @@ def is_retryable(error: BaseException | None) -> bool:
     Readers turn what the system refuses into an InputError that names the file; the system's own error is still its
     context.
     """
-    return any(_passes(link) for link in _chain(error))
-
-
-def _passes(error: BaseException) -> bool:
-    if isinstance(error, MemoryError):
-        return True
-    if isinstance(error, OSError) and error.errno is not None:
-        return error.errno in PASSING
-    if isinstance(error, PhasestackError):
-        return False  # its words may be a user's
-    text = str(error).lower()
-    return any(word in text for word in WORDS)
-
-
-def _chain(error: BaseException | None) -> Iterator[BaseException]:
-    """An exception, what it was raised from and what was being handled then."""
-    seen: set[int] = set()
-    waiting = [error]
-    while waiting:
-        link = waiting.pop()
-        if link is not None and id(link) not in seen:
-            seen.add(id(link))
-            yield link
-            waiting += [link.__cause__, link.__context__]
+    while error is not None:
+        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno in PASSING):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
