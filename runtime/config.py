@@ -166,7 +166,7 @@ class CalibrationSettings(Section):
 
     file: str = Field("", description="calibration TOML; empty: the built-in one of the demo recording")
     ipd_m: Annotated[float, within(0.04, 0.08, "m", zero=True)] = Field(
-        0.0, description="the viewer's known eye separation, metres, 0: unknown; for charts, and to check for drift"
+        0.0, description="the viewer's known eye separation, metres, 0: unknown; for charts, and cameras without depth"
     )
     viewing_m: tuple[Annotated[float, within(0.05, 20.0, "m")], Annotated[float, within(0.05, 20.0, "m")]] = Field(
         (0.4, 0.6), description="nearest and farthest viewer: charts and registration are for there"

@@ -96,7 +96,6 @@ class EyesEstimate:
     capture_ns: int  # of the newest sample that went into it; 0 with label none
     eyes_m: F64 | None  # (2, 3) left, right; frame `stack`; None with label none
     label: EyesLabel
-    age_ns: int = 0  # time_ns - capture_ns
     sigma_m: float = 0.0  # standard deviation of an axis of the middle between the eyes, at that instant
 
 

@@ -255,7 +255,7 @@ class Tracker:
             return self._past(time_ns)
         age_s = newest.head.age_s(time_ns)
         if age_s > self.settings.hold_s:
-            return EyesEstimate(time_ns, capture_ns, None, "none", time_ns - capture_ns)
+            return EyesEstimate(time_ns, capture_ns, None, "none")
         self._asked_ns = max(self._asked_ns, time_ns)
         label: EyesLabel = "held" if self._lost_ns is not None or age_s > LOSS_S else "predicted"
         ahead_s = min(age_s, HORIZON_S)
@@ -285,7 +285,7 @@ class Tracker:
         error_m2 = imm.spread(head.middle, age_s, acceleration=ACCELERATION, about=middle_m)
         error_m2 += imm.spread(head.half, age_s, acceleration=TURN_ACCELERATION, about=half_m)
         sigma_m = sideways_sigma_m(error_m2, middle_m, panel_m=self._panel_m)
-        return EyesEstimate(time_ns, head.capture_ns, eyes_m, label, time_ns - head.capture_ns, sigma_m)
+        return EyesEstimate(time_ns, head.capture_ns, eyes_m, label, sigma_m)
 
 
 def sideways_sigma_m(error_m2: F64, eye_m: F64, *, panel_m: tuple[float, float]) -> float:

@@ -10,11 +10,10 @@ from dataclasses import replace
 from runtime.clock import NS_PER_S
 from runtime.config import Settings
 from runtime.eyes.calibration import Calibration
-from runtime.eyes.calibration_drift import SeparationWatch
 from runtime.eyes.plausibility import RefusalWatch
 from runtime.eyes.rest import RestWatch
 from runtime.eyes.tracker import Tracker
-from runtime.records import EyePoints, EyesEstimate, SensorFrame
+from runtime.records import EyesEstimate, SensorFrame
 
 log = logging.getLogger("phasestack.viewer")
 
@@ -33,7 +32,6 @@ class Viewer:
         self._nearest_m, self._in_stack_frame = front_m + IN_FRONT_M, in_stack_frame
         self._tracker = self._new_tracker()
         self._rest = _rest_watch(settings)
-        self._drift = SeparationWatch(known_ipd_m=settings.calibration.ipd_m)
         self._refusals = RefusalWatch()
         self._serial_checked = False
         self._captures_ns: deque[int] = deque(maxlen=64)
@@ -45,8 +43,6 @@ class Viewer:
             self._tracker = self._new_tracker()
         if (settings.plan, settings.model) != (before.plan, before.model):
             self._rest = _rest_watch(settings)
-        if settings.calibration != before.calibration:
-            self._drift = SeparationWatch(known_ipd_m=settings.calibration.ipd_m)
 
     def _new_tracker(self) -> Tracker:
         stack = self._settings.stack
@@ -80,18 +76,12 @@ class Viewer:
         if points is not None:
             if line := self._refusals.update(refused):
                 log.warning("%s", line)
-            if not refused:
-                self._believe(points, frame.capture_ns)
+            if not refused and self._rest is not None:
+                self._rest.update(points.eyes_m, capture_ns=frame.capture_ns)
         if not self._serial_checked and serial:
             self._serial_checked = True
             if warning := self._calibration.serial_warning(serial):
                 log.warning("%s", warning)
-
-    def _believe(self, points: EyePoints, capture_ns: int) -> None:
-        if self._rest is not None:
-            self._rest.update(points.eyes_m, capture_ns=capture_ns)
-        if not self._in_stack_frame and (line := self._drift.update(points)):
-            log.warning("%s", line)
 
     def at(self, display_ns: int) -> EyesEstimate:
         """The eyes at the display time of a refresh: what is shown next is aligned to them."""
@@ -109,7 +99,7 @@ class Viewer:
             label = eyes.label if eyes.label == "held" else "rested"
             return replace(eyes, eyes_m=self._rest.place, label=label, sigma_m=self._rest.sigma_m)
         if float(eyes.eyes_m[:, 0].min()) <= self._nearest_m:
-            return EyesEstimate(eyes.time_ns, eyes.capture_ns, None, "none", eyes.age_ns)
+            return EyesEstimate(eyes.time_ns, eyes.capture_ns, None, "none")
         return eyes
 
 
