@@ -14,7 +14,6 @@ from runtime.daemon.pictures import pictures_of
 from runtime.errors import ContextLost
 from runtime.frame.presenter import Presenter
 from runtime.records import RefreshAccount
-from runtime.support import logs
 from runtime.support.version import version
 
 
@@ -62,7 +61,6 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
         "photon_now_ms": (account.photon_ns - account.capture_ns) / NS_PER_MS if account.capture_ns else None,
         "rejected_samples": dict(presenter.viewer.refused),
         "sensor_hz": presenter.viewer.rate_hz if "sensor" not in presenter.missing else None,
-        "log_lines_lost": logs.lost(),
         **stats.rates_now(),
         **stats.summary(stale_inputs=presenter.samples.stale_inputs, nearly=True),
     }

@@ -9,65 +9,39 @@ import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
 from runtime.errors import one_line
 from runtime.support.folders import state_folder
 
-APPLICATION = "phasestack"
-KEPT = 20  # files in a folder; older ones make way
+STEM = "phasestack-error-"
+KEPT = 20  # files in a folder; older ones make way: a service that fails again and again must not fill the disk
 
 
 def written(error: BaseException) -> str:
     """Write the exception down, and answer the line that tells it with the file's name. Never raises."""
-    what = one_line(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
-    text = _report(error)
-    for folder in _folders():
-        try:
-            path = _write(folder, text)
-        except OSError:
-            continue
-        return f"unexpected error ({what}); the whole of it is in {path}"
-    return f"unexpected error ({what}); it could be written down nowhere"
-
-
-def _report(error: BaseException) -> str:
     from runtime.support.version import version
 
-    return (
+    what = one_line(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__)
+    now = datetime.now(UTC)
+    text = (
         f"phasestack {version()}, Python {platform.python_version()}, {platform.platform()}\n"
-        f"{datetime.now(UTC).isoformat(timespec='seconds')}, process {os.getpid()}\n"
+        f"{now.isoformat(timespec='seconds')}, process {os.getpid()}\n"
         f"arguments: {sys.argv[1:]!r}\n\n" + "".join(traceback.format_exception(error))
     )
-
-
-def _folders() -> Iterator[Path]:
-    """Where such a file belongs, the best place first."""
-    yield state_folder()
-    yield Path(tempfile.gettempdir())
-
-
-def _write(folder: Path, text: str) -> Path:
-    """A new file that only its owner reads: a path or a name in it may be private. Raises OSError."""
-    folder.mkdir(parents=True, exist_ok=True)
-    stem = f"{APPLICATION}-error-{datetime.now(UTC):%Y%m%dT%H%M%S}-{os.getpid()}-"
-    file, path = tempfile.mkstemp(".log", stem, folder)
-    with os.fdopen(file, "w", encoding="utf-8", errors="backslashreplace") as opened:
-        opened.write(text)
-    _make_room(folder)
-    return Path(path)
-
-
-def _make_room(folder: Path) -> None:
-    """A service that fails again and again must not fill the disk."""
-    files = sorted(folder.glob(f"{APPLICATION}-error-*.log"))
-    for path in files[:-KEPT]:
-        try:
-            path.unlink()
-        except OSError:
-            return  # another user's
+    for folder in (state_folder(), Path(tempfile.gettempdir())):
+        with contextlib.suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+            # Its owner alone reads it: a path or a name in it may be private.
+            file, path = tempfile.mkstemp(".log", f"{STEM}{now:%Y%m%dT%H%M%S}-{os.getpid()}-", folder)
+            with os.fdopen(file, "w", encoding="utf-8", errors="backslashreplace") as opened:
+                opened.write(text)
+            with contextlib.suppress(OSError):  # another user's
+                for old in sorted(folder.glob(f"{STEM}*.log"))[:-KEPT]:
+                    old.unlink()
+            return f"unexpected error ({what}); the whole of it is in {path}"
+    return f"unexpected error ({what}); it could be written down nowhere"
 
 
 def watch_threads() -> None:

@@ -12,6 +12,7 @@ import queue
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from datetime import datetime
 from logging.handlers import QueueHandler, QueueListener
 from typing import Any, TextIO
@@ -97,28 +98,17 @@ class RateLimit(logging.Filter):
 class _Lines(logging.Handler):
     """Writes lines to a descriptor, and waits for who reads it: used on the listener's thread."""
 
-    def __init__(self, descriptor: int, owner: QueuedLines) -> None:
+    def __init__(self, descriptor: int) -> None:
         super().__init__()
-        self._descriptor, self._owner, self._missed = descriptor, owner, 0  # lines whose loss is not reported yet
+        self._descriptor = descriptor
 
     def createLock(self) -> None:
         """None: one thread uses it, and who shuts logging down must not wait until it is through."""
         self.lock = None
 
     def emit(self, record: logging.LogRecord) -> None:
-        if not self._written(record):
-            self._owner.lost += 1
-        if (missed := self._owner.lost - self._missed) and self._owner.queue.empty():
-            text = f"{missed} log lines were lost: they could not be written"
-            if self._written(logging.LogRecord("phasestack.log", logging.WARNING, "", 0, text, (), None)):
-                self._missed += missed
-
-    def _written(self, record: logging.LogRecord) -> bool:
-        data = self.format(record).encode("utf-8", "backslashreplace") + b"\n"
-        try:
-            return os.write(self._descriptor, data) == len(data)
-        except OSError:  # nobody reads any more, or the disk is full
-            return False
+        with suppress(OSError):  # nobody reads any more, or the disk is full
+            os.write(self._descriptor, self.format(record).encode("utf-8", "backslashreplace") + b"\n")
 
 
 class QueuedLines(QueueHandler):
@@ -127,10 +117,9 @@ class QueuedLines(QueueHandler):
     def __init__(self, descriptor: int, form: logging.Formatter) -> None:
         self.queue: queue.Queue[Any] = queue.Queue(QUEUED_MAX)
         super().__init__(self.queue)
-        self.lost = 0
-        self._lines = _Lines(descriptor, self)
-        self._lines.setFormatter(form)
-        self._listener = QueueListener(self.queue, self._lines)
+        lines = _Lines(descriptor)
+        lines.setFormatter(form)
+        self._listener = QueueListener(self.queue, lines)
         self._listener.start()
 
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
@@ -140,10 +129,8 @@ class QueuedLines(QueueHandler):
         return prepared
 
     def enqueue(self, record: logging.LogRecord) -> None:
-        try:
+        with suppress(queue.Full):
             self.queue.put_nowait(record)
-        except queue.Full:
-            self.lost += 1
 
     def flush(self) -> None:
         """Wait a moment for what is not written yet."""
@@ -176,11 +163,6 @@ def configure(
         root.handlers[:] = [handler]
         root.setLevel(logging.INFO)
         root.propagate = False
-
-
-def lost() -> int:
-    """Lines that could not be written since the logs were configured."""
-    return sum(handler.lost for handler in logging.getLogger(ROOTS[0]).handlers if isinstance(handler, QueuedLines))
 
 
 def flush() -> None:

@@ -232,7 +232,6 @@ def test_where_nobody_reads_its_log_the_display_goes_on_and_it_can_be_ended(
         assert ask([daemon.socket], {"command": command}, timeout_s=30)["ok"]
     before = daemon.status()["presented"]
     assert eventually(lambda: daemon.status()["presented"] > before + 10)
-    assert (daemon.status()["log_lines_lost"] > 0) == (reader == "has died")
     daemon.process.send_signal(signal.SIGTERM)
     assert daemon.process.wait(timeout=60) == 0
     if reader == "never reads":

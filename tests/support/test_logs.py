@@ -93,7 +93,7 @@ def say(text: str) -> None:
     log.info("%s", text, extra={"always": True})
 
 
-def test_a_reader_that_never_reads_holds_up_nobody_and_what_was_lost_is_told_when_it_reads(pipe: Pipe) -> None:
+def test_a_reader_that_never_reads_holds_up_nobody_and_hears_the_rest_when_it_reads(pipe: Pipe) -> None:
     configured(pipe.stream)
     count = 2 * QUEUED_MAX
     longest_s = 0.0
@@ -102,22 +102,18 @@ def test_a_reader_that_never_reads_holds_up_nobody_and_what_was_lost_is_told_whe
         say(f"line {number} " + "x" * 100)
         longest_s = max(longest_s, time.monotonic() - begin_s)
     assert longest_s < 2.0  # without the thread the first full pipe would hold it for ever
-    assert logs.lost() > 0
-    lost = int(pipe.read_until(r"(\d+) log lines were lost")[1])
-    assert lost == logs.lost()
-    assert len(re.findall(r"line \d+ x", pipe.text)) + lost == count
+    pipe.read_until(f"line {QUEUED_MAX} x")
     say("and on")
     pipe.read_until("and on")
 
 
-def test_a_reader_that_is_gone_is_survived_and_counted() -> None:
+def test_a_reader_that_is_gone_is_survived() -> None:
     out, descriptor = os.pipe()
     with open(descriptor, "w", encoding="utf-8") as stream:  # noqa: PTH123
         configured(stream)
         os.close(out)
         say("nobody hears this")
         logs.flush()
-        assert logs.lost() == 1
 
 
 def test_a_process_whose_log_nobody_reads_ends_all_the_same() -> None:
