@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def stability(
-    out: Annotated[Path | None, typer.Option(help="folder for stability.json, the plots and index.html")] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for stability.json")] = None,
     full: Annotated[bool, typer.Option("--full", help="the long cases as well: minutes instead of seconds")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
     record: Annotated[
@@ -34,8 +34,7 @@ def stability(
 
     from runtime.report.machine import describe
     from runtime.report.stability import suite
-    from runtime.report.stability.page import stability_page, stages_of
-    from runtime.support.artifacts import to_json
+    from runtime.support.artifacts import OutputFolder, to_json, write_json
     from runtime.support.progress import progress_bar
 
     started = time.perf_counter()
@@ -44,17 +43,15 @@ def stability(
         cases = suite.run(trials, record=record, progress=tell)
     seconds = time.perf_counter() - started
     failed = [case for case in cases if not case.passed]
-    machine = describe()
-    result = {"cases": [asdict(case) for case in cases], "machine": machine, "seconds": round(seconds, 1)}
+    result = {"cases": [asdict(case) for case in cases], "machine": describe(), "seconds": round(seconds, 1)}
     if out is not None:
-        command = "phasestack stability" + (" --full" if full else "")
-        page = stability_page(cases, machine=machine, seconds=seconds, command=command)
-        page.write(out, record="stability.json", data=result)
+        with OutputFolder(out) as folder:
+            write_json(folder.staging / "stability.json", result)
     if as_json:
         print(to_json(result))
     else:
         console = Console(highlight=False)
-        for stage in stages_of(cases):
+        for stage in dict.fromkeys(case.stage for case in cases):
             own = [case for case in cases if case.stage == stage]
             refused = sum(case.behaviour == "refuses" for case in own)
             bad = sum(not case.passed for case in own)
@@ -67,7 +64,9 @@ def stability(
                 f"FAILS {case.stage}: {case.name}: {case.behaviour}, {error} {case.note}", style="red", soft_wrap=True
             )
         verdict = f"{len(failed)} of {len(cases)} cases fail" if failed else f"all {len(cases)} cases pass"
-        console.print(f"{verdict}, in {seconds:.0f} s" + (f"; see {out / 'index.html'}" if out else ""), soft_wrap=True)
+        console.print(
+            f"{verdict}, in {seconds:.0f} s" + (f"; see {out / 'stability.json'}" if out else ""), soft_wrap=True
+        )
     if failed:
         raise typer.Exit(1)
 

@@ -27,13 +27,12 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of texts under headings. A row's style is `good`, `bad` or empty."""
+    """Rows of texts under headings. A row's style is `good` or empty."""
 
     headings: Sequence[str]
     rows: Sequence[Sequence[str]]
     caption: str = ""
     styles: Sequence[str] = ()
-    folded: bool = False  # long tables open on a click
 
     def styled_rows(self) -> list[tuple[str, Sequence[str]]]:
         styles = [*self.styles, *[""] * (len(self.rows) - len(self.styles))]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -17,8 +16,6 @@ from runtime.report.machine import describe
 from runtime.report.moving import Moving
 from runtime.report.page import Page, Section, Table
 from runtime.report.sections import frontier_section, moving_section
-from runtime.report.stability.page import stability_page
-from runtime.report.stability.trial import Answer, Trial, settle
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = (
@@ -59,14 +56,6 @@ def report_page() -> Page:
     return Page("Error against run time", "A lead.", sections, describe(), "phasestack report")
 
 
-def small_stability_page() -> Page:
-    cases = [
-        settle(Trial("solve", f"CG-30, gap {n}", lambda n=n: Answer(n / 10, 1.0, 10.0**n), measure="of the wanted"))
-        for n in range(1, 6)
-    ]
-    return stability_page(cases, machine=describe(), seconds=1.0, command="phasestack stability")
-
-
 def browse(tmp_path: Path, *arguments: str) -> str:
     assert BROWSER is not None
     profile = f"--user-data-dir={tmp_path / 'profile'}"
@@ -76,7 +65,7 @@ def browse(tmp_path: Path, *arguments: str) -> str:
 
 @pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine")
 def test_a_browser_decodes_every_plot_of_the_page(tmp_path: Path) -> None:
-    page = replace(report_page(), sections=[*report_page().sections, *small_stability_page().sections])
+    page = report_page()
     path = tmp_path / "index.html"
     path.write_text(page.html().replace("</body>", f"<script>{COUNT_DECODED}</script></body>"))
     dom = browse(tmp_path, "--dump-dom", path.as_uri())

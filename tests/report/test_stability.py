@@ -40,6 +40,7 @@ def test_there_are_at_least_120_cases_over_six_stages_and_all_pass(record: tuple
     assert {case["stage"] for case in cases} == STAGES
     assert [case["name"] for case in cases if not case["passed"]] == []
     assert len({(case["stage"], case["name"]) for case in cases}) == len(cases), "a name is used twice"
+    assert json.loads((record[1] / "stability.json").read_text())["cases"] == cases
 
 
 @pytest.mark.slow
@@ -50,15 +51,6 @@ def test_the_long_cases_pass_too(tmp_path: Path) -> None:
     assert {"1000000 updates of a still head", "best: panels of 3840x2160"} <= {case["name"] for case in cases}
     assert [case["name"] for case in cases if not case["passed"]] == []
     assert done.exit_code == 0
-
-
-def test_json_plots_and_page_lie_in_the_folder(record: tuple[dict, Path]) -> None:
-    found, out = record
-    assert json.loads((out / "stability.json").read_text())["cases"] == found["cases"]
-    assert (out / "stiffness.png").read_bytes().startswith(b"\x89PNG")
-    page = (out / "index.html").read_text()
-    assert found["machine"]["processor"] in page
-    assert "://" not in page, "the page must need nothing from elsewhere"
 
 
 STAGES = {
@@ -102,7 +94,6 @@ def test_a_case_that_crashes_fails_by_its_name_and_the_others_go_on(
     assert "FAILS solve: a bad one" in done.output and "ZeroDivisionError" in done.output
     cases = {case["name"]: case for case in json.loads((tmp_path / "stability.json").read_text())["cases"]}
     assert cases["a good one"]["passed"] and not cases["a bad one"]["passed"]
-    assert "a bad one" in (tmp_path / "index.html").read_text()
 
 
 def held(forward: float, limit: float | None, *, tolerance: float = 1.0, floor: float = 0.0) -> Case:

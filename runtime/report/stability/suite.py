@@ -9,22 +9,12 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from runtime.report.stability import (
-    calibration,
-    networks,
-    phases,
-    poses,
-    retina,
-    rpu,
-    solve,
-    tracking,
-)
+from runtime.report.stability import calibration, networks, phases, poses, retina, rpu, solve, tracking
 from runtime.report.stability.calibration import Fit
-from runtime.report.stability.trial import Answer, Case, Trial, settle
+from runtime.report.stability.trial import Case, Trial, settle
 from runtime.support.artifacts import write_text
 
 LIMITS = Path(__file__).with_name("limits.json")  # forward errors by `stage: case`
@@ -33,30 +23,15 @@ SOLVERS = (*networks.MODELS, "sart")
 
 
 def every_trial(fits: Mapping[str, Fit], *, full: bool) -> Iterator[Trial]:
-    """What there is to try. `fits` are the calibration's solvers by rule.
-
-    A stage whose cases can't be made is one case, which fails.
-    """
-    methods = {name: networks.solver(name) for name in SOLVERS}
-    stages: dict[str, Callable[[], Iterable[Trial]]] = {
-        poses.STAGE: poses.trials,
-        rpu.STAGE: rpu.trials,
-        phases.PHASE: phases.trials,
-        retina.STAGE: retina.trials,
-        solve.STAGE: partial(solve.trials, methods),
-        networks.STAGE: partial(networks.trials, full=full),
-        tracking.STAGE: partial(tracking.trials, full=full),
-        calibration.STAGE: partial(calibration.trials, fits),
-    }
-    for stage, make in stages.items():
-        try:
-            yield from make()
-        except Exception as error:  # one stage's fault is not the end of the others
-            yield Trial(stage, "its cases", partial(_raise, error))
-
-
-def _raise(error: Exception) -> Answer:
-    raise RuntimeError(f"{type(error).__name__}: {error}") from error
+    """What there is to try. `fits` are the calibration's solvers by rule."""
+    yield from poses.trials()
+    yield from rpu.trials()
+    yield from phases.trials()
+    yield from retina.trials()
+    yield from solve.trials({name: networks.solver(name) for name in SOLVERS})
+    yield from networks.trials(full=full)
+    yield from tracking.trials(full=full)
+    yield from calibration.trials(fits)
 
 
 def run(
