@@ -16,7 +16,6 @@ from calib.walk import Walk
 from runtime.clock import NS_PER_S, SimulatedClock
 from runtime.config import Settings
 from runtime.errors import InputError
-from runtime.eyes.detect import EyeFinder
 from runtime.sensor.registry import open_sensor
 from runtime.sensor.samples import RecordedSamples
 
@@ -48,7 +47,7 @@ def capture_live(
 def capture_recording(out: Path, settings: Settings, *, source: str) -> dict[str, Any]:
     """A pair for every sample of a recording that knows its true eyes. Raises InputError."""
     chosen = settings.sensor.model_copy(update={"driver": "replay", "source": source, "loop": False})
-    samples = RecordedSamples(open_sensor(chosen, SimulatedClock()), lambda: EyeFinder(settings).find)
+    samples = RecordedSamples(open_sensor(chosen, SimulatedClock()))
     file, pairs, known = PairsFile(out), [], False
     with closing(samples):
         for frame in samples.arrived(sys.maxsize):

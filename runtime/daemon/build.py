@@ -150,7 +150,7 @@ def build_run(
     driver = make_driver()
     samples: Samples
     if simulated:
-        samples = RecordedSamples(driver, make_find)
+        samples = RecordedSamples(driver)
         cleanup.callback(samples.close)
     context = offscreen_context()
     cleanup.callback(context.release)

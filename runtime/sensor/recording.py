@@ -46,7 +46,7 @@ class RecordingWriter:
         from mcap.writer import CompressionType, IndexType, Writer
 
         self._file, self._max_ns, self._on_first = file, round(max_s * NS_PER_S), on_first
-        self._images, self._eye_points = header.colour or header.depth, header.eye_points or header.truth
+        self._images = header.colour or header.depth
         # Eye points alone are so few that plain bytes, the same with every version of a library, are worth more.
         compression = CompressionType.LZ4 if self._images else CompressionType.NONE
         index = IndexType.CHUNK | IndexType.METADATA
@@ -75,8 +75,7 @@ class RecordingWriter:
             messages.append((fmt.COLOUR_TOPIC, fmt.colour_message(frame.colour, capture_ns=at)))
         if self._images and frame.depth_mm is not None:
             messages.append((fmt.DEPTH_TOPIC, fmt.depth_message(frame.depth_mm, capture_ns=at)))
-        if self._eye_points:
-            messages.append((fmt.EYES_TOPIC, fmt.eyes_message(frame)))
+        messages.append((fmt.EYES_TOPIC, fmt.eyes_message(frame)))
         first_ns = at if self._first_ns is None else self._first_ns
         size = sum(len(data) + MESSAGE_OVERHEAD_BYTES for _, data in messages)
         indices = INDEX_BYTES_PER_CHUNK * (self._chunks + len(messages))
@@ -206,22 +205,12 @@ class Recording:
     def samples(self) -> Iterator[SensorFrame]:
         """All whole samples in the order of recording. Raises InputError for a sample that is not one of ours.
 
-        A message of eye points, or of the truth alone, completes a sample. A recording that has none (pictures alone)
-        has a sample for each time stamp: pictures of one stamp that follow each other are one sample, numbered from 1.
+        A message of eye points completes a sample.
         """
         parts: dict[str, Any] = {}
-        stamp_ns: int | None = None  # of the pictures in `parts`
         intrinsics: Intrinsics | None = None
-        number = 0
         for topic, message in self._records():
             try:
-                if topic in (fmt.COLOUR_TOPIC, fmt.DEPTH_TOPIC) and not self.header.eye_points:
-                    at_ns = fmt.capture_ns_of_image(message.data)
-                    if parts and at_ns != stamp_ns:
-                        number += 1
-                        yield SensorFrame(number, stamp_ns or 0, intrinsics=intrinsics, **parts)
-                        parts = {}
-                    stamp_ns = at_ns
                 if topic == fmt.COLOUR_TOPIC:
                     parts["colour"] = fmt.colour_from_message(message.data, max_pixels=LIMITS.pixels)
                 elif topic == fmt.DEPTH_TOPIC:
@@ -233,5 +222,3 @@ class Recording:
                     parts = {}
             except ValueError as error:
                 raise InputError(self.path, topic, f"malformed message: {error}") from None
-        if parts and not self.header.eye_points:
-            yield SensorFrame(number + 1, stamp_ns or 0, intrinsics=intrinsics, **parts)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, WithJsonSchema, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, WithJsonSchema
 
 from runtime.clock import NS_PER_S
 from runtime.records import F64, U8, U16, EyePoints, Intrinsics, SensorFrame
@@ -56,16 +56,6 @@ class EyeSample(Message):
     )
     completed: Literal["", "left", "right"] = Field("", description="the eye that was hidden and filled in")
     true_eyes_m: tuple[Point, Point] | None = Field(None, description="frame `stack`; only where the truth is known")
-
-    @field_validator("covariance_m2")
-    @classmethod
-    def _is_covariance(cls, rows: tuple[Row, Row, Row] | None) -> tuple[Row, Row, Row] | None:
-        matrix = np.array(rows or np.eye(3))
-        if not np.allclose(matrix, matrix.T, rtol=1e-3, atol=0):
-            raise ValueError("is no covariance")
-        if np.linalg.eigvalsh(matrix)[0] < -1e-3 * matrix.max():
-            raise ValueError("is no covariance")
-        return rows
 
 
 class Stamp(Message):
@@ -132,16 +122,16 @@ class RecordingHeader:
 
     driver: str  # name of the driver that delivered it
     serial: str = ""
-    eye_points: bool = True  # every sample says where the eyes are, or that there is no face
     colour: bool = False
     depth: bool = False
     truth: bool = False
 
     def metadata(self) -> dict[str, str]:
         """As MCAP metadata: text to text."""
-        return {"schema_version": str(SCHEMA_VERSION)} | {
-            key: (str(int(value)) if isinstance(value, bool) else value) for key, value in asdict(self).items()
-        }
+        flags = {name: str(int(value)) for name, value in asdict(self).items() if isinstance(value, bool)}
+        # `eye_points`: every sample says where the eyes are, or that there is no face.
+        texts = {"schema_version": str(SCHEMA_VERSION), "driver": self.driver, "serial": self.serial, "eye_points": "1"}
+        return texts | flags
 
     @classmethod
     def from_metadata(cls, metadata: dict[str, str]) -> RecordingHeader:
@@ -202,12 +192,6 @@ def _stamped(capture_ns: int, **values: Any) -> bytes:
     """A message of pictures."""
     seconds, nanoseconds = divmod(capture_ns, NS_PER_S)
     return json.dumps({"timestamp": {"sec": seconds, "nsec": nanoseconds}, "frame_id": "sensor"} | values).encode()
-
-
-def capture_ns_of_image(data: bytes) -> int:
-    """The capture time that a colour or depth message carries. Raises ValueError."""
-    stamp = _read(Stamped, data).timestamp
-    return stamp.sec * NS_PER_S + stamp.nsec
 
 
 def colour_message(colour: U8, *, capture_ns: int) -> bytes:

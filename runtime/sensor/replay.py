@@ -57,7 +57,7 @@ class ReplayDriver(SteppedSensor):
         recording = Recording(self.path)
         header = recording.header
         self.serial = header.serial
-        self.capabilities = Capabilities(header.colour, header.depth, header.eye_points, may_pause=True)
+        self.capabilities = Capabilities(header.colour, header.depth, eye_points=True, may_pause=True)
         self._frames = self._shifted(recording)
         self._next = next(self._frames, None)
 

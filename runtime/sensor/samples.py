@@ -53,17 +53,13 @@ def searched(frame: SensorFrame, find: FindEyes | None, *, keep_images: bool = F
 class RecordedSamples(Samples):
     """A recording on the simulated clock: each sample arrives at its capture plus the configured latency."""
 
-    def __init__(self, driver: Sensor, make_find: Callable[[], FindEyes] | None = None) -> None:
-        """make_find: what finds eyes, made where the recording holds pictures alone.
-
-        Raises InputError where the driver can't be stepped, or the recording can't be read.
-        """
+    def __init__(self, driver: Sensor) -> None:
+        """Raises InputError where the driver can't be stepped, or the recording can't be read."""
         if not isinstance(driver, SteppedSensor):
             raise InputError("run", "--max-speed", f"needs a recording, not the sensor {driver.name}")
         self._driver = driver
         self.stale_inputs = 0
         driver.open()
-        self._find = finder(driver, make_find)
         self.serial = driver.serial
 
     def arrived(self, now_ns: int) -> list[SensorFrame]:
@@ -82,7 +78,7 @@ class RecordedSamples(Samples):
     def _next_while(self, holds: Callable[[SensorFrame], bool]) -> list[SensorFrame]:
         frames = []
         while (following := self._driver.peek()) is not None and holds(following):
-            frames.append(searched(self._driver.next_sample(), self._find))
+            frames.append(searched(self._driver.next_sample(), None))
         return frames
 
     def close(self) -> None:

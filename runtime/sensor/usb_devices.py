@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from runtime.errors import MissingPart, SensorLost
@@ -14,7 +13,6 @@ UDEV_RULE = "70-phasestack-sensors.rules"
 SPEEDS = {1: "low speed (1.5 Mbit/s)", 2: "full speed (12 Mbit/s)", 3: "high speed, USB 2 (480 Mbit/s)"}
 SPEEDS |= {4: "SuperSpeed, USB 3 (5 Gbit/s)", 5: "SuperSpeed+, USB 3 (10 Gbit/s)"}
 SUPER_SPEED = 4
-SYSFS = Path("/sys/bus/usb/devices")
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,18 +41,7 @@ class UsbDevice:
             found.append(f"is on {SPEEDS[self.speed]} and needs USB 3: use a blue port, and its own cable")
         if not self.is_accessible:
             found.append(f"may not be opened: install the udev rule {UDEV_RULE} and plug it in again")
-        if not self.known.driver:
-            found.append(self.known.note)
         return found
-
-
-def _sysfs_serial(device: Any) -> str:
-    """The serial number as the kernel read it, for devices that we may not open."""
-    try:
-        place = f"{device.bus}-{'.'.join(map(str, device.port_numbers))}"
-        return (SYSFS / place / "serial").read_text().strip()
-    except (OSError, TypeError, AttributeError, NotImplementedError):
-        return ""
 
 
 def _described(device: Any, known: KnownDevice) -> UsbDevice:
@@ -65,8 +52,7 @@ def _described(device: Any, known: KnownDevice) -> UsbDevice:
     try:
         serial = device.serial_number or ""
     except (usb.core.USBError, NotImplementedError, ValueError):
-        # pyusb says ValueError ("no langid") where strings may not be read.
-        serial, accessible = _sysfs_serial(device), False
+        accessible = False  # pyusb says ValueError ("no langid") where strings may not be read
     finally:
         usb.util.dispose_resources(device)  # reading the serial opened it; whoever uses it opens it again
     return UsbDevice(known, device.bus or 0, device.address or 0, serial, device.speed or 0, accessible, device)

@@ -124,7 +124,7 @@ def test_after_three_pairs_a_person_is_told_where_to_go(tmp_path: Path) -> None:
 
 def recording(path: Path, places: list[np.ndarray], *, true: bool) -> Path:
     """A second at each place."""
-    with recording_to(path, RecordingHeader(driver="openni2", serial="A1", eye_points=True)) as writer:
+    with recording_to(path, RecordingHeader(driver="openni2", serial="A1")) as writer:
         for number in range(30 * len(places)):
             place = places[number // 30]
             truth = place + np.array([[0.0, -0.03, 0.0], [0.0, 0.03, 0.0]]) if true else None

@@ -93,7 +93,7 @@ def recordings() -> list[bytes]:
             RecordingHeader(driver="b", colour=True, depth=True),
             {"eyes": EYES, "colour": colour, "depth_mm": depth, "intrinsics": camera},
         ),
-        (RecordingHeader(driver="c", eye_points=False, depth=True), {"depth_mm": depth, "intrinsics": camera}),
+        (RecordingHeader(driver="c", depth=True), {"depth_mm": depth, "intrinsics": camera}),
     ):
         held = io.BytesIO()
         writer = RecordingWriter(held, header)

@@ -233,18 +233,6 @@ write(pathlib.Path({str(path)!r}), [sample(k) for k in range(1000)])
     assert len(list(Recording(path).samples())) > 50
 
 
-def test_a_recording_of_pictures_alone_needs_no_empty_messages(tmp_path: Path) -> None:
-    colour, depth = np.full((48, 64, 3), 90, np.uint8), np.full((48, 64), 700, np.uint16)
-    pictures = [(10, {"depth_mm": depth}), (20, {}), (30, {"depth_mm": depth + np.uint16(1)})]
-    frames = [SensorFrame(9, at, colour=colour, intrinsics=CAMERA, **more) for at, more in pictures]
-    write(tmp_path / "p.mcap", frames, RecordingHeader(driver="other", eye_points=False, colour=True, depth=True))
-    assert b"/eyes" not in (tmp_path / "p.mcap").read_bytes()
-    back = list(Recording(tmp_path / "p.mcap").samples())
-    assert [(f.sequence, f.capture_ns) for f in back] == [(1, 10), (2, 20), (3, 30)]
-    assert [None if f.depth_mm is None else int(f.depth_mm[0, 0]) for f in back] == [700, None, 701]
-    assert all(f.colour is not None and f.eyes is None and f.intrinsics == CAMERA for f in back)
-
-
 def bomb(path: Path, *, kind: str, unpacked: int, says: int) -> int:
     """A recording that begins with a chunk which is small, and large when unpacked. Answers the chunk's size."""
     import lz4.frame
@@ -322,12 +310,8 @@ def test_a_capture_time_that_is_none_is_refused_in_one_line(text: str) -> None:
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
 
 
-def test_the_covariance_of_the_eyes_is_kept_and_one_that_is_none_is_refused() -> None:
+def test_the_covariance_of_the_eyes_is_kept() -> None:
     covariance_m2 = np.array([[4e-6, 1e-9, 0.0], [1e-9, 1e-8, 0.0], [0.0, 0.0, 1.2e-8]])
     eyes = EyePoints(np.array([[-0.03, 0, 0.6], [0.03, 0, 0.6]]), np.ones(2), covariance_m2=covariance_m2)
     message = eyes_message(SensorFrame(1, 0, eyes))
     np.testing.assert_allclose(frame_from_eyes_message(message).eyes.covariance_m2, covariance_m2, rtol=1e-3)
-    record = json.loads(message)
-    for wrong in ([1, 2], [[0, 0, 0]] * 2, [[-1, 0, 0], [0, 1, 0], [0, 0, 1]], [[1, 2, 0], [0, 1, 0], [0, 0, 1]], "x"):
-        with pytest.raises(ValueError, match="covariance_m2"):
-            frame_from_eyes_message(json.dumps(record | {"covariance_m2": wrong}).encode())
