@@ -29,9 +29,7 @@ app = typer.Typer(
 
 @app.command()
 def panels(
-    out: Annotated[
-        Path | None, typer.Option(help="folder for the registration; without --photos: for the boards as PNGs")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="folder for the registration")] = None,
     photos: Annotated[Path | None, typer.Option(help="folder of 8 to 20 photographs of the boards")] = None,
     show: Annotated[bool, typer.Option("--show", help="show the boards on the panels until Enter or q")] = False,
     write: Annotated[bool, typer.Option("--write", help="put distances, tilts and homographies into --config")] = False,
@@ -46,8 +44,8 @@ def panels(
 
     Example: phasestack calibrate panels --photos photos --config phasestack.toml --write --out registration
     """
-    if out is None and (photos is not None or not show):
-        raise InputError("calibrate panels", "--out", "is missing")
+    if show == (photos is not None) or (photos is not None and out is None):
+        raise InputError("calibrate panels", "--show", "or --photos with --out: one of them")
     if write and (config is None or photos is None):
         raise InputError("calibrate panels", "--write", "needs --config and --photos")
     settings = _settings(config)
@@ -62,26 +60,16 @@ def panels(
         return
     from calib.board import boards
     from calib.display import grey_layers, open_display, show_until_key
-    from calib.registration_run import write_boards
 
-    stack = settings.stack.stack()
-    if out is not None:
-        summary = write_boards(out, stack)
-        _report(summary, f"{len(summary['files'])} boards in {out}", as_json)
-    if show:
-        show_until_key(open_display(settings), grey_layers(boards(stack)), "the boards of all panels")
+    layers = grey_layers(boards(settings.stack.stack()))
+    show_until_key(open_display(settings), layers, "the boards of all panels")
 
 
 @app.command()
 def grey(
-    out: Annotated[
-        Path | None, typer.Option(help="the panel's LUT, CSV; without --photos and --series: its chart, PNG")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="the panel's LUT, CSV")] = None,
     panel: Annotated[int, typer.Option(help="0 is the rear one; the others are clear", min=0)] = 0,
     photos: Annotated[Path | None, typer.Option(help="folder of two or three photographs of the chart")] = None,
-    series: Annotated[Path | None, typer.Option(help="photometer's CSV: grey, luminance or grey, red, green, blue")] = (
-        None
-    ),
     show: Annotated[bool, typer.Option("--show", help="show the chart on the panel until Enter or q")] = False,
     config: ConfigOption = None,
     as_json: JsonOption = False,
@@ -89,41 +77,29 @@ def grey(
     """Measure what one panel makes of a grey, and invert it to the panel's LUT.
 
     First --show: photograph the chart with any camera from two or three places, exposure locked, the room dark, the
-    whole chart in the picture, nothing cut off. Then --photos. With a photometer: --series, the other panels at zero.
+    whole chart in the picture, nothing cut off. Then --photos.
 
     Example: phasestack calibrate grey --panel 2 --photos photos --out panel-2.csv
     """
-    if photos is not None and series is not None:
-        raise InputError("calibrate grey", "--photos", "or --series, not both")
-    if out is None and (photos is not None or series is not None or not show):
-        raise InputError("calibrate grey", "--out", "is missing")
+    if show == (photos is not None) or (photos is not None and out is None):
+        raise InputError("calibrate grey", "--show", "or --photos with --out: one of them")
     settings = _settings(config)
     stack = settings.stack.stack()
     if panel >= stack.count:
         raise InputError("calibrate grey", "--panel", f"must be 0 to {stack.count - 1}")
-    source = photos or series
-    if source is not None and out is not None:
-        from calib.grey import fit_lut, read_series
+    if photos is not None and out is not None:
+        from calib.grey import fit_lut
         from calib.grey_chart import photographed_series
         from calib.photographs import photographs
 
-        if photos is None:
-            measured = read_series(source)
-        else:
-            measured = photographed_series(photographs(photos), stack, panel=panel, source=str(photos))
-        _report(*fit_lut(out, measured, source=source), as_json)
+        measured = photographed_series(photographs(photos), stack, panel=panel, source=str(photos))
+        _report(*fit_lut(out, *measured), as_json)
         return
     from calib.display import alone, open_display, show_until_key
     from calib.grey_chart import grey_chart
-    from runtime.support.artifacts import write_png
 
-    chart = grey_chart(stack, panel)
-    if out is not None:
-        write_png(out, chart)
-        _report({"file": str(out)}, str(out), as_json)
-    if show:
-        display = open_display(settings, grey_curve=False)
-        show_until_key(display, alone(chart, stack, index=panel), f"the chart of panel {panel}")
+    display = open_display(settings, grey_curve=False)
+    show_until_key(display, alone(grey_chart(stack, panel), stack, index=panel), f"the chart of panel {panel}")
 
 
 @app.command()

@@ -1,4 +1,4 @@
-"""A panel's grey curve: from a short series of luminances to phase against grey, and its inverse, the LUT.
+"""A panel's grey curve: from the luminances of some greys to phase against grey, and its inverse, the LUT.
 
 Between crossed polarizers, with the other panels at zero, a panel of phase p shows L = dark + range·sin²(pi/2·p)
 (EyeReal, (4)). Either the phase or the intensity sin²(pi/2·p) is modelled as B(g^gamma), whichever explains the series
@@ -10,8 +10,6 @@ reach it.
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,19 +17,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel
 from scipy.interpolate import BPoly, PchipInterpolator
 from scipy.optimize import least_squares
 
-from calib.tables import Number, read_table, validated_rows
-from runtime.errors import InputError
 from runtime.optics.malus import intensity_from_phase, phase_from_intensity
-from runtime.panels.lut import COLUMNS
 from runtime.records import F64
 from runtime.support.artifacts import write_text
 
-CHANNELS = ("red", "green", "blue")
-MIN_LEVELS = 4
 MAX_DEGREE = 6
 LUT_ROWS = 256
 EXACT = 1e-14  # mean square, of the range, below which a fit cannot be bettered
@@ -39,7 +31,7 @@ EXACT = 1e-14  # mean square, of the range, below which a fit cannot be bettered
 
 @dataclass(frozen=True, slots=True)
 class GreyCurve:
-    """Phase against grey of one channel."""
+    """Phase against grey of one panel."""
 
     of_intensity: bool  # the polynomial is of the intensity; else of the phase
     gamma: float
@@ -81,25 +73,17 @@ def _coefficients(free: F64) -> F64:
 
 
 def fit_grey_curve(grey: F64, luminance: F64) -> GreyCurve:
-    """The curve of one channel from (n,) greys in [0, 1] and (n,) luminances, n >= 4 different greys.
+    """The curve from (n,) greys from 0 to 1 and (n,) luminances, at least four greys, white brighter than black.
 
     Kind and degree of the polynomial are those of the lowest corrected AIC.
-    Raises ValueError, saying what is wrong with the series.
     """
-    levels = np.unique(grey)
-    if len(levels) < MIN_LEVELS:
-        raise ValueError(f"{len(levels)} grey levels: at least {MIN_LEVELS} are needed")
-    if levels[0] > 0.02 or levels[-1] < 0.98:
-        raise ValueError("the series must reach from black to full white")
-    low, high = float(np.mean(luminance[grey == levels[0]])), float(np.mean(luminance[grey == levels[-1]]))
-    if not high > low:
-        raise ValueError("white is not brighter than black: is the panel's polarizer the wrong way round?")
+    low, high = float(luminance[np.argmin(grey)]), float(luminance[np.argmax(grey)])
     values = (luminance - low) / (high - low)
     best: tuple[float, GreyCurve] | None = None
     for of_intensity in (False, True):
         for degree in range(1, MAX_DEGREE + 1):
             parameters = 3 + degree - 1
-            if degree > 1 and parameters + 2 > len(levels):
+            if degree > 1 and parameters + 2 > len(grey):
                 break
             curve, cost = _fit(grey, values, degree, of_intensity=of_intensity)
             score = _information(cost, count=len(grey), parameters=parameters)
@@ -139,85 +123,18 @@ def _fit(grey: F64, values: F64, degree: int, *, of_intensity: bool) -> tuple[Gr
     return replace(curve, residual=rms), float(2 * fit.cost)
 
 
-def lut_text(curves: tuple[GreyCurve, GreyCurve, GreyCurve]) -> str:
-    """The panel's LUT as the panels read it: 256 rows of phase and grey per channel, all 0 to 1."""
-    phase = np.linspace(0.0, 1.0, LUT_ROWS)
-    greys = [np.maximum.accumulate(curve.grey(phase)) for curve in curves]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for row in zip(phase, *greys, strict=True):
-        writer.writerow([f"{value:.6f}" for value in row])
-    return text.getvalue()
+def fit_lut(out: Path, grey: F64, luminance: F64) -> tuple[dict[str, Any], str]:
+    """Write a panel's LUT, 256 rows of phase and grey from 0 to 1; returns the summary and its text.
 
-
-@dataclass(frozen=True, slots=True)
-class Series:
-    """Measured luminances of one panel."""
-
-    grey: F64  # (n,) in [0, 1]
-    luminance: F64  # (n, 3) red, green, blue, any unit; a grey series has three equal columns
-
-
-class GreyRow(BaseModel):
-    """One luminance of a grey."""
-
-    grey: Number
-    luminance: Number
-
-
-class ColourRow(BaseModel):
-    """The luminances of the three channels at a grey."""
-
-    grey: Number
-    red: Number
-    green: Number
-    blue: Number
-
-
-def read_series(path: Path) -> Series:
-    """CSV with columns grey and luminance, or grey, red, green, blue. Greys above 1 are taken as 0 to 255.
-
-    Raises InputError, naming every row and column that is wrong.
+    grey, luminance: (n,). Raises InputError.
     """
-    table = read_table(path)
-    coloured = set(CHANNELS) <= table.columns
-    rows = [list(row.model_dump().values()) for row in validated_rows(table, ColourRow if coloured else GreyRow)]
-    if not rows:
-        raise InputError(path, "grey", "there are no rows")
-    grey, luminance = np.array(rows)[:, 0], np.array(rows)[:, 1:]
-    grey = grey / (255.0 if grey.max() > 1.0 else 1.0)
-    if grey.min() < 0.0 or grey.max() > 1.0:
-        raise InputError(path, "grey", "must lie between 0 and 1, or 0 and 255")
-    if luminance.min() < 0.0:
-        raise InputError(path, "luminance", "must not be negative")
-    return Series(grey, np.broadcast_to(luminance, (len(grey), 3)))
-
-
-def fit_series(series: Series, source: Path | str) -> tuple[GreyCurve, GreyCurve, GreyCurve]:
-    """Red, green and blue curve. Raises InputError, naming the channel."""
-    curves = []
-    for channel, name in enumerate(CHANNELS):
-        try:
-            curves.append(fit_grey_curve(series.grey, series.luminance[:, channel]))
-        except ValueError as problem:
-            raise InputError(source, name, str(problem)) from None
-    return curves[0], curves[1], curves[2]
-
-
-def fit_lut(out: Path, series: Series, *, source: Path | str) -> tuple[dict[str, Any], str]:
-    """Write a panel's LUT; returns the summary and its text. Raises InputError."""
-    curves = fit_series(series, source)
-    write_text(out, lut_text(curves))
-    channels = dict(zip(CHANNELS, curves, strict=True))
-    lines = [
-        f"{name}: smooth in {'intensity' if curve.of_intensity else 'phase'}, gamma {curve.gamma:.3f}, contrast "
+    curve = fit_grey_curve(grey, luminance)
+    phase = np.linspace(0.0, 1.0, LUT_ROWS)
+    greys = np.maximum.accumulate(curve.grey(phase))
+    rows = [f"{at:.6f},{value:.6f}\n" for at, value in zip(phase, greys, strict=True)]
+    write_text(out, "phase,grey\n" + "".join(rows))
+    text = (
+        f"smooth in {'intensity' if curve.of_intensity else 'phase'}, gamma {curve.gamma:.3f}, contrast "
         f"{1 + curve.span / max(curve.dark, 1e-9 * curve.span):.4g}, residual {100 * curve.residual:.2f}% of the range"
-        for name, curve in channels.items()
-    ]
-    summary = {
-        "file": str(out),
-        "channels": {name: asdict(curve) for name, curve in channels.items()},
-        "residual": max(curve.residual for curve in curves),
-    }
-    return summary, "\n".join([*lines, str(out)])
+    )
+    return {"file": str(out), **asdict(curve)}, f"{text}\n{out}"

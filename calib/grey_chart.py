@@ -13,12 +13,10 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from calib.board import CORNER, TILE, board, marks
 from calib.detect_marks import find_marks
-from calib.grey import Series
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
@@ -90,13 +88,18 @@ def grey_chart(stack: PanelStack, panel: int) -> U8:
     return picture
 
 
-def photographed_series(pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, panel: int, source: str) -> Series:
-    """Relative luminance of every grey from named photographs (h, w) of a panel's chart. Raises InputError."""
+def photographed_series(
+    pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, panel: int, source: str
+) -> tuple[F64, F64]:
+    """Greys from 0 to 1 and their relative luminances, from named photographs (h, w) of a panel's chart.
+
+    Raises InputError.
+    """
     found = [histograms(picture, stack, panel, source=f"{source}, {name}") for name, picture in pictures]
     return measure(found, stack, panel, source=source)
 
 
-def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> NDArray[np.float64]:
+def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F64:
     """(P, 256) shares of the code values in the middle of every patch of a grey photograph (h, w).
 
     Raises InputError.
@@ -125,8 +128,8 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> ND
     return counts
 
 
-def measure(pictures: list[NDArray[np.float64]], stack: PanelStack, panel: int, *, source: str) -> Series:
-    """Relative luminance of every grey from the histograms of one or more photographs with one exposure.
+def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) -> tuple[F64, F64]:
+    """Greys and relative luminances from the histograms of one or more photographs with one exposure.
 
     Fitted together: the camera's tone curve, each photograph's uneven light (a quadratic of its logarithm), and the
     greys. Raises InputError where the greys do not ascend.
@@ -168,4 +171,4 @@ def measure(pictures: list[NDArray[np.float64]], stack: PanelStack, panel: int, 
         problem = f"grey {upper} is darker than grey {lower}: not a grey curve"
         raise InputError(source, "greys", f"{problem} (a reflection, another exposure, a wrong LUT)")
     luminance = dark + (1 - dark) * np.clip(levels, 0.0, None)
-    return Series(np.array(GREYS) / 255, np.repeat(luminance[:, None], 3, axis=1))
+    return np.array(GREYS) / 255, luminance

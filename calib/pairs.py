@@ -4,20 +4,38 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, TypeAdapter, ValidationError
 
-from calib.tables import Number, read_table, validated_rows
 from runtime.errors import InputError
 from runtime.records import F64
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_text
 
 MAX_PAIRS = 1_000_000
+MAX_LISTED = 3  # mistakes that a refusal spells out
+MAX_MAGNITUDE = 1e9  # of a number, in whatever unit
+
+
+def _no_truth_value(value: Any) -> Any:
+    return str(value) if isinstance(value, bool) else value
+
+
+def _bounded(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError("is not finite")
+    if abs(value) > MAX_MAGNITUDE:
+        raise ValueError(f"is beyond {MAX_MAGNITUDE:g}")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_no_truth_value), AfterValidator(_bounded)]
 
 
 class PairRow(BaseModel):
@@ -70,19 +88,60 @@ def read_pairs(path: Path) -> Pairs:
 
     Raises InputError, naming the file and every row and column that is wrong.
     """
-    table = read_table(path)
-    if len(table.rows) > MAX_PAIRS:
-        raise InputError(path, "", f"holds {len(table.rows)} pairs, more than {MAX_PAIRS}")
-    rows = validated_rows(table, PairRow)
+    labels, rows = _read_rows(path)
+    if len(rows) > MAX_PAIRS:
+        raise InputError(path, "", f"holds {len(rows)} pairs, more than {MAX_PAIRS}")
     serials = {row.sensor_serial for row in rows} - {""}
     if len(serials) > 1:
         raise InputError(path, "sensor_serial", f"pairs of different sensors: {', '.join(sorted(serials))}")
     names = tuple(
-        f"{label} ({row.viewpoint})" if row.viewpoint else label
-        for (label, _), row in zip(table.rows, rows, strict=True)
+        f"{label} ({row.viewpoint})" if row.viewpoint else label for label, row in zip(labels, rows, strict=True)
     )
     sensor_m, stack_m = points_of(rows)
     return Pairs(sensor_m, stack_m, names, str(path), "".join(serials))
+
+
+def _read_rows(path: Path) -> tuple[list[str], list[PairRow]]:
+    """Where each pair stands in its file, and the pairs.
+
+    Raises InputError with every row and column that is wrong, the first few spelled out.
+    """
+    text = untrusted_input.read_text(path)
+    if path.suffix.lower() == ".json":
+        value = untrusted_input.parsed_json(text, source=path)
+        items = value.get("pairs") if isinstance(value, dict) else value
+        if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
+            raise InputError(path, "pairs", "must be a list of objects")
+        labels = [f"pair {number}" for number in range(1, len(items) + 1)]
+        columns = {name for item in items for name in item}
+    else:
+        reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
+        try:
+            reader.fieldnames = [name.strip().lower() for name in reader.fieldnames or ()]
+            columns = set(reader.fieldnames)
+            # Nothing in a cell: the value is missing.
+            read = [(f"line {reader.line_num}", {k: v for k, v in row.items() if k and v}) for row in reader]
+        except csv.Error as error:
+            raise InputError(path, f"line {reader.line_num}", f"malformed: {error}") from None
+        labels, items = [label for label, _ in read], [row for _, row in read]
+    missing = [name for name in COLUMNS if name not in columns]
+    if missing:
+        raise InputError(path, missing[0], "column is missing (wanted: " + ", ".join(COLUMNS) + ")")
+    try:
+        return labels, TypeAdapter(list[PairRow]).validate_python(items)
+    except ValidationError as error:
+        wrong = error.errors()
+    listed = [f"{labels[int(one['loc'][0])]}, {one['loc'][1]}: {_problem(one)}" for one in wrong[:MAX_LISTED]]
+    if len(wrong) > MAX_LISTED:
+        listed.append(f"and {len(wrong) - MAX_LISTED} more")
+    raise InputError(path, "", "; ".join(listed))
+
+
+def _problem(error: Any) -> str:
+    if error["type"] == "missing":
+        return "is missing"
+    text = str(error["msg"]).removeprefix("Value error, ") if error["type"] == "value_error" else "is not a number"
+    return f"{text}: {untrusted_input.shown(error['input'])}"
 
 
 def points_of(rows: Iterable[PairRow]) -> tuple[F64, F64]:
@@ -99,7 +158,7 @@ class PairsFile:
         self.path = path
         self.rows: list[PairRow] = []
         if untrusted_input.is_there(path):
-            self.rows = validated_rows(read_table(path), PairRow)
+            self.rows = _read_rows(path)[1]
 
     @property
     def viewpoints(self) -> frozenset[str]:

@@ -10,7 +10,6 @@ import numpy as np
 import tomlkit
 from tomlkit import TOMLDocument
 
-from calib.board import board
 from calib.bundle import Undetermined
 from calib.config_file import put, put_homographies, rewrite
 from calib.detect_marks import find_marks
@@ -18,22 +17,13 @@ from calib.registration import Registration, register_photographs
 from calib.viewpoints import viewing_place_m
 from runtime.config import Settings
 from runtime.errors import InputError
-from runtime.optics.stack import UNEVEN_MOST, PanelStack
+from runtime.optics.stack import UNEVEN_MOST
 from runtime.records import U8
 from runtime.report.page import in_columns
-from runtime.support.artifacts import OutputFolder, write_json, write_png, write_text
+from runtime.support.artifacts import OutputFolder, write_json, write_text
 from runtime.support.progress import status_line
 
 NOTED_TILT_DEG = 0.3
-
-
-def write_boards(out: Path, stack: PanelStack) -> dict[str, Any]:
-    """PNGs `board-N.png`, one for each panel, for a computer that phasestack does not run on."""
-    files = [f"board-{index}.png" for index in range(stack.count)]
-    with OutputFolder(out) as folder:
-        for index, name in enumerate(files):
-            write_png(folder.staging / name, board(stack, index))
-    return {"out": str(out), "files": files}
 
 
 def register_photos(

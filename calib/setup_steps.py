@@ -231,7 +231,7 @@ def _measure_grey(setup: Setup, panel: int) -> float:
     pictures = setup.hardware.photographs(settings, charts, panel=panel, say=setup.say)
     series = photographed_series(pictures, stack, panel=panel, source="photographs")
     path = (setup.out / "grey" / f"panel-{panel}.csv").resolve()
-    summary, text = fit_lut(path, series, source="photographs")
+    summary, text = fit_lut(path, *series)
     setup.write(lambda document: put_lut(document, panel, str(path), panels=stack.count))
     setup.say(f"panel {panel}: taken\n{text}")
     return float(summary["residual"])

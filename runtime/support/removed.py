@@ -58,6 +58,7 @@ REMOVED_COMMANDS: dict[str, str] = {
     "calibrate panels cost": "`calibrate panels` says what is uncertain in mm at the eye",
     "calibrate panels grey": "`calibrate grey`",
     "calibrate panels grey-chart": "`calibrate grey --panel N --show`",
+    "calibrate grey --series": "write the LUT itself: a CSV of phase and grey, 0 to 1",
     "calibrate capture --marks": "capture from the live sensor; recordings that know their true eyes need no marks",
     "calibrate capture --again": "undo (u) takes a pair back; without its row it is asked for again",
     "calibrate charts --show": "`calibrate capture --show` shows each chart on the panels",

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
-from calib.commands import app
-from calib.grey import fit_grey_curve, read_series
-from runtime.errors import InputError
+from calib.grey import fit_grey_curve, fit_lut
 from runtime.panels.lut import measured_curve
-
-run = CliRunner()
 
 
 def luminance(phase: np.ndarray, *, dark: float = 0.5, white: float = 200.0) -> np.ndarray:
@@ -62,47 +56,8 @@ def test_whatever_was_measured_the_curve_ascends(values: list[float]) -> None:
     assert (np.diff(found.phase(np.linspace(0, 1, 200))) >= -1e-12).all()
 
 
-@pytest.mark.parametrize(
-    ("grey", "told", "why"),
-    [
-        ([0, 0.5, 1], [0, 1, 2], "at least 4"),
-        ([0, 0.3, 0.5, 0.6], [0, 1, 2, 3], "from black to full white"),
-        ([0, 0.3, 0.6, 1], [3, 2, 1, 0], "not brighter"),
-        ([0, 0.3, 0.6, 1], [1, 1, 1, 1], "not brighter"),
-    ],
-)
-def test_a_series_that_tells_nothing_is_refused(grey: list[float], told: list[int], why: str) -> None:
-    with pytest.raises(ValueError, match=why):
-        fit_grey_curve(np.array(grey, dtype=float), np.array(told, dtype=float))
-
-
 def test_the_panels_read_the_lut_that_is_written(tmp_path: Path) -> None:
-    grey = np.linspace(0, 255, 17).round()
-    rows = [f"{g:.0f}," + ",".join(f"{luminance((g / 255) ** gamma):.4f}" for gamma in (1.0, 1.5, 2.0)) for g in grey]
-    (tmp_path / "series.csv").write_text("grey,red,green,blue\n" + "\n".join(rows) + "\n")
-    out = tmp_path / "deep" / "lut.csv"
-    result = run.invoke(app, ["grey", "--series", str(tmp_path / "series.csv"), "--out", str(out), "--json"])
-    assert result.exit_code == 0, result.output
-    table = measured_curve(out)
-    phase = np.linspace(0, 1, 256)
-    for channel, gamma in enumerate((1.0, 1.5, 2.0)):
-        np.testing.assert_allclose(table[:, channel], phase ** (1 / gamma), atol=0.02)
-    told = json.loads(result.stdout)
-    assert set(told["channels"]) == {"red", "green", "blue"}
-
-
-@pytest.mark.parametrize(
-    ("text", "wanted"),
-    [
-        ("", "grey: column is missing"),
-        ("grey,red\n", "luminance: column is missing"),
-        ("grey,luminance\n", "there are no rows"),
-        ("grey,luminance\n0,x\n1,\n", "line 2, luminance: is not a number: x; line 3, luminance: is missing"),
-        ("grey,luminance\n0,1\n300,2\n", "grey: must lie"),
-        ("grey,luminance\n0,-1\n1,2\n", "luminance: must not be negative"),
-    ],
-)
-def test_a_wrong_series_is_refused_with_its_place(tmp_path: Path, text: str, wanted: str) -> None:
-    (tmp_path / "s.csv").write_text(text)
-    with pytest.raises(InputError, match=wanted):
-        read_series(tmp_path / "s.csv")
+    grey = np.linspace(0, 1, 13)
+    fit_lut(tmp_path / "deep" / "lut.csv", grey, luminance(grey**1.5))
+    table = measured_curve(tmp_path / "deep" / "lut.csv")
+    np.testing.assert_allclose(table, np.repeat(np.linspace(0, 1, 256)[:, None] ** (1 / 1.5), 3, axis=1), atol=0.02)

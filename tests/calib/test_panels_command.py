@@ -22,7 +22,6 @@ from calib.viewpoints import viewing_place_m
 from runtime.config import Settings, StackGeometry, load_settings
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
-from runtime.support.artifacts import read_image
 from tests.calib.photo_scenes import error_over_panel_px, in_frame_of, simulated_photographs
 
 run = CliRunner()
@@ -168,8 +167,3 @@ def test_a_file_that_is_no_picture_is_named(tmp_path: Path, photos: Path) -> Non
     (photos / "0.jpg").write_bytes(b"not a picture")
     with pytest.raises(InputError, match=r"0\.jpg: is not a photograph"):
         panels("--photos", str(photos), "--out", str(tmp_path / "r"))
-
-
-def test_boards_are_written_one_for_each_panel(tmp_path: Path) -> None:
-    told = panels("--out", str(tmp_path / "b"))
-    assert np.array_equal(read_image(tmp_path / "b" / told["files"][2])[..., 0], board(STACK, 2))

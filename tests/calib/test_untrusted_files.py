@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 
 from calib.config_file import read_document
-from calib.grey import read_series
 from calib.pairs import PairsFile, read_pairs
 from calib.photographs import read_photograph
 from calib.service_files import gather
@@ -21,7 +20,6 @@ from runtime.panels.lut import measured_curve
 
 READERS = {
     "configuration": read_document,
-    "grey series": read_series,
     "pairs": read_pairs,
     "pairs to go on with": PairsFile,
     "photograph": read_photograph,

@@ -22,7 +22,6 @@ import tomlkit
 import trimesh
 from PIL import Image
 
-from calib.grey import fit_series, read_series
 from calib.pairs import read_pairs
 from calib.setup_run import read_progress
 from runtime.clock import MonotonicClock, SimulatedClock
@@ -144,10 +143,7 @@ def pairs() -> list[bytes]:
 
 def tables() -> list[bytes]:
     """What calibration reads besides pairs: the first line tells which reader it is for."""
-    greys = "\n".join(f"{grey},{0.1 + grey**2}" for grey in (0, 64, 128, 192, 255))
     return [
-        b"grey,luminance\n" + greys.encode(),
-        b"grey,red,green,blue\n0,1,1,1\n0.5,2,2,2\n0.7,3,3,3\n1,4,4,4\n",
         b"phase,grey\n0,0\n0.4,0.5\n1,1\n",
         b"phase,red,green,blue\n0,0,0,0\n1,1,1,1\n",
         b'{"done": {"geometry": {"width_m": 0.5}}}',
@@ -155,10 +151,7 @@ def tables() -> list[bytes]:
 
 
 def table(path: Path) -> object:
-    first = path.read_bytes()[:1]
-    if first == b"{":
-        return read_progress(path)
-    return measured_curve(path) if first == b"p" else fit_series(read_series(path), path)
+    return read_progress(path) if path.read_bytes()[:1] == b"{" else measured_curve(path)
 
 
 # Models
