@@ -42,8 +42,6 @@ class Residuals(Lenient):
     """`[residuals]`: how well the pairs fit the matrix, metres, in `stack`."""
 
     rms_m: Annotated[float, Field(ge=0)]
-    max_m: Annotated[float, Field(ge=0)]
-    axis_rms_m: Vector3
     leave_one_out_rms_m: Annotated[float, Field(ge=0)] | None = None
 
 
@@ -72,10 +70,7 @@ class CalibrationFile(Lenient):
     units: Literal["m"] = "m"
     method: str = ""
     date: str = ""
-    sensor_driver: str = ""
     sensor_serial: str = ""
-    panel_ids: tuple[str, ...] = ()
-    pairs: Annotated[int, Field(ge=0)] = 0
     condition: Annotated[float, Field(ge=0)] | None = None
     residuals: Residuals | None = None
     covariance: CovarianceTable | None = None
@@ -94,10 +89,7 @@ class Calibration:
     source: str = "built-in demo"  # the file's name, for messages
     method: str = ""
     date: str = ""
-    sensor_driver: str = ""
     sensor_serial: str = ""  # empty: of no particular device
-    panel_ids: tuple[str, ...] = ()
-    pairs: int = 0
     condition: float | None = None
     residuals: Residuals | None = None
     pivot_m: F64 | None = None  # (3,) frame `stack`
@@ -230,10 +222,7 @@ def load_calibration(path: Path | None) -> Calibration:
         source=source,
         method=parsed.method,
         date=parsed.date,
-        sensor_driver=parsed.sensor_driver,
         sensor_serial=parsed.sensor_serial,
-        panel_ids=parsed.panel_ids,
-        pairs=parsed.pairs,
         condition=parsed.condition,
         residuals=parsed.residuals,
         pivot_m=None if spread is None else np.array(spread.pivot_m),
