@@ -72,8 +72,6 @@ def compare(
 
     Example: phasestack bench compare old.json new.json
     """
-    from rich.console import Console
-
     from runtime.report import benchmark
     from runtime.support.artifacts import to_json
 
@@ -85,18 +83,14 @@ def compare(
         rows = [{"what": change.what, "worse": change.worse, "text": change.text} for change in changes]
         print(to_json({"worse": len(worse), "changes": rows, "times_compared": not busy, "too_busy": busy}))
     else:
-        console = Console(highlight=False, soft_wrap=True)
         for why in busy:
-            console.print(f"times are not compared, the machine was too busy: {why}", style="yellow")
+            print(f"times are not compared, the machine was too busy: {why}")
         speed = after.yardstick_ms / before.yardstick_ms
-        console.print(f"machine: {speed:.2f} times the time of the yardstick; solutions are compared net of it")
+        print(f"machine: {speed:.2f} times the time of the yardstick; solutions are compared net of it")
         for change in sorted(changes, key=lambda change: not change.worse):
-            verdict, style = ("worse ", "red") if change.worse else ("better", "green")
-            console.print(f"{verdict} {change.what}: {change.text}", style=style)
+            print(f"{'worse ' if change.worse else 'better'} {change.what}: {change.text}")
         again = ", but for times, which can't be compared: measure again" if busy else ""
-        ends = (
-            f"{len(worse)} worse, {len(changes) - len(worse)} better" if changes else f"no change beyond noise{again}"
-        )
-        console.print(ends)
+        ends = f"{len(worse)} worse, {len(changes) - len(worse)} better"
+        print(ends if changes else f"no change beyond noise{again}")
     if worse:
         raise typer.Exit(1)

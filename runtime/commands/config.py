@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from typing import Any
-
 
 def config() -> None:
     """Print a complete configuration: every setting, its default and what it means. It is valid TOML.
@@ -13,37 +10,23 @@ def config() -> None:
 
     Example: phasestack config > phasestack.toml
     """
+    import tomlkit
+
     from runtime.config import Settings
 
-    print("# Paths are relative to this file's folder.")
-    print("\n".join(_lines(Settings, Settings(), "")))
-
-
-def _lines(model: Any, values: Any, prefix: str) -> list[str]:
-    """TOML with a comment above each key."""
-    from pydantic import BaseModel
-
-    plain: list[str] = []
-    tables: list[str] = []
-    for name, info in model.model_fields.items():
-        value = getattr(values, name)
-        if isinstance(value, BaseModel):
-            title = f"{prefix}{name}"
-            tables += ["", f"# {info.description or ''}", f"[{title}]", *_lines(type(value), value, f"{title}.")]
-            continue
-        plain.append(f"# {info.description or ''}")
-        text = _toml(value)
-        plain.append(f"# {name} =" if text is None else f"{name} = {text}")
-    return plain + tables
-
-
-def _toml(value: Any) -> str | None:
-    if value is None:
-        return None
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
-    if isinstance(value, tuple | list):
-        return "[" + ", ".join(str(_toml(item)) for item in value) + "]"
-    return json.dumps(value)
+    defaults, document = Settings(), tomlkit.document()
+    document.add(tomlkit.comment("Paths are relative to this file's folder."))
+    for name, values in defaults.model_dump(mode="json").items():
+        document.add(tomlkit.nl())
+        document[name] = table = tomlkit.table()
+        table.add(tomlkit.comment(Settings.model_fields[name].description or ""))
+        for key, value in values.items():
+            table.add(tomlkit.comment(type(getattr(defaults, name)).model_fields[key].description))
+            if value is None:
+                table.add(tomlkit.comment(f"{key} ="))
+            elif isinstance(value, dict):
+                table[key] = inline = tomlkit.inline_table()
+                inline.update(value)
+            else:
+                table[key] = value
+    print(tomlkit.dumps(document), end="")

@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-
-if TYPE_CHECKING:
-    from runtime.commands.doctor_checks import Row
-
-COLOURS = {"ok": "green", "warn": "yellow", "fail": "red", "skip": "dim"}
 
 
 def doctor(
@@ -34,20 +29,8 @@ def doctor(
     if as_json:
         typer.echo(json.dumps({"ok": not failed, "checks": [asdict(row) for row in rows]}))
     else:
-        _print(rows)
+        for row in rows:
+            remedy = f"\n      to do: {row.remedy}" if row.remedy else ""
+            typer.echo(f"{row.state:5} {row.name}: {row.detail}{remedy}")
     if failed:
         raise typer.Exit(1)
-
-
-def _print(rows: list[Row]) -> None:
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(expand=False)
-    for title in ("check", "state", "what was found", "what to do"):
-        table.add_column(title, overflow="fold")  # a path or a command is of no use without its end
-    for row in rows:
-        colour = COLOURS[row.state]
-        table.add_row(row.name, f"[{colour}]{row.state}[/]", escape(row.detail), escape(row.remedy))
-    Console().print(table)

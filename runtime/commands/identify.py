@@ -19,9 +19,6 @@ if TYPE_CHECKING:
 
 def identify(
     config: Annotated[Path | None, typer.Option(help="configuration; without one, every monitor is shown")] = None,
-    panel: Annotated[
-        int | None, typer.Option(min=0, help="show this panel (or monitor) alone; default: one after the other")
-    ] = None,
 ) -> None:
     """Show a panel its index, its monitor, an arrow that should point up, colour bars and its edges.
 
@@ -44,11 +41,8 @@ def identify(
         raise InputError("output", "panels", str(error)) from None
     keys = TerminalKeys(quit_at_end=False)
     try:
-        if panel is not None and panel >= len(cards):
-            raise InputError("identify", "--panel", f"must be 0 to {len(cards) - 1}")
-        order = list(range(len(cards))) if panel is None else [panel]
         windows = WindowKeys(panels)
-        _hold(panels, cards, order, lambda: keys.poll() or windows.poll())
+        _hold(panels, cards, lambda: keys.poll() or windows.poll())
     finally:
         keys.close()
         panels.close()
@@ -70,9 +64,8 @@ def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
     cards = []
     for index, (panel, monitor) in enumerate(zip(mounted, panels.monitors, strict=True)):
         typer.echo(f"panel {index}: {monitor}")
-        place = {0: "rear", stack.count - 1: "front"}.get(index, "between")
         lines = [
-            f"{place}, at x = {stack.x_m[index] * 100:+.1f} cm",
+            f"at x = {stack.x_m[index] * 100:+.1f} cm",
             *str(monitor).replace(" (", "\n(").splitlines(),
             f"mounted at {panel.rotation_deg} degrees, mirroring {panel.mirror}",
         ]
@@ -109,18 +102,16 @@ def every_monitor() -> tuple[PanelSink, list[U8], tuple[Monitor, ...]]:
     output = OutputSettings(kind="windows", panels=bound)
     panels = WindowPanels(output, bound, stack, MonotonicClock(), offscreen_context(), any_shape=True)
     cards = []
-    for index, monitor in enumerate(monitors):
+    for monitor in monitors:
         name = f'edid_serial = "{monitor.serial}"' if monitor.serial else f'connector = "{monitor.connector}"'
         typer.echo(f"{monitor}: [[output.panels]] {name}")
         lines = [monitor.model or "(no name in its EDID)", f"{monitor.width_px} x {monitor.height_px}",
                  "in the configuration:", "[[output.panels]]", name]  # fmt: skip
         cards.append(identity_card(width, height, title=monitor.connector, lines=lines))
-        if not monitor.serial:
-            typer.echo(f"  {monitor.connector} has no EDID serial: monitor {index} is known by its connector only")
     return panels, cards, monitors
 
 
-def _hold(panels: PanelSink, cards: list[U8], order: list[int], poll: Callable[[], Key | None]) -> None:
+def _hold(panels: PanelSink, cards: list[U8], poll: Callable[[], Key | None]) -> None:
     """Show cards again and again, so that closed windows and lost monitors come back; keys go on to the next."""
     import time
 
@@ -128,14 +119,13 @@ def _hold(panels: PanelSink, cards: list[U8], order: list[int], poll: Callable[[
     from runtime.errors import PanelLost
     from runtime.records import PanelFrame
 
-    lost, place, number = "", 0, 0
-    frame = PanelFrame(number, alone(cards, order[place]), number)
-    if len(order) > 1:
-        typer.echo("one panel at a time (Enter, n: the next; p: the one before; q: done)")
+    lost, number = "", 0  # of presses, so that each is another frame
+    shown, layers = 0, alone(cards, 0)
+    typer.echo("one panel at a time (Enter, n: the next; p: the one before; q: done)")
     try:
         while True:
             try:
-                panels.present(frame)
+                panels.present(PanelFrame(number, layers, number))
                 lost = ""
             except PanelLost as error:
                 if str(error) != lost:
@@ -144,10 +134,9 @@ def _hold(panels: PanelSink, cards: list[U8], order: list[int], poll: Callable[[
             key = poll()
             if key is Key.QUIT:
                 return
-            if key in (Key.ACCEPT, Key.NEXT, Key.RIGHT, Key.PREVIOUS, Key.LEFT) and len(order) > 1:
-                place = (place + (-1 if key in (Key.PREVIOUS, Key.LEFT) else 1)) % len(order)
-                number += 1
-                frame = PanelFrame(number, alone(cards, order[place]), number)
+            if key in (Key.ACCEPT, Key.NEXT, Key.RIGHT, Key.PREVIOUS, Key.LEFT):
+                shown = (shown + (-1 if key in (Key.PREVIOUS, Key.LEFT) else 1)) % len(cards)
+                number, layers = number + 1, alone(cards, shown)
             elif key is None:
                 time.sleep(0.05)
     except KeyboardInterrupt:

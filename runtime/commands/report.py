@@ -23,8 +23,6 @@ def report(
 
     Example: phasestack report --pairs my-pairs --out report
     """
-    from rich.console import Console
-
     from runtime.report.assemble import whole_report
     from runtime.support.artifacts import to_json
     from runtime.support.progress import status_line
@@ -48,12 +46,11 @@ def report(
     if as_json:
         print(to_json(record))
         return
-    console = Console(highlight=False, soft_wrap=True)
     for result in sorted(record["methods"], key=lambda r: r["ms_p50"]):
         size = f"{result['width_px']}x{result['height_px']}"
         light = result["light_db"].get("1", float("nan"))
-        console.print(
+        print(
             f"{result['name']:18}{size:>11}{result['ms_p50']:10.1f} ms   "
             f"light {light:6.2f} dB, one ray {result['psnr_db']:6.2f} dB {result['memory_mib']:7.0f} MiB"
         )
-    console.print(f"see {out / 'index.html'}; light, of eyes sure to 1 mm, is the figure to quote")
+    print(f"see {out / 'index.html'}; light, of eyes sure to 1 mm, is the figure to quote")

@@ -30,8 +30,6 @@ def stability(
     import time
     from dataclasses import asdict
 
-    from rich.console import Console
-
     from runtime.report.machine import describe
     from runtime.report.stability import suite
     from runtime.support.artifacts import OutputFolder, to_json, write_json
@@ -50,23 +48,16 @@ def stability(
     if as_json:
         print(to_json(result))
     else:
-        console = Console(highlight=False)
         for stage in dict.fromkeys(case.stage for case in cases):
             own = [case for case in cases if case.stage == stage]
             refused = sum(case.behaviour == "refuses" for case in own)
             bad = sum(not case.passed for case in own)
-            console.print(
-                f"{stage:14}{len(own):4} cases {refused:4} refused {bad:4} failed", style="red" if bad else None
-            )
+            print(f"{stage:14}{len(own):4} cases {refused:4} refused {bad:4} failed")
         for case in failed:
             error = f"error {case.forward_error:.2g}, tolerance {case.tolerance:.2g} ({case.measure})"
-            console.print(
-                f"FAILS {case.stage}: {case.name}: {case.behaviour}, {error} {case.note}", style="red", soft_wrap=True
-            )
+            print(f"FAILS {case.stage}: {case.name}: {case.behaviour}, {error} {case.note}")
         verdict = f"{len(failed)} of {len(cases)} cases fail" if failed else f"all {len(cases)} cases pass"
-        console.print(
-            f"{verdict}, in {seconds:.0f} s" + (f"; see {out / 'stability.json'}" if out else ""), soft_wrap=True
-        )
+        print(f"{verdict}, in {seconds:.0f} s" + (f"; see {out / 'stability.json'}" if out else ""))
     if failed:
         raise typer.Exit(1)
 

@@ -71,6 +71,7 @@ REMOVED_COMMANDS: dict[str, str] = {
     "calibrate report --pairs": "`calibrate solve` writes the pairs into its file",
     "page --host": "`ssh -L 8717:localhost:8717`, or a proxy on the display's machine",
     "identify --seconds": "q ends it",
+    "identify --panel": "n goes to the next panel",
     "identify --ask": "`setup`: its first step asks which monitor is which panel",
     "setup --again": "p goes a step back; every step can be done again",
     "report --no-compare": "take it out: the published network is compared only where `--model FILE.onnx` names it",

@@ -101,7 +101,6 @@ def test_without_a_configuration_every_monitor_tells_how_to_name_it(x: XServer) 
     assert code == 0 and seen
     assert 'EIZ CG2700X (320x180+320+0, serial A1B2-0003): [[output.panels]] edid_serial = "A1B2-0003"' in said
     assert '[[output.panels]] connector = "DUMMY2"' in said
-    assert "DUMMY2 has no EDID serial" in said
 
 
 @pytest.mark.windows
@@ -111,7 +110,7 @@ def test_with_a_configuration_panels_are_shown_as_they_will_be(x: XServer, confi
     def turned() -> bool:
         return tuple(x.panel(2)[HEIGHT_PX - 1 - bars, -13]) == BARS[0]
 
-    code, said, seen = shown_during(x, "--panel", "0", "--config", config, when=turned)
+    code, said, seen = shown_during(x, "--config", config, when=turned)
     assert code == 0 and seen and "panel 0: DUMMY2" in said
 
 
@@ -169,11 +168,6 @@ def test_the_mounting_that_is_answered_shows_the_card_upright(rotation_deg: int,
     direction = tuple(np.rint(seen[:2, :2] @ card_points_up).astype(int))
     arrow = {(0, -1): "up", (0, 1): "down", (-1, 0): "left", (1, 0): "right"}[direction]
     assert mounting_of(arrow, mirrored=mirror == "horizontal") == (rotation_deg, mirror)
-
-
-@pytest.mark.windows
-def test_a_panel_that_is_none_is_refused(x: XServer, config: Path) -> None:
-    assert isinstance(invoke(identify, "--config", config, "--panel", "3").exception, InputError)
 
 
 def test_without_a_screen_it_says_so_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
