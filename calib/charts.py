@@ -11,18 +11,14 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
-from calib.display import FONT, open_display
+from calib.display import open_display
 from calib.viewpoints import IPD_M, Viewpoint
 from runtime.config import Settings
 from runtime.model.predictor import load_predictor
 from runtime.model.still import solve_still
-from runtime.model.visible import visible_boxes
-from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
-from runtime.optics.views import relative_scale_shift
 from runtime.records import F64, U8
 from runtime.support.artifacts import OutputFolder, write_json, write_png
 from runtime.support.progress import tracked
@@ -30,9 +26,6 @@ from runtime.support.progress import tracked
 MODEL = "best"
 LINE_PX = 10.0
 WIDEST_FOV_DEG = 40.0  # horizontal, of the eyes' images, as the published code has it
-CAPTION_SHARE = 0.07  # of the height, for words
-CAPTION_ROOM_M = 0.015  # by which all panels are clear beyond the words: who reads is not there yet
-UNFUSED_M = 0.03  # beside the viewpoint: what lines that do not fuse look like
 
 
 def chart_fov_deg(viewpoint: Viewpoint, stack: PanelStack) -> float:
@@ -78,13 +71,6 @@ class Drawer:
         prediction = solve_still(picture, picture, eyes_m=eyes_m, fov_deg=fov_deg, predictor=self._predictor)
         return np.array(prediction.layers)  # a copy: the predictor uses its own again
 
-    def seen(self, viewpoint: Viewpoint, *, aside_m: float) -> U8:
-        """(h, w, 3) what the right eye sees of a viewpoint's chart from there, or so far to the right of it."""
-        eye_m = viewpoint.eyes_m(self.ipd_m)[1] + np.array([0.0, aside_m, 0.0])
-        fov_deg = chart_fov_deg(viewpoint, self.stack)
-        light = seen_by(eye_m, self.layers(viewpoint), self.stack, fov_deg=fov_deg).image
-        return np.asarray(np.rint(255 * np.clip(light, 0, 1)).astype(np.uint8))
-
     def close(self) -> None:
         """Release the model. May be called twice."""
         if self._predictor is not None:
@@ -93,12 +79,9 @@ class Drawer:
 
 
 def make_charts(out: Path, viewpoints: Sequence[Viewpoint], settings: Settings) -> dict[str, Any]:
-    """Write a PNG for each panel and viewpoint, `charts.json`, and what an eye sees at the first viewpoint and 3 cm
-    beside it. Raises InputError, MissingPart."""
+    """Write a PNG for each panel and viewpoint, and `charts.json`. Raises InputError, MissingPart."""
     charts = []
     with OutputFolder(out) as folder, closing(Drawer(settings)) as drawer:
-        for name, aside_m in (("fused", 0.0), ("unfused", UNFUSED_M)):
-            write_png(folder.staging / f"reference-{name}.png", drawer.seen(viewpoints[0], aside_m=aside_m))
         for viewpoint in tracked("charts", viewpoints):
             files = [f"chart-{viewpoint.name}-layer-{index}.png" for index in range(drawer.stack.count)]
             for name, layer in zip(files, drawer.layers(viewpoint), strict=True):
@@ -115,54 +98,18 @@ def make_charts(out: Path, viewpoints: Sequence[Viewpoint], settings: Settings) 
 
 
 class ChartDisplay:
-    """The panels, showing one viewpoint's chart at a time, with a line of words."""
+    """The panels, showing one viewpoint's chart at a time."""
 
     def __init__(self, settings: Settings) -> None:
         """Opens the panels. Raises InputError, MissingPart, PanelLost."""
         self._drawer = Drawer(settings)
         self.display = open_display(settings, registered=True)
 
-    def show(self, viewpoint: Viewpoint, *, caption: str = "") -> None:
-        """The viewpoint's chart, and a line of words below it. Raises PanelLost."""
-        layers = self._drawer.layers(viewpoint)
-        if caption:
-            eyes_m = viewpoint.eyes_m(self._drawer.ipd_m)
-            layers = captioned(layers, caption, stack=self._drawer.stack, eyes_m=eyes_m)
-        self.display.show(layers)
+    def show(self, viewpoint: Viewpoint) -> None:
+        """The viewpoint's chart. Raises PanelLost."""
+        self.display.show(self._drawer.layers(viewpoint))
 
     def close(self) -> None:
         """Close the panels and the model. May be called twice."""
         self.display.close()
         self._drawer.close()
-
-
-def captioned(layers: U8, text: str, *, stack: PanelStack, eyes_m: F64) -> U8:
-    """(N, H, W, 4) layers with a line of words that eyes (2, 3) about there read: on the middle panel, low down.
-
-    All panels are clear where these eyes look through them at it, and `CAPTION_ROOM_M` around.
-    """
-    shown, middle = layers.copy(), stack.count // 2
-    box, pitch_m = visible_boxes(eyes_m, stack)[middle], stack.height_m / stack.height_px
-    tall_px = round(CAPTION_SHARE * stack.height_px)
-    bottom = box.v1 - round(CAPTION_ROOM_M / 2 / pitch_m)
-    top = max(bottom - tall_px, 0)
-    edges_m = stack.height_m / 2 - np.array([top, bottom]) * pitch_m
-    for index, x_m in enumerate(stack.x_m):
-        seen_m = []
-        for eye_m in eyes_m:
-            scale, shift_m = relative_scale_shift(eye_m, from_x_m=stack.x_m[middle], to_x_m=x_m)
-            seen_m.append(edges_m * scale + shift_m[1])
-        rims_m = np.array([np.max(seen_m) + CAPTION_ROOM_M, np.min(seen_m) - CAPTION_ROOM_M])
-        rows = (stack.height_m / 2 - rims_m) / pitch_m
-        first, last = np.clip(np.rint(rows), 0, stack.height_px).astype(int)
-        shown[index, first:last, :, :3] = 0
-    (long, tall), below = cv2.getTextSize(text, FONT, 1.0, 2)
-    scale = min(0.6 * tall_px / tall, 0.8 * box.width_px / max(long, 1))
-    page = np.zeros((stack.height_px, stack.width_px), np.uint8)
-    place = (
-        round((box.u0 + box.u1 - scale * long) / 2),
-        round((top + bottom + scale * (tall - below)) / 2),
-    )
-    cv2.putText(page, text, place, FONT, scale, 255, max(1, round(2 * scale)), cv2.LINE_AA)
-    shown[middle, top:bottom, :, :3] = page[top:bottom, :, None]
-    return shown

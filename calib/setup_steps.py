@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from calib.config_file import put, put_lut, put_monitors, rewrite
 from calib.grey import fit_lut
 from calib.grey_chart import grey_chart, photographed_series
 from calib.hardware import Say, SetupHardware
-from calib.interview import Interview
 from calib.keys import Key
 from calib.registration_run import register_photos
 from calib.service_files import gather
@@ -23,12 +22,15 @@ from calib.solve_run import solve_file
 from calib.viewpoints import IPD_M
 from runtime.config import Settings, load_settings
 from runtime.errors import InputError
+from runtime.panels.monitors import Monitor
+from runtime.panels.mounting import Arrow, mounting_of
 from runtime.sensor.registry import driver_names
 from runtime.support import untrusted_input
 
 Figures = dict[str, Any]
 MIN_PAIRS = 9
 SERVICE_FOLDER = "/etc/phasestack"
+ARROWS: dict[Key, Arrow] = {Key.UP: "up", Key.DOWN: "down", Key.LEFT: "left", Key.RIGHT: "right"}
 
 
 class Stopped(Exception):
@@ -80,23 +82,47 @@ class Step:
 
 
 def identify(setup: Setup) -> Figures:
-    """Which monitor is which panel, and how each is mounted."""
-    hardware = setup.hardware
-    try:
-        interview = Interview(hardware.monitors(), panels=setup.settings.stack.stack().count, say=setup.say)
-    except ValueError as problem:
-        raise InputError(setup.config, "stack.x_m", str(problem)) from None
-    interview.ask()
-    shown: Any = None
-    while not interview.finished:
-        if shown != (interview.shown, interview.asked):
-            shown = interview.shown, interview.asked
-            hardware.show_card(*shown)
-        interview.press(hardware.key())
-    if not interview.done:
-        raise Stopped
-    setup.write(lambda document: put_monitors(document, interview.tables))
-    return {"text": f"{len(interview.tables)} bound to their monitors"}
+    """Which monitor is which panel, rear to front, and how each is mounted; one monitor at a time shows a card."""
+    hardware, count = setup.hardware, setup.settings.stack.stack().count
+    monitors = hardware.monitors()
+    if len(monitors) < count:
+        raise InputError(setup.config, "stack.x_m", f"{len(monitors)} monitors for {count} panels")
+    free, taken = list(range(len(monitors))), []  # the first of those that are free shows its card
+    tables: list[dict[str, Any]] = []
+
+    def ask(question: str, keys: str, answers: Container[Key]) -> Key:
+        setup.say(f"{monitors[free[0]]} shows its card, the others are clear. {question} ({keys}; q: stop)")
+        hardware.show_card(free[0], [question, f"{keys}; q: stop"])
+        while (key := hardware.key()) not in answers:
+            if key is Key.QUIT:
+                raise Stopped
+        return key
+
+    while len(tables) < count:
+        place = {0: "the rearmost, at the backlight", count - 1: "the front one"}.get(len(tables), "the next one")
+        keys, answers = "Enter: yes, n: another monitor, u: one back", (Key.ACCEPT, Key.NEXT, Key.UNDO)
+        key = ask(f"Is it panel {len(tables)}, {place}?", keys, answers)
+        if key is Key.NEXT:
+            free.append(free.pop(0))
+        elif key is Key.ACCEPT:
+            arrow = ARROWS[ask("Which way does its arrow point, seen from the front?", "arrow keys", ARROWS)]
+            yes_no = (Key.ACCEPT, Key.NEXT)
+            mirrored = ask("Does its writing read rightly?", "Enter: yes, n: it is mirrored", yes_no) is Key.NEXT
+            rotation_deg, mirror = mounting_of(arrow, mirrored=mirrored)
+            named = _name_of(monitors[free[0]], monitors)
+            tables.append(named | {"rotation_deg": rotation_deg, "mirror": mirror})
+            taken.append(free.pop(0))
+        elif taken:
+            free.insert(0, taken.pop())
+            tables.pop()
+    setup.write(lambda document: put_monitors(document, tables))
+    return {"text": f"{count} bound to their monitors"}
+
+
+def _name_of(monitor: Monitor, monitors: Sequence[Monitor]) -> dict[str, Any]:
+    """How a configuration names a monitor: by its serial where no other has it, else by its connector."""
+    alone = [m.serial for m in monitors].count(monitor.serial) == 1
+    return {"edid_serial": monitor.serial} if monitor.serial and alone else {"connector": monitor.connector}
 
 
 @dataclass

@@ -170,8 +170,6 @@ class Walk:
         if way != self._guide:
             self._guide = way
             self._say(way)
-            if self._chart is not None:
-                self._chart.show(self.current, caption=way)
 
     def _go(self, step: int) -> None:
         index = min(max(self._index + step, 0), len(self._left) - 1)

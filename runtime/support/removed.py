@@ -63,7 +63,7 @@ REMOVED_COMMANDS: dict[str, str] = {
     "calibrate capture --again": "undo (u) takes a pair back; without its row it is asked for again",
     "calibrate charts --show": "`calibrate capture --show` shows each chart on the panels",
     "calibrate charts --kind": "charts are for both eyes at once",
-    "calibrate charts --check": "`reference-fused.png` shows what an eye sees",
+    "calibrate charts --check": "`capture --show`: at the viewpoint the lines are single and clean",
     "calibrate solve --rollback": "past versions are beside the file: copy the one you want, as calibration.1.toml",
     "calibrate solve --sensor-unit": "pairs are in metres",
     "calibrate solve --stack-unit": "pairs are in metres",

@@ -5,16 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
-import pytest
 from typer.testing import CliRunner
 
-from calib.charts import captioned, chart_fov_deg, line_picture
+from calib.charts import chart_fov_deg, line_picture
 from calib.commands import app
 from calib.viewpoints import grid
 from runtime.optics.quality import psnr_db
-from runtime.optics.retina import panel_positions, seen_by
+from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import read_image
 
@@ -47,32 +45,5 @@ def test_a_solved_chart_shows_both_eyes_the_picture_from_its_viewpoint_alone(tmp
             errors.append(((seen.image - wanted)[seen.mask] ** 2).ravel())
         return psnr_db(float(np.concatenate(errors).mean()))
 
-    fused, unfused = (read_image(tmp_path / "c" / f"reference-{name}.png") for name in ("fused", "unfused"))
-    assert np.abs(fused - 255 * wanted).mean() < np.abs(unfused - 255 * wanted).mean()
     assert seen_db(0.0) > 16
     assert seen_db(0.0) > 1.5 + max(seen_db(0.03), seen_db(-0.03))
-
-
-@pytest.mark.parametrize("name", ["R40-phi70-theta80", "R50-phi80-theta90", "R60-phi90-theta100"])
-@pytest.mark.parametrize("aside_m", [0.0, 0.07])
-def test_guidance_is_read_through_the_stack_from_about_the_viewpoint(name: str, aside_m: float) -> None:
-    """Where a ray crosses the middle panel's words it is bright, beside them dark, whatever the chart was there."""
-    stack = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 960, 540)
-    viewpoint = next(v for v in grid() if v.name == name)
-    chart = np.full((3, 540, 960, 4), 200, np.uint8)
-    layers = captioned(chart, "7 cm to the right", stack=stack, eyes_m=viewpoint.eyes_m())
-    words = (layers[1, ..., 0] > 200) & (chart[1, ..., 0] != layers[1, ..., 0])
-    rows = np.flatnonzero(words.any(axis=1))
-    paper = np.zeros_like(words)
-    line = slice(rows.min(), rows.max() + 1)
-    paper[line] = cv2.dilate(words.astype(np.uint8), np.ones((7, 7)))[line] == 0
-    for eye_m in viewpoint.eyes_m() + np.array([0.0, aside_m, 0.0]):
-        view = {"fov_deg": 60.0, "width_px": 960, "height_px": 540}
-        seen = seen_by(eye_m, layers, stack, **view)
-        u, v = panel_positions(eye_m, stack, index=1, **view)
-        inside = seen.mask & (u > 1) & (v > 1) & (u < 959) & (v < 539)
-        place = v[inside].astype(int), u[inside].astype(int)
-        light = seen.image[inside].mean(axis=-1)
-        assert words[place].sum() > 100
-        assert np.median(light[words[place]]) > 0.6
-        assert np.percentile(light[paper[place]], 90) < 0.1

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from runtime.eyes.calibration import load_calibration
 from runtime.eyes.demo_geometry import demo_stack_from_sensor
 from runtime.optics.quality import psnr_db
 from runtime.panels import lut
+from runtime.panels.monitors import Monitor
 from runtime.support.artifacts import read_image
 from tests.calib.photo_scenes import in_frame_of
 from tests.optics.carried_rays import seen_along
@@ -261,6 +263,29 @@ def test_panels_already_known_keep_their_registration_when_they_are_identified_a
     config.write_text(text)
     identify(Scripted(tmp_path, keys).setup)
     assert [panel.gamma for panel in load_settings(config).output.panels] == [2.0, 2.0, 2.0]
+
+
+class FourMonitors(SimulatedHardware):
+    """Two of which have the same serial, and one has none."""
+
+    def monitors(self) -> tuple[Monitor, ...]:
+        self.shown: list[int] = []
+        return tuple(
+            Monitor(f"HDMI-{n}", serial, "", 100 * n, 0, 100, 50, 60.0) for n, serial in enumerate(("S", "T", "T", ""))
+        )
+
+    def show_card(self, number: int, words: Sequence[str]) -> None:
+        self.shown.append(number)
+
+
+def test_a_monitor_is_named_by_a_serial_of_its_own_and_an_answer_can_be_taken_back(tmp_path: Path) -> None:
+    taken = [Key.ACCEPT, Key.UP, Key.ACCEPT]
+    pressed = iter([Key.NEXT, *taken, *[Key.NEXT] * 3, Key.UNDO, *[Key.NEXT] * 3, *taken * 3])
+    hardware = FourMonitors(lambda: next(pressed), STACK, say=lambda text: None)
+    identify(Setup(tmp_path / "c.toml", tmp_path / "out", hardware, lambda text: None))
+    assert hardware.shown[:9] == [0, 1, 1, 1, 2, 3, 0, 2, 1], "what is taken is not offered, until it is taken back"
+    panels = load_settings(tmp_path / "c.toml").output.panels
+    assert [panel.edid_serial or panel.connector for panel in panels] == ["S", "HDMI-1", "HDMI-2"]
 
 
 def test_progress_that_is_not_ours_is_refused(tmp_path: Path) -> None:

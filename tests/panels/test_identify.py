@@ -16,14 +16,11 @@ import pytest
 import typer
 from typer.testing import CliRunner, Result
 
-from calib.interview import Interview, identity
-from calib.keys import Key
 from runtime.commands.doctor import doctor
 from runtime.commands.identify import identify
 from runtime.errors import InputError
 from runtime.panels.card import BARS, identity_card
 from runtime.panels.geometry import panel_from_screen
-from runtime.panels.monitors import Monitor
 from runtime.panels.mounting import mounting_of
 from tests.panels.edids import block
 from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, XServer
@@ -131,32 +128,6 @@ def test_keys_go_from_panel_to_panel(x: XServer, config: Path) -> None:
             assert running.wait(timeout=60) == 0
         finally:
             running.kill()
-
-
-MONITORS = [Monitor(f"HDMI-{n}", serial, "", 100 * n, 0, 100, 50, 60.0) for n, serial in enumerate(("S", "T", "T", ""))]
-
-
-def test_a_monitor_is_named_by_a_serial_of_its_own_or_else_by_its_connector() -> None:
-    named = [identity(monitor, MONITORS) for monitor in MONITORS]
-    assert named == [{"edid_serial": "S"}, {"connector": "HDMI-1"}, {"connector": "HDMI-2"}, {"connector": "HDMI-3"}]
-
-
-def test_a_monitor_that_is_taken_is_not_offered_again_and_an_answer_can_be_taken_back() -> None:
-    said: list[str] = []
-    interview = Interview(MONITORS, panels=2, say=said.append)
-    for key in (Key.NEXT, Key.ACCEPT, Key.UP, Key.ACCEPT):
-        interview.press(key)
-    assert interview.shown != 1
-    shown = {interview.shown}
-    for _ in range(5):
-        interview.press(Key.NEXT)
-        shown.add(interview.shown)
-    assert shown == {0, 2, 3}
-    interview.press(Key.UNDO)
-    assert interview.shown == 1
-    assert not interview.tables
-    with pytest.raises(ValueError, match="4 monitors for 5 panels"):
-        Interview(MONITORS, panels=5, say=said.append)
 
 
 @pytest.mark.parametrize("rotation_deg", [0, 90, 180, 270])
