@@ -101,11 +101,6 @@ def film(folder: Path) -> Made:
     return str(folder / "film_sbs.mp4"), ""
 
 
-def live(folder: Path) -> Made:
-    """The same film as a stream would be: decoded beside the run, its newest picture."""
-    return f"live:{film(folder)[0]}", ""
-
-
 def mesh(folder: Path, suffix: str) -> Made:
     """Two coloured shapes."""
     import trimesh
@@ -220,7 +215,7 @@ def placed(folder: Path) -> Made:
 
 KINDS: dict[str, Callable[[Path], Made]] = {
     "picture": picture, "side-by-side": side_by_side, "half-side-by-side": half_side_by_side, "quilt": quilt,
-    "rgbd": rgbd, "film": film, "live": live, "obj": obj, "stl": stl, "splats": splats,
+    "rgbd": rgbd, "film": film, "obj": obj, "stl": stl, "splats": splats,
     "gltf": gltf, "playlist": playlist, "data-set": data_set, "placed": placed,
 }  # fmt: skip
 

@@ -25,7 +25,6 @@ from pydantic import (
 from runtime.errors import InputError, one_line
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.support import untrusted_input
-from runtime.support.live import LIVE
 from runtime.support.plausible import check_text, nearest, socket_path, within
 from runtime.support.plugins import is_plugin
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
@@ -497,10 +496,8 @@ NAMES_OR_PATHS = (("content", "scene"), ("model", "name"))
 def located(name: str, folder: Path) -> str:
     """A name as it is; a path that is relative, seen from a folder. A bare word without a suffix is a name.
 
-    What has a scheme (`rtsp://...`) is no path, nor is a class (`module:Class`); `live:FILE` is one behind its mark.
+    What has a scheme (`rtsp://...`) is no path, nor is a class (`module:Class`).
     """
-    if name.startswith(LIVE) and "://" not in name:
-        return LIVE + located(name.removeprefix(LIVE), folder)
     if "://" in name or is_plugin(name):
         return name
     if not name or "\0" in name or not ("/" in name or Path(name).suffix):

@@ -21,7 +21,6 @@ from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
 from runtime.support import progress, untrusted_input
 from runtime.support.crash import written
-from runtime.support.live import is_live
 from runtime.support.plausible import nearest
 from runtime.support.plugins import is_plugin, plugin_class
 
@@ -65,10 +64,12 @@ def _prepared(file: SceneFile) -> Opener:
             chosen = preset(name, settings.reading)
             return _from_path(replace(file, path=Path(settings.file), preset=chosen))
         return _built_in("demo", file, stands_for=name)
-    if is_live(name):
+    if "://" in name or name.startswith("/dev/video"):
         from runtime.content import stream
 
         return stream.prepare(file)
+    if name.startswith("live:"):
+        raise InputError("content", "scene", f"`live:` is gone: a film plays by its own name, {name[5:]}")
     if is_plugin(name):
         return _plugin(name, file)
     if not untrusted_input.checked_path(name, source="content", field="scene").exists():

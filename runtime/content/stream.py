@@ -1,4 +1,4 @@
-"""Live pictures: a stream, a capture card, or a file played as one; read and decoded alongside by PyAV.
+"""Live pictures: a stream or a capture card, read and decoded alongside by PyAV.
 
 The newest whole picture is shown, for both eyes the same one. What ends is opened again, what stalls or changes its
 size is reported in one line, and the last good picture stays.
@@ -13,7 +13,6 @@ import time
 import weakref
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from queue import Queue
@@ -24,75 +23,41 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.config import ContentSettings
 from runtime.content.base import ContentInfo, ContentSource
-from runtime.content.pictures import CONTAINERS, Layout, ScreenSource, layout_of
+from runtime.content.pictures import Layout, ScreenSource, layout_of
 from runtime.content.placing import SceneFile
 from runtime.errors import ContentFailure, InputError, MissingPart, one_line
 from runtime.records import U8
 from runtime.support import untrusted_input
-from runtime.support.live import LIVE
 from runtime.support.picture_header import check_size
 
 log = logging.getLogger("phasestack.content")
 
 PROTOCOLS = ("rtsp", "rtsps", "rtp", "rtmp", "http", "https", "udp", "tcp", "srt")
-CARRIED_BY = "rtsp,rtsps,rtp,rtmp,http,https,udp,tcp,tls,srt,crypto,data"
+STREAM_OPTIONS = {  # for FFmpeg: nothing is opened but what was named
+    "fflags": "nobuffer",
+    "analyzeduration": "1000000",  # microseconds before the first picture; it would look at five seconds
+    "protocol_whitelist": "rtsp,rtsps,rtp,rtmp,http,https,udp,tcp,tls,srt,crypto,data",
+    "rtsp_transport": "tcp",
+}
 OPEN_S, READ_S = 5.0, 5.0  # a source that does not answer for so long is opened anew
-ANALYSED_US = "1000000"  # of a stream, before its first picture; FFmpeg would look at five seconds
 FIRST_PICTURE_S = 3.0  # that is waited for, where it comes soon
 STALLED_S = 2.0  # without a new picture it is reported
 AGAIN_S, AGAIN_MAX_S = 0.5, 8.0  # between attempts; doubles
-RATES_HZ = (0.5, 240.0)  # of a file; beyond, it lies
-USUAL_STEP_S = 1 / 30
 BEHIND = 8  # packets that wait, from which on all before the newest key picture are left out
 WAITING_MAX = 512  # packets; the oldest make way
-
-
-class Target:
-    """What a live scene's name stands for."""
-
-    def __init__(self, name: str) -> None:
-        """Raises InputError for a protocol that is not taken, or a file that is not there."""
-        self.url = name.removeprefix(LIVE)
-        scheme = self.url.partition("://")[0].lower() if "://" in self.url else ""
-        if scheme and scheme not in PROTOCOLS:
-            raise InputError(
-                "content", "scene", f"{untrusted_input.shown(scheme)}:// is none of {', '.join(PROTOCOLS)}"
-            )
-        self.is_device = re.fullmatch(r"/dev/video\d+", self.url) is not None
-        self.is_file = not scheme and not self.is_device
-        # A password must not be in the status, nor in a log.
-        self.shown = re.sub(r"//[^/@]*@", "//", self.url)
-        self.path = Path(re.sub(r"[?#].*", "", self.url) if scheme else self.url)
-        if self.is_file:
-            with untrusted_input.open_regular(self.url):
-                pass
-
-    def options(self, given: dict[str, str]) -> dict[str, str]:
-        """For FFmpeg: nothing is opened but what was named."""
-        if self.is_device:
-            return dict(given)
-        if self.is_file:
-            return {"protocol_whitelist": "file", "format_whitelist": CONTAINERS + ",mpegts,h264,hevc,mjpeg"}
-        usual = {
-            "fflags": "nobuffer",
-            "analyzeduration": ANALYSED_US,
-            "protocol_whitelist": CARRIED_BY,
-            "rtsp_transport": "tcp",
-        }
-        return usual | given
 
 
 class Feed:
     """A source that is being read, from when this is made until it is closed or forgotten."""
 
-    def __init__(self, target: Target, settings: ContentSettings) -> None:
+    def __init__(self, settings: ContentSettings) -> None:
         """Raises MissingPart without PyAV."""
         try:
             import av
         except ImportError:
             raise MissingPart("live pictures need PyAV: pip install av") from None
         av.logging.set_level(av.logging.PANIC)
-        self.reader = Reader(target, settings)
+        self.reader = Reader(settings)
         threading.Thread(target=self.reader.run, name="stream", daemon=True).start()
         # A scene that was skipped while it was loaded is dropped, and its thread ends with it.
         self.close = weakref.finalize(self, self.reader.ending.set)
@@ -101,14 +66,14 @@ class Feed:
 class Reader:
     """The decoding thread, and the newest picture that it has. Holds no Feed: who forgets that ends this."""
 
-    def __init__(self, target: Target, settings: ContentSettings) -> None:
-        self.shown = target.shown
+    def __init__(self, settings: ContentSettings) -> None:
+        self._url, self._options = settings.scene, settings.stream_options
+        # A password must not be in the status, nor in a log.
+        self.shown = re.sub(r"//[^/@]*@", "//", self._url)
         self.ending, self.first = threading.Event(), threading.Event()
         self.newest: tuple[int, U8] | None = None  # number, (h, w, 4) RGBA
         self.arrived_ns = time.monotonic_ns()
         self.problem = "waiting for its first picture"
-        self._target = target
-        self._options = dict(settings.stream_options)
         self._size: tuple[int, int] | None = None
         self._reported = ""
 
@@ -119,10 +84,7 @@ class Reader:
             problem = self._played()
             if self.ending.is_set():
                 return
-            came = self.newest is not before
-            if self._target.is_file and came and not problem:
-                continue
-            wait_s = AGAIN_S if came else min(2 * wait_s, AGAIN_MAX_S)
+            wait_s = AGAIN_S if self.newest is not before else min(2 * wait_s, AGAIN_MAX_S)
             self._report(problem or "it has ended")
             self.ending.wait(wait_s)
 
@@ -148,35 +110,27 @@ class Reader:
         return ""
 
     def pictures(self) -> Iterator[U8]:
-        """Every picture of a file when it is due; of all else the newest."""
+        """The newest one, whenever there is one."""
         import av
+
+        is_stream = "://" in self._url
+        kind, options = None if is_stream else "v4l2", (STREAM_OPTIONS if is_stream else {}) | self._options
+        with closing(av.open(self._url, format=kind, options=options, timeout=(OPEN_S, READ_S))) as container:
+            yield from self.decoded(container)
+
+    def decoded(self, container: Any) -> Iterator[U8]:
+        """(h, w, 4) of an open `av` container. Raises InputError for too many pixels, or none."""
         from av.video.reformatter import VideoReformatter
 
-        kind = "v4l2" if self._target.is_device else None
-        options = self._target.options(self._options)
-        with closing(av.open(self._target.url, format=kind, options=options, timeout=(OPEN_S, READ_S))) as container:
-            if not container.streams.video or container.streams.video[0].codec_context is None:
-                raise InputError(self.shown, "", "holds no pictures that can be decoded")
-            stream = container.streams.video[0]
-            self._check_size(stream.codec_context.width, stream.codec_context.height)
-            # One for all pictures: made anew, with threads of its own, for each, it took longer than all the rest.
-            reformatter = VideoReformatter()
-            frames = self._when_due if self._target.is_file else self._as_they_come
-            with closing(frames(container, stream)) as these:  # before the container: nobody reads from it any more
-                for frame in these:
-                    yield np.asarray(reformatter.reformat(frame, format="rgba", threads=1).to_ndarray(), np.uint8)
-
-    def _when_due(self, container: Any, stream: Any) -> Generator[Any, None, None]:
-        """A file's frames, at the pace that it says; a usual one where it says nonsense."""
-        rate_hz = float(stream.average_rate or 0)
-        step_s = 1 / rate_hz if RATES_HZ[0] <= rate_hz <= RATES_HZ[1] else USUAL_STEP_S
-        due_s = time.monotonic()
-        for frame in container.decode(stream):
-            self._check_size(frame.width, frame.height)
-            if self.ending.wait(max(0.0, due_s - time.monotonic())):
-                return
-            yield frame
-            due_s = max(due_s, time.monotonic() - step_s) + step_s  # a machine that slept does not race
+        if not container.streams.video or container.streams.video[0].codec_context is None:
+            raise InputError(self.shown, "", "holds no pictures that can be decoded")
+        stream = container.streams.video[0]
+        self._check_size(stream.codec_context.width, stream.codec_context.height)
+        # One for all pictures: made anew, with threads of its own, for each, it took longer than all the rest.
+        reformatter = VideoReformatter()
+        with closing(self._as_they_come(container, stream)) as frames:  # before the container: nobody reads on
+            for frame in frames:
+                yield np.asarray(reformatter.reformat(frame, format="rgba", threads=1).to_ndarray(), np.uint8)
 
     def _as_they_come(self, container: Any, stream: Any) -> Generator[Any, None, None]:
         """The newest frame of a stream, whenever there is one."""
@@ -263,12 +217,14 @@ class _Packets:
 
 def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
     """Begin to read, and wait a moment for the first picture. Raises InputError, MissingPart."""
-    target = Target(file.settings.scene)
-    file = replace(file, path=target.path)
-    layout = layout_of(file.path, file.settings)
+    url = file.settings.scene
+    scheme = url.partition("://")[0].lower()
+    if "://" in url and scheme not in PROTOCOLS:
+        raise InputError("content", "scene", f"{untrusted_input.shown(scheme)}:// is none of {', '.join(PROTOCOLS)}")
+    layout = layout_of(Path(re.sub(r"[?#].*", "", url)), file.settings)
     if layout.kind == "rgbd":
         raise InputError("content", "layout", "rgbd is not for live pictures")
-    feed = Feed(target, file.settings)
+    feed = Feed(file.settings)
     feed.reader.first.wait(FIRST_PICTURE_S)
     return lambda context: LiveSource(feed, layout=layout, file=file)
 

@@ -6,8 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from runtime.support.live import LIVE
-
 if TYPE_CHECKING:
     from runtime.config import ContentSettings
 
@@ -54,8 +52,6 @@ def scene_from_here(name: str) -> str:
 
     What is neither known nor there is left as it is: the daemon says what it knows.
     """
-    if name.startswith(LIVE):
-        return LIVE + _from_here(name.removeprefix(LIVE), tuple)
     return _from_here(name, scene_names)
 
 

@@ -1,4 +1,4 @@
-"""Films made for the tests, and a server that sends one as a stream, as well or badly as it is told."""
+"""A server that sends a stream, as well or badly as it is told."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from fractions import Fraction
-from pathlib import Path
 
 import av
 import numpy as np
@@ -25,17 +24,11 @@ def stereo_picture(number: int, width: int = 160, height: int = 48) -> np.ndarra
     return picture
 
 
-def film(
-    file: str | io.BytesIO,
-    *,
-    kind: str,
-    pictures: int,
-    first: int = 0,
-    size: tuple[int, int] = (160, 48),
-) -> None:
-    """A film of stereo pictures."""
-    with av.open(file, "w", format=kind) as container:
-        stream = container.add_stream("mpeg2video" if kind == "mpegts" else "mpeg4", rate=RATE)
+def transport_stream(pictures: int, *, first: int = 0, size: tuple[int, int] = (160, 48)) -> bytes:
+    """Stereo pictures as MPEG-TS bytes, as cameras and encoders send them."""
+    held = io.BytesIO()
+    with av.open(held, "w", format="mpegts") as container:
+        stream = container.add_stream("mpeg2video", rate=RATE)
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
         stream.bit_rate = 4_000_000
         stream.gop_size = 5
@@ -44,12 +37,6 @@ def film(
             frame.pts, frame.time_base = number, Fraction(1, RATE)
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-
-
-def transport_stream(pictures: int, **options: object) -> bytes:
-    """The same as MPEG-TS bytes, as cameras and encoders send it."""
-    held = io.BytesIO()
-    film(held, kind="mpegts", pictures=pictures, **options)  # type: ignore[arg-type]
     return held.getvalue()
 
 
@@ -94,8 +81,3 @@ def served(data: bytes) -> Iterator[StreamServer]:
         yield server
     finally:
         server.close()
-
-
-def film_file(path: Path, **options: object) -> Path:
-    film(str(path), kind=path.suffix.removeprefix(".").replace("mkv", "matroska"), **options)  # type: ignore[arg-type]
-    return path

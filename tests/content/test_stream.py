@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,11 @@ from runtime.content.base import ContentSource
 from runtime.content.registry import open_content, prepare_content
 from runtime.errors import ContentFailure, InputError, MissingPart
 from runtime.optics.stack import PanelStack
-from runtime.support.live import is_live
 from tests.content.conftest import panel_view
 from tests.waiting import eventually
 
 pytest.importorskip("av")
-from tests.content.streams import film_file, served, transport_stream
+from tests.content.streams import served, transport_stream
 
 EYES = ((0.6, -0.03, 0.0), (0.6, 0.03, 0.0))
 CLOCK = MonotonicClock()
@@ -54,23 +54,21 @@ def level(source: ContentSource, stack: PanelStack) -> int:
     return seen(source, stack)[0][1]
 
 
-def test_a_film_is_played_live_each_eye_its_half_of_one_picture(
-    tmp_path: Path, context: Any, stack: PanelStack
-) -> None:
-    path = film_file(tmp_path / "a_sbs.mkv", pictures=50)
-    source = opened(f"live:{path}", context, stack, layout="auto")
+def test_each_eye_gets_its_half_of_one_picture(context: Any, stack: PanelStack) -> None:
     levels = set()
+    with served(transport_stream(200)) as server:
+        source = opened(server.url, context, stack)
 
-    def moves() -> bool:
-        left, right = seen(source, stack)
-        assert left[0] > 150 and left[2] < 60 and right[2] > 150 and right[0] < 60
-        assert abs(left[1] - right[1]) < 12  # one picture
-        levels.add(left[1] // 8)
-        return len(levels) >= 4
+        def moves() -> bool:
+            left, right = seen(source, stack)
+            assert left[0] > 150 and left[2] < 60 and right[2] > 150 and right[0] < 60
+            assert abs(left[1] - right[1]) < 12  # one picture
+            levels.add(left[1] // 8)
+            return len(levels) >= 4
 
-    assert source.info.moving and eventually(moves, within_s=20)
-    assert source.problem == ""
-    source.close()
+        assert source.info.moving and eventually(moves, within_s=20)
+        assert source.problem == ""
+        source.close()
 
 
 def test_a_stream_that_stalls_and_ends_keeps_its_last_picture_and_is_taken_up_again(
@@ -138,7 +136,7 @@ def test_a_password_is_in_no_name_and_no_log(context: Any, stack: PanelStack, mo
 @pytest.mark.parametrize(
     ("name", "settings", "told"),
     [
-        ("live:/nowhere/a.mkv", {}, "/nowhere/a.mkv: cannot be read"),
+        ("live:film.mp4", {}, "content: scene: `live:` is gone: a film plays by its own name, film.mp4"),
         ("gopher://x", {}, "content: scene: gopher:// is none of rtsp"),
         ("file:///etc/passwd", {}, "content: scene: file:// is none of"),
         ("rtsp://127.0.0.1:9/x", {"layout": "rgbd"}, "content: layout: rgbd is not for live pictures"),
@@ -152,38 +150,22 @@ def test_what_is_no_live_source_is_one_line(
     assert told in str(refused.value)
 
 
-def test_a_playlist_under_a_films_name_opens_nothing_else(
-    tmp_path: Path, context: Any, stack: PanelStack, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(stream, "FIRST_PICTURE_S", 0.3)
-    path = tmp_path / "a.mkv"
-    path.write_text("#EXTM3U\n#EXTINF:1,\nhttp://127.0.0.1:9/x.ts\n")
-    source = opened(f"live:{path}", context, stack)
-    assert eventually(lambda: "tried again" in source.problem)
-    source.close()
-
-
 def test_without_the_extra_the_line_says_what_to_install(
-    tmp_path: Path, context: Any, stack: PanelStack, monkeypatch: pytest.MonkeyPatch
+    context: Any, stack: PanelStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import sys
-
-    path = film_file(tmp_path / "a.mkv", pictures=3)
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(MissingPart, match=r"pip install av"):
-        opened(f"live:{path}", context, stack)
+        opened("tcp://127.0.0.1:9", context, stack)
 
 
-def test_a_scene_that_is_dropped_while_it_loads_ends_its_thread(tmp_path: Path, stack: PanelStack) -> None:
-    path = film_file(tmp_path / "a.mkv", pictures=200)
-    opener = prepare_content(ContentSettings(scene=f"live:{path}"), stack)
-    assert any(thread.name == "stream" for thread in threading.enumerate())
-    del opener
-    assert eventually(lambda: not any(thread.name == "stream" for thread in threading.enumerate()), within_s=20)
+def test_a_scene_that_is_dropped_while_it_loads_ends_its_thread(stack: PanelStack) -> None:
+    with served(transport_stream(200)) as server:
+        opener = prepare_content(ContentSettings(scene=server.url), stack)
+        assert any(thread.name == "stream" for thread in threading.enumerate())
+        del opener
+        assert eventually(lambda: not any(thread.name == "stream" for thread in threading.enumerate()), within_s=20)
 
 
 def test_names_of_live_scenes_are_no_paths(tmp_path: Path) -> None:
     assert located("rtsp://host/a.mkv", tmp_path) == "rtsp://host/a.mkv"
-    assert located("live:a.mkv", tmp_path) == f"live:{tmp_path}/a.mkv"
     assert located("/dev/video0", tmp_path) == "/dev/video0"
-    assert is_live("/dev/video2") and is_live("live:a.mkv") and not is_live("a.mkv")

@@ -6,7 +6,6 @@ import contextlib
 import io
 import json
 import tempfile
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -32,7 +31,6 @@ from runtime.content.pictures import open_frames
 from runtime.content.playlist import read_playlist
 from runtime.content.ply import read_header
 from runtime.content.stream import Reader
-from runtime.content.stream import Target as Live
 from runtime.content.triangles import DrawnPart
 from runtime.daemon.server import StatusServer
 from runtime.errors import PhasestackError
@@ -267,20 +265,12 @@ show = [
 """
 
 
-class Hurried(threading.Event):
-    """Nothing is waited for."""
-
-    def wait(self, timeout: float | None = None) -> bool:
-        return self.is_set()
-
-
 def stream(path: Path) -> object:
-    """Decoded as a live film is, without its thread and its times."""
-    reader = Reader(Live(f"live:{path}"), ContentSettings())
-    reader.ending = Hurried()
+    """Decoded as a stream is, without its thread and its times."""
     av.logging.set_level(av.logging.PANIC)
     try:
-        return sum(1 for _ in islice(reader.pictures(), 5))
+        with av.open(str(path)) as container, contextlib.closing(Reader(ContentSettings()).decoded(container)) as found:
+            return sum(1 for _ in islice(found, 5))
     except (OSError, ValueError, av.error.FFmpegError) as error:  # which its loop tells and tries again
         raise PhasestackError(str(error)[:100].replace("\n", " ")) from None
 
