@@ -69,17 +69,10 @@ def sensor(settings: Settings) -> Iterator[Row]:
         return
     finally:
         driver.close()
-    seen = ""
-    if frame.eyes is None and frame.colour is not None:
-        from runtime.eyes.detect import EyeFinder
-
-        finder = EyeFinder(settings)
-        found = finder.find(frame)
-        seen = f"; a viewer {found.eyes_m[:, 2].mean():.2f} m away" if found is not None else f"; {finder.reason}"
     streams = {"eyes": frame.eyes, "colour": frame.colour, "depth": frame.depth_mm}
     kinds = [name for name, value in streams.items() if value is not None]
     serial = f", serial {driver.serial}" if driver.serial else ""
-    yield Row("sensor", "ok", f"{what} delivers {', '.join(kinds) or 'frames without a face'}{serial}{seen}")
+    yield Row("sensor", "ok", f"{what} delivers {', '.join(kinds) or 'frames without a face'}{serial}")
     calibrated = load_calibration(Path(settings.calibration.file) if settings.calibration.file else None)
     if warning := calibrated.serial_warning(driver.serial):
         yield Row("calibration", "fail", warning, "phasestack calibrate capture, then solve, with this sensor")
@@ -169,7 +162,6 @@ def model(settings: Settings) -> Iterator[Row]:
     """The network loads, its contract fits the stack, and the provider is there."""
     from runtime.model.backends import choose
     from runtime.model.predictor import load_predictor
-    from runtime.model.session import told_nodes
     from runtime.support.gl import offscreen_context
 
     predictor = load_predictor(settings.model.name, settings.stack.stack(), settings.model)
@@ -186,17 +178,7 @@ def model(settings: Settings) -> Iterator[Row]:
     other = settings.model.name not in name and "/" not in settings.model.name
     remedy = f"{settings.model.name} was asked for and does not fit this stack" if other else ""
     yield Row("model", "warn" if other else "ok", f"{name} on {settings.model.provider}", remedy)
-    if predictor.fell_back:
-        count, which = told_nodes(predictor.fell_back)
-        detail = f"{settings.model.provider} leaves {count} to another: {which}"
-        remedy = 'they cross to the processor and back: model.provider = "cpu" may be faster'
-        yield Row("provider", "warn", detail, remedy)
     yield Row("backend", "ok", f"{choice.backend.name} around the network: {choice.why}")
-    if choice.backend.name == "cpu":
-        from runtime.model.compiled import KEPT_IN
-
-        yield Row("kernels", "ok" if KEPT_IN else "warn", f"compiled code is kept in {KEPT_IN or 'no folder'}",
-                  "" if KEPT_IN else "every start compiles it anew: make the user's cache folder writable")  # fmt: skip
 
 
 def calibration(settings: Settings) -> Iterator[Row]:

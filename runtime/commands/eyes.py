@@ -36,6 +36,7 @@ def eyes(
 
     from runtime.commands.eyes_looking import look_at_files, look_at_sensor
     from runtime.config import load_settings
+    from runtime.support.figures import in_words
 
     settings = load_settings(config)
     rows: list[dict[str, Any]] = []
@@ -45,22 +46,9 @@ def eyes(
         look_at_sensor(settings, rows.append, out=out, seconds=JSON_S)
     else:
         with Live() as live:
-            look_at_sensor(settings, lambda row: live.update(_in_words(row)), out=out)
+            look_at_sensor(settings, lambda row: live.update(in_words(row)), out=out)
     if as_json:
         typer.echo(json.dumps({"pictures": rows}))
         return
     for row in rows:
-        typer.echo(_in_words(row))
-
-
-def _in_words(row: dict[str, Any]) -> str:
-    where = row["file"] if row["frame"] is None else f"{row['file']}, frame {row['frame']}"
-    said = [row["reason"]] if row["reason"] else []
-    if row["eyes_m"] is not None:
-        left, right = (" ".join(f"{1e3 * x:.0f}" for x in eye) for eye in row["eyes_m"])
-        said.append(f"left eye {left} mm, right eye {right} mm, frame of the sensor")
-    if row["eyes_px"] is None:
-        return ", ".join([f"{where}: {'the sensor sees eyes' if row['eyes_m'] else 'nobody'}", *said])
-    left, right = (" ".join(f"{x:.1f}" for x in eye) for eye in row["eyes_px"])
-    found = f"{where}: left {left} px, right {right} px, sigma {row['sigma_px']:.2f} px, {row['seen']}"
-    return ", ".join([found, f"{row['ms']:.1f} ms", *said])
+        typer.echo(in_words(row))

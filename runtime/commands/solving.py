@@ -183,8 +183,6 @@ class _Pair:
 def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stack: PanelStack) -> F64:
     """(2, 3) eyes that can be served. Raises InputError, naming the option."""
     for option, eye in (("--left-eye", left_eye), ("--right-eye", right_eye)):
-        if not all(math.isfinite(value) for value in eye):
-            raise InputError("solve", option, "must be three finite numbers")
         if eye[0] <= max(stack.x_m):
             raise InputError("solve", option, f"x = {eye[0]:g} m : not in front of the panels (x > {max(stack.x_m):g})")
     separation_m = math.dist(left_eye, right_eye)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import fcntl
 import grp
 import json
 import logging
@@ -19,7 +18,7 @@ import stat
 import struct
 import threading
 from asyncio import StreamReader, StreamWriter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -69,17 +68,16 @@ class StatusServer:
         self._reading: dict[asyncio.Task[None], None] = {}  # who waits for a whole request, the longest first
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with _locked(path.parent):  # of two that start at once the second finds the first listening
-                _check_dead(path)
-                self._loop = asyncio.new_event_loop()
-                # The mode must hold from the first moment, so it is the mask that makes it, not a later chmod.
-                mask = os.umask(0o117)
-                try:
-                    self._server = self._loop.run_until_complete(
-                        asyncio.start_unix_server(self._serve, path, limit=LINE_MAX_BYTES, backlog=BACKLOG)
-                    )
-                finally:
-                    os.umask(mask)
+            _check_dead(path)
+            self._loop = asyncio.new_event_loop()
+            # The mode must hold from the first moment, so it is the mask that makes it, not a later chmod.
+            mask = os.umask(0o117)
+            try:
+                self._server = self._loop.run_until_complete(
+                    asyncio.start_unix_server(self._serve, path, limit=LINE_MAX_BYTES, backlog=BACKLOG)
+                )
+            finally:
+                os.umask(mask)
             self._own = path.lstat().st_ino
         except OSError as error:
             raise InputError("service", "socket", f"{path} can't be made ({error.strerror or error})") from error
@@ -238,18 +236,6 @@ async def _outcome(command: Command) -> dict[str, Any]:
     if done:
         return answer.result()
     return {"ok": True, "note": f"still loading after {LOADED_WITHIN_S:g} s: ask `phasestack status`"}
-
-
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """A lock on a folder that ends with the process, however it ends; none where the file system has no locks."""
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        with contextlib.suppress(OSError):
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)
 
 
 def _check_dead(path: Path) -> None:

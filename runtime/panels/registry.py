@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 from runtime.clock import Clock
 from runtime.config import OutputSettings, PanelSettings
-from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 
@@ -15,9 +14,7 @@ if TYPE_CHECKING:
 
 
 def panel_settings(settings: OutputSettings, count: int) -> tuple[PanelSettings, ...]:
-    """One table a panel: as configured, or defaults where none is. Raises InputError on a wrong number."""
-    if settings.panels and len(settings.panels) != count:
-        raise InputError("output", "panels", f"has {len(settings.panels)} tables, the stack {count} panels")
+    """One table a panel: as configured, or defaults where none is."""
     return settings.panels or tuple(PanelSettings() for _ in range(count))
 
 

@@ -18,11 +18,12 @@ def lines_of(record: Mapping[str, Any]) -> Iterator[str]:
     for name, value in record.items():
         is_list = isinstance(value, list | tuple) and all(isinstance(item, dict) for item in value)
         for each in value if is_list else (value,):
-            if text := _text(each):
+            if text := in_words(each):
                 yield one_line(f"{name:20} {text}", most=LINE_MAX)
 
 
-def _text(value: Any) -> str:
+def in_words(value: Any) -> str:
+    """A value on one line; empty where there is none."""
     match value:
         case None | False:
             return ""
@@ -31,9 +32,10 @@ def _text(value: Any) -> str:
         case float():
             return f"{value:.4g}"
         case {"p50": median, "p99": most}:  # quantiles
-            return f"{_text(median)} (p99 {_text(most)})" if median is not None else ""
+            return f"{in_words(median)} (p99 {in_words(most)})" if median is not None else ""
         case dict():
-            return ", ".join(f"{name} {text}" for name, item in value.items() if (text := _text(item)))
+            return ", ".join(f"{name} {text}" for name, item in value.items() if (text := in_words(item)))
         case list() | tuple():
-            return " ".join(f"({_text(item)})" if isinstance(item, list | tuple) else _text(item) for item in value)
+            form = "({})" if any(isinstance(item, list | tuple) for item in value) else "{}"
+            return " ".join(form.format(in_words(item)) for item in value)
     return str(value)

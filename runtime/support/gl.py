@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-import resource
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -37,7 +36,7 @@ def offscreen_context() -> moderngl.Context:
     except Exception as error:  # moderngl and glcontext raise plain Exception
         raise MissingPart(
             f"no OpenGL without a screen ({str(error).strip() or 'EGL failed'}): "
-            f"install Debian's packages {DEBIAN_PACKAGES}{_limited()}"
+            f"install Debian's packages {DEBIAN_PACKAGES}"
         ) from None
 
 
@@ -46,12 +45,6 @@ def linked_program(context: moderngl.Context, *, vertex: str, fragment: str) -> 
     in one of them was a segmentation fault."""
     with interrupts_held():
         return context.program(vertex_shader=vertex, fragment_shader=fragment)
-
-
-def _limited() -> str:
-    """What else may be wrong: drivers take hundreds of MiB of addresses, and do not say that there are none."""
-    most, _ = resource.getrlimit(resource.RLIMIT_AS)
-    return "" if most == resource.RLIM_INFINITY else f"; or lift the limit of {most >> 20} MiB (ulimit -v)"
 
 
 @cache

@@ -95,7 +95,7 @@ def test_without_a_file_the_sensor_is_looked_at(tmp_path: Path) -> None:
     write_motion(tmp_path / "second.mcap", "still", seconds=1.0)
     config.write_text('[sensor]\nsource = "second.mcap"\n')
     live = eyes("--config", config)
-    assert live.exit_code == 0 and "left eye" in live.stdout
+    assert live.exit_code == 0 and "eyes_m (" in live.stdout
 
 
 def test_the_benchmark_measures_detection_error_sigma_jitter_and_time(tmp_path: Path) -> None:

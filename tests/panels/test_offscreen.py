@@ -12,11 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from runtime.clock import SimulatedClock
-from runtime.config import OutputSettings, PanelSettings
-from runtime.errors import InputError, PanelLost
+from runtime.config import PanelSettings
+from runtime.errors import PanelLost
 from runtime.optics.alignment import align, shown_layers
 from runtime.optics.stack import PanelStack
-from runtime.panels.registry import open_panels
 from runtime.records import Layers, PanelFrame
 from runtime.support.gl import offscreen_context
 from runtime.support.gl_sharing import ShareGroup
@@ -303,8 +302,3 @@ def test_layers_of_another_group_are_uploaded(sink: DrawnPanels, context: modern
 def aligned(solved: NDArray[np.uint8], flat: NDArray[np.uint8]) -> PanelFrame:
     matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.0, 0.016, 0.03])).solved_from_shown
     return PanelFrame(1, solved, 1, matrices, flat, 1, 0.25)
-
-
-def test_a_wrong_number_of_panel_tables_is_refused(context: moderngl.Context) -> None:
-    with pytest.raises(InputError, match="output: panels"):
-        open_panels(OutputSettings(panels=(PanelSettings(),)), TINY, SimulatedClock(), context)
