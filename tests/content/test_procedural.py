@@ -10,7 +10,6 @@ import pytest
 
 from runtime.content import shapes
 from runtime.content.camera import project
-from runtime.content.images import image_from_view
 from runtime.content.procedural import ProceduralSource
 from runtime.content.scenes import SCENES, Scene, Thing
 from runtime.optics.stack import PanelStack
@@ -71,35 +70,6 @@ def test_the_nearer_of_two_surfaces_hides_the_other(context: Any, stack: PanelSt
         u, v = (int(value) for value in project(view.pixels_from_stack, front[None])[0][0])
         assert picture[v, u].tolist() == [255, 0, 0, 255]
         source.close()
-
-
-@pytest.mark.parametrize("eye", [EYES["ahead"], EYES["near"], EYES["65 degrees to the right"]])
-def test_raster_and_eye_image_agree_under_the_plane_induced_homography(
-    context: Any, stack: PanelStack, eye: tuple[float, ...]
-) -> None:
-    source = ProceduralSource("demo", stack=stack, context=context)
-    raster = panel_view(eye, stack.panel(1), side=0)
-    image = image_view(eye, 1920, 1080, fov_deg=75, side=1)
-    straight = source.render(raster, time_ns=0).copy()
-    seen = source.render(image, time_ns=0)
-    matrix = image_from_view(image.pixels_from_stack, raster.pixels_from_stack, x_m=0.0)
-    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
-    warped = cv2.warpPerspective(
-        cv2.GaussianBlur(seen, (0, 0), 1.0),
-        np.linalg.inv(half) @ matrix @ half,
-        (raster.width_px, raster.height_px),
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-    )
-    inside = cv2.warpPerspective(
-        np.ones(seen.shape[:2], np.uint8), matrix, (raster.width_px, raster.height_px), flags=cv2.WARP_INVERSE_MAP
-    ).astype(bool)
-    blurred = cv2.GaussianBlur(straight, (0, 0), 1.0).astype(float), cv2.GaussianBlur(warped, (0, 0), 1.0).astype(float)
-    right, wrong = blurred[0] - blurred[1], blurred[0] - np.roll(blurred[1], 2, axis=1)
-    assert inside.mean() > 0.3
-    assert (straight[..., 3] > 0).mean() > 0.1
-    assert np.sqrt((right[inside] ** 2).mean()) < 14
-    assert np.sqrt((right[inside] ** 2).mean()) < 0.6 * np.sqrt((wrong[inside] ** 2).mean())
-    source.close()
 
 
 def test_the_same_view_and_time_give_the_same_bytes_in_another_context_too(context: Any, stack: PanelStack) -> None:

@@ -102,26 +102,16 @@ def test_the_picture_agrees_with_an_exact_renderer_of_the_same_equations(
         assert -10 * np.log10(error.mean()) > 40
 
 
-@pytest.mark.parametrize(
-    ("count", "width", "height", "log_scale"),
-    [
-        pytest.param(2000, 320, 180, -3.1, id="2,000 at 320x180"),
-        pytest.param(100_000, 1920, 1080, -4.3, id="100,000 at 1920x1080", marks=pytest.mark.slow),
-    ],
-)
-def test_many_splats_deep_agree_with_the_exact_renderer_for_both_eyes(
-    tmp_path: Path, context: Any, count: int, width: int, height: int, log_scale: float
-) -> None:
+def test_many_splats_deep_agree_with_the_exact_renderer_for_both_eyes(tmp_path: Path, context: Any) -> None:
     """Tens of layers a pixel: what rounding, cut-offs and the order of sorting add up to."""
-    stack = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), width, height)
-    table = splat_table(count)
+    stack = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 320, 180)
+    table = splat_table(2000)
     for axis in range(3):
-        table[f"scale_{axis}"] = np.random.default_rng(axis).normal(log_scale, 0.6, count)
+        table[f"scale_{axis}"] = np.random.default_rng(axis).normal(-3.1, 0.6, 2000)
     source, matrix = placed(written(tmp_path, table), context, stack, depth_m=(-0.1, 0.1))
     for side, eye in enumerate(((0.6, -0.03, 0.05), (0.6, 0.03, 0.05))):
         view = panel_view(eye, stack.panel(1), side=side)
         error = source.render(view, time_ns=0)[..., :3] / 255 - np.clip(exact(table, matrix, view), 0, 1)
-        print(f"{count} splats, {width}x{height}, eye {side}: {-10 * np.log10((error**2).mean()):.1f} dB")
         assert -10 * np.log10((error**2).mean()) > 40
         assert np.abs(error.mean()) < 0.5 / 255
 

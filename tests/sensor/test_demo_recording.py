@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from runtime.evaluation.demo_recording import demo_recording_bytes, samples
-from runtime.eyes.demo_geometry import demo_sensor_from_stack, demo_stack_from_sensor
 from runtime.sensor.replay import demo_recording_path
 
 FRAMES = list(samples())
@@ -30,9 +29,3 @@ def test_there_are_two_dropouts_and_a_blink() -> None:
     assert (ends - starts).tolist() == [6, 24]
     unsure = [f.sequence for f in FRAMES if f.eyes is not None and f.eyes.confidence.max() < 0.3]
     assert len(unsure) == 3 and np.ptp(unsure) == 2
-
-
-def test_the_demo_s_geometry_and_its_inverse_are_rotations() -> None:
-    forward, back = demo_stack_from_sensor(), demo_sensor_from_stack()
-    np.testing.assert_allclose(forward @ back, np.eye(4), atol=1e-12)
-    assert np.linalg.det(forward[:3, :3]) > 0.999999
