@@ -11,11 +11,9 @@ import re
 import threading
 import time
 import weakref
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
-from functools import partial
 from pathlib import Path
-from queue import Queue
 from typing import Any
 
 import numpy as np
@@ -43,8 +41,6 @@ OPEN_S, READ_S = 5.0, 5.0  # a source that does not answer for so long is opened
 FIRST_PICTURE_S = 3.0  # that is waited for, where it comes soon
 STALLED_S = 2.0  # without a new picture it is reported
 AGAIN_S, AGAIN_MAX_S = 0.5, 8.0  # between attempts; doubles
-BEHIND = 8  # packets that wait, from which on all before the newest key picture are left out
-WAITING_MAX = 512  # packets; the oldest make way
 
 
 class Feed:
@@ -128,25 +124,11 @@ class Reader:
         self._check_size(stream.codec_context.width, stream.codec_context.height)
         # One for all pictures: made anew, with threads of its own, for each, it took longer than all the rest.
         reformatter = VideoReformatter()
-        with closing(self._as_they_come(container, stream)) as frames:  # before the container: nobody reads on
-            for frame in frames:
-                yield np.asarray(reformatter.reformat(frame, format="rgba", threads=1).to_ndarray(), np.uint8)
-
-    def _as_they_come(self, container: Any, stream: Any) -> Generator[Any, None, None]:
-        """The newest frame of a stream, whenever there is one."""
-        with closing(_Packets(container, stream)) as arrived:
-            for packets, broken in arrived.batches():
-                if self.ending.is_set():
-                    return
-                if broken:
-                    stream.codec_context.flush_buffers()
-                newest = None
-                for packet in packets:
-                    for frame in packet.decode():
-                        self._check_size(frame.width, frame.height)
-                        newest = frame
-                if newest is not None:
-                    yield newest
+        for frame in container.decode(stream):
+            if self.ending.is_set():
+                return
+            self._check_size(frame.width, frame.height)
+            yield np.asarray(reformatter.reformat(frame, format="rgba", threads=1).to_ndarray(), np.uint8)
 
     def _check_size(self, width_px: int, height_px: int) -> None:
         """Raises InputError for too many pixels; reports a change."""
@@ -163,56 +145,6 @@ class Reader:
             self._reported = problem
             stays = "; the last picture stays" if self.newest is not None else ""
             log.warning("%s: %s%s", self.shown, problem, stays)
-
-
-class _Packets:
-    """A stream's packets, taken in by a thread of their own: who decodes slowly knows that it is behind."""
-
-    def __init__(self, container: Any, stream: Any) -> None:
-        """container: an open `av` container, which nobody else reads."""
-        self._waiting: Queue[Any] = Queue()  # packets, and at the end what ended them, an exception
-        self._broken = False  # something was left out: what follows cannot be decoded on from what was before
-        self._closing = False
-        run = partial(self._run, container.demux(stream))
-        self._thread = threading.Thread(target=run, name="stream packets", daemon=True)
-        self._thread.start()
-
-    def batches(self) -> Iterator[tuple[list[Any], bool]]:
-        """All packets that wait, each time that some do, and whether some were left out before them.
-
-        Ends with the stream. Raises what reading it raised.
-        """
-        end: Exception | None = None
-        while end is None:
-            packets = [self._waiting.get()] + [self._waiting.get() for _ in range(self._waiting.qsize())]
-            broken, self._broken = self._broken, False
-            if isinstance(packets[-1], Exception):
-                end = packets.pop()
-            if len(packets) >= BEHIND:
-                newest_key = max((place for place, packet in enumerate(packets) if packet.is_keyframe), default=0)
-                packets, broken = packets[newest_key:], broken or newest_key > 0
-            if packets:
-                yield packets, broken
-        if not isinstance(end, EOFError):
-            raise end
-
-    def close(self) -> None:
-        """No more is read. Waits for the read that is under way, which has a time limit of its own."""
-        self._closing = True
-        self._thread.join()
-
-    def _run(self, packets: Iterator[Any]) -> None:
-        try:
-            for packet in packets:
-                if self._closing:
-                    return
-                self._waiting.put(packet)
-                if self._waiting.qsize() > WAITING_MAX:
-                    self._waiting.get()
-                    self._broken = True
-            self._waiting.put(EOFError())
-        except Exception as error:  # raised again by who takes
-            self._waiting.put(error)
 
 
 def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
