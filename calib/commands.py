@@ -88,12 +88,11 @@ def grey(
     if panel >= stack.count:
         raise InputError("calibrate grey", "--panel", f"must be 0 to {stack.count - 1}")
     if photos is not None and out is not None:
-        from calib.grey import fit_lut
-        from calib.grey_chart import photographed_series
+        from calib.grey_chart import lut_from_photographs
         from calib.photographs import photographs
 
-        measured = photographed_series(photographs(photos), stack, panel=panel, source=str(photos))
-        _report(*fit_lut(out, *measured), as_json)
+        found = lut_from_photographs(out, photographs(photos), stack, panel=panel, source=str(photos))
+        _report(*found, as_json)
         return
     from calib.display import alone, open_display, show_until_key
     from calib.grey_chart import grey_chart

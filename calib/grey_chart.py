@@ -3,6 +3,9 @@
 Patches of every grey, many of each and scattered, so that an uneven light is separated from the greys; and patches
 of black and white pixels mixed in known shares, whose light is known however the panel's greys are: they measure the
 camera. The board's marks among them tell where each patch lies in a photograph.
+
+Between crossed polarizers, with the other panels at zero, a panel of phase p shows dark + range·sin²(pi/2·p) (EyeReal,
+(4)). That full white is a phase of 1 is assumed: light alone cannot tell a panel that does not reach it.
 """
 
 from __future__ import annotations
@@ -10,16 +13,21 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 from scipy.optimize import least_squares
 
 from calib.board import CORNER, TILE, board, marks
 from calib.detect_marks import find_marks
 from runtime.errors import InputError
+from runtime.optics.malus import phase_from_intensity
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
+from runtime.support.artifacts import write_text
 
 GREYS = tuple(round(255 * step / 12) for step in range(13))
 SHARES = tuple(step / 16 for step in (1, 2, 4, 6, 8, 11, 14))  # of white pixels in a mixed patch
@@ -30,6 +38,7 @@ SAMPLES = 24  # by as many, of a patch
 MIN_MARKS = 4
 FALLS = 0.01  # of the range: a brighter grey that is darker by more is no grey curve
 CLIPPED = 0.02
+LUT_ROWS = 256
 BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
 
 
@@ -88,15 +97,28 @@ def grey_chart(stack: PanelStack, panel: int) -> U8:
     return picture
 
 
-def photographed_series(
-    pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, panel: int, source: str
-) -> tuple[F64, F64]:
-    """Greys from 0 to 1 and their relative luminances, from named photographs (h, w) of a panel's chart.
+def lut_from_photographs(
+    out: Path, pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, panel: int, source: str
+) -> tuple[dict[str, Any], str]:
+    """Write a panel's LUT from named photographs (h, w) of its chart; returns the summary and its text.
 
     Raises InputError.
     """
     found = [histograms(picture, stack, panel, source=f"{source}, {name}") for name, picture in pictures]
-    return measure(found, stack, panel, source=source)
+    intensity, residual = measure(found, stack, panel, source=source)
+    write_lut(out, intensity)
+    summary = {"file": str(out), "grey": GREYS, "intensity": intensity, "residual": residual}
+    return summary, f"{out}: measured to {100 * residual:.2f}%"
+
+
+def write_lut(out: Path, intensity: F64) -> None:
+    """A panel's LUT, 256 rows of phase and grey from 0 to 1, from the intensities (13,) in [0, 1] of `GREYS`."""
+    # The root of the intensity is smooth at both ends, of a bare panel and of a monitor with a tone curve of its own.
+    root = PchipInterpolator(np.array(GREYS) / 255, np.sqrt(np.maximum.accumulate(intensity)))
+    fine, rows = np.linspace(0.0, 1.0, 4097), np.linspace(0.0, 1.0, LUT_ROWS)
+    greys = np.interp(rows, phase_from_intensity(np.clip(root(fine), 0.0, 1.0) ** 2, branch=1), fine)
+    text = "".join(f"{phase:.6f},{grey:.6f}\n" for phase, grey in zip(rows, greys, strict=True))
+    write_text(out, "phase,grey\n" + text)
 
 
 def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F64:
@@ -128,8 +150,9 @@ def histograms(picture: U8, stack: PanelStack, panel: int, *, source: str) -> F6
     return counts
 
 
-def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) -> tuple[F64, F64]:
-    """Greys and relative luminances from the histograms of one or more photographs with one exposure.
+def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) -> tuple[F64, float]:
+    """(13,) intensities of `GREYS`, from 0 to 1, from the histograms of one or more photographs with one exposure, and
+    how far a patch is off them, typically, as a share of its light.
 
     Fitted together: the camera's tone curve, each photograph's uneven light (a quadratic of its logarithm), and the
     greys. Raises InputError where the greys do not ascend.
@@ -164,11 +187,9 @@ def measure(pictures: list[F64], stack: PanelStack, panel: int, *, source: str) 
     start = np.concatenate([[np.log(2.0), 0.0, 0.0, 0.01], inner**2, np.zeros(6 * photographs)])
     fit = least_squares(residuals, start, loss="soft_l1", f_scale=0.05, x_scale="jac", max_nfev=200)
     _, _, _, levels = parts(fit.x)
-    dark = max(float(fit.x[3]), 0.0)
     falls = np.flatnonzero(np.diff(levels) < -FALLS)
     if falls.size:
         lower, upper = GREYS[int(falls[0])], GREYS[int(falls[0]) + 1]
         problem = f"grey {upper} is darker than grey {lower}: not a grey curve"
         raise InputError(source, "greys", f"{problem} (a reflection, another exposure, a wrong LUT)")
-    luminance = dark + (1 - dark) * np.clip(levels, 0.0, None)
-    return np.array(GREYS) / 255, luminance
+    return np.clip(levels, 0.0, 1.0), float(np.median(np.abs(fit.fun)))

@@ -12,8 +12,7 @@ import numpy as np
 from calib.board import boards
 from calib.capture_run import capture_live
 from calib.config_file import put, put_lut, put_monitors, rewrite
-from calib.grey import fit_lut
-from calib.grey_chart import grey_chart, photographed_series
+from calib.grey_chart import grey_chart, lut_from_photographs
 from calib.hardware import Say, SetupHardware
 from calib.keys import Key
 from calib.registration_run import register_photos
@@ -245,7 +244,7 @@ def grey(setup: Setup) -> Figures:
         setup.say("no panel has a curve: gammas stay as they are configured")
         raise Stopped
     which = ", ".join(str(n) for n, has in enumerate(known) if has)
-    return {"text": f"of panels {which}, measured to {100 * max(residuals):.2f}% of the range"}
+    return {"text": f"of panels {which}, measured to {100 * max(residuals):.2f}%"}
 
 
 def _measure_grey(setup: Setup, panel: int) -> float:
@@ -255,11 +254,10 @@ def _measure_grey(setup: Setup, panel: int) -> float:
     charts = np.zeros((stack.count, stack.height_px, stack.width_px), np.uint8)
     charts[panel] = grey_chart(stack, panel)
     pictures = setup.hardware.photographs(settings, charts, panel=panel, say=setup.say)
-    series = photographed_series(pictures, stack, panel=panel, source="photographs")
     path = (setup.out / "grey" / f"panel-{panel}.csv").resolve()
-    summary, text = fit_lut(path, *series)
+    summary, text = lut_from_photographs(path, pictures, stack, panel=panel, source="photographs")
     setup.write(lambda document: put_lut(document, panel, str(path), panels=stack.count))
-    setup.say(f"panel {panel}: taken\n{text}")
+    setup.say(f"panel {panel}: taken, {text}")
     return float(summary["residual"])
 
 
