@@ -80,9 +80,3 @@ def run_traced(folder: Path, *arguments: str) -> tuple[list[str], list[str]]:
 def test_a_command_writes_only_where_it_is_told_and_opens_no_connection(tmp_path: Path, command: str) -> None:
     written, sockets = run_traced(tmp_path, *command.format(out=tmp_path / "out").split())
     assert written == [] and sockets == []
-
-
-@pytest.mark.parametrize("name", ["systemd/phasestack.service", "systemd/phasestack-user.service", "Dockerfile"])
-def test_units_and_image_have_the_switch_too(name: str) -> None:
-    text = (ROOT / name).read_text(encoding="utf-8")
-    assert "ORT_DISABLE_TELEMETRY=1" in text

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from runtime.clock import MonotonicClock
@@ -223,58 +222,6 @@ def test_a_reload_keeps_the_scene_model_and_place_that_were_chosen_until_the_fil
     served.config.write_text(configuration(scene="nowhere.glb"))
     assert not served.asked("reload")["ok"]
     assert served.status()["scene"] == "thin"
-
-
-def test_what_is_paused_stays_and_is_told_and_goes_on(served: Served) -> None:
-    assert served.asked("pause")["ok"]
-    served.rig.settle()  # what was under way comes yet
-    number = served.rig.accounts[-1].solution
-    accounts = served.rig.refreshes(50)
-    assert {account.solution for account in accounts} == {number}
-    assert served.status()["paused"] is True
-    assert served.asked("resume")["ok"]
-    served.rig.refresh_until_solved()
-    assert served.status()["paused"] is False
-
-
-def items(served: Served) -> list[str]:
-    return [item["what"] for item in served.run.plan_items()]
-
-
-def test_the_plan_follows_the_viewer_and_the_content(served: Served) -> None:
-    solver = served.run.parts.solver
-    served.rig.plan.eyes_m = np.array([[0.135, 0.43, 0.0], [0.09, 0.47, 0.0]])  # the right eye is off by 79.2 degrees
-    served.rig.refresh_until_solved(times=10)
-    before = items(served)
-    assert "the right eye" not in before
-    served.rig.plan.eyes_m = np.array([[0.123, 0.43, 0.0], [0.078, 0.47, 0.0]])  # 80.6 degrees
-    served.rig.refresh_until(lambda: "the right eye" in items(served))
-    served.rig.refresh_until(lambda: solver.plan.eyes == (True, False))
-    served.rig.refresh_until(lambda: served.rig.presenter.last.solution.seeing == (True, False))
-    assert "the right eye" in [item["what"] for item in served.run.summary()["plan"]]
-    served.rig.plan.eyes_m = np.array([[0.7, -0.031, 0.0], [0.7, 0.031, 0.0]])
-    served.rig.refresh_until(lambda: solver.plan.eyes == (True, True))
-    assert served.asked("scene", "moving")["ok"]
-    served.rig.refreshes(2)
-    assert "render and inference" in before
-    assert "render and inference" not in [item["what"] for item in served.status()["plan"]]
-
-
-def test_a_head_at_rest_costs_no_solution_whatever_its_sensor_s_noise(served: Served) -> None:
-    served.rig.plan.sway_m, served.rig.plan.noise_m = 0.0, 0.0015
-    served.rig.refresh_until(lambda: served.rig.accounts[-1].eyes_label == "rested")
-    served.rig.settle()  # its last solution comes
-    served.rig.settle()
-    accounts = served.rig.refreshes(200)
-    assert [account.inference for account in accounts] == ["reused"] * 200
-    assert all(account.presented for account in accounts)
-    assert {account.eyes_label for account in accounts} == {"rested"}
-    assert len({account.eyes_m.tobytes() for account in accounts}) == 1
-    (item,) = [item for item in served.run.plan_items() if item["what"] == "render and inference"]
-    assert item["saves_ms"] > 0
-    assert item["costs_db"] is None  # what the eyes would have seen of a fresh solution is not known here
-    served.rig.plan.eyes_m = served.rig.plan.eyes_m + np.array([0.0, 0.02, 0.0])
-    served.rig.refresh_until_solved()
 
 
 def test_a_command_that_fails_in_a_way_that_nobody_expected_is_refused_and_the_run_goes_on(

@@ -32,21 +32,6 @@ def test_it_does_not_run_as_root() -> None:
     assert f"useradd --system --uid 990 --gid {users[-1]}" in " ".join(of("RUN"))
 
 
-def test_dependencies_come_from_the_lock_alone() -> None:
-    installs = [command for value in of("RUN") for command in value.split("&&") if "pip install" in command]
-    assert installs
-    for command in installs:
-        assert "-r requirements/runtime.lock" in command or "--no-deps" in command
-        assert "--no-cache-dir" in command
-
-
-def test_what_is_copied_is_there() -> None:
-    for value in of("COPY"):
-        if not value.startswith("--from="):
-            for source in value.split()[:-1]:
-                assert (ROOT / source).exists(), source
-
-
 def apt_packages() -> list[str]:
     (command,) = [part for value in of("RUN") for part in value.split("&&") if "apt-get install" in part]
     assert "--no-install-recommends" in command

@@ -114,22 +114,6 @@ def test_of_a_window_of_the_plan_nothing_else_crosses(outputs: dict[str, Any], c
         assert layers[0].std() > 1
 
 
-def test_of_a_head_on_its_side_nothing_else_crosses(outputs: dict[str, Any], crossing: Crossing) -> None:
-    with Rig(model=MODEL, tracker=HELD, **outputs) as rig:
-        rig.plan.eyes_m = np.array([[0.7, 0.0, -0.031], [0.7, 0.0, 0.031]])
-        rig.refresh_until(lambda: rig.presenter.last is not None and on_its_side(rig.presenter.last.solution))
-        rig.refresh_until_solved()
-        crossing.assert_only_the_network_s(rig, solutions=4)
-        assert on_its_side(left_in_textures(rig))
-
-
-def on_its_side(solution: Solution | None) -> bool:
-    if solution is None or solution.solved_for_m is None:
-        return False
-    across_m = np.abs(solution.solved_for_m[1] - solution.solved_for_m[0])
-    return bool(across_m[2] > across_m[1])
-
-
 def left_in_textures(rig: Rig) -> Solution:
     """What is shown, which a solver left for the panels to sample."""
     solution: Solution = rig.presenter.last.solution  # type: ignore[union-attr]

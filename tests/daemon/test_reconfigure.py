@@ -116,42 +116,6 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
 SCENE, MODEL = {"content": {"scene": "sparse"}}, {"model": {"name": "balanced"}}
 
 
-def test_all_of_a_change_is_one_new_state(bench: Bench, tmp_path: Path) -> None:
-    before = bench.state
-    change = bench.change(settings(**SCENE, **MODEL, tracker={"hold_s": 2.0}))
-    bench.advance(change)
-    assert bench.state.version == before.version + 1
-    assert (bench.state.content.info.name, bench.state.predictor.name) == ("sparse", "balanced")
-    assert bench.state.settings.tracker.hold_s == 2.0
-
-
-def test_nothing_changes_until_all_of_it_is_ready(bench: Bench) -> None:
-    bench.gate.clear()
-    before = bench.state
-    change = bench.change(settings(**SCENE, **MODEL))
-    assert eventually(lambda: bool(bench.models), within_s=PATIENCE_S)
-    for _ in range(5):
-        assert change.advance(bench.parts) is False
-        bench.solve()
-    assert bench.state is before
-    assert change.progress == "loading model balanced"
-    bench.gate.set()
-    bench.advance(change)
-    assert bench.state.content.info.name == "sparse"
-
-
-BAD = {"content": {"scene": "no-such-scene"}}
-
-
-def test_where_a_part_can_t_be_had_everything_stays(bench: Bench) -> None:
-    before = bench.state
-    change = bench.change(settings(**BAD, **MODEL))
-    bench.advance(change)
-    assert "no-such-scene" in change.problem and "\n" not in change.problem
-    assert bench.state is before and not bench.models
-    bench.solve()
-
-
 @pytest.mark.parametrize("fails", ["uploading the scene", "choosing the backend"])
 def test_what_was_loaded_is_closed_where_it_can_t_be_taken_over(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, fails: str

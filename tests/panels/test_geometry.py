@@ -21,18 +21,6 @@ def apply(matrix: Any, x: Any, y: Any) -> Any:
     return u / w, v / w
 
 
-def test_a_panel_turned_a_quarter_counter_clockwise_has_its_top_edge_on_the_viewers_left() -> None:
-    matrix = panel_from_screen(screen_width_px=1920, screen_height_px=1080, rotation_deg=90, mirror="none")
-    assert apply(matrix, 0, 0) == (0, 1920)  # its top left corner is at the viewer's bottom left
-    assert apply(matrix, 1920, 0) == (0, 0)
-    assert apply(matrix, 0, 1080) == (1080, 1920)
-
-
-def test_mirroring_is_the_viewers_left_and_right_even_on_a_turned_panel() -> None:
-    matrix = panel_from_screen(screen_width_px=1920, screen_height_px=1080, rotation_deg=90, mirror="horizontal")
-    assert apply(matrix, 0, 0) == (1080, 1920)
-
-
 @given(size=SIZES, rotation_deg=MOUNTED, mirror=MIRRORED)
 def test_without_registration_pixels_are_only_permuted(size: Any, rotation_deg: Any, mirror: Any) -> None:
     width, height = size

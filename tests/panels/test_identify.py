@@ -19,7 +19,7 @@ from typer.testing import CliRunner, Result
 from runtime.commands.doctor import doctor
 from runtime.commands.identify import identify
 from runtime.errors import InputError
-from runtime.panels.card import BARS, identity_card
+from runtime.panels.card import BARS
 from runtime.panels.geometry import panel_from_screen
 from runtime.panels.mounting import mounting_of
 from tests.panels.edids import block
@@ -62,16 +62,6 @@ def config(tmp_path: Path) -> Path:
     path = tmp_path / "phasestack.toml"
     path.write_text(BOUND)
     return path
-
-
-def card(title: str, *lines: str) -> np.ndarray:
-    return identity_card(WIDTH_PX, HEIGHT_PX, title=title, lines=lines)
-
-
-def test_no_turning_or_mirroring_of_a_card_looks_like_it() -> None:
-    picture = card("PANEL 0")
-    for other in (picture[::-1], picture[:, ::-1], picture[::-1, ::-1]):
-        assert not np.array_equal(picture, other)
 
 
 def started(x: XServer, *arguments: Path | str) -> Popen[Any]:

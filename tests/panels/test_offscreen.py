@@ -157,23 +157,6 @@ def test_a_panel_that_needs_no_alignment_is_fetched_to_the_bit_beside_those_that
     assert not np.array_equal(codes(sink.read_back())[0], codes(frame.solved)[0])
 
 
-@pytest.mark.parametrize(("rotation_deg", "clockwise_quarters"), [(0, 0), (90, 1), (180, 2), (270, 3)])
-@pytest.mark.parametrize(("mirror", "axis"), [("none", None), ("horizontal", 2), ("vertical", 1)])
-def test_layers_are_aligned_as_the_viewer_sees_them_then_mirrored_and_turned(
-    context: moderngl.Context, rotation_deg: int, clockwise_quarters: int, mirror: str, axis: int | None
-) -> None:
-    panels = (PanelSettings(rotation_deg=rotation_deg, mirror=mirror),) * 3
-    sink = offscreen(context, STACK, *panels)
-    matrices = align(STACK, solved_for_m=HEAD, eyes_m=HEAD + np.array([0.02, 0.016, 0.03])).solved_from_shown
-    frame = PanelFrame(1, smooth(1), 1, matrices)
-    sink.present(frame)
-    seen = codes(shown_layers(frame))
-    seen = np.rot90(seen if axis is None else np.flip(seen, axis), -clockwise_quarters, axes=(1, 2))
-    difference = np.abs(codes(sink.read_back()) - seen)
-    assert difference.max() <= 2 and (difference <= 1).mean() >= 0.999
-    sink.close()
-
-
 def test_a_registered_panel_is_aligned_first_and_then_sent_where_registration_found_it(
     context: moderngl.Context,
 ) -> None:

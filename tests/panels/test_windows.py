@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import moderngl
@@ -24,9 +19,7 @@ from runtime.panels import window
 from runtime.panels.display import glfw
 from runtime.panels.registry import open_panels
 from runtime.panels.window import WindowPanels
-from runtime.panels.xlib import SERVER_DIED
 from runtime.records import PanelFrame
-from tests.panels import xserver
 from tests.panels.edids import block
 from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, XServer
 from tests.waiting import eventually
@@ -213,43 +206,3 @@ def test_content_can_draw_in_its_own_context_between_two_frames(
         assert target.read(components=1)[0] == round(255 * red)
         sink.present(frame(number))
     assert context.error == "GL_NO_ERROR"
-
-
-PRESENTING = """
-import numpy as np
-from runtime.clock import MonotonicClock
-from runtime.config import OutputSettings, PanelSettings
-from runtime.support.gl import offscreen_context
-from runtime.panels.registry import open_panels
-from runtime.records import PanelFrame
-from tests.panels.test_windows import STACK
-
-panels = tuple(PanelSettings(connector=f"DUMMY{index}") for index in range(3))
-sink = open_panels(OutputSettings(kind="windows", panels=panels), STACK, MonotonicClock(), offscreen_context())
-layers = np.zeros((3, STACK.height_px, STACK.width_px, 4), np.uint8)
-for number in range(100_000):
-    sink.present(PanelFrame(number, layers, number))
-    if number == 10:
-        print("presenting", flush=True)
-"""
-
-
-@pytest.mark.parametrize("attempt", range(3))
-def test_the_death_of_the_x_server_ends_the_process_at_once_with_a_reason(tmp_path: Path, attempt: int) -> None:
-    """In the middle of whatever call it happens to be: hence several attempts."""
-    server = xserver.start_or_skip(tmp_path)
-    process = subprocess.Popen(
-        [sys.executable, "-c", PRESENTING], env={**os.environ, "DISPLAY": server.name},
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
-        assert process.stdout.readline() == "presenting\n"
-        time.sleep(0.03 * attempt)
-        server.stop()
-        _, errors = process.communicate(timeout=60)
-    finally:
-        process.kill()
-        server.stop()
-    assert process.returncode == SERVER_DIED
-    assert "the X server died" in errors
-    assert "Traceback" not in errors

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 
 import cv2
 import pytest
@@ -14,21 +13,6 @@ from runtime.support.threads import at_once
 @pytest.fixture(autouse=True)
 def two_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cv2, "getNumThreads", lambda: 2)
-
-
-def test_results_come_in_order_from_two_threads() -> None:
-    both = threading.Barrier(2, timeout=10)
-
-    def work(item: int) -> int:
-        both.wait()  # nobody goes on alone
-        return item * item
-
-    assert at_once(work, [1, 2, 3, 4]) == [1, 4, 9, 16]
-
-
-def test_what_it_raises_is_raised() -> None:
-    with pytest.raises(ZeroDivisionError):
-        at_once(lambda item: 1 // item, [1, 0])
 
 
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
