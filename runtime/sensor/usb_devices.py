@@ -74,18 +74,16 @@ def find_devices(backend: Any = None) -> list[UsbDevice]:
 
 
 def find_device(*, source: str, serial: str, driver: str, backend: Any = None) -> UsbDevice:
-    """The one device of a driver that a source (`VVVV:PPPP`, a serial number, or empty for any) names.
+    """The one device of a driver that a source (a serial number, or empty for any) names.
 
     A serial number, once known, has the last word. Raises SensorLost where it is not plugged in, or more than
     one fits: it is never guessed.
     """
-    wanted = serial or ("" if ":" in source or source in ("", "demo", "any") else source)
+    wanted = serial or ("" if source in ("", "demo", "any") else source)
     fitting = [
         device
         for device in find_devices(backend)
-        if device.known.driver == driver
-        and (not wanted or device.serial == wanted)
-        and (":" not in source or device.usb_id == source.lower())
+        if device.known.driver == driver and (not wanted or device.serial == wanted)
     ]
     name = wanted or source or "any"
     if not fitting:

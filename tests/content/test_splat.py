@@ -187,15 +187,8 @@ def edited(folder: Path, old: bytes, new: bytes, cut: int = 0) -> Path:
     ("old", "new", "cut", "told"),
     [
         (b"", b"", 100, "vertex: the file is cut off: 20 are promised and 19 there"),
-        (
-            b"vertex 20",
-            b"vertex 999999999999",
-            0,
-            "element vertex: 999,999,999,999 is over the limit of 3,000,000",
-        ),
         (b"vertex 20", b"vertex 2999999", 0, "element vertex: the file is cut off"),
-        (b"vertex 20", b"vertex -20", 0, "element vertex: is -20; must be 0 to"),
-        (b"vertex 20", b"vertex " + b"9" * 5000, 0, "element vertex: is a number of 5000 digits"),
+        (b"vertex 20", b"vertex 3000001", 0, "element vertex: 3,000,001 is over the limit of 3,000,000"),
         (b"vertex 20", b"vertex 0", 0, "vertex: there are none"),
         (b"element vertex", b"element corner", 0, "vertex: the header has no format, no vertices"),
         (

@@ -122,12 +122,6 @@ def test_a_wrong_file_is_refused_with_its_name_and_the_field(tmp_path: Path, tex
     assert wanted in refusal(tmp_path, text)
 
 
-def test_a_covariance_that_is_none_is_refused(tmp_path: Path) -> None:
-    for matrix in (-np.eye(7), np.eye(7) + np.eye(7)[[1, 2, 3, 4, 5, 6, 0]]):
-        table = f"[covariance]\npivot_m = [0, 0, 0]\nmatrix = {matrix.tolist()}\n"
-        assert "covariance.matrix" in refusal(tmp_path, toml(np.eye(4)) + table)
-
-
 def test_another_sensor_than_the_calibrated_one_is_warned_of(tmp_path: Path) -> None:
     file = tmp_path / "c.toml"
     file.write_text(toml(np.eye(4)) + 'sensor_serial = "A1"\n')

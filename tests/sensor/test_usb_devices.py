@@ -27,7 +27,7 @@ def test_a_device_is_found_by_its_serial_and_never_guessed() -> None:
     bus = FakeUsb(FakeDevice(serial="A1", address=5), FakeDevice(serial="B2", address=6))
     choice = {"driver": "usb-eyes", "backend": bus}
     assert find_device(source="B2", serial="", **choice).serial == "B2"
-    assert find_device(source="1209:0001", serial="A1", **choice).serial == "A1"
+    assert find_device(source="", serial="A1", **choice).serial == "A1"
     with pytest.raises(SensorLost, match="A1, B2"):
         find_device(source="", serial="", **choice)
     with pytest.raises(SensorLost, match="C3"):
