@@ -1,4 +1,4 @@
-"""What an eye sees, and how good that is: simulated retinas and PSNR against a tracer of 50 digits (contracts)."""
+"""What an eye sees: simulated retinas, and the error of light (contracts), against a tracer of 50 digits."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from runtime.optics.light import squared_error
-from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.records import U8
@@ -85,31 +84,6 @@ def seen_rays(eye: Sequence[float], stack: PanelStack, kind: str) -> Answer:
     return Answer(error, 8 * EPS32 * SIZE[0] * stack.count, float(stack.count), note=f"{counted} rays")
 
 
-def displayed(eyes: Sequence[Sequence[float]], kind: str) -> Answer:
-    """PSNR of one mean squared error over both eyes, all rays that count and all channels, in dB."""
-    layers = layers_of("noise", THREE)
-    random = np.random.default_rng(9)
-    seen = [seen_by(eye, layers, THREE, fov_deg=FOV_DEG) for eye in eyes]
-    total, count = exact.mpf(0), 0
-    wanted = []
-    for eye, retina in zip(eyes, seen, strict=True):
-        if kind == "nearly right":
-            target = np.clip(retina.image + random.normal(0, 1e-3, retina.image.shape), 0, 1).astype(np.float32)
-        else:
-            target = random.random(retina.image.shape, dtype=np.float32)
-        wanted.append(target)
-        e = exact.vector(eye)
-        for row, column in np.ndindex(*retina.mask.shape):
-            truth, inside = traced(e, THREE, layers, column, row)
-            if inside > 0:
-                total += sum((a - exact.mpf(float(b))) ** 2 for a, b in zip(truth, target[row, column], strict=True))
-                count += 3
-    truth_db = -10 * exact.mp.log10(total / count)
-    found = quality([r.image for r in seen], wanted, [r.mask for r in seen])
-    note = f"{float(truth_db):.3f} dB of {count} values"
-    return Answer(exact.distance(found.psnr_db, truth_db), 0.002, note=note)
-
-
 def light(eyes: Sequence[Sequence[float]], true: Sequence[Sequence[float]], kind: str) -> Answer:
     """Mean squared error of the light of nine rays a pixel, for eyes that are elsewhere than solved for, ray by ray."""
     layers, rays = layers_of(kind, SMALL), 3
@@ -169,8 +143,6 @@ def trials() -> Iterator[Trial]:
         yield Trial(STAGE, f"rays, {name}", run, measure="intensity")
     yield Trial(STAGE, "rays, all white", partial(seen_rays, [0.6, 0, 0], THREE, "white"), measure="intensity")
     eyes = [[0.7, -0.03, 0.05], [0.7, 0.03, 0.05]]
-    for kind in ("nearly right", "all wrong"):
-        yield Trial(STAGE, f"PSNR, {kind}", partial(displayed, eyes, kind), measure="dB")
     for name, moved_m, kind in (
         ("at", 0.0, "checkerboard"),
         ("2 mm beside", 0.002, "noise"),

@@ -141,9 +141,9 @@ def converges(method: Method, gap_m: float, ipd_m: float, distance_m: float) -> 
 
 
 GEOMETRIES: Sequence[tuple[str, dict[str, float]]] = (
-    *((f"gap {gap:g} m", {"gap_m": gap}) for gap in (1e-4, 1e-3, 5e-3, 0.01, 0.03, 0.06, 0.1, 0.5, 1.0)),
-    *((f"eyes {ipd:g} m apart", {"ipd_m": ipd}) for ipd in (1e-4, 0.005, 0.02, 0.2)),
-    *((f"eyes at {distance:g} m", {"distance_m": distance}) for distance in (0.1, 0.3, 1.5, 4.0, 30.0)),
+    *((f"gap {gap:g} m", {"gap_m": gap}) for gap in (1e-4, 5e-3, 0.03, 0.1, 1.0)),
+    *((f"eyes {ipd:g} m apart", {"ipd_m": ipd}) for ipd in (1e-4, 0.005, 0.2)),
+    *((f"eyes at {distance:g} m", {"distance_m": distance}) for distance in (0.1, 1.5, 30.0)),
 )
 USUAL = {"gap_m": 0.06, "ipd_m": 0.06, "distance_m": 0.54}
 
