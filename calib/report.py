@@ -101,8 +101,6 @@ def _summary(calibration: Calibration, points: Points | None, volume_m: F64) -> 
             "max_mm": float(distance_m.max()) * 1e3,
             "axis_rms_mm": (np.sqrt((residual_m**2).mean(axis=0)) * 1e3).tolist(),
         }
-    if calibration.residuals is not None and calibration.residuals.leave_one_out_rms_m is not None:
-        found["leave_one_out_mm"] = calibration.residuals.leave_one_out_rms_m * 1e3
     eye_error = calibration.position_error_m(volume_m)
     found["eye_error_mm"] = None if eye_error is None else float(eye_error.mean()) * 1e3
     found["eye_error_p95_mm"] = None if eye_error is None else float(np.percentile(eye_error, 95)) * 1e3
@@ -117,7 +115,6 @@ def _numbers(summary: dict[str, Any]) -> list[list[str]]:
         "rms_mm": "residual, RMS (mm)",
         "max_mm": "residual, largest (mm)",
         "axis_rms_mm": "residual along x, y, z (mm)",
-        "leave_one_out_mm": "error of a point left out, RMS (mm)",
         "eye_error_mm": "expected error at the eye, mean over the viewing volume (mm)",
         "eye_error_p95_mm": "expected error at the eye, 95th percentile (mm)",
     }

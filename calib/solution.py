@@ -34,7 +34,6 @@ class Solution:
     pivot_m: F64  # (3,) frame `stack`: the centre of the used pairs
     unit_covariance: F64  # (7, 7) for noise of 1 m; the scale's row is zero where it is fixed
     condition: float  # of the design, lengths in units of the pairs' RMS radius
-    leave_one_out_m: F64  # (used, 3) error of each used pair when the others predict it
     reason: str = ""  # why this method was chosen
 
     @property
@@ -45,7 +44,7 @@ class Solution:
     @property
     def rms_m(self) -> float:
         """RMS distance of the used pairs."""
-        return _rms(self.residual_m[self.used])
+        return float(np.sqrt((self.residual_m[self.used] ** 2).sum(-1).mean()))
 
     @property
     def max_m(self) -> float:
@@ -58,11 +57,6 @@ class Solution:
         return np.asarray(np.sqrt((self.residual_m[self.used] ** 2).mean(0)), dtype=np.float64)
 
     @property
-    def leave_one_out_rms_m(self) -> float:
-        """RMS error of the used pairs when the others predict them; infinite where one cannot be left out."""
-        return _rms(self.leave_one_out_m)
-
-    @property
     def scale_sigma(self) -> float:
         """Standard deviation of the logarithm of the scale."""
         return float(np.sqrt(self.covariance[6, 6]))
@@ -73,10 +67,6 @@ class Solution:
         covariance = self.unit_covariance * (self.noise_m if noise_m is None else noise_m) ** 2
         spread: F64 = jacobian @ covariance @ np.swapaxes(jacobian, -1, -2)
         return np.asarray(np.sqrt(np.trace(spread, axis1=-2, axis2=-1)), dtype=np.float64)
-
-
-def _rms(vectors: F64) -> float:
-    return float(np.sqrt((vectors**2).sum(-1).mean()))
 
 
 def design_covariance(stack_m: F64, *, fixed_scale: bool) -> tuple[F64, F64, float]:
@@ -102,18 +92,6 @@ def design_covariance(stack_m: F64, *, fixed_scale: bool) -> tuple[F64, F64, flo
     return pivot_m, covariance, float(values[0] / values[-1])
 
 
-def leave_one_out(residual_m: F64, stack_m: F64, *, pivot_m: F64, unit_covariance: F64) -> F64:
-    """(K, 3) error of each pair when it is left out: (I - J C J^T)^-1 r, exact for the linearised fit."""
-    jacobian = position_jacobian(stack_m, pivot_m=pivot_m)
-    leverage = jacobian @ unit_covariance @ np.swapaxes(jacobian, -1, -2)
-    remaining = np.eye(3) - leverage
-    alone = np.linalg.eigvalsh(remaining).min(-1) < 1e-9
-    remaining[alone] = np.eye(3)
-    errors: F64 = np.asarray(np.linalg.solve(remaining, residual_m[..., None])[..., 0], dtype=np.float64)
-    errors[alone] = np.inf
-    return errors
-
-
 def solve(sensor_m: F64, stack_m: F64, *, method: Method, known_scale: float = 1.0, reason: str = "") -> Solution:
     """One method's similarity of (K, 3) pairs with all its error figures. Raises `similarity.Degenerate`."""
     used = np.ones(len(sensor_m), bool)
@@ -134,9 +112,6 @@ def solve(sensor_m: F64, stack_m: F64, *, method: Method, known_scale: float = 1
         pivot_m=pivot_m,
         unit_covariance=unit_covariance,
         condition=condition,
-        leave_one_out_m=leave_one_out(
-            residual_m[used], stack_m[used], pivot_m=pivot_m, unit_covariance=unit_covariance
-        ),
         reason=reason,
     )
 

@@ -73,7 +73,6 @@ def _figures(solution: Solution, volume_m: F64) -> dict[str, Any]:
         "scale": float(solution.similarity.scale),
         "rms_mm": solution.rms_m * 1e3,
         "max_mm": solution.max_m * 1e3,
-        "leave_one_out_mm": solution.leave_one_out_rms_m * 1e3,
         "eye_error_mm": float(error_m.mean()) * 1e3,
         "eye_error_p95_mm": float(np.percentile(error_m, 95)) * 1e3,
         "condition": solution.condition,
@@ -82,10 +81,10 @@ def _figures(solution: Solution, volume_m: F64) -> dict[str, Any]:
 
 
 def _text(summary: dict[str, Any]) -> str:
-    rows = [["method", "scale", "RMS mm", "max mm", "left out mm", "at the eye mm"]]
+    rows = [["method", "scale", "RMS mm", "max mm", "at the eye mm"]]
     for row in summary["methods"]:
         mark = "> " if row["method"] == summary["method"] else ""
-        figures = [row[name] for name in ("rms_mm", "max_mm", "leave_one_out_mm", "eye_error_mm")]
+        figures = [row[name] for name in ("rms_mm", "max_mm", "eye_error_mm")]
         rows.append([mark + row["method"], f"{row['scale']:.5f}", *[f"{value:.3f}" for value in figures]])
     axes = ", ".join(f"{value:.2f}" for value in summary["axis_rms_mm"])
     return "\n".join([
@@ -117,15 +116,12 @@ def calibration_text(
         "condition": solution.condition,
         "warnings": warnings,
     })  # fmt: skip
-    residuals = {
+    document["residuals"] = {
         "rms_m": solution.rms_m,
         "max_m": solution.max_m,
         "axis_rms_m": solution.axis_rms_m.tolist(),
         "eye_error_m": float(solution.eye_error_m(volume_m).mean()),
     }
-    if np.isfinite(solution.leave_one_out_rms_m):
-        residuals["leave_one_out_rms_m"] = solution.leave_one_out_rms_m
-    document["residuals"] = residuals
     covariance = tomlkit.table()
     covariance.add(tomlkit.comment("of rotation vector, shift and log scale about the pivot, in the stack's axes"))
     covariance["pivot_m"] = solution.pivot_m.tolist()

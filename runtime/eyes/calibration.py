@@ -42,7 +42,6 @@ class Residuals(Lenient):
     """`[residuals]`: how well the pairs fit the matrix, metres, in `stack`."""
 
     rms_m: Annotated[float, Field(ge=0)]
-    leave_one_out_rms_m: Annotated[float, Field(ge=0)] | None = None
 
 
 class CovarianceTable(Lenient):

@@ -64,13 +64,6 @@ def test_the_published_prototype_is_reported_without_its_points(tmp_path: Path) 
     assert "holds no pairs" in page
 
 
-def test_what_a_file_says_is_not_taken_for_markup(tmp_path: Path) -> None:
-    path = tmp_path / "c.toml"
-    path.write_text(PUBLISHED + 'method = "<script>alert(1)</script>"\n')
-    report(str(path), "--out", str(tmp_path / "r"))
-    assert "<script>" not in (tmp_path / "r" / "index.html").read_text()
-
-
 @pytest.mark.parametrize(
     "data",
     [
