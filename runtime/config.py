@@ -193,7 +193,6 @@ class ContentSettings(Section):
 
     scene: str = Field("demo", description="a built-in scene, a preset, a file or folder, or a class: `module:Class`")
     options: dict[str, Any] = Field(default_factory=dict, description="of a scene that is a class: its own settings")
-    reading: Literal["seed", "published-code"] = Field("seed", description="of a preset: its scale and place")
     fov_deg: Annotated[float, within(*FOV_RANGE_DEG, "degrees")] = Field(
         40.0, description="horizontal field of view of eye images"
     )

@@ -14,7 +14,7 @@ import numpy as np
 from runtime.content.base import WHITE, ContentInfo, ContentSource, View
 from runtime.content.images import WarpedPicture, image_from_view, rgba_from_rgb
 from runtime.content.placing import SceneFile
-from runtime.content.presets import Preset, preset, preset_names
+from runtime.content.presets import drawn_scene_from_stack, preset_names
 from runtime.errors import ContentFailure, InputError
 from runtime.optics.views import image_from_stack
 from runtime.records import F64, U8
@@ -47,14 +47,13 @@ def is_data_set(folder: Path) -> bool:
     return folder.is_dir() and any(NAME.match(path.name) for path in folder.iterdir())
 
 
-def read_folder(folder: Path, preset: Preset) -> tuple[Pair, ...]:
+def read_folder(folder: Path, preset: str) -> tuple[Pair, ...]:
     """Every pair, by number. Raises InputError: no pair, half a pair, coordinates that are no eye.
 
     Names hold the eyes in the scene's digital units. Of `_0` and `_1` geometry tells which one is left; `_left` and
-    `_right`, of the set's newer data, say so, and geometry must agree. preset: in the published code's reading, which
-    drew the pictures.
+    `_right`, of the set's newer data, say so, and geometry must agree. preset: the scene's name.
     """
-    stack_from_scene: F64 = np.linalg.inv(preset.scene_from_stack).astype(np.float64)
+    stack_from_scene: F64 = np.linalg.inv(drawn_scene_from_stack(preset)).astype(np.float64)
     found: dict[int, list[tuple[str, Path, F64]]] = {}
     for path in sorted(folder.iterdir()):
         match = NAME.match(path.name)
@@ -62,7 +61,7 @@ def read_folder(folder: Path, preset: Preset) -> tuple[Pair, ...]:
             continue
         eye = (stack_from_scene @ [float(match[2]), float(match[3]), float(match[4]), 1.0])[:3]
         if eye[0] <= 0:
-            problem = f"its eye is behind the display (x = {eye[0]:.3f} m) with preset {preset.name}"
+            problem = f"its eye is behind the display (x = {eye[0]:.3f} m) with preset {preset}"
             raise InputError(path, "name", problem)
         found.setdefault(int(match[1]), []).append((match[5].lower(), path, eye))
     if not found:
@@ -77,7 +76,7 @@ def read_folder(folder: Path, preset: Preset) -> tuple[Pair, ...]:
         if left_eye[1] == right_eye[1]:
             raise InputError(left, f"pair{number}", "both eyes are at the same y: left can't be told from right")
         if name == "right":
-            raise InputError(right, f"pair{number}", f"_left stands to the right of _right with preset {preset.name}")
+            raise InputError(right, f"pair{number}", f"_left stands to the right of _right with preset {preset}")
         pairs.append(Pair(number, (left, right), np.array([left_eye, right_eye]), stack_from_scene[:3, 3]))
     return tuple(pairs)
 
@@ -85,13 +84,10 @@ def read_folder(folder: Path, preset: Preset) -> tuple[Pair, ...]:
 def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
     """Read a folder as the preset that was chosen, or that its name holds. Raises InputError."""
     path, settings = file.path, file.settings
-    name = next((name for name in preset_names() if name in path.resolve().name), "")
-    if file.preset is not None:
-        name = file.preset.name
+    name = file.preset or next((name for name in preset_names() if name in path.resolve().name), "")
     if not name:
         raise InputError(path, "name", "names no preset: set content.scene to one and content.file to the folder")
-    # The data set was drawn by the published code: its scale holds in every reading.
-    pairs = read_folder(path, preset(name, "published-code"))
+    pairs = read_folder(path, name)
     source = EyeRealSource(pairs, fov_deg=settings.fov_deg, background=settings.background or WHITE, name=name)
     return lambda context: source
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from runtime.config import ContentSettings
-from runtime.content.presets import Preset, axes_matrix
+from runtime.content.presets import axes_matrix, stack_from_preset
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
@@ -31,7 +31,7 @@ class SceneFile:
     path: Path
     settings: ContentSettings
     stack: PanelStack
-    preset: Preset | None = None  # that the file is of
+    preset: str = ""  # that the file is of
 
     @property
     def background(self) -> tuple[float, float, float]:
@@ -44,8 +44,8 @@ class SceneFile:
         Raises InputError for a scene that lies wholly behind every viewer.
         """
         settings = self.settings
-        if self.preset is not None:
-            matrix = np.asarray(np.linalg.inv(self.preset.scene_from_stack), dtype=np.float64)
+        if self.preset:
+            matrix = stack_from_preset(self.preset)
         else:
             axes = self._axes(low, high)
             if settings.fit:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,17 +16,7 @@ from runtime.records import F64
 FILE = Path(__file__).with_name("presets.toml")
 CM = 0.01
 
-Reading = Literal["seed", "published-code"]
-Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 Triple = tuple[float, float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Preset:
-    """One scene in one reading."""
-
-    name: str
-    scene_from_stack: F64  # 4x4 similarity: digital coordinates of a point in metres of the stack frame
 
 
 @cache
@@ -41,34 +30,37 @@ def preset_names() -> tuple[str, ...]:
     return tuple(preset_file()["scene"])
 
 
-def preset(name: str, reading: Reading = "seed") -> Preset:
-    """A scene by name. Raises InputError for an unknown one.
-
-    `seed`: r_p2d, rotation and translation as printed; light-field = R·scene/(100 r_p2d) + t, metres.
-    `published-code`: that code's scale; d_thick is the gap; the scene's own axes, and its panels' place in the scene,
-    as it evaluates and infers.
-    """
+def _table(name: str) -> dict[str, Any]:
     file = preset_file()
     if name not in file["scene"]:
         raise InputError("content", "scene", f"no preset `{name}`; there are {', '.join(preset_names())}")
-    table = file["scene"][name]
-    if reading == "seed":
-        stack_from_scene = np.eye(4)
-        rotation = rotation_matrix(table["rotation_deg"], file["rotation_order"])
-        stack_from_scene[:3, :3] = rotation / (table["scale_per_cm"] / CM)
-        stack_from_scene[:3, 3] = table["translation_m"]
-        scene_from_stack = np.asarray(np.linalg.inv(stack_from_scene), dtype=np.float64)
-        return Preset(name, scene_from_stack)
-    code = table["published"]
+    table: dict[str, Any] = file["scene"][name]
+    return table
+
+
+def stack_from_preset(name: str) -> F64:
+    """4x4 metres of the stack frame from a scene's digital units, as the supplement prints: R·scene/(100 r_p2d) + t.
+
+    Raises InputError for an unknown one.
+    """
+    table, matrix = _table(name), np.eye(4)
+    rotation = rotation_matrix(table["rotation_deg"], preset_file()["rotation_order"])
+    matrix[:3, :3] = rotation / (table["scale_per_cm"] / CM)
+    matrix[:3, 3] = table["translation_m"]
+    return matrix
+
+
+def drawn_scene_from_stack(name: str) -> F64:
+    """4x4 the scene's digital units from metres of the stack frame, as the published code drew the data set: its scale,
+    the scene's own axes, and the panels where it evaluates. Raises InputError for an unknown one."""
+    code, matrix = _table(name)["published"], np.eye(4)
     axes = axes_matrix(out=code["out"], up=code["up"])
     gap = code["thickness_cm"] * code["scale_per_cm"]
     # The middle panel stands half a gap beyond that code's ground, along `out`; the ground may be in gaps.
     middle = gap / 2 + code.get("ground", gap * code.get("ground_coefficient", 0.0))
-    shift = np.array(code.get("shift", (0.0, 0.0, 0.0)))
-    scene_from_stack = np.eye(4)
-    scene_from_stack[:3, :3] = axes * (code["scale_per_cm"] / CM)
-    scene_from_stack[:3, 3] = shift + axes[:, 0] * middle
-    return Preset(name, scene_from_stack)
+    matrix[:3, :3] = axes * (code["scale_per_cm"] / CM)
+    matrix[:3, 3] = np.array(code.get("shift", (0.0, 0.0, 0.0))) + axes[:, 0] * middle
+    return matrix
 
 
 def rotation_matrix(angles_deg: Triple, order: str) -> F64:

@@ -14,7 +14,7 @@ from runtime.content.base import ContentSource, View
 from runtime.content.placed import placed_source, placing_of
 from runtime.content.placing import SceneFile
 from runtime.content.ply import read_header
-from runtime.content.presets import preset, preset_names
+from runtime.content.presets import preset_names
 from runtime.content.scenes import SCENES
 from runtime.errors import InputError, PhasestackError
 from runtime.optics.stack import PanelStack
@@ -61,8 +61,7 @@ def _prepared(file: SceneFile) -> Opener:
         return _built_in(name, file)
     if name in preset_names():
         if settings.file:
-            chosen = preset(name, settings.reading)
-            return _from_path(replace(file, path=Path(settings.file), preset=chosen))
+            return _from_path(replace(file, path=Path(settings.file), preset=name))
         return _built_in("demo", file, stands_for=name)
     if "://" in name or name.startswith("/dev/video"):
         from runtime.content import stream
@@ -135,7 +134,7 @@ def _playlist(file: SceneFile) -> Opener:
     for number, entry in enumerate(playlist.entries):
         progress.tell(f"{file.path.name}: {Path(entry.scene).name}", number, len(playlist.entries))
         try:
-            openers.append(_placed(replace(file, path=Path(entry.scene), settings=entry, preset=None)))
+            openers.append(_placed(replace(file, path=Path(entry.scene), settings=entry)))
         except InputError as error:
             raise InputError(file.path, f"show[{number}]", str(error)) from None
     return lambda context: PlaylistSource(playlist, openers, context=context)

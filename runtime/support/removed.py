@@ -16,6 +16,7 @@ REMOVED_SETTINGS: dict[str, str] = {
     "content.up": 'set content.axes to both axes, up first, such as "+z -y"',
     "content.out": 'set content.axes to both axes, up first, such as "+z -y"',
     "content.quilt": 'set content.layout to its columns, rows and aspect, such as "qs8x6a0.75"',
+    "content.reading": "files of a preset stand as the supplement prints it, data-set folders as they were drawn",
     "content.at_end": "films repeat; a playlist with `repeat = false` ends",
     "service.log_format": "`journalctl -o json` makes objects of the lines",
     "service.group": "the socket is of the group `phasestack`",

@@ -11,7 +11,7 @@ import pytest
 from runtime.config import ContentSettings
 from runtime.content.base import ContentSource, View
 from runtime.content.eyereal import EyeRealSource, Pair, is_data_set, read_folder
-from runtime.content.presets import preset
+from runtime.content.presets import drawn_scene_from_stack
 from runtime.content.procedural import ProceduralSource
 from runtime.content.registry import open_content
 from runtime.errors import InputError
@@ -19,7 +19,7 @@ from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import write_png
 from tests.content.conftest import image_view, panel_view
 
-LEGO = preset("lego_bulldozer", "published-code")
+LEGO = "lego_bulldozer"
 LEFT, RIGHT = (6.486, -0.263, 2.004), (6.487, 0.237, 2.004)
 
 
@@ -71,19 +71,19 @@ def test_pictures_look_at_the_scene_s_origin_wherever_the_display_stands(
     tmp_path: Path, context: Any, stack: PanelStack, name: str
 ) -> None:
     """Orchids' middle panel stands 0.7 m behind the scene's origin, chair's 4.5 cm before it."""
-    chosen = preset(name, "published-code")
-    origin = np.linalg.solve(chosen.scene_from_stack, [0.0, 0.0, 0.0, 1.0])[:3]
+    scene_from_stack = drawn_scene_from_stack(name)
+    origin = np.linalg.solve(scene_from_stack, [0.0, 0.0, 0.0, 1.0])[:3]
     assert np.linalg.norm(origin) > 0.005
     scene = ProceduralSource("demo", stack=stack, context=context)
     for half, y in enumerate((-0.03, 0.03)):
         eye = np.array([1.5, y, 0.2])
-        digital = (chosen.scene_from_stack @ np.append(eye, 1.0))[:3]
+        digital = (scene_from_stack @ np.append(eye, 1.0))[:3]
         own = image_view(eye - origin, 480, 270)  # of an eye that looks at the origin of its coordinates
         shifted = own.pixels_from_stack @ np.block([[np.eye(3), -origin[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
         picture = scene.render(View(eye, half, shifted, 480, 270), time_ns=0)
         coordinates = "_".join(f"{axis}{value:.5f}" for axis, value in zip("xyz", digital, strict=True))
         write_png(tmp_path / f"pair0_{coordinates}_{half}.png", picture)
-    (pair,) = read_folder(tmp_path, chosen)
+    (pair,) = read_folder(tmp_path, name)
     assert pair.eyes_m == pytest.approx(np.array([[1.5, -0.03, 0.2], [1.5, 0.03, 0.2]]), abs=1e-3)
     check_alike(scene, pair, stack, inside_share=0.5, better=0.6)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from runtime.content.presets import axes_matrix, preset, preset_file
+from runtime.content.presets import axes_matrix, drawn_scene_from_stack, preset_file, stack_from_preset
 from runtime.errors import InputError
 
 # Of the published code's table: scale per cm, thickness in cm, out axis, up axis; ground (digital units) or its
@@ -26,10 +26,10 @@ def test_the_published_reading_puts_the_panels_where_that_code_does_in_the_scene
     z_min = ground if coefficient is None else thickness_cm * scale * coefficient
     z_max = z_min + thickness_cm * scale
     wanted = np.linspace(z_min - thickness_cm * scale / 2, z_max + thickness_cm * scale / 2, 3)
-    axes = axes_matrix(out=out, up=up)  # type: ignore[arg-type]
-    chosen = preset(name, "published-code")
+    axes = axes_matrix(out=out, up=up)
+    scene_from_stack = drawn_scene_from_stack(name)
     for x_m, along in zip((-thickness_cm / 100, 0.0, thickness_cm / 100), wanted, strict=True):
-        place = (chosen.scene_from_stack @ [x_m, 0.0, 0.0, 1.0])[:3]
+        place = (scene_from_stack @ [x_m, 0.0, 0.0, 1.0])[:3]
         assert place == pytest.approx(axes[:, 0] * along + SHIFTS.get(name, (0, 0, 0)), abs=1e-9)
 
 
@@ -39,22 +39,21 @@ COLUMNS = {"matrixcity": "+x", "room_floor": "+y", "lego_bulldozer": "+y", "hotd
 
 @pytest.mark.parametrize("name", COLUMNS)
 def test_chair_and_ficus_are_mirrored_in_that_code_and_nothing_else_is(name: str) -> None:
-    right = preset(name, "published-code").scene_from_stack[:3, 1]
+    right = drawn_scene_from_stack(name)[:3, 1]
     theirs = np.eye(3)["xyz".index(COLUMNS[name][1])]
     assert np.sign(right @ theirs) == (-1 if name in ("chair", "ficus") else 1)
 
 
 def test_the_seed_s_pose_takes_the_scene_into_the_light_field_frame() -> None:
     table = preset_file()["scene"]["traffic"]
-    chosen = preset("traffic")
     point = np.array([0.4, -1.2, 2.0])
     turned = Rotation.from_euler("xyz", table["rotation_deg"], degrees=True).apply(
         point / (100 * table["scale_per_cm"])
     )
     in_stack = turned + table["translation_m"]
-    assert chosen.scene_from_stack @ np.append(in_stack, 1.0) == pytest.approx(np.append(point, 1.0))
+    assert stack_from_preset("traffic") @ np.append(point, 1.0) == pytest.approx(np.append(in_stack, 1.0))
 
 
 def test_an_unknown_preset_is_one_line_that_lists_them() -> None:
     with pytest.raises(InputError, match=r"^content: scene: no preset `lego`; there are .*lego_bulldozer"):
-        preset("lego")
+        stack_from_preset("lego")

@@ -18,7 +18,6 @@ from model_export.checkpoint import load_eyereal, load_spectral  # noqa: E402
 from model_export.export import eyereal_model, spectral_model  # noqa: E402
 from model_export.eyereal import EyeRealNet  # noqa: E402
 from runtime.content.eyereal import Pair, read_folder  # noqa: E402
-from runtime.content.presets import preset  # noqa: E402
 from runtime.errors import InputError  # noqa: E402
 from runtime.model.contract import parse_contract  # noqa: E402
 from runtime.model.network import NetworkPredictor  # noqa: E402
@@ -179,7 +178,7 @@ def pair_of(folder: Path, place: str) -> Pair:
     """The golden pictures as the data set names them, read as the data set is."""
     for half, (x, y, z) in enumerate(EYES[place]):
         write_png(folder / f"pair0_x{x}_y{y}_z{z}_{half}.png", picture(half))
-    (pair,) = read_folder(folder, preset("lego_bulldozer", "published-code"))
+    (pair,) = read_folder(folder, "lego_bulldozer")
     return pair
 
 
