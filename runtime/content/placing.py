@@ -10,7 +10,6 @@ import numpy as np
 
 from runtime.config import ContentSettings
 from runtime.content.presets import axes_matrix, stack_from_preset
-from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
 
@@ -20,7 +19,6 @@ FILL = 0.75  # of the display's width and height that a fitted scene takes: its 
 DEEPER = 2.0  # times `depth_m`, that a fitted scene may be
 FLAT = 0.1  # what is thinner than this share of its other sides is shown from its flat side
 STANDS = 0.2  # of its height: what stands so much higher above 0 along one axis than along another has that one up
-FARTHEST_VIEWER_M = 1.5
 DARK = (0.12, 0.12, 0.12)  # behind all but the built-in scenes: ghosts are seen on it, brighter and darker ones
 
 
@@ -39,25 +37,14 @@ class SceneFile:
         return self.settings.background or DARK
 
     def placed(self, low: F64, high: F64) -> F64:
-        """4x4 stack_from_scene of what has these corners: the preset's, else fitted, else its own metres.
-
-        Raises InputError for a scene that lies wholly behind every viewer.
-        """
-        settings = self.settings
+        """4x4 stack_from_scene of what has these corners: the preset's, else fitted, else its own metres."""
         if self.preset:
-            matrix = stack_from_preset(self.preset)
-        else:
-            axes = self._axes(low, high)
-            if settings.fit:
-                matrix = fitted(low, high, axes=axes, stack=self.stack, depth_m=settings.depth_m)
-            else:
-                matrix = np.eye(4)
-                matrix[:3, :3] = axes.T
-        corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-        nearest_m = float((corners @ matrix[0, :3] + matrix[0, 3]).min())
-        if nearest_m > FARTHEST_VIEWER_M:
-            problem = f"the scene begins at x = {nearest_m:.2f} m, wholly behind the viewer"
-            raise InputError(self.path, "position", problem)
+            return stack_from_preset(self.preset)
+        axes = self._axes(low, high)
+        if self.settings.fit:
+            return fitted(low, high, axes=axes, stack=self.stack, depth_m=self.settings.depth_m)
+        matrix = np.eye(4)
+        matrix[:3, :3] = axes.T
         return matrix
 
     def _axes(self, low: F64, high: F64) -> F64:

@@ -217,12 +217,3 @@ def test_an_obj_in_another_encoding_and_a_texture_with_a_space_in_its_name_are_r
     (part,) = load_mesh(tmp_path / "a.obj").parts
     assert part.picture is not None
     assert part.picture[0, 0].tolist() == [255, 0, 0, 255]
-
-
-def test_a_scene_wholly_behind_the_viewer_is_refused(tmp_path: Path, context: Any, stack: PanelStack) -> None:
-    box = trimesh.creation.box((0.1, 0.1, 0.1))
-    box.apply_translation([2.0, 0.0, 0.0])
-    path = tmp_path / "behind.ply"
-    box.export(path)
-    with pytest.raises(InputError, match=r"behind.ply: position: .*wholly behind the viewer"):
-        source_of(path, context, stack, fit=False)
