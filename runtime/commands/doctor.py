@@ -1,11 +1,39 @@
-"""`phasestack doctor`: is everything there that the configuration asks for, and what to do where it is not?"""
+"""`phasestack doctor`: is everything there that the configuration asks for, and what to do where it is not?
+
+Each check is a small function of the settings that answers rows and never raises.
+"""
 
 from __future__ import annotations
 
+import json
+import os
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+
+from runtime.errors import PhasestackError
+
+if TYPE_CHECKING:
+    from runtime.config import Settings
+
+Verdict = Literal["ok", "warn", "fail", "skip"]
+CHECK_SENSOR_FOR_S = 3.0
+HUNG_AFTER_S = 5.0
+NO_DEVICE = ("replay", "fixed")  # drivers that need no device
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of the table."""
+
+    name: str
+    state: Verdict
+    detail: str  # what was found
+    remedy: str = ""  # what to do; empty where nothing needs doing
 
 
 def doctor(
@@ -18,10 +46,6 @@ def doctor(
 
     Example: phasestack doctor --config /etc/phasestack/phasestack.toml
     """
-    import json
-    from dataclasses import asdict
-
-    from runtime.commands.doctor_checks import examine
     from runtime.config import load_settings
 
     rows = examine(load_settings(config))
@@ -34,3 +58,208 @@ def doctor(
             typer.echo(f"{row.state:5} {row.name}: {row.detail}{remedy}")
     if failed:
         raise typer.Exit(1)
+
+
+Check = Callable[["Settings"], Iterator[Row]]
+
+
+def examine(settings: Settings) -> list[Row]:
+    """Every check in turn. A check that fails unexpectedly is a failed row, not the end."""
+    rows: list[Row] = []
+    for name, check in CHECKS.items():
+        try:
+            rows += check(settings)
+        except PhasestackError as error:
+            rows.append(Row(name, "fail", str(error)))
+        except Exception as error:  # a doctor that dies of what it looks for helps nobody
+            rows.append(Row(name, "fail", f"{type(error).__name__}: {error}", "a fault of phasestack: report it"))
+    return rows
+
+
+def sensor(settings: Settings) -> Iterator[Row]:
+    """The configured driver opens and delivers."""
+    from runtime.clock import MonotonicClock
+    from runtime.errors import EndOfRecording, SensorLost, SensorTimeout
+    from runtime.eyes.calibration import load_calibration
+    from runtime.sensor.registry import open_sensor
+
+    if settings.sensor.driver not in NO_DEVICE and (answer := _daemon(settings)):
+        eyes = answer.get("eyes_label", "unknown")
+        yield Row("sensor", "skip", f"the running daemon has it (eyes: {eyes})")
+        return
+    driver = open_sensor(settings.sensor, MonotonicClock())
+    what = f"{settings.sensor.driver} ({settings.sensor.source})"
+    try:
+        driver.open()
+        frame = driver.read_newest(CHECK_SENSOR_FOR_S)
+    except (SensorLost, SensorTimeout, EndOfRecording) as error:
+        yield Row(
+            "sensor", "fail", f"{what}: {error or 'no sample'}", "plug it in; see the rows on USB; docs/hardware.md"
+        )
+        return
+    finally:
+        driver.close()
+    streams = {"eyes": frame.eyes, "colour": frame.colour, "depth": frame.depth_mm}
+    kinds = [name for name, value in streams.items() if value is not None]
+    serial = f", serial {driver.serial}" if driver.serial else ""
+    yield Row("sensor", "ok", f"{what} delivers {', '.join(kinds) or 'frames without a face'}{serial}")
+    calibrated = load_calibration(Path(settings.calibration.file) if settings.calibration.file else None)
+    if warning := calibrated.serial_warning(driver.serial):
+        yield Row("calibration", "fail", warning, "phasestack calibrate capture, then solve, with this sensor")
+
+
+def usb(settings: Settings) -> Iterator[Row]:
+    """Known depth cameras on USB: port speed, permissions, driver."""
+    from runtime.errors import MissingPart
+    from runtime.sensor.usb_devices import find_devices
+
+    needed = settings.sensor.driver not in (*NO_DEVICE, "usb-camera")
+    absent: Verdict = "fail" if needed else "skip"
+    try:
+        devices = find_devices()
+    except MissingPart as error:
+        yield Row("usb", absent, str(error), "install it" if needed else "")
+        return
+    if not devices:
+        remedy = "plug one in; docs/hardware.md lists them" if needed else ""
+        yield Row("usb", absent, "no known depth camera is plugged in", remedy)
+    for device in devices:
+        problems = device.problems()
+        state: Verdict = "ok" if not problems else "fail" if needed else "warn"
+        yield Row("usb", state, str(device), "; ".join(problems))
+
+
+def opengl(settings: Settings) -> Iterator[Row]:
+    """OpenGL without a screen, for the content and offscreen panels."""
+    from runtime.support.gl import describe, offscreen_context
+
+    context = offscreen_context()
+    try:
+        found = describe(context)
+    finally:
+        context.release()
+    for node in sorted(Path("/dev/dri").glob("renderD*")):
+        if not os.access(node, os.R_OK | os.W_OK):
+            yield Row("opengl", "warn", f"{node} may not be opened by this user", "join the groups video and render")
+    software = any(name in found["renderer"].lower() for name in ("llvmpipe", "softpipe", "swrast"))
+    bad = software and (settings.output.kind != "offscreen" or settings.model.backend == "gl")
+    slow = "slow: the processor draws; install the GPU's driver where there is one" if software else ""
+    yield Row("opengl", "warn" if bad else "ok", f"{found['renderer']}, {found['version']} ({found['vendor']})", slow)
+
+
+def monitors(settings: Settings) -> Iterator[Row]:
+    """Each panel has its monitor."""
+    from runtime.errors import InputError, PanelLost
+    from runtime.panels.monitors import bind, check_modes, refresh_difference
+    from runtime.panels.registry import panel_settings
+
+    if settings.output.kind == "offscreen":
+        yield Row("monitors", "skip", "output.kind is offscreen: no monitor is used")
+        return
+    from runtime.panels.display import connected_monitors
+
+    remedy = "phasestack identify shows what each monitor is called"
+    try:
+        there = connected_monitors()
+    except PanelLost as error:
+        yield Row("monitors", "fail", str(error), "start the X server; DISPLAY and XAUTHORITY name it")
+        return
+    for monitor in there:
+        yield Row("monitor", "ok", str(monitor), "" if monitor.serial else "has no EDID serial: bind it by connector")
+    panels = panel_settings(settings.output, len(settings.stack.x_m))
+    try:
+        bound = bind(panels, there)
+        size = {"width_px": settings.stack.width_px, "height_px": settings.stack.height_px}
+        check_modes(panels, bound, **size, allow_rescaling=settings.output.allow_rescaling)
+    except (InputError, PanelLost) as error:
+        yield Row("panels", "fail", str(error), remedy)
+        return
+    for number, monitor in enumerate(bound):
+        yield Row("panels", "ok", f"panel {number} is {monitor}")
+    if difference := refresh_difference(bound):
+        yield Row("panels", "warn", difference, "set them to the same mode")
+
+
+def content(settings: Settings) -> Iterator[Row]:
+    """The scene is there and can be read."""
+    from runtime.content.registry import prepare_content
+
+    prepare_content(settings.content, settings.stack.stack())
+    yield Row("content", "ok", settings.content.scene)
+
+
+def model(settings: Settings) -> Iterator[Row]:
+    """The network loads, its contract fits the stack, and the provider is there."""
+    from runtime.model.backends import choose
+    from runtime.model.predictor import load_predictor
+    from runtime.support.gl import offscreen_context
+
+    predictor = load_predictor(settings.model.name, settings.stack.stack(), settings.model)
+    name = predictor.name
+    with ExitStack() as cleanup:
+
+        def context() -> Any:
+            made = offscreen_context()
+            cleanup.callback(made.release)
+            return made
+
+        choice = choose(settings.model.backend, predictor, context)
+        predictor.close()
+    other = settings.model.name not in name and "/" not in settings.model.name
+    remedy = f"{settings.model.name} was asked for and does not fit this stack" if other else ""
+    yield Row("model", "warn" if other else "ok", f"{name} on {settings.model.provider}", remedy)
+    yield Row("backend", "ok", f"{choice.backend.name} around the network: {choice.why}")
+
+
+def calibration(settings: Settings) -> Iterator[Row]:
+    """The calibration file is there, is a similarity, and is not the demo's on a real sensor."""
+    from runtime.eyes.calibration import load_calibration
+
+    if not settings.calibration.file:
+        real = settings.sensor.driver not in NO_DEVICE
+        remedy = "phasestack calibrate capture, then solve, and set calibration.file" if real else ""
+        yield Row("calibration", "fail" if real else "ok", "the built-in one of the demo recording", remedy)
+        return
+    found = load_calibration(Path(settings.calibration.file))
+    fit = f", residual {found.residuals.rms_m * 1000:.1f} mm" if found.residuals else ""
+    yield Row("calibration", "ok", f"{found.source}: scale {found.scale:.4f}{fit}")
+    for warning in found.warnings:
+        yield Row("calibration", "warn", warning, "calibrate again")
+
+
+def service(settings: Settings) -> Iterator[Row]:
+    """Whether a daemon runs, and how it is."""
+    answer = _daemon(settings)
+    if answer is None:
+        yield Row("service", "skip", f"no daemon answers at {settings.service.socket}")
+        return
+    state = str(answer.get("state", "unknown"))
+    age_s = float(answer.get("turn_age_s", 0.0))
+    if age_s > HUNG_AFTER_S:
+        yield Row("service", "fail", f"its loop has stood still for {age_s:.0f} s", "journalctl -u phasestack")
+    elif state.startswith("degraded"):
+        yield Row("service", "fail", f"{state} ({answer.get('reason', '')})", "journalctl -u phasestack")
+    else:
+        yield Row("service", "ok", f"{state} ({answer.get('reason', '')}), pid {answer.get('pid')}")
+
+
+def _daemon(settings: Settings) -> dict[str, Any] | None:
+    """What the running daemon says of itself; None where none runs."""
+    from runtime.daemon.client import NotRunning, ask, candidates
+
+    try:
+        return ask(candidates(settings.service.socket), {"command": "status"}, timeout_s=2.0)
+    except NotRunning:
+        return None
+
+
+CHECKS: dict[str, Check] = {
+    "opengl": opengl,
+    "monitors": monitors,
+    "usb": usb,
+    "sensor": sensor,
+    "calibration": calibration,
+    "content": content,
+    "model": model,
+    "service": service,
+}

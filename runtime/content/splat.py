@@ -15,7 +15,7 @@ from runtime.content.placing import SceneFile
 from runtime.content.ply import read_header
 from runtime.optics.rect import PixelRect
 from runtime.records import F64
-from runtime.support.gl import DrawnPicture, linked_program
+from runtime.support.gl import DrawnPicture
 
 OVER = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA)
 STRAY = 1.0  # percent of the splats at either end of an axis that do not decide the scale
@@ -63,7 +63,7 @@ class SplatSource(CanvasSource):
         self._gaussians = moved(gaussians, stack_from_scene)
         linear = stack_from_scene[:3, :3]
         self._scene_from_stack_rotation = (np.linalg.inv(linear) * np.cbrt(np.linalg.det(linear))).astype(np.float32)
-        self._program = linked_program(context, vertex=VERTEX, fragment=FRAGMENT)
+        self._program = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
         count = len(gaussians.centres)
         self._corners = np.empty((count, 4, FLOATS), np.float32)
         self._buffer = context.buffer(reserve=max(self._corners.nbytes, 1), dynamic=True)

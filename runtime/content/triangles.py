@@ -19,7 +19,7 @@ from runtime.content.fringe import edges_of, ramps, silhouette
 from runtime.content.shapes import I32, Shape
 from runtime.optics.rect import PixelRect, union
 from runtime.records import F32, F64, U8
-from runtime.support.gl import DrawnPicture, linked_program
+from runtime.support.gl import DrawnPicture
 
 OUTLINED_MAX = 200_000  # triangles of a part; beyond, finding its outline costs more than drawing it
 PROJECTED_MAX = 5000  # vertices of a part that are projected to see where it lies; beyond, its box is
@@ -227,7 +227,8 @@ class TriangleSource(CanvasSource):
     def _program(self, features: tuple[str, ...]) -> Any:
         if features not in self._programs:
             head = "#version 330\n" + "".join(f"#define {name}\n" for name in features)
-            self._programs[features] = linked_program(self.context, vertex=head + VERTEX, fragment=head + FRAGMENT)
+            shaders = {"vertex_shader": head + VERTEX, "fragment_shader": head + FRAGMENT}
+            self._programs[features] = self.context.program(**shaders)
         return self._programs[features]
 
     def _texture(self, picture: U8) -> Any:

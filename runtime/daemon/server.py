@@ -95,11 +95,6 @@ class StatusServer:
         """
         self._snapshot = (self._clock.now_ns(), snapshot)
 
-    @property
-    def connections(self) -> int:
-        """Clients that are connected now."""
-        return len(self._clients)
-
     def close(self) -> None:
         """Answer what waits, stop, and remove the socket. May be called twice."""
         if self._thread is None:

@@ -14,9 +14,10 @@ from importlib.resources import files
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-import anyio
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
+from starlette.middleware import Middleware
+from starlette.middleware.base import BaseHTTPMiddleware
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 from starlette.routing import Route
@@ -30,7 +31,6 @@ from runtime.support.untrusted_input import parsed_json
 
 COOKIE = "phasestack"
 BODY_MAX_BYTES = 65536
-WRONG_TOKEN_S = 0.5  # so long a wrong token is thought about
 ASSETS = {"page.js": "text/javascript", "page.css": "text/css"}
 Handler = Callable[[Request], Awaitable[Response]]
 
@@ -99,7 +99,6 @@ def application(daemon: Daemon, token: str) -> Starlette:
         except ValueError:  # too long, or the client went away
             fields = {}
         if not same(fields.get("token", [""])[0].strip(), token):
-            await anyio.sleep(WRONG_TOKEN_S)
             return HTMLResponse(_login("That is not the token."), 401)
         answer = RedirectResponse("/", 303)
         answer.set_cookie(COOKIE, cookie, httponly=True, samesite="strict", path="/")
@@ -118,46 +117,29 @@ def application(daemon: Daemon, token: str) -> Starlette:
         Route("/now/{name}", guarded(look_up), methods=["GET"]),
         Route("/{name}", guarded(asset), methods=["GET"]),
     ]
-    app = Starlette(routes=routes)
-    app.add_middleware(_Guard)
-    return app
+    return Starlette(routes=routes, middleware=[Middleware(BaseHTTPMiddleware, dispatch=_guard)])
 
 
-class _Guard:
+async def _guard(request: Request, handler: Handler) -> Response:
     """For every request: whose page it comes from, by which name, and what the answer may load."""
+    refused = _refused(request)
+    answer = Answer({"ok": False, "error": refused}, 403) if refused else await handler(request)
+    answer.headers.update(_headers())
+    return answer
 
-    def __init__(self, app: Any) -> None:
-        self._app = app
 
-    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-        request = Request(scope)
-        refused = self._refused(request)
-
-        async def send_with_headers(message: Any) -> None:
-            if message["type"] == "http.response.start":
-                message["headers"] = [*message.get("headers", []), *_headers()]
-            await send(message)
-
-        if refused:
-            await Answer({"ok": False, "error": refused}, 403)(scope, receive, send_with_headers)
-        else:
-            await self._app(scope, receive, send_with_headers)
-
-    def _refused(self, request: Request) -> str:
-        host = request.headers.get("host", "")
-        # A name that another site has made to lead here is none of ours.
-        if _name(host) not in ("localhost", "127.0.0.1", "::1"):
-            return "not by this name: open http://localhost"
-        if request.method in ("GET", "HEAD"):
-            return ""
-        origin = request.headers.get("origin")
-        if origin is None:
-            given = request.headers.get("authorization", "").lower().startswith("bearer ")
-            return "" if given else "a browser's request says where it comes from (Origin)"
-        return "" if host and _place(origin) == host else "from another site"
+def _refused(request: Request) -> str:
+    host = request.headers.get("host", "")
+    # A name that another site has made to lead here is none of ours.
+    if _name(host) not in ("localhost", "127.0.0.1", "::1"):
+        return "not by this name: open http://localhost"
+    if request.method in ("GET", "HEAD"):
+        return ""
+    origin = request.headers.get("origin")
+    if origin is None:
+        given = request.headers.get("authorization", "").lower().startswith("bearer ")
+        return "" if given else "a browser's request says where it comes from (Origin)"
+    return "" if host and _place(origin) == host else "from another site"
 
 
 def _place(origin: str) -> str:
@@ -175,13 +157,13 @@ def _name(host: str) -> str:
 
 
 @cache
-def _headers() -> tuple[tuple[bytes, bytes], ...]:
+def _headers() -> dict[str, str]:
     style = base64.b64encode(hashlib.sha256(_login_style().encode()).digest()).decode()
     policy = (
         f"default-src 'none'; script-src 'self'; style-src 'self' 'sha256-{style}'; img-src 'self' data:; "
         "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
     )
-    told = {
+    return {
         "Content-Security-Policy": policy,
         "X-Content-Type-Options": "nosniff",
         "X-Frame-Options": "DENY",
@@ -190,7 +172,6 @@ def _headers() -> tuple[tuple[bytes, bytes], ...]:
         "Cross-Origin-Opener-Policy": "same-origin",
         "Cache-Control": "no-store",
     }
-    return tuple((name.lower().encode(), value.encode()) for name, value in told.items())
 
 
 async def _body(request: Request) -> bytes:

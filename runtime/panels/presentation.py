@@ -10,7 +10,6 @@ from runtime.optics.alignment import EVEN_CODE, is_identity, scale_and_shift
 from runtime.panels import lut
 from runtime.panels.geometry import layer_from_screen, permutes_pixels
 from runtime.records import Layers, PanelFrame, pixels_of
-from runtime.support.gl import linked_program
 from runtime.support.gl_sharing import LayerTextures, ShareGroup, lies_in
 
 VERTEX = """#version 330 core
@@ -205,7 +204,7 @@ class Painter:
         )
         # A homography's sign means nothing; the shader wants the panel's middle before the horizon.
         matrix = matrix / (matrix[2] @ np.array([screen_px[0] / 2, screen_px[1] / 2, 1.0]))
-        self._program = linked_program(context, vertex=VERTEX, fragment=FRAGMENT)
+        self._program = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
         self._array = context.vertex_array(self._program, [])
         table = np.ascontiguousarray(lut.curve(lut=settings.lut, gamma=settings.gamma).T)
         self._curve = context.texture((lut.ENTRIES, 3), 1, table.tobytes(), dtype="f4")

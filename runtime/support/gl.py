@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from runtime.errors import MissingPart
 from runtime.records import U8
-from runtime.support.interrupts import interrupts_held
 
 if TYPE_CHECKING:
     import moderngl
@@ -31,20 +30,12 @@ def offscreen_context() -> moderngl.Context:
     if "MESA_SHADER_CACHE_DIR" not in os.environ:  # nothing is left in a home: ours compile in milliseconds
         os.environ["MESA_SHADER_CACHE_DISABLE"] = "true"
     try:
-        with interrupts_held():
-            return moderngl.create_context(require=MINIMUM_VERSION, standalone=True, **EGL)
+        return moderngl.create_context(require=MINIMUM_VERSION, standalone=True, **EGL)
     except Exception as error:  # moderngl and glcontext raise plain Exception
         raise MissingPart(
             f"no OpenGL without a screen ({str(error).strip() or 'EGL failed'}): "
             f"install Debian's packages {DEBIAN_PACKAGES}"
         ) from None
-
-
-def linked_program(context: moderngl.Context, *, vertex: str, fragment: str) -> Any:
-    """Two shaders as a program. moderngl makes its uniforms by calls of Python that it takes to succeed: an interrupt
-    in one of them was a segmentation fault."""
-    with interrupts_held():
-        return context.program(vertex_shader=vertex, fragment_shader=fragment)
 
 
 @cache

@@ -14,19 +14,15 @@ PASSING = frozenset(
 )
 
 
-class RetryableError(TransientError):
-    """The machine lacked something: start again. Its text is that of what went wrong."""
-
-
 @contextmanager
 def retry_advised() -> Iterator[None]:
-    """What may pass becomes a RetryableError: exit 75, start again."""
+    """What may pass becomes a TransientError: exit 75, start again."""
     try:
         yield
     except Exception as error:
         if isinstance(error, TransientError) or not is_retryable(error):
             raise
-        raise RetryableError(f"{str(error) or type(error).__name__} (this may pass: start again)") from error
+        raise TransientError(f"{str(error) or type(error).__name__} (this may pass: start again)") from error
 
 
 def is_retryable(error: BaseException | None) -> bool:

@@ -222,7 +222,7 @@ def test_tricklers_lock_out_nobody(server: StatusServer, path: Path) -> None:
             command.take()
             command.done()
             assert asked.result(timeout=60) == {"ok": True}
-        assert server.connections <= server_module.CLIENTS_MAX
+        assert len(server._clients) <= server_module.CLIENTS_MAX
     finally:
         stop.set()
         for thread in threads:
@@ -254,7 +254,7 @@ def test_a_client_that_does_not_read_its_answers_is_let_go(hasty: StatusServer, 
         with pytest.raises(OSError):  # at last the server reads no more
             while True:
                 client.sendall(b'{"command": "status"}\n' * 100)
-        assert eventually(lambda: hasty.connections == 0, within_s=20)
+        assert eventually(lambda: not hasty._clients, within_s=20)
     assert ask([path], STATUS)["ok"]
 
 

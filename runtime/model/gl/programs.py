@@ -12,7 +12,6 @@ from typing import Any
 import moderngl
 
 from runtime.errors import ContextLost, PhasestackError
-from runtime.support.gl import linked_program
 
 INCLUDE = re.compile(r'^#include "([a-z_]+\.glsl)"$', re.MULTILINE)
 SHADERS = "runtime.model.gl"
@@ -159,7 +158,7 @@ class Passes:
     def _program(self, name: str, defines: tuple[str, ...]) -> tuple[Any, Any, dict[str, Any]]:
         if (name, defines) not in self._programs:
             fragment = source(f"{name}.frag.glsl", defines=defines)
-            program = linked_program(self.context, vertex=self._vertex, fragment=fragment)
+            program = self.context.program(vertex_shader=self._vertex, fragment_shader=fragment)
             self._programs[name, defines] = program, self.context.vertex_array(program, []), {}
         return self._programs[name, defines]
 
