@@ -12,13 +12,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from runtime.clock import NS_PER_S
 from runtime.eyes.demo_geometry import demo_sensor_from_stack
 from runtime.eyes.motions import true_eyes
 from runtime.records import EyePoints, SensorFrame
-from runtime.sensor.recording import recording_to
+from runtime.sensor.recording import Recording, recording_to
 from runtime.sensor.recording_format import RecordingHeader
+from runtime.sensor.replay import demo_recording_path
 from runtime.support.artifacts import read_image
 from tests.test_cli import phasestack
 from tests.waiting import PATIENT
@@ -140,8 +142,10 @@ def known(folder: Path) -> list[dict[str, Any]]:
 
 
 def test_true_eyes_are_those_at_the_light(runs: tuple[Path, Path]) -> None:
-    from runtime.evaluation.demo_recording import true_eyes as of_the_demo
-
+    samples = list(Recording(demo_recording_path()).samples())
+    began_ns = samples[0].capture_ns
+    times_s = [(sample.capture_ns - began_ns) / NS_PER_S for sample in samples]
+    of_the_demo = CubicSpline(times_s, [sample.true_eyes_m for sample in samples])
     for line in known(runs[0])[5:]:
         expected = of_the_demo(line["predicted_for_ns"] / NS_PER_S)
         assert np.abs(np.array(line["true_eyes_m"]) - expected).max() < 0.0005

@@ -17,15 +17,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runtime.errors import InputError
-from runtime.evaluation.demo_recording import demo_recording_bytes, samples
 from runtime.records import EyePoints, Intrinsics, SensorFrame
 from runtime.sensor.recording import MAX_S, Recording, recording_to
 from runtime.sensor.recording_format import RecordingHeader, eyes_message, frame_from_eyes_message
+from runtime.sensor.replay import demo_recording_path
 
 EYES_ONLY = RecordingHeader(driver="test", serial="S1")
 WITH_IMAGES = RecordingHeader(driver="test", colour=True, depth=True)
-DEMO = [eyes_message(frame) for frame in samples()]
-DEMO_BYTES = demo_recording_bytes()
+DEMO = [eyes_message(frame) for frame in Recording(demo_recording_path()).samples()]
+DEMO_BYTES = demo_recording_path().read_bytes()
 CAMERA = Intrinsics(64, 48, 60.0, 61.0, 32.5, 23.5)
 
 
