@@ -29,22 +29,12 @@ class Placing:
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # frame `stack`
     rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # about x, y, z of `stack`, in this order
     turntable_per_min: float = 0.0  # about the vertical
-    start_turns: float = 0.0  # of the turntable at time 0
-
-    @property
-    def stands_as_it_is(self) -> bool:
-        """Nothing is moved."""
-        return self == Placing(start_turns=self.start_turns)
-
-    def turns_at(self, time_ns: int) -> float:
-        """Of the turntable."""
-        # Whole turns are left out first: a clock that has run for months keeps its fractions.
-        period_ns = NS_PER_MIN / self.turntable_per_min if self.turntable_per_min else 0.0
-        return self.start_turns + (time_ns % period_ns) / period_ns if period_ns else 0.0
 
     def rotation(self, time_ns: int) -> F64:
         """3x3 stack_from_scene turn."""
-        turntable = rotation_matrix((0.0, 0.0, 360.0 * self.turns_at(time_ns)), "xyz")
+        # Whole turns are left out first: a clock that has run for months keeps its fractions.
+        period_ns = NS_PER_MIN / self.turntable_per_min if self.turntable_per_min else np.inf
+        turntable = rotation_matrix((0.0, 0.0, 360.0 * (time_ns % period_ns) / period_ns), "xyz")
         return turntable @ rotation_matrix(self.rotation_deg, "xyz")
 
     def stack_from_scene(self, time_ns: int) -> F64:
@@ -54,25 +44,17 @@ class Placing:
         matrix[:3, 3] = self.offset_m
         return matrix
 
-    def after(self, earlier: Placing, time_ns: int) -> Placing:
-        """This one, its turntable going on from where an earlier one's stands."""
-        if not self.turntable_per_min:
-            return self
-        ahead = replace(self, start_turns=0.0).turns_at(time_ns)
-        return replace(self, start_turns=(earlier.turns_at(time_ns) - ahead) % 1.0)
-
 
 def placing_of(settings: ContentSettings) -> Placing:
     """As the settings have it."""
     return Placing(settings.scale, settings.offset_m, settings.rotation_deg, settings.turntable_per_min)
 
 
-def placed_source(source: ContentSource, placing: Placing, *, time_ns: int = 0) -> ContentSource:
+def placed_source(source: ContentSource, placing: Placing) -> ContentSource:
     """The source at its place; one that was placed before is placed anew."""
     if isinstance(source, PlacedSource):
-        placing = placing.after(source.placing, time_ns)
         source = source.source
-    return source if placing.stands_as_it_is else PlacedSource(source, placing)
+    return source if placing == Placing() else PlacedSource(source, placing)
 
 
 class PlacedSource(ForwardingSource):

@@ -183,9 +183,9 @@ class Daemon(Host):
         changed(presenter.run_cell.state.settings, "content", values, source="place")
 
         def place(parts: Any) -> bool:
-            state, now_ns = parts.run.state, presenter.clock.now_ns()
+            state = parts.run.state
             settings = changed(state.settings, "content", values, source="place")
-            source = placed_source(state.content, placing_of(settings.content), time_ns=now_ns)
+            source = placed_source(state.content, placing_of(settings.content))
             parts.run.replace(settings=settings, content=source)
             self._chosen = self._chosen | {("content", key): value for key, value in values.items()}
             self._answer(presenter, command, "")

@@ -22,8 +22,7 @@ from runtime.sensor.recording_format import RecordingHeader
 from runtime.support import untrusted_input
 
 CHUNK_BYTES = 4096  # some 20 eye samples
-MESSAGE_OVERHEAD_BYTES = 64
-INDEX_BYTES_PER_CHUNK = 256
+INDEX_SHARE = 1.1  # a file with the indices of its chunks, beside without
 SUMMARY_BYTES = 10_000  # with the schemas
 MAX_S, MAX_BYTES = 600.0, 2 << 30  # a recording ends before it is longer or larger
 MAGIC = b"\x89MCAP0\r\n"
@@ -54,7 +53,7 @@ class RecordingWriter:
         self._writer.start(profile="phasestack", library="phasestack")
         self._writer.add_metadata(fmt.METADATA_NAME, header.metadata())
         self._channels: dict[str, int] = {}
-        self._chunks = self.count = 0
+        self.count = 0
         self._first_ns: int | None = None
         self._intrinsics: Intrinsics | None = None
 
@@ -77,15 +76,11 @@ class RecordingWriter:
             messages.append((fmt.DEPTH_TOPIC, fmt.depth_message(frame.depth_mm, capture_ns=at)))
         messages.append((fmt.EYES_TOPIC, fmt.eyes_message(frame)))
         first_ns = at if self._first_ns is None else self._first_ns
-        size = sum(len(data) + MESSAGE_OVERHEAD_BYTES for _, data in messages)
-        indices = INDEX_BYTES_PER_CHUNK * (self._chunks + len(messages))
-        total = self._file.tell() + CHUNK_BYTES + size + SUMMARY_BYTES + indices
-        if at - first_ns > self._max_ns or total > MAX_BYTES:
+        written = self._file.tell() + CHUNK_BYTES + sum(len(data) for _, data in messages)
+        if at - first_ns > self._max_ns or INDEX_SHARE * written + SUMMARY_BYTES > MAX_BYTES:
             return False
         for topic, data in messages:
-            before = self._file.tell()
             self._writer.add_message(self._channel(topic), at, data, at, frame.sequence & 0xFFFFFFFF)
-            self._chunks += self._file.tell() > before
         self._file.flush()
         self._first_ns, self._intrinsics = first_ns, frame.intrinsics or self._intrinsics
         self.count += 1
