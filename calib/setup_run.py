@@ -1,4 +1,4 @@
-"""`phasestack setup`: from step to step with a person, resumable, and a page of figures at the end."""
+"""`phasestack setup`: from step to step with a person, resumable, and the figures at the end."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from calib.keys import Key, TerminalKeys
 from calib.setup_steps import STEPS, Setup, Step, Stopped
 from runtime.config import load_settings
 from runtime.errors import InputError, PhasestackError
-from runtime.report.page import Page, section_of
 from runtime.support import untrusted_input
-from runtime.support.artifacts import write_json, write_text
+from runtime.support.artifacts import write_json
 
 MAX_PROGRESS_BYTES = 4 << 20
 
@@ -107,7 +106,7 @@ def _problem_of(setup: Setup, step: Step) -> str:
 
 
 def summarise(setup: Setup, *, finished: bool) -> tuple[dict[str, Any], str]:
-    """Write the page of figures, and say what comes next."""
+    """Write the figures, and say what comes next."""
     missing = [step.name for step in STEPS if step.name not in setup.done]
     summary: dict[str, Any] = {
         "config": str(setup.config),
@@ -116,15 +115,11 @@ def summarise(setup: Setup, *, finished: bool) -> tuple[dict[str, Any], str]:
         "missing": missing,
         "simulated": setup.hardware.simulated,
     }
-    rows = [[step.title, str(setup.done[step.name].get("text", ""))] for step in STEPS if step.name in setup.done]
-    lines = [f"{title}: {text}" for title, text in rows]
+    lines = [f"{step.title}: {setup.done[step.name].get('text', '')}" for step in STEPS if step.name in setup.done]
     if finished:
-        notes = [note for figures in setup.done.values() for note in figures.get("notes", [])]
-        section = section_of("Figures", [["", "figure"], *rows])
-        page = Page("Setting up", f"{setup.config}: the figures of each step.", [section], notes=notes)
-        write_text(setup.out / "index.html", page.html())
+        lines += [f"note: {note}" for figures in setup.done.values() for note in figures.get("notes", [])]
         write_json(setup.out / "setup.json", summary)
-        lines.append(f"{setup.out / 'index.html'} has the figures; {setup.config} is valid")
+        lines.append(f"{setup.out / 'setup.json'} has the figures; {setup.config} is valid")
         if setup.hardware.simulated:
             lines.append(f"look: phasestack run --config {setup.config} --replay demo --headless --frames 60 --out run")
         else:

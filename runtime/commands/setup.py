@@ -12,9 +12,7 @@ def setup(
     config: Annotated[
         Path, typer.Option(help="configuration to write; one that is there is changed, the old one kept")
     ] = Path("phasestack.toml"),
-    out: Annotated[Path, typer.Option(help="folder for pairs, calibration, reports and the page of figures")] = Path(
-        "setup"
-    ),
+    out: Annotated[Path, typer.Option(help="folder for pairs, calibration, reports and setup.json")] = Path("setup"),
     photos: Annotated[Path, typer.Option(help="folder in which the photographs will lie")] = Path("photos"),
     simulate: Annotated[bool, typer.Option("--simulate", help="a display that is not there, to try it out")] = False,
     seed: Annotated[int, typer.Option(min=0, help="of the simulated display")] = 0,
@@ -23,8 +21,8 @@ def setup(
     """Set a display up: which monitor is which panel, sizes, registration by photographs, sensor, calibration.
 
     Driven by keys alone, in the terminal or on a panel's window; what is asked stands on the panels too. Every step
-    can be skipped and repeated; q stops, and the same command goes on there. At the end: a page of figures, and a
-    configuration that is valid.
+    can be skipped and repeated; q stops, and the same command goes on there. At the end: the figures of each step,
+    and a configuration that is valid.
 
     Example: phasestack setup --simulate --config try.toml --out try
     """

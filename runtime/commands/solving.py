@@ -159,11 +159,11 @@ class _Pair:
             middle = "between"
             ways[middle] = lambda job: replace(job, channels=1)
 
-        def call(changed: Callable[[Job], Job] | None) -> Callable[[int], U8]:
-            return lambda _: self.solve(changed).layers
+        def call(changed: Callable[[Job], Job] | None) -> Callable[[], U8]:
+            return lambda: self.solve(changed).layers
 
         calls = {name: call(changed) for name, changed in ways.items()}
-        done = timed_in_turn(calls, runs=COMPARED, keep=lambda layers: layers.copy())
+        done = timed_in_turn(calls, runs=COMPARED)
         shown_db = {name: self._psnr_db(way.answer) for name, way in done.items() if name != "planned"}
         shown_db["planned"] = planned_db
 

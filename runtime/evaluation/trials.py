@@ -10,6 +10,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S
+from runtime.records import U8
 
 T = TypeVar("T")
 
@@ -48,28 +49,19 @@ def timed(
     return Timed(answer, tuple(times_ms))
 
 
-def timed_in_turn(
-    ways: Mapping[str, Callable[[int], T]],
-    *,
-    runs: int,
-    keep: Callable[[T], T] = lambda answer: answer,
-) -> dict[str, Timed[T]]:
+def timed_in_turn(ways: Mapping[str, Callable[[], U8]], *, runs: int) -> dict[str, Timed[U8]]:
     """Several calls that take turns, run by run: what slows the machine slows all of them.
 
-    The first run of each doesn't count. Each is told the number of its run.
-    keep: makes the last answer one's own, outside of the time.
+    The first run of each doesn't count. Answers are copies: a call may use its own again.
     """
     times: dict[str, list[float]] = {name: [] for name in ways}
-    answers: dict[str, T] = {}
+    answers: dict[str, U8] = {}
     for run in range(1 + runs):
         for name, way in ways.items():
-            begin_ns = perf_counter_ns()
-            answer = way(run)
-            took_ms = (perf_counter_ns() - begin_ns) / NS_PER_MS
-            if run > 0:
-                times[name].append(took_ms)
+            answer, took_ms = _timed(way)
+            times[name] += [took_ms] if run > 0 else []
             if run == runs:
-                answers[name] = keep(answer)
+                answers[name] = answer.copy()
     return {name: Timed(answers[name], tuple(times[name])) for name in ways}
 
 

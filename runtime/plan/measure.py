@@ -51,8 +51,8 @@ def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_de
         targets = retina_pictures(content, at_m, stack, fov_deg=fov_deg, time_ns=0)
         return displayed(layers, targets, stack, eyes_m=at_m, fov_deg=fov_deg, similarity=False).quality.psnr_db
 
-    def frames(made: Callable[[], Job]) -> Callable[[int], U8]:
-        return lambda _: predictor.solve(made()).layers
+    def frames(made: Callable[[], Job]) -> Callable[[], U8]:
+        return lambda: predictor.solve(made()).layers
 
     stack = predictor.stack
     job = drawn_for(predictor, content, eyes_m, time_ns=0, trimmed=True)
@@ -67,7 +67,7 @@ def measure(predictor: Predictor, content: ContentSource, eyes_m: F64, *, fov_de
     calls = {name: frames(way) for name, way in ways.items()}
     done = {
         name: TrialResult(way.answer, way.times_ms, psnr_db(way.answer, eyes_m))
-        for name, way in timed_in_turn(calls, runs=REPEATS, keep=lambda layers: layers.copy()).items()
+        for name, way in timed_in_turn(calls, runs=REPEATS).items()
     }
     without, with_plan = done["without"], done["with"]
     between = done.get("one channel", without)

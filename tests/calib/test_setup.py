@@ -102,7 +102,8 @@ def test_keys_alone_lead_from_nothing_to_a_configuration_that_is_valid(set_up: S
     told = json.loads((folder / "out" / "setup.json").read_text())
     assert told["finished"]
     assert set(told["done"]) == {step.name for step in STEPS}
-    assert "mm of error expected at the eye" in (folder / "out" / "index.html").read_text()
+    assert "mm of error expected at the eye" in told["done"]["calibration"]["text"]
+    assert told["done"]["calibration"]["text"] in done.stdout
 
 
 @pytest.mark.slow
