@@ -26,7 +26,7 @@ from runtime.errors import InputError, one_line
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.support import untrusted_input
 from runtime.support.plausible import check_text, nearest, socket_path, within
-from runtime.support.plugins import is_plugin
+from runtime.support.plugins import located
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
 from runtime.support.removed import REMOVED_SETTINGS
 
@@ -490,18 +490,6 @@ PATHS = (
     ("content", "library"), ("service", "socket"),
 )  # fmt: skip
 NAMES_OR_PATHS = (("content", "scene"), ("model", "name"))
-
-
-def located(name: str, folder: Path) -> str:
-    """A name as it is; a path that is relative, seen from a folder. A bare word without a suffix is a name.
-
-    What has a scheme (`rtsp://...`) is no path, nor is a class (`module:Class`).
-    """
-    if "://" in name or is_plugin(name):
-        return name
-    if not name or "\0" in name or not ("/" in name or Path(name).suffix):
-        return name
-    return str(folder / name)
 
 
 def _seen_from(folder: Path, table: dict[str, Any]) -> dict[str, Any]:

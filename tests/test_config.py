@@ -12,10 +12,8 @@ import pytest
 
 from runtime.commands.app import app
 from runtime.config import Settings, load_settings, load_stack, with_options
-from runtime.daemon.names import scene_from_here, scene_names
 from runtime.errors import InputError
 from runtime.support import cache
-from runtime.support.artifacts import write_png
 from runtime.support.removed import REMOVED_COMMANDS, removed_command
 from tests.test_cli import phasestack
 
@@ -146,23 +144,6 @@ def test_what_the_command_line_says_is_checked_like_the_file(given: dict[str, st
     with pytest.raises(InputError, match=f"^--{next(iter(given))}: "):
         with_options(Settings(), **given)
     assert with_options(Settings(), model="fast", headless=True).model.name == "fast"
-
-
-def test_a_scene_for_the_daemon_is_absolute_and_a_name_stays_a_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import numpy as np
-
-    monkeypatch.chdir(tmp_path)
-    write_png(tmp_path / "a.png", np.zeros((4, 4, 3), np.uint8))
-    (tmp_path / "demo").mkdir()
-    (tmp_path / "pictures").mkdir()
-    assert scene_from_here("a.png") == str(tmp_path / "a.png")
-    assert scene_from_here("pictures") == str(tmp_path / "pictures")
-    assert scene_from_here("demo") == "demo", "a folder of that name does not hide the scene"
-    assert "lego_bulldozer" in scene_names()
-    assert scene_from_here("nowhere") == "nowhere"
-    assert scene_from_here("n" * 5000) == "n" * 5000
 
 
 def test_every_wrong_field_of_a_file_is_told_in_one_line(tmp_path: Path) -> None:

@@ -27,15 +27,15 @@ def scene(
     config: Config = None,
     socket: Socket = None,
 ) -> None:
-    """Show another scene: a preset's name, `demo`, or a file or folder of this machine, seen from here.
+    """Show another scene: a preset's name, `demo`, or a file or folder (`./NAME`) of this machine.
 
     The present scene goes on while it is loaded, and stays where it can't be: then this exits with 2 and one line.
 
     Example: phasestack ctl scene demo
     """
-    from runtime.daemon.names import scene_from_here
+    from runtime.support.plugins import located
 
-    request = {"command": "next"} if name == "next" else {"command": "scene", "value": scene_from_here(name)}
+    request = {"command": "next"} if name == "next" else {"command": "scene", "value": located(name, Path.cwd())}
     tell(request, config, socket)
 
 
@@ -82,9 +82,9 @@ def model(
 
     Example: phasestack ctl model best
     """
-    from runtime.daemon.names import model_from_here
+    from runtime.support.plugins import located
 
-    tell({"command": "model", "value": model_from_here(name)}, config, socket)
+    tell({"command": "model", "value": located(name, Path.cwd())}, config, socket)
 
 
 PLAIN = {

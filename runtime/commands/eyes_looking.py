@@ -18,7 +18,7 @@ from runtime.errors import EndOfRecording, InputError, SensorTimeout
 from runtime.eyes.detect import EyeFinder
 from runtime.eyes.face_flow import RIGID
 from runtime.eyes.pupils import Pupils
-from runtime.records import U8, EyePoints, SensorFrame
+from runtime.records import U8, SensorFrame
 from runtime.sensor.recording import Recording
 from runtime.sensor.registry import open_sensor
 from runtime.support import untrusted_input
@@ -58,17 +58,9 @@ class Watcher:
             "seen": None if pupils is None else pupils.seen,
             "ms": ms,
             "eyes_m": None if found is None else found.eyes_m.tolist(),
-            "sigma_mm": _sigma_mm(found),
             "reason": reason,
         }
         return row, pupils
-
-
-def _sigma_mm(found: EyePoints | None) -> list[float] | None:
-    """Of the eyes' middle along the axes of the sensor."""
-    if found is None or found.covariance_m2 is None:
-        return None
-    return [float(1e3 * sigma) for sigma in np.sqrt(np.diag(found.covariance_m2))]
 
 
 def look_at_files(

@@ -14,11 +14,12 @@ from typing import Annotated, Any
 from pydantic import Field, field_validator
 
 from runtime.clock import NS_PER_S
-from runtime.config import ContentSettings, Section, located, read_table, validated
+from runtime.config import ContentSettings, Section, read_table, validated
 from runtime.content.base import ContentInfo, ContentSource, ForwardingSource, View
 from runtime.content.placed import FIELDS
 from runtime.errors import InputError
 from runtime.support.plausible import within
+from runtime.support.plugins import located
 
 ENTRIES_MAX = 64
 

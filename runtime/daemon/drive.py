@@ -19,16 +19,14 @@ from runtime.support.figures import lines_of
 JOBS_END_WITHIN_S = 3.0  # what is still loading at the end
 
 
-def drive(
-    settings: Settings, options: RunOptions, host: Host | None = None, *, expected: int | None = None
-) -> dict[str, Any]:
-    """Run to the end and answer the summary. expected: refreshes that the progress counts to, where it is known."""
+def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> dict[str, Any]:
+    """Run to the end and answer the summary."""
     done = 0
 
     def advance(account: RefreshAccount) -> None:
         nonlocal done
         done += 1
-        progress.tell(f"{account.state}: refresh", done, options.frames or expected)
+        progress.tell(f"{account.state}: refresh", done, options.frames)
 
     with ExitStack() as cleanup:
         cleanup.callback(progress.tell, "", 0)

@@ -1,8 +1,7 @@
-"""What an operator may name: scenes and models, seen from here."""
+"""What an operator may name: scenes and models."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -45,25 +44,3 @@ def model_names() -> tuple[str, ...]:
     from runtime.model.predictor import SHIPPED
 
     return (*SHIPPED, "sart")
-
-
-def scene_from_here(name: str) -> str:
-    """A scene for a daemon that runs elsewhere: a file's or folder's absolute path; a known name as it is.
-
-    What is neither known nor there is left as it is: the daemon says what it knows.
-    """
-    return _from_here(name, scene_names)
-
-
-def model_from_here(name: str) -> str:
-    """The same of a model."""
-    return _from_here(name, model_names)
-
-
-def _from_here(name: str, known: Callable[[], tuple[str, ...]]) -> str:
-    try:
-        if not Path(name).exists() or (Path(name).name == name and name in known()):
-            return name
-        return str(Path(name).absolute())
-    except (OSError, ValueError):  # too long, or a NUL character
-        return name

@@ -46,23 +46,13 @@ class TextFormat(logging.Formatter):
         self._journald = journald
 
     def format(self, record: logging.LogRecord) -> str:
-        text = _message(record)
-        if problem := _exception(record):
-            text += f": {problem}"
+        text = one_line(record.getMessage(), most=LINE_MAX)  # nobody's name or message forges another line
+        if record.exc_info and record.exc_info[1]:
+            text += f": {written(record.exc_info[1])}"  # the file where it stands whole: for whoever mends it
         if self._journald:
             return PRIORITY.get(record.levelno, "<6>") + text
         when = datetime.fromtimestamp(record.created).strftime("%H:%M:%S")
         return f"{when} {record.levelname.lower():7} {text}"
-
-
-def _message(record: logging.LogRecord) -> str:
-    """On one line: nobody's name or message forges another."""
-    return one_line(record.getMessage(), most=LINE_MAX)
-
-
-def _exception(record: logging.LogRecord) -> str:
-    """One line that names the file where it stands whole: a traceback is for whoever mends it. Empty: there is none."""
-    return written(record.exc_info[1]) if record.exc_info and record.exc_info[1] else ""
 
 
 class RateLimit(logging.Filter):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
+from pathlib import Path
 from typing import Any
 
 from runtime.errors import InputError, one_line
@@ -14,6 +15,18 @@ PLUGIN = re.compile(r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", re.ASCII)
 def is_plugin(name: str) -> bool:
     """True for `module:Class`."""
     return PLUGIN.fullmatch(name) is not None
+
+
+def located(name: str, folder: Path) -> str:
+    """A name as it is; a path that is relative, seen from a folder. A bare word without a suffix is a name.
+
+    What has a scheme (`rtsp://...`) is no path, nor is a class (`module:Class`).
+    """
+    if "://" in name or is_plugin(name):
+        return name
+    if not name or "\0" in name or not ("/" in name or Path(name).suffix):
+        return name
+    return str(folder / name)
 
 
 def plugin_class(name: str, base: type, *, field: str) -> Any:

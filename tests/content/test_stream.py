@@ -11,12 +11,13 @@ from typing import Any
 import pytest
 
 from runtime.clock import MonotonicClock
-from runtime.config import ContentSettings, located
+from runtime.config import ContentSettings
 from runtime.content import stream
 from runtime.content.base import ContentSource
 from runtime.content.registry import open_content, prepare_content
 from runtime.errors import ContentFailure, InputError, MissingPart
 from runtime.optics.stack import PanelStack
+from runtime.support.plugins import located
 from tests.content.conftest import panel_view
 from tests.waiting import eventually
 
