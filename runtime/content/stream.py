@@ -1,7 +1,7 @@
 """Live pictures: a stream or a capture card, read and decoded alongside by PyAV.
 
-The newest whole picture is shown, for both eyes the same one. What ends is opened again, what stalls or changes its
-size is reported in one line, and the last good picture stays.
+The newest whole picture is shown, for both eyes the same one. What ends or sends nothing is opened again, in one line
+of the log, and the last good picture stays.
 """
 
 from __future__ import annotations
@@ -70,7 +70,6 @@ class Reader:
         self.newest: tuple[int, U8] | None = None  # number, (h, w, 4) RGBA
         self.arrived_ns = time.monotonic_ns()
         self.problem = "waiting for its first picture"
-        self._size: tuple[int, int] | None = None
         self._reported = ""
 
     def run(self) -> None:
@@ -121,23 +120,14 @@ class Reader:
         if not container.streams.video or container.streams.video[0].codec_context is None:
             raise InputError(self.shown, "", "holds no pictures that can be decoded")
         stream = container.streams.video[0]
-        self._check_size(stream.codec_context.width, stream.codec_context.height)
+        check_size(stream.codec_context.width, stream.codec_context.height, source=self.shown)
         # One for all pictures: made anew, with threads of its own, for each, it took longer than all the rest.
         reformatter = VideoReformatter()
         for frame in container.decode(stream):
             if self.ending.is_set():
                 return
-            self._check_size(frame.width, frame.height)
+            check_size(frame.width, frame.height, source=self.shown)
             yield np.asarray(reformatter.reformat(frame, format="rgba", threads=1).to_ndarray(), np.uint8)
-
-    def _check_size(self, width_px: int, height_px: int) -> None:
-        """Raises InputError for too many pixels; reports a change."""
-        check_size(width_px, height_px, source=self.shown)
-        if self._size not in (None, (width_px, height_px)) and width_px:
-            now = f"{width_px} x {height_px}"
-            log.warning("%s: its pictures changed from %d x %d to %s pixels", self.shown, *self._size, now)
-        if width_px:
-            self._size = (width_px, height_px)
 
     def _report(self, problem: str) -> None:
         self.problem = f"{problem}; it is tried again"
@@ -169,21 +159,21 @@ class LiveSource(ScreenSource):
         self._feed, self._reader = feed, feed.reader
         self._number, self._newest = 0, np.empty((0, 0, 4), np.uint8)  # that is shown
         self._looked_ns: int | None = None
-        self._stalled = False
         self.info = ContentInfo(name=feed.reader.shown, moving=True, background=file.background)
 
     @property
     def problem(self) -> str:
         if self._reader.problem:
             return f"{self._reader.shown}: {self._reader.problem}"
-        silent_s = self._silent_s()
+        silent_s = (time.monotonic_ns() - self._reader.arrived_ns) / NS_PER_S
         return f"{self._reader.shown}: no new picture for {silent_s:.0f} s" if silent_s > STALLED_S else ""
 
     def revision(self, *, time_ns: int) -> int:
         # Both eyes of one frame see one picture: two would be depth that isn't there.
         if time_ns != self._looked_ns:
             self._looked_ns = time_ns
-            self._look()
+            if self._reader.newest is not None:
+                self._number, self._newest = self._reader.newest
         return self._number
 
     def picture(self, number: int) -> U8:
@@ -193,15 +183,3 @@ class LiveSource(ScreenSource):
 
     def close(self) -> None:
         self._feed.close()
-
-    def _look(self) -> None:
-        if self._reader.newest is not None:
-            self._number, self._newest = self._reader.newest
-        silent_s = self._silent_s()
-        if (silent_s > STALLED_S) != self._stalled and self._number:  # once when it begins, once when it is over
-            self._stalled = not self._stalled
-            stays = f"no new picture for {silent_s:.0f} s; the last one stays"
-            log.warning("%s: %s", self._reader.shown, stays if self._stalled else "pictures come again")
-
-    def _silent_s(self) -> float:
-        return (time.monotonic_ns() - self._reader.arrived_ns) / NS_PER_S

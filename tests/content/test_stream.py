@@ -91,16 +91,13 @@ def test_a_stream_that_stalls_and_ends_keeps_its_last_picture_and_is_taken_up_ag
         assert eventually(lambda: bool(seen(source, stack)) and source.problem == "", within_s=20)
         source.close()
     told = [record.getMessage() for record in caplog.records]
-    assert sum("the last one stays" in line for line in told) == 1
-    assert any("pictures come again" in line for line in told)
+    assert sum("the last picture stays" in line for line in told) == 1
     assert all("\n" not in line and server.url in line for line in told)
 
 
-def test_a_stream_that_changes_its_size_goes_on_and_is_told(
-    context: Any, stack: PanelStack, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_stream_that_changes_its_size_goes_on(context: Any, stack: PanelStack) -> None:
     data = transport_stream(60) + transport_stream(400, size=(320, 48), first=60)
-    with served(data) as server, caplog.at_level(logging.WARNING, "phasestack.content"):
+    with served(data) as server:
         source = opened(server.url, context, stack)
         seen(source, stack)
         shape = source._views[0].shape
@@ -112,7 +109,6 @@ def test_a_stream_that_changes_its_size_goes_on_and_is_told(
         assert eventually(changed, within_s=30)
         assert seen(source, stack)[1][2] > 150
         source.close()
-    assert "its pictures changed from 160 x 48 to 320 x 48 pixels" in caplog.text
 
 
 def test_one_that_is_not_there_yet_is_waited_for(context: Any, stack: PanelStack, monkeypatch: Any) -> None:
