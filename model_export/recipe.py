@@ -68,13 +68,7 @@ class Recipe(Section):
 
     def text(self) -> str:
         """As a file holds it."""
-        table = self.model_dump(mode="json", exclude_none=True)
-        weights = table.pop("weights", None)
-        text = json.dumps(table, indent=1)
-        if weights is None:
-            return text + "\n"
-        lines = ",\n".join(f'  "{key}": {json.dumps(value)}' for key, value in weights.items())
-        return f'{text[:-2]},\n "weights": {{\n{lines}\n }}\n}}\n'
+        return json.dumps(self.model_dump(mode="json", exclude_none=True), indent=1) + "\n"
 
 
 def recipe_path(name: str) -> Path:

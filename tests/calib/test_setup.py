@@ -10,17 +10,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
 from calib.hardware import SimulatedHardware
 from calib.keys import Key
-from calib.placed import ideal_panel, through, true_from_ideal_seen
 from calib.setup_run import progress_path, read_progress, walk_through
 from calib.setup_steps import STEPS, Setup, geometry, identify
 from calib.viewpoints import grid
@@ -28,12 +24,7 @@ from runtime.config import Settings, load_settings
 from runtime.errors import InputError
 from runtime.eyes.calibration import load_calibration
 from runtime.eyes.demo_geometry import demo_stack_from_sensor
-from runtime.optics.quality import psnr_db
-from runtime.panels import lut
 from runtime.panels.monitors import Monitor
-from runtime.support.artifacts import read_image
-from tests.calib.photo_scenes import in_frame_of
-from tests.optics.carried_rays import seen_along
 
 STACK = Settings().stack.stack()
 SetUp = tuple[Path, subprocess.CompletedProcess[str], SimulatedHardware]
@@ -119,81 +110,6 @@ def test_panels_are_bound_as_they_are_mounted_and_the_sensor_is_found_where_it_s
     eyes = np.array([viewpoint.midpoint_m for viewpoint in grid()])
     sensor = np.column_stack([eyes, np.ones(27)]) @ np.linalg.inv(demo_stack_from_sensor()).T
     assert np.linalg.norm((sensor @ found.T)[:, :3] - eyes, axis=1).mean() < 0.002
-
-
-def corrected(layers: np.ndarray, true_from_ideal: list[np.ndarray]) -> np.ndarray:
-    """The layers as the presentation shader shows them on registered panels: bicubic, black beyond the edges."""
-    half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
-    height, width = layers.shape[1:3]
-    shown = [
-        layer
-        if np.array_equal(matrix, np.eye(3))
-        else cv2.warpPerspective(layer, np.linalg.inv(half) @ matrix @ half, (width, height), flags=cv2.INTER_CUBIC)
-        for layer, matrix in zip(layers, true_from_ideal, strict=True)
-    ]
-    return np.stack(shown)
-
-
-def sent_through(layers: np.ndarray, settings: Settings, hardware: SimulatedHardware, *, curves: bool) -> np.ndarray:
-    """(N, h, w, 3) codes of the phases that the simulated panels turn to for layers, by their configured curves."""
-    found = np.empty_like(layers)
-    for index, panel in enumerate(settings.output.panels):
-        greys = np.rint(255 * (lut.curve(lut=panel.lut if curves else "", gamma=1.0)))[:, 0] / 255
-        found[index] = np.rint(255 * hardware.phase_of(index, greys)).astype(np.uint8)[layers[index]]
-    return found
-
-
-def carried_db(
-    light: Path, settings: Settings, panels: Any, *, registered: bool, hardware: SimulatedHardware | None = None,
-    curves: bool = True,
-) -> float:  # fmt: skip
-    """Displayed dB (docs/contracts.md) of what a run left of a refresh's light, on panels that stand where they do.
-
-    hardware: whose panels turn to what their monitors make of a grey; none: they follow exactly.
-    """
-    told = json.loads((light / "light.json").read_text())
-    stack = replace(settings.stack.stack(), tilt=None)
-    layers = np.stack([read_image(light / f"layer-{index}.png") for index in range(stack.count)])
-    if registered:
-        layers = corrected(layers, [np.array(panel.homography) for panel in settings.output.panels])
-    if hardware is not None:
-        layers = sent_through(layers, settings, hardware, curves=curves)
-    errors = []
-    for side, name in enumerate(("left", "right")):
-        drawn = read_image(light / f"drawn-{name}.png")
-        true_m = np.array(told["eyes_m"][side])
-
-        def truly(index: int, places: np.ndarray, true_m: np.ndarray = true_m) -> Any:
-            return through(true_from_ideal_seen(panels[index], true_m, stack, index), places)
-
-        seen = seen_along(
-            told["solved_for_m"][side], true_m, layers, stack, width_px=drawn.shape[1], height_px=drawn.shape[0],
-            fov_deg=told["fov"], moved=truly,
-        )  # fmt: skip
-        errors.append(((seen.image - drawn / np.float32(255))[seen.mask] ** 2).ravel())
-    return psnr_db(float(np.concatenate(errors).mean()))
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1800)
-def test_a_run_of_it_shows_the_eyes_within_a_decibel_of_a_perfect_stack(set_up: SetUp, tmp_path: Path) -> None:
-    """The run's own light, sent through the registration to the panels where they truly are."""
-    folder, _, hardware = set_up
-    command = [sys.executable, "-m", "runtime.cli", "run", "--config", str(folder / "new.toml"), "--replay", "demo",
-               "--headless", "--max-speed", "--frames", "31", "--keep-light", "15",
-               "--out", str(tmp_path / "run")]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, timeout=1700, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "calibrated for sensor" not in done.stderr
-    settings = load_settings(folder / "new.toml")
-    light = max((tmp_path / "run" / "light").iterdir(), key=lambda path: int(path.name))
-    ideal = tuple(ideal_panel(settings.stack.stack(), index) for index in range(3))
-    perfect = carried_db(light, settings, ideal, registered=False)
-    assert perfect > 28.0
-    true = in_frame_of(hardware.true_panels, reference=1, reference_x_m=0.0)
-    assert perfect - carried_db(light, settings, true, registered=True, hardware=hardware) < 1.0
-    assert perfect - carried_db(light, settings, true, registered=False, hardware=hardware) > 5.0
-    assert perfect - carried_db(light, settings, true, registered=True, hardware=hardware, curves=False) > 5.0
 
 
 @pytest.mark.slow

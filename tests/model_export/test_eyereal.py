@@ -4,10 +4,8 @@ what the official code does and feeds (golden arrays, made by running that code)
 from __future__ import annotations
 
 import argparse
-import io
 import os
 import re
-import tarfile
 from pathlib import Path
 
 import numpy as np
@@ -120,21 +118,12 @@ def test_a_damaged_checkpoint_is_refused_by_the_key_that_is_amiss(published: Pat
         load_eyereal(published)
 
 
-def test_a_checkpoint_of_another_architecture_is_refused_by_name(published: Path) -> None:
-    with pytest.raises(InputError, match="is a checkpoint of eyereal, not of spectral"):
+def test_a_checkpoint_of_another_architecture_is_refused(published: Path) -> None:
+    with pytest.raises(InputError, match="recipe: missing: not a checkpoint of phasestack train"):
         load_spectral(published, name="balanced")
 
 
-def old_tar_format() -> bytes:
-    """As torch wrote checkpoints once."""
-    buffer = io.BytesIO()
-    with tarfile.open(fileobj=buffer, mode="w", format=tarfile.PAX_FORMAT) as archive:
-        for name in ("storages", "tensors", "pickle"):
-            archive.addfile(tarfile.TarInfo(name), io.BytesIO())
-    return buffer.getvalue()
-
-
-@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 cut", old_tar_format()], ids=range(4))
+@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 cut"], ids=range(3))
 def test_a_corrupt_file_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "corrupt.pth"
     path.write_bytes(content)

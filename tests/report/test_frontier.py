@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.report.frontier import MethodResult, MethodRun, measure, pair_result, pareto
-from runtime.report.methods import Method, check_models
+from runtime.report.methods import Method
 from runtime.report.pairs import Painter, StillPair, eyes_at
 from runtime.report.worker import apart
 
@@ -87,14 +86,6 @@ def test_the_pareto_front_is_what_nothing_beats(points: list[tuple[int, int]]) -
             and (o.ms_p50, o.quoted_db) != (member.ms_p50, member.quoted_db)
             for o in results
         )
-
-
-def test_a_model_that_is_not_there_is_refused_before_anything_is_measured(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="is not a file"):
-        check_models([str(tmp_path / "none.onnx")])
-    (tmp_path / "bad.onnx").write_bytes(b"no onnx")
-    with pytest.raises(InputError, match=r"bad\.onnx"):
-        check_models([str(tmp_path / "bad.onnx")])
 
 
 def echo(value: int) -> int:
