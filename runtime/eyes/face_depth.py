@@ -37,7 +37,6 @@ class EyeDepths:
 
     eyes_m: F64  # (2,) left, right
     sigma_m: float  # standard deviation of their middle
-    measured: bool  # by the camera in this picture, not from the eye distance alone
 
 
 class FaceDepth:
@@ -71,11 +70,10 @@ class FaceDepth:
         away = focal / length  # distance of the eyes' middle, in eye distances
         self._predict(float(across) / length)
         relief, eyes = relief - eyes.mean(), eyes - eyes.mean()
-        measured = False
         if depth_mm is not None:
             scale = self._distance / length  # m a pixel of the mesh
             tilts_m = tilts[0] * scale, tilts[1] * scale
-            measured = self._measure(pupils, depth_mm, depth_from_colour, relief * scale, eyes * scale, tilts_m, away)
+            self._measure(pupils, depth_mm, depth_from_colour, relief * scale, eyes * scale, tilts_m, away)
         elif not self._known:
             self._learn(length / pupils.iris_px)
         middle = self._distance * away
@@ -84,7 +82,7 @@ class FaceDepth:
         beside = self._shape_variance.mean() if self.has_measured else 2 * (pupils.sigma_px / length * middle) ** 2
         sigma = np.sqrt(self._variance * away**2 + beside)
         relief_m = (eyes * self._relief + tilts[1]) * self._distance / length
-        return EyeDepths(middle + relief_m + shape, float(sigma), measured)
+        return EyeDepths(middle + relief_m + shape, float(sigma))
 
     def _predict(self, foreshortening: float) -> None:
         """A picture later; a turned head's eye distance is known as well as its turn."""
@@ -110,7 +108,7 @@ class FaceDepth:
         eyes: F64,
         tilts: tuple[F64, F64],
         away: float,
-    ) -> bool:
+    ) -> None:
         """relief: (468,) m of the mesh; eyes: (2,) m of the eyes in it; away from the camera, from the eyes' middle.
 
         tilts: m of the rigid points, and (2,) of the eyes, on a plane across the line of sight.
@@ -120,17 +118,17 @@ class FaceDepth:
         face = face - tilts[0]
         for within in (2 * FLYING_M, FLYING_M):
             if good.sum() < POINTS_MIN:
-                return False
+                return
             off = face - self._relief * shape
             good &= np.abs(off - np.median(off[good])) < within
         if good.sum() < POINTS_MIN:
-            return False
+            return
         self._fit_relief(face[good], shape[good])
         depths, eyes = face[good] - self._relief * shape[good], eyes * self._relief
         middle = float(np.median(depths))
         spread = 1.4826 * float(np.median(np.abs(depths - middle)))
         if not PERSON_M[0] < middle / away < PERSON_M[1]:
-            return False
+            return
         radius = EYE_WINDOW * pupils.eye_distance_px * float(scale[0])
         for side in (0, 1):
             window = _window(depth_mm, pupils.eyes_px[side] * scale, radius)
@@ -148,7 +146,6 @@ class FaceDepth:
         self._distance += gain * (seen - self._distance)
         self._variance *= 1 - gain
         self.has_measured = True
-        return True
 
     def _fit_relief(self, depths: F64, shape: F64) -> None:
         """How prominent this face is beside the mesh's; a picture of a face is flat."""

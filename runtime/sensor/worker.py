@@ -79,7 +79,6 @@ class SensorWorker(Samples):
         self._driver: Sensor | None = None
         self.serial = ""  # of the device, once it was open; it is reopened by this
         self.error: FatalError | None = None
-        self.reopened = 0
 
     def start(self) -> None:
         """Begin, in the background."""
@@ -160,7 +159,6 @@ class SensorWorker(Samples):
             self._account(self._driver)
             self._hung.append(attempt)
         if len(self._hung) <= ABANDONED_MAX:
-            self.reopened += 1
             self._begin(REOPEN_AFTER_S)
 
     def _set(self, attempt: _Attempt, state: SensorState, reason: str) -> None:
@@ -218,7 +216,6 @@ class SensorWorker(Samples):
                 backoff_s = REOPEN_AFTER_S
             wait_s, backoff_s = backoff_s, min(2 * backoff_s, REOPEN_AFTER_MAX_S)
             self._allow(attempt, wait_s + OPEN_TIMEOUT_S)
-            self.reopened += 1
 
     def _receive(self, attempt: _Attempt, driver: Sensor) -> None:
         """Read until the driver fails or the worker stops."""

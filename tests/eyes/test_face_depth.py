@@ -97,9 +97,10 @@ def test_the_eyes_of_a_head_beside_the_picture_s_middle_are_across_its_line_of_s
     rows, columns = np.mgrid[0:480, 0:640] + 0.5
     rays = np.stack([(columns - CAMERA.cx_px) / CAMERA.fx_px, (rows - CAMERA.cy_px) / CAMERA.fy_px], 2)
     depth_mm = np.rint(1000 * (sight @ middle) / (rays @ sight[:2] + sight[2])).astype(np.uint16)
-    found = FaceDepth(eye_distance_m=IPD_M).at(pupils, depth_mm if has_depth else None, CAMERA, np.ones(2))
+    face_depth = FaceDepth(eye_distance_m=IPD_M)
+    found = face_depth.at(pupils, depth_mm if has_depth else None, CAMERA, np.ones(2))
     assert np.abs(found.eyes_m - eyes[:, 2]).max() < 0.001
-    assert found.measured == has_depth
+    assert face_depth.has_measured == has_depth
 
 
 def seen(points_m: np.ndarray) -> np.ndarray:

@@ -103,7 +103,7 @@ def test_a_driver_that_may_pause_is_neither_stalled_nor_reopened(
     monkeypatch.setattr(Scripted, "capabilities", Capabilities(eye_points=True, may_pause=True))
     worker, log = started(raiser(SensorTimeout("nothing")))
     time.sleep(0.5)
-    assert worker.state == "opening" and log == ["open"] and worker.reopened == 0
+    assert worker.state == "opening" and log == ["open"]
 
 
 def test_a_lost_device_is_closed_and_reopened_by_its_serial(started: Callable[..., Any]) -> None:
@@ -196,7 +196,7 @@ def test_an_sdk_that_hangs_is_left_behind_and_never_blocks_the_loop(
         state = worker.state
         taken.append(time.perf_counter() - begin)
         time.sleep(0.002)
-    assert seen and state == "running" and worker.reopened == 1
+    assert seen and state == "running" and sum("open" in line for line in log) == 2
     # The driver hangs for 20 s; no call waited for it, whatever else this machine was busy with.
     assert max(taken) < 0.5 and statistics.median(taken) < FRAME_S / 4
     assert hung[0].is_alive()
