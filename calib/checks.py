@@ -21,18 +21,11 @@ MIRROR_GAIN = 0.5  # mirrored data fit a mirrored sensor this much better at lea
 NAMED = 8  # pairs that a message lists
 
 
-def check_pairs(pairs: Pairs) -> tuple[Pairs, list[str]]:
-    """The pairs that may be solved, without exact duplicates, and warnings. Raises InputError with the pairs' file.
+def check_pairs(pairs: Pairs) -> list[str]:
+    """Warnings about pairs before they are solved. Raises InputError with the pairs' file.
 
     Refused: fewer than 3 pairs, coincident, collinear, beyond double precision, mirrored, mixed units.
     """
-    warnings = []
-    table = np.column_stack([pairs.sensor_m, pairs.stack_m])
-    unique = np.sort(np.unique(table, axis=0, return_index=True)[1])
-    if len(unique) < len(pairs):
-        dropped = np.setdiff1d(np.arange(len(pairs)), unique).tolist()
-        warnings.append(f"{_listed(pairs, dropped)}: repeats an earlier pair exactly; left out")
-        pairs = pairs.only(unique)
     if _is_mirrored(pairs):
         raise InputError(
             pairs.source,
@@ -49,11 +42,9 @@ def check_pairs(pairs: Pairs) -> tuple[Pairs, list[str]]:
             problem = f"units are mixed (scale {scale:.4g}): {side} is in millimetres? Metres are wanted"
             raise InputError(pairs.source, f"{side}_x", problem)
     first, _, third = extents(pairs.stack_m)
-    if third <= COPLANAR * first:
-        warnings.append(
-            "the viewpoints lie in one plane: enough for the rotation, but mirrored axes would go unnoticed"
-        )
-    return pairs, warnings
+    if third > COPLANAR * first:
+        return []
+    return ["the viewpoints lie in one plane: enough for the rotation, but mirrored axes would go unnoticed"]
 
 
 def check_solution(pairs: Pairs, solution: Solution, volume_m: F64) -> list[str]:

@@ -6,7 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -75,12 +75,6 @@ class Pairs:
 
     def __len__(self) -> int:
         return len(self.names)
-
-    def only(self, keep: Iterable[int]) -> Pairs:
-        """Some of them, by index."""
-        index = np.array(list(keep), dtype=int)
-        names = tuple(self.names[i] for i in index.tolist())
-        return replace(self, sensor_m=self.sensor_m[index], stack_m=self.stack_m[index], names=names)
 
 
 def read_pairs(path: Path) -> Pairs:

@@ -17,7 +17,7 @@ from runtime.records import F64
 
 STARTS = 120
 START_PAIRS = 4
-KEPT_STARTS = 8
+STEPS = 4
 MAX_SCORED = 2000  # of more pairs than these a sample picks the start; the rejection sees them all
 REJECTION_PROBABILITY = 1e-4  # of a good pair, Gaussian noise
 RULE: ScaleRule = "inverse"
@@ -30,7 +30,6 @@ class RobustFit:
 
     similarity: Similarity
     inlier: NDArray[np.bool_]  # (K,)
-    noise_m: float  # of one coordinate of the inliers, in `stack`
 
 
 def _residuals(candidate: Similarity, sensor_m: F64, stack_m: F64) -> F64:
@@ -40,33 +39,20 @@ def _residuals(candidate: Similarity, sensor_m: F64, stack_m: F64) -> F64:
     return found
 
 
-def _concentrated(
-    candidate: Similarity, sensor_m: F64, stack_m: F64, *, keep: int, steps: int
-) -> tuple[Similarity, F64]:
-    """Refit to the `keep` best pairs of each candidate, repeatedly: never worse. Returns the fits and their sums."""
-    for _ in range(steps):
-        squared = np.nan_to_num(_residuals(candidate, sensor_m, stack_m), nan=np.inf)
-        chosen = np.argpartition(squared, keep - 1, axis=-1)[..., :keep]
-        candidate = fit_batch(sensor_m[chosen], stack_m[chosen], rule=RULE)
-    squared = np.nan_to_num(_residuals(candidate, sensor_m, stack_m), nan=np.inf)
-    return candidate, np.partition(squared, keep - 1, axis=-1)[..., :keep].sum(-1)
-
-
 def _best_half(sensor_m: F64, stack_m: F64, *, random: np.random.Generator) -> NDArray[np.intp]:
-    """Indices of the half of the pairs that agree best."""
+    """Indices of the half of the pairs that agree best: of many starts, each refitted to its own best half."""
     count = len(sensor_m)
     keep = min(count, max(3, (count + 5) // 2))
-    subsets = np.argsort(random.random((STARTS, count)), axis=1)[:, : min(START_PAIRS, count)]
-    starts = fit_batch(sensor_m[subsets], stack_m[subsets], rule=RULE)
-    starts, sums = _concentrated(starts, sensor_m, stack_m, keep=keep, steps=2)
-    best = np.argsort(sums)[:KEPT_STARTS]
-    finalists = Similarity(starts.scale[best], starts.rotation[best], starts.translation_m[best])
-    finalists, sums = _concentrated(finalists, sensor_m, stack_m, keep=keep, steps=10)
+    chosen = np.argsort(random.random((STARTS, count)), axis=1)[:, : min(START_PAIRS, count)]
+    for _ in range(1 + STEPS):
+        found = fit_batch(sensor_m[chosen], stack_m[chosen], rule=RULE)
+        squared = np.nan_to_num(_residuals(found, sensor_m, stack_m), nan=np.inf)
+        chosen = np.argpartition(squared, keep - 1, axis=-1)[:, :keep]
+    sums = np.take_along_axis(squared, chosen, axis=-1).sum(-1)
     winner = int(np.argmin(sums))
     if not np.isfinite(sums[winner]):
         raise Degenerate("no half of the pairs agrees on a similarity")
-    chosen = Similarity(finalists.scale[winner], finalists.rotation[winner], finalists.translation_m[winner])
-    return np.argsort(_residuals(chosen, sensor_m, stack_m))[:keep]
+    return np.asarray(chosen[winner])
 
 
 def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
@@ -79,7 +65,7 @@ def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
     everything = fit(sensor_m, stack_m, rule=RULE)
     spread = float(np.sqrt(((stack_m - stack_m.mean(0)) ** 2).sum(-1).mean()))
     if count <= 5:
-        return RobustFit(everything, np.ones(count, bool), _noise(everything, sensor_m, stack_m, np.ones(count, bool)))
+        return RobustFit(everything, np.ones(count, bool))
     random = np.random.default_rng(0)
     scored = random.permutation(count)[:MAX_SCORED] if count > MAX_SCORED else np.arange(count)
     # Centred and to one size: the batched fits have no polish and no units.
@@ -90,7 +76,8 @@ def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
     current = fit(sensor_m[inlier], stack_m[inlier], rule=RULE)
     squared = ((current.points(sensor_m) - stack_m) ** 2).sum(-1)
     # The median of the squared distances of chi² with three degrees of freedom; small samples look too quiet.
-    noise_m = np.sqrt(np.partition(squared[scored], len(half) - 1)[len(half) - 1] / _quantile(len(half) / len(scored)))
+    share = len(half) / len(scored)
+    noise_m = np.sqrt(np.partition(squared[scored], len(half) - 1)[len(half) - 1] / chi2.ppf(0.999 * share, 3))
     noise_m *= 1 + 5 / max(len(scored) - 3, 1)
     for _ in range(20):
         kept = squared <= limit * max(noise_m, MIN_NOISE * spread) ** 2
@@ -102,13 +89,7 @@ def fit_robust(sensor_m: F64, stack_m: F64) -> RobustFit:
         if np.array_equal(kept, inlier):
             break
         inlier = kept
-    if inlier.all():
-        current = everything
-    return RobustFit(current, inlier, _noise(current, sensor_m, stack_m, inlier))
-
-
-def _quantile(share: float) -> float:
-    return float(chi2.ppf(share * 0.999, 3))
+    return RobustFit(everything if inlier.all() else current, inlier)
 
 
 def _noise(similarity: Similarity, sensor_m: F64, stack_m: F64, inlier: NDArray[np.bool_]) -> float:

@@ -36,7 +36,8 @@ def solve_file(
     """
     if method and method not in METHODS:
         raise InputError("calibrate solve", "--method", f"must be one of {', '.join(METHODS)}, not {method}")
-    pairs, warnings = check_pairs(read_pairs(pairs_path))
+    pairs = read_pairs(pairs_path)
+    warnings = check_pairs(pairs)
     volume_m = viewing_volume_m(settings.calibration)
     try:
         chosen = (

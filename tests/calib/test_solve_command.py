@@ -121,13 +121,6 @@ def test_millimetres_on_one_side_are_refused(tmp_path: Path, scale: float, side:
     assert f"{side} is in millimetres" in message
 
 
-def test_repeated_rows_are_left_out_and_named(tmp_path: Path) -> None:
-    twice = [*range(27), 3]
-    told = solve(write_pairs(tmp_path, measured(sigma_m=0.001)[twice], KNOWN_M[twice]), tmp_path / "c.toml")
-    assert told["pairs"] == 27
-    assert any("line 29: repeats" in warning for warning in told["warnings"])
-
-
 def test_pairs_that_do_not_fit_are_refused_with_a_hint(tmp_path: Path) -> None:
     sensor = measured()
     sensor[::5] += [0.2, 0.1, -0.2]
