@@ -84,7 +84,7 @@ class Reconfiguration:
             self.progress = f"{what}: {done} of {total}" if total else f"{what}: {done}" if done else what
 
     def _take_over(self, parts: RunningSolver, opener: Opener | None, predictor: Predictor | None) -> None:
-        """One new state, and what it replaces is closed; where another backend or the upload fails, nothing changes."""
+        """One new state, and what it replaces is closed; where the upload fails, nothing changes."""
         changes: dict[str, Any] = {"settings": self.settings, "calibration": self._calibration}
         with ExitStack() as undo:
             try:
@@ -95,7 +95,7 @@ class Reconfiguration:
                     changes["content"] = opener(parts.context)
                     undo.callback(changes["content"].close)
                 if predictor is not None:
-                    parts.set_backend(predictor, self.settings)
+                    predictor.set_backend(parts.backend.backend)
             except PhasestackError as error:
                 self.problem = str(error)
                 return

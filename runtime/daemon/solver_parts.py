@@ -42,7 +42,6 @@ class RunningSolver:
     owns_context: bool  # it is released with the rest
     group: ShareGroup | None  # the context's
     panels_group: PanelsGroup
-    wanted_backend: Wanted
     _held: RunState = field(init=False)
 
     def __post_init__(self) -> None:
@@ -52,19 +51,6 @@ class RunningSolver:
     def content(self) -> ContentSource:
         """What is drawn at present."""
         return self.run.state.content
-
-    def set_backend(self, predictor: Predictor, settings: Settings) -> None:
-        """Give a model this run's backend; chosen anew where the settings ask for another.
-
-        Raises PhasestackError where that can't be had; nothing has changed then.
-        """
-        before = self.backend
-        if settings.model.backend != self.wanted_backend:
-            self.backend = choose(settings.model.backend, predictor, lambda: self.context, group=self.group)
-            self.wanted_backend = settings.model.backend
-        predictor.set_backend(self.backend.backend)
-        if before is not self.backend:
-            before.backend.close()
 
     def step(self, request: SolveRequest) -> SolverStep:
         if self.panels_group() is not self.group or (self.group is not None and self.group.lost):
@@ -144,7 +130,6 @@ class SolverMaker:
             owns_context=own,
             group=group,
             panels_group=self._shared_group,
-            wanted_backend=settings.model.backend,
         )
         return self.parts
 

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ log = logging.getLogger("phasestack.daemon")
 
 PANEL_RETRY_S = 1.0
 START_EXTENSION_S = 10.0
-NEEDS_RESTART = ("stack", "sensor", "output", "service")
+NEEDS_RESTART = ("stack", "sensor", "output", "service", "model.backend")
 Chosen = dict[tuple[str, str], Any]  # section and key of a setting: what an operator chose while it runs
 
 
@@ -219,7 +220,7 @@ class Daemon(Host):
     def _reload(self, presenter: Presenter, command: Command) -> None:
         """Read the configuration again. What an operator chose stays, but where the file says something new."""
         settings, before = self._read_settings(), self._configured
-        frozen = [name for name in NEEDS_RESTART if getattr(settings, name) != getattr(before, name)]
+        frozen = [name for name in NEEDS_RESTART if attrgetter(name)(settings) != attrgetter(name)(before)]
         if frozen:
             raise InputError("reload", ", ".join(frozen), "a change needs a restart of the service")
         chosen = {

@@ -128,7 +128,6 @@ def read_picture(path: Path) -> U8 | U16:
     if image is None or image.dtype not in (np.uint8, np.uint16):
         why = f" ({said.first_line})" if said.first_line else ""
         raise InputError(path, "", f"is not an image that can be decoded{why}")
-    said.release()
     if stored is not None and stored.ndim == 3 and stored.shape[2] == 4:
         if not np.array_equal(stored[..., :3], image):
             raise InputError(path, "orientation", "a transparent picture that its EXIF entry turns can't be read")

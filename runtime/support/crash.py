@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import platform
+import signal
 import sys
 import tempfile
 import threading
@@ -54,10 +55,10 @@ def _say(error: BaseException | None, kind: type[BaseException]) -> None:
     if issubclass(kind, SystemExit):
         return
     if issubclass(kind, KeyboardInterrupt):
-        # It fell into a finaliser or a callback, where Python drops it: send it again.
-        import signal
-
-        signal.raise_signal(signal.SIGINT)
+        # It fell into a finaliser or a callback, where Python drops it, as it would in here: send it again soon.
+        again = threading.Timer(0.01, signal.raise_signal, (signal.SIGINT,))
+        again.daemon = True
+        again.start()
         return
     if sys.is_finalizing():
         return

@@ -1,11 +1,11 @@
-"""What a C library writes to stderr by itself, held back until it is known whether it belongs to an error."""
+"""What a C library writes to stderr by itself, held back: it belongs into the one line of an error, or to nobody."""
 
 from __future__ import annotations
 
 import os
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 
@@ -20,12 +20,6 @@ class Held:
         """Empty where there is none."""
         return next((line.strip() for line in self.text.splitlines() if line.strip()), "")
 
-    def release(self) -> None:
-        """Write it to stderr after all: no error tells it."""
-        if self.text:
-            with suppress(OSError):
-                os.write(2, self.text.encode())
-
 
 @contextmanager
 def held_back() -> Iterator[Held]:
@@ -37,12 +31,8 @@ def held_back() -> Iterator[Held]:
     if threading.active_count() > 1:
         yield held
         return
-    try:
-        kept = os.dup(2)
-        buffer = os.memfd_create("stderr")
-    except OSError:  # closed, or none left
-        yield held
-        return
+    kept = os.dup(2)
+    buffer = os.memfd_create("stderr")
     os.dup2(buffer, 2)
     try:
         yield held

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -39,7 +38,3 @@ def shares(count: int, threads: int) -> list[tuple[int, int]]:
 def _pool(threads: int) -> ThreadPoolExecutor:
     """Threads that stay: a new one begins two milliseconds late."""
     return ThreadPoolExecutor(threads, "at-once")
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)  # a child has none of its parent's threads

@@ -14,7 +14,7 @@ from runtime.config import Settings
 from runtime.daemon import reconfigure
 from runtime.daemon.reconfigure import Reconfiguration
 from runtime.daemon.solver_parts import RunningSolver, SolverMaker, ready_predictor
-from runtime.errors import InputError, MissingPart
+from runtime.errors import InputError
 from runtime.eyes.calibration import load_calibration
 from runtime.frame.run_state import RunState
 from runtime.records import SolveRequest
@@ -116,18 +116,12 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
 SCENE, MODEL = {"content": {"scene": "sparse"}}, {"model": {"name": "balanced"}}
 
 
-@pytest.mark.parametrize("fails", ["uploading the scene", "choosing the backend"])
-def test_what_was_loaded_is_closed_where_it_can_t_be_taken_over(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch, fails: str
-) -> None:
+def test_what_was_loaded_is_closed_where_it_can_t_be_taken_over(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     def failing(*_: Any, **__: Any) -> Any:
-        raise MissingPart("no OpenGL") if fails == "choosing the backend" else RuntimeError("out of textures")
+        raise RuntimeError("out of textures")
 
     before = bench.state
-    if fails == "choosing the backend":
-        monkeypatch.setattr(bench.parts, "set_backend", failing)
-    else:
-        monkeypatch.setattr(reconfigure, "prepare_content", lambda *_, **__: failing)
+    monkeypatch.setattr(reconfigure, "prepare_content", lambda *_, **__: failing)
     change = bench.change(settings(**SCENE, **MODEL))
     bench.advance(change)
     assert change.problem and bench.state is before

@@ -43,8 +43,8 @@ def test_one_grey_column_serves_all_channels(tmp_path: Path) -> None:
         ("phase,grey\n0,0\n0,1\n", "phase"),
         ("phase,grey\n0,0\n1,1.5\n", "values"),
         ("phase,grey\n0,0\n1,nan\n", "values"),
-        ("phase,grey\n0,0\n1,x\n", "row 3"),
-        ("phase,grey\n0,0\n1\n", "row 3"),
+        ("phase,grey\n0,0\n1,x\n", "rows"),
+        ("phase,grey\n0,0\n1\n", "rows"),
     ],
 )
 def test_a_wrong_curve_is_refused_by_file_and_field(tmp_path: Path, text: str, field: str) -> None:
