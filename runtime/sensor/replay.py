@@ -15,8 +15,6 @@ from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, SteppedSensor
 from runtime.sensor.recording import Recording
 
-ROUND_INTERVAL_MIN_NS = NS_PER_S // 240  # between the rounds of a looped recording: the fastest sensor's period
-
 log = logging.getLogger(__name__)
 
 
@@ -93,7 +91,7 @@ class ReplayDriver(SteppedSensor):
                 interval_ns = capture_ns - last_ns if delivered else interval_ns or NS_PER_S // 30
                 last_ns, last_sequence, delivered = capture_ns, frame.sequence + sequence_shift, delivered + 1
                 yield replace(frame, capture_ns=capture_ns, sequence=last_sequence)
-            interval_ns, is_first_round = max(interval_ns, ROUND_INTERVAL_MIN_NS), False
+            is_first_round = False
             if not self._loop or not delivered:
                 return
 

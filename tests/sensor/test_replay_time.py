@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import ReplayDriver
 from runtime.sensor.worker import SensorWorker
 from tests.sensor.taken import taken_until
-from tests.waiting import eventually
 
 HEADER = RecordingHeader(driver="test", serial="S")
 RATE_HZ = 240
@@ -42,7 +40,6 @@ def play(
     path: Path,
     *,
     timeout_s: float = 0.1,
-    loop: bool = False,
     latency_ms: float = 0.0,
     busy_s: float = 0.002,
     at_most_s: float = 8.0,
@@ -50,7 +47,7 @@ def play(
     """Every sample that a worker hands out, with the time at which the reader got it, and the worker."""
     clock = MonotonicClock()
     settings = SensorSettings(timeout_s=timeout_s)
-    worker = SensorWorker(lambda: ReplayDriver(str(path), clock, loop=loop, latency_ms=latency_ms), settings, clock)
+    worker = SensorWorker(lambda: ReplayDriver(str(path), clock, latency_ms=latency_ms), settings, clock)
     worker.start()
     got, states, end = [], set(), time.monotonic() + at_most_s
     while time.monotonic() < end:
@@ -105,14 +102,6 @@ def test_samples_whose_time_goes_backwards_are_left_out_and_told_once(
     frames = taken_until(driver, 10 * NS_PER_S)
     assert [f.sequence for f in frames] == [1, 2, 5, 9]
     assert len(caplog.records) == 1
-
-
-def test_a_looped_recording_of_equal_times_leaves_no_thread_behind(tmp_path: Path) -> None:
-    path, before = recorded(tmp_path / "a.mcap", [1.0] * 50), threading.active_count()
-    got, states, _ = play(path, loop=True, timeout_s=0.05, at_most_s=2.0)
-    assert not states & {"lost", "hung"} and len(got) > 10
-    assert eventually(lambda: threading.active_count() <= before)
-    assert [frame.sequence for frame, _ in got[:3]] == [1, 2, 3]
 
 
 def test_a_recording_longer_than_the_limit_is_refused_with_both_figures(
