@@ -138,13 +138,13 @@ class PictureFiles(Frames):
     def __init__(self, paths: Sequence[Path], *, rate_hz: float) -> None:
         size_of_file(paths[0])  # before it is unpacked
         self._paths, self._held = paths, (0, read_image(paths[0]))
-        self._size = self._held[1].shape[1::-1]
+        first_size = self._held[1].shape[1::-1]
         for number, path in enumerate(paths[1:], start=1):
             if number % TELL_EVERY == 0:
                 progress.tell(f"{path.parent.name}: pictures", number, len(paths))
             size = size_of_file(path)  # by its header alone: a long sequence opens quickly
-            if size != self._size:
-                problem = "{} x {} pixels; the folder's first picture has {} x {}".format(*size, *self._size)
+            if size != first_size:
+                problem = "{} x {} pixels; the folder's first picture has {} x {}".format(*size, *first_size)
                 raise InputError(path, "size", problem)
         self.count, self.rate_hz = len(paths), rate_hz
 
@@ -154,10 +154,7 @@ class PictureFiles(Frames):
                 self._held = index, read_image(self._paths[index])
             except InputError as error:
                 raise ContentFailure(str(error)) from None
-        picture = self._held[1]
-        if picture.shape[1::-1] != self._size:
-            raise ContentFailure(f"{self._paths[index]}: its size differs from the first picture's")
-        return picture
+        return self._held[1]
 
 
 def _opened(path: Path) -> cv2.VideoCapture:

@@ -171,11 +171,8 @@ def many_nodes(table: dict[str, Any]) -> None:
         (many_bones, "nodes and bones: 100,003 is over the limit of 5,000"),
         (many_nodes, "nodes and bones: 20,005 is over the limit of 5,000"),
         (lambda t: t["skins"][0].update(joints=[1]), "JOINTS_0 names bones beyond the 1 there are"),
-        (lambda t: t["accessors"][4].update(count=1), "is damaged, or no glTF (ValueError"),
-        (lambda t: t["animations"][0]["channels"][0].update(sampler=3), "is damaged, or no glTF (IndexError"),
         (lambda t: t["nodes"][1].update(rotation=[0, 0, 1]), "[0, 0, 1] must be 4 numbers"),
         (lambda t: t["nodes"][1].update(scale=[1e99, 0, 1]), "must be 3 numbers"),
-        (lambda t: t["accessors"][0].update(count=10_000), "is damaged, or no glTF (ValueError"),
         (lambda t: t["accessors"][0].update(type="VEC4"), "accessors[0] is VEC4, not VEC3"),
     ],
 )

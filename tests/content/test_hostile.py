@@ -189,17 +189,12 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
         "nodes: are nested deeper than 64",
     ),
     "a circle of nodes": (gltf(nodes=[{"children": [0], "mesh": 0}]), ""),
-    "no such child": (gltf(nodes=[{"children": [7]}]), "is damaged, or no glTF (IndexError"),
     "a child before the first": (gltf(nodes=[{"children": [-1]}]), "-1 is no index, count or size"),
     "a count": (
         gltf(accessors=[{"componentType": 5126, "count": 10**9, "type": "VEC3"}] * 2),
         "accessors[0].count: 1,000,000,000 is over the limit of 20,000,000",
     ),
     "a negative count": (gltf(accessors=[{"componentType": 5126, "count": -1, "type": "VEC3"}] * 2), "-1 is no index"),
-    "a view beyond its buffer": (
-        gltf(bufferViews=[{"buffer": 0, "byteOffset": 40, "byteLength": 36}] * 2),
-        "is damaged, or no glTF (ValueError",
-    ),
     "a buffer that is not there": (
         gltf(buffers=[{"uri": "gone.bin", "byteLength": 9}]),
         "buffers[0].uri: gone.bin is not there",
@@ -209,7 +204,6 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
         "buffers[0]: its 2 bytes are fewer than the 9 promised",
     ),
     "a number for a list": (gltf(buffers=5), "is damaged, or no glTF (TypeError"),
-    "no numbers": (gltf(accessors=[]), "is damaged, or no glTF (IndexError"),
     "nothing": (gltf(meshes=[], nodes=[], scenes=[]), "faces: there are none"),
     "a URI with NUL": (gltf(buffers=[{"byteLength": 48, "uri": "a%00b.bin"}]), "buffers[0].uri: the path holds a NUL"),
     "a long name": (
@@ -219,7 +213,6 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
     "an address": (gltf(buffers=[{"byteLength": 48, "uri": "http://localhost/a.bin"}]), "only files beside this one"),
     "an absolute path": (gltf(buffers=[{"byteLength": 48, "uri": "/etc/passwd"}]), "is an absolute path"),
     "a device": (gltf(buffers=[{"byteLength": 48, "uri": "zero.bin"}]), "buffers[0].uri: is a device"),
-    "a fifo of a texture": (textured(0, [{"source": 0}], [{"uri": "fifo.png"}]), "texture: is a FIFO"),
     "a missing texture": (textured(0, [{"source": 0}], [{"uri": "gone.png"}]), "texture: gone.png is not there"),
     "a broken texture": (
         textured(0, [{"source": 0}], [{"uri": "data:image/png;base64,iVBORw0KGgo="}]),
@@ -244,7 +237,6 @@ GLTFS: dict[str, tuple[dict[str, Any], str]] = {
 def test_a_gltf_is_refused_by_what_it_says_of_itself(tmp_path: Path, name: str) -> None:
     table, told = GLTFS[name]
     (tmp_path / "zero.bin").symlink_to("/dev/zero")
-    os.mkfifo(tmp_path / "fifo.png")
     path = tmp_path / "a.gltf"
     path.write_text(json.dumps(table))
     start = time.monotonic()
