@@ -26,8 +26,8 @@ def capture_live(
     """Walk through the viewpoints with a person before the display. Raises InputError, FatalError."""
     file = PairsFile(out)
     say(f"sensor: {hardware.open_sensor(settings)}")
-    chart = hardware.chart(settings) if show else None
     try:
+        chart = hardware.chart(settings) if show else None
         walk = Walk(file, grid(settings.calibration), say=say, chart=chart)
         walk.begin()
         while not walk.finished:
@@ -40,8 +40,6 @@ def capture_live(
         return walk.summary()
     finally:
         hardware.let_go()
-        if chart is not None:
-            chart.close()
 
 
 def capture_recording(out: Path, settings: Settings, *, source: str) -> dict[str, Any]:

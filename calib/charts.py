@@ -7,13 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calib.display import open_display
 from calib.viewpoints import IPD_M, Viewpoint
 from runtime.config import Settings
 from runtime.model.predictor import load_predictor
@@ -49,67 +47,41 @@ def _ink(length_px: int) -> F64:
     return np.clip(LINE_PX / 2 - distance + 0.5, 0.0, 1.0)
 
 
-class Drawer:
-    """Draws the charts of one stack; the model is loaded when the first one needs it."""
+class Charts:
+    """The charts of one stack."""
 
     def __init__(self, settings: Settings) -> None:
+        """Raises InputError, MissingPart."""
         self.stack = settings.stack.stack()
         self.ipd_m = settings.calibration.ipd_m or IPD_M
-        self._settings = settings.model
-        self._predictor: Any = None
-        self.layers = lru_cache(maxsize=2)(self._layers)  # a person goes back by one
+        self._predictor = load_predictor(MODEL, self.stack, settings.model)
 
-    def _layers(self, viewpoint: Viewpoint) -> U8:
-        """(N, H, W, 4) layers through which both eyes see the line picture at the viewpoint.
-
-        Raises InputError, MissingPart.
-        """
-        if self._predictor is None:
-            self._predictor = load_predictor(MODEL, self.stack, self._settings)
+    def layers(self, viewpoint: Viewpoint) -> U8:
+        """(N, H, W, 4) layers through which both eyes see the line picture at the viewpoint."""
         picture = line_picture(width_px=self.stack.width_px, height_px=self.stack.height_px)
         eyes_m, fov_deg = viewpoint.eyes_m(self.ipd_m), chart_fov_deg(viewpoint, self.stack)
         prediction = solve_still(picture, picture, eyes_m=eyes_m, fov_deg=fov_deg, predictor=self._predictor)
         return np.array(prediction.layers)  # a copy: the predictor uses its own again
 
     def close(self) -> None:
-        """Release the model. May be called twice."""
-        if self._predictor is not None:
-            self._predictor.close()
-            self._predictor = None
+        """Release the model."""
+        self._predictor.close()
 
 
 def make_charts(out: Path, viewpoints: Sequence[Viewpoint], settings: Settings) -> dict[str, Any]:
     """Write a PNG for each panel and viewpoint, and `charts.json`. Raises InputError, MissingPart."""
     charts = []
-    with OutputFolder(out) as folder, closing(Drawer(settings)) as drawer:
+    with OutputFolder(out) as folder, closing(Charts(settings)) as drawn:
         for viewpoint in tracked("charts", viewpoints):
-            files = [f"chart-{viewpoint.name}-layer-{index}.png" for index in range(drawer.stack.count)]
-            for name, layer in zip(files, drawer.layers(viewpoint), strict=True):
+            files = [f"chart-{viewpoint.name}-layer-{index}.png" for index in range(drawn.stack.count)]
+            for name, layer in zip(files, drawn.layers(viewpoint), strict=True):
                 write_png(folder.staging / name, layer)
             charts.append({
                 "viewpoint": viewpoint.name,
                 "midpoint_m": viewpoint.midpoint_m,
-                "eyes_m": viewpoint.eyes_m(drawer.ipd_m),
-                "fov_deg": chart_fov_deg(viewpoint, drawer.stack),
+                "eyes_m": viewpoint.eyes_m(drawn.ipd_m),
+                "fov_deg": chart_fov_deg(viewpoint, drawn.stack),
                 "files": files,
             })  # fmt: skip
-        write_json(folder.staging / "charts.json", {"ipd_m": drawer.ipd_m, "model": MODEL, "charts": charts})
-    return {"out": str(out), "viewpoints": [v.name for v in viewpoints], "files": len(charts) * drawer.stack.count}
-
-
-class ChartDisplay:
-    """The panels, showing one viewpoint's chart at a time."""
-
-    def __init__(self, settings: Settings) -> None:
-        """Opens the panels. Raises InputError, MissingPart, PanelLost."""
-        self._drawer = Drawer(settings)
-        self.display = open_display(settings, registered=True)
-
-    def show(self, viewpoint: Viewpoint) -> None:
-        """The viewpoint's chart. Raises PanelLost."""
-        self.display.show(self._drawer.layers(viewpoint))
-
-    def close(self) -> None:
-        """Close the panels and the model. May be called twice."""
-        self.display.close()
-        self._drawer.close()
+        write_json(folder.staging / "charts.json", {"ipd_m": drawn.ipd_m, "model": MODEL, "charts": charts})
+    return {"out": str(out), "viewpoints": [v.name for v in viewpoints], "files": len(charts) * drawn.stack.count}

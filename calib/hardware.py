@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.charts import ChartDisplay
+from calib.charts import Charts
 from calib.display import PanelDisplay, grey_layers, message_layers, open_display
 from calib.keys import Key
 from calib.photographs import photographs
@@ -49,6 +49,7 @@ class SetupHardware:
         self._keys, self._photos = keys, photos
         self._clock = MonotonicClock()
         self._display: PanelDisplay | None = None  # whatever windows are open: only one owner at a time
+        self._charts: Charts | None = None
         self._bound: Any = None  # the output settings that words are shown on
         self._cards: tuple[list[U8], tuple[Monitor, ...]] = ([], ())
         self._worker: SensorWorker | None = None
@@ -155,12 +156,12 @@ class SetupHardware:
         frames = self._worker.take()
         return (frames[-1].capture_ns, frames[-1].eyes, self._worker.serial) if frames else None
 
-    def chart(self, settings: Settings) -> ChartDisplay | None:
-        """What shows charts and captions while capturing; None: nobody sees any."""
+    def chart(self, settings: Settings) -> Callable[[Viewpoint], None] | None:
+        """What shows a viewpoint's chart while capturing; None: nobody sees any."""
         self.let_go()
-        chart = ChartDisplay(settings)
-        self._display = chart.display
-        return chart
+        charts, display = Charts(settings), open_display(settings, registered=True)
+        self._charts, self._display = charts, display
+        return lambda viewpoint: display.show(charts.layers(viewpoint))
 
     def close(self) -> None:
         """Give everything back. May be called twice."""
@@ -168,10 +169,11 @@ class SetupHardware:
         self._stop_sensor()
 
     def let_go(self) -> None:
-        """Close whatever windows are open."""
-        if self._display is not None:
-            self._display.close()
-        self._display = self._bound = None
+        """Close whatever windows are open, and the model that draws for them."""
+        for part in (self._display, self._charts):
+            if part is not None:
+                part.close()
+        self._display = self._bound = self._charts = None
 
     def _stop_sensor(self) -> None:
         if self._worker is not None:
@@ -278,5 +280,5 @@ class SimulatedHardware(SetupHardware):
         seen = seen + self._random.normal(scale=SENSOR_NOISE_M, size=(2, 3))
         return self._seen_ns, EyePoints(seen, np.ones(2)), "demo"
 
-    def chart(self, settings: Settings) -> ChartDisplay | None:
+    def chart(self, settings: Settings) -> Callable[[Viewpoint], None] | None:
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,9 +14,6 @@ from calib.similarity import Degenerate, Similarity, extents, fit
 from calib.viewpoints import Viewpoint
 from runtime.clock import NS_PER_S
 from runtime.records import F64, EyePoints
-
-if TYPE_CHECKING:
-    from calib.charts import ChartDisplay
 
 HERE = "here: till the lines fuse; then Enter"
 GUIDE_NS = NS_PER_S // 2  # between two words of guidance
@@ -65,7 +62,7 @@ class Walk:
         viewpoints: Sequence[Viewpoint],
         *,
         say: Callable[[str], None],
-        chart: ChartDisplay | None = None,
+        chart: Callable[[Viewpoint], None] | None = None,
     ) -> None:
         """chart: None: the person follows the charts elsewhere."""
         self._file, self._say, self._chart = file, say, chart
@@ -187,4 +184,4 @@ class Walk:
             f"Enter: fused, n: next, p: previous, u: undo, q: stop"
         )
         if self._chart is not None:
-            self._chart.show(viewpoint)
+            self._chart(viewpoint)

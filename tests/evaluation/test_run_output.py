@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import signal
 import subprocess
@@ -17,7 +16,6 @@ import pytest
 from runtime.evaluation import contact_sheet, run_output
 from runtime.evaluation.displayed import displayed
 from runtime.evaluation.run_output import RunOutput
-from runtime.optics.carried import carried_db
 from runtime.optics.stack import PanelStack
 from runtime.records import State
 from runtime.support.artifacts import OutputFolder, read_image
@@ -37,53 +35,6 @@ def pictures(seed: int = 0) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
     layers = rng.integers(0, 256, (3, 18, 32, 4), dtype=np.uint8)
     left, right = rng.integers(0, 256, (2, 18, 32, 3), dtype=np.uint8)
     return layers, (left, right)
-
-
-def test_a_line_a_refresh_is_written(tmp_path: Path) -> None:
-    with RunOutput(tmp_path) as output:
-        output.refresh(line(0))
-        output.refresh(line(1, true_eyes_m=EYES))
-    told = [json.loads(text) for text in (tmp_path / "frames.jsonl").read_text().splitlines()]
-    assert [entry["frame"] for entry in told] == [0, 1]
-    assert (told[0]["state"], told[0]["eyes_m"]) == ("tracking", EYES.tolist())
-    assert (told[0]["true_eyes_m"], told[1]["true_eyes_m"]) == (None, EYES.tolist())
-
-
-def test_a_light_holds_what_is_needed_to_judge_it_without_the_run(tmp_path: Path) -> None:
-    layers, drawn = pictures()
-    info = {
-        "solved_for_m": EYES,
-        "eyes_m": EYES + 0.002,
-        "true_eyes_m": EYES + np.array([0.0, 0.004, 0.0]),
-        "fov": 40.0,
-    }
-    with RunOutput(tmp_path) as output:
-        output.light(20, layers=layers, drawn=drawn, info=info)
-    folder = tmp_path / "light" / "20"
-    told = json.loads((folder / "light.json").read_text())
-    again = np.stack([read_image(folder / f"layer-{n}.png") for n in range(3)])
-    np.testing.assert_array_equal(again, layers[..., :3])
-    judged = carried_db(
-        again,
-        [read_image(folder / f"drawn-{eye}.png") for eye in ("left", "right")],
-        STACK,
-        solved_for_m=told["solved_for_m"],
-        eyes_m=told["true_eyes_m"],
-        fov_deg=told["fov"],
-    )
-    here = carried_db(layers, drawn, STACK, solved_for_m=EYES, eyes_m=info["true_eyes_m"], fov_deg=40.0)
-    assert judged == pytest.approx(here, abs=1e-9)
-
-
-def test_the_last_frame_leaves_its_layers_and_what_the_eyes_see(tmp_path: Path) -> None:
-    layers, wanted = pictures()
-    look = displayed(layers, wanted, STACK, eyes_m=EYES, fov_deg=40)
-    with RunOutput(tmp_path / "new" / "folder") as output:
-        output.finish(SUMMARY, layers, look)
-    left = {path.name for path in (tmp_path / "new" / "folder").iterdir()}
-    pairs = {f"{what}-{eye}.png" for what in ("seen", "wanted") for eye in ("left", "right")}
-    layer_names = {f"layer-{n}.png" for n in range(3)}
-    assert left == pairs | layer_names | {"contact-sheet.png", "frames.jsonl", "summary.json"}
 
 
 def test_the_sheet_shows_the_moment_with_the_one_figure_to_quote(
