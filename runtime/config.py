@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
-    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -25,7 +24,7 @@ from pydantic import (
 from runtime.errors import InputError, one_line
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.support import untrusted_input
-from runtime.support.plausible import check_text, nearest, socket_path, within
+from runtime.support.plausible import check_text, nearest, within
 from runtime.support.plugins import located
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
 from runtime.support.removed import REMOVED_SETTINGS
@@ -53,7 +52,6 @@ PANELS_MOST = 8  # of a stack
 
 NonNegative = Annotated[float, Field(ge=0, le=MOST)]
 Unit = Annotated[float, Field(ge=0, le=1)]
-SocketPath = Annotated[str, AfterValidator(socket_path)]
 Entry = Annotated[float, Field(ge=-MOST, le=MOST)]  # of a matrix
 Slope = Annotated[float, Field(ge=-0.2, le=0.2)]  # of a panel that should stand upright
 Place = Annotated[float, within(-EYE_MOST_M, EYE_MOST_M, "m")]  # a coordinate of an eye
@@ -373,7 +371,7 @@ LIMITS = LimitSettings()  # the same for every display; tests lower them
 class ServiceSettings(Section):
     """The daemon's socket, metrics and black box."""
 
-    socket: SocketPath = Field("/run/phasestack/status.sock", description="status and control socket")
+    socket: str = Field("/run/phasestack/status.sock", description="status and control socket")
     metrics_port: Annotated[int, Field(ge=0, le=65535)] = Field(0, description="Prometheus on loopback; 0: off")
     blackbox_minutes: Annotated[float, within(0.0, 60.0, "min")] = Field(
         2.0, description="what the black box keeps in memory, to be written at a fault or by `ctl blackbox`; 0: none"

@@ -14,7 +14,6 @@ from runtime.commands.app import app
 from runtime.errors import FatalError
 from runtime.support.artifacts import write_png
 
-RUN = ("run", "--headless", "--max-speed", "--frames", "1", "--scale", "0.1")
 PANELS = {"width_m": 0.5184, "height_m": 0.2916, "x_m": [-0.06, 0.0, 0.06]}
 
 
@@ -132,29 +131,3 @@ def test_pictures_of_different_sizes_are_refused(pair: Path) -> None:
 def test_panels_that_make_no_stack_are_refused_by_field(pair: Path, table: dict[str, object], field: str) -> None:
     (pair / "panels.json").write_text(json.dumps(table))
     assert f"panels.json: {field}" in refusal(*solve_arguments(pair))
-
-
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
-        ("[loop\n", "malformed"),
-        ("[model]\nname = 'quick'\n", "quick"),
-        ("[calibration]\nfile = 'missing.toml'\n", "missing.toml"),
-    ],
-)
-def test_a_wrong_configuration_is_refused_by_file_and_field(tmp_path: Path, text: str, named: str) -> None:
-    config = tmp_path / "phasestack.toml"
-    config.write_text(text)
-    out = tmp_path / "out"
-    assert named in refusal(*RUN, "--config", config, "--replay", "demo", "--out", out)
-    assert not out.exists()
-
-
-@pytest.mark.parametrize("content", [b"", b"no recording at all", None])
-def test_a_recording_that_is_none_is_refused(tmp_path: Path, content: bytes | None) -> None:
-    recording = tmp_path / "eyes.mcap"
-    if content is not None:
-        recording.write_bytes(content)
-    out = tmp_path / "out"
-    assert "eyes.mcap" in refusal(*RUN, "--replay", recording, "--out", out)
-    assert not out.exists()

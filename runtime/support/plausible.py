@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
-from pathlib import PurePosixPath
 
 from pydantic import AfterValidator
 
@@ -12,7 +11,6 @@ from runtime.support.ranges import refusal
 
 TEXT_MAX_BYTES = 4095  # of a path on Linux
 PART_MAX_BYTES = 255  # of one part of a path
-SOCKET_MAX_BYTES = 107  # of a Unix socket's path
 
 
 def within(low: float, high: float, unit: str, *, zero: bool = False) -> AfterValidator:
@@ -43,15 +41,6 @@ def check_text(value: str) -> str:
         raise ValueError("is not UTF-8") from None
     if size > TEXT_MAX_BYTES or longest > PART_MAX_BYTES:
         raise ValueError(f"is too long ({len(value)} characters, beginning {value[:20]!r})")
-    return value
-
-
-def socket_path(value: str) -> str:
-    """The text, where a socket can be there. Raises ValueError."""
-    if not value or value.endswith("/") or PurePosixPath(value).name in ("", ".", ".."):
-        raise ValueError(f"{value!r} names no file: a socket's path, such as /run/phasestack/status.sock")
-    if len(value.encode()) > SOCKET_MAX_BYTES:
-        raise ValueError(f"is too long for a socket ({len(value.encode())} bytes, {SOCKET_MAX_BYTES} at most)")
     return value
 
 

@@ -138,20 +138,6 @@ def test_a_signal_at_any_stage_of_the_start_ends_it_without_a_traceback(
     assert "Traceback" not in errors
 
 
-@pytest.mark.parametrize("after_s", [1.2])
-def test_a_hangup_during_the_start_is_a_reload_that_comes_when_it_can(
-    started: Callable[..., Any], after_s: float
-) -> None:
-    daemon = started()
-    time.sleep(after_s)
-    daemon.process.send_signal(signal.SIGHUP)
-    if daemon.hears("READY=1"):  # before our handlers are there it ends the process, as it ends any
-        daemon.process.send_signal(signal.SIGTERM)
-    code, errors = daemon.ends()
-    assert code in (0, -signal.SIGHUP)
-    assert "Traceback" not in errors
-
-
 def test_an_operator_steers_it(started: Callable[..., Any]) -> None:
     daemon = started()
     assert daemon.hears("READY=1")

@@ -7,7 +7,6 @@ import numpy as np
 
 from runtime.clock import Clock
 from runtime.config import PanelSettings
-from runtime.errors import PanelLost
 from runtime.panels.offscreen import OffscreenPanels
 from runtime.panels.presentation import Painter
 from runtime.records import U8
@@ -32,19 +31,14 @@ class DrawnPanels(OffscreenPanels):
         """The monitors' pictures of the last frame, rear to front: (h, w, 4) RGBA each, top row first."""
         assert self._frame is not None
         pictures = []
-        try:
-            self._textures.upload(self._frame)
-            for index, (target, painter) in enumerate(zip(self._targets, self._painters, strict=True)):
-                target.use()
-                painter.draw(self._textures, self._frame, index)
-                width, height = target.size
-                bottom_up = np.frombuffer(target.read(components=4), np.uint8).reshape(height, width, 4)
-                pictures.append(np.ascontiguousarray(bottom_up[::-1]))
-            fault = self._context.error
-        except Exception as error:
-            raise PanelLost(f"{error}") from error
-        if fault != "GL_NO_ERROR":
-            raise PanelLost(fault)
+        self._textures.upload(self._frame)
+        for index, (target, painter) in enumerate(zip(self._targets, self._painters, strict=True)):
+            target.use()
+            painter.draw(self._textures, self._frame, index)
+            width, height = target.size
+            bottom_up = np.frombuffer(target.read(components=4), np.uint8).reshape(height, width, 4)
+            pictures.append(np.ascontiguousarray(bottom_up[::-1]))
+        assert self._context.error == "GL_NO_ERROR"
         return tuple(pictures)
 
     def close(self) -> None:

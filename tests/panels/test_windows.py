@@ -193,16 +193,3 @@ def test_an_unchanged_frame_stays_and_is_drawn_anew_where_the_windows_were_lost(
 
     assert eventually(shown_again)
     assert shows(x, 2, picture(50, 0))
-
-
-def test_content_can_draw_in_its_own_context_between_two_frames(
-    context: moderngl.Context, opened: Callable[..., Any]
-) -> None:
-    sink = opened(*BY_CONNECTOR)
-    target = context.simple_framebuffer((4, 4))
-    for number, red in enumerate((0.0, 1.0, 0.0)):
-        target.use()
-        target.clear(red, 0, 0)
-        assert target.read(components=1)[0] == round(255 * red)
-        sink.present(frame(number))
-    assert context.error == "GL_NO_ERROR"

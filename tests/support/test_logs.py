@@ -107,34 +107,6 @@ def test_a_reader_that_never_reads_holds_up_nobody_and_hears_the_rest_when_it_re
     pipe.read_until("and on")
 
 
-def test_a_reader_that_is_gone_is_survived() -> None:
-    out, descriptor = os.pipe()
-    with open(descriptor, "w", encoding="utf-8") as stream:  # noqa: PTH123
-        configured(stream)
-        os.close(out)
-        say("nobody hears this")
-        logs.flush()
-
-
-def test_a_process_whose_log_nobody_reads_ends_all_the_same() -> None:
-    """Python's own clean-up waits for no thread that is stuck in a full pipe."""
-    code = (
-        "import logging; from runtime.support.logs import configure;"
-        "configure(environment={});"
-        "[logging.getLogger('phasestack').info('%s', 'x' * 1000, extra={'always': True}) for _ in range(1000)];"
-        "print('done')"
-    )
-    out, descriptor = os.pipe()
-    try:
-        done = subprocess.run(
-            [sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=descriptor, timeout=60, check=False
-        )
-    finally:
-        os.close(out)
-        os.close(descriptor)
-    assert (done.returncode, done.stdout) == (0, b"done\n")
-
-
 def test_the_last_lines_before_the_end_are_written() -> None:
     code = (
         "import logging; from runtime.support.logs import configure;"
