@@ -15,7 +15,7 @@ from runtime.model.predictor import Predictor
 from runtime.optics.stack import PanelStack
 from runtime.support.background import Job
 from runtime.support.crash import written
-from runtime.support.memory import give_back_later
+from runtime.support.memory import give_back
 from runtime.support.progress import listening
 
 Ready = tuple[Opener | None, Predictor | None]  # None: stays as it is
@@ -61,7 +61,7 @@ class Reconfiguration:
                     predictor.close()
             else:
                 self._take_over(parts, opener, predictor)
-        give_back_later()
+        Job("memory", give_back)  # what was replaced is large, and nobody waits for it
         self.finished = True
         return True
 

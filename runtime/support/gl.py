@@ -40,10 +40,7 @@ def offscreen_context() -> moderngl.Context:
 
 @cache
 def _gl_finish() -> Any:
-    try:
-        return ctypes.CDLL(EGL["libgl"]).glFinish
-    except (OSError, AttributeError):  # a driver without that library: reading waits then, as it always did
-        return lambda: None
+    return ctypes.CDLL(EGL["libgl"]).glFinish
 
 
 def finish() -> None:

@@ -5,32 +5,16 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import gc
-import threading
 from collections.abc import Iterator
 
-from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
 
-
-def give_back() -> bool:
+def give_back() -> None:
     """Give freed memory back to the system; the C library keeps what lies between pieces that are still in use.
 
-    False where the C library has no such call. Takes milliseconds.
+    Takes milliseconds. Does nothing where the C library has no such call.
     """
-    try:
-        return bool(ctypes.CDLL(None).malloc_trim(0))
-    except (OSError, AttributeError):
-        return False
-
-
-def give_back_later() -> None:
-    """The same on a thread of its own: what was replaced is large, and nobody waits for it."""
-
-    def run() -> None:
-        set_niceness(BACKGROUND_NICENESS)
-        give_back()
-
-    with contextlib.suppress(RuntimeError):  # no thread to be had: another time
-        threading.Thread(target=run, name="memory", daemon=True).start()
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 @contextlib.contextmanager

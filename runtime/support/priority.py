@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
-
-log = logging.getLogger("phasestack.priority")
+from contextlib import contextmanager, suppress
 
 PRESENTER_NICENESS = -10
 SOLVER_NICENESS = 5
@@ -26,11 +23,7 @@ def niceness(value: int) -> Iterator[None]:
         set_niceness(before)
 
 
-def set_niceness(niceness: int) -> bool:
-    """Of the calling thread, and of those that it starts from now on. False where the system does not allow it."""
-    try:
+def set_niceness(niceness: int) -> None:
+    """Of the calling thread, and of those that it starts from now on; where the system allows it."""
+    with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
-    except (OSError, AttributeError):
-        log.debug("this thread's niceness can't become %d here", niceness)
-        return False
-    return True
