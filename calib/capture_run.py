@@ -8,11 +8,10 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from calib.capture import midpoint
 from calib.hardware import SetupHardware
 from calib.pairs import PairRow, PairsFile
 from calib.viewpoints import grid
-from calib.walk import Walk
+from calib.walk import Walk, midpoint
 from runtime.clock import NS_PER_S, SimulatedClock
 from runtime.config import Settings
 from runtime.errors import InputError

@@ -21,13 +21,11 @@ from runtime.optics.stack import PanelStack, Tilt
 from runtime.records import F64
 
 MIN_PHOTOGRAPHS = 5
-WANTED_PHOTOGRAPHS = 8
 MIN_SPAN_DEG = 15.0  # between the two directions that lie farthest apart
 DISAGREES = 0.4  # share of a photograph's points that do not fit
 MISFIT_PX = 1.5  # of a photograph: panels that move, or no rigid stack at all
 IMPLAUSIBLE_M = 0.010  # a panel farther off than hands put it
 DOUBTFUL_PX = 0.3  # a corner that is not known better is not worth writing
-FEWER_IS_NOTED_PX = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +40,7 @@ class Registration:
     corner_sigma_px: F64  # (N, 4, 2)
     eye_m: F64  # (3,) the viewing place
     used: int  # photographs
-    left_out: dict[str, str]  # photographs by name, and why
-    notes: list[str]
+    notes: list[str]  # photographs that were left out, and why
 
     @property
     def sigma_panel_px(self) -> F64:
@@ -108,11 +105,6 @@ def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m:
         raise Undetermined(
             f"the photographs leave a panel's corner uncertain by {worst_px:.2f} px: take more, from more directions"
         )
-    notes = [f"{name} {why}: left out" for name, why in left_out.items()]
-    if len(good) < WANTED_PHOTOGRAPHS:
-        notes.append(f"{len(good)} photographs were used: 8 to 20 are better, and tell whether one of them is wrong")
-    if worst_px > FEWER_IS_NOTED_PX:
-        notes.append(f"a corner is uncertain by {worst_px:.2f} px: more photographs, from farther aside, would help")
     return Registration(
         bundle=bundle,
         stack=model,
@@ -122,8 +114,7 @@ def register_photographs(seen: Sequence[SeenMarks], stack: PanelStack, *, eye_m:
         corner_sigma_px=corner_sigma_px,
         eye_m=eye_m,
         used=len(good),
-        left_out=left_out,
-        notes=notes,
+        notes=[f"{name} {why}: left out" for name, why in left_out.items()],
     )
 
 

@@ -23,8 +23,6 @@ from runtime.report.page import in_columns
 from runtime.support.artifacts import OutputFolder, write_json, write_text
 from runtime.support.progress import status_line
 
-NOTED_TILT_DEG = 0.3
-
 
 def register_photos(
     pictures: Iterable[tuple[str, U8]], source: str, out: Path, settings: Settings, *, config: Path | None
@@ -89,12 +87,6 @@ def registration_summary(found: Registration) -> dict[str, Any]:
     notes = list(found.notes)
     if not stack.is_evenly_spaced:
         notes.append(f"the gaps differ by more than {100 * UNEVEN_MOST:.0f}%: the model sart serves them, no network")
-    worst_deg = float(np.abs(tilt_deg).max())
-    if worst_deg > NOTED_TILT_DEG:
-        notes.append(
-            f"a panel is tilted by {worst_deg:.1f} degrees against panel {bundle.reference}: the shipped models "
-            "allow for it; with others it is exact from the viewing place alone"
-        )
     return {
         "reference": bundle.reference,
         "eye_m": found.eye_m,

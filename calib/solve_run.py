@@ -11,10 +11,10 @@ import numpy as np
 import tomlkit
 
 from calib.checks import check_pairs, check_solution
+from calib.config_file import save
 from calib.pairs import Pairs, read_pairs
 from calib.similarity import Degenerate
 from calib.solution import METHODS, Solution, solve, solve_default
-from calib.store import save
 from calib.viewpoints import viewing_volume_m
 from runtime.config import Settings
 from runtime.errors import InputError

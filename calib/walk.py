@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from calib.capture import MAX_SPREAD_M, EyeWindow
 from calib.keys import Key
 from calib.pairs import PairRow, PairsFile, points_of
 from calib.similarity import Degenerate, Similarity, extents, fit
@@ -15,11 +15,53 @@ from calib.viewpoints import Viewpoint
 from runtime.clock import NS_PER_S
 from runtime.records import F64, EyePoints
 
+WINDOW_NS = NS_PER_S // 2  # a pair is the median over so long
+MAX_SPREAD_M = 0.010  # eyes that moved or scattered by more meanwhile make no pair
+MIN_SAMPLES = 5
+MIN_CONFIDENCE = 0.3
+MAD_TO_SIGMA = 1.4826
+
 HERE = "here: till the lines fuse; then Enter"
 GUIDE_NS = NS_PER_S // 2  # between two words of guidance
 MIN_PAIRS = 3  # that show roughly where the camera stands
 MIN_WIDTH_M = 0.02  # of these across their longest direction: nearly a line leaves the turn about it open
 NEAR_M = 0.015  # nearer than this the lines themselves are the better guide
+
+
+def midpoint(eyes: EyePoints | None) -> F64 | None:
+    """(3,) middle of two measured eyes; None where one is missing, uncertain or filled in."""
+    if eyes is None or eyes.completed or eyes.confidence.min() < MIN_CONFIDENCE:
+        return None
+    middle = eyes.eyes_m.mean(axis=0)
+    return middle if np.isfinite(middle).all() else None
+
+
+class EyeWindow:
+    """The samples of the last half second before the newest one."""
+
+    def __init__(self) -> None:
+        self._samples: deque[tuple[int, F64]] = deque()  # instant, middle of the eyes
+
+    def add(self, capture_ns: int, eyes: EyePoints | None) -> None:
+        """Take in a sample in frame `sensor`; unusable ones only let time pass."""
+        middle = midpoint(eyes)
+        if middle is not None:
+            self._samples.append((capture_ns, middle))
+        while self._samples and self._samples[0][0] <= capture_ns - WINDOW_NS:
+            self._samples.popleft()
+
+    def clear(self) -> None:
+        """Forget all: what was seen before does not belong to what comes."""
+        self._samples.clear()
+
+    def measure(self) -> tuple[F64, float] | None:
+        """Their median (3,), frame `sensor`, and robust RMS distance from it; None with fewer than `MIN_SAMPLES`."""
+        if len(self._samples) < MIN_SAMPLES:
+            return None
+        points = np.array([point for _, point in self._samples])
+        centre = np.median(points, axis=0)
+        mad_m = np.median(np.abs(points - centre), axis=0) * MAD_TO_SIGMA
+        return centre, float(np.linalg.norm(mad_m))
 
 
 def rough_similarity(sensor_m: F64, stack_m: F64) -> Similarity | None:
@@ -128,12 +170,13 @@ class Walk:
         if seen is None:
             self._say(f"{viewpoint.name}: not taken: the sensor sees no pair of eyes")
             return
-        spread = f"{seen.spread_m * 1e3:.1f}"
-        if seen.spread_m > MAX_SPREAD_M:
+        middle_m, spread_m = seen
+        spread = f"{spread_m * 1e3:.1f}"
+        if spread_m > MAX_SPREAD_M:
             self._say(f"{viewpoint.name}: not taken: the eyes moved or scattered by {spread} mm: hold still")
             return
         self._file.accept(
-            PairRow.of(seen.midpoint_m, viewpoint.midpoint_m, viewpoint.name, serial=self._serial, spread_mm=spread)
+            PairRow.of(middle_m, viewpoint.midpoint_m, viewpoint.name, serial=self._serial, spread_mm=spread)
         )
         self._accepted += 1
         self._rough = rough_similarity(*points_of(self._file.rows))
@@ -162,7 +205,7 @@ class Walk:
         if self._rough is None or seen is None:
             return
         self._guided_ns = now_ns
-        eyes_m = self._rough.points(seen.midpoint_m[None])[0]
+        eyes_m = self._rough.points(seen[0][None])[0]
         way = way_to(self.current.midpoint_m, eyes_m) or HERE
         if way != self._guide:
             self._guide = way

@@ -25,7 +25,7 @@ HELD_OUT_SEED = 9_000_001  # of the validation pairs: no training seed reaches i
 PAIRS_A_STEP = 2
 FLOOR = 1e-6  # of the squared error in the loss: beyond 60 dB nothing is gained
 GRADIENT_MAX = 5.0
-COLUMNS = ("iteration", "training_loss_db", "held_out_exact_db", "held_out_expected_db", "held_out_loss_db")
+COLUMNS = ("iteration", "training_loss_db", "held_out_exact_db", "held_out_expected_db")
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,6 @@ class Point:
     training_loss_db: float  # mean since the last point; NaN before the first step
     exact_db: float  # displayed PSNR at the eyes, mean over held-out pairs
     expected_db: float  # over each pair's uncertainty, of those that have one
-    loss_db: float  # minus what is expected, of all pairs: lower is better
 
 
 def run_training(
@@ -95,17 +94,14 @@ def held_out_pairs(count: int, *, width_px: int, height_px: int) -> list[Trainin
 
 
 @torch.no_grad()
-def validate(model: SpectralSolver, pairs: Sequence[TrainingPair], recipe: Recipe) -> tuple[float, float, float]:
-    """Mean dB at the eyes, mean dB expected (of the pairs with unsure eyes), and mean loss."""
-    exact_db, expected_db, losses = [], [], []
+def validate(model: SpectralSolver, pairs: Sequence[TrainingPair], recipe: Recipe) -> tuple[float, float]:
+    """Mean dB at the eyes, and mean dB expected of the pairs with unsure eyes."""
+    exact_db, expected_db = [], []
     for pair in pairs:
-        errors = displayed_mse(model, sight_of(pair, recipe))
-        exact, expected = (-10 * math.log10(float(error) + FLOOR) for error in errors)
+        exact, expected = (-10 * math.log10(float(e) + FLOOR) for e in displayed_mse(model, sight_of(pair, recipe)))
         exact_db.append(exact)
-        if pair.eye_sigma_mm > 0:
-            expected_db.append(expected)
-        losses.append(-expected)
-    return float(np.mean(exact_db)), float(np.mean(expected_db)) if expected_db else math.nan, float(np.mean(losses))
+        expected_db += [expected] if pair.eye_sigma_mm > 0 else []
+    return float(np.mean(exact_db)), float(np.mean(expected_db)) if expected_db else math.nan
 
 
 def _annealed(done: float) -> float:

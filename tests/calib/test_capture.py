@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from calib.capture import EyeWindow
 from calib.commands import app
 from calib.keys import Key
 from calib.pairs import PairsFile, read_pairs
 from calib.viewpoints import grid
-from calib.walk import Walk
+from calib.walk import EyeWindow, Walk
 from runtime.clock import NS_PER_S
 from runtime.errors import InputError
 from runtime.eyes.demo_geometry import demo_stack_from_sensor
@@ -44,7 +43,7 @@ def test_the_median_over_the_window_ignores_a_wild_sample() -> None:
         window.add(number * STEP_NS, eyes_at(place + (5.0 if number == 7 else 0.0)))
     measured = window.measure()
     assert measured is not None
-    np.testing.assert_allclose(measured.midpoint_m, eyes_at(place).eyes_m.mean(0), atol=1e-12)
+    np.testing.assert_allclose(measured[0], eyes_at(place).eyes_m.mean(0), atol=1e-12)
 
 
 def walk(path: Path, said: list[str]) -> Walk:

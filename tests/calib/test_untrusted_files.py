@@ -9,12 +9,11 @@ from typing import Any
 
 import pytest
 
-from calib.config_file import read_document
+from calib.config_file import read_document, save
 from calib.pairs import PairsFile, read_pairs
 from calib.photographs import read_photograph
 from calib.service_files import gather
 from calib.setup_run import read_progress
-from calib.store import save
 from runtime.errors import InputError
 from runtime.panels.lut import measured_curve
 
