@@ -113,12 +113,24 @@ def corrected(belief: Belief, measured: F64, *, noise: F64) -> Belief:
     off = measured - belief.state[:, :3]
     likely = -0.5 * (_chi2(off, total) + np.linalg.slogdet(total)[1])
     weight = belief.weight * np.exp(likely - likely.max()) + WEIGHT_FLOOR
-    # Joseph's form: rounding can't turn a variance negative.
+    # Joseph's form: rounding hardly turns a variance negative.
     keep = np.repeat(np.eye(9)[None], len(weight), axis=0)
     keep[:, :, :3] -= gain
     covariance = keep @ belief.covariance @ keep.transpose(0, 2, 1) + gain @ noise @ gain.transpose(0, 2, 1)
     state = belief.state + (gain @ off[..., None])[..., 0]
-    return Belief(state, (covariance + covariance.transpose(0, 2, 1)) / 2, weight / weight.sum())
+    return Belief(state, _positive((covariance + covariance.transpose(0, 2, 1)) / 2), weight / weight.sum())
+
+
+def _positive(covariance: F64) -> F64:
+    """(n, 9, 9) as it is; where jumps of metres, which no head makes, leave it to rounding, the nearest that is one."""
+    try:
+        np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        size = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 1e-12))
+        scale = size[:, :, None] * size[:, None, :]
+        shares, axes = np.linalg.eigh(covariance / scale)
+        covariance = scale * ((axes * np.maximum(shares, 1e-9)[:, None]) @ axes.transpose(0, 2, 1))
+    return covariance
 
 
 def ahead(belief: Belief, dt_s: float) -> F64:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
@@ -71,6 +71,11 @@ def test_mixing_matches_the_published_equations() -> None:
     places=st.lists(st.tuples(*[st.floats(-20, 20)] * 3), min_size=2, max_size=20),
     steps=st.lists(st.floats(0, 0.5), min_size=20, max_size=20),
     sigmas=st.tuples(*[st.floats(2e-5, 1.0)] * 3),
+)
+@example(
+    places=[(0, 0, 0), (0, 2, 0), (0, 0, 10), (0, 0, 13), (0, 1, 0), (0, 0, 0)],
+    steps=[0.5, 0.03125, 0.25, 6e-8, 0.5],
+    sigmas=(1.0, 0.125, 2e-5),
 )
 def test_covariances_stay_positive_and_everything_finite(places: Any, steps: Any, sigmas: Any) -> None:
     noise = np.diag(np.square(sigmas))
