@@ -14,7 +14,7 @@ import numpy as np
 
 from runtime.records import F64
 from runtime.report.stability import exact
-from runtime.report.stability.trial import EPS64, Answer, Trial, refusal
+from runtime.report.stability.trial import EPS64, Answer, Trial
 
 STAGE = "calibration"
 Fit = Callable[[F64, F64], F64]  # (K, 3) sensor, (K, 3) stack, metres -> 4x4 stack_from_sensor
@@ -154,12 +154,3 @@ def trials(fits: Mapping[str, Fit]) -> Iterator[Trial]:
     }
     for name, case in cases.items():
         yield Trial(STAGE, name, case, measure="rad")
-    for name, points in (
-        ("two pairs", cloud(count=2)),
-        ("points at one place", np.repeat(cloud(count=1), 9, axis=0)),
-        ("points on a line", cloud(aspect=0.0)),
-        ("points 1e-12 as wide as long", cloud(aspect=1e-12)),
-        ("points 1e12 m from the origin", cloud() + 1e12),
-        ("a point at NaN", np.where(np.arange(27)[:, None] == 5, np.nan, cloud())),
-    ):
-        yield refusal(STAGE, name, partial(fit, points))
