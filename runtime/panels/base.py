@@ -31,7 +31,7 @@ class PanelSink(ABC):
         The frame's arrays stay as they are until another frame has been presented: a sink may read them as late as
         that. unchanged: the caller vouches that this shows what the frame before did: panels that still show it
         upload, draw and swap nothing, so that a picture without a viewer costs next to nothing.
-        Raises PanelLost: rebuilt by a later call, the loop goes on. Raises ValueError for a frame that doesn't fit.
+        Raises PanelLost: rebuilt by a later call, the loop goes on.
         """
 
     @abstractmethod

@@ -108,22 +108,6 @@ class FrameTextures:
         self._solved_version: int | None = None
         self._flat_version: int | None = None
 
-    def check(self, frame: PanelFrame) -> None:
-        """Raises ValueError for layers of another shape, too few matrices, or nothing to show."""
-        width_px, height_px = self.size_px
-        for name, layers, needed in (
-            ("solved", frame.solved, shows_solved(frame)),
-            ("flat", frame.flat, shows_flat(frame)),
-        ):
-            if layers is None and needed:
-                raise ValueError(f"a frame without its {name} layers")
-            if layers is not None and layers.shape != (self._count, height_px, width_px, 4):
-                raise ValueError(
-                    f"{name} layers are {layers.shape}, the panels {self._count} of {width_px}x{height_px}"
-                )
-        if frame.solved_from_shown and len(frame.solved_from_shown) != self._count:
-            raise ValueError(f"a frame aligns {len(frame.solved_from_shown)} panels of {self._count}")
-
     def lacks(self, frame: PanelFrame) -> tuple[bool, bool]:
         """Whether its solution, and its flat picture, are seen and not here yet."""
         return (
@@ -134,7 +118,7 @@ class FrameTextures:
         )
 
     def upload(self, frame: PanelFrame) -> None:
-        """Take in what the frame shows and is not here yet. It fits (`check`). Raises ContextLost."""
+        """Take in what the frame shows and is not here yet. Raises ContextLost."""
         lacks_solved, lacks_flat = self.lacks(frame)
         if lacks_solved and frame.solved is not None:
             self._solved_version = None  # until it is here as a whole

@@ -23,11 +23,10 @@ def open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, conte
 
     Raises InputError (settings that don't fit), PanelLost (a monitor is not there yet: wait and retry).
     """
-    panels = panel_settings(settings, stack.count)
     if settings.kind != "offscreen":
         from runtime.panels.window import WindowPanels
 
-        return WindowPanels(settings, panels, stack, clock, context)
+        return WindowPanels(settings, panel_settings(settings, stack.count), stack, clock, context)
     from runtime.panels.offscreen import OffscreenPanels
 
-    return OffscreenPanels(context, clock=clock, size_px=(stack.width_px, stack.height_px), panels=panels)
+    return OffscreenPanels(clock)

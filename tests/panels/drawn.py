@@ -8,7 +8,7 @@ import numpy as np
 from runtime.clock import Clock
 from runtime.config import PanelSettings
 from runtime.panels.offscreen import OffscreenPanels
-from runtime.panels.presentation import Painter
+from runtime.panels.presentation import FrameTextures, Painter
 from runtime.records import U8
 
 
@@ -18,7 +18,8 @@ class DrawnPanels(OffscreenPanels):
     def __init__(
         self, context: moderngl.Context, *, clock: Clock, size_px: tuple[int, int], panels: tuple[PanelSettings, ...]
     ) -> None:
-        super().__init__(context, clock=clock, size_px=size_px, panels=panels)
+        super().__init__(clock)
+        self._textures = FrameTextures(context, size_px, count=len(panels), group=self._group)
         self._context = context
         self._painters: list[Painter] = []
         self._targets: list[moderngl.Framebuffer] = []

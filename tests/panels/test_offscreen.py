@@ -204,21 +204,6 @@ def test_a_new_solution_is_shown_where_only_its_version_tells_it_from_the_old(si
         assert np.array_equal(codes(sink.read_back()), codes(smooth(version)))
 
 
-@pytest.mark.parametrize(
-    ("frame", "says"),
-    [
-        (PanelFrame(1, None, 0), "flat"),
-        (PanelFrame(1, smooth(1), 0, flatness=0.5), "flat"),
-        (PanelFrame(1, smooth(1)[:2], 0), "solved layers are"),
-        (PanelFrame(1, smooth(1), 0, (), smooth(1)[:, 1:], 0, 0.5), "flat layers are"),
-        (PanelFrame(1, smooth(1), 0, (np.eye(3),) * 2), "aligns 2 panels of 3"),
-    ],
-)
-def test_a_frame_that_does_not_fit_is_a_mistake_of_the_caller(sink: DrawnPanels, frame: PanelFrame, says: str) -> None:
-    with pytest.raises(ValueError, match=says):
-        sink.present(frame)
-
-
 def test_an_unchanged_frame_costs_nothing_and_stays(context: moderngl.Context, layers: NDArray[np.uint8]) -> None:
     sink = offscreen(context, TINY, *(PanelSettings(),) * 3)
     other = np.zeros_like(layers)
