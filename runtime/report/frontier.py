@@ -175,12 +175,3 @@ def _means(tables: Sequence[Any]) -> dict[str, float]:
     keys = dict.fromkeys(key for table in tables for key in table)
     found = {key: [table[key] for table in tables if table.get(key) is not None] for key in keys}
     return {key: float(np.mean(values)) for key, values in found.items() if values}
-
-
-def pareto(results: Sequence[MethodResult]) -> list[MethodResult]:
-    """Those that nothing else beats in both time and light, fastest first."""
-    front: list[MethodResult] = []
-    for result in sorted(results, key=lambda r: (r.ms_p50, -r.quoted_db)):
-        if not front or result.quoted_db > front[-1].quoted_db:
-            front.append(result)
-    return front

@@ -27,16 +27,11 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of texts under headings. A row's style is `good` or empty."""
+    """Rows of texts under headings."""
 
     headings: Sequence[str]
     rows: Sequence[Sequence[str]]
     caption: str = ""
-    styles: Sequence[str] = ()
-
-    def styled_rows(self) -> list[tuple[str, Sequence[str]]]:
-        styles = [*self.styles, *[""] * (len(self.rows) - len(self.styles))]
-        return list(zip(styles, self.rows, strict=True))
 
     def numeric(self) -> list[bool]:
         """Which columns hold numbers: they are set flush right."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from runtime.report.focal import CARDS_M, DISTANCE_M, PUPIL_M, FocalStack
-from runtime.report.frontier import MethodResult, pareto
+from runtime.report.frontier import MethodResult
 from runtime.report.moving import Moving
 from runtime.report.page import Figure, Section, Table
 from runtime.report.plots import COLOURS, drawing, png
@@ -53,7 +53,6 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
 def method_table(results: Sequence[MethodResult]) -> Table:
     """The numbers, fastest first; times also as multiples of the fastest method's."""
     ordered = sorted(results, key=lambda r: r.ms_p50)
-    front = {result.name for result in pareto(results)}
     beside = list(dict.fromkeys(key for result in results for key in result.psnr_db_off_eye))
     headings = ["method", "× fastest", "p50 ms", "p99 ms", "MiB", "parameters", "light 1 mm dB", "0 mm", "2 mm"]
     headings += ["one ray dB", "SSIM", "worst eye", *(f"{key} beside" for key in beside)]
@@ -65,8 +64,7 @@ def method_table(results: Sequence[MethodResult]) -> Table:
         times = [f"{r.ms_p50 / ordered[0].ms_p50:.1f}", f"{r.ms_p50:.1f}", f"{r.ms_p99:.1f}"]
         rows.append([r.name, *times, f"{r.memory_mib:.0f}", f"{r.parameters:,}", *told])
     size = f"{ordered[0].width_px}x{ordered[0].height_px}"
-    styles = ["good" if r.name in front else "" for r in ordered]
-    return Table(headings, rows, f"Panels of {size}. Marked: what nothing beats in both time and light.", styles)
+    return Table(headings, rows, f"Panels of {size}.")
 
 
 def moving_section(found: Sequence[Moving]) -> Section:

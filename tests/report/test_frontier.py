@@ -7,15 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from runtime.errors import FatalError, InputError
 from runtime.optics.carried import expected_psnrs_db, intensities, light_psnrs_db
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
-from runtime.report.frontier import MethodResult, MethodRun, measure, pair_result, pareto
+from runtime.report.frontier import MethodRun, measure, pair_result
 from runtime.report.methods import Method
 from runtime.report.pairs import Painter, StillPair, eyes_at
 from runtime.report.worker import apart
@@ -61,26 +59,6 @@ def test_methods_are_measured_whole_pair_by_pair(pair: StillPair) -> None:
         assert result.quoted_db == result.light_db["1"]
         # What is exact at the eyes is less so beside them.
         assert result.psnr_db_off_eye["6mm"] < result.psnr_db
-
-
-def result(name: str, ms: float, psnr_db: float) -> MethodResult:
-    light = {"1": psnr_db}
-    return MethodResult(name, "iterative", "fp32", 1, 1, ms, ms, 1.0, 0, light, {}, 0.0, 1.0, 0.0, {})
-
-
-@given(st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9)), min_size=1, max_size=12))
-def test_the_pareto_front_is_what_nothing_beats(points: list[tuple[int, int]]) -> None:
-    results = [result(str(i), ms, db) for i, (ms, db) in enumerate(points)]
-    front = pareto(results)
-    for other in results:
-        assert any(f.ms_p50 <= other.ms_p50 and f.quoted_db >= other.quoted_db for f in front)
-    for member in front:
-        assert not any(
-            o.ms_p50 <= member.ms_p50
-            and o.quoted_db >= member.quoted_db
-            and (o.ms_p50, o.quoted_db) != (member.ms_p50, member.quoted_db)
-            for o in results
-        )
 
 
 def echo(value: int) -> int:
