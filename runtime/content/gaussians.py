@@ -18,8 +18,6 @@ from runtime.records import F32, F64
 LOW_PASS_PX2 = 0.3  # added to each splat's covariance: none falls between the pixels
 ALPHA_MIN = 1 / 255
 LARGEST_RELATIVE_SCALE = 1000.0  # of a splat, in units of the scene's extent
-FARTHEST_RELATIVE = 1e6  # of a splat from the middle, in units of the median distance
-LARGEST_COEFFICIENT = 1e4  # of the harmonics: colours are blended as half floats, which end at 65504
 COEFFICIENTS = (0, 9, 24, 45)  # f_rest properties: of harmonics to degree 0, 1, 2, 3
 PACKED = [0, 1, 2, 4, 5, 8]  # of a 3x3 matrix, row by row
 
@@ -51,7 +49,7 @@ class Splats:
 def load_gaussians(header: Header) -> Gaussians:
     """Read a splat file as the reference implementation writes it.
 
-    Raises InputError: a property missing, values that aren't finite, absurd places, scales and colours.
+    Raises InputError: a property missing, values that aren't finite, absurd scales.
     """
     path, table = header.path, read_vertices(header)
     names = set(table.dtype.names or ())
@@ -75,9 +73,6 @@ def load_gaussians(header: Header) -> Gaussians:
             raise InputError(path, field, f"{int(wrong.sum())} of {len(wrong)} splats {problem}")
 
     centres = columns("x, y, z", "x", "y", "z")
-    away = np.abs(centres.astype(np.float64) - np.median(centres, axis=0)).max(1)
-    usual = float(np.median(away)) or np.inf
-    refuse("x, y, z", away > FARTHEST_RELATIVE * usual, f"are over {FARTHEST_RELATIVE:g} times the scene's size away")
     log_scales = columns("scale", *(f"scale_{axis}" for axis in range(3)))
     extent = float(np.ptp(np.percentile(centres, [1, 99], axis=0), axis=0).max()) or 1.0
     absurd = (log_scales > np.log(LARGEST_RELATIVE_SCALE * extent)).any(1)
@@ -86,8 +81,6 @@ def load_gaussians(header: Header) -> Gaussians:
     if rest:
         higher = columns("f_rest", *(f"f_rest_{number}" for number in range(rest))).reshape(len(table), 3, -1)
         harmonics = np.ascontiguousarray(np.concatenate([harmonics, higher.transpose(0, 2, 1)], axis=1))
-    glaring = (np.abs(harmonics) > LARGEST_COEFFICIENT).any((1, 2))
-    refuse("f_dc, f_rest", glaring, f"have coefficients over {LARGEST_COEFFICIENT:g}")
     rotations = columns("rot", *(f"rot_{axis}" for axis in range(4)))
     refuse("rot", ~rotations.any(1), "are no rotations: all four numbers are 0")
     opacities = np.asarray(expit(columns("opacity", "opacity")[:, 0].astype(np.float64)), dtype=np.float32)

@@ -53,7 +53,7 @@ def scene_of(kind: str, folder: Path) -> str:
     return kind
 
 
-@pytest.mark.parametrize("kind", ["demo", "texture", "sparse", "moving", "mesh", "splats"])
+@pytest.mark.parametrize("kind", ["moving", "mesh", "splats"])
 def test_a_closed_source_has_released_every_object_that_it_made(
     context: Any, stack: PanelStack, tmp_path: Path, kind: str
 ) -> None:

@@ -146,11 +146,9 @@ def test_the_harmonics_are_the_textbook_s() -> None:
         ("scale_1", 60.0, "scale: 1 of 50 splats are over"),
         ("scale_1", np.inf, "scale: 1 of 50"),
         ("x", np.nan, "x, y, z: 1 of 50"),
-        ("y", 1e30, "x, y, z: 1 of 50 splats are over 1e"),
         ("rot_2", np.nan, "rot: 1 of 50"),
         ("opacity", -np.inf, "opacity: 1 of 50"),
         ("f_rest_40", np.nan, "f_rest: 1 of 50"),
-        ("f_dc_2", 1e30, "f_dc, f_rest: 1 of 50 splats"),
     ],
 )
 def test_what_is_missing_or_absurd_is_told(tmp_path: Path, name: str, value: float | None, told: str) -> None:
