@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 from runtime.config import Settings
@@ -35,9 +34,7 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
             output = cleanup.enter_context(RunOutput(options.out, every_one=options.max_speed))
         on_account = advance if options.max_speed else None
         run = build_run(settings, options, cleanup, host, output=output, on_account=on_account)
-        begin_s = perf_counter()
         reason = run.presenter.run(frames=options.frames)
-        machine_s = perf_counter() - begin_s
         for sample in run.presenter.samples.recorded_ahead():
             run.observer.sampled(sample)  # the last lights' truth: nothing else is done with it
         run.observer.finish()
@@ -48,7 +45,7 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
             layers = shown_layers(last.frame) if last is not None and has_picture else None
             output.finish(summary, layers, run.observer.eye_views, run.observer.moment)
     wait_for_all(JOBS_END_WITHIN_S)
-    return summary | {"machine_s": round(machine_s, 3)}
+    return summary
 
 
 def print_summary(summary: dict[str, Any], out: Path | None) -> None:

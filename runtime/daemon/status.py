@@ -66,10 +66,8 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
     }
 
 
-def about(run: Run | None) -> dict[str, Any]:
+def about(run: Run) -> dict[str, Any]:
     """What does not change while it runs, and which scenes there are: for the page."""
-    if run is None:
-        return {}
     settings, stack = run.presenter.run_cell.state.settings, run.presenter.stack
     return {
         "version": version(),
@@ -82,10 +80,10 @@ def about(run: Run | None) -> dict[str, Any]:
     }
 
 
-def pictures(run: Run | None) -> dict[str, Any]:
+def pictures(run: Run) -> dict[str, Any]:
     """What is shown now, as JPEGs in base64: for the page."""
-    refresh = run.presenter.last if run is not None else None
-    if run is None or refresh is None:
+    refresh = run.presenter.last
+    if refresh is None:
         return {"frame": None, "jpegs": {}}
     try:
         fov_deg = run.presenter.run_cell.state.settings.content.fov_deg

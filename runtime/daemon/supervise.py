@@ -71,9 +71,6 @@ class Daemon(Host):
         self._chosen: Chosen = {}  # by an operator, in force over the configuration
         self._change: _Change | None = None  # under way
         self._refused = ""  # why the last change was refused, until one is taken
-        if server is not None:
-            server.lookups |= {"about": lambda: status.about(self.run), "pictures": lambda: status.pictures(self.run)}
-            server.lookups |= {"log": recorder.look_at_log} if recorder is not None else {}
 
     def stop_reason(self) -> str:
         return f"{self._signals.stop} received" if self._signals.stop else ""
@@ -121,6 +118,9 @@ class Daemon(Host):
     def watches(self, run: Run) -> None:
         self.run = run
         self._configured = run.presenter.run_cell.state.settings
+        if self._server is not None:
+            self._server.lookups |= {"about": lambda: status.about(run), "pictures": lambda: status.pictures(run)}
+            self._server.lookups |= {"log": self.recorder.look_at_log} if self.recorder is not None else {}
 
     def wait_for_panel(self, why: str) -> bool:
         """Under a supervisor wait for it, by hand refuse."""

@@ -52,7 +52,7 @@ class Window:
 
     handle: Any
     context: moderngl.Context
-    faults: list[str] = field(default_factory=list)  # what its callbacks saw: closed, another size
+    faults: list[str] = field(default_factory=list)  # what its callback saw: closed
 
     def make_current(self) -> None:
         """Its context on this thread."""
@@ -164,17 +164,11 @@ class Display:
         glfw.make_context_current(handle)
         context = _attach(handle)
         window = Window(handle, context)
-        size = glfw.get_framebuffer_size(handle)
 
         def closed(_handle: Any) -> None:
             window.faults.append("a panel's window was closed")
 
-        def resized(_handle: Any, width_px: int, height_px: int) -> None:
-            if (width_px, height_px) != size:
-                window.faults.append(f"a panel's window became {width_px}x{height_px}")
-
         glfw.set_window_close_callback(handle, closed)
-        glfw.set_framebuffer_size_callback(handle, resized)
         glfw.set_input_mode(handle, glfw.CURSOR, glfw.CURSOR_HIDDEN)
         self._windows.append(window)
         return window
