@@ -130,8 +130,8 @@ def capture(
 ) -> None:
     """Pair each chart's viewpoint with where the sensor sees the eyes. Every accepted pair is on disk at once.
 
-    Live: at each chart move until the lines fuse, then press Enter (n: next, p: previous, u: undo, q: stop); after
-    three places that are not on a line it says where to go.
+    Live: at each chart move until the lines fuse, then press Enter (n: next, p: previous, whose pair Enter
+    replaces, q: stop); after three places that are not on a line it says where to go.
     A recording must know its true eyes, as the demo does.
 
     Example: phasestack calibrate capture --config /etc/phasestack/phasestack.toml --show --out pairs.csv

@@ -162,14 +162,6 @@ class PairsFile:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def undo(self) -> str:
-        """Take the newest pair out again; returns its viewpoint, empty where there is none."""
-        if not self.rows:
-            return ""
-        name = self.rows.pop().viewpoint
-        self._write()
-        return name
-
     def accept(self, *pairs: PairRow) -> None:
         """Add pairs of one sensor; those of the same viewpoints are replaced. On disk when this returns.
 

@@ -148,8 +148,6 @@ class Walk:
                 self.finished = True
             case Key.ACCEPT:
                 self._accept()
-            case Key.UNDO:
-                self._undo()
             case Key.NEXT | Key.RIGHT:
                 self._go(1)
             case Key.PREVIOUS | Key.LEFT:
@@ -186,19 +184,6 @@ class Walk:
         else:
             self._go(1)
 
-    def _undo(self) -> None:
-        name = self._file.undo()
-        if not name:
-            self._say("nothing to undo")
-            return
-        self._rough = rough_similarity(*points_of(self._file.rows))
-        self._accepted = max(0, self._accepted - 1)
-        self._say(f"{name}: taken back, {len(self._file)} pairs in all")
-        places = [viewpoint.name for viewpoint in self._left]
-        self._window.clear()
-        if name in places:
-            self._go(places.index(name) - self._index)
-
     def _say_way(self, now_ns: int) -> None:
         """Where to move, as soon as three pairs show roughly where the camera stands."""
         seen = self._window.measure()
@@ -224,7 +209,7 @@ class Walk:
         self._say(
             f"{viewpoint.name} ({self._index + 1} of {len(self._left)}): {x * 100:.0f} cm before the display, "
             f"{abs(y) * 100:.0f} cm to its {'right' if y > 0 else 'left'}, {z * 100:.0f} cm up; "
-            f"Enter: fused, n: next, p: previous, u: undo, q: stop"
+            f"Enter: fused, n: next, p: previous, q: stop"
         )
         if self._chart is not None:
             self._chart(viewpoint)

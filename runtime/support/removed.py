@@ -61,7 +61,7 @@ REMOVED_COMMANDS: dict[str, str] = {
     "calibrate panels grey-chart": "`calibrate grey --panel N --show`",
     "calibrate grey --series": "write the LUT itself: a CSV of phase and grey, 0 to 1",
     "calibrate capture --marks": "capture from the live sensor; recordings that know their true eyes need no marks",
-    "calibrate capture --again": "undo (u) takes a pair back; without its row it is asked for again",
+    "calibrate capture --again": "p goes back, where Enter replaces the pair; without its row it is asked for again",
     "calibrate charts --show": "`calibrate capture --show` shows each chart on the panels",
     "calibrate charts --kind": "charts are for both eyes at once",
     "calibrate charts --check": "`capture --show`: at the viewpoint the lines are single and clean",

@@ -61,7 +61,7 @@ def every_key(seed: int) -> str:
         "\n",
         "\n" + "\n" * len(STACK.x_m),
         "\n\n",
-        "\n" + "\n\n\nu" + "\n" * (len(grid()) - 2),
+        "\n" + "\n\n\np" + "\n" * (len(grid()) - 2),
         "p" + "n" + "\n",
     ]
     return "".join(steps)
