@@ -54,7 +54,7 @@ def write_report(file: Path, out: Path, *, stack: PanelStack, viewing: Calibrati
     else:
         heading = "Points" if len(points.names) <= LISTED_POINTS else f"The {LISTED_POINTS} worst points"
         sections.append(section_of(heading, _point_rows(points)))
-    if calibration.covariance is None:
+    if calibration.file.covariance is None:
         notes.append("This file holds no covariance: the error at the eye is not known.")
     lead = "Where the depth camera stands before the stack of panels, and how well that is known."
     Page(f"Calibration {file.name}", lead, sections, notes=notes).write(out, record="report.json", data=summary)
@@ -84,12 +84,12 @@ def _pictures(calibration: Calibration, points: Points | None, stack: PanelStack
 def _summary(calibration: Calibration, points: Points | None, volume_m: F64) -> dict[str, Any]:
     """What `report.json` holds, None where it is not known."""
     found: dict[str, Any] = {
-        "method": calibration.method,
-        "date": calibration.date,
-        "sensor_serial": calibration.sensor_serial,
+        "method": calibration.file.method,
+        "date": str(calibration.file.date),
+        "sensor_serial": calibration.file.sensor_serial,
         "scale": calibration.scale,
         "similarity_defect": similarity_defect(calibration.stack_from_sensor),
-        "condition": calibration.condition,
+        "condition": calibration.file.condition,
     }
     if points is not None:
         residual_m = points.residual_m[points.used]

@@ -221,7 +221,7 @@ def calibration(settings: Settings) -> Iterator[Row]:
         yield Row("calibration", "fail" if real else "ok", "the built-in one of the demo recording", remedy)
         return
     found = load_calibration(Path(settings.calibration.file))
-    fit = f", residual {found.residuals.rms_m * 1000:.1f} mm" if found.residuals else ""
+    fit = f", residual {found.file.residuals.rms_m * 1000:.1f} mm" if found.file.residuals else ""
     yield Row("calibration", "ok", f"{found.source}: scale {found.scale:.4f}{fit}")
     for warning in found.warnings:
         yield Row("calibration", "warn", warning, "calibrate again")

@@ -8,13 +8,13 @@ a point w by  d_rot × (w - w0) + d_shift + d_scale·(w - w0).
 from __future__ import annotations
 
 import datetime
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import ConfigDict, Field, field_validator
+from pydantic import ConfigDict, Field
 
 from runtime.config import MOST, Section, read_table, validated
 from runtime.errors import InputError
@@ -57,16 +57,11 @@ class CalibrationFile(Lenient):
     stack_from_sensor: tuple[Row4, Row4, Row4, Row4]
     units: Literal["m"] = "m"
     method: str = ""
-    date: str = ""
-    sensor_serial: str = ""
+    date: str | datetime.date = ""
+    sensor_serial: str = ""  # empty: of no particular device
     condition: Annotated[float, Field(ge=0)] | None = None
     residuals: Residuals | None = None
     covariance: CovarianceTable | None = None
-
-    @field_validator("date", mode="before")
-    @classmethod
-    def _date_text(cls, value: Any) -> Any:
-        return value.isoformat() if isinstance(value, datetime.date) else value
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,15 +69,9 @@ class Calibration:
     """A similarity from `sensor` to `stack`, where it comes from, and how good it is."""
 
     stack_from_sensor: F64  # (4, 4) [sR t; 0 1]
-    source: str = "built-in demo"  # the file's name, for messages
-    method: str = ""
-    date: str = ""
-    sensor_serial: str = ""  # empty: of no particular device
-    condition: float | None = None
-    residuals: Residuals | None = None
-    pivot_m: F64 | None = None  # (3,) frame `stack`
-    covariance: F64 | None = None  # (7, 7) of rotation (rad), shift (m), log scale about the pivot; None: not known
-    warnings: tuple[str, ...] = field(default=())  # what a person should know before trusting it
+    file: CalibrationFile  # all that it holds
+    source: str  # the file's name, for messages
+    warnings: tuple[str, ...]  # what a person should know before trusting it
 
     @property
     def scale(self) -> float:
@@ -108,19 +97,20 @@ class Calibration:
 
         None where that is not known.
         """
-        if self.covariance is None or self.pivot_m is None:
+        if self.file.covariance is None:
             return None
-        jacobian = position_jacobian(stack_m, pivot_m=self.pivot_m)
-        spread = jacobian @ self.covariance @ np.swapaxes(jacobian, -1, -2)
+        jacobian = position_jacobian(stack_m, pivot_m=self.file.covariance.pivot_m)
+        spread = jacobian @ np.array(self.file.covariance.matrix) @ np.swapaxes(jacobian, -1, -2)
         error_m: F64 = np.sqrt(np.trace(spread, axis1=-2, axis2=-1))
         return error_m
 
     def serial_warning(self, serial: str) -> str:
         """One line where a sensor is not the one that was calibrated, else an empty text."""
-        if not self.sensor_serial or serial == self.sensor_serial:
+        own = self.file.sensor_serial
+        if not own or serial == own:
             return ""
         found = f"the sensor is {serial}" if serial else "the sensor reports no serial"
-        return f"{self.source}: calibrated for sensor {self.sensor_serial}, but {found}: calibrate again"
+        return f"{self.source}: calibrated for sensor {own}, but {found}: calibrate again"
 
 
 def position_jacobian(stack_m: ArrayLike, *, pivot_m: ArrayLike) -> F64:
@@ -204,16 +194,4 @@ def load_calibration(path: Path | None) -> Calibration:
     matrix = np.array(parsed.stack_from_sensor, dtype=np.float64)
     check_similarity(matrix, source=file)
     source = "built-in demo" if path is None else str(path)
-    spread = parsed.covariance
-    return Calibration(
-        stack_from_sensor=matrix,
-        source=source,
-        method=parsed.method,
-        date=parsed.date,
-        sensor_serial=parsed.sensor_serial,
-        condition=parsed.condition,
-        residuals=parsed.residuals,
-        pivot_m=None if spread is None else np.array(spread.pivot_m),
-        covariance=None if spread is None else np.array(spread.matrix),
-        warnings=_warnings(matrix, source),
-    )
+    return Calibration(matrix, parsed, source, _warnings(matrix, source))

@@ -43,10 +43,10 @@ def test_the_runtime_loads_what_solve_writes(tmp_path: Path) -> None:
     loaded = load_calibration(out)
     np.testing.assert_array_equal(loaded.stack_from_sensor, told["stack_from_sensor"])
     np.testing.assert_allclose(loaded.stack_from_sensor, demo_stack_from_sensor(), atol=0.02)
-    assert loaded.method == told["method"] == "fixed-scale"
-    assert loaded.residuals is not None and loaded.residuals.rms_m * 1e3 == pytest.approx(told["rms_mm"])
+    assert loaded.file.method == told["method"] == "fixed-scale"
+    assert loaded.file.residuals is not None and loaded.file.residuals.rms_m * 1e3 == pytest.approx(told["rms_mm"])
     assert loaded.position_error_m([[0.5, 0.0, 0.0]])[0] < 0.003
-    assert loaded.date.endswith("+00:00")
+    assert loaded.file.date.endswith("+00:00")
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -54,7 +54,7 @@ def test_every_method_can_be_asked_for(tmp_path: Path, method: str) -> None:
     told = solve(write_pairs(tmp_path, measured(sigma_m=0.002)), tmp_path / "c.toml", "--method", method)
     assert told["method"] == method
     assert {row["method"] for row in told["methods"]} == set(METHODS)
-    assert load_calibration(tmp_path / "c.toml").method == method
+    assert load_calibration(tmp_path / "c.toml").file.method == method
 
 
 def test_the_sensors_serial_travels_from_the_pairs_to_the_runtimes_check(tmp_path: Path) -> None:

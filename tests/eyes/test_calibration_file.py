@@ -79,12 +79,12 @@ pivot_m = [0.5, 0.1, 0.2]
         + f"matrix = {spread}\n"
     )
     told = load_calibration(file)
-    assert (told.method, told.date, told.sensor_serial) == ("robust", "2026-11-21", "A1")
-    assert (told.condition, told.source) == (3.5, str(file))
-    assert told.residuals is not None and told.pivot_m is not None
-    assert told.residuals.rms_m == 0.001
-    assert told.pivot_m.tolist() == [0.5, 0.1, 0.2]
-    np.testing.assert_array_equal(told.covariance, spread)
+    assert told.source == str(file)
+    assert (told.file.method, str(told.file.date), told.file.sensor_serial) == ("robust", "2026-11-21", "A1")
+    assert told.file.residuals is not None and told.file.covariance is not None
+    assert (told.file.condition, told.file.residuals.rms_m) == (3.5, 0.001)
+    assert told.file.covariance.pivot_m == (0.5, 0.1, 0.2)
+    np.testing.assert_array_equal(told.file.covariance.matrix, spread)
 
 
 def test_the_published_prototype_matrix_is_a_similarity_to_its_printed_digits(tmp_path: Path) -> None:
