@@ -65,10 +65,7 @@ def _code_of(app: Any) -> int:
     except SystemExit as error:
         if isinstance(error.__context__, BrokenPipeError):  # typer ends them so
             return NOBODY_READS
-        if isinstance(error.code, str):
-            _say(error.code)
-            return 1
-        return error.code or 0
+        return int(error.code or 0)
     return 0
 
 

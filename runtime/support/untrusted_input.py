@@ -11,7 +11,6 @@ import json
 import math
 import os
 import stat
-from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -64,21 +63,12 @@ def open_regular(
         status = os.fstat(number)
         if not stat.S_ISREG(status.st_mode):
             raise InputError(whence, field, f"is {_kind(status.st_mode)}, not a file")
-        if _is_kernels(number):
-            raise InputError(whence, field, "is the kernel's own, not a file")
         if most_bytes is not None and status.st_size > most_bytes:
             raise InputError(whence, field, f"has {_size(status.st_size)}; at most {_size(most_bytes)}")
         return os.fdopen(number, "rb")
     except BaseException:
         os.close(number)
         raise
-
-
-def _is_kernels(number: int) -> bool:
-    """Whether an open file is one of /proc or /sys: regular by its kind, it may never begin or never end."""
-    with suppress(OSError):
-        return str(Path(f"/proc/self/fd/{number}").readlink()).startswith(("/proc/", "/sys/"))
-    return False
 
 
 def read_bytes(path: str | Path, *, most_bytes: int, source: str | Path = "", field: str = "") -> bytes:
