@@ -36,6 +36,7 @@ STREAM_OPTIONS = {  # for FFmpeg: nothing is opened but what was named
     "analyzeduration": "1000000",  # microseconds before the first picture; it would look at five seconds
     "protocol_whitelist": "rtsp,rtsps,rtp,rtmp,http,https,udp,tcp,tls,srt,crypto,data",
     "rtsp_transport": "tcp",
+    "overrun_nonfatal": "1",  # of UDP: a machine that is too slow loses packets, not the stream
 }
 OPEN_S, READ_S = 5.0, 5.0  # a source that does not answer for so long is opened anew
 FIRST_PICTURE_S = 3.0  # that is waited for, where it comes soon
