@@ -24,6 +24,7 @@ MARGIN_NUMBERS = 40  # to spare to the right: compiled loops read whole pieces o
 SEARCH = 96  # pixels among which a whole place in the source is looked for
 GOOD_PHASE = 1 / 24  # of a pixel: the search ends here; so small a shift leaves an error below -55 dB
 LEAST_RUN = 8  # pixels of source and result that are worth resizing
+NODE_PX = 4  # of a result: what lies between errs by a hundredth of a pixel, by a twentieth beside a head turned far
 WORST_PHASE = 1 / 12  # where nothing better is found
 
 Image = NDArray[Any]
@@ -65,8 +66,11 @@ def resample(
     """
     flags = cv2.INTER_CUBIC if cubic else cv2.INTER_LINEAR
     if image_columns.bend or result_columns.bend:
-        places = _places(image_from_result, out.shape[:2], image_columns, result_columns)
-        out[...] = cv2.remap(image, *places, interpolation=flags, borderMode=cv2.BORDER_REPLICATE)
+        columns, rows = _places(image_from_result, out.shape[:2], image_columns, result_columns)
+        if cubic:  # twice as fine and then linear: by places, OpenCV's own kernel takes five times as long
+            image = cv2.resize(image, None, fx=2, fy=2, interpolation=flags)
+            columns, rows = 2 * columns + 0.5, 2 * rows + 0.5
+        cv2.remap(image, columns, rows, cv2.INTER_LINEAR, dst=out, borderMode=cv2.BORDER_REPLICATE)
         return out
     if np.count_nonzero(image_from_result[_BESIDE_SCALE_AND_SHIFT]) == 0:
         across = _whole_place(image_from_result[0, 0], image_from_result[0, 2], image.shape[1], out.shape[1])
@@ -76,14 +80,16 @@ def resample(
     return _warped(image, image_from_result, out, 0, 0, *out.shape[1::-1])
 
 
-def _places(
-    matrix: F64, size: tuple[int, ...], image_columns: ColumnLaw, result_columns: ColumnLaw
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(h, w) each: columns and rows of the image for every pixel of the result, with pixel centres at integers."""
-    u, v = result_columns.homography_from_column(np.arange(size[1]) + 0.5), (np.arange(size[0]) + 0.5)[:, None]
+def _places(matrix: F64, size: tuple[int, ...], image_columns: ColumnLaw, result_columns: ColumnLaw) -> list[Image]:
+    """(h, w) float32 each: columns and rows of the image for every pixel of the result, with pixel centres at integers;
+    worked out at every `NODE_PX`th and between them linear."""
+    height, width = size
+    columns, rows = (NODE_PX * (np.arange(-(-count // NODE_PX) + 2) - 0.5) for count in (width, height))
+    u, v = result_columns.homography_from_column(columns), rows[:, None]
     x, y, w = (row[0] * u + row[1] * v + row[2] for row in matrix)
-    columns = image_columns.column_from_homography(x / w)
-    return (columns - 0.5).astype(np.float32), (y / w - 0.5).astype(np.float32)
+    nodes = image_columns.column_from_homography(x / w), y / w
+    whole = [cv2.resize((place - 0.5).astype(np.float32), None, fx=NODE_PX, fy=NODE_PX) for place in nodes]
+    return [place[NODE_PX : NODE_PX + height, NODE_PX : NODE_PX + width] for place in whole]
 
 
 def _whole_place(scale: float, shift: float, source_px: int, result_px: int) -> tuple[int, int, int, int] | None:

@@ -8,13 +8,17 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import moderngl
 import numpy as np
 
-from runtime.config import Settings
+from runtime.clock import Clock
+from runtime.config import OutputSettings, Settings
 from runtime.daemon.build import Host, Run, RunOptions
 from runtime.daemon.drive import drive
 from runtime.frame.presenter import Presenter, Refresh
 from runtime.optics.alignment import scale_and_shift, shown_layers
+from runtime.optics.stack import PanelStack
+from runtime.panels.registry import panel_settings
 from runtime.records import U8, SensorFrame
 from tests.golden.cases import Case
 from tests.panels.drawn import DrawnPanels
@@ -99,7 +103,7 @@ def play(case: Case, out: Path) -> Played:
     runs: list[Run] = []
     operator = Operator(case, runs)
     operator.recorder = collector
-    with patch("runtime.panels.offscreen.OffscreenPanels", DrawnPanels):
+    with patch("runtime.daemon.build.open_panels", drawn_panels):
         summary = drive(settings, RunOptions(max_speed=True, measure=True, out=out), operator)
     lines = [json.loads(line) for line in (out / "frames.jsonl").read_text(encoding="utf-8").splitlines()]
     refreshes = [line | told for line, told in zip(lines, collector.refreshes, strict=True)]
@@ -110,6 +114,12 @@ def play(case: Case, out: Path) -> Played:
     told["plan"] = [item["what"] for item in summary["plan"]]
     told["samples"] = runs[0].observer.means.values
     return Played(rounded(told), rounded(refreshes), collector.panels, collector.light)
+
+
+def drawn_panels(output: OutputSettings, stack: PanelStack, clock: Clock, context: moderngl.Context) -> DrawnPanels:
+    """In place of `open_panels`: what offscreen panels hold is looked at here."""
+    size_px = stack.width_px, stack.height_px
+    return DrawnPanels(context, clock=clock, size_px=size_px, panels=panel_settings(output, stack.count))
 
 
 def rounded(value: Any) -> Any:
