@@ -14,7 +14,6 @@ from runtime.records import F64
 NOT_NEWER = "no newer than the sample before"
 NOT_A_NUMBER = "not a number"
 MILLIMETRES = "in millimetres, not metres"
-CENTIMETRES = "in centimetres, not metres"
 TOO_CLOSE = "too close together for a person"
 TOO_FAR_APART = "too far apart for a person"
 BEHIND = "not in front of the panels"
@@ -29,11 +28,10 @@ UNIT_SLACK = 1.25  # a separation of 40 to 94 units is one in millimetres: peopl
 DISTANT_M = 20.0
 UPSIDE_DOWN_COSINE = -0.5  # a head rolled by more than 120 degrees is an exchange of its eyes
 
-MISTAKES = (NOT_NEWER, NOT_A_NUMBER, MILLIMETRES, CENTIMETRES, TOO_CLOSE, TOO_FAR_APART, BEHIND, TOO_DISTANT, EXCHANGED)
+MISTAKES = (NOT_NEWER, NOT_A_NUMBER, MILLIMETRES, TOO_CLOSE, TOO_FAR_APART, BEHIND, TOO_DISTANT, EXCHANGED)
 _HINTS = {
     NOT_NEWER: "the driver must say when each was captured",
     MILLIMETRES: "the driver must deliver metres",
-    CENTIMETRES: "the driver must deliver metres",
     EXCHANGED: "`left` is the viewer's own left; or the calibration is of a mirrored picture",
     BEHIND: "calibrate again, or the calibration is another sensor's",
     TOO_DISTANT: "calibrate again, or the calibration is another sensor's",
@@ -49,9 +47,8 @@ def reason_against(eyes_m: F64, *, in_front_m: float = 0.0) -> str:
     if not all(map(math.isfinite, (lx, ly, lz, rx, ry, rz))):
         return NOT_A_NUMBER
     apart_m = math.hypot(rx - lx, ry - ly, rz - lz)
-    for unit, per_metre in ((MILLIMETRES, 1000.0), (CENTIMETRES, 100.0)):
-        if IPD_MIN_M / UNIT_SLACK <= apart_m / per_metre <= IPD_MAX_M * UNIT_SLACK:
-            return unit
+    if IPD_MIN_M / UNIT_SLACK <= apart_m / 1000 <= IPD_MAX_M * UNIT_SLACK:
+        return MILLIMETRES
     if not IPD_MIN_M <= apart_m <= IPD_MAX_M:
         return TOO_CLOSE if apart_m < IPD_MIN_M else TOO_FAR_APART
     mx, my, mz = (lx + rx) / 2, (ly + ry) / 2, (lz + rz) / 2

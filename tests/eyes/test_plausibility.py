@@ -15,7 +15,6 @@ EYES = np.array([[0.6, -0.031, 0.02], [0.6, 0.031, 0.02]])
 WRONG = {
     p.EXCHANGED: EYES[::-1],
     p.MILLIMETRES: EYES * 1000,
-    p.CENTIMETRES: EYES * 100,
     p.BEHIND: EYES * [-1, 1, 1],
     p.TOO_DISTANT: EYES + np.array([30, 0, 0]),
     p.TOO_CLOSE: EYES * [1, 0.1, 1],
