@@ -17,22 +17,19 @@ from runtime.optics.stack import PanelStack
 from runtime.records import F64
 from runtime.report.page import Figure, Page, Section, section_of
 
-LISTED_POINTS = 200
-
 
 class StoredPairs(Lenient):
     """`[data]` of a calibration file: the pairs behind it, where it holds them."""
 
     sensor_m: tuple[Vector3, ...]
     stack_m: tuple[Vector3, ...]
-    used: tuple[bool, ...] = ()
-    names: tuple[str, ...] = ()
+    used: tuple[bool, ...]
+    names: tuple[str, ...]
 
     @model_validator(mode="after")
     def _fit_together(self) -> StoredPairs:
-        count = len(self.sensor_m)
-        sizes = {len(self.stack_m), len(self.used or self.sensor_m), len(self.names or self.sensor_m)}
-        if sizes != {count} or not count or (self.used and not any(self.used)):
+        sizes = {len(column) for column in (self.sensor_m, self.stack_m, self.used, self.names)}
+        if len(sizes) > 1 or not any(self.used):
             raise ValueError("names, used, sensor_m and stack_m do not fit together")
         return self
 
@@ -52,8 +49,7 @@ def write_report(file: Path, out: Path, *, stack: PanelStack, viewing: Calibrati
     if points is None:
         notes.append("This file holds no pairs (or too many): the error of each point is not known.")
     else:
-        heading = "Points" if len(points.names) <= LISTED_POINTS else f"The {LISTED_POINTS} worst points"
-        sections.append(section_of(heading, _point_rows(points)))
+        sections.append(section_of("Points", _point_rows(points)))
     if calibration.file.covariance is None:
         notes.append("This file holds no covariance: the error at the eye is not known.")
     lead = "Where the depth camera stands before the stack of panels, and how well that is known."
@@ -66,9 +62,7 @@ def _stored_points(data: Any, calibration: Calibration, *, source: Path) -> Poin
     if not isinstance(data, dict) or "sensor_m" not in data:
         return None
     found = validated(StoredPairs, data, source=f"{source}: data")
-    names = found.names or tuple(str(number + 1) for number in range(len(found.sensor_m)))
-    used = np.array(found.used or [True] * len(found.sensor_m))
-    return Points(names, np.array(found.stack_m), calibration.points(found.sensor_m), used)
+    return Points(found.names, np.array(found.stack_m), calibration.points(found.sensor_m), np.array(found.used))
 
 
 def _pictures(calibration: Calibration, points: Points | None, stack: PanelStack) -> list[Figure]:
@@ -131,10 +125,7 @@ def _shown(value: Any) -> str:
 
 def _point_rows(points: Points) -> list[list[str]]:
     rows = [["", "point", "X error, mm", "Y error, mm", "Z error, mm", "distance, mm", ""]]
-    worst_first = np.argsort(-np.linalg.norm(points.residual_m, axis=1))
-    for index in sorted(worst_first[:LISTED_POINTS].tolist()):
-        number, name = index + 1, points.names[index]
-        error, used = points.residual_m[index] * 1e3, bool(points.used[index])
-        rows.append([str(number), name, *[f"{value:.2f}" for value in error], f"{np.linalg.norm(error):.2f}",
-                     "" if used else "rejected"])  # fmt: skip
+    for number, (name, error, used) in enumerate(zip(points.names, points.residual_m * 1e3, points.used, strict=True)):
+        cells = [f"{value:.2f}" for value in (*error, np.linalg.norm(error))]
+        rows.append([str(number + 1), name, *cells, "" if used else "rejected"])
     return rows

@@ -67,11 +67,11 @@ def test_the_published_prototype_is_reported_without_its_points(tmp_path: Path) 
 @pytest.mark.parametrize(
     "data",
     [
-        "sensor_m = [[1, 2]]\nstack_m = [[1, 2]]",
+        "sensor_m = [[1, 2]]\nstack_m = [[1, 2, 3]]\nused = [true]\nnames = ['a']",
         "sensor_m = [[1, 2, 3]]",
-        "sensor_m = 3\nstack_m = 4",
-        "sensor_m = [[1, 2, 3]]\nstack_m = [[1, 2, 3]]\nused = [false]",
-        "sensor_m = [[1, 2, nan]]\nstack_m = [[1, 2, 3]]",
+        "sensor_m = [[1, 2, 3]]\nstack_m = [[1, 2, 3]]\nused = [true, true]\nnames = ['a']",
+        "sensor_m = [[1, 2, 3]]\nstack_m = [[1, 2, 3]]\nused = [false]\nnames = ['a']",
+        "sensor_m = [[1, 2, nan]]\nstack_m = [[1, 2, 3]]\nused = [true]\nnames = ['a']",
     ],
 )
 def test_spoiled_points_are_refused_and_nothing_is_written(tmp_path: Path, data: str) -> None:
