@@ -10,7 +10,7 @@ import numpy as np
 from runtime.clock import NS_PER_S
 from runtime.content import shapes, textures
 from runtime.content.base import WHITE, Colour, ContentInfo
-from runtime.content.scenes import Scene, Thing, scene
+from runtime.content.scenes import SCENES, Scene, Thing
 from runtime.content.triangles import DrawnPart, Part, TriangleSource
 from runtime.optics.stack import PanelStack
 from runtime.records import F64
@@ -49,7 +49,7 @@ class ProceduralSource(TriangleSource):
         parts: Sequence[DrawnPart] | None = None,
     ) -> None:
         """background: None: white; parts: `parts_of` the scene, where they were made on another thread."""
-        self._scene = scene(built_in) if isinstance(built_in, str) else built_in
+        self._scene = SCENES[built_in]() if isinstance(built_in, str) else built_in
         self._scale = stack.height_m / MODELLED_HEIGHT_M
         parts = parts or parts_of(self._scene)
         still = [self._placed(thing, 0.0) for thing in self._scene.things]

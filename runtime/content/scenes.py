@@ -10,7 +10,6 @@ import numpy as np
 from runtime.content import shapes
 from runtime.content.base import WHITE, Colour
 from runtime.content.shapes import Shape
-from runtime.errors import InputError
 from runtime.records import F64
 
 
@@ -112,10 +111,3 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "thin": lambda: Scene("thin", _thin()),
     "moving": lambda: Scene("moving", _demo(turns_per_s=0.2), moving=True),
 }
-
-
-def scene(name: str) -> Scene:
-    """A built-in scene by name. Raises InputError for another."""
-    if name not in SCENES:
-        raise InputError("content", "scene", f"`{name}` is none of {', '.join(SCENES)}")
-    return SCENES[name]()

@@ -12,8 +12,8 @@ import pytest
 from runtime.config import ModelSettings
 from runtime.content.base import View
 from runtime.content.procedural import ProceduralSource
+from runtime.content.scenes import SCENES
 from runtime.content.scenes import Scene as Things
-from runtime.content.scenes import scene
 from runtime.evaluation.displayed import displayed
 from runtime.model.job import Job
 from runtime.model.predictor import Predictor, load_predictor
@@ -140,7 +140,7 @@ def test_a_window_costs_nothing_wherever_the_object_is(
 ) -> None:
     tilt = Tilt(((0.0, 0.005, -0.004), (0.0, 0.0, 0.0), (0.0, -0.004, 0.005)), (0.6, 0.0, 0.0))
     stack = replace(STACK, tilt=tilt) if tilted else STACK
-    thing = replace(scene("sparse").things[0], centre_m=(-0.02, *at))
+    thing = replace(SCENES["sparse"]().things[0], centre_m=(-0.02, *at))
     source = ProceduralSource(Things("other", (thing,)), stack=stack, context=context, background=(0.3, 0.5, 0.4))
     eyes = EYES + np.array([turn, np.zeros(3)])
     whole, part, share = compared(load_predictor("balanced", stack), source, eyes)
@@ -163,7 +163,7 @@ def test_one_eye_alone_costs_no_inference(context: Any, fast: Predictor) -> None
 
 def test_grey_windows_are_solved_in_one_channel(context: Any) -> None:
     source = ProceduralSource(
-        Things("grey", scene("sparse").things, grey=True), stack=STACK, context=context, background=(0.5, 0.5, 0.5)
+        Things("grey", SCENES["sparse"]().things, grey=True), stack=STACK, context=context, background=(0.5, 0.5, 0.5)
     )
     predictor = load_predictor("balanced", STACK)
     job = trimmed(source, predictor)
