@@ -40,6 +40,7 @@ def solve(
     --panels panels.json --out out/solve
     """
     from runtime.commands.solving import solve_pair
+    from runtime.support.figures import lines_of
 
     with blame_option("solve", model=model):
         result = solve_pair(
@@ -57,11 +58,7 @@ def solve(
     if as_json:
         typer.echo(json.dumps(result))
     else:
-        light = " / ".join("-" if value is None else f"{value:.1f}" for value in result["light_db"].values())
-        wall = ", ".join(f"{seconds:.1f} s {part}" for part, seconds in result["wall_s"].items())
-        typer.echo(
-            f"{result['model']}: light {light} dB for eyes sure to 0 / 1 / 2 mm (1: a pupil, the figure to quote); "
-            f"one ray a pixel {result['psnr_db']:.1f} dB, SSIM {result['ssim']:.4f}\n"
-            f"{result['total_ms']:.1f} ms a solution, {result['inference_ms']:.1f} ms of it the network; "
-            f"wall time: {wall}\nsee {out / 'contact-sheet.png'}"
-        )
+        for line in lines_of(result):
+            typer.echo(line)
+        typer.echo("light_db of eyes sure to 1 mm (a pupil) is the figure to quote")
+        typer.echo(f"see {out / 'contact-sheet.png'}")

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import re
 from collections.abc import Awaitable, Callable
 from functools import cache
 from importlib.resources import files
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -131,7 +132,7 @@ async def _guard(request: Request, handler: Handler) -> Response:
 def _refused(request: Request) -> str:
     host = request.headers.get("host", "")
     # A name that another site has made to lead here is none of ours.
-    if _name(host) not in ("localhost", "127.0.0.1", "::1"):
+    if re.sub(r":\d*$", "", host) not in ("localhost", "127.0.0.1", "[::1]"):
         return "not by this name: open http://localhost"
     if request.method in ("GET", "HEAD"):
         return ""
@@ -139,21 +140,7 @@ def _refused(request: Request) -> str:
     if origin is None:
         given = request.headers.get("authorization", "").lower().startswith("bearer ")
         return "" if given else "a browser's request says where it comes from (Origin)"
-    return "" if host and _place(origin) == host else "from another site"
-
-
-def _place(origin: str) -> str:
-    try:
-        return urlsplit(origin).netloc
-    except ValueError:
-        return ""
-
-
-def _name(host: str) -> str:
-    try:
-        return urlsplit(f"//{host}").hostname or ""
-    except ValueError:
-        return ""
+    return "" if origin.partition("://")[2] == host else "from another site"
 
 
 @cache
