@@ -81,14 +81,3 @@ def test_every_number_has_a_range_and_what_is_outside_is_told_by_its_option(
     given = [name for name in parameter.opts if name.startswith("-")]
     with pytest.raises(InputError, match=f"^{' '.join(words)}: {parameter.opts[0]}: "):
         app([*words, *given, *[text] * count])
-
-
-@pytest.mark.parametrize(
-    ("words", "parameter"),
-    [(words, one) for words, one in parameters("int") if one.opts == ["--seed"]],
-    ids=lambda x: " ".join(getattr(x, "opts", x)),
-)
-def test_a_seed_is_not_negative(words: tuple[str, ...], parameter: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        app([*words, "--seed", "-1"])
-    assert ended.value.code == 2 and "--seed" in capsys.readouterr().err

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 
 from runtime.clock import NS_PER_S, SimulatedClock
-from runtime.config import ServiceSettings, Settings
+from runtime.config import ServiceSettings
 from runtime.daemon import server as server_module
-from runtime.daemon.client import NotRunning, ask, configured_socket
+from runtime.daemon.client import NotRunning, ask
 from runtime.daemon.server import SocketInUse, StatusServer, open_status_server
 from runtime.errors import InputError
 from tests.waiting import eventually
@@ -256,13 +256,3 @@ def test_a_client_that_does_not_read_its_answers_is_let_go(hasty: StatusServer, 
                 client.sendall(b'{"command": "status"}\n' * 100)
         assert eventually(lambda: not hasty._clients, within_s=20)
     assert ask([path], STATUS)["ok"]
-
-
-# The client
-
-
-def test_a_configuration_says_where_the_daemon_listens(tmp_path: Path) -> None:
-    config = tmp_path / "phasestack.toml"
-    config.write_text('[service]\nsocket = "here.sock"\n')
-    assert configured_socket(config) == str(tmp_path / "here.sock")
-    assert configured_socket(None) == Settings().service.socket

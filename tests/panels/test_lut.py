@@ -54,8 +54,3 @@ def test_a_wrong_curve_is_refused_by_file_and_field(tmp_path: Path, text: str, f
         curve(lut=str(path), gamma=1.0)
     assert caught.value.source == str(path)
     assert caught.value.field == field
-
-
-def test_a_missing_curve_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none\.csv"):
-        curve(lut=str(tmp_path / "none.csv"), gamma=1.0)

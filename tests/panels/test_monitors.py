@@ -3,22 +3,16 @@ show the stack's own pixels, and all panels at one rate: else phases are rescale
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 from hypothesis import given
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
-from runtime.commands.doctor import doctor
 from runtime.config import PanelSettings
 from runtime.errors import InputError, PanelLost
 from runtime.panels.monitors import Monitor, bind, check_modes, refresh_difference
-from tests.panels.xserver import XServer
 
 
 def monitor(connector: str, serial: str = "", x_px: int = 0) -> Monitor:
@@ -90,23 +84,3 @@ def test_rates_that_drift_apart_are_told_and_unknown_ones_are_not_guessed_at() -
     assert refresh_difference([FULL, replace(FULL, refresh_hz=0.0)]) == ""
     told = refresh_difference([FULL, replace(FULL, connector="DP-2", refresh_hz=59.94)])
     assert "DP-1 60.00 Hz, DP-2 59.94 Hz" in told
-
-
-def test_the_doctor_fails_monitors_of_another_mode_and_passes_them_where_rescaling_is_allowed(
-    screen: XServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("DISPLAY", screen.name)
-    state, detail = panels_row(tmp_path, "")
-    assert state == "fail" and "shows 320x180, the stack is 1920x1080" in detail
-    assert panels_row(tmp_path, "allow_rescaling = true")[0] == "ok"
-
-
-def panels_row(folder: Path, more: str) -> tuple[str, str]:
-    config = folder / "phasestack.toml"
-    panels = "".join(f'[[output.panels]]\nconnector = "DUMMY{n}"\n' for n in range(3))
-    config.write_text(f'[output]\nkind = "windows"\n{more}\n{panels}[service]\nsocket = "status.sock"\n')
-    app = typer.Typer()
-    app.command()(doctor)
-    result = CliRunner().invoke(app, ["--json", "--config", str(config)])
-    row = next(check for check in json.loads(result.stdout)["checks"] if check["name"] == "panels")
-    return row["state"], row["detail"]
