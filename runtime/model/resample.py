@@ -20,7 +20,7 @@ from runtime.optics.views import relative_scale_shift
 from runtime.records import F64
 
 MARGIN = 4  # pixels to spare, right and below, in buffers that are resampled into
-MARGIN_NUMBERS = 40  # to spare to the right: compiled loops read whole pieces of a row
+MARGIN_NUMBERS = 64  # to spare to the right: compiled loops read whole pieces of a row
 SEARCH = 96  # pixels among which a whole place in the source is looked for
 GOOD_PHASE = 1 / 24  # of a pixel: the search ends here; so small a shift leaves an error below -55 dB
 LEAST_RUN = 8  # pixels of source and result that are worth resizing

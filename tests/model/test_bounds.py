@@ -1,4 +1,4 @@
-"""Compiled loops stay within their arrays: random pairs of the whole design range, with every index checked."""
+"""Compiled loops stay within their arrays: what holds them is run once more with every index checked."""
 
 from __future__ import annotations
 
@@ -9,15 +9,11 @@ from pathlib import Path
 
 import pytest
 
-ROLLED = 138  # of `bench robust`: eyes that see one row of the rear panel 46 rows apart
-
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("first", "pairs"), [(0, 12), (ROLLED, 1)])
-def test_no_index_lies_beside_an_array(tmp_path: Path, first: int, pairs: int) -> None:
+@pytest.mark.parametrize("held_by", ["test_compiled.py", "test_joint.py"])
+def test_no_index_lies_beside_an_array(tmp_path: Path, held_by: str) -> None:
     environment = os.environ | {"NUMBA_BOUNDSCHECK": "1", "XDG_CACHE_HOME": str(tmp_path)}
-    command = ["bench", "robust", "--first", str(first), "--pairs", str(pairs)]
-    answer = subprocess.run(
-        [sys.executable, "-m", "runtime.cli", *command], env=environment, capture_output=True, text=True, timeout=900
-    )
-    assert answer.returncode == 0, answer.stderr
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(Path(__file__).with_name(held_by))]
+    answer = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=900)
+    assert answer.returncode == 0, answer.stdout
