@@ -11,6 +11,7 @@ import logging
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from queue import Empty, SimpleQueue
 from typing import Any, Protocol
 
 import numpy as np
@@ -29,13 +30,13 @@ from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import retina_pictures
 from runtime.records import F64, U8, RefreshAccount, SensorFrame, State
 from runtime.support.background import Job
-from runtime.support.waiting import wait_for
 
 log = logging.getLogger("phasestack.quality")
 
 LIGHT_STEP = 2  # of the pixels whose light is measured
 FIGURES = ("light_db", "psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
 WAITING_MAX = 2048  # lines that wait for the truth; older ones go without
+DRAWN_WITHIN_S = 10.0  # the pictures of the last refresh, by the solver
 
 
 LINE = (
@@ -131,11 +132,13 @@ class RunObserver:
         if last is None or not self._measure or not _has_picture(last) or last.account.eyes_m is None:
             return
         true_m = self.truth.at(last.account.photon_ns)
-        found: list[Pictures] = []
-        self._draw(last, true_m, found.append)
-        if not self._simulated:
-            wait_for(lambda: bool(found), timeout_s=10.0)
-        measured = self._compared(last, true_m, found[0]) if found else None
+        found: SimpleQueue[Pictures] = SimpleQueue()
+        self._draw(last, true_m, found.put)
+        try:
+            pictures = found.get(timeout=0.0 if self._simulated else DRAWN_WITHIN_S)
+        except Empty:
+            return
+        measured = self._compared(last, true_m, pictures)
         if measured is not None:
             self.eye_views = measured.moment.eye_views
             if not self.means.values and last.account.state is State.TRACKING:
