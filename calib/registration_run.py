@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomlkit
 from tomlkit import TOMLDocument
 
 from calib.bundle import Undetermined
@@ -20,7 +19,7 @@ from runtime.errors import InputError
 from runtime.optics.stack import UNEVEN_MOST
 from runtime.records import U8
 from runtime.report.page import in_columns
-from runtime.support.artifacts import OutputFolder, write_json, write_text
+from runtime.support.artifacts import write_json
 from runtime.support.progress import status_line
 
 
@@ -46,11 +45,7 @@ def register_photos(
     except Undetermined as problem:
         raise InputError(source, "photographs", str(problem)) from None
     summary = registration_summary(found) | {"source": source}
-    document = tomlkit.document()
-    put_registration(document, found)
-    with OutputFolder(out) as folder:
-        write_json(folder.staging / "registration.json", summary)
-        write_text(folder.staging / "panels.toml", tomlkit.dumps(document))
+    write_json(out / "registration.json", summary)
     if config is not None:
         kept = rewrite(config, lambda configured: put_registration(configured, found))
         summary["kept_version"] = str(kept) if kept else None
