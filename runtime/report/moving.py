@@ -58,7 +58,6 @@ class Watched:
     def __init__(self) -> None:
         self.lines: list[Mapping[str, Any]] = []  # of frames.jsonl
         self.lights: list[Light] = []  # of which all is known
-        self.summary: Mapping[str, Any] = {}
 
     def refresh(self, line: Mapping[str, Any]) -> None:
         self.lines.append(line)
@@ -79,7 +78,6 @@ def simulated_run(settings: Settings, *, scale: float, keep_light: int) -> Watch
         run = build_run(settings, options, cleanup, output=watched)
         run.presenter.run()
         run.observer.finish()
-        watched.summary = run.summary()
     return watched
 
 

@@ -77,13 +77,6 @@ def test_shipped_models_pass_validation(name: str) -> None:
     assert validate_file(path).passed
 
 
-def test_the_published_network_is_exported_and_served(tmp_path: Path) -> None:
-    path = exported(narrow_eyereal(tmp_path))
-    again = validate_file(path)
-    assert again.passed, again.table()
-    assert layers_of(path)[..., :3].std() > 0
-
-
 def test_the_eye_that_the_data_had_first_gets_the_first_channels(tmp_path: Path) -> None:
     pictures = np.random.default_rng(9).integers(0, 256, (2, 108, 192, 3), dtype=np.uint8)
     layers = {}
