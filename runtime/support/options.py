@@ -43,7 +43,8 @@ def _checked(low: float, high: float, unit: str) -> Callable[[typer.Context, typ
     def checked(context: typer.Context, parameter: typer.CallbackParam, value: Any) -> Any:
         for each in () if value is None else value if isinstance(value, tuple | list) else (value,):
             if problem := refusal(each, low, high, unit):
-                command = context.command_path.partition(" ")[2] or str(context.command.name)
+                own = context.command_path.removeprefix(context.find_root().command_path).strip()
+                command = own or str(context.command.name)
                 option = parameter.opts[0] if parameter.opts else str(parameter.name)
                 raise InputError(command, option, problem)
         return value
