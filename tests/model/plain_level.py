@@ -12,7 +12,7 @@ import pytest
 import runtime.model.compiled.level
 import runtime.model.cpu
 import runtime.model.workspace
-from runtime.model.compiled.level import Level, clamp_and_quantise
+from runtime.model.compiled.level import Level
 from runtime.model.reprojection import CENTRE, EYES, FRONT, OUTER, REAR, START, reprojection
 from runtime.model.transfer import FULL, SUBCODE
 from runtime.optics.rect import PixelRect
@@ -57,10 +57,6 @@ class PlainLevel(Level):
         codes = np.clip(outer + np.clip(size * change, -FULL, FULL), 0, FULL)
         codes = np.floor(codes / SUBCODE + 0.5) * SUBCODE if shown else np.rint(codes)
         self.outer[panel][...] = codes.reshape(self.outer[panel].shape)
-
-    def _enlarge(self, image: I16, fine: I16, *, shown: bool) -> None:
-        cv2.resize(image, fine.shape[1::-1], dst=fine, interpolation=cv2.INTER_CUBIC)
-        clamp_and_quantise(fine, shown=shown)
 
     def show(self, layers: U8, boxes: Sequence[PixelRect]) -> None:
         outer = {n: np.ascontiguousarray(self.outer[n]) for n in OUTER}

@@ -15,7 +15,6 @@ import numpy as np
 
 from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
 from runtime.model.compiled.along import ANYWHERE_PX, EDGE_PX, new_layout, work_row, work_tiles
-from runtime.model.compiled.enlarge import enlarge
 from runtime.model.compiled.fade import fade_codes
 from runtime.model.compiled.joint import JointState, rays_of
 from runtime.model.compiled.loops import PIECE, numbers_of
@@ -119,11 +118,8 @@ class Level:
         """Take the outer panels over from a coarser raster of the same boxes."""
         for n in OUTER:
             image, fine = coarser.outer[n], self.outer[n]
-            if fine.shape[:2] == (2 * image.shape[0], 2 * image.shape[1]):
-                self._enlarge(image, fine, shown=shown)
-            else:
-                cv2.resize(image, fine.shape[1::-1], dst=fine, interpolation=cv2.INTER_CUBIC)
-                clamp_and_quantise(fine, shown=shown)
+            cv2.resize(image, fine.shape[1::-1], dst=fine, interpolation=cv2.INTER_CUBIC)
+            clamp_and_quantise(fine, shown=shown)
 
     def show(self, layers: U8, boxes: Sequence[PixelRect]) -> None:
         """All panels in 8-bit codes, the centre closed, into layers (N, H, W, 4), each within its box."""
@@ -208,18 +204,6 @@ class Level:
             blur(numbers, down, across, *values, *size, first, last, channels, subcode, rows)
 
         self._on_rows(panel, work)
-
-    def _enlarge(self, image: I16, fine: I16, *, shown: bool) -> None:
-        """An outer panel that is twice as fine."""
-        channels, _, full, subcode = self._constants()
-        height, width = image.shape[:2]
-
-        def work(rows: tuple[int, int]) -> None:
-            numbers = (np.empty((width + margin) * channels, np.float32) for margin in (4, 0, 0))
-            how = shown, full, subcode
-            enlarge(numbers_of(image), height, width, channels, numbers_of(fine), *rows, *how, *numbers)
-
-        at_once(work, shares(fine.shape[0], self._threads))
 
     def _mean(self, panel: int) -> I16:
         """An outer panel as eyes see it that may be unsure."""
