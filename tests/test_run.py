@@ -222,10 +222,12 @@ def test_real_and_simulated_time_pass_the_same_states(tmp_path: Path) -> None:
     passed = {}
     for name, more in (("simulated", ["--max-speed"]), ("real", [])):
         command = [sys.executable, "-c", PATIENT, *common, *more, "--out", str(tmp_path / name)]
-        subprocess.run(command, check=True, timeout=120)
+        told = subprocess.run(command, check=True, timeout=120, capture_output=True, text=True).stdout
+        assert ("nothing of it was measured" in told) == (name == "simulated")
         passed[name] = states_passed(lines_of(tmp_path / name))
     # In real time the sensor's first sample may be there before the first refresh, or not.
     assert passed["real"][-4:] == passed["simulated"][-4:] == ["tracking", "holding", "flat", "tracking"]
     assert set(passed["real"][:-4]) | set(passed["simulated"][:-4]) <= {"flat"}
     real, simulated = summary_of(tmp_path / "real"), summary_of(tmp_path / "simulated")
     assert real["seconds"] == pytest.approx(simulated["seconds"], abs=0.5)
+    assert "fps" in simulated["configured"] and real["configured"] == []

@@ -41,6 +41,9 @@ log = logging.getLogger("phasestack.build")
 
 SWITCH_INTERVAL_S = 0.0005  # between Python threads: the presenter must not wait long for the solver's
 
+# Of summary.json: on the simulated clock these follow from what is configured, and nothing was measured.
+SIMULATED_FIGURES = ("seconds", "fps", "solutions_per_s", "interval_ms", "photon_ms", "stage_ms", "overhead_ms")
+
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
@@ -84,6 +87,7 @@ class Run:
             "backend": self.presenter.run_cell.state.predictor.backend,
             "scene": self.presenter.run_cell.state.content.info.name,
             "plan": self.plan_items(),
+            "configured": list(SIMULATED_FIGURES) if self.simulated else [],
         }
 
 

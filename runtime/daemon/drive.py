@@ -49,9 +49,14 @@ def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> 
 
 
 def print_summary(summary: dict[str, Any], out: Path | None) -> None:
-    """For a person: what summary.json holds, and which figure of it to quote."""
-    for line in lines_of(summary):
+    """For a person: what summary.json holds, what was measured first, and which figure of it to quote."""
+    configured = summary["configured"]
+    for line in lines_of({name: value for name, value in summary.items() if name not in (*configured, "configured")}):
         print(line)
+    if configured:
+        print("as configured, on the simulated clock (nothing of it was measured):")
+        for line in lines_of({name: summary[name] for name in configured}):
+            print(f"  {line}")
     if summary["light_db"] is not None:
         print("light_db, of a pupil at the eyes used, is the figure to quote")
     if out is not None:
