@@ -12,12 +12,13 @@ from typing import Any
 import cv2
 import numpy as np
 
+from runtime.clock import Stopwatch
 from runtime.config import Settings, load_stack, with_options
 from runtime.content.base import ContentInfo
 from runtime.errors import EyesNotServed, InputError
 from runtime.evaluation.displayed import Picture, displayed
 from runtime.evaluation.solved import judged
-from runtime.evaluation.trials import Stopwatch, timed, timed_in_turn
+from runtime.evaluation.trials import timed, timed_in_turn
 from runtime.model.backends import choose
 from runtime.model.job import Job
 from runtime.model.predictor import Prediction, Predictor, load_predictor
@@ -48,7 +49,7 @@ def solve_pair(
     plan: bool,
 ) -> dict[str, Any]:
     """Layers, what the eyes see of them, and solve.json (docs/contracts.md). Raises InputError."""
-    clock = Stopwatch()
+    watch = Stopwatch()
     settings = with_options(Settings(), model=model, backend=backend).model
     cv2.setNumThreads(settings.threads)
     stored = [read_picture(path) for path in files]
@@ -58,7 +59,7 @@ def solve_pair(
         raise InputError(files[1], "size", f"the two pictures differ: {sizes}")
     stack = load_stack(panels, width_px=pictures[0].shape[1], height_px=pictures[0].shape[0])
     eyes_m = checked_eyes(*eyes, stack)
-    clock.ended("read pictures")
+    watch.lap("read pictures")
     with ExitStack() as contexts, ExitStack() as cleanup:
 
         def context() -> Any:
@@ -71,7 +72,7 @@ def solve_pair(
         # One solution is sooner made than two backends are measured.
         wanted = "cpu" if settings.backend == "auto" and repeat < MEASURED_FROM else settings.backend
         predictor.set_backend(choose(wanted, predictor, context).backend)
-        clock.ended("load model")
+        watch.lap("load model")
         pair = _Pair(pictures, stored, eyes_m, fov_deg, eye_sigma_mm, predictor)
         inference_ms: list[float] = []
 
@@ -81,7 +82,7 @@ def solve_pair(
             return prediction
 
         done = timed(solve_timed, runs=repeat)
-        clock.ended("solve, warm-up included")
+        watch.lap("solve, warm-up included")
         with OutputFolder(out) as folder:
             try:
                 seen = judged(done.answer.layers, stored, stack, eyes_m=eyes_m, fov_deg=fov_deg)
@@ -93,9 +94,9 @@ def solve_pair(
             )
             line += f"one ray a pixel, as published: {seen.quality.psnr_db:.1f} dB"
             seen.write(folder.staging, lines=[line])
-            clock.ended("measure and write")
+            watch.lap("measure and write")
             left_out = pair.price(ContentInfo(files[0].name), planned_db=seen.quality.psnr_db)
-            clock.ended("compare with the plan off")
+            watch.lap("compare with the plan off")
             result = seen.quality.table() | {
                 "inference_ms": round(float(np.median(inference_ms[-repeat:])), 3),
                 "total_ms": round(done.median_ms, 3),
@@ -105,7 +106,7 @@ def solve_pair(
                 "eye_sigma_mm": eye_sigma_mm,
                 "steps": done.answer.steps,
                 "plan": [asdict(item) for item in left_out],
-                "wall_s": clock.seconds,
+                "wall_s": {part: round(ms / 1e3, 3) for part, ms in watch.stage_ms.items()},
             }
             write_json(folder.staging / "solve.json", result)
     return result

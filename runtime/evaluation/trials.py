@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from runtime.clock import NS_PER_MS, NS_PER_S
+from runtime.clock import NS_PER_MS
 from runtime.records import U8
 
 T = TypeVar("T")
@@ -69,17 +69,3 @@ def _timed(call: Callable[[], T]) -> tuple[T, float]:
     begin_ns = perf_counter_ns()
     answer = call()
     return answer, (perf_counter_ns() - begin_ns) / NS_PER_MS
-
-
-class Stopwatch:
-    """Where the time went, part by part: each part ends where the next begins."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._began_ns = perf_counter_ns()
-
-    def ended(self, part: str) -> None:
-        """The time since the last part's end was this one's."""
-        now_ns = perf_counter_ns()
-        self.seconds[part] = round((now_ns - self._began_ns) / NS_PER_S, 3)
-        self._began_ns = now_ns

@@ -9,13 +9,12 @@ from time import perf_counter_ns
 
 import numpy as np
 
-from runtime.clock import NS_PER_MS
+from runtime.clock import NS_PER_MS, Stopwatch
 from runtime.content.base import View
 from runtime.errors import ContentFailure, ContextLost, ModelFailure
 from runtime.frame.buffers import LayerBuffers
 from runtime.frame.policy import FramePolicy, SolutionKey
 from runtime.frame.run_state import RunCell, RunState
-from runtime.frame.timing import Stopwatch
 from runtime.model.flat import flat_layers
 from runtime.model.job import Part
 from runtime.model.trim import Savings
@@ -89,7 +88,6 @@ class Solver:
 
     def _solve(self, state: RunState, request: SolveRequest, eyes_m: F64, *, revision: int) -> SolverStep:
         settings, watch = state.settings.model, Stopwatch()
-        stages: dict[str, float] = {}
         sigma_mm = configured_sigma_mm(settings.eye_sigma_mm, tracker_sigma_m=request.sigma_m)
         limited = self._timed and settings.budget_ms > 0
         deadline_ns = perf_counter_ns() + round(settings.budget_ms * NS_PER_MS) if limited else None
@@ -108,7 +106,7 @@ class Solver:
             raise
         except Exception as error:
             return SolverStep(missing=self._failed("content", error, expected=ContentFailure))
-        stages["render"] = watch.lap_ms()
+        watch.lap("render")
         try:
             prediction = state.predictor.solve(job)
         except ContextLost:
@@ -118,9 +116,9 @@ class Solver:
         made = prediction.made
         if isinstance(made, np.ndarray):
             made = self._buffers.copy_of(made)
-        rest_ms = max(0.0, watch.lap_ms() - sum(prediction.stage_ms.values()))
-        stages |= prediction.stage_ms
-        stages["finish"] = stages.get("finish", 0.0) + rest_ms
+        rest_ms = max(0.0, watch.lap("finish") - sum(prediction.stage_ms.values()))
+        stages = watch.stage_ms | prediction.stage_ms
+        stages["finish"] = prediction.stage_ms.get("finish", 0.0) + rest_ms
         self._missing = {}
         self._part = job.part if job.part is not None and job.part.box.width_px else None
         left_out = Savings(job.solved_share(self.stack), job.channels)
@@ -155,8 +153,8 @@ class Solver:
         if not missing:
             self._missing.pop("content", None)
             self._flat = SolutionKey(state.version, revision, None, self._policy.episode)
-        stages = {"render": watch.lap_ms()}
-        flat = Solution(self.run.next_number(), layers, None, time_ns, stage_ms=stages)
+        watch.lap("render")
+        flat = Solution(self.run.next_number(), layers, None, time_ns, stage_ms=watch.stage_ms)
         return SolverStep(flat=flat, missing=missing)
 
     def plan_items(self, measured: Measured | None = None) -> tuple[PlanItem, ...]:

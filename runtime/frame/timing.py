@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from time import perf_counter_ns
 
-from runtime.clock import NS_PER_MS, Clock, SimulatedClock
+from runtime.clock import NS_PER_MS, Clock, SimulatedClock, Stopwatch
 
 SOLVING_STAGES = ("render", "prepare", "inference", "finish")
 STAGES = ("sensor", "track", *SOLVING_STAGES, "present", "wait")
@@ -18,8 +18,7 @@ class RefreshTimes:
         self._simulated = clock if isinstance(clock, SimulatedClock) else None
         self._simulated_ms = simulated_ms
         self.stage_ms: dict[str, float] = {}
-        self.machine_ms: dict[str, float] = {}
-        self._start_ns = self._last_ns = perf_counter_ns()
+        self._watch, self._start_ns = Stopwatch(), perf_counter_ns()
 
     @property
     def simulated(self) -> bool:
@@ -28,11 +27,9 @@ class RefreshTimes:
 
     def lap(self, stage: str) -> None:
         """What happened since the last lap was `stage`."""
-        now_ns = perf_counter_ns()
-        self.machine_ms[stage] = self.machine_ms.get(stage, 0.0) + (now_ns - self._last_ns) / NS_PER_MS
-        self._last_ns = now_ns
+        self._watch.lap(stage)
         if self._simulated is None:
-            self.stage_ms[stage] = self.machine_ms[stage]
+            self.stage_ms[stage] = self._watch.stage_ms[stage]
         elif stage not in self.stage_ms:
             cost_ms = self._simulated_ms.get(stage, 0.0)
             if stage != "wait":  # waiting passes on the simulated clock by itself
@@ -42,16 +39,4 @@ class RefreshTimes:
     def overhead_ms(self) -> float:
         """The refresh so far, less presenting and waiting; on the machine's clock."""
         whole_ms = (perf_counter_ns() - self._start_ns) / NS_PER_MS
-        return max(0.0, whole_ms - self.machine_ms.get("present", 0.0) - self.machine_ms.get("wait", 0.0))
-
-
-class Stopwatch:
-    """Milliseconds since it was made or last asked, on the machine's clock."""
-
-    def __init__(self) -> None:
-        self._last_ns = perf_counter_ns()
-
-    def lap_ms(self) -> float:
-        now_ns = perf_counter_ns()
-        spent_ms, self._last_ns = (now_ns - self._last_ns) / NS_PER_MS, now_ns
-        return spent_ms
+        return max(0.0, whole_ms - sum(self._watch.stage_ms.get(stage, 0.0) for stage in ("present", "wait")))

@@ -17,12 +17,15 @@ if TYPE_CHECKING:
     from runtime.model.steps import SolverBackend
 
 
+STAGES = ("prepare", "inference", "finish")  # inference: the network alone
+
+
 @dataclass(frozen=True, slots=True)
 class Prediction:
     """The layers for a job, and what they took."""
 
     made: Layers  # (N, height_px, width_px, 4) RGBA, rear to front; an array is the predictor's until its next call
-    stage_ms: dict[str, float] = field(default_factory=dict)  # prepare, inference (the network alone), finish
+    stage_ms: dict[str, float] = field(default_factory=dict)  # by STAGES
     steps: int = 1  # of the model, that were done
 
     @property

@@ -8,12 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from runtime.clock import Stopwatch
 from runtime.errors import InputError, ModelFailure
-from runtime.model.base import Prediction, Predictor
+from runtime.model.base import STAGES, Prediction, Predictor
 from runtime.model.job import Job
 from runtime.model.resample import buffer, resample, target_from_source
 from runtime.model.session import ModelSession
-from runtime.model.timing import Stopwatch
 from runtime.optics.malus import phase_from_intensity
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack
@@ -58,7 +58,7 @@ class NetworkPredictor(Predictor):
         return tuple(self.stack.panel(n) for n in self._panels)
 
     def solve(self, job: Job) -> Prediction:
-        watch, images, eyes_m = Stopwatch(), job.arrays, job.eyes_m
+        watch, images, eyes_m = Stopwatch(*STAGES), job.arrays, job.eyes_m
         channel = 0
         for raster in range(len(self._panels)):
             for side in self._order:

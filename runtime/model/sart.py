@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.clock import Stopwatch
 from runtime.errors import ModelFailure
-from runtime.model.base import Prediction, Predictor
+from runtime.model.base import STAGES, Prediction, Predictor
 from runtime.model.job import Job
 from runtime.model.resample import target_from_source
-from runtime.model.timing import Stopwatch
 from runtime.optics.malus import phase_from_intensity
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen, layer_pixels_from_seen
@@ -41,7 +41,7 @@ class SartPredictor(Predictor):
         return (self.stack.panel(self.stack.count // 2),)
 
     def solve(self, job: Job) -> Prediction:
-        watch = Stopwatch()
+        watch = Stopwatch(*STAGES)
         stack = self.stack
         table = phase_from_intensity(np.arange(256, dtype=np.float32) / np.float32(255)).astype(np.float32)
         target = [cv2.LUT(np.ascontiguousarray(image[0][..., :3]), table) for image in job.arrays]

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.clock import Stopwatch
 from runtime.errors import EyesNotServed, ModelFailure
 from runtime.model.assembly import Assembly, Placed, Rest, Shared, Uniform
-from runtime.model.base import Prediction, Predictor
+from runtime.model.base import STAGES, Prediction, Predictor
 from runtime.model.chain import chain_frame, chain_modes
 from runtime.model.contract import Step
 from runtime.model.cpu import CpuBackend
@@ -22,7 +23,6 @@ from runtime.model.job import Job, Picture
 from runtime.model.reprojection import CENTRE, FRONT, REAR
 from runtime.model.session import ModelSession
 from runtime.model.steps import Answer, Problem, SolverBackend, SolverState, run_steps
-from runtime.model.timing import Stopwatch
 from runtime.model.visible import visible_boxes
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, I16, Layers
@@ -80,7 +80,7 @@ class UnrolledPredictor(Predictor):
         return (visible_boxes(eyes_m, self.stack)[CENTRE].slices,)
 
     def solve(self, job: Job) -> Prediction:
-        watch, part = Stopwatch(), job.part
+        watch, part = Stopwatch(*STAGES), job.part
         pictures = [images[0] for images in job.pictures]
         if part is None:
             layers, steps = self._panels(job, pictures, self.stack, job.eyes_m, None, watch)
