@@ -17,15 +17,14 @@ from calib.placed import PlacedPanel, misplaced
 from calib.simulator import Exposure, Scene, by_hand, camera_from_stack, camera_rays, phone, photograph
 from calib.viewpoints import Viewpoint
 from runtime.clock import NS_PER_MS, NS_PER_S, MonotonicClock
-from runtime.commands.identify import alone as card_alone
-from runtime.commands.identify import every_monitor
 from runtime.config import Settings
 from runtime.errors import InputError, PanelLost
 from runtime.eyes.demo_geometry import demo_sensor_from_stack
 from runtime.eyes.detect import EyeFinder
 from runtime.optics.malus import phase_from_intensity
 from runtime.optics.stack import PanelStack
-from runtime.panels.card import identity_card
+from runtime.panels.card import alone, identity_card
+from runtime.panels.every_monitor import every_monitor
 from runtime.panels.monitors import Monitor
 from runtime.records import F64, U8, EyePoints
 from runtime.sensor.registry import open_sensor
@@ -85,7 +84,7 @@ class SetupHardware:
         lines = [line for text in words for line in wrap(text, CARD_CHARACTERS)]
         card = identity_card(width, height, title=monitors[number].connector, lines=lines)
         if self._display is not None:
-            self._display.show(card_alone([*cards[:number], card, *cards[number + 1 :]], number))
+            self._display.show(alone([*cards[:number], card, *cards[number + 1 :]], number))
 
     def show_words(self, settings: Settings, lines: Sequence[str]) -> None:
         """Words on the panels, where they are bound already."""

@@ -4,7 +4,7 @@
     scene = "tunnel:Tunnel"
     options = { radius_m = 0.15, speed_m_per_s = 0.1 }
 
-    PYTHONPATH=examples phasestack run --config tunnel.toml --replay demo --headless --frames 60 --out out/tunnel
+    PYTHONPATH=examples phasestack run --config tunnel.toml --replay demo --headless --max-speed --frames 60 --out out
 
 The frame is the display's: x out of it, y to the right, z up, metres from its middle.
 """

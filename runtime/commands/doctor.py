@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from runtime.errors import PhasestackError
+from runtime.support.plugins import is_plugin, plugin_class
 
 if TYPE_CHECKING:
     from runtime.config import Settings
@@ -88,14 +89,14 @@ def sensor(settings: Settings) -> Iterator[Row]:
         yield Row("sensor", "skip", f"the running daemon has it (eyes: {eyes})")
         return
     driver = open_sensor(settings.sensor, MonotonicClock())
-    what = f"{settings.sensor.driver} ({settings.sensor.source})"
+    own = is_plugin(settings.sensor.driver)
+    what = settings.sensor.driver if own else f"{settings.sensor.driver} ({settings.sensor.source})"
     try:
         driver.open()
         frame = driver.read_newest(CHECK_SENSOR_FOR_S)
     except (SensorLost, SensorTimeout, EndOfRecording) as error:
-        yield Row(
-            "sensor", "fail", f"{what}: {error or 'no sample'}", "plug it in; see the rows on USB; docs/hardware.md"
-        )
+        remedy = "docs/sensors.md: a driver of your own" if own else "plug it in; see the rows on USB; docs/hardware.md"
+        yield Row("sensor", "fail", f"{what}: {error or 'no sample'}", remedy)
         return
     finally:
         driver.close()
@@ -113,7 +114,8 @@ def usb(settings: Settings) -> Iterator[Row]:
     from runtime.errors import MissingPart
     from runtime.sensor.usb_devices import find_devices
 
-    needed = settings.sensor.driver not in (*NO_DEVICE, "usb-camera")
+    driver = settings.sensor.driver
+    needed = driver not in (*NO_DEVICE, "usb-camera") and not is_plugin(driver)
     absent: Verdict = "fail" if needed else "skip"
     try:
         devices = find_devices()
@@ -214,9 +216,14 @@ def model(settings: Settings) -> Iterator[Row]:
 def calibration(settings: Settings) -> Iterator[Row]:
     """The calibration file is there, is a similarity, and is not the demo's on a real sensor."""
     from runtime.eyes.calibration import load_calibration
+    from runtime.sensor.base import Sensor
 
     if not settings.calibration.file:
-        real = settings.sensor.driver not in NO_DEVICE
+        driver = settings.sensor.driver
+        if is_plugin(driver) and plugin_class(driver, Sensor, field="sensor.driver").capabilities.in_stack_frame:
+            yield Row("calibration", "ok", "none is needed: this sensor's eyes are in the stack's frame")
+            return
+        real = driver not in NO_DEVICE
         remedy = "phasestack calibrate capture, then solve, and set calibration.file" if real else ""
         yield Row("calibration", "fail" if real else "ok", "the built-in one of the demo recording", remedy)
         return

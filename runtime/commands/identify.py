@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from calib.keys import Key
     from runtime.config import Settings
     from runtime.panels.base import PanelSink
-    from runtime.panels.monitors import Monitor
     from runtime.records import U8
 
 
@@ -33,10 +32,16 @@ def identify(
     from calib.keys import TerminalKeys, WindowKeys
     from runtime.config import load_settings
     from runtime.errors import InputError, PanelLost
+    from runtime.panels.every_monitor import every_monitor
 
     settings = load_settings(config)
     try:
-        panels, cards = _bound(settings) if settings.output.panels else every_monitor()[:2]
+        if settings.output.panels:
+            panels, cards = _bound(settings)
+        else:
+            panels, cards, monitors = every_monitor()
+            for monitor in monitors:
+                typer.echo(f"{monitor}: [[output.panels]] {monitor.setting}")
     except PanelLost as error:
         raise InputError("output", "panels", str(error)) from None
     keys = TerminalKeys(quit_at_end=False)
@@ -73,50 +78,13 @@ def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
     return panels, cards
 
 
-def alone(cards: list[U8], index: int) -> U8:
-    """(N, H, W, 4) layers with one card, the other panels clear."""
-    import numpy as np
-
-    layers = np.stack(cards)
-    for other in range(len(cards)):
-        if index != other:
-            layers[other, ..., :3] = 0
-    return layers
-
-
-def every_monitor() -> tuple[PanelSink, list[U8], tuple[Monitor, ...]]:
-    """Windows on all monitors whatever they are, their cards, and what they are called. Raises PanelLost."""
-    from runtime.clock import MonotonicClock
-    from runtime.config import OutputSettings, PanelSettings
-    from runtime.optics.stack import PanelStack
-    from runtime.panels.card import identity_card
-    from runtime.panels.display import connected_monitors
-    from runtime.panels.window import WindowPanels
-    from runtime.support.gl import offscreen_context
-
-    monitors = connected_monitors()
-    width, height = max(m.width_px for m in monitors), max(m.height_px for m in monitors)
-    bound = tuple(PanelSettings(connector=monitor.connector) for monitor in monitors)
-    # Only for this picture: monitors of any shape, each filled.
-    stack = PanelStack(1.0, 1.0, tuple(0.01 * index for index in range(len(monitors))), width, height)
-    output = OutputSettings(kind="windows", panels=bound)
-    panels = WindowPanels(output, bound, stack, MonotonicClock(), offscreen_context(), any_shape=True)
-    cards = []
-    for monitor in monitors:
-        name = f'edid_serial = "{monitor.serial}"' if monitor.serial else f'connector = "{monitor.connector}"'
-        typer.echo(f"{monitor}: [[output.panels]] {name}")
-        lines = [monitor.model or "(no name in its EDID)", f"{monitor.width_px} x {monitor.height_px}",
-                 "in the configuration:", "[[output.panels]]", name]  # fmt: skip
-        cards.append(identity_card(width, height, title=monitor.connector, lines=lines))
-    return panels, cards, monitors
-
-
 def _hold(panels: PanelSink, cards: list[U8], poll: Callable[[], Key | None]) -> None:
     """Show cards again and again, so that closed windows and lost monitors come back; keys go on to the next."""
     import time
 
     from calib.keys import Key
     from runtime.errors import PanelLost
+    from runtime.panels.card import alone
     from runtime.records import PanelFrame
 
     lost, number = "", 0  # of presses, so that each is another frame

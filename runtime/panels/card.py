@@ -40,6 +40,14 @@ def identity_card(width_px: int, height_px: int, *, title: str, lines: Sequence[
     return card
 
 
+def alone(cards: Sequence[U8], index: int) -> U8:
+    """(N, H, W, 4) layers with one card, the other panels clear."""
+    layers = np.zeros((len(cards), *cards[index].shape), np.uint8)
+    layers[..., 3] = 255
+    layers[index] = cards[index]
+    return layers
+
+
 def _bars(card: U8, *, top: int) -> None:
     height, width = card.shape[:2]
     middle = (top + height) // 2

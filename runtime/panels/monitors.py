@@ -45,6 +45,11 @@ class Monitor:
         """What it shows of the X screen."""
         return Rectangle(self.x_px, self.y_px, self.width_px, self.height_px)
 
+    @property
+    def setting(self) -> str:
+        """How a table of `[[output.panels]]` names it."""
+        return f'edid_serial = "{self.serial}"' if self.serial else f'connector = "{self.connector}"'
+
     def __str__(self) -> str:
         serial = f", serial {self.serial}" if self.serial else ""
         model = f" {self.model}" if self.model else ""

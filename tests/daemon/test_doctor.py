@@ -95,3 +95,37 @@ def test_a_running_daemon_is_asked_how_it_is(tmp_path: Path, account: Any, secon
     assert checks["service"]["state"] == state
     assert checks["sensor"]["state"] == "skip"  # it has the device: opening it here would fail, or disturb
     assert code == 1
+
+
+OWN = """
+import numpy as np
+from phasestack import Capabilities, EyePoints, Sensor, SensorFrame
+
+
+class Own(Sensor):
+    capabilities = Capabilities(eye_points=True, in_stack_frame=True)
+
+    def __init__(self, options, *, clock):
+        self._clock = clock
+
+    def open(self):
+        pass
+
+    def read_newest(self, timeout_s):
+        eyes_m = np.array([[0.6, -0.03, 0.0], [0.6, 0.03, 0.0]])
+        return SensorFrame(1, self._clock.now_ns(), EyePoints(eyes_m, np.ones(2)))
+
+    def close(self):
+        pass
+"""
+
+
+def test_a_sensor_of_ones_own_in_the_stacks_frame_needs_no_usb_and_no_calibration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_eyes.py").write_text(OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    code, checks = examined(tmp_path, '[sensor]\ndriver = "own_eyes:Own"')
+    assert code == 0 and checks["usb"]["state"] != "fail"
+    assert checks["sensor"]["detail"] == "own_eyes:Own delivers eyes"
+    assert "none is needed" in checks["calibration"]["detail"]
