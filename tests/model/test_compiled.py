@@ -200,7 +200,7 @@ def test_samples_are_those_of_the_definition_wherever_the_rasters_are(
         for tile in range(-(-size[1] // step)):
             pixels, to = min(step, size[1] - tile * step), tile * step * channels
             place = held, source[0], source[0], source[1], -along.EDGE_PX, matrix, v, tile, pixels, channels, 0
-            along.sum_where(tiles[0], *place, np.float32(7), layout, row, tiles[1])
+            along.sample_or(*place, np.float32(7), layout, row, tiles[1])
             found[v, to : to + pixels * channels] = tiles[1, : pixels * channels]
     expected = np.zeros((*size, channels))
     exact_resample(image, image_from_result=matrix, out=expected, outside=7)

@@ -23,15 +23,12 @@ RUN = 480  # numbers of a row whose height in an image counts as a line
 
 
 @intrinsic
-def _add_piece(typing, row, source, step, weight, slope, before, at, out, start):
-    """out[start + k] = before[at + k] + what lies between row[source + k] and row[source + k + step], `PIECE` numbers
-    at once."""
-    signature = types.void(
-        row, types.uint64, types.uint64, types.float32, types.float32, before, types.uint64, out, types.uint64
-    )
+def _blend_piece(typing, row, source, step, weight, slope, out, start):
+    """out[start + k] = what lies between row[source + k] and row[source + k + step], `PIECE` numbers at once."""
+    signature = types.void(row, types.uint64, types.uint64, types.float32, types.float32, out, types.uint64)
 
     def generate(context, builder, signature, arguments):
-        row, source, step, weight, slope, before, at, out, start = arguments
+        row, source, step, weight, slope, out, start = arguments
         kinds, fast = signature.args, ["contract"]
         pixels = builder.select(
             builder.icmp_unsigned("==", step, ir.Constant(ir.IntType(64), 3)),
@@ -43,9 +40,8 @@ def _add_piece(typing, row, source, step, weight, slope, before, at, out, start)
         grown = builder.fmul(pixels, everywhere(builder, slope), flags=fast)
         share = builder.fadd(grown, everywhere(builder, weight), flags=fast)
         between = builder.fmul(builder.fsub(beside, here, flags=fast), share, flags=fast)
-        sums = builder.fadd(loaded(context, builder, kinds[5], before, at), here, flags=fast)
-        place = builder.gep(context.make_array(kinds[7])(context, builder, out).data, [start])
-        result = builder.fadd(sums, between, flags=fast)
+        place = builder.gep(context.make_array(kinds[5])(context, builder, out).data, [start])
+        result = builder.fadd(here, between, flags=fast)
         builder.store(result, builder.bitcast(place, ir.PointerType(VECTOR)), align=4)
         return context.get_dummy_value()
 
@@ -98,9 +94,9 @@ def _lay(scale, bend, shift, pixels, width, near, channels, n, tile, layout):  #
 
 @njit(**OPTIONS)
 def sample(
-    before, image, ring, height, width, near, matrix, v, tile, pixels, channels, n, layout, row, out
+    image, ring, height, width, near, matrix, v, tile, pixels, channels, n, layout, row, out
 ):  # pragma: no cover
-    """out = before + bilinear samples of an image (ring rows, numbers), whose row r is at r % ring, for the pixels of a
+    """Bilinear samples of an image (ring rows, numbers), whose row r is at r % ring, for the pixels of a
     tile of row v; the pixels that lie within it. matrix (3, 3): the image's pixels from the tile's raster's, centres at
     halves; along a tile a parabola stands for it."""
     a, ends, y = tile * (TILE // channels) + 0.5, max(pixels - 1, 1), v + 0.5
@@ -169,14 +165,12 @@ def sample(
     for piece in range(count):
         start = U(layout.starts[n, tile, U(piece)])
         drifted = np.float32(shift) + along * np.float32(start)
-        _add_piece(
+        _blend_piece(
             row,
             U(layout.sources[n, tile, U(piece)] - source),
             U(channels),
             layout.weights[n, tile, U(piece), 0] + drifted,
             layout.weights[n, tile, U(piece), 1] + growth,
-            before,
-            start,
             out,
             start,
         )
@@ -184,17 +178,15 @@ def sample(
 
 
 @njit(**OPTIONS)
-def sum_where(
-    before, image, ring, height, width, near, matrix, v, tile, pixels, channels, n, outside, layout, row, out
+def sample_or(
+    image, ring, height, width, near, matrix, v, tile, pixels, channels, n, outside, layout, row, out
 ):  # pragma: no cover
-    """As `sample`, and before + outside for the pixels that lie beside the image."""
-    first, last = sample(
-        before, image, ring, height, width, near, matrix, v, tile, pixels, channels, n, layout, row, out
-    )
+    """As `sample`, and `outside` for the pixels that lie beside the image."""
+    first, last = sample(image, ring, height, width, near, matrix, v, tile, pixels, channels, n, layout, row, out)
     for k in range(first * channels):
-        out[U(k)] = before[U(k)] + outside
+        out[U(k)] = outside
     for k in range(last * channels, pixels * channels):
-        out[U(k)] = before[U(k)] + outside
+        out[U(k)] = outside
 
 
 def new_layout(images: int, columns: int, channels: int) -> Layout:
@@ -213,5 +205,5 @@ def work_row(scale: float) -> F32:
 
 
 def work_tiles() -> F32:
-    """(10, numbers): tiles to work in, the first all zeros."""
+    """(10, numbers): tiles to work in."""
     return np.zeros((10, TILE + 4 * PIECE), np.float32)

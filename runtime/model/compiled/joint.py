@@ -31,7 +31,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from runtime.model.compiled.along import new_layout, sample, sum_where, work_row, work_tiles
+from runtime.model.compiled.along import new_layout, sample, sample_or, work_row, work_tiles
 from runtime.model.compiled.loops import PASS, PIECE, TILE, U
 from runtime.records import F32, F64
 from runtime.support.threads import at_once
@@ -93,66 +93,22 @@ def move_rows(
                 begin = tile * size_of_tile
                 pixels = min(size_of_tile, width - begin)
                 first, last = 0, pixels
-                sums, other = tiles[1], tiles[2]
-                low, high = sample(
-                    tiles[0],
-                    panels[0],
-                    sizes[0, 0],
-                    sizes[0, 0],
-                    sizes[0, 1],
-                    near,
-                    seen[e, 0],
-                    r,
-                    tile,
-                    pixels,
-                    channels,
-                    3 * e,
-                    seen_layout,
-                    row,
-                    sums,
-                )
-                first, last = max(first, low), min(last, high)
-                low, high = sample(
-                    sums,
-                    panels[2],
-                    sizes[2, 0],
-                    sizes[2, 0],
-                    sizes[2, 1],
-                    near,
-                    seen[e, 2],
-                    r,
-                    tile,
-                    pixels,
-                    channels,
-                    3 * e + 2,
-                    seen_layout,
-                    row,
-                    other,
-                )
-                first, last = max(first, low), min(last, high)
-                offset = U(begin * channels)
+                offset, sums = U(begin * channels), tiles[3]
+                for n in range(3):
+                    if n == CENTRE and same_centre:
+                        continue
+                    low, high = sample(
+                        panels[n], sizes[n, 0], sizes[n, 0], sizes[n, 1], near, seen[e, n], r, tile, pixels, channels,
+                        3 * e + n, seen_layout, row, tiles[n],
+                    )  # fmt: skip
+                    first, last = max(first, low), min(last, high)
                 if same_centre:
                     for k in range(pixels * channels):
-                        sums[U(k)] = other[U(k)] + np.float32(panels[CENTRE, U(r), U(k) + offset])
+                        outer = tiles[0, U(k)] + tiles[2, U(k)]
+                        sums[U(k)] = outer + np.float32(panels[CENTRE, U(r), U(k) + offset])
                 else:
-                    low, high = sample(
-                        other,
-                        panels[1],
-                        sizes[1, 0],
-                        sizes[1, 0],
-                        sizes[1, 1],
-                        near,
-                        seen[e, 1],
-                        r,
-                        tile,
-                        pixels,
-                        channels,
-                        3 * e + 1,
-                        seen_layout,
-                        row,
-                        sums,
-                    )
-                    first, last = max(first, low), min(last, high)
+                    for k in range(pixels * channels):
+                        sums[U(k)] = tiles[0, U(k)] + tiles[1, U(k)] + tiles[2, U(k)]
                 line, side, fade = U(r % ring_rows), U(e % 2), fade_rows[U(r)]
                 for k in range(pixels * channels):
                     half_turn = sums[U(k)] * turns
@@ -195,27 +151,14 @@ def move_rows(
                         for k in range(pixels * channels):
                             total[U(k)] = none
                             weight[U(k)] = none
-                        for e in range(rays):  # an even number
+                        for e in range(rays):
                             for part in range(2):  # what is wrong, and its weight
-                                a, b = (3 + part, 5 + part) if e % 2 == 0 else (5 + part, 3 + part)
-                                sum_where(
-                                    tiles[a],
-                                    ring[e, part],
-                                    ring_rows,
-                                    height,
-                                    width,
-                                    0.0,
-                                    back[e, n],
-                                    q,
-                                    tile,
-                                    pixels,
-                                    channels,
-                                    3 * e + n,
-                                    none,
-                                    back_layout,
-                                    row,
-                                    tiles[b],
-                                )
+                                sample_or(
+                                    ring[e, part], ring_rows, height, width, 0.0, back[e, n], q, tile, pixels, channels,
+                                    3 * e + n, none, back_layout, row, tiles[5],
+                                )  # fmt: skip
+                                for k in range(pixels * channels):
+                                    tiles[3 + part, U(k)] += tiles[5, U(k)]
                     for k in range(pixels * channels):
                         change = size * total[U(k)] / max(weight[U(k)], least)
                         now = min(max(np.float32(panels[U(n), line, U(k) + offset]) - change, none), full)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from runtime.model.compiled.along import sum_where
+from runtime.model.compiled.along import sample_or
 from runtime.model.compiled.loops import OPTIONS, PASS, TILE, U
 
 WHOLE = 4096  # of a weight, in 16 bits
@@ -42,16 +42,16 @@ def _lacks(
 ):  # pragma: no cover
     """What an eye lacks of a target (rows, numbers) on row v of a tile of the centre panel, beside two outer panels
     (rows, numbers) of sizes (rows, pixels). matrices: (2, 3, 3) theirs from the centre's pixels; index: of the first's
-    in the layout; out: (numbers,); tiles: (2, numbers), the first all zeros."""
+    in the layout; out: (numbers,); tiles: (2, numbers), to work in."""
     begin, line = U(tile * (TILE // channels) * channels), U(v)
     for n in range(2):
         height, width = sizes[n, 0], sizes[n, 1]
-        sum_where(
-            tiles[n], panels[n], height, height, width, near, matrices[n], v, tile, pixels, channels, index + n,
-            start, layout, row, tiles[1] if n == 0 else out,
+        sample_or(
+            panels[n], height, height, width, near, matrices[n], v, tile, pixels, channels, index + n, start, layout,
+            row, tiles[n],
         )  # fmt: skip
     for k in range(pixels * channels):
-        out[U(k)] = np.float32(target[line, U(k) + begin]) - out[U(k)]
+        out[U(k)] = np.float32(target[line, U(k) + begin]) - (tiles[0, U(k)] + tiles[1, U(k)])
 
 
 @njit(**PASS)
@@ -138,14 +138,15 @@ def correct(
             count, lacked, weight = pixels * channels, tiles[3], tiles[5]
             for part in range(2 if floor < one else 1):  # residuals, and what they weigh
                 for side in range(2):
-                    sum_where(
-                        tiles[side * (2 + 2 * part)], ring[2 * part + side], ring_rows, height, width, near,
-                        back[side], q, tile, pixels, channels, side, whole if part else none, back_layout, row,
-                        tiles[2 + 2 * part + side],
+                    sample_or(
+                        ring[2 * part + side], ring_rows, height, width, near, back[side], q, tile, pixels, channels,
+                        side, whole if part else none, back_layout, row, tiles[2 + 2 * part + side],
                     )  # fmt: skip
+            for k in range(count):
+                lacked[U(k)] += tiles[2, U(k)]
             if floor < one:
                 for k in range(count):
-                    lacked[U(k)] *= np.float32(2) * whole / weight[U(k)]
+                    lacked[U(k)] *= np.float32(2) * whole / (tiles[4, U(k)] + weight[U(k)])
             if shown:
                 for k in range(count):
                     code = min(max(np.float32(panels[0][at, U(k) + begin]) + lacked[U(k)] * size, low), high)
