@@ -58,8 +58,7 @@ def place(
 ) -> None:
     """Move, turn or scale the scene that is shown, at once. What is not named stays as it is.
 
-    Another scene stands as the configuration has it again. Where nothing would be seen the scene stays where it is,
-    and this exits with 2 and one line.
+    Another scene stands as the configuration has it again.
 
     Example: phasestack ctl place --scale 1.2 --offset 0.01 0 -0.02 --turntable 3
     """

@@ -6,8 +6,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from runtime.config import Settings
+from runtime.config import ContentSettings, Settings
+from runtime.content.placed import placed_source, placing_of
 from runtime.content.registry import Opener, prepare_content
+from runtime.daemon.commands import PLACING
 from runtime.daemon.solver_parts import RunningSolver, ready_predictor
 from runtime.errors import PhasestackError, Stopped
 from runtime.eyes.calibration import load_calibration
@@ -33,7 +35,7 @@ class Reconfiguration:
 
         Raises InputError for a bad calibration file, before anything has begun.
         """
-        self.settings, self._stack = settings, stack
+        self.settings, self._old, self._stack = settings, old, stack
         self._calibration = load_calibration(Path(settings.calibration.file) if settings.calibration.file else None)
         self._needs_content = reload_content or settings.content != old.content
         self._needs_model = _model_part(settings) != _model_part(old)
@@ -85,7 +87,12 @@ class Reconfiguration:
 
     def _take_over(self, parts: RunningSolver, opener: Opener | None, predictor: Predictor | None) -> None:
         """One new state, and what it replaces is closed; where the upload fails, nothing changes."""
-        changes: dict[str, Any] = {"settings": self.settings, "calibration": self._calibration}
+        now, moved = parts.run.state.settings.content, {}
+        if now.scene == self.settings.content.scene:  # another scene stands as the configuration has it
+            moved = moved_since(self._old.content, now)
+        placed = self.settings.content.model_copy(update=moved)
+        settings = self.settings.model_copy(update={"content": placed})
+        changes: dict[str, Any] = {"settings": settings, "calibration": self._calibration}
         with ExitStack() as undo:
             try:
                 if predictor is not None:
@@ -94,6 +101,8 @@ class Reconfiguration:
                 if opener is not None:
                     changes["content"] = opener(parts.context)
                     undo.callback(changes["content"].close)
+                    if moved:
+                        changes["content"] = placed_source(changes["content"], placing_of(placed))
                 if predictor is not None:
                     predictor.set_backend(parts.backend.backend)
             except PhasestackError as error:
@@ -108,6 +117,11 @@ class Reconfiguration:
             before.content.close()
         if predictor is not None:
             before.predictor.close()
+
+
+def moved_since(before: ContentSettings, now: ContentSettings) -> dict[str, Any]:
+    """Where a scene stands now, in what that has changed."""
+    return {key: getattr(now, key) for key in PLACING if getattr(now, key) != getattr(before, key)}
 
 
 def _model_part(settings: Settings) -> Any:

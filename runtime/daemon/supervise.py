@@ -21,7 +21,7 @@ from runtime.daemon.commands import PLACING, Command
 from runtime.daemon.drive import drive
 from runtime.daemon.metrics import Metrics
 from runtime.daemon.notify import Notifier
-from runtime.daemon.reconfigure import Reconfiguration
+from runtime.daemon.reconfigure import Reconfiguration, moved_since
 from runtime.daemon.server import StatusServer, open_status_server
 from runtime.daemon.signals import Signals
 from runtime.errors import InputError, PanelLost, PhasestackError, Stopped
@@ -88,8 +88,10 @@ class Daemon(Host):
         if self._change is not None and self._change.loading.finished:
             change, self._change = self._change, None
             if not change.loading.problem:
-                self._configured, self._chosen = change.configured, change.chosen
                 state = presenter.run_cell.state
+                moved = moved_since(change.loading.settings.content, state.settings.content)  # while it was loading
+                self._configured = change.configured
+                self._chosen = change.chosen | {("content", key): value for key, value in moved.items()}
                 log.info("changed: scene %s, model %s", state.content.info.name, state.predictor.name)
             self._answer(presenter, change.command, change.loading.problem)
 

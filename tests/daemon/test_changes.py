@@ -15,6 +15,7 @@ import pytest
 
 from runtime.clock import MonotonicClock
 from runtime.config import Settings, load_settings
+from runtime.content.placed import PlacedSource
 from runtime.daemon import reconfigure
 from runtime.daemon import server as server_module
 from runtime.daemon.client import ask
@@ -184,6 +185,22 @@ def test_a_newer_scene_overtakes_one_that_is_being_loaded(served: Served, gate: 
     first.join(30.0)
     assert answers == [{"ok": False, "error": "skipped: a newer change came"}]
     assert served.rig.content.info.name == "sparse"
+
+
+def test_a_place_given_while_the_scene_is_read_again_stays(served: Served, gate: threading.Event) -> None:
+    answers: list[dict[str, Any]] = []
+    request = {"command": "scene", "value": "demo"}
+    first = threading.Thread(target=lambda: answers.append(ask([served.server.path], request)))
+    first.start()
+    while "loading" not in served.status():
+        served.rig.presenter.refresh()
+    assert served.asked("place", {"scale": 1.5})["placing"]["scale"] == 1.5
+    gate.set()
+    while first.is_alive():
+        served.rig.presenter.refresh()
+    assert answers[0]["ok"] and answers[0]["placing"]["scale"] == 1.5
+    assert isinstance(served.rig.content, PlacedSource) and served.rig.content.placing.scale == 1.5
+    assert served.asked("model", "balanced")["placing"]["scale"] == 1.5
 
 
 @pytest.mark.usefixtures("gate")

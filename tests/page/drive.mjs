@@ -104,9 +104,6 @@ say("moved at once", (await statusIs((s) => Math.abs(s.placing.offset_m[1] - 0.0
   (await until(async () => (await page.textContent("#placed")).includes("place: done"))));
 await page.fill("#p-turntable", "6");
 say("turntable", await statusIs((s) => s.placing.turntable_per_min === 6 && Math.abs(s.placing.offset_m[1] - 0.06) < 1e-9));
-await page.fill("#p-up", "5000");
-say("a place where nothing is seen", (await until(async () => (await page.textContent("#placed")).includes("leaves nothing"))) &&
-  (await statusIs((s) => s.placing.offset_m[2] === 0)));
 await page.click("#place-reset");
 say("as configured", await statusIs((s) => s.placing.turntable_per_min === 0 && s.placing.offset_m[1] === 0));
 await page.fill("#model", "sart");

@@ -25,8 +25,7 @@ pytestmark = pytest.mark.slow
 CONTROLS = (
     "state is shown", "pictures are shown", "pause", "resume", "flat", "resume by the keyboard", "reload", "scene",
     "a scene that is not there", "scene back", "black box", "it says that the daemon is gone",
-    "moved at once", "turntable", "a place where nothing is seen",
-    "as configured", "another model", "the model back", "a playlist", "the next one",
+    "moved at once", "turntable", "as configured", "another model", "the model back", "a playlist", "the next one",
     "from a playlist to a scene", "a wish without a daemon is refused",
     "it goes on when it is back", "and without the old refusal", "fits 1280", "fits 390",
 )  # fmt: skip
