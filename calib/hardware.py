@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
+import cv2
 import numpy as np
+from rich.console import Console
+from rich.text import Text
 
 from calib.charts import Charts
 from calib.display import PanelDisplay, grey_layers, message_layers, open_display
@@ -35,6 +39,7 @@ Say = Callable[[str], None]
 Named = tuple[str, U8]  # a photograph (h, w), and what to call it
 Sample = tuple[int, EyePoints | None, str]  # when it was taken, eyes in frame `sensor`, the sensor's serial
 POLL_NS = 20 * NS_PER_MS
+TERMINAL_COLUMNS = 72  # of a picture in a terminal
 CARD_CHARACTERS = 32  # of a line on a card
 
 
@@ -227,8 +232,12 @@ class SimulatedHardware(SetupHardware):
         )
 
     def show_card(self, number: int, words: Sequence[str]) -> None:
-        """In the terminal: which panel the card is on, and how it looks."""
+        """In the terminal: the card as it stands before the person, and which panel it is on."""
         rotation_deg, mirror = self.mounted[number]
+        lines = [line for text in words for line in wrap(text, CARD_CHARACTERS)]
+        card = identity_card(self._stack.width_px, self._stack.height_px, title=f"SIM-{number}", lines=lines)
+        seen = card[::-1, ::-1] if rotation_deg else card
+        show_in_terminal(seen[:, ::-1] if mirror != "none" else seen)
         self._say(
             f"(simulated: it is panel {self.order[number]}; its arrow points {'down' if rotation_deg else 'up'}, its "
             f"writing {'is mirrored' if mirror != 'none' else 'reads rightly'})"
@@ -281,3 +290,17 @@ class SimulatedHardware(SetupHardware):
 
     def chart(self, settings: Settings) -> Callable[[Viewpoint], None] | None:
         return None
+
+
+def show_in_terminal(picture: U8) -> None:
+    """A picture (h, w, 4) as coloured half blocks, where stdout is a terminal."""
+    if not sys.stdout.isatty():
+        return
+    rows = round(TERMINAL_COLUMNS * picture.shape[0] / picture.shape[1] / 2) * 2
+    small = cv2.resize(np.ascontiguousarray(picture[..., :3]), (TERMINAL_COLUMNS, rows), interpolation=cv2.INTER_AREA)
+    text = Text()
+    for above, below in zip(small[::2].tolist(), small[1::2].tolist(), strict=True):
+        for (r, g, b), (s, h, c) in zip(above, below, strict=True):
+            text.append("▀", style=f"rgb({r},{g},{b}) on rgb({s},{h},{c})")
+        text.append("\n")
+    Console().print(text)

@@ -217,7 +217,7 @@ def processor_s(process: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def test_in_a_terminal_a_key_is_waited_for_without_work(tmp_path: Path) -> None:
+def test_a_simulated_card_is_shown_in_the_terminal_and_waiting_for_a_key_is_no_work(tmp_path: Path) -> None:
     terminal, other_end = pty.openpty()
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "TERM": "xterm-256color"}
     command = [sys.executable, "-m", "runtime.cli", "setup", "--simulate"]
@@ -231,6 +231,7 @@ def test_in_a_terminal_a_key_is_waited_for_without_work(tmp_path: Path) -> None:
                 while wanted not in shown:
                     shown += os.read(terminal, 65536)
                 os.write(terminal, key)
+            assert shown.count("▀".encode()) > 1000
             before = processor_s(running.pid)
             time.sleep(4)
             assert processor_s(running.pid) - before < 0.8
