@@ -42,7 +42,10 @@ log = logging.getLogger("phasestack.build")
 SWITCH_INTERVAL_S = 0.0005  # between Python threads: the presenter must not wait long for the solver's
 
 # Of summary.json: on the simulated clock these follow from what is configured, and nothing was measured.
-SIMULATED_FIGURES = ("seconds", "fps", "solutions_per_s", "interval_ms", "photon_ms", "stage_ms", "overhead_ms")
+SIMULATED_FIGURES = (
+    "seconds", "fps", "solutions_per_s", "interval_ms", "photon_ms", "stage_ms", "overhead_ms", "skew_ms",
+    "solution_age_ms",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
