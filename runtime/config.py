@@ -9,7 +9,7 @@ from __future__ import annotations
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, cast
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
     BaseModel,
@@ -450,9 +450,6 @@ def read_table(path: Path) -> dict[str, Any]:
 
 def validated(model: type[M], table: dict[str, Any], *, source: str | Path) -> M:
     """A table as settings. Raises InputError with every wrong field's full name, and what may have been meant."""
-    if "extra" not in model.model_config:  # a class of the user's own: a mistyped key is no default there either
-        strict = {"__module__": __name__, "model_config": {"extra": "forbid"}}
-        model = cast(type[M], type(model.__name__, (model,), strict))
     try:
         return model.model_validate(table)
     except ValidationError as error:

@@ -22,7 +22,7 @@ from runtime.optics.views import raster_from_stack
 from runtime.support import progress, untrusted_input
 from runtime.support.crash import written
 from runtime.support.plausible import nearest
-from runtime.support.plugins import is_plugin, plugin_class
+from runtime.support.plugins import is_plugin, plugin_class, strict
 
 MESHES = (".glb", ".gltf", ".obj", ".stl")
 PLAYLISTS = (".toml", ".json")
@@ -143,7 +143,7 @@ def _playlist(file: SceneFile) -> Opener:
 def _plugin(name: str, file: SceneFile) -> Opener:
     """A class of the user's own: imported and its options checked here, made and tried once with the context."""
     plugin = plugin_class(name, ContentSource, field="content.scene")
-    options = validated(plugin.Options, file.settings.options, source="content.options")
+    options = validated(strict(plugin.Options), file.settings.options, source="content.options")
 
     def make(context: Any) -> ContentSource:
         eye = np.array([0.6, 0.0, 0.0])

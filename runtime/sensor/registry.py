@@ -10,7 +10,7 @@ from runtime.errors import InputError, PhasestackError
 from runtime.sensor.base import Sensor
 from runtime.support.crash import written
 from runtime.support.plausible import nearest
-from runtime.support.plugins import is_plugin, plugin_class
+from runtime.support.plugins import is_plugin, plugin_class, strict
 
 
 def _replay(settings: SensorSettings, clock: Clock, latency_ms: float) -> Sensor:
@@ -62,7 +62,7 @@ def open_sensor(settings: SensorSettings, clock: Clock, *, latency_ms: float = 0
 
 def _plugin(name: str, settings: SensorSettings, clock: Clock) -> Sensor:
     plugin = plugin_class(name, Sensor, field="sensor.driver")
-    options = validated(plugin.Options, settings.options, source="sensor.options")
+    options = validated(strict(plugin.Options), settings.options, source="sensor.options")
     try:
         sensor: Sensor = plugin(options, clock=clock)
     except PhasestackError:

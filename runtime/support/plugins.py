@@ -7,6 +7,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
+
 from runtime.errors import InputError, one_line
 
 PLUGIN = re.compile(r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", re.ASCII)
@@ -43,3 +45,10 @@ def plugin_class(name: str, base: type, *, field: str) -> Any:
     if not (isinstance(found, type) and issubclass(found, base)):
         raise InputError(field, "", f"`{name}` is no class that derives from phasestack.{base.__name__}")
     return found
+
+
+def strict(options: type[BaseModel]) -> type[BaseModel]:
+    """A class's options, where a mistyped key is refused, unless the class itself says what becomes of such."""
+    if "extra" in options.model_config:
+        return options
+    return type(options.__name__, (options,), {"__module__": __name__, "model_config": {"extra": "forbid"}})
