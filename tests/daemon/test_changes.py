@@ -174,13 +174,19 @@ def test_content_that_can_t_be_loaded_is_refused_and_the_last_good_stays(
     assert "refused" not in served.status()
 
 
-def test_a_newer_scene_overtakes_one_that_is_being_loaded(served: Served, gate: threading.Event) -> None:
+def loading(served: Served, scene: str) -> tuple[threading.Thread, list[dict[str, Any]]]:
+    """Who asked for a scene that is being loaded by now, and the answer once it is there."""
     answers: list[dict[str, Any]] = []
-    request = {"command": "scene", "value": "texture"}
-    first = threading.Thread(target=lambda: answers.append(ask([served.server.path], request)))
-    first.start()
+    request = {"command": "scene", "value": scene}
+    asking = threading.Thread(target=lambda: answers.append(ask([served.server.path], request)))
+    asking.start()
     while "loading" not in served.status():
         served.rig.presenter.refresh()
+    return asking, answers
+
+
+def test_a_newer_scene_overtakes_one_that_is_being_loaded(served: Served, gate: threading.Event) -> None:
+    first, answers = loading(served, "texture")
     assert served.asked("scene", "sparse", meanwhile=gate.set)["ok"]
     first.join(30.0)
     assert answers == [{"ok": False, "error": "skipped: a newer change came"}]
@@ -188,12 +194,7 @@ def test_a_newer_scene_overtakes_one_that_is_being_loaded(served: Served, gate: 
 
 
 def test_a_place_given_while_the_scene_is_read_again_stays(served: Served, gate: threading.Event) -> None:
-    answers: list[dict[str, Any]] = []
-    request = {"command": "scene", "value": "demo"}
-    first = threading.Thread(target=lambda: answers.append(ask([served.server.path], request)))
-    first.start()
-    while "loading" not in served.status():
-        served.rig.presenter.refresh()
+    first, answers = loading(served, "demo")
     assert served.asked("place", {"scale": 1.5})["placing"]["scale"] == 1.5
     gate.set()
     while first.is_alive():
