@@ -1,4 +1,4 @@
-"""Whether windows and monitors are still what was bound: asked of the X server once a second.
+"""Whether windows and monitors are still what was bound: asked of the X server once a second, a question at a time.
 
 GLFW reports monitors that come and go and of windows that are asked to close or become another size. It doesn't
 report a window that somebody destroyed, unmapped or moved, nor a monitor that got another place or mode: what is shown
@@ -7,15 +7,16 @@ then is on the wrong panel, or on none, and every swap succeeds.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from runtime.clock import NS_PER_S, Clock
 from runtime.panels import xlib
 from runtime.panels.display import Display, Window
 from runtime.panels.monitors import Monitor, Rectangle
 
-EVERY_NS = NS_PER_S
+EVERY_NS = NS_PER_S  # a round of all questions
 REFRESH_TOLERANCE = 1e-3  # of a monitor's rate
 
 
@@ -29,9 +30,9 @@ class Surface:
 
 
 class PlacementWatch:
-    """Every window and every monitor is looked at once in EVERY_NS.
+    """Every window and every monitor is looked at once in EVERY_NS, one of them a call.
 
-    At once where the X server has refused a request since the last look: something has gone.
+    All at once where the X server has refused a request since the last look: something has gone.
     """
 
     def __init__(
@@ -42,20 +43,27 @@ class PlacementWatch:
         # Against what was there when it was bound; what came between binding and here differs from the monitor.
         self._states = [display.output_state(monitor.connector) for monitor in monitors]
         self._monitors = monitors
-        self._surfaces = surfaces
+        self._questions: list[Callable[[], str]] = [
+            *(partial(self._window_fault, surface) for surface in surfaces),
+            *(partial(self._monitor_fault, panel) for panel in range(len(monitors))),
+        ]
+        self._next = 0
         self._due_ns = clock.now_ns() + EVERY_NS
         self._refusals = xlib.refusals()
 
     def look(self) -> str:
-        """What is wrong, with which panel; empty: nothing, or it is not time to look."""
+        """What is wrong, with which panel; empty: nothing, or no question was due."""
+        if xlib.refusals() != self._refusals:
+            faults = [fault for fault in (question() for question in self._questions) if fault]
+            self._refusals = xlib.refusals()  # after the questions: those about what has gone are refused too
+            return "; ".join(faults)
         now_ns = self._clock.now_ns()
-        if now_ns < self._due_ns and xlib.refusals() == self._refusals:
+        if now_ns < self._due_ns:
             return ""
-        self._due_ns = now_ns + EVERY_NS
-        faults = [self._window_fault(surface) for surface in self._surfaces]
-        faults += [self._monitor_fault(panel) for panel in range(len(self._monitors))]
-        self._refusals = xlib.refusals()  # after the questions: those about what has gone are refused too
-        return "; ".join(filter(None, faults))
+        self._due_ns = now_ns + EVERY_NS // len(self._questions)
+        question = self._questions[self._next]
+        self._next = (self._next + 1) % len(self._questions)
+        return question()
 
     def _window_fault(self, surface: Surface) -> str:
         state = self._display.window_state(surface.window)

@@ -43,7 +43,7 @@ class WindowPanels(PanelSink):
     turn would divide the rate by N. `skew_ms` is the time between the first and the last return from a swap;
     what it can't know is how far the monitors' own blanks lie apart (`kind = "span"` has one swap).
 
-    Once a second every window and monitor is compared with what was bound (some 0.1 ms each).
+    Once a second every window and monitor is compared with what was bound (a question a refresh, some 0.1 ms).
     Where a monitor, a window or the context is lost or became another, every window is closed, `present` raises
     PanelLost, and a later `present` builds it anew: half a second later, or as soon as X says that a missing
     monitor is there. A hidden window's context, which all share, stays unless it is what was lost: what a solver
