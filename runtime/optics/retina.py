@@ -144,11 +144,6 @@ def panel_positions(
     return u.astype(np.float32), v.astype(np.float32)
 
 
-def ray_mask(eye_m: ArrayLike, stack: PanelStack, *, width_px: int, height_px: int, fov_deg: float) -> Mask:
-    """(h, w) True where the ray goes towards the panels (not away behind the eye)."""
-    return Rays.of_eye(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg).toward_panels()
-
-
 def seen_by(
     eye_m: ArrayLike,
     layers: U8 | F32,
@@ -171,12 +166,6 @@ def seen_by(
     return through_layers(
         layers, lambda rows: (rays.on(panel, rows, moved=m) for panel, m in panels), rays.toward_panels(), stack
     )
-
-
-def layer_from_image(stack: PanelStack, index: int, eye_m: F64, from_stack: F64) -> F64:
-    """3x3 the pixels of a panel's layer from those of an eye's image with projection `from_stack` (3x4) (M_RPU)."""
-    matrix, moved = panel_from_image(from_stack, stack.panel(index)), _moved(stack, index, eye_m)
-    return matrix if moved is None else np.asarray(moved @ matrix, np.float64)
 
 
 def _moved(stack: PanelStack, index: int, eye_m: F64) -> F64 | None:

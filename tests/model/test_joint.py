@@ -124,7 +124,8 @@ def test_many_steps_with_momentum_do_not_diverge() -> None:
 
 def light_mse(layers: U8, pictures: list[U8], pair: F64, stack: PanelStack, rays: int) -> float:
     """Mean squared error of the mean light of `rays` by `rays` rays a picture's pixel, panels' pixels being boxes."""
-    from runtime.optics.retina import layer_from_image
+    from runtime.optics.rpu import panel_from_image
+    from runtime.optics.tilt import layer_from_seen, layer_pixels_from_seen
 
     height, width = pictures[0].shape[:2]
     v, u = np.mgrid[0:height, 0:width] + 0.5
@@ -137,7 +138,9 @@ def light_mse(layers: U8, pictures: list[U8], pair: F64, stack: PanelStack, rays
             for right in offsets:
                 total = np.zeros((height, width, 3))
                 for n in range(3):
-                    matrix = layer_from_image(stack, n, eye, projection)
+                    panel = stack.panel(n)
+                    layer = layer_pixels_from_seen(panel, layer_from_seen(stack, n, eye))
+                    matrix = layer @ panel_from_image(projection, panel)
                     x, y, w = (row[0] * (u + right) + row[1] * (v + down) + row[2] for row in matrix)
                     x, y = x / w, y / w
                     inside &= (x > 0.5) & (x < stack.width_px - 0.5) & (y > 0.5) & (y < stack.height_px - 0.5)
