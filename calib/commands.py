@@ -131,7 +131,7 @@ def capture(
     """Pair each chart's viewpoint with where the sensor sees the eyes. Every accepted pair is on disk at once.
 
     Live: at each chart move until the lines fuse, then press Enter (n: next, p: previous, whose pair Enter
-    replaces, q: stop); after three places that are not on a line it says where to go.
+    replaces, q: stop).
     A recording must know its true eyes, as the demo does.
 
     Example: phasestack calibrate capture --config /etc/phasestack/phasestack.toml --show --out pairs.csv
@@ -184,14 +184,14 @@ def report(
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show a calibration's error at every point, and camera, panels and points from above and from the side.
+    """Show a calibration's figures, and its error at every point.
 
     Example: phasestack calibrate report calibration.toml --out report
     """
     from calib.report import write_report
 
     settings = _settings(config)
-    summary = write_report(file, out, stack=settings.stack.stack(), viewing=settings.calibration)
+    summary = write_report(file, out, viewing=settings.calibration)
     _report(summary, str(out / "index.html"), as_json)
 
 

@@ -1,21 +1,39 @@
-"""`calibrate report`: the error of every point (seed's figure S5), and camera, panels and points, on one page."""
+"""`calibrate report`: the error of every point (seed's figure S5), and all other figures, on one page."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import model_validator
 
 from calib.checks import RESIDUAL_LIMIT_M
-from calib.figures import Points, geometry_figure, residual_figure
 from calib.viewpoints import viewing_volume_m
 from runtime.config import CalibrationSettings, read_table, validated
 from runtime.eyes.calibration import Calibration, Lenient, Vector3, load_calibration, similarity_defect
-from runtime.optics.stack import PanelStack
 from runtime.records import F64
 from runtime.report.page import Figure, Page, Section, section_of
+from runtime.report.plots import drawing, png
+
+COLOURS = {"X": "#c0392b", "Y": "#27803b", "Z": "#2260a8"}
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """The pairs behind a calibration."""
+
+    names: tuple[str, ...]
+    stack_m: F64  # (K, 3) known
+    fitted_m: F64  # (K, 3) where the calibration puts them, frame `stack`
+    used: NDArray[np.bool_]  # (K,)
+
+    @property
+    def residual_m(self) -> F64:
+        """(K, 3) calibrated minus known."""
+        return self.fitted_m - self.stack_m
 
 
 class StoredPairs(Lenient):
@@ -34,22 +52,21 @@ class StoredPairs(Lenient):
         return self
 
 
-def write_report(file: Path, out: Path, *, stack: PanelStack, viewing: CalibrationSettings) -> dict[str, Any]:
+def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict[str, Any]:
     """Write `index.html`, its PNGs and `report.json`. Raises InputError."""
     calibration, table = load_calibration(file), read_table(file)
     points = _stored_points(table.get("data"), calibration, source=file)
     summary = _summary(calibration, points, viewing_volume_m(viewing))
-    sections = [
-        section_of("Numbers", _numbers(summary)),
-        Section("Pictures", figures=_pictures(calibration, points, stack)),
-    ]
+    sections = [section_of("Numbers", _numbers(summary))]
     notes = [*calibration.warnings]
     if isinstance(table.get("warnings"), list):
         notes += [str(text) for text in table["warnings"]]
     if points is None:
         notes.append("This file holds no pairs (or too many): the error of each point is not known.")
     else:
-        sections.append(section_of("Points", _point_rows(points)))
+        text = "X, Y and Z error of every calibration point (the EyeReal supplement's figure S5)"
+        figure = Figure("residuals", residual_figure(points, limit_m=RESIDUAL_LIMIT_M), text)
+        sections += [Section("Pictures", figures=[figure]), section_of("Points", _point_rows(points))]
     if calibration.file.covariance is None:
         notes.append("This file holds no covariance: the error at the eye is not known.")
     lead = "Where the depth camera stands before the stack of panels, and how well that is known."
@@ -65,14 +82,29 @@ def _stored_points(data: Any, calibration: Calibration, *, source: Path) -> Poin
     return Points(found.names, np.array(found.stack_m), calibration.points(found.sensor_m), np.array(found.used))
 
 
-def _pictures(calibration: Calibration, points: Points | None, stack: PanelStack) -> list[Figure]:
-    found = []
-    if points is not None:
-        text = "X, Y and Z error of every calibration point (the EyeReal supplement's figure S5)"
-        found.append(Figure("residuals", residual_figure(points, limit_m=RESIDUAL_LIMIT_M), text))
-    text = "Camera, panels and points; the arrow is the camera's line of sight"
-    found.append(Figure("geometry", geometry_figure(calibration.stack_from_sensor, stack, points), text))
-    return found
+def residual_figure(points: Points, *, limit_m: float) -> bytes:
+    """X, Y, Z error of every calibration point (the EyeReal supplement's figure S5), millimetres."""
+    residual_m, used = points.residual_m, points.used
+    with drawing(9, 6.5) as canvas:
+        axes = canvas.subplots(nrows=3, sharex=True, sharey=True)
+        numbers = np.arange(1, len(residual_m) + 1)
+        largest = 1e3 * max(float(np.abs(residual_m[used]).max(initial=0.0)), 1e-6)
+        for panel, (name, colour), values in zip(axes, COLOURS.items(), residual_m.T * 1e3, strict=True):
+            shown = np.clip(values, -2 * largest, 2 * largest)
+            panel.vlines(numbers[used], 0, shown[used], color=colour, linewidth=2, label="used")
+            panel.vlines(numbers[~used], 0, shown[~used], color="#bbbbbb", linewidth=2,
+                         label="rejected (may be cut off)")  # fmt: skip
+            rms = float(np.sqrt((values[used] ** 2).mean()))
+            panel.axhline(0, color="#222222", linewidth=0.8)
+            panel.set(ylabel=f"{name} error (mm)", title=f"{name}: RMS {rms:.2f} mm")
+            if limit_m * 1e3 < 2 * largest:
+                for limit_mm in (-limit_m * 1e3, limit_m * 1e3):
+                    panel.axhline(limit_mm, color="#c0392b", linestyle="--", linewidth=0.8)
+        if (~used).any():
+            axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, fontsize=8, frameon=False)
+        axes[-1].set_xlabel("calibration point")
+        canvas.suptitle("What the calibration makes of each point, less where it truly was", fontsize=11)
+        return png(canvas)
 
 
 def _summary(calibration: Calibration, points: Points | None, volume_m: F64) -> dict[str, Any]:

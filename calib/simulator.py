@@ -2,8 +2,7 @@
 
 Every ray of the camera crosses every panel where that panel truly is; the panels' phases along it add up and
 sin² of the sum is what is seen (EyeReal, (7)). The lens distorts (Brown), darkens the corners and is out of focus; the
-panels' pixel grids beat with each other and with the sensor's (moiré); the sensor adds shot and read noise; the
-picture has a tone curve, eight bits and JPEG's losses.
+sensor adds shot and read noise; the picture has a tone curve, eight bits and JPEG's losses.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ APERTURE_PX = 0.5  # of the sensor's pixels, on the panels: standard deviation
 BLUR_PX = 0.7  # standard deviation: lens, focus and the sensor's own pixels
 ELECTRONS, READ_NOISE = 4000.0, 0.003  # at full scale: shot noise; of full scale
 VIGNETTING = 0.3  # loss of light in the corners
-GRID = 0.05  # depth to which the grid between a panel's pixels still modulates the light that is sampled
 GAMMA = 2.2  # of the camera's tone curve
 JPEG_QUALITY = 92
 
@@ -155,15 +153,13 @@ def photograph(
 def _light(scene: Scene, layers: Sequence[U8], pose: F64, exposure: Exposure, x: F32, y: F32) -> F32:
     """(h, w) light along the rays with x/z and y/z, before the lens softens it."""
     total = np.zeros(x.shape, np.float32)
-    passes = np.ones(x.shape, np.float32)
     kind = cv2.INTER_LINEAR if exposure.samples == 1 else cv2.INTER_NEAREST
     inside = np.ones(x.shape, bool)
     for index in range(len(scene.panels)):
         u, v = crossing(scene, index, pose, x, y)
         total += cv2.remap(layers[index], u - np.float32(0.5), v - np.float32(0.5), kind).astype(np.float32)
         inside &= (u > 0) & (u < scene.stack.width_px) & (v > 0) & (v < scene.stack.height_px)
-        passes *= _grid(u) * _grid(v)
-    light = exposure.dark + intensity_from_phase(total * np.float32(1 / 255)) * passes
+    light = exposure.dark + intensity_from_phase(total * np.float32(1 / 255))
     return np.asarray(light * inside, dtype=np.float32)
 
 
@@ -178,12 +174,6 @@ def crossing(scene: Scene, index: int, pose: F64, x: F32, y: F32) -> tuple[F32, 
     h = (h / h[2, 2]).astype(np.float32)
     weight = h[2, 0] * x + h[2, 1] * y + h[2, 2]
     return (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / weight, (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / weight
-
-
-def _grid(position: F32) -> F32:
-    """Light that a panel's pixels let through along one axis: least between two pixels."""
-    found: F32 = np.float32(1 - GRID / 2) - np.float32(GRID / 2) * np.cos(np.float32(2 * np.pi) * position)
-    return found
 
 
 def _developed(light: F32, lens: Lens, exposure: Exposure, random: np.random.Generator) -> U8:

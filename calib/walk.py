@@ -1,4 +1,4 @@
-"""The person's way through the viewpoints: what each key does, where to go, when a pair is good enough to keep."""
+"""The person's way through the viewpoints: what each key does, when a pair is good enough to keep."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib.keys import Key
-from calib.pairs import PairRow, PairsFile, points_of
-from calib.similarity import Degenerate, Similarity, extents, fit
+from calib.pairs import PairRow, PairsFile
 from calib.viewpoints import Viewpoint
 from runtime.clock import NS_PER_S
 from runtime.records import F64, EyePoints
@@ -20,12 +19,6 @@ MAX_SPREAD_M = 0.010  # eyes that moved or scattered by more meanwhile make no p
 MIN_SAMPLES = 5
 MIN_CONFIDENCE = 0.3
 MAD_TO_SIGMA = 1.4826
-
-HERE = "here: till the lines fuse; then Enter"
-GUIDE_NS = NS_PER_S // 2  # between two words of guidance
-MIN_PAIRS = 3  # that show roughly where the camera stands
-MIN_WIDTH_M = 0.02  # of these across their longest direction: nearly a line leaves the turn about it open
-NEAR_M = 0.015  # nearer than this the lines themselves are the better guide
 
 
 def midpoint(eyes: EyePoints | None) -> F64 | None:
@@ -64,37 +57,6 @@ class EyeWindow:
         return centre, float(np.linalg.norm(mad_m))
 
 
-def rough_similarity(sensor_m: F64, stack_m: F64) -> Similarity | None:
-    """`stack_from_sensor` of the pairs so far, metres on both sides; None where they do not determine it yet."""
-    if len(sensor_m) < MIN_PAIRS or extents(stack_m)[1] < MIN_WIDTH_M:
-        return None
-    try:
-        return fit(sensor_m, stack_m, rule=1.0)
-    except Degenerate:
-        return None
-
-
-def way_to(viewpoint_m: F64, eyes_m: F64) -> str:
-    """The way from where the eyes (3,) are to a viewpoint (3,), frame `stack`, as "7 cm to the right, 3 cm nearer".
-
-    Empty where they are there.
-    """
-    step_m = np.asarray(viewpoint_m) - eyes_m
-    if np.linalg.norm(step_m) < NEAR_M:
-        return ""
-    words: Sequence[tuple[float, str, str]] = (
-        (float(step_m[1]), "to the right", "to the left"),
-        (float(step_m[2]), "up", "down"),
-        (float(step_m[0]), "farther away", "nearer"),
-    )
-    parts = [
-        f"{abs(round(100 * distance))} cm {positive if distance > 0 else negative}"
-        for distance, positive, negative in words
-        if abs(round(100 * distance)) >= 1
-    ]
-    return ", ".join(parts)
-
-
 class Walk:
     """The person's way through the viewpoints. No clock, no threads."""
 
@@ -113,9 +75,6 @@ class Walk:
         self._index = 0
         self._serial = ""
         self._accepted = 0
-        self._rough = rough_similarity(*points_of(file.rows))
-        self._guided_ns = 0
-        self._guide = ""
         self.finished = not self._left
 
     @property
@@ -136,8 +95,6 @@ class Walk:
             return
         self._serial = serial
         self._window.add(capture_ns, eyes)
-        if capture_ns - self._guided_ns >= GUIDE_NS:
-            self._say_way(capture_ns)
 
     def press(self, key: Key | None) -> None:
         """Do what a key says; None: nothing was pressed."""
@@ -177,24 +134,11 @@ class Walk:
             PairRow.of(middle_m, viewpoint.midpoint_m, viewpoint.name, serial=self._serial, spread_mm=spread)
         )
         self._accepted += 1
-        self._rough = rough_similarity(*points_of(self._file.rows))
         self._say(f"{viewpoint.name}: taken, spread {spread} mm, {len(self._file)} pairs in all")
         if self._index + 1 == len(self._left):
             self.finished = True
         else:
             self._go(1)
-
-    def _say_way(self, now_ns: int) -> None:
-        """Where to move, as soon as three pairs show roughly where the camera stands."""
-        seen = self._window.measure()
-        if self._rough is None or seen is None:
-            return
-        self._guided_ns = now_ns
-        eyes_m = self._rough.points(seen[0][None])[0]
-        way = way_to(self.current.midpoint_m, eyes_m) or HERE
-        if way != self._guide:
-            self._guide = way
-            self._say(way)
 
     def _go(self, step: int) -> None:
         index = min(max(self._index + step, 0), len(self._left) - 1)

@@ -102,21 +102,6 @@ def test_a_viewpoint_is_taken_anew_from_the_one_after_it(tmp_path: Path) -> None
     np.testing.assert_allclose(pairs.sensor_m, [eyes_at(grid()[0].midpoint_m).eyes_m.mean(0)], atol=1e-8)
 
 
-def test_after_three_pairs_a_person_is_told_where_to_go(tmp_path: Path) -> None:
-    said: list[str] = []
-    chosen = [grid()[number] for number in (0, 2, 6, 13)]
-    person = Walk(PairsFile(tmp_path / "p.csv"), chosen, say=said.append)
-    for number, viewpoint in enumerate(chosen[:3]):
-        stand(person, viewpoint.midpoint_m, start_ns=number * NS_PER_S)
-        assert not any("cm to the" in text and "Enter" not in text for text in said)
-        person.press(Key.ACCEPT)
-    wanted = chosen[3].midpoint_m
-    stand(person, wanted + np.array([0.03, -0.07, 0.0]), start_ns=10 * NS_PER_S)
-    assert said[-1] == "7 cm to the right, 3 cm nearer"
-    stand(person, wanted, start_ns=12 * NS_PER_S)
-    assert said[-1].startswith("here")
-
-
 def recording(path: Path, places: list[np.ndarray], *, true: bool) -> Path:
     """A second at each place."""
     with recording_to(path, RecordingHeader(driver="openni2", serial="A1")) as writer:
