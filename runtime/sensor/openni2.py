@@ -17,14 +17,14 @@ from runtime.errors import EndOfRecording, InputError, SensorLost, SensorTimeout
 from runtime.records import U8, U16, Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
 from runtime.sensor.device_clock import DeviceClock
-from runtime.sensor.openni2_library import load, needs
+from runtime.sensor.openni2_library import load
 from runtime.sensor.persistent_thread import PersistentThread, borrowed, give_back
 
 SERIAL_PROPERTY = 3
 DEPTH_1_MM, DEPTH_100_UM, RGB888, GRAY8 = 100, 101, 200, 202
 PAIR_APART_US = 40_000  # depth and colour of one instant are no further apart: a period of a camera without sync
 PAIR_WAIT_S = 0.02
-THREADS_STOP_S = 0.5  # fifteen periods of a test device's threads: on a busy machine three were too few (crashes)
+THREADS_STOP_S = 0.5  # fifteen periods of a file's threads: on a busy machine three were too few (crashes)
 DRAIN_MAX = 32  # frames that are passed over in one call: a queue can't keep us
 
 log = logging.getLogger(__name__)
@@ -46,7 +46,7 @@ class OpenNI2Driver(Sensor):
     capabilities = Capabilities(colour=True, depth=True)
 
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
-        """settings.source: `demo` or empty for the only camera, a serial number, a device URI, `Dummy`, or a .oni."""
+        """settings.source: `demo` or empty for the only camera, a serial number, a device URI, or a .oni."""
         self._settings, self._clock = settings, clock
         self._thread: PersistentThread | None = None  # while it is open
         self._openni: Any = None
@@ -70,7 +70,7 @@ class OpenNI2Driver(Sensor):
         source = self._settings.source
         if source.endswith(".oni") and not Path(source).is_file():
             raise InputError(source, "", "cannot be read")
-        self._openni = load(source, self._settings.openni2_folder)
+        self._openni = load(self._settings.openni2_folder)
         try:
             self._device = self._find_device()
             self._start_streams()
@@ -81,7 +81,7 @@ class OpenNI2Driver(Sensor):
 
     def _find_device(self) -> Any:
         source, openni = self._settings.source, self._openni
-        if source == "Dummy" or source.endswith(".oni"):
+        if source.endswith(".oni"):
             return openni.Device(source.encode())
         uris = openni.Device.enumerate_uris()
         wanted = self.serial or ("" if source in ("", "demo", "any") else source)
@@ -217,7 +217,7 @@ class OpenNI2Driver(Sensor):
         device, self._device = self._device, None
         for stream in streams.values():
             _quietly(stream.stop)
-        if streams and needs(self._settings.source) == "test":
+        if streams and self._settings.source.endswith(".oni"):
             # Their threads are told to stop but not waited for: without a pause they write to freed memory.
             time.sleep(THREADS_STOP_S)
         for handle in (*streams.values(), device):

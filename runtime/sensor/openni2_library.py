@@ -2,7 +2,7 @@
 
 The `openni` package wants a folder with `libOpenNI2.so` and `OpenNI2/Drivers/`, which distributions install under
 other names; a folder of links serves. Drivers are pinned in memory: some leave threads running when their device is
-closed (the Dummy does), which crash the process when the library unmaps their code on its way out.
+closed, which crash the process when the library unmaps their code on its way out.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ LIBRARY_FOLDERS = (
     "/usr/lib",
     "/usr/local/lib",
 )
-DUMMY, FILE = "DummyDevice", "OniFile"
+DUMMY = "DummyDevice"  # sample code, whose device is there beside every camera
 INSTALL = "OpenNI2 is not installed (Debian: apt install libopenni2-0), or set sensor.openni2_folder"
 
 _lock = threading.Lock()
-_loaded: str | None = None
+_loaded = False
 
 
 def find_library(folder: str = "") -> tuple[Path, Path]:
@@ -42,32 +42,23 @@ def find_library(folder: str = "") -> tuple[Path, Path]:
     raise MissingPart(f"{folder}: holds no libOpenNI2.so beside OpenNI2/Drivers" if folder else INSTALL)
 
 
-def needs(source: str) -> str:
-    """Which drivers a source needs: those of test devices and files, or those of cameras."""
-    return "test" if source == "Dummy" or source.endswith(".oni") else "cameras"
-
-
-def load(source: str, folder: str = "") -> Any:
+def load(folder: str = "") -> Any:
     """The `openni.openni2` module with its library loaded. Raises MissingPart, SensorLost."""
     global _loaded
     try:
         from openni import openni2
     except ImportError:
         raise MissingPart("the Python package `openni` is not installed") from None
-    kind = needs(source)
     with _lock:
-        if _loaded == kind:
+        if _loaded:
             return openni2
-        if _loaded is not None:
-            raise SensorLost(f"OpenNI2 is in use for {_loaded}: start again to use it for {kind}")
         library, drivers = find_library(folder)
         links = Path(tempfile.mkdtemp(prefix="phasestack-openni2-"))
         atexit.register(shutil.rmtree, links, ignore_errors=True)
         (links / "OpenNI2" / "Drivers").mkdir(parents=True)
         (links / "libOpenNI2.so").symlink_to(library)
         for file in sorted(drivers.glob("lib*.so*")):
-            is_test = DUMMY in file.name or FILE in file.name
-            if is_test == (kind == "test") or FILE in file.name:
+            if DUMMY not in file.name:
                 # Debian's library looks for lib*.so.0, the original for lib*.so.
                 for name in {file.name, f"{file.name.split('.so')[0]}.so", f"{file.name.split('.so')[0]}.so.0"}:
                     (links / "OpenNI2" / "Drivers" / name).symlink_to(file)
@@ -77,5 +68,5 @@ def load(source: str, folder: str = "") -> Any:
             raise SensorLost(f"OpenNI2 cannot be started: {error}") from None
         for file in (links / "OpenNI2" / "Drivers").iterdir():
             ctypes.CDLL(str(file), mode=os.RTLD_NOW | os.RTLD_NODELETE)
-        _loaded = kind
+        _loaded = True
         return openni2

@@ -6,7 +6,6 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
 from enum import StrEnum
 
 from runtime.clock import NS_PER_S, Clock
@@ -14,7 +13,6 @@ from runtime.config import SensorSettings
 from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout, TransientError
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
-from runtime.sensor.device_clock import DeviceClock
 from runtime.sensor.samples import FindEyes, Samples, finder, searched
 from runtime.support.transient import is_retryable
 
@@ -52,7 +50,6 @@ class _Attempt:
         self.wait_s, self.deadline_ns = wait_s, deadline_ns
         self.thread = threading.Thread(target=run, args=(self,), name=f"sensor-{number}", daemon=True)
         self.received = 0
-        self.times: DeviceClock | None = None  # of stamps that are not of this machine's clock
 
 
 class SensorWorker(Samples):
@@ -238,6 +235,9 @@ class SensorWorker(Samples):
                 if timeouts >= TIMEOUTS_TO_REOPEN:
                     raise SensorLost(f"nothing new for {timeouts * s.timeout_s:g} s") from error
                 continue
+            age_ns = self._clock.now_ns() - frames[-1].capture_ns
+            if not attempt.received and not -AHEAD_NS <= age_ns <= BEHIND_NS:
+                raise FatalError(f"captures are stamped {-age_ns / NS_PER_S:+.3f} s from now, not by the run's clock")
             overtaken = 0 if find is None else len(frames) - 1  # a search takes a camera's period: only the newest
             frames = [searched(frame, find, keep_images=self._keep_images) for frame in frames[overtaken:]]
             attempt.received, timeouts = attempt.received + 1, 0
@@ -246,23 +246,9 @@ class SensorWorker(Samples):
                     return
                 self._skipped += overtaken
                 for frame in frames:
-                    self._keep(self._dated(frame, attempt))
+                    self._keep(frame)
             if self._state is not SensorState.RUNNING:
                 self._set(attempt, SensorState.RUNNING, "")
-
-    def _dated(self, frame: SensorFrame, attempt: _Attempt) -> SensorFrame:
-        """With a capture on this machine's clock: a driver's stamps may be ahead of it, or of a clock of its own.
-
-        From the first such stamp on, all of that driver are dated by when the quickest of them arrive.
-        """
-        now_ns = self._clock.now_ns()
-        if attempt.times is None and not -AHEAD_NS <= now_ns - frame.capture_ns <= BEHIND_NS:
-            ahead_s = (frame.capture_ns - now_ns) / NS_PER_S
-            log.warning("sensor: captures are stamped %+.3f s from now: they are dated by their arrival", ahead_s)
-            attempt.times = DeviceClock()
-        if attempt.times is None:
-            return frame
-        return replace(frame, capture_ns=attempt.times.host_ns(frame.capture_ns, arrival_ns=now_ns))
 
     def _keep(self, frame: SensorFrame) -> None:
         """Let a sample wait to be read; where too many wait, the oldest goes."""

@@ -50,7 +50,6 @@ class Plan:
         self.eyes_m = np.array([[0.7, -0.031, 0.0], [0.7, 0.031, 0.0]])
         self.sway_m = 0.002
         self.noise_m = 0.0  # standard deviation of each axis of each eye
-        self.clock_jump_ns = 0
 
 
 class FragileDriver(Sensor):
@@ -78,7 +77,7 @@ class FragileDriver(Sensor):
         self._sequence += 1
         eyes_m = self._plan.eyes_m + np.array([0.0, self._plan.sway_m * np.sin(self._sequence / 10), 0.0])
         eyes_m = eyes_m + self._random.normal(0.0, self._plan.noise_m, (2, 3))
-        capture_ns = self._clock.now_ns() + self._plan.clock_jump_ns
+        capture_ns = self._clock.now_ns()
         return SensorFrame(self._sequence, capture_ns, EyePoints(eyes_m, np.ones(2)))
 
     def close(self) -> None:

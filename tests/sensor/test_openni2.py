@@ -1,8 +1,7 @@
-"""The real OpenNI2 library: its Dummy device, and recordings that the test makes itself."""
+"""The real OpenNI2 library, on recordings that the test makes itself."""
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -83,30 +82,6 @@ def test_what_is_no_recording_or_holds_no_library_is_named(tmp_path: Path, conte
         driver_for(tmp_path / "none.oni").open()
     with pytest.raises(MissingPart, match=str(tmp_path)):
         find_library(str(tmp_path))
-
-
-DUMMY = """
-import json
-from runtime.clock import MonotonicClock
-from runtime.config import SensorSettings
-from runtime.sensor.openni2 import OpenNI2Driver
-driver = OpenNI2Driver(SensorSettings(driver="openni2", source="Dummy", fov_deg=60), MonotonicClock())
-driver.open()
-frames = [driver.read_newest(1.0) for _ in range(8)]
-print(json.dumps([[f.sequence, f.capture_ns, f.depth_mm.shape, f.colour is not None and f.colour.shape,
-                   f.intrinsics.fx_px] for f in frames]), flush=True)
-driver.close()
-"""
-
-
-def test_the_dummy_device_of_the_library_delivers_both_streams() -> None:
-    # In a process of its own: the Dummy is sample code, and has been seen to crash another device's process.
-    answer = subprocess.run([sys.executable, "-c", DUMMY], capture_output=True, timeout=60, text=True)
-    frames = json.loads(answer.stdout)
-    assert all(frame[2] == [240, 320] for frame in frames)
-    assert [240, 320, 3] in [frame[3] for frame in frames]
-    assert frames[0][4] == pytest.approx(160 / np.tan(np.radians(30)))
-    assert np.diff([frame[0] for frame in frames]).min() >= 1 and np.diff([frame[1] for frame in frames]).min() > 0
 
 
 NO_CAMERA = """
