@@ -197,7 +197,7 @@ class ContentSettings(Section):
     background: tuple[Unit, Unit, Unit] | None = Field(
         None, description="colour behind the scene, 0-1; without: dark, and white behind the built-in scenes"
     )
-    file: str = Field("", description="a preset's data: its .ply or .glb, or its data-set folder; empty: a stand-in")
+    file: str = Field("", description="a preset's data: its .ply or .glb, or its data-set folder")
     layout: Annotated[str, Field(pattern=LAYOUT)] = Field(
         "auto",
         description="how a picture or video holds its views: mono, side-by-side, top-bottom, half-side-by-side, "

@@ -12,7 +12,7 @@ from runtime.support.options import number
 app = typer.Typer(
     no_args_is_help=True,
     help="Tell the running daemon what to do between two of its turns. Exits with 1 where no daemon answers.\n\n"
-    "Example: phasestack ctl scene lego_bulldozer",
+    "Example: phasestack ctl scene demo",
 )
 
 ANSWERS_WITHIN_S = 70.0  # a scene or a model is loaded first: longer than the daemon itself waits for that
@@ -27,7 +27,7 @@ def scene(
     config: Config = None,
     socket: Socket = None,
 ) -> None:
-    """Show another scene: a preset's name, `demo`, or a file or folder (`./NAME`) of this machine.
+    """Show another scene: a built-in one, such as `demo`, or a file or folder (`./NAME`) of this machine.
 
     The present scene goes on while it is loaded, and stays where it can't be: then this exits with 2 and one line.
 

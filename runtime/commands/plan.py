@@ -13,7 +13,7 @@ from runtime.support.options import blame_option, number
 
 def plan(
     config: Annotated[Path | None, typer.Option(help="TOML file; see `phasestack config`")] = None,
-    scene: Annotated[str | None, typer.Option(help="a preset's name, a built-in scene, a file or folder")] = None,
+    scene: Annotated[str | None, typer.Option(help="a built-in scene, a file or folder")] = None,
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
     scale: Annotated[float, number(0.05, 2.0, help="panel resolution, times the configured one")] = 1.0,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,

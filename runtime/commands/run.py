@@ -24,7 +24,7 @@ def run(
         bool, typer.Option("--max-speed", help="a recording on a simulated clock, no waiting: reproducible")
     ] = False,
     out: Annotated[Path | None, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = None,
-    scene: Annotated[str | None, typer.Option(help="a built-in scene, a preset's name, a file or folder")] = None,
+    scene: Annotated[str | None, typer.Option(help="a built-in scene, a file or folder")] = None,
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
     scale: Annotated[float, number(0.05, 2.0, help="panel resolution, times the configured one")] = 1.0,
     backend: Annotated[

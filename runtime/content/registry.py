@@ -60,9 +60,9 @@ def _prepared(file: SceneFile) -> Opener:
     if name in SCENES:
         return _built_in(name, file)
     if name in preset_names():
-        if settings.file:
-            return _from_path(replace(file, path=Path(settings.file), preset=name))
-        return _built_in("demo", file, stands_for=name)
+        if not settings.file:
+            raise InputError("content", "file", f"is needed: {name}'s .ply, .glb or data-set folder, which is not shipped")
+        return _from_path(replace(file, path=Path(settings.file), preset=name))
     if "://" in name or name.startswith("/dev/video"):
         from runtime.content import stream
 
@@ -109,21 +109,16 @@ def _from_path(file: SceneFile) -> Opener:
     return rgbd.prepare(file) if is_rgbd else pictures.prepare(file)
 
 
-def _built_in(name: str, file: SceneFile, *, stands_for: str = "") -> Opener:
-    """stands_for: the preset in whose place it is shown: the paper's scenes are not shipped."""
+def _built_in(name: str, file: SceneFile) -> Opener:
     from runtime.content.procedural import ProceduralSource, parts_of
 
     scene = SCENES[name]()
     parts = parts_of(scene)
 
-    def make(context: Any) -> ContentSource:
-        background = file.settings.background
-        source = ProceduralSource(scene, stack=file.stack, context=context, background=background, parts=parts)
-        if stands_for:
-            source.info = replace(source.info, name=f"{stands_for} (stand-in `{name}`: content.file is empty)")
-        return source
-
-    return make
+    background = file.settings.background
+    return lambda context: ProceduralSource(
+        scene, stack=file.stack, context=context, background=background, parts=parts
+    )
 
 
 def _playlist(file: SceneFile) -> Opener:

@@ -12,11 +12,10 @@ LIBRARY_MOST, LIBRARY_LOOKED_AT = 200, 2000
 
 
 def scene_names() -> tuple[str, ...]:
-    """Every scene that is no file."""
-    from runtime.content.presets import preset_names
+    """The built-in scenes."""
     from runtime.content.scenes import SCENES
 
-    return (*SCENES, *preset_names())
+    return tuple(SCENES)
 
 
 def library_scenes(settings: ContentSettings) -> tuple[str, ...]:

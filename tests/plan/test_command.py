@@ -52,13 +52,6 @@ def test_a_wrong_scene_is_one_line(tmp_path: Path) -> None:
     assert isinstance(done.exception, InputError)
 
 
-@pytest.mark.parametrize("name", ["lego_bulldozer", "street"])
-def test_a_preset_without_its_data_shows_a_stand_in_and_says_so(name: str) -> None:
-    done = runner.invoke(app, ["--scene", name, "--scale", "0.1", "--json"])
-    assert done.exit_code == 0, done.output
-    assert json.loads(done.stdout)["scene"].startswith(f"{name} (stand-in")
-
-
 def test_what_reuse_costs_agrees_with_what_is_shown_after_the_drift() -> None:
     done = runner.invoke(app, ["--scene", "sparse", "--scale", "0.2"])
     assert done.exit_code == 0, done.output
@@ -75,6 +68,7 @@ def test_what_reuse_costs_agrees_with_what_is_shown_after_the_drift() -> None:
     [
         ("--scene", "textures", "plan: --scene: `textures` is neither .* did you mean texture"),
         ("--scene", "nosuch", "17 presets, such as lego_bulldozer"),
+        ("--scene", "street", "content: file: is needed: street's .ply, .glb or data-set folder"),
         ("--model", "nosuch", "plan: --model: 'nosuch'"),
     ],
 )
