@@ -61,7 +61,7 @@ def _prepared(file: SceneFile) -> Opener:
         return _built_in(name, file)
     if name in preset_names():
         if not settings.file:
-            raise InputError("content", "file", f"is needed: {name}'s .ply, .glb or data-set folder, which is not shipped")
+            raise InputError("content", "file", f"is needed: {name}'s .ply, .glb or data-set folder (not shipped)")
         return _from_path(replace(file, path=Path(settings.file), preset=name))
     if "://" in name or name.startswith("/dev/video"):
         from runtime.content import stream
