@@ -101,7 +101,7 @@ def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -
     Until then an older file of that name stays; what a crash leaves is readable up to its last whole chunk.
     One with pictures is its owner's alone. Raises InputError where it can't be written, or another process writes it.
     """
-    part = path.with_name(f".{path.name}.part")
+    part, file = path.with_name(f".{path.name}.part"), None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_file():
@@ -111,10 +111,12 @@ def recording_to(path: Path, header: RecordingHeader, *, max_s: float = MAX_S) -
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until it is closed, under either name
         file.truncate()
         os.fchmod(file.fileno(), 0o600 if header.colour or header.depth else 0o644)  # a face is private
-    except BlockingIOError:
-        raise InputError(path, "", "is being recorded by another process") from None
     except OSError as error:
-        raise InputError(path, "", f"cannot be written ({error.strerror})") from None
+        if file is not None:
+            file.close()
+        is_taken = isinstance(error, BlockingIOError)
+        problem = "is being recorded by another process" if is_taken else f"cannot be written ({error.strerror})"
+        raise InputError(path, "", problem) from None
     try:
         with file:
             writer = RecordingWriter(file, header, max_s=max_s, on_first=lambda: part.replace(path))

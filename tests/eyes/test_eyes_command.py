@@ -97,7 +97,10 @@ def test_without_a_file_the_sensor_is_looked_at(tmp_path: Path) -> None:
     assert live.exit_code == 0 and "eyes_m (" in live.stdout
 
 
-def test_the_benchmark_measures_detection_error_sigma_jitter_and_time(tmp_path: Path) -> None:
+def test_the_benchmark_measures_detection_error_sigma_jitter_and_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("runtime.eyes.benchmark.TRACKS_MAX", 1)
     for portrait, name in ((eileen(), "eileen.png"), (grace(), "grace.png")):
         write_png(tmp_path / name, portrait.picture)
     rows = [

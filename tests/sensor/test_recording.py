@@ -104,12 +104,12 @@ def test_images_are_recorded_only_with_a_header_that_says_so(tmp_path: Path) -> 
 
 def test_images_do_not_pile_up_in_memory(tmp_path: Path) -> None:
     depth = np.zeros((480, 640), np.uint16)
-    write(tmp_path / "a.mcap", [sample(k, depth_mm=depth) for k in range(60)], WITH_IMAGES)
+    write(tmp_path / "a.mcap", [sample(k, depth_mm=depth) for k in range(30)], WITH_IMAGES)
     tracemalloc.start()
     count = sum(1 for _ in Recording(tmp_path / "a.mcap").samples())
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert count == 60 and peak < 15 * depth.nbytes
+    assert count == 30 and peak < 15 * depth.nbytes
 
 
 def test_a_truncated_file_opens_up_to_its_last_whole_chunk_and_says_so(
@@ -196,19 +196,27 @@ def test_without_a_sample_an_older_file_stays_and_nothing_new_is_left(tmp_path: 
     assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("a.mcap", b"older")]
 
 
-def test_a_killed_recorder_leaves_all_but_its_last_chunk(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    code = f"""
-import pathlib, time
-from tests.sensor.test_recording import EYES_ONLY, sample
+# A process of its own, with nothing imported that it does not need.
+RECORDER = """
+import pathlib, resource, sys, time
+import numpy as np
+from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.recording import recording_to
-with recording_to(pathlib.Path({str(path)!r}), EYES_ONLY) as writer:
-    for k in range(200):
-        writer.write(sample(k))
+from runtime.sensor.recording_format import RecordingHeader
+if limit := int(sys.argv[2]):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+eyes = EyePoints(np.array([[0.03, 0.0, 0.6], [-0.03, 0.0, 0.6]]), np.array([0.9, 0.5]))
+with recording_to(pathlib.Path(sys.argv[1]), RecordingHeader(driver="test")) as writer:
+    for k in range(1000 if limit else 200):
+        writer.write(SensorFrame(k, 10**9 + k * 33_333_333, eyes))
     print("written", flush=True)
     time.sleep(60)
 """
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, env=os.environ)
+
+
+def test_a_killed_recorder_leaves_all_but_its_last_chunk(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    process = subprocess.Popen([sys.executable, "-c", RECORDER, str(path), "0"], stdout=subprocess.PIPE)
     assert process.stdout.readline() == b"written\n"
     process.send_signal(signal.SIGKILL)
     process.wait()
@@ -220,78 +228,68 @@ with recording_to(pathlib.Path({str(path)!r}), EYES_ONLY) as writer:
 
 def test_a_full_disk_is_told_by_name_and_what_is_there_can_be_read(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    code = f"""
-import pathlib, resource
-from tests.sensor.test_recording import sample, write
-resource.setrlimit(resource.RLIMIT_FSIZE, (30000, 30000))
-write(pathlib.Path({str(path)!r}), [sample(k) for k in range(1000)])
-"""
     # A measurement of coverage would write a file of its own.
     environment = {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE_")}
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    command = [sys.executable, "-c", RECORDER, str(path), "30000"]
+    answer = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert answer.returncode != 0 and "InputError" in answer.stderr.splitlines()[-1] and str(path) in answer.stderr
     assert len(list(Recording(path).samples())) > 50
 
 
-def bomb(path: Path, *, kind: str, unpacked: int, says: int) -> int:
-    """A recording that begins with a chunk which is small, and large when unpacked. Answers the chunk's size."""
-    import lz4.frame
-    import zstandard
+def bomb(path: Path, packed: bytes, *, kind: str, says: int) -> None:
+    """A recording that begins with a chunk which is small, and large when unpacked."""
     from mcap.data_stream import RecordBuilder
     from mcap.records import Chunk
 
-    pack = lz4.frame.compress if kind == "lz4" else zstandard.ZstdCompressor().compress
-    packed = pack(b"\0" * unpacked)
     builder = RecordBuilder()
     Chunk(kind, packed, 0, 0, 0, says).write(builder)
     whole, at = DEMO_BYTES, 8
     for _ in range(2):  # the header and the metadata
         at += 9 + int.from_bytes(whole[at + 1 : at + 9], "little")
     path.write_bytes(whole[:at] + builder.end() + whole[at:])
-    return len(packed)
 
 
-@pytest.mark.parametrize("kind", ["lz4", "zstd"])
-@pytest.mark.parametrize("says", [300 << 20, 100, 1 << 62])
-def test_a_small_chunk_that_becomes_a_large_one_takes_no_memory(tmp_path: Path, kind: str, says: int) -> None:
-    size = bomb(tmp_path / "bomb.mcap", kind=kind, unpacked=300 << 20, says=says)
-    assert size < 2 << 20
-    code = f"""
+OPENED = """
 import pathlib, resource, sys
 from runtime.errors import InputError
 from runtime.sensor.recording import Recording
 base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-try:
-    list(Recording(pathlib.Path({str(tmp_path / "bomb.mcap")!r})).samples())
-except InputError as error:
-    print(error)
+for name in sys.argv[1:]:
+    try:
+        list(Recording(pathlib.Path(name)).samples())
+    except InputError as error:
+        print(error)
 print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - base) >> 10)
 """
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    told, grown_mib = answer.stdout.splitlines()
+
+
+def test_a_small_chunk_that_becomes_a_large_one_takes_no_memory(tmp_path: Path) -> None:
+    import lz4.frame
+    import zstandard
+
+    large, names = b"\0" * (300 << 20), []
+    for kind, pack in (("lz4", lz4.frame.compress), ("zstd", zstandard.ZstdCompressor().compress)):
+        packed = pack(large)
+        assert len(packed) < 2 << 20
+        for says in (300 << 20, 100, 1 << 62):
+            names.append(str(tmp_path / f"{kind}-{says}.mcap"))
+            bomb(Path(names[-1]), packed, kind=kind, says=says)
+    answer = subprocess.run([sys.executable, "-c", OPENED, *names], capture_output=True, text=True, check=True)
+    *told, grown_mib = answer.stdout.splitlines()
     assert int(grown_mib) < 120
-    if says == 300 << 20:
-        assert "unpacks to 300.0 MiB; at most 32" in told
-    else:
-        assert "bomb.mcap" in told
+    for name, line in zip(names, told, strict=True):
+        assert ("unpacks to 300.0 MiB; at most 32" if name.endswith(f"-{300 << 20}.mcap") else name) in line
 
 
 def test_two_recorders_into_one_file_are_one_too_many(tmp_path: Path) -> None:
     path = tmp_path / "o.mcap"
-    code = f"from pathlib import Path; from tests.sensor.test_recording import second; second(Path({str(path)!r}))"
     with recording_to(path, RecordingHeader("test")) as writer:
-        for _ in range(2):  # before the file has its name, and after
-            ran = subprocess.run(
-                [sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[2]
-            )
-            assert "is being recorded by another process" in ran.stderr
+        for _ in range(2):  # before the file has its name, and after; a lock is of an open file, whoever has it
+            second = recording_to(path, RecordingHeader("second"))
+            with pytest.raises(InputError, match="is being recorded by another process"), second:
+                pass
             assert writer.write(SensorFrame(writer.count + 1, writer.count * 10**7))
     assert len(list(Recording(path).samples())) == 2
-
-
-def second(path: Path) -> None:
-    with recording_to(path, RecordingHeader("second")):
-        pass
 
 
 @pytest.mark.parametrize(("colour", "mode"), [(False, 0o644), (True, 0o600)])
