@@ -12,7 +12,6 @@ from runtime.support.options import number
 from runtime.support.ranges import SCALE
 
 if TYPE_CHECKING:
-    from calib.viewpoints import Viewpoint
     from runtime.config import Settings
 
 ConfigOption = Annotated[Path | None, typer.Option(help="configuration TOML; without it the defaults hold")]
@@ -104,20 +103,19 @@ def grey(
 @app.command()
 def charts(
     out: Annotated[Path, typer.Option(help="folder for the charts")],
-    viewpoint: Annotated[list[str] | None, typer.Option(help="only this one, as R40-phi70-theta80; repeatable")] = None,
     config: ConfigOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Draw the calibration charts: lines that fuse only when the eyes are at the chart's viewpoint.
 
-    Example: phasestack calibrate charts --out charts --viewpoint R50-phi80-theta90
+    Example: phasestack calibrate charts --out charts
     """
     from calib.charts import make_charts
+    from calib.viewpoints import grid
 
     settings = _settings(config)
-    chosen = _viewpoints(viewpoint, settings)
-    summary = make_charts(out, chosen, settings)
-    _report(summary, f"{summary['files']} files for {len(chosen)} viewpoints in {out}", as_json)
+    summary = make_charts(out, grid(settings.calibration), settings)
+    _report(summary, f"{summary['files']} files for {len(summary['viewpoints'])} viewpoints in {out}", as_json)
 
 
 @app.command()
@@ -206,14 +204,3 @@ def _report(summary: dict[str, Any], text: str, as_json: bool) -> None:
     from runtime.support.artifacts import to_json
 
     typer.echo(to_json(summary) if as_json else text)
-
-
-def _viewpoints(names: list[str] | None, settings: Settings) -> tuple[Viewpoint, ...]:
-    from calib.viewpoints import grid
-
-    known = {viewpoint.name: viewpoint for viewpoint in grid(settings.calibration)}
-    for name in names or ():
-        if name not in known:
-            problem = f"unknown: {name}; known: {min(known)} .. {max(known)}"
-            raise InputError("calibrate charts", "--viewpoint", problem)
-    return tuple(known[name] for name in dict.fromkeys(names or known))

@@ -143,18 +143,9 @@ class FaceNetwork:
                 box = np.concatenate([(corner + boxes[cell, :2]) * stride - size / 2, size])
                 five = (corner + points[cell].reshape(5, 2).astype(np.float64)) * stride
                 faces.append(FoundFace(float(scores[cell]), box, five))
-        kept: list[FoundFace] = []
-        for face in sorted(faces, key=lambda one: -one.score):
-            if all(_overlap(face.box, other.box) < OVERLAP_MAX for other in kept):
-                kept.append(face)
-        return kept
-
-
-def _overlap(a: F64, b: F64) -> float:
-    """Intersection over union of two boxes."""
-    sides = np.minimum(a[:2] + a[2:], b[:2] + b[2:]) - np.maximum(a[:2], b[:2])
-    shared = float(np.prod(np.maximum(sides, 0)))
-    return shared / float(a[2] * a[3] + b[2] * b[3] - shared)
+        boxes = [face.box.tolist() for face in faces]
+        kept = cv2.dnn.NMSBoxes(boxes, [face.score for face in faces], score_min, OVERLAP_MAX)
+        return [faces[index] for index in kept]
 
 
 class MeshNetwork:

@@ -63,6 +63,7 @@ REMOVED_COMMANDS: dict[str, str] = {
     "calibrate capture --marks": "capture from the live sensor; recordings that know their true eyes need no marks",
     "calibrate capture --again": "p goes back, where Enter replaces the pair; without its row it is asked for again",
     "calibrate charts --show": "`calibrate capture --show` shows each chart on the panels",
+    "calibrate charts --viewpoint": "take it out: the charts of all viewpoints are drawn",
     "calibrate charts --kind": "charts are for both eyes at once",
     "calibrate charts --check": "`capture --show`: at the viewpoint the lines are single and clean",
     "calibrate solve --rollback": "past versions are beside the file: copy the one you want, as calibration.1.toml",

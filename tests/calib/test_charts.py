@@ -6,18 +6,14 @@ import json
 from pathlib import Path
 
 import numpy as np
-from typer.testing import CliRunner
 
-from calib.charts import chart_fov_deg, line_picture
-from calib.commands import app
+from calib.charts import chart_fov_deg, line_picture, make_charts
 from calib.viewpoints import grid
+from runtime.config import load_settings
 from runtime.optics.quality import psnr_db
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import read_image
-
-run = CliRunner()
-
 
 SMALL = "[stack]\nwidth_px = 480\nheight_px = 270\n"
 
@@ -26,14 +22,9 @@ def test_a_solved_chart_shows_both_eyes_the_picture_from_its_viewpoint_alone(tmp
     """Seen through the written files: the vertical lines stay clean at the viewpoint and grow ghosts 3 cm aside."""
     viewpoint = grid()[13]
     (tmp_path / "small.toml").write_text(SMALL)
-    result = run.invoke(
-        app,
-        ["charts", "--out", str(tmp_path / "c"), "--config", str(tmp_path / "small.toml"), "--viewpoint",
-         viewpoint.name, "--json"],
-    )  # fmt: skip
-    assert result.exit_code == 0, result.output
+    made = make_charts(tmp_path / "c", [viewpoint], load_settings(tmp_path / "small.toml"))
     listed = json.loads((tmp_path / "c" / "charts.json").read_text())["charts"]
-    assert [entry["viewpoint"] for entry in listed] == json.loads(result.stdout)["viewpoints"] == [viewpoint.name]
+    assert [entry["viewpoint"] for entry in listed] == made["viewpoints"] == [viewpoint.name]
     layers = np.stack([read_image(tmp_path / "c" / f"chart-{viewpoint.name}-layer-{n}.png") for n in range(3)])
     stack = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
     wanted = line_picture(width_px=480, height_px=270).astype(np.float32) / 255

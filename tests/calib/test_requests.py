@@ -11,7 +11,6 @@ from calib.commands import app
 from runtime.errors import InputError
 
 WRONG = [
-    "charts --out x --viewpoint R1-phi2-theta3",
     "charts --out x --config no-such-file.toml",
     "grey --out l.csv --photos none --panel 1",
     "grey --photos . --panel 1",
