@@ -7,7 +7,6 @@ file are relative to the folder of the file.
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -294,14 +293,9 @@ class PanelSettings(Section):
 class OutputSettings(Section):
     """How layers leave the machine."""
 
-    kind: Literal["offscreen", "windows", "span"] = Field(
-        "offscreen", description="EGL, one window a panel, or one window"
-    )
+    kind: Literal["offscreen", "windows"] = Field("offscreen", description="EGL, or one fullscreen window a panel")
     panels: tuple[PanelSettings, ...] = Field(
         (), max_length=PANELS_MOST, description="one table a panel, rear to front"
-    )
-    allow_rescaling: bool = Field(
-        False, description="let a monitor whose mode has other pixels than the stack rescale the phases"
     )
 
 
@@ -342,30 +336,6 @@ class PlanSettings(Section):
         True, description="leave out what the scene and a resting head do not need; false: draw and solve all of it"
     )
     align: bool = Field(True, description="shift and scale the panels at every refresh to where the eyes are then")
-
-
-@dataclass(slots=True)
-class LimitSettings:
-    """What a file from outside may hold: more is refused with its figure, before memory is taken for it."""
-
-    file_mib: float = 1024.0  # one file of content or of a recording
-    pixels: int = 134_217_728  # of one picture; 16384 x 8192
-    triangles: int = 2_000_000  # of a mesh, all instances together
-    splats: int = 3_000_000
-    instances: int = 2000  # times that meshes stand in a glTF scene
-    nodes: int = 5000  # of a glTF scene that moves, bones among them
-    depth: int = 64  # how deep JSON or a glTF scene may nest
-    load_s: float = 120.0  # loading of one piece of content is given up after this
-    start_s: float = 600.0  # a start is given up where content and model are not ready after this
-    recording_s: float = 21_600.0  # length of a recording that is replayed
-    chunk_mib: float = 32.0  # one chunk or message of a recording, unpacked
-
-    @property
-    def file_bytes(self) -> int:
-        return round(self.file_mib * (1 << 20))
-
-
-LIMITS = LimitSettings()  # the same for every display; tests lower them
 
 
 class ServiceSettings(Section):

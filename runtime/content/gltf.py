@@ -17,7 +17,6 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from runtime.config import LIMITS
 from runtime.content.rig import Binding, Channel, Node, Rig, Skin
 from runtime.content.shapes import I32, Shape
 from runtime.content.triangles import Part
@@ -25,6 +24,7 @@ from runtime.errors import InputError, one_line
 from runtime.records import F32, F64, U8
 from runtime.support import progress, untrusted_input
 from runtime.support.picture_header import check_picture
+from runtime.support.untrusted_input import LIMITS
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}

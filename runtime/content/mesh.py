@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from runtime.clock import NS_PER_S
-from runtime.config import LIMITS
 from runtime.content.base import ContentInfo
 from runtime.content.gltf import file_of, load_gltf, texture_of
 from runtime.content.placing import SceneFile
@@ -24,6 +23,7 @@ from runtime.errors import InputError, one_line
 from runtime.records import F32, F64, U8
 from runtime.support import progress, untrusted_input
 from runtime.support.picture_header import check_picture
+from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.content")
 

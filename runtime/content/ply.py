@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.config import LIMITS
 from runtime.errors import InputError
 from runtime.support import untrusted_input
+from runtime.support.untrusted_input import LIMITS
 
 Table = NDArray[Any]
 

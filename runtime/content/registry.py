@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from runtime.config import LIMITS, ContentSettings, validated
+from runtime.config import ContentSettings, validated
 from runtime.content.base import ContentSource, View
 from runtime.content.placed import placed_source, placing_of
 from runtime.content.placing import SceneFile
@@ -23,6 +23,7 @@ from runtime.support import progress, untrusted_input
 from runtime.support.crash import written
 from runtime.support.plausible import nearest
 from runtime.support.plugins import is_plugin, plugin_class, strict
+from runtime.support.untrusted_input import LIMITS
 
 MESHES = (".glb", ".gltf", ".obj", ".stl")
 PLAYLISTS = (".toml", ".json")

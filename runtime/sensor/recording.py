@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import IO, Any
 
 from runtime.clock import NS_PER_S
-from runtime.config import LIMITS
 from runtime.errors import InputError
 from runtime.records import Intrinsics, SensorFrame
 from runtime.sensor import recording_format as fmt
 from runtime.sensor.mcap_records import mcap_records
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.support import untrusted_input
+from runtime.support.untrusted_input import LIMITS
 
 CHUNK_BYTES = 4096  # some 20 eye samples
 INDEX_SHARE = 1.1  # a file with the indices of its chunks, beside without
@@ -189,7 +189,7 @@ class Recording:
 
     def _to_the_break(self, file: IO[bytes]) -> Iterator[Any]:
         try:
-            yield from mcap_records(file, source=self.path, max_bytes=round(LIMITS.chunk_mib * untrusted_input.MIB))
+            yield from mcap_records(file, source=self.path, max_bytes=LIMITS.chunk_bytes)
         except InputError:
             raise
         except OSError as error:

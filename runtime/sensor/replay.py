@@ -9,11 +9,11 @@ from importlib.resources import files
 from pathlib import Path
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
-from runtime.config import LIMITS
 from runtime.errors import EndOfRecording, InputError, SensorLost
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, SteppedSensor
 from runtime.sensor.recording import Recording
+from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger(__name__)
 

@@ -7,9 +7,9 @@ import warnings
 from pathlib import Path
 from typing import IO, Any
 
-from runtime.config import LIMITS
 from runtime.errors import InputError
 from runtime.support import untrusted_input
+from runtime.support.untrusted_input import LIMITS
 
 PNG = b"\x89PNG\r\n\x1a\n"
 CHUNK_BYTES = 12  # of a PNG's part without what it holds: length, kind, checksum

@@ -11,6 +11,7 @@ import json
 import math
 import os
 import stat
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -20,6 +21,26 @@ JSON_DEPTH_MAX = 64
 JSON_BYTES_MAX = 64 << 20
 DIGITS_MAX = 19  # of a 63-bit number
 MIB = 1 << 20
+
+
+@dataclass(slots=True)
+class Limits:
+    """What a file from outside may hold: more is refused with its figure, before memory is taken for it."""
+
+    file_bytes: int = 1 << 30  # one file of content or of a recording
+    pixels: int = 134_217_728  # of one picture; 16384 x 8192
+    triangles: int = 2_000_000  # of a mesh, all instances together
+    splats: int = 3_000_000
+    instances: int = 2000  # times that meshes stand in a glTF scene
+    nodes: int = 5000  # of a glTF scene that moves, bones among them
+    depth: int = 64  # how deep JSON or a glTF scene may nest
+    load_s: float = 120.0  # loading of one piece of content is given up after this
+    start_s: float = 600.0  # a start is given up where content and model are not ready after this
+    recording_s: float = 21_600.0  # length of a recording that is replayed
+    chunk_bytes: int = 32 << 20  # one chunk or message of a recording, unpacked
+
+
+LIMITS = Limits()  # the same for every display; tests lower them
 
 
 def checked_path(path: str | Path, *, source: str | Path = "", field: str = "") -> Path:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from runtime.config import LIMITS, ContentSettings
+from runtime.config import ContentSettings
 from runtime.content.mesh import load_mesh
 from runtime.content.pictures import open_frames
 from runtime.content.registry import prepare_content
@@ -25,6 +25,7 @@ from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from runtime.support.artifacts import read_image
 from runtime.support.progress import listening
+from runtime.support.untrusted_input import LIMITS
 from tests.content.gltf_files import Buffer
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)

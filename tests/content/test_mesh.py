@@ -10,12 +10,13 @@ import pytest
 import trimesh
 from PIL import Image
 
-from runtime.config import LIMITS, ContentSettings
+from runtime.config import ContentSettings
 from runtime.content.camera import project
 from runtime.content.mesh import MeshSource, load_mesh, prepare
 from runtime.content.placing import SceneFile, guessed_axes
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
+from runtime.support.untrusted_input import LIMITS
 from tests.content.conftest import panel_view
 
 EYE = (0.7, 0.05, 0.1)

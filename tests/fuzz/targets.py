@@ -53,7 +53,9 @@ from tests.sensor.fake_usb import encode
 from tests.sensor.taken import taken_until
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 64, 36)
-LOW = {"pixels": 1 << 22, "triangles": 50_000, "splats": 50_000, "instances": 200, "file_mib": 16, "chunk_mib": 2}
+MIB = 1 << 20
+LOW = {"pixels": 4 * MIB, "triangles": 50_000, "splats": 50_000, "instances": 200}
+LOW |= {"file_bytes": 16 * MIB, "chunk_bytes": 2 * MIB}
 MODELS = sorted((Path(__file__).resolve().parents[2] / "runtime" / "model" / "data").glob("*.onnx"))
 EYES = EyePoints(np.array([[0.03, 0.0, 0.6], [-0.03, 0.0, 0.6]]), np.ones(2))
 

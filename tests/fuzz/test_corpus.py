@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 
-from runtime.config import LIMITS
 from runtime.errors import PhasestackError
+from runtime.support.untrusted_input import LIMITS
 from tests.fuzz.mutations import mutated
 from tests.fuzz.targets import LOW, TARGETS
 

@@ -11,13 +11,14 @@ import pytest
 from numpy.typing import NDArray
 
 from runtime.clock import NS_PER_S, MonotonicClock, SimulatedClock
-from runtime.config import LIMITS, SensorSettings
+from runtime.config import SensorSettings
 from runtime.errors import EndOfRecording, InputError
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import ReplayDriver
 from runtime.sensor.worker import SensorWorker
+from runtime.support.untrusted_input import LIMITS
 from tests.sensor.taken import taken_until
 
 HEADER = RecordingHeader(driver="test", serial="S")
