@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,23 +15,21 @@ from runtime.clock import Stopwatch
 from runtime.config import Settings, load_stack, with_options
 from runtime.content.base import ContentInfo
 from runtime.errors import EyesNotServed, InputError
-from runtime.evaluation.displayed import Picture, displayed
 from runtime.evaluation.solved import judged
-from runtime.evaluation.trials import timed, timed_in_turn
+from runtime.evaluation.trials import timed
 from runtime.model.backends import choose
 from runtime.model.job import Job
-from runtime.model.predictor import Prediction, Predictor, load_predictor
+from runtime.model.predictor import Prediction, load_predictor
 from runtime.model.still import solve_still
 from runtime.model.trim import Savings, Scene, trim
 from runtime.optics.stack import PanelStack
-from runtime.plan.savings import Measured, Saving, network_items
-from runtime.records import F64, U8, PlanItem
+from runtime.plan.savings import Measured, network_items
+from runtime.records import F64
 from runtime.support.artifacts import OutputFolder, in_8_bits, read_picture, write_json
 from runtime.support.gl import offscreen_context
 
 SEPARATION_MIN_M = 0.005
 MEASURED_FROM = 10  # runs that are worth a look at which backend is faster
-COMPARED = 3  # timed runs with and without the plan
 
 
 def solve_pair(
@@ -73,15 +70,26 @@ def solve_pair(
         wanted = "cpu" if settings.backend == "auto" and repeat < MEASURED_FROM else settings.backend
         predictor.set_backend(choose(wanted, predictor, context).backend)
         watch.lap("load model")
-        pair = _Pair(pictures, stored, eyes_m, fov_deg, eye_sigma_mm, predictor)
         inference_ms: list[float] = []
+        left_out = Savings()
 
-        def solve_timed() -> Prediction:
-            prediction = pair.solve(pair.trim if plan and predictor.trims else None)
+        def trimmed(job: Job) -> Job:
+            nonlocal left_out
+            if plan and predictor.trims:
+                job, left_out = trim(job, Scene(stack))
+            return job
+
+        def solve() -> Prediction:
+            given: dict[str, Any] = {"eyes_m": eyes_m, "fov_deg": fov_deg, "eye_sigma_mm": eye_sigma_mm}
+            prediction = solve_still(*pictures, predictor=predictor, changed=trimmed, **given)
             inference_ms.append(prediction.stage_ms["inference"])
             return prediction
 
-        done = timed(solve_timed, runs=repeat)
+        try:
+            done = timed(solve, runs=repeat)
+        except EyesNotServed as error:  # here they will not move on
+            why = f"{error}: {predictor.name} can't serve them (try --model sart)"
+            raise InputError("solve", "--left-eye, --right-eye", why) from None
         watch.lap("solve, warm-up included")
         with OutputFolder(out) as folder:
             try:
@@ -95,8 +103,7 @@ def solve_pair(
             line += f"one ray a pixel, as published: {seen.quality.psnr_db:.1f} dB"
             seen.write(folder.staging, lines=[line])
             watch.lap("measure and write")
-            left_out = pair.price(ContentInfo(files[0].name), planned_db=seen.quality.psnr_db)
-            watch.lap("compare with the plan off")
+            items = network_items(ContentInfo(files[0].name), Measured(left_out=left_out))
             result = seen.quality.table() | {
                 "inference_ms": round(float(np.median(inference_ms[-repeat:])), 3),
                 "total_ms": round(done.median_ms, 3),
@@ -105,80 +112,11 @@ def solve_pair(
                 "backend": predictor.backend,
                 "eye_sigma_mm": eye_sigma_mm,
                 "steps": done.answer.steps,
-                "plan": [asdict(item) for item in left_out],
+                "plan": [asdict(item) for item in items],
                 "wall_s": {part: round(ms / 1e3, 3) for part, ms in watch.stage_ms.items()},
             }
             write_json(folder.staging / "solve.json", result)
     return result
-
-
-@dataclass
-class _Pair:
-    """Two pictures for two eyes, solved with what they do not need left out, or not."""
-
-    pictures: Sequence[U8]
-    stored: Sequence[Picture]  # the same in their files' own bits: what the eyes should see
-    eyes_m: F64
-    fov_deg: float
-    eye_sigma_mm: float
-    predictor: Predictor
-    left_out: Savings = field(default_factory=Savings)  # of the newest trimmed job
-
-    def solve(self, changed: Callable[[Job], Job] | None = None) -> Prediction:
-        """changed: the job that is solved instead. Raises InputError for eyes that the model does not serve."""
-        try:
-            return solve_still(
-                *self.pictures,
-                eyes_m=self.eyes_m,
-                fov_deg=self.fov_deg,
-                predictor=self.predictor,
-                eye_sigma_mm=self.eye_sigma_mm,
-                changed=changed or (lambda job: job),
-            )
-        except EyesNotServed as error:  # here they will not move on
-            why = f"{error}: {self.predictor.name} can't serve them (try --model sart)"
-            raise InputError("solve", "--left-eye, --right-eye", why) from None
-
-    def trim(self, job: Job) -> Job:
-        """What the pictures need of a job."""
-        job, self.left_out = trim(job, Scene(self.predictor.stack))
-        return job
-
-    def price(self, info: ContentInfo, *, planned_db: float) -> list[PlanItem]:
-        """What was left out, and what that saved and cost against a model that leaves out nothing.
-
-        All ways are timed again, in turn, so that what slows one slows the others.
-        """
-        left_out = self.left_out
-        numbers = Measured(left_out=left_out)
-        if not network_items(info, numbers):
-            return []
-        ways: dict[str, Callable[[Job], Job] | None] = {"plain": None, "planned": self.trim}
-        # In colour, or of the whole, one saving is all there is.
-        middle = "plain" if left_out.channels == 3 else "planned"
-        if left_out.channels == 1 and left_out.solved_share < 1:
-            middle = "between"
-            ways[middle] = lambda job: replace(job, channels=1)
-
-        def call(changed: Callable[[Job], Job] | None) -> Callable[[], U8]:
-            return lambda: self.solve(changed).layers
-
-        calls = {name: call(changed) for name, changed in ways.items()}
-        done = timed_in_turn(calls, runs=COMPARED)
-        shown_db = {name: self._psnr_db(way.answer) for name, way in done.items() if name != "planned"}
-        shown_db["planned"] = planned_db
-
-        def saving(without: str, with_it: str) -> Saving:
-            return Saving(done[without].median_ms - done[with_it].median_ms, shown_db[without] - shown_db[with_it])
-
-        return network_items(
-            info, replace(numbers, one_channel=saving("plain", middle), focus=saving(middle, "planned"))
-        )
-
-    def _psnr_db(self, layers: U8) -> float:
-        stack, eyes_m, fov_deg = self.predictor.stack, self.eyes_m, self.fov_deg
-        views = displayed(layers, self.stored, stack, eyes_m=eyes_m, fov_deg=fov_deg, similarity=False)
-        return views.quality.psnr_db
 
 
 def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stack: PanelStack) -> F64:

@@ -48,11 +48,9 @@ def test_the_window_is_solved_alone_and_costs_no_quality(tmp_path: Path, model: 
     planned = solved(tmp_path, model=model)
     (item,) = planned["plan"]
     assert item["what"] == "inference beside the active window"
-    assert item["costs_db"] < 0.1
-    assert isinstance(item["saves_ms"], float)
     plain = solved(tmp_path, "--no-plan", model=model)
     assert plain["plan"] == []
-    assert planned["psnr_db"] - plain["psnr_db"] == pytest.approx(-item["costs_db"], abs=0.002)
+    assert plain["psnr_db"] - planned["psnr_db"] < 0.1
 
 
 def test_grey_pictures_are_solved_in_one_channel(tmp_path: Path) -> None:
