@@ -115,7 +115,7 @@ class WindowKeys:
     def poll(self) -> Key | None:
         """The next key, or None. Never waits. Call it after a frame was presented, on the windows' thread."""
         # The panels keep their windows to themselves; nothing but their keyboard is wanted of them.
-        handles = [surface.window.handle for surface in getattr(self._sink, "_surfaces", ())]
+        handles = [window.handle for window, _ in getattr(self._sink, "_surfaces", ())]
         if handles != self._watched:
             self._watch(handles)
         return self._pending.pop(0) if self._pending else None

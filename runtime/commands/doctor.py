@@ -171,8 +171,7 @@ def monitors(settings: Settings) -> Iterator[Row]:
     panels = panel_settings(settings.output, len(settings.stack.x_m))
     try:
         bound = bind(panels, there)
-        size = {"width_px": settings.stack.width_px, "height_px": settings.stack.height_px}
-        check_modes(panels, bound, **size, allow_rescaling=settings.output.allow_rescaling)
+        check_modes(panels, bound, width_px=settings.stack.width_px, height_px=settings.stack.height_px)
     except (InputError, PanelLost) as error:
         yield Row("panels", "fail", str(error), remedy)
         return

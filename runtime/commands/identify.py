@@ -57,15 +57,12 @@ def _bound(settings: Settings) -> tuple[PanelSink, list[U8]]:
     """The configured panels and their cards. Raises InputError, PanelLost."""
     from runtime.clock import MonotonicClock
     from runtime.panels.card import identity_card
-    from runtime.panels.registry import panel_settings
     from runtime.panels.window import WindowPanels
     from runtime.support.gl import offscreen_context
 
-    kind = "span" if settings.output.kind == "span" else "windows"
-    output = settings.output.model_copy(update={"kind": kind})
     stack = settings.stack.stack()
-    mounted = panel_settings(output, stack.count)
-    panels = WindowPanels(output, mounted, stack, MonotonicClock(), offscreen_context())
+    mounted = settings.output.panels
+    panels = WindowPanels(mounted, stack, MonotonicClock(), offscreen_context())
     cards = []
     for index, (panel, monitor) in enumerate(zip(mounted, panels.monitors, strict=True)):
         typer.echo(f"panel {index}: {monitor}")

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock, SimulatedClock
-from runtime.config import LIMITS, Settings
+from runtime.config import Settings
 from runtime.daemon.solver_parts import RunningSolver, SolverMaker
 from runtime.errors import PanelLost, Stopped
 from runtime.eyes.calibration import load_calibration
@@ -36,6 +36,7 @@ from runtime.sensor.worker import SensorWorker
 from runtime.support.gl import offscreen_context
 from runtime.support.memory import gc_frozen
 from runtime.support.priority import PRESENTER_NICENESS, niceness
+from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.build")
 
@@ -216,12 +217,10 @@ def build_run(
 def _open_panels(
     settings: Settings, options: RunOptions, stack: PanelStack, clock: Clock, context: Any, host: Host
 ) -> PanelSink:
-    output = settings.output
-    if options.scale != 1.0:  # asked for: no monitor's mode fits such a stack
-        output = output.model_copy(update={"allow_rescaling": True})
+    any_size = options.scale != 1.0  # asked for: no monitor's mode fits such a stack
     while True:
         try:
-            return open_panels(output, stack, clock, context)
+            return open_panels(settings.output, stack, clock, context, any_size=any_size)
         except PanelLost as error:
             if not host.wait_for_panel(str(error)):
                 raise

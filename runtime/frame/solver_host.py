@@ -51,11 +51,6 @@ class SolverHost(ABC):
     def do(self, task: Task) -> None:
         """Have something done between two steps, again and again until it answers True."""
 
-    @property
-    def left_behind(self) -> int:
-        """Threads that are in a call that did not return, once it was closed."""
-        return 0
-
     @abstractmethod
     def close(self) -> None:
         """Stop, and release what the solver holds. May be called twice."""

@@ -95,12 +95,6 @@ class SolverThread(SolverHost):
         if thread is not None and thread is not threading.current_thread():
             thread.join(timeout_s)
 
-    @property
-    def left_behind(self) -> int:
-        """Threads that are still in a call that did not return."""
-        hung = [*self._hung, *([self._attempt] if self._closing.is_set() else [])]
-        return sum(attempt.thread is not None and attempt.thread.is_alive() for attempt in hung)
-
     def _late_reason(self) -> str:
         """Why there is no solver at the moment, empty where all is well; leaves a hung thread behind."""
         attempt = self._attempt

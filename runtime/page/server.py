@@ -105,15 +105,9 @@ def application(daemon: Daemon, token: str) -> Starlette:
         answer.set_cookie(COOKIE, cookie, httponly=True, samesite="strict", path="/")
         return answer
 
-    async def logout(request: Request) -> Response:
-        answer = RedirectResponse("/", 303)
-        answer.delete_cookie(COOKIE, httponly=True, samesite="strict", path="/")
-        return answer
-
     routes = [
         Route("/", index, methods=["GET"]),
         Route("/login", login, methods=["POST"]),
-        Route("/logout", guarded(logout), methods=["POST"]),
         Route("/do", guarded(do), methods=["POST"]),
         Route("/now/{name}", guarded(look_up), methods=["GET"]),
         Route("/{name}", guarded(asset), methods=["GET"]),

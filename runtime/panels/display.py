@@ -118,17 +118,6 @@ class Display:
         handle = glfw.create_window(monitor.width_px, monitor.height_px, title, handles[monitor.connector], share)
         return self._adopt(handle)
 
-    def spanning_window(self, place: Rectangle, *, title: str) -> Window:
-        """One borderless window over a part of the X screen, whatever monitors are there."""
-        share = self.root.handle
-        glfw.window_hint(glfw.VISIBLE, False)
-        glfw.window_hint(glfw.DECORATED, False)
-        handle = glfw.create_window(place.width_px, place.height_px, title, None, share)
-        glfw.window_hint(glfw.DECORATED, True)
-        glfw.set_window_pos(handle, place.x_px, place.y_px)
-        glfw.show_window(handle)
-        return self._adopt(handle)
-
     def poll(self) -> str:
         """Take in what the X server says. Answers what makes the windows useless; empty: nothing."""
         glfw.poll_events()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from runtime.clock import MonotonicClock
-from runtime.config import OutputSettings, PanelSettings
+from runtime.config import PanelSettings
 from runtime.optics.stack import PanelStack
 from runtime.panels.card import identity_card
 from runtime.panels.display import connected_monitors
@@ -20,8 +20,7 @@ def every_monitor() -> tuple[WindowPanels, list[U8], tuple[Monitor, ...]]:
     bound = tuple(PanelSettings(connector=monitor.connector) for monitor in monitors)
     # Only for this picture: monitors of any shape, each filled.
     stack = PanelStack(1.0, 1.0, tuple(0.01 * index for index in range(len(monitors))), width, height)
-    output = OutputSettings(kind="windows", panels=bound)
-    panels = WindowPanels(output, bound, stack, MonotonicClock(), offscreen_context(), any_shape=True)
+    panels = WindowPanels(bound, stack, MonotonicClock(), offscreen_context(), any_shape=True)
     cards = []
     for monitor in monitors:
         lines = [monitor.model or "(no name in its EDID)", f"{monitor.width_px} x {monitor.height_px}",

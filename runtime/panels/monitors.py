@@ -106,9 +106,9 @@ def check_modes(
     *,
     width_px: int,
     height_px: int,
-    allow_rescaling: bool,
+    any_size: bool = False,
 ) -> None:
-    """Raise PanelLost where a monitor's mode has another shape than the stack, or, unless allowed, other pixels.
+    """Raise PanelLost where a monitor's mode has another shape than the stack, or, unless `any_size`, other pixels.
 
     A picture of another shape is distorted. A phase between two pixels' phases is none that was solved for: a rescaled
     layer shows neither eye its picture.
@@ -121,10 +121,10 @@ def check_modes(
         if abs(columns * height_px / (rows * width_px) - 1.0) > ASPECT_TOLERANCE:
             mounted = f"mounted at {panel.rotation_deg} degrees"
             raise PanelLost(f"{shows} ({mounted}), the stack is {width_px}x{height_px}: set its mode or rotation_deg")
-        if (columns, rows) != (width_px, height_px) and not allow_rescaling:
+        if (columns, rows) != (width_px, height_px) and not any_size:
             raise PanelLost(
-                f"{shows}, the stack is {width_px}x{height_px}: phases would be rescaled. Set its mode or "
-                "stack.width_px and height_px, or output.allow_rescaling = true"
+                f"{shows}, the stack is {width_px}x{height_px}: phases would be rescaled. Set its mode, or "
+                "stack.width_px and height_px"
             )
 
 

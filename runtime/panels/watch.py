@@ -8,25 +8,15 @@ then is on the wrong panel, or on none, and every swap succeeds.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 from runtime.clock import NS_PER_S, Clock
 from runtime.panels import xlib
 from runtime.panels.display import Display, Window
-from runtime.panels.monitors import Monitor, Rectangle
+from runtime.panels.monitors import Monitor
 
 EVERY_NS = NS_PER_S  # a round of all questions
 REFRESH_TOLERANCE = 1e-3  # of a monitor's rate
-
-
-@dataclass(frozen=True, slots=True)
-class Surface:
-    """One window, where it belongs, and the panels in it."""
-
-    window: Window
-    place: Rectangle
-    panels: tuple[int, ...]
 
 
 class PlacementWatch:
@@ -35,16 +25,14 @@ class PlacementWatch:
     All at once where the X server has refused a request since the last look: something has gone.
     """
 
-    def __init__(
-        self, display: Display, monitors: Sequence[Monitor], surfaces: Sequence[Surface], clock: Clock
-    ) -> None:
-        """monitors: as they were bound, one a panel. Nothing is asked in the first EVERY_NS."""
+    def __init__(self, display: Display, monitors: Sequence[Monitor], windows: Sequence[Window], clock: Clock) -> None:
+        """monitors: as they were bound, with their windows, one a panel. Nothing is asked in the first EVERY_NS."""
         self._display, self._clock = display, clock
         # Against what was there when it was bound; what came between binding and here differs from the monitor.
         self._states = [display.output_state(monitor.connector) for monitor in monitors]
-        self._monitors = monitors
+        self._monitors, self._windows = monitors, windows
         self._questions: list[Callable[[], str]] = [
-            *(partial(self._window_fault, surface) for surface in surfaces),
+            *(partial(self._window_fault, panel) for panel in range(len(windows))),
             *(partial(self._monitor_fault, panel) for panel in range(len(monitors))),
         ]
         self._next = 0
@@ -65,15 +53,14 @@ class PlacementWatch:
         self._next = (self._next + 1) % len(self._questions)
         return question()
 
-    def _window_fault(self, surface: Surface) -> str:
-        state = self._display.window_state(surface.window)
-        whose = f"panel {surface.panels[0]}" if len(surface.panels) == 1 else "the panels"
+    def _window_fault(self, panel: int) -> str:
+        state, wanted = self._display.window_state(self._windows[panel]), self._monitors[panel].place
         if state is None:
-            return f"{whose}: the window was destroyed"
+            return f"panel {panel}: the window was destroyed"
         is_viewable, place = state
         if not is_viewable:
-            return f"{whose}: the window was unmapped"
-        return "" if place == surface.place else f"{whose}: the window is {place}, not {surface.place}"
+            return f"panel {panel}: the window was unmapped"
+        return "" if place == wanted else f"panel {panel}: the window is {place}, not {wanted}"
 
     def _monitor_fault(self, panel: int) -> str:
         monitor, then = self._monitors[panel], self._states[panel]

@@ -1,22 +1,22 @@
-"""Panels on monitors: one fullscreen window a panel, or one window over all of them; a frame is on all or on none."""
+"""Panels on monitors: one fullscreen window a panel; a frame is on all or on none."""
 
 from __future__ import annotations
 
 import ctypes
 import logging
-from typing import Any, NamedTuple
+from typing import Any
 
 import moderngl
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
-from runtime.config import OutputSettings, PanelSettings
+from runtime.config import PanelSettings
 from runtime.errors import ContextLost, PanelLost
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
 from runtime.panels.display import Display, Window, glfw
-from runtime.panels.monitors import Monitor, Rectangle, bind, check_modes, refresh_difference
+from runtime.panels.monitors import Monitor, bind, check_modes, refresh_difference
 from runtime.panels.presentation import FrameTextures, Painter
-from runtime.panels.watch import PlacementWatch, Surface
+from runtime.panels.watch import PlacementWatch
 from runtime.records import PanelFrame, PresentReport
 from runtime.support.gl_sharing import ShareGroup
 
@@ -26,14 +26,6 @@ RETRY_NS = NS_PER_S // 2  # between attempts to open what was lost
 LOOK_NS = 5 * NS_PER_S  # between looks at monitors that X has not said anything about
 
 
-class Spot(NamedTuple):
-    """Where one panel's picture goes in its window."""
-
-    panel: int
-    viewport: tuple[int, int, int, int]  # x, y (from the bottom), width, height
-    painter: Painter
-
-
 class WindowPanels(PanelSink):
     """All panels of the stack on X11 monitors.
 
@@ -41,7 +33,7 @@ class WindowPanels(PanelSink):
     for the drawing, and only then swaps them, one directly after the other: a fault before the first swap leaves
     the old frame on all. Only the first window waits for its vertical blank: N windows that each waited in
     turn would divide the rate by N. `skew_ms` is the time between the first and the last return from a swap;
-    what it can't know is how far the monitors' own blanks lie apart (`kind = "span"` has one swap).
+    what it can't know is how far the monitors' own blanks lie apart.
 
     Once a second every window and monitor is compared with what was bound (a question a refresh, some 0.1 ms).
     Where a monitor, a window or the context is lost or became another, every window is closed, `present` raises
@@ -51,20 +43,22 @@ class WindowPanels(PanelSink):
     Uses GLFW, so: one thread, the main one. The `content` context is current again after every call.
     """
 
+    name = "windows"
+
     def __init__(
-        self, settings: OutputSettings, panels: tuple[PanelSettings, ...], stack: PanelStack, clock: Clock,
-        content: moderngl.Context, *, any_shape: bool = False,
+        self, panels: tuple[PanelSettings, ...], stack: PanelStack, clock: Clock, content: moderngl.Context, *,
+        any_size: bool = False, any_shape: bool = False,
     ) -> None:  # fmt: skip
-        """`any_shape`: fill monitors whose shape is not the stack's (identify), rather than refuse them.
+        """What is filled, rather than refused: any_size: monitors of other pixels than the stack's, but of its shape;
+        any_shape: whatever there is (identify).
 
         Raises InputError (settings), PanelLost (a panel is missing or ambiguous, no X server: it may come).
         """
-        self._any_shape = any_shape
-        self.name = settings.kind
-        self._settings, self._panels, self._stack = settings, panels, stack
+        self._any_size, self._any_shape = any_size, any_shape
+        self._panels, self._stack = panels, stack
         self._clock, self._content = clock, content
         self._display: Display | None = None
-        self._surfaces: dict[Surface, list[Spot]] = {}
+        self._surfaces: list[tuple[Window, Painter]] = []  # of each panel
         self._textures: FrameTextures | None = None
         self._watch: PlacementWatch | None = None
         self._retry_ns, self._lost = 0, ""
@@ -129,9 +123,9 @@ class WindowPanels(PanelSink):
             textures.upload(frame)
             # Another context may use what this one has uploaded only after this one is known to be done.
             display.root.context.finish()
-        for surface, spots in self._surfaces.items():
-            self._draw(surface, spots, textures, frame)
-        swapped_ns = [self._swap(surface) for surface in self._surfaces]
+        for panel, (window, painter) in enumerate(self._surfaces):
+            self._draw(panel, window, painter, textures, frame)
+        swapped_ns = [self._swap(window) for window, _ in self._surfaces]
         self._shown = True
         return PresentReport(
             frame.number,
@@ -140,24 +134,20 @@ class WindowPanels(PanelSink):
             vblank_ns=swapped_ns[0],
         )
 
-    def _draw(self, surface: Surface, spots: list[Spot], textures: FrameTextures, frame: PanelFrame) -> None:
-        surface.window.make_current()
-        context = surface.window.context
+    def _draw(self, panel: int, window: Window, painter: Painter, textures: FrameTextures, frame: PanelFrame) -> None:
+        window.make_current()
+        context = window.context
         context.screen.use()
-        if len(spots) > 1:
-            context.screen.viewport = (0, 0, *context.screen.size)
-            context.clear()
-        for spot in spots:
-            context.viewport = spot.viewport
-            spot.painter.draw(textures, frame, spot.panel)
+        context.viewport = (0, 0, self.monitors[panel].width_px, self.monitors[panel].height_px)
+        painter.draw(textures, frame, panel)
         context.finish()
         if fault := _reset_status() or _error(context):
             self._context_lost = True
-            raise PanelLost(f"the GL context of panel {spots[0].panel}: {fault}")
+            raise PanelLost(f"the GL context of panel {panel}: {fault}")
 
-    def _swap(self, surface: Surface) -> int:
-        surface.window.make_current()
-        glfw.swap_buffers(surface.window.handle)
+    def _swap(self, window: Window) -> int:
+        window.make_current()
+        glfw.swap_buffers(window.handle)
         return self._clock.now_ns()
 
     def _may_try(self) -> bool:
@@ -175,42 +165,18 @@ class WindowPanels(PanelSink):
         layer_px = self._stack.width_px, self._stack.height_px
         if not self._any_shape:
             size = {"width_px": layer_px[0], "height_px": layer_px[1]}
-            check_modes(self._panels, self.monitors, **size, allow_rescaling=self._settings.allow_rescaling)
+            check_modes(self._panels, self.monitors, **size, any_size=self._any_size)
         if difference := refresh_difference(self.monitors):
             log.warning("%s", difference)
         display.root.make_current()
         self._textures = FrameTextures(display.root.context, layer_px, count=len(self._panels), group=display.group)
-        for number, (place, panels) in enumerate(self._places()):
-            if self._settings.kind == "span":
-                window = display.spanning_window(place, title="panels")
-            else:
-                window = display.fullscreen_window(self.monitors[number], title=f"panel {number}")
-            spots = [self._spot(window, place, panel) for panel in panels]
-            self._surfaces[Surface(window, place, panels)] = spots
+        for number, (panel, monitor) in enumerate(zip(self._panels, self.monitors, strict=True)):
+            window = display.fullscreen_window(monitor, title=f"panel {number}")
+            screen_px = monitor.width_px, monitor.height_px
+            self._surfaces.append((window, Painter(window.context, panel, screen_px=screen_px, layer_px=layer_px)))
             glfw.swap_interval(1 if number == 0 else 0)
         glfw.poll_events()
-        self._watch = PlacementWatch(display, self.monitors, tuple(self._surfaces), self._clock)
-
-    def _places(self) -> list[tuple[Rectangle, tuple[int, ...]]]:
-        """Of each window, with the panels in it."""
-        if self._settings.kind != "span":
-            return [(monitor.place, (panel,)) for panel, monitor in enumerate(self.monitors)]
-        left, top = min(m.x_px for m in self.monitors), min(m.y_px for m in self.monitors)
-        right = max(m.x_px + m.width_px for m in self.monitors)
-        bottom = max(m.y_px + m.height_px for m in self.monitors)
-        return [(Rectangle(left, top, right - left, bottom - top), tuple(range(len(self.monitors))))]
-
-    def _spot(self, window: Window, place: Rectangle, panel: int) -> Spot:
-        monitor = self.monitors[panel]
-        below = place.y_px + place.height_px - (monitor.y_px + monitor.height_px)
-        viewport = (monitor.x_px - place.x_px, below, monitor.width_px, monitor.height_px)
-        painter = Painter(
-            window.context,
-            self._panels[panel],
-            screen_px=(monitor.width_px, monitor.height_px),
-            layer_px=(self._stack.width_px, self._stack.height_px),
-        )
-        return Spot(panel, viewport, painter)
+        self._watch = PlacementWatch(display, self.monitors, [window for window, _ in self._surfaces], self._clock)
 
     def _retreat(self) -> None:
         """After a failure: keep the connection, and where it is sound the context that all windows share."""
@@ -225,10 +191,9 @@ class WindowPanels(PanelSink):
         self._away = True
         try:
             display.root.make_current()
-            for surface, spots in self._surfaces.items():
-                surface.window.make_current()
-                for spot in spots:
-                    spot.painter.release()
+            for window, painter in self._surfaces:
+                window.make_current()
+                painter.release()
             display.root.make_current()
             if self._textures is not None:
                 self._textures.release()
@@ -251,7 +216,7 @@ class WindowPanels(PanelSink):
 
     def _forget(self) -> None:
         """There are no windows any more; they are made again after a while."""
-        self._surfaces, self._textures, self._watch, self._shown = {}, None, None, False
+        self._surfaces, self._textures, self._watch, self._shown = [], None, None, False
         self._retry_ns = self._clock.now_ns() + RETRY_NS
 
     def _give_back(self) -> None:

@@ -143,7 +143,8 @@ def test_a_fault_writes_what_was_before_it_and_what_followed_for_its_owner_alone
     path = the_file(tmp_path)
     assert path.stem.endswith("-fault-sensor") and stat.S_IMODE(path.stat().st_mode) == 0o600
     messages = read(path)
-    passed = [state for state, _ in groupby(m.value["state"] for m in messages if m.topic == "/state")]
+    states = [m.value["state"] for m in messages if m.topic == "/state"]
+    passed = [state for state, _ in groupby(s for s in states if s not in ("holding", "flat"))]  # a busy machine's
     assert passed[-3:] == ["tracking", "degraded", "tracking"]
     reason = [m.value for m in messages if m.topic == "/state" and m.value["state"] == "degraded"][-1]
     assert reason["missing"] == ["sensor"] and "unplugged" in reason["reason"]

@@ -136,7 +136,7 @@ def test_parts_are_made_used_and_closed_on_one_thread_that_is_not_the_presenter_
     shop.host.close(PATIENCE_S)
     assert [*threads, shop.closed.get(timeout=PATIENCE_S)] == ["solver-1", "solver-1"]
     assert shop.all[0].closed == [False]
-    assert shop.host.left_behind == 0
+    assert not shop.hung
 
 
 def test_what_can_t_be_made_is_raised_to_who_waits_for_it() -> None:
@@ -230,7 +230,7 @@ def test_a_step_that_does_not_return_is_left_behind_and_the_solver_made_anew_ser
     shop.post(2)
     shop.left()
     assert shop.host.restarts == 1
-    assert shop.host.left_behind == 1
+    assert [thread.is_alive() for thread in shop.hung] == [True]
     assert shop.host.news().solution.solved_for_ns == 1  # until there is another
     shop.behave = solves
     shop.solve(3)
@@ -345,6 +345,6 @@ def test_closing_does_not_wait_for_ever_for_a_step_that_hangs(shop: Workshop) ->
     shop.behave = shop.hang
     shop.post(1)
     shop.host.close(0.01)
-    assert shop.host.left_behind == 1
+    assert [thread.is_alive() for thread in shop.hung] == [True]
     shop.gates[0].set()
     assert shop.closed.get(timeout=PATIENCE_S) == "solver-1"

@@ -48,15 +48,13 @@ def shows(x: XServer, monitor: int, expected: np.ndarray) -> bool:
     return eventually(lambda: np.array_equal(x.panel(monitor), expected[..., :3]))
 
 
-@pytest.mark.parametrize("kind", ["windows", "span"])
 def test_a_panel_mounted_upside_down_and_one_mirrored_are_sent_what_sets_it_right(
-    x: XServer, opened: Callable[..., Any], kind: str
+    x: XServer, opened: Callable[..., Any]
 ) -> None:
     sink = opened(
         PanelSettings(connector="DUMMY0", rotation_deg=180),
         PanelSettings(connector="DUMMY1", mirror="horizontal"),
         PanelSettings(connector="DUMMY2", gamma=2.0),
-        kind=kind,
     )
     sink.present(frame(3))
     assert shows(x, 0, picture(3, 0)[::-1, ::-1])
@@ -89,11 +87,10 @@ def presents(sink: WindowPanels, number: int) -> bool:
         return False
 
 
-@pytest.mark.parametrize("kind", ["windows", "span"])
 def test_a_monitor_that_goes_is_named_and_one_that_returns_is_used_again(
-    x: XServer, opened: Callable[..., Any], kind: str
+    x: XServer, opened: Callable[..., Any]
 ) -> None:
-    sink = opened(*BY_CONNECTOR, kind=kind)
+    sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
     x.unplug(1)
     with pytest.raises(PanelLost, match="DUMMY1"):
@@ -109,7 +106,7 @@ def test_a_monitor_that_goes_is_named_and_one_that_returns_is_used_again(
 def test_a_closed_window_is_a_lost_panel_and_comes_back(x: XServer, opened: Callable[..., Any]) -> None:
     sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
-    x.ask_to_close(glfw.get_x11_window(list(sink._surfaces)[1].window.handle))
+    x.ask_to_close(glfw.get_x11_window(sink._surfaces[1][0].handle))
     with pytest.raises(PanelLost, match="closed"):
         for number in range(1, 50):
             sink.present(frame(number))
@@ -130,11 +127,8 @@ def moved(number: int, *, flatness: float = 0.0) -> PanelFrame:
     return PanelFrame(number, solved, 7, matrices, solved[::-1], 7, flatness)
 
 
-@pytest.mark.parametrize("kind", ["windows", "span"])
-def test_the_aligned_picture_is_on_all_panels_in_the_same_frame(
-    x: XServer, opened: Callable[..., Any], kind: str
-) -> None:
-    sink = opened(*BY_CONNECTOR, kind=kind)
+def test_the_aligned_picture_is_on_all_panels_in_the_same_frame(x: XServer, opened: Callable[..., Any]) -> None:
+    sink = opened(*BY_CONNECTOR)
     for number in range(6):
         frame = moved(number, flatness=0.2 * number)
         assert sink.present(frame).number == number
