@@ -17,6 +17,7 @@ from runtime.eyes.calibration import Calibration, Lenient, Vector3, load_calibra
 from runtime.records import F64
 from runtime.report.page import Figure, Page, Section, section_of
 from runtime.report.plots import drawing, png
+from runtime.support.figures import in_words
 
 COLOURS = {"X": "#c0392b", "Y": "#27803b", "Z": "#2260a8"}
 
@@ -57,7 +58,8 @@ def write_report(file: Path, out: Path, *, viewing: CalibrationSettings) -> dict
     calibration, table = load_calibration(file), read_table(file)
     points = _stored_points(table.get("data"), calibration, source=file)
     summary = _summary(calibration, points, viewing_volume_m(viewing))
-    sections = [section_of("Numbers", _numbers(summary))]
+    rows = [[name, text] for name, value in summary.items() if (text := in_words(value))]
+    sections = [section_of("Numbers", [["", ""], *rows])]
     notes = [*calibration.warnings]
     if isinstance(table.get("warnings"), list):
         notes += [str(text) for text in table["warnings"]]
@@ -131,28 +133,6 @@ def _summary(calibration: Calibration, points: Points | None, volume_m: F64) -> 
     found["eye_error_mm"] = None if eye_error is None else float(eye_error.mean()) * 1e3
     found["eye_error_p95_mm"] = None if eye_error is None else float(np.percentile(eye_error, 95)) * 1e3
     return found
-
-
-def _numbers(summary: dict[str, Any]) -> list[list[str]]:
-    names = {
-        "sensor_serial": "sensor",
-        "rejected": "rejected as outliers",
-        "similarity_defect": "departure from a similarity",
-        "rms_mm": "residual, RMS (mm)",
-        "max_mm": "residual, largest (mm)",
-        "axis_rms_mm": "residual along x, y, z (mm)",
-        "eye_error_mm": "expected error at the eye, mean over the viewing volume (mm)",
-        "eye_error_p95_mm": "expected error at the eye, 95th percentile (mm)",
-    }
-    rows = [["", ""]]
-    rows += [[names.get(key, key), _shown(value)] for key, value in summary.items() if value not in (None, "")]
-    return rows
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(f"{item:.3g}" for item in value)
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
 def _point_rows(points: Points) -> list[list[str]]:

@@ -28,7 +28,7 @@ from runtime.support.untrusted_input import LIMITS
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-TRIANGLES, STRIP, FAN = 4, 5, 6  # of `mode`
+TRIANGLES, STRIP, FAN = 4, 5, 6  # of `mode`; the last two are refused
 LARGEST_TEXTURE_PX = 4096
 ELEMENTS_PER_TRIANGLE = 10  # all accessors together, for the limit on triangles
 UNDERSTOOD = {
@@ -241,11 +241,13 @@ class _Reader:
 
     def _primitive(self, primitive: Table, weights: ArrayLike | None) -> tuple[Part, Binding] | None:
         attributes, mode = primitive["attributes"], primitive.get("mode", TRIANGLES)
-        if "POSITION" not in attributes or mode not in (TRIANGLES, STRIP, FAN):
+        if mode in (STRIP, FAN):
+            raise InputError(self._path, "mode", "strips and fans of triangles are not read: export triangles")
+        if "POSITION" not in attributes or mode != TRIANGLES:
             return None  # points and lines
         positions = self._floats(attributes["POSITION"], "VEC3")
         count = len(positions)
-        triangles = self._triangles(primitive, mode, count)
+        triangles = self._triangles(primitive, count)
         if not len(triangles):
             return None
         look = self._look(primitive.get("material"))
@@ -281,22 +283,14 @@ class _Reader:
             rest_weights=np.zeros(len(morphs)) if weights is None else np.asarray(weights, dtype=np.float64),
         )
 
-    def _triangles(self, primitive: Table, mode: int, count: int) -> I32:
+    def _triangles(self, primitive: Table, count: int) -> I32:
         indices = np.arange(count, dtype=np.int32)
         if "indices" in primitive:
             found = self._accessor(primitive["indices"], "SCALAR")[:, 0]
             if found.dtype.kind != "u" or found.max(initial=0) >= max(count, 1):
                 raise InputError(self._path, "faces", "refer to vertices that are not there")
             indices = found.astype(np.int32)
-        if mode == TRIANGLES:
-            return np.ascontiguousarray(indices[: len(indices) // 3 * 3].reshape(-1, 3))
-        if len(indices) < 3:
-            return np.zeros((0, 3), np.int32)
-        first = np.full(len(indices) - 2, indices[0]) if mode == FAN else indices[:-2]
-        strip = np.column_stack([first, indices[1:-1], indices[2:]]).astype(np.int32)
-        if mode == STRIP:
-            strip[1::2] = strip[1::2, [1, 0, 2]]
-        return strip
+        return np.ascontiguousarray(indices[: len(indices) // 3 * 3].reshape(-1, 3))
 
     # Materials.
 

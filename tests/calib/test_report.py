@@ -46,7 +46,7 @@ def test_the_page_holds_numbers_and_pictures_and_needs_nothing_else(tmp_path: Pa
     page = (out / "index.html").read_text()
     assert page.count("data:image/png;base64,") == 1
     assert not re.search(r"(src|href)=\"(?!data:|#)", page)
-    for text in ("residual, RMS", "robust", "condition", "expected error at the eye", "line 7", "rejected"):
+    for text in ("rms_mm", "robust", "condition", "eye_error_mm", "line 7", "rejected"):
         assert text in page
     assert read_image(out / "residuals.png").std() > 5
 

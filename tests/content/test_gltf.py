@@ -22,7 +22,7 @@ from runtime.content.rig import Channel, slerp
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from tests.content.conftest import panel_view
-from tests.content.gltf_files import SQUARE, Buffer, bending_bar, growing_square, moving_square
+from tests.content.gltf_files import SQUARE, SQUARE_FACES, Buffer, bending_bar, growing_square, moving_square
 
 EYE = (0.6, 0.0, 0.0)
 
@@ -141,7 +141,7 @@ def test_alpha_is_what_the_material_says(
     attributes = {"POSITION": b.add(SQUARE), "TEXCOORD_0": b.add([[0, 1], [1, 1], [1, 0], [0, 0]])}
     b.write(
         tmp_path / "a.gltf",
-        {"attributes": attributes, "mode": 6, "material": 0},
+        {"attributes": attributes, "indices": b.add(SQUARE_FACES, np.uint16), "material": 0},
         images=[{"uri": "skin.png"}],
         textures=[{"source": 0}],
         materials=[{"alphaMode": mode, "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
@@ -174,6 +174,7 @@ def many_nodes(table: dict[str, Any]) -> None:
         (lambda t: t["nodes"][1].update(rotation=[0, 0, 1]), "[0, 0, 1] must be 4 numbers"),
         (lambda t: t["nodes"][1].update(scale=[1e99, 0, 1]), "must be 3 numbers"),
         (lambda t: t["accessors"][0].update(type="VEC4"), "accessors[0] is VEC4, not VEC3"),
+        (lambda t: t["meshes"][0]["primitives"][0].update(mode=5), "mode: strips and fans of triangles are not read"),
     ],
 )
 def test_a_hostile_rig_is_one_line_that_names_the_field(tmp_path: Path, change: Any, told: str) -> None:
