@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -52,10 +53,8 @@ def panels(
         from calib.photographs import photographs
         from calib.registration_run import register_photos
 
-        summary, text = register_photos(
-            photographs(photos), str(photos), out, settings, config=config if write else None
-        )
-        _report(summary, text, as_json)
+        target = config if write else None
+        _report(register_photos(photographs(photos), str(photos), out, settings, config=target), as_json)
         return
     from calib.board import boards
     from calib.display import grey_layers, open_display, show_until_key
@@ -90,8 +89,7 @@ def grey(
         from calib.grey_chart import lut_from_photographs
         from calib.photographs import photographs
 
-        found = lut_from_photographs(out, photographs(photos), stack, panel=panel, source=str(photos))
-        _report(*found, as_json)
+        _report(lut_from_photographs(out, photographs(photos), stack, panel=panel, source=str(photos)), as_json)
         return
     from calib.display import alone, open_display, show_until_key
     from calib.grey_chart import grey_chart
@@ -114,8 +112,7 @@ def charts(
     from calib.viewpoints import grid
 
     settings = _settings(config)
-    summary = make_charts(out, grid(settings.calibration), settings)
-    _report(summary, f"{summary['files']} files for {len(summary['viewpoints'])} viewpoints in {out}", as_json)
+    _report(make_charts(out, grid(settings.calibration), settings), as_json)
 
 
 @app.command()
@@ -149,7 +146,7 @@ def capture(
         finally:
             keys.close()
             hardware.close()
-    _report(summary, f"{summary['pairs']} pairs in {out} ({summary['accepted']} new)", as_json)
+    _report(summary, as_json)
 
 
 @app.command()
@@ -169,10 +166,7 @@ def solve(
     """
     from calib.solve_run import solve_file
 
-    summary, text = solve_file(pairs, out, settings=_settings(config), method=method, known_scale=scale)
-    for warning in summary["warnings"]:
-        typer.echo(f"warning: {warning}", err=True)
-    _report(summary, text, as_json)
+    _report(solve_file(pairs, out, settings=_settings(config), method=method, known_scale=scale), as_json)
 
 
 @app.command()
@@ -188,9 +182,8 @@ def report(
     """
     from calib.report import write_report
 
-    settings = _settings(config)
-    summary = write_report(file, out, viewing=settings.calibration)
-    _report(summary, str(out / "index.html"), as_json)
+    summary = write_report(file, out, viewing=_settings(config).calibration)
+    _report({"page": str(out / "index.html")} | summary, as_json)
 
 
 def _settings(config: Path | None) -> Settings:
@@ -199,8 +192,10 @@ def _settings(config: Path | None) -> Settings:
     return load_settings(config)
 
 
-def _report(summary: dict[str, Any], text: str, as_json: bool) -> None:
-    """Print a command's summary as one JSON object, or its text for a person."""
+def _report(summary: dict[str, Any], as_json: bool) -> None:
+    """Print a command's summary as one JSON object, or a line a field."""
     from runtime.support.artifacts import to_json
+    from runtime.support.figures import lines_of
 
-    typer.echo(to_json(summary) if as_json else text)
+    text = to_json(summary)
+    typer.echo(text if as_json else "\n".join(lines_of(json.loads(text))))

@@ -99,16 +99,12 @@ def grey_chart(stack: PanelStack, panel: int) -> U8:
 
 def lut_from_photographs(
     out: Path, pictures: Iterable[tuple[str, U8]], stack: PanelStack, *, panel: int, source: str
-) -> tuple[dict[str, Any], str]:
-    """Write a panel's LUT from named photographs (h, w) of its chart; returns the summary and its text.
-
-    Raises InputError.
-    """
+) -> dict[str, Any]:
+    """Write a panel's LUT from named photographs (h, w) of its chart; returns the summary. Raises InputError."""
     found = [histograms(picture, stack, panel, source=f"{source}, {name}") for name, picture in pictures]
     intensity, residual = measure(found, stack, panel, source=source)
     write_lut(out, intensity)
-    summary = {"file": str(out), "grey": GREYS, "intensity": intensity, "residual": residual}
-    return summary, f"{out}: measured to {100 * residual:.2f}%"
+    return {"file": str(out), "grey": GREYS, "intensity": intensity, "residual": residual}
 
 
 def write_lut(out: Path, intensity: F64) -> None:

@@ -18,14 +18,13 @@ from runtime.config import Settings
 from runtime.errors import InputError
 from runtime.optics.stack import UNEVEN_MOST
 from runtime.records import U8
-from runtime.report.page import in_columns
 from runtime.support.artifacts import write_json
 from runtime.support.progress import status_line
 
 
 def register_photos(
     pictures: Iterable[tuple[str, U8]], source: str, out: Path, settings: Settings, *, config: Path | None
-) -> tuple[dict[str, Any], str]:
+) -> dict[str, Any]:
     """Register from named photographs (h, w) of the boards, report, and write into `config` where one is given.
 
     Raises InputError; nothing is written then.
@@ -49,7 +48,7 @@ def register_photos(
     if config is not None:
         kept = rewrite(config, lambda configured: put_registration(configured, found))
         summary["kept_version"] = str(kept) if kept else None
-    return summary, summary_text(summary)
+    return summary
 
 
 def put_registration(document: TOMLDocument, found: Registration) -> None:
@@ -94,23 +93,3 @@ def registration_summary(found: Registration) -> dict[str, Any]:
         "panels": panels,
         "notes": notes,
     }
-
-
-def summary_text(summary: dict[str, Any]) -> str:
-    """What the command prints."""
-    rows = [["panel", "x (mm)", "turned (°)", "tilt right, up (°)", "corner off (px)", "± (px)"]]
-    for index, panel in enumerate(summary["panels"]):
-        rows.append([
-            str(index) + (", the reference" if index == summary["reference"] else ""),
-            f"{panel['x_m'] * 1e3:+.2f}", f"{panel['turn_deg']:+.3f}",
-            "{:+.2f}, {:+.2f}".format(*panel["tilt_deg"]), f"{panel['corner_off_px']:.2f}",
-            f"{panel['sigma_px']:.3f}",
-        ])  # fmt: skip
-    pairs = zip(summary["gap_m"] * 1e3, summary["gap_sigma_m"] * 1e3, strict=True)
-    gaps = ", ".join(f"{gap:.2f} ± {sigma:.2f}" for gap, sigma in pairs)
-    lines = [
-        in_columns(rows),
-        f"gaps {gaps} mm; {summary['points']} points of {summary['used']} photographs, {summary['outliers']} left out",
-        f"what is uncertain is worth {summary['eye_error_mm']:.2f} mm at the eye",
-    ]
-    return "\n".join([*lines, *(f"note: {note}" for note in summary["notes"])])

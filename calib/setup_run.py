@@ -101,7 +101,7 @@ def _problem_of(setup: Setup, step: Step) -> str:
         return problem
     setup.done[step.name] = figures
     write_json(progress_path(setup.config), {"done": setup.done})
-    setup.say(f"step {step.name}: done")
+    setup.say(f"step {step.name}: done: {figures['text']}")
     return ""
 
 

@@ -211,8 +211,7 @@ def registration(setup: Setup) -> Figures:
     setup.write(lambda document: None)  # an empty configuration where there was none
     settings = setup.settings
     pictures = setup.hardware.photographs(settings, boards(settings.stack.stack()), panel=None, say=setup.say)
-    summary, text = register_photos(pictures, "photographs", setup.out / "registration", settings, config=setup.config)
-    setup.say(text)
+    summary = register_photos(pictures, "photographs", setup.out / "registration", settings, config=setup.config)
     gaps = ", ".join(f"{gap * 1e3:.2f}" for gap in summary["gap_m"])
     figures = f"gaps {gaps} mm, from {summary['used']} photographs; what is uncertain is worth"
     return {"text": f"{figures} {summary['eye_error_mm']:.2f} mm at the eye", "notes": summary["notes"]}
@@ -255,10 +254,11 @@ def _measure_grey(setup: Setup, panel: int) -> float:
     charts[panel] = grey_chart(stack, panel)
     pictures = setup.hardware.photographs(settings, charts, panel=panel, say=setup.say)
     path = (setup.out / "grey" / f"panel-{panel}.csv").resolve()
-    summary, text = lut_from_photographs(path, pictures, stack, panel=panel, source="photographs")
+    summary = lut_from_photographs(path, pictures, stack, panel=panel, source="photographs")
     setup.write(lambda document: put_lut(document, panel, str(path), panels=stack.count))
-    setup.say(f"panel {panel}: taken, {text}")
-    return float(summary["residual"])
+    residual = float(summary["residual"])
+    setup.say(f"panel {panel}: taken, measured to {100 * residual:.2f}%")
+    return residual
 
 
 def sensor(setup: Setup) -> Figures:
@@ -295,8 +295,7 @@ def calibration(setup: Setup) -> Figures:
     if count < MIN_PAIRS:
         setup.say(f"{count} pairs are kept in {pairs_path}; at least {MIN_PAIRS} are needed")
         raise Stopped
-    summary, text = solve_file(pairs_path, target, settings=setup.settings)
-    setup.say(text)
+    summary = solve_file(pairs_path, target, settings=setup.settings)
     setup.write(lambda document: put(document, "calibration", {"file": str(target.resolve())}))
     text = f"{summary['eye_error_mm']:.1f} mm of error expected at the eye, from {summary['pairs']} pairs"
     return {"text": text, "notes": summary["warnings"]}

@@ -1,4 +1,4 @@
-"""`calibrate solve`: pairs in, a calibration file and the methods' table out."""
+"""`calibrate solve`: pairs in, a calibration file and every method's figures out."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from calib.viewpoints import viewing_volume_m
 from runtime.config import Settings
 from runtime.errors import InputError
 from runtime.records import F64
-from runtime.report.page import in_columns
 
 if TYPE_CHECKING:
     from tomlkit.items import Array
@@ -29,8 +28,8 @@ STORED_PAIRS = 500  # more are left in their own file
 
 def solve_file(
     pairs_path: Path, out: Path, *, settings: Settings, method: str = "", known_scale: float = 1.0
-) -> tuple[dict[str, Any], str]:
-    """Write the calibration; returns the summary and a table for people. Raises InputError.
+) -> dict[str, Any]:
+    """Write the calibration; returns the summary, with every method's figures. Raises InputError.
 
     method: empty: the one with the least error at the eye for such pairs; known_scale: of `fixed-scale`.
     """
@@ -54,7 +53,7 @@ def solve_file(
             other = solve(pairs.sensor_m, pairs.stack_m, method=name, known_scale=known_scale)
             methods.append(_figures(chosen if name == chosen.method else other, volume_m))
     save(out, calibration_text(chosen, pairs, settings, warnings=warnings, volume_m=volume_m))
-    summary = _figures(chosen, volume_m) | {
+    return _figures(chosen, volume_m) | {
         "file": str(out),
         "reason": chosen.reason,
         "stack_from_sensor": chosen.similarity.matrix,
@@ -64,7 +63,6 @@ def solve_file(
         "warnings": warnings,
         "methods": methods,
     }
-    return summary, _text(summary)
 
 
 def _figures(solution: Solution, volume_m: F64) -> dict[str, Any]:
@@ -79,23 +77,6 @@ def _figures(solution: Solution, volume_m: F64) -> dict[str, Any]:
         "condition": solution.condition,
         "rejected": int((~solution.used).sum()),
     }
-
-
-def _text(summary: dict[str, Any]) -> str:
-    rows = [["method", "scale", "RMS mm", "max mm", "at the eye mm"]]
-    for row in summary["methods"]:
-        mark = "> " if row["method"] == summary["method"] else ""
-        figures = [row[name] for name in ("rms_mm", "max_mm", "eye_error_mm")]
-        rows.append([mark + row["method"], f"{row['scale']:.5f}", *[f"{value:.3f}" for value in figures]])
-    axes = ", ".join(f"{value:.2f}" for value in summary["axis_rms_mm"])
-    return "\n".join([
-        f"{summary['file']}: {summary['method']} ({summary['reason']})",
-        f"  {summary['pairs']} pairs, {summary['rejected']} rejected; residual RMS {summary['rms_mm']:.2f} mm, "
-        f"largest {summary['max_mm']:.2f} mm; x, y, z {axes} mm",
-        f"  expected error at the eye {summary['eye_error_mm']:.2f} mm on average over the viewing volume, "
-        f"95% below {summary['eye_error_p95_mm']:.2f} mm",
-        in_columns(rows),
-    ])  # fmt: skip
 
 
 def calibration_text(
