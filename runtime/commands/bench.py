@@ -55,9 +55,10 @@ def eyes(
     """
     from runtime.eyes import benchmark
     from runtime.support.artifacts import to_json
+    from runtime.support.figures import lines_of
 
     measured = benchmark.measure(folder)
-    print(to_json(measured) if as_json else benchmark.told(measured))
+    print(to_json(measured) if as_json else "\n".join(lines_of(measured)))
 
 
 @app.command()

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from runtime.errors import InputError
 from runtime.records import F64
 
 FILE = Path(__file__).with_name("presets.toml")
@@ -30,20 +29,9 @@ def preset_names() -> tuple[str, ...]:
     return tuple(preset_file()["scene"])
 
 
-def _table(name: str) -> dict[str, Any]:
-    file = preset_file()
-    if name not in file["scene"]:
-        raise InputError("content", "scene", f"no preset `{name}`; there are {', '.join(preset_names())}")
-    table: dict[str, Any] = file["scene"][name]
-    return table
-
-
 def stack_from_preset(name: str) -> F64:
-    """4x4 metres of the stack frame from a scene's digital units, as the supplement prints: R·scene/(100 r_p2d) + t.
-
-    Raises InputError for an unknown one.
-    """
-    table, matrix = _table(name), np.eye(4)
+    """4x4 metres of the stack frame from a scene's digital units, as the supplement prints: R·scene/(100 r_p2d) + t."""
+    table, matrix = preset_file()["scene"][name], np.eye(4)
     rotation = rotation_matrix(table["rotation_deg"], preset_file()["rotation_order"])
     matrix[:3, :3] = rotation / (table["scale_per_cm"] / CM)
     matrix[:3, 3] = table["translation_m"]
@@ -52,8 +40,8 @@ def stack_from_preset(name: str) -> F64:
 
 def drawn_scene_from_stack(name: str) -> F64:
     """4x4 the scene's digital units from metres of the stack frame, as the published code drew the data set: its scale,
-    the scene's own axes, and the panels where it evaluates. Raises InputError for an unknown one."""
-    code, matrix = _table(name)["published"], np.eye(4)
+    the scene's own axes, and the panels where it evaluates."""
+    code, matrix = preset_file()["scene"][name]["published"], np.eye(4)
     axes = axes_matrix(out=code["out"], up=code["up"])
     gap = code["thickness_cm"] * code["scale_per_cm"]
     # The middle panel stands half a gap beyond that code's ground, along `out`; the ground may be in gaps.

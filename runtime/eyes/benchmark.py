@@ -165,21 +165,3 @@ def _followed(faces: list[Face], find: Any, finder: PupilFinder) -> dict[str, An
         "up_mm": up,
         "lag_frames": float(np.median(lags)) if lags else None,
     }
-
-
-def told(measured: dict[str, Any]) -> str:
-    """The same as a table."""
-    lines = ["distance  light  both eyes   mean    p95   error/sigma"]
-    for row in measured["cameras"]:
-        figures = (
-            "nobody" if row["mean_mm"] is None else "{mean_mm:.2f}   {p95_mm:.2f}   {error_in_sigmas:.2f}".format(**row)
-        )
-        lines.append(f"{row['distance_m']:6.2f} m  {row['light']:4.0%}   {row['right']:8.1%}   {figures}")
-    steady, ms = measured["steady"], measured["processor_ms"]
-    if steady["faces"]:
-        lines.append("{right_mm:.3f} mm right, {up_mm:.3f} mm up: jitter at {distance_m} m".format(**steady))
-        lines.append("{lag_frames:.3f} frames: lag".format(**steady))
-    lines += [
-        f"{name}: {row['p50']:.1f} ms (p99 {row['p99']:.1f})" for name, row in ms.items() if row["p50"] is not None
-    ]
-    return "\n".join(lines)

@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from runtime.content.presets import axes_matrix, drawn_scene_from_stack, preset_file, stack_from_preset
-from runtime.errors import InputError
 
 # Of the published code's table: scale per cm, thickness in cm, out axis, up axis; ground (digital units) or its
 # coefficient. One scene of each kind.
@@ -52,8 +51,3 @@ def test_the_seed_s_pose_takes_the_scene_into_the_light_field_frame() -> None:
     )
     in_stack = turned + table["translation_m"]
     assert stack_from_preset("traffic") @ np.append(point, 1.0) == pytest.approx(np.append(in_stack, 1.0))
-
-
-def test_an_unknown_preset_is_one_line_that_lists_them() -> None:
-    with pytest.raises(InputError, match=r"^content: scene: no preset `lego`; there are .*lego_bulldozer"):
-        stack_from_preset("lego")
