@@ -27,8 +27,9 @@ import psutil
 
 from runtime.blackbox.recorder import Recorder
 from runtime.clock import NS_PER_S
+from runtime.content.presets import preset_names
+from runtime.content.scenes import SCENES as BUILT_IN
 from runtime.daemon.client import ask
-from runtime.daemon.names import scene_names
 from runtime.errors import SensorLost
 from runtime.page.daemon import LOOKED_UP_AGAIN_S, Daemon
 from tests.daemon.rig import TRACKING
@@ -40,7 +41,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "loop": {"rate_hz": 200.0},
     "tracker": {"hold_s": 0.5},
 }
-SCENES, MODELS = scene_names()[:20], ("balanced", "fast")
+SCENES, MODELS = (*BUILT_IN, *preset_names())[:20], ("balanced", "fast")
 KEPT_MIN = 0.05  # by the black box, so that it is full before memory is looked at
 COUNTED = ("state", "reason", "scene", "model", "paused", "frames", "presented", "dropped", "faults")
 

@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 from base64 import b64encode
+from pathlib import Path
 from typing import Any
 
 from runtime.clock import NS_PER_MS
-from runtime.config import Settings
+from runtime.config import ContentSettings, Settings
+from runtime.content.pictures import PICTURES, VIDEOS
+from runtime.content.presets import preset_names
+from runtime.content.registry import MESHES, PLAYLISTS
+from runtime.content.scenes import SCENES
 from runtime.daemon.build import Run
 from runtime.daemon.commands import PLACING
-from runtime.daemon.names import library_scenes, model_names, scene_names
 from runtime.daemon.pictures import pictures_of
 from runtime.errors import ContextLost
 from runtime.frame.presenter import Presenter
+from runtime.model.predictor import SHIPPED
 from runtime.records import RefreshAccount
 from runtime.support.version import version
+
+LIBRARY_MOST, LIBRARY_LOOKED_AT = 200, 2000
+IN_LIBRARY = {*PICTURES, *VIDEOS, *MESHES, *PLAYLISTS, ".ply"}
 
 
 def placing_in(settings: Settings) -> dict[str, Any]:
@@ -75,9 +83,25 @@ def about(run: Run) -> dict[str, Any]:
         "viewing_m": settings.calibration.viewing_m,
         "viewing_side_deg": settings.calibration.viewing_side_deg,
         "viewing_up_deg": settings.calibration.viewing_up_deg,
-        "models": model_names(),
-        "scenes": (*scene_names(), *library_scenes(settings.content)),
+        "models": (*SHIPPED, "sart"),
+        "scenes": (*SCENES, *preset_names(), *library_scenes(settings.content)),
     }
+
+
+def library_scenes(settings: ContentSettings) -> tuple[str, ...]:
+    """What can be shown of the library's folder, by its whole path; as many as a page can offer.
+
+    A name that is not UTF-8 (no setting can hold it) or that can't be printed is left out.
+    """
+    if not settings.library:
+        return ()
+    try:
+        entries = sorted(Path(settings.library).absolute().iterdir())[:LIBRARY_LOOKED_AT]
+    except (OSError, ValueError):
+        return ()
+    entries = [path for path in entries if not path.name.startswith(".") and path.name.isprintable()]
+    found = [str(path) for path in entries if path.suffix.lower() in IN_LIBRARY or path.is_dir()]
+    return tuple(found[:LIBRARY_MOST])
 
 
 def pictures(run: Run) -> dict[str, Any]:

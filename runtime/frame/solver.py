@@ -165,8 +165,6 @@ class Solver:
     def _replan(self, state: RunState, eyes_m: F64 | None) -> None:
         """Make the plan again where the content, the model, the settings or what the eyes can see have changed."""
         seeing = self._seeing if eyes_m is None else seeing_eyes(eyes_m, self._seeing)
-        if seeing != self._seeing:
-            log.info("plan: %s", _who_sees(seeing))
         self._seeing = seeing
         made_for = (state.version, seeing)
         if made_for != self._planned_for:
@@ -186,13 +184,3 @@ class Solver:
         else:
             log.exception("%s: unexpected error", part)
         return dict(self._missing)
-
-
-def _who_sees(seeing: tuple[bool, bool]) -> str:
-    """One line for the log."""
-    match seeing:
-        case (True, False):
-            return "the right eye can't see the display: solved for the left one alone"
-        case (False, True):
-            return "the left eye can't see the display: solved for the right one alone"
-    return "solved for both eyes"
