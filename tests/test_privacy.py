@@ -71,7 +71,6 @@ def run_traced(folder: Path, *arguments: str) -> tuple[list[str], list[str]]:
     [
         "run --replay demo --headless --max-speed --frames 3 --scale 0.1 --out {out}",
         "record --seconds 0.5 --out {out}/a.mcap",
-        "plan --scale 0.1",
     ],
     ids=lambda command: " ".join(command.split()[:3]),
 )

@@ -15,6 +15,9 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from runtime.clock import NS_PER_S
+from runtime.config import Settings, with_options
+from runtime.daemon.build import RunOptions
+from runtime.daemon.drive import drive
 from runtime.eyes.demo_geometry import demo_sensor_from_stack
 from runtime.eyes.motions import true_eyes
 from runtime.records import EyePoints, SensorFrame
@@ -51,6 +54,13 @@ def run(folder: Path, *arguments: Any) -> Path:
     """A run as fast as it can, whose files are in `folder`."""
     result = phasestack("run", "--headless", "--max-speed", *map(str, arguments), "--out", str(folder))
     assert result.returncode == 0, result.stderr
+    return folder
+
+
+def played(folder: Path, recording: Path | str, *, scale: float = 0.05, frames: int | None = None) -> Path:
+    """The same without a process of its own."""
+    options = RunOptions(max_speed=True, measure=True, scale=scale, frames=frames, out=folder)
+    drive(with_options(Settings(), replay=str(recording), headless=True), options)
     return folder
 
 
@@ -105,8 +115,7 @@ def test_the_summary_has_figures_and_null_where_nothing_was_measured(runs: tuple
     for name in ("psnr_db", "ssim", "carried_db", "carried_db_true_eyes", "psnr_db_true_eyes"):
         assert summary[name] is not None, name
     assert summary["carried_db"] > 20
-    nobody = run(tmp_path / "first", "--replay", "demo", "--frames", 1, "--scale", 0.1)
-    short = summary_of(nobody)
+    short = summary_of(played(tmp_path / "first", "demo", frames=1))
     for name in ("psnr_db", "ssim", "carried_db", "fps", "interval_ms", "photon_ms", "overhead_ms"):
         assert short[name] is None, name
 
@@ -175,9 +184,9 @@ def test_a_recording_of_any_rate_plays_through_once_in_its_own_time_the_same_eve
     tmp_path: Path, rate_hz: int
 ) -> None:
     recording = recorded(tmp_path / "head.mcap", evenly(rate_hz, 1.0))
-    first = run(tmp_path / "a", "--replay", recording, "--scale", 0.05)
+    first = played(tmp_path / "a", recording)
     if rate_hz in (SLOWEST_HZ, FASTEST_HZ):  # those between differ in nothing that could be random
-        assert files_of(first) == files_of(run(tmp_path / "b", "--replay", recording, "--scale", 0.05))
+        assert files_of(first) == files_of(played(tmp_path / "b", recording))
     summary, lines = summary_of(first), lines_of(first)
     # From the first sample to the arrival of the last.
     assert summary["seconds"] == pytest.approx((rate_hz - 1) / rate_hz + 0.015, abs=0.02)
@@ -193,8 +202,8 @@ def test_a_recording_of_any_rate_plays_through_once_in_its_own_time_the_same_eve
 def test_a_gap_of_three_seconds_is_passed_once_through_holding_and_flat_and_back(tmp_path: Path) -> None:
     times = [*evenly(30, 0.7), *evenly(30, 0.7, start_s=4.7)]
     recording = recorded(tmp_path / "gap.mcap", times, motion="still")
-    first = run(tmp_path / "a", "--replay", recording, "--scale", 0.05)
-    assert files_of(first) == files_of(run(tmp_path / "b", "--replay", recording, "--scale", 0.05))
+    first = played(tmp_path / "a", recording)
+    assert files_of(first) == files_of(played(tmp_path / "b", recording))
     lines = lines_of(first)
     assert states_passed(lines) == ["flat", "tracking", "holding", "flat", "tracking"]
     assert summary_of(first)["seconds"] == pytest.approx(3.7 + 0.7, abs=0.08)

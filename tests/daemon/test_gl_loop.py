@@ -135,7 +135,7 @@ def resident_mib() -> float:
 
 
 @pytest.mark.parametrize(
-    ("solutions", "lost_every"), [(30, 5), pytest.param(2000, 500, marks=pytest.mark.slow)], ids=["some", "thousands"]
+    ("solutions", "lost_every"), [(15, 5), pytest.param(2000, 500, marks=pytest.mark.slow)], ids=["some", "thousands"]
 )
 def test_solutions_with_contexts_lost_under_way_leave_no_object_and_no_memory_behind(
     solutions: int, lost_every: int

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from runtime.clock import NS_PER_S
 from runtime.model.gl.state import GlState
 from runtime.model.reprojection import NEUTRAL
 from runtime.optics.alignment import shown_layers
@@ -104,8 +105,8 @@ def test_nothing_is_read_back_in_the_loop_but_the_network_s_raster(outputs: dict
         assert len(crossing.counted.calls) > before
 
 
-def test_of_a_window_of_the_plan_nothing_else_crosses(outputs: dict[str, Any], crossing: Crossing) -> None:
-    with Rig(model=MODEL, tracker=HELD, content={"scene": "sparse"}, **outputs) as rig:
+def test_of_a_window_of_the_plan_nothing_else_crosses(crossing: Crossing) -> None:
+    with Rig(model=MODEL, tracker=HELD, content={"scene": "sparse"}) as rig:
         rig.refresh_until_solved()
         crossing.assert_only_the_network_s(rig, solutions=4)
         assert 0 < rig.run.parts.solver.measured.left_out.solved_share < 0.5
@@ -144,6 +145,7 @@ def test_monitors_that_come_and_go_leave_the_solver_its_textures(
     server: xserver.XServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DISPLAY", server.name)
+    monkeypatch.setattr("runtime.panels.window.RETRY_NS", NS_PER_S // 20)
     with Rig(model=MODEL, **on_windows()) as rig:
         rig.refresh_until_solved()
         parts, group = rig.run.parts, rig.presenter.panels.group
@@ -162,6 +164,7 @@ def test_a_context_that_the_panels_lost_is_made_anew_with_the_solver(
     server: xserver.XServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DISPLAY", server.name)
+    monkeypatch.setattr("runtime.panels.window.RETRY_NS", NS_PER_S // 20)
     with Rig(model=MODEL, abandon_s=0.2, loop={"rate_hz": 100.0}, **on_windows()) as rig:
         rig.refresh_until_solved()
         parts, group = rig.run.parts, rig.presenter.panels.group

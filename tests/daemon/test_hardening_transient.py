@@ -70,7 +70,7 @@ def lived(read_settings: Callable[[], Settings] = Settings) -> None:
     supervise.run_daemon(read_settings, RunOptions(max_speed=True, frames=1, scale=0.1))
 
 
-@pytest.mark.parametrize("limit", [8, 12, 24])
+@pytest.mark.parametrize("limit", [8, 12])
 def test_without_descriptors_the_exit_code_is_never_that_of_bad_configuration(tmp_path: Path, limit: int) -> None:
     code = (
         "import resource, sys; from runtime.cli import main\n"

@@ -103,15 +103,14 @@ def test_a_monitor_in_another_mode_of_the_same_shape_is_bound_anew_where_any_wil
     assert eventually(lambda: np.abs(x.screenshot()[:90, 640:800] - halved).max() <= 1.0)
 
 
-@pytest.mark.parametrize(("mode", "size"), [("tall", "160x180"), ("half", "160x90")])
 def test_a_monitor_in_a_mode_that_does_not_fit_is_held_and_named_until_it_is_put_right(
-    x: XServer, opened: Callable[..., Any], mode: str, size: str
+    x: XServer, opened: Callable[..., Any]
 ) -> None:
     sink = opened(*BY_CONNECTOR)
     assert presents(sink, 0)
-    x.set_mode(0, mode)
-    assert size in lost(sink)
-    assert eventually(lambda: f"panel 1: DUMMY0 shows {size}" in lost(sink, within_s=0.1))
+    x.set_mode(0, "tall")
+    assert "160x180" in lost(sink)
+    assert eventually(lambda: "panel 1: DUMMY0 shows 160x180" in lost(sink, within_s=0.1))
     x.plug(0)
     assert comes_back(x, sink, 2, 0, 1)
 
