@@ -13,11 +13,13 @@ import typer
 
 from calib.solution import Method
 from runtime.commands.app import app
-from runtime.config import Settings
+from runtime.config import Settings, with_options
+from runtime.daemon.build import RunOptions
+from runtime.daemon.drive import drive
 from runtime.model.contract import Contract
 from runtime.report.frontier import MethodResult
 from runtime.report.stability.trial import Case
-from tests.test_cli import pair_in, phasestack, solve_arguments
+from tests.test_cli import pair_in, solve_arguments
 from tests.test_docs import walk
 
 PAGE = (Path(__file__).parents[1] / "docs" / "contracts.md").read_text(encoding="utf-8")
@@ -41,11 +43,8 @@ def test_every_command_is_promised() -> None:
 def left(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What a short run leaves."""
     out = tmp_path_factory.mktemp("contract") / "out"
-    result = phasestack(
-        *("run", "--replay", "demo", "--headless", "--max-speed", "--frames", "12", "--scale", "0.05"),
-        *("--keep-light", "6", "--out", str(out)),
-    )
-    assert result.returncode == 0, result.stderr
+    options = RunOptions(max_speed=True, measure=True, scale=0.05, keep_light=6, frames=12, out=out)
+    drive(with_options(Settings(), replay="demo", headless=True), options)
     return out
 
 
@@ -62,13 +61,12 @@ def test_a_run_leaves_every_file_and_every_field(left: Path) -> None:
     assert fields_of("field of light.json") == light.keys()
 
 
-def test_solve_leaves_every_file_and_every_field(tmp_path: Path) -> None:
+def test_solve_leaves_every_file_and_every_field(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pair = pair_in(tmp_path)
     panels = json.loads((pair / "panels.json").read_text())
     assert panels.keys() <= fields_of("field of panels")
-    result = phasestack(*solve_arguments(pair), "--json")
-    assert result.returncode == 0, result.stderr
-    solved = json.loads(result.stdout)
+    app([*solve_arguments(pair), "--json"], standalone_mode=False)
+    solved = json.loads(capsys.readouterr().out)
     assert solved == json.loads((pair / "out" / "solve.json").read_text())
     assert fields_of("field of solve.json") <= solved.keys()
     names = {path.name for path in (pair / "out").iterdir()}

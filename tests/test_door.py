@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import phasestack
+from runtime.commands.app import app
 from tests.test_cli import pair_in, solve_arguments
-from tests.test_cli import phasestack as command
 
 STACK = phasestack.Stack(width_m=0.5184, height_m=0.2916, x_m=(-0.06, 0.0, 0.06), width_px=320, height_px=180)
 EYES = ((0.78, -0.03, 0.24), (0.78, 0.03, 0.24))
@@ -39,13 +39,13 @@ def test_a_pair_becomes_layers_with_what_each_eye_sees_and_how_good_that_is(tmp_
 
 def test_it_is_what_the_command_makes(tmp_path: Path) -> None:
     pair = pair_in(tmp_path)
-    done = command(*solve_arguments(pair), "--json")
-    assert done.returncode == 0, done.stderr
+    app(solve_arguments(pair), standalone_mode=False)
     left, right = (cv2.imread(str(pair / f"{side}.png"))[..., ::-1] for side in ("left", "right"))
     panels = json.loads((pair / "panels.json").read_text()) | {"height_px": left.shape[0], "width_px": left.shape[1]}
     stack = phasestack.Stack(**panels | {"x_m": tuple(panels["x_m"])})
     result = phasestack.solve(left, right, eyes_m=((0.6, -0.03, 0.0), (0.6, 0.03, 0.0)), stack=stack)
-    assert result.quality.light_db["1"] == pytest.approx(json.loads(done.stdout)["light_db"]["1"], abs=0.01)
+    told = json.loads((pair / "out" / "solve.json").read_text())
+    assert result.quality.light_db["1"] == pytest.approx(told["light_db"]["1"], abs=0.01)
 
 
 def test_pictures_are_codes_or_intensities_with_or_without_transparency() -> None:

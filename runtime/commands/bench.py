@@ -26,6 +26,7 @@ def bench(
         return
     from runtime.report import benchmark
     from runtime.support.artifacts import to_json, write_json
+    from runtime.support.figures import lines_of
     from runtime.support.progress import status_line
 
     with status_line("bench") as tell:
@@ -35,13 +36,7 @@ def bench(
     if as_json:
         print(to_json(record))
         return
-    print(f"{'':19}{'p50 ms':>10}{'light dB':>10}{'one ray':>10}{'MiB':>8}   (light of eyes sure to 1 mm)")
-    for method in record["methods"]:
-        name = f"{method['name']} {method['width_px']}x{method['height_px']}"
-        light = method["light_db"].get("1", float("nan"))
-        print(f"{name:19}{method['ms_p50']:10.1f}{light:10.2f}{method['psnr_db']:10.2f}{method['memory_mib']:8.0f}")
-    written = f"; written to {out}" if out else ""
-    print(f"yardstick of this machine: {record['yardstick_ms']:.1f} ms{written}")
+    print("\n".join(lines_of(record)))
 
 
 @app.command()

@@ -70,7 +70,7 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
         "rejected_samples": dict(presenter.viewer.refused),
         "sensor_hz": presenter.viewer.rate_hz if "sensor" not in presenter.missing else None,
         **stats.rates_now(),
-        **stats.summary(stale_inputs=presenter.samples.stale_inputs, nearly=True),
+        **stats.summary(stale_inputs=presenter.samples.stale_inputs),
     }
 
 

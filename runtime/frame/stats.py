@@ -13,7 +13,6 @@ from runtime.frame.timing import SOLVING_STAGES, STAGES
 from runtime.records import RefreshAccount, State
 
 WINDOW = 8192  # values that quantiles are taken over
-RECENT_SHARE = 1 / 64  # of the values held, that a quantile which is nearly the newest may be without
 NOW_NS = NS_PER_S  # rates "now" are those of the last second
 NOW_KEPT = 1024
 OVERHEAD_STAGES = ("sensor", "track")
@@ -25,28 +24,18 @@ class Ring:
     def __init__(self, size: int = WINDOW) -> None:
         self._values = np.zeros(size)
         self._count = 0
-        self._known: dict[tuple[str, ...], tuple[int, dict[str, float] | None]] = {}  # at how many values, and what
 
     def add(self, value: float) -> None:
         self._values[self._count % self._values.size] = value
         self._count += 1
 
-    def quantiles(self, names: tuple[str, ...], *, nearly: bool = False) -> dict[str, float] | None:
-        """`p50`, `p95`, `p99`, `max`, ... of what is held; None before the first value.
-
-        nearly: those taken before will do, where hardly a value has come since. Who asks often costs little then.
-        """
-        asked_at, known = self._known.get(names, (0, None))
-        if nearly and known is not None and self._count - asked_at <= RECENT_SHARE * min(asked_at, self._values.size):
-            return known
-        count = self._count
-        held = self._values[: min(count, self._values.size)]
+    def quantiles(self, *names: str) -> dict[str, float] | None:
+        """`p50`, `p95`, `p99`, `max`, ... of what is held; None before the first value."""
+        held = self._values[: min(self._count, self._values.size)]
         if held.size == 0:
             return None
         shares = [1.0 if name == "max" else float(name[1:]) / 100.0 for name in names]
-        known = {name: round(value, 4) for name, value in zip(names, np.quantile(held, shares).tolist(), strict=True)}
-        self._known[names] = count, known
-        return known
+        return {name: round(value, 4) for name, value in zip(names, np.quantile(held, shares).tolist(), strict=True)}
 
 
 class RunStats:
@@ -98,7 +87,7 @@ class RunStats:
 
     def reuse_saves_ms(self) -> float | None:
         """What a refresh that shows a solution again does without; None before there was a solution."""
-        medians = [self._stages[stage].quantiles(("p50",), nearly=True) for stage in SOLVING_STAGES]
+        medians = [self._stages[stage].quantiles("p50") for stage in SOLVING_STAGES]
         known = [median["p50"] for median in medians if median is not None]
         return sum(known) if known and self.presented > self.solutions > 0 else None
 
@@ -118,17 +107,9 @@ class RunStats:
         """A fault that the run lives on with."""
         self.faults[part] = self.faults.get(part, 0) + 1
 
-    def summary(self, *, stale_inputs: int, simulated: bool = False, nearly: bool = False) -> dict[str, Any]:
-        """The counted part of summary.json (contract 5.2); what was not measured is None.
-
-        nearly: quantiles may be without the newest values, as those of `Ring.quantiles`.
-        """
+    def summary(self, *, stale_inputs: int, simulated: bool = False) -> dict[str, Any]:
+        """The counted part of summary.json (contract 5.2); what was not measured is None."""
         seconds = self.seconds()
-
-        def quantiles(ring: Ring, *names: str) -> dict[str, float] | None:
-            return ring.quantiles(names, nearly=nearly)
-
-        stages = {stage: quantiles(ring, "p50", "p95", "p99", "max") for stage, ring in self._stages.items()}
         return {
             "frames": self.frames,
             "presented": self.presented,
@@ -138,13 +119,13 @@ class RunStats:
             "seconds": round(seconds, 3),
             "fps": round((self.presented - 1) / seconds, 2) if seconds > 0 else None,
             "solutions_per_s": round(self.solutions / seconds, 2) if seconds > 0 else None,
-            "stage_ms": stages,
-            "interval_ms": quantiles(self._interval, "p50", "p99"),
-            "photon_ms": quantiles(self._photon, "p50", "p99"),
-            "overhead_ms": quantiles(self._overhead_run if simulated else self._overhead, "p50", "p99"),
-            "skew_ms": quantiles(self._skew, "p50", "p99", "max"),
-            "solution_age_ms": quantiles(self._age, "p50", "p99"),
-            "eye_sigma_mm": quantiles(self._sigma, "p50", "p99"),
+            "stage_ms": {stage: ring.quantiles("p50", "p95", "p99", "max") for stage, ring in self._stages.items()},
+            "interval_ms": self._interval.quantiles("p50", "p99"),
+            "photon_ms": self._photon.quantiles("p50", "p99"),
+            "overhead_ms": (self._overhead_run if simulated else self._overhead).quantiles("p50", "p99"),
+            "skew_ms": self._skew.quantiles("p50", "p99", "max"),
+            "solution_age_ms": self._age.quantiles("p50", "p99"),
+            "eye_sigma_mm": self._sigma.quantiles("p50", "p99"),
             "missed_blanks": self.missed_blanks,
             "faults": dict(self.faults),
         }
