@@ -96,18 +96,11 @@ def _flat() -> tuple[Thing, ...]:
     return (Thing(shapes.card(0.44, 0.25, repeat=(1.76, 1.0)), "picture", (0.0, 0.0, 0.0), lit=False),)
 
 
-def _thin() -> tuple[Thing, ...]:
-    """Everything within 6 mm of the middle panel's plane."""
-    near = Thing(shapes.lettering("PHASE", cell_m=0.007, depth_m=0.002), "plain", (0.005, 0.0, 0.0), (0.93, 0.36, 0.12))
-    return (Thing(shapes.card(0.34, 0.20, repeat=(1.7, 1.0)), "globe", (-0.006, 0.0, 0.0), lit=False), near)
-
-
 SCENES: dict[str, Callable[[], Scene]] = {
     "demo": lambda: Scene("demo", _demo()),
     "sparse": lambda: Scene("sparse", _sparse()),
     "texture": lambda: Scene("texture", _texture()),
     "grey": lambda: Scene("grey", _demo(), grey=True),
     "flat": lambda: Scene("flat", _flat(), flat=True),
-    "thin": lambda: Scene("thin", _thin()),
     "moving": lambda: Scene("moving", _demo(turns_per_s=0.2), moving=True),
 }

@@ -215,12 +215,12 @@ def test_a_reload_keeps_the_scene_model_and_place_that_were_chosen_until_the_fil
     answer = served.asked("reload")
     assert answer == holds and served.rig.content is content
     assert served.rig.presenter.run_cell.state.settings.plan.align is False
-    served.config.write_text(configuration(scene="thin"))
+    served.config.write_text(configuration(scene="flat"))
     answer = served.asked("reload")
-    assert (answer["scene"], answer["model"], answer["placing"]["scale"]) == ("thin", "balanced", 1.5)
+    assert (answer["scene"], answer["model"], answer["placing"]["scale"]) == ("flat", "balanced", 1.5)
     served.config.write_text(configuration(scene="nowhere.glb"))
     assert not served.asked("reload")["ok"]
-    assert served.status()["scene"] == "thin"
+    assert served.status()["scene"] == "flat"
 
 
 def test_a_command_that_fails_in_a_way_that_nobody_expected_is_refused_and_the_run_goes_on(

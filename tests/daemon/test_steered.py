@@ -66,7 +66,7 @@ def test_ctl_place_wants_something_to_change(arguments: list[str]) -> None:
 
 
 def test_a_playlist_is_shown_and_gone_through(tmp_path: Path) -> None:
-    shows = [{"scene": "thin", "seconds": 500}, {"scene": "grey", "seconds": 700}]
+    shows = [{"scene": "flat", "seconds": 500}, {"scene": "grey", "seconds": 700}]
     path = tmp_path / "two.json"
     path.write_text(json.dumps({"show": shows}))
     with Served(tmp_path) as served:

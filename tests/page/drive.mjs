@@ -114,7 +114,7 @@ await page.click("#model-form button");
 say("the model back", (await told("model: done")) && (await statusIs((s) => s.model.startsWith("fast"))));
 await page.fill("#scene", playlist);
 await page.click("#scene-form button");
-say("a playlist", (await told("scene: done")) && (await statusIs((s) => s.playlist && s.playlist.entries.length === 2 && s.content.includes("thin (1 of 2)"))) &&
+say("a playlist", (await told("scene: done")) && (await statusIs((s) => s.playlist && s.playlist.entries.length === 2 && s.content.includes("flat (1 of 2)"))) &&
   (await until(async () => (await page.textContent("#list-told")).includes("1 of 2"))));
 await page.click("[data-command=next]");
 say("the next one", (await told("next: done")) && (await statusIs((s) => s.content.includes("grey (2 of 2)"))));

@@ -74,7 +74,7 @@ def tried(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
         daemon.start()
         script = Path(__file__).with_name("drive.mjs")
         playlist = folder / "two.toml"
-        playlist.write_text('[[show]]\nscene = "thin"\nseconds = 300\n[[show]]\nscene = "grey"\nseconds = 300\n')
+        playlist.write_text('[[show]]\nscene = "flat"\nseconds = 300\n[[show]]\nscene = "grey"\nseconds = 300\n')
         command = ["node", str(script), page.origin, page.token, str(pictures), str(playlist)]
         results: dict[str, Any] = {}
         try:
