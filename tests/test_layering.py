@@ -35,8 +35,8 @@ def test_no_module_imports_in_a_circle_not_even_inside_a_function() -> None:
         (["--help"], ()),
         (["solve", "--help"], ()),
         (["config"], ("numpy",)),
-        (["status", "--socket", "/nonexistent/s"], ()),
-        (["ctl", "--socket", "/nonexistent/s", "pause"], ()),
+        (["status"], ()),
+        (["ctl", "pause"], ()),
         (
             ["run", "--replay", "demo", "--headless", "--max-speed", "--frames", "1", "--scale", "0.05"],
             ("numpy", "cv2", "onnxruntime", "moderngl", "numba", "scipy"),  # numba asks scipy for its BLAS

@@ -18,14 +18,12 @@ app = typer.Typer(
 ANSWERS_WITHIN_S = 70.0  # a scene or a model is loaded first: longer than the daemon itself waits for that
 
 Config = Annotated[Path | None, typer.Option(help="configuration of the daemon: says where its socket is")]
-Socket = Annotated[Path | None, typer.Option(help="the socket itself, whatever the configuration says")]
 
 
 @app.command()
 def scene(
     name: Annotated[str, typer.Argument(help="what `content.scene` takes; `next`: of the playlist that is shown")],
     config: Config = None,
-    socket: Socket = None,
 ) -> None:
     """Show another scene: a built-in one, such as `demo`, or a file or folder (`./NAME`) of this machine.
 
@@ -36,7 +34,7 @@ def scene(
     from runtime.support.plugins import located
 
     request = {"command": "next"} if name == "next" else {"command": "scene", "value": located(name, Path.cwd())}
-    tell(request, config, socket)
+    tell(request, config)
 
 
 @app.command()
@@ -54,7 +52,6 @@ def place(
     ] = None,
     reset: Annotated[bool, typer.Option("--reset", help="as the configuration has it")] = False,
     config: Config = None,
-    socket: Socket = None,
 ) -> None:
     """Move, turn or scale the scene that is shown, at once. What is not named stays as it is.
 
@@ -68,14 +65,13 @@ def place(
     value = {name: asked for name, asked in given.items() if asked is not None}
     if reset == bool(value):
         raise InputError("ctl place", "", "give --reset alone, or what is to change: --scale, --offset, --rotate, ...")
-    tell({"command": "place", "value": None if reset else value}, config, socket)
+    tell({"command": "place", "value": None if reset else value}, config)
 
 
 @app.command()
 def model(
     name: Annotated[str, typer.Argument(help="fast, balanced, best, sart or an ONNX file")],
     config: Config = None,
-    socket: Socket = None,
 ) -> None:
     """Solve with another model; the present one goes on while it is loaded, and stays where it can't be.
 
@@ -83,7 +79,7 @@ def model(
     """
     from runtime.support.plugins import located
 
-    tell({"command": "model", "value": located(name, Path.cwd())}, config, socket)
+    tell({"command": "model", "value": located(name, Path.cwd())}, config)
 
 
 PLAIN = {
@@ -98,23 +94,22 @@ PLAIN = {
 
 def _add_plain(name: str, meaning: str) -> None:
     @app.command(name, help=f"{meaning}\n\nExample: phasestack ctl {name}")
-    def plain(config: Config = None, socket: Socket = None) -> None:
-        tell({"command": name}, config, socket)
+    def plain(config: Config = None) -> None:
+        tell({"command": name}, config)
 
 
 for _name, _meaning in PLAIN.items():
     _add_plain(_name, _meaning)
 
 
-def tell(request: dict[str, Any], config: Path | None, socket: Path | None) -> None:
+def tell(request: dict[str, Any], config: Path | None) -> None:
     """Send one request; prints what holds now. Exits with 1 where no daemon answers, 2 where it refuses."""
-    from runtime.commands.status import sockets
-    from runtime.daemon.client import NotRunning, ask
+    from runtime.daemon.client import NotRunning, ask, sockets
     from runtime.errors import InputError
     from runtime.support.figures import lines_of
 
     try:
-        answer = ask(sockets(config, socket), request, timeout_s=ANSWERS_WITHIN_S)
+        answer = ask(sockets(config), request, timeout_s=ANSWERS_WITHIN_S)
     except NotRunning as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(1) from None

@@ -15,7 +15,6 @@ LOOPBACK, DEFAULT_PORT = "127.0.0.1", 8717
 
 def page(
     config: Annotated[Path | None, typer.Option(help="configuration of the daemon: says where its socket is")] = None,
-    socket: Annotated[Path | None, typer.Option(help="the daemon's socket, whatever the configuration says")] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any that is free")] = DEFAULT_PORT,
     token_file: Annotated[
         Path | None, typer.Option(help="file with the token, made where there is none; default: in the state folder")
@@ -37,14 +36,14 @@ def page(
     except ImportError as error:
         raise MissingPart(f"page: {error.name} is not installed: pip install starlette uvicorn") from None
 
-    from runtime.commands.status import sockets
+    from runtime.daemon.client import sockets
     from runtime.page.daemon import Daemon
     from runtime.page.token import token_of
     from runtime.support.folders import state_folder
     from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
 
     set_niceness(BACKGROUND_NICENESS)  # the display comes first; its threads are started after this
-    places = sockets(config, socket)
+    places = sockets(config)
     path = token_file or state_folder() / "page-token"
     token = token_of(path)
     listening = _listening(port)

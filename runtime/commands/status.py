@@ -13,7 +13,6 @@ HUNG_AFTER_S = 5.0
 
 def status(
     config: Annotated[Path | None, typer.Option(help="configuration of the daemon: says where its socket is")] = None,
-    socket: Annotated[Path | None, typer.Option(help="the socket itself, whatever the configuration says")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
 ) -> None:
     """Ask the running daemon: its state and why, rates now, eyes and how sure they are, times, faults.
@@ -22,11 +21,11 @@ def status(
 
     Example: phasestack status --json
     """
-    from runtime.daemon.client import NotRunning, ask
+    from runtime.daemon.client import NotRunning, ask, sockets
     from runtime.support.figures import lines_of
 
     try:
-        answer = ask(sockets(config, socket), {"command": "status"})
+        answer = ask(sockets(config), {"command": "status"})
     except NotRunning as error:
         typer.echo(json.dumps({"ok": False, "error": str(error)}) if as_json else str(error), err=not as_json)
         raise typer.Exit(1) from None
@@ -38,12 +37,3 @@ def status(
     if float(answer.get("turn_age_s", 0.0)) > HUNG_AFTER_S:
         typer.echo(f"the loop has not completed a turn for {answer['turn_age_s']:.0f} s", err=True)
         raise typer.Exit(1)
-
-
-def sockets(config: Path | None, socket: Path | None) -> tuple[Path, ...]:
-    """Where the daemon may listen: the one given, or the configured one and the person's own."""
-    if socket is not None:
-        return (socket,)
-    from runtime.daemon.client import candidates, configured_socket
-
-    return candidates(configured_socket(config))

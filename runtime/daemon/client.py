@@ -28,13 +28,13 @@ def candidates(configured: str) -> tuple[Path, ...]:
     return (Path(configured),) if own is None else (Path(configured), own)
 
 
-def configured_socket(config: Path | None) -> str:
-    """The socket that a configuration names. Raises InputError, naming the file and the field."""
+def sockets(config: Path | None) -> tuple[Path, ...]:
+    """The same by a configuration's file. Raises InputError, naming the file and the field."""
     if config is None:
-        return DEFAULT_SOCKET  # without loading all that settings need: a client is started quickly
+        return candidates(DEFAULT_SOCKET)  # without loading all that settings need: a client is started quickly
     from runtime.config import load_settings
 
-    return load_settings(config).service.socket
+    return candidates(load_settings(config).service.socket)
 
 
 class NotRunning(TransientError):

@@ -42,6 +42,7 @@ REMOVED_COMMANDS: dict[str, str] = {
     "calibrate charts --viewpoint": "take it out: the charts of all viewpoints are drawn",
     "calibrate charts --check": "`capture --show`: at the viewpoint the lines are single and clean",
     "page --host": "`ssh -L 8717:localhost:8717`, or a proxy on the display's machine",
+    **dict.fromkeys(("status --socket", "ctl --socket", "page --socket"), "`--config FILE` whose service.socket it is"),
     "identify --seconds": "q ends it",
     "identify --panel": "n goes to the next panel",
     "identify --ask": "`setup`: its first step asks which monitor is which panel",

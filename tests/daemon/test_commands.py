@@ -40,14 +40,21 @@ def server(tmp_path: Path, clock: Any) -> Any:
     made.close()
 
 
-def ask_status(*arguments: Any) -> Any:
+def configuration(socket: Path) -> Path:
+    """A file that says where the socket is."""
+    path = socket.with_name("phasestack.toml")
+    path.write_text(f'[service]\nsocket = "{socket}"\n')
+    return path
+
+
+def ask_status(socket: Path, *arguments: str) -> Any:
     app = typer.Typer()
     app.command()(status)
-    return CliRunner().invoke(app, list(arguments))
+    return CliRunner().invoke(app, [*arguments, "--config", str(configuration(socket))])
 
 
 def test_people_see_state_reason_rate_eyes_and_faults(server: StatusServer) -> None:
-    result = ask_status("--socket", str(server.path))
+    result = ask_status(server.path)
     assert result.exit_code == 0
     told = " ".join(result.stdout.split())
     for words in ("degraded: sensor", "unplugged", "fps 31.25", "dropped 2", "(0.9 -0.03 0)", "held",
@@ -56,28 +63,22 @@ def test_people_see_state_reason_rate_eyes_and_faults(server: StatusServer) -> N
 
 
 def test_machines_get_one_object(server: StatusServer) -> None:
-    result = ask_status("--json", "--socket", str(server.path))
+    result = ask_status(server.path, "--json")
     assert json.loads(result.stdout)["state"] == "degraded: sensor"
 
 
 def test_a_loop_that_stands_still_is_a_failure(server: StatusServer, clock: SimulatedClock) -> None:
     clock.advance_ns(6 * NS_PER_S)
-    result = ask_status("--socket", str(server.path))
+    result = ask_status(server.path)
     assert result.exit_code == 1
     assert "has not completed a turn for 6 s" in result.stderr
 
 
 def test_without_a_daemon_status_fails_with_one_line(tmp_path: Path) -> None:
-    result = ask_status("--socket", str(tmp_path / "none.sock"))
+    result = ask_status(tmp_path / "none.sock")
     assert result.exit_code == 1
     assert result.stderr.count("\n") == 1
     assert "no daemon" in result.stderr
-
-
-def test_the_configuration_says_where_the_socket_is(server: StatusServer, tmp_path: Path) -> None:
-    config = tmp_path / "phasestack.toml"
-    config.write_text(f'[service]\nsocket = "{server.path}"\n')
-    assert ask_status("--config", str(config)).exit_code == 0
 
 
 @pytest.mark.parametrize(
@@ -106,7 +107,7 @@ def test_every_command_arrives(
 
     thread = threading.Thread(target=loop)
     thread.start()
-    result = CliRunner().invoke(ctl.app, [*arguments, "--socket", str(server.path)])
+    result = CliRunner().invoke(ctl.app, [*arguments, "--config", str(configuration(server.path))])
     thread.join()
     assert result.exit_code == 0
     holds = [" ".join(line.split()) for line in result.stdout.splitlines()]
@@ -117,4 +118,4 @@ def test_every_command_arrives(
 
 def test_a_refusal_is_bad_input(server: StatusServer) -> None:
     with pytest.raises(InputError, match="place wants an object"):
-        ctl.tell({"command": "place", "value": 1e8}, None, server.path)
+        ctl.tell({"command": "place", "value": 1e8}, configuration(server.path))

@@ -72,8 +72,9 @@ class Page:
 @contextmanager
 def page_of(socket: Path, folder: Path) -> Iterator[Page]:
     """`phasestack page` for a daemon's socket, whether that is there or not."""
-    token_file = folder / "token"
-    command = [sys.executable, "-m", "runtime.cli", "page", "--socket", str(socket), "--port", "0"]
+    token_file, config = folder / "token", folder / "page.toml"
+    config.write_text(f'[service]\nsocket = "{socket}"\n')
+    command = [sys.executable, "-m", "runtime.cli", "page", "--config", str(config), "--port", "0"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
         [*command, "--token-file", str(token_file)], cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True
