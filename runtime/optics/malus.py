@@ -31,10 +31,9 @@ def jones_intensity(angles_rad: ArrayLike) -> float:
 def intensity_from_phase(phase: NDArray[T]) -> NDArray[T]:
     """What an eye sees where the panel values along its ray add up to `phase` (units of pi/2): sin² (equation (7)).
 
-    Single precision stays single; whole numbers are taken as doubles.
+    Single precision stays single.
     """
-    phase = _floating(phase)
-    result: NDArray[T] = np.sin(phase * phase.dtype.type(HALF_PI)) ** 2
+    result: NDArray[T] = np.sin(phase * HALF_PI) ** 2
     return result
 
 
@@ -42,24 +41,7 @@ def phase_from_intensity(intensity: NDArray[T], branch: Branch = 2) -> NDArray[T
     """(...) the phase sum (units of pi/2) whose sin² is `intensity`, which is clipped to [0, 1].
 
     Branch 1 lies in [0, 1], branch 2 in [1, 2]: with three panels it keeps every panel far from its limits.
-    Whole numbers are taken as doubles.
     """
-    intensity = _floating(intensity)
-    root = np.arcsin(np.sqrt(np.clip(intensity, 0.0, 1.0))) / intensity.dtype.type(HALF_PI)
+    root = np.arcsin(np.sqrt(np.clip(intensity, 0.0, 1.0))) / HALF_PI
     result: NDArray[T] = root if branch == 1 else 2 - root
     return result
-
-
-def _floating(values: NDArray[T]) -> NDArray[T]:
-    """The values, doubles where they are of a type that can't hold pi/2. Raises ValueError for what is no real number.
-
-    A table of grey levels (uint8) is refused too: it is neither a phase nor an intensity before it is divided by 255.
-    """
-    values = np.asarray(values)
-    if values.dtype.kind == "f":
-        return values
-    if values.dtype.kind in "ib":
-        return values.astype(np.float64)
-    raise ValueError(
-        f"phases and intensities are real numbers, not {values.dtype}: grey levels are divided by 255 first"
-    )

@@ -67,11 +67,3 @@ def test_whole_numbers_are_taken_as_numbers_and_not_rounded_to_their_type(dtype:
     np.testing.assert_allclose(intensity_from_phase(np.array([0, 1], dtype)), [0.0, 1.0], atol=1e-15)  # type: ignore[type-var]
     np.testing.assert_allclose(phase_from_intensity(np.array([0, 1], dtype), 1), [0.0, 1.0], atol=1e-15)  # type: ignore[type-var]
     np.testing.assert_allclose(phase_from_intensity(np.array([0, 1], dtype), 2), [2.0, 1.0], atol=1e-15)  # type: ignore[type-var]
-
-
-@pytest.mark.parametrize("values", [np.array([0, 255], np.uint8), np.array(["1"]), np.array([1j])])
-def test_what_is_neither_phase_nor_intensity_is_refused(values: np.ndarray) -> None:
-    with pytest.raises(ValueError, match="real numbers"):
-        intensity_from_phase(values)
-    with pytest.raises(ValueError, match="real numbers"):
-        phase_from_intensity(values)
