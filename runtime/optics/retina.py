@@ -30,21 +30,6 @@ class Retina:
     mask: Mask  # (h, w)
 
 
-def sample_bilinear(layer: NDArray[np.uint8] | F32, *, u: F32, v: F32) -> F32:
-    """Exact bilinear samples of (H, W, C) at continuous pixel positions (h, w), edges clamped; float32 (h, w, C).
-
-    Exact: weights are float32, not the 32nds of a pixel that image libraries round to, which at 45 dB would show.
-    At most 32767 pixels a side.
-    """
-    planes = _planes(layer)
-    result: F32 = np.empty((*u.shape, len(planes)), np.float32)
-    for rows in strips(u.shape[0]):
-        samples = _Samples(u[rows], v[rows], layer.shape)
-        for channel, plane in enumerate(planes):
-            result[rows, :, channel] = samples.of(plane)
-    return result
-
-
 def strips(rows: int) -> Iterator[slice]:
     """An image's rows, a few at a time: what one step writes is still in the cache for the next."""
     return (slice(start, min(start + STRIP_ROWS, rows)) for start in range(0, rows, STRIP_ROWS))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from runtime.optics.quality import Quality, quality
-from runtime.optics.retina import sample_bilinear, seen_by
+from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack
-from runtime.records import F64, U8
+from runtime.records import F32, F64, U8
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
 FOV_DEG = 40.0
@@ -22,6 +23,13 @@ def eyes(
     half = separation_m / 2 * np.array([0.0, np.cos(roll), np.sin(roll)])
     middle = np.array([distance_m, side_m, up_m])
     return np.array([middle - half, middle + half])
+
+
+def sampled(image: F64 | F32, u: F64 | F32, v: F64 | F32) -> F64:
+    """(..., C) exact bilinear samples of (H, W, C) at continuous pixels, edges clamped."""
+    places = np.array([v, u], np.float64) - 0.5
+    planes = [map_coordinates(plane, places, order=1, mode="nearest") for plane in np.moveaxis(image, 2, 0)]
+    return np.stack(planes, axis=-1)
 
 
 def card_scene(eye_m: F64, *, seed: int = 0, width_px: int = 480, height_px: int = 270) -> U8:
@@ -43,7 +51,7 @@ def card_scene(eye_m: F64, *, seed: int = 0, width_px: int = 480, height_px: int
         s = ((back[0, 0] * u + back[0, 1] * v + back[0, 2]) / weight).astype(np.float32)
         t = ((back[1, 0] * u + back[1, 1] * v + back[1, 2]) / weight).astype(np.float32)
         inside = (s > 0) & (s < 96) & (t > 0) & (t < 96)
-        picture[inside] = sample_bilinear(texture, u=s, v=t)[inside]
+        picture[inside] = sampled(texture, s, t)[inside]
     return np.rint(picture).astype(np.uint8)
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runtime.model.resample import WORST_PHASE, buffer, resample
-from runtime.optics.retina import sample_bilinear
+from tests.model.scenes import sampled
 
 HEIGHT, WIDTH = 96, 128
 
@@ -38,7 +38,7 @@ def test_samples_are_where_the_matrix_says(
     result = resample(image, image_from_result=matrix, out=out)
     v, u = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
     su, sv = scale * u + shift_u, shear * u + scale * v + shift_v
-    exact = sample_bilinear(image.astype(np.float32), u=su.astype(np.float32), v=sv.astype(np.float32))
+    exact = sampled(image.astype(np.float32), su, sv)
     inside = (su > 1) & (su < WIDTH - 1) & (sv > 1) & (sv < HEIGHT - 1)
     # The steepest slope of the picture is 1000/7 + 1000/9 a pixel.
     tolerance = (WORST_PHASE + 1 / 32) * 254 * 1.5 + 2
@@ -51,7 +51,7 @@ def test_an_image_that_shrinks_to_a_few_pixels_or_less_is_sampled_all_the_same(s
     matrix = np.array([[scale, 0.0, 3.0], [0.0, scale, 3.0], [0.0, 0.0, 1.0]])
     result = resample(image, image_from_result=matrix, out=buffer(HEIGHT, WIDTH))
     if scale < 100:
-        exact = sample_bilinear(image.astype(np.float32), u=np.float32([[13.0]]), v=np.float32([[13.0]]))
+        exact = sampled(image.astype(np.float32), np.array([[13.0]]), np.array([[13.0]]))
         assert np.abs(result[0, 0] - exact[0, 0]).max() <= 12
 
 

@@ -21,9 +21,9 @@ from runtime.config import ModelSettings  # noqa: E402
 from runtime.model.job import Job  # noqa: E402
 from runtime.model.predictor import load_predictor  # noqa: E402
 from runtime.model.resample import target_from_source  # noqa: E402
-from runtime.optics.retina import sample_bilinear  # noqa: E402
 from runtime.optics.stack import PanelStack  # noqa: E402
 from runtime.optics.views import raster_from_stack  # noqa: E402
+from tests.model.scenes import sampled  # noqa: E402
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
 EYES = np.array([[0.7, -0.0315, 0.02], [0.7, 0.0315, 0.02]])
@@ -107,7 +107,8 @@ def test_the_raster_s_own_sight_is_what_eyes_see_of_panels_that_are_drawn_on_it(
             m = target_from_source(eye, source=pair.stack.panel(1), target=pair.stack.panel(n))
             x, y = m[0, 0] * u + m[0, 2], m[1, 1] * v + m[1, 2]
             counts &= (x > 2) & (x < 478) & (y > 2) & (y < 268)
-            phase += sample_bilinear(layers[n].astype(np.float32), u=x, v=y)
+            x, y = np.broadcast_arrays(x, y)
+            phase += sampled(layers[n], x, y)
         errors.append(np.square(np.sin(phase * np.pi / 2) ** 2 - picture / 255)[counts].mean())
     theirs_db, ours_db = -10 * np.log10(np.mean(errors)), -10 * np.log10(float(ours[0]))
     mirrored = replace(sight, wanted=sight.wanted[::-1])

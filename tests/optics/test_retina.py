@@ -10,7 +10,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from runtime.optics.retina import Rays, average, panel_positions, pupil_points, sample_bilinear, seen_by
+from runtime.optics.retina import Rays, average, pupil_points, seen_by
 from runtime.optics.stack import PanelStack
 from tests.optics import reference
 from tests.optics.strategies import eyes, floats, stacks
@@ -93,28 +93,6 @@ def test_rays_parallel_to_the_panels_are_masked_and_not_an_error() -> None:
     eye = [1.0, 0.0, -1.0]
     seen = seen_by(eye, np.full((2, 8, 8, 3), 128, np.uint8), stack, fov_deg=90, width_px=1, height_px=3)
     assert np.isfinite(seen.image[seen.mask]).all()
-    for u, v in (panel_positions(eye, stack, index=i, width_px=1, height_px=3, fov_deg=90) for i in (0, 1)):
-        sampled = sample_bilinear(np.zeros((8, 8, 3), np.uint8), u=u, v=v)
-        assert sampled.shape == (3, 1, 3)
-
-
-@given(st.integers(1, 6), st.integers(1, 6), st.integers(0, 2**31))
-def test_samples_are_bilinear_between_centres_and_clamped_beyond(width: int, height: int, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    layer = rng.random((height, width, 1), dtype=np.float32)
-    u = rng.uniform(-2, width + 2, (5, 7)).astype(np.float32)
-    v = rng.uniform(-2, height + 2, (5, 7)).astype(np.float32)
-    expected = [
-        [reference.bilinear(layer[..., 0].tolist(), float(a), float(b)) for a, b in zip(*row)] for row in zip(u, v)
-    ]
-    np.testing.assert_allclose(sample_bilinear(layer, u=u, v=v)[..., 0], expected, atol=1e-5)
-
-
-@pytest.mark.parametrize("position", [math.nan, math.inf, -math.inf, 1e30])
-def test_a_sample_nowhere_is_some_value_of_the_image(position: float) -> None:
-    layer = np.full((4, 4, 3), 7, np.uint8)
-    bad = np.full((1, 1), position, np.float32)
-    assert (sample_bilinear(layer, u=bad, v=np.ones((1, 1), np.float32)) == 7).all()
 
 
 @given(floats(1e-3, 8e-3), st.integers(1, 6))
