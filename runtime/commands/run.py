@@ -26,7 +26,7 @@ def run(
     out: Annotated[Path | None, typer.Option(help="folder for pictures, frames.jsonl and summary.json")] = None,
     scene: Annotated[str | None, typer.Option(help="a built-in scene, a file or folder")] = None,
     model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
-    scale: Annotated[float, number(0.05, 2.0, help="panel resolution, times the configured one")] = 1.0,
+    scale: Annotated[float, number(0.05, 2.0, help="pixels of offscreen panels, times the configured")] = 1.0,
     backend: Annotated[
         str | None, typer.Option(help="what surrounds the network: auto (the faster one here), cpu or gl")
     ] = None,

@@ -15,7 +15,7 @@ import cv2
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock, SimulatedClock
 from runtime.config import Settings
 from runtime.daemon.solver_parts import RunningSolver, SolverMaker
-from runtime.errors import PanelLost, Stopped
+from runtime.errors import InputError, PanelLost, Stopped
 from runtime.eyes.calibration import load_calibration
 from runtime.eyes.detect import EyeFinder
 from runtime.frame.observer import Output, RunObserver
@@ -136,6 +136,8 @@ def build_run(
     Raises FatalError, PanelLost, Stopped where the host says so.
     """
     host = host or Host()
+    if options.scale != 1.0 and settings.output.kind != "offscreen":
+        raise InputError("run", "--scale", "needs --headless: no monitor's mode fits a scaled stack")
     cv2.setNumThreads(settings.model.threads or -1)
     simulated, stage_ms = options.max_speed, settings.loop.simulated_stage_ms
     clock: Clock = SimulatedClock() if simulated else MonotonicClock()
@@ -157,7 +159,7 @@ def build_run(
         cleanup.callback(samples.close)
     context = offscreen_context()
     cleanup.callback(context.release)
-    panels = _open_panels(settings, options, stack, clock, context, host)
+    panels = _open_panels(settings, stack, clock, context, host)
     cleanup.callback(panels.close)
     maker = SolverMaker(settings, stack, calibration, panels_group=lambda: panels.group)
     solver: SolverHost
@@ -214,13 +216,10 @@ def build_run(
     return run
 
 
-def _open_panels(
-    settings: Settings, options: RunOptions, stack: PanelStack, clock: Clock, context: Any, host: Host
-) -> PanelSink:
-    any_size = options.scale != 1.0  # asked for: no monitor's mode fits such a stack
+def _open_panels(settings: Settings, stack: PanelStack, clock: Clock, context: Any, host: Host) -> PanelSink:
     while True:
         try:
-            return open_panels(settings.output, stack, clock, context, any_size=any_size)
+            return open_panels(settings.output, stack, clock, context)
         except PanelLost as error:
             if not host.wait_for_panel(str(error)):
                 raise

@@ -29,11 +29,6 @@ class LayerBuffers:
         self._buffers[index] = buffer, weakref.ref(view)
         return view
 
-    @property
-    def count(self) -> int:
-        """How many there are."""
-        return len(self._buffers)
-
 
 def _nobody() -> None:
     return None

@@ -40,14 +40,9 @@ class FramePolicy:
     """Decides between solving, drawing the flat picture and doing nothing, from what is there already."""
 
     def __init__(self) -> None:
-        self._episode = 0  # counts the times that the flat picture came to be wanted
+        self.episode = 0  # number of the present (or last) time that the flat picture was wanted
         self._flat_wanted = False
         self._flat_was_last = False
-
-    @property
-    def episode(self) -> int:
-        """Number of the present (or last) time that the flat picture was wanted."""
-        return self._episode
 
     def next_job(
         self,
@@ -61,11 +56,11 @@ class FramePolicy:
     ) -> Decision:
         """plan: what may be left out; solved, flat: what there is; revision: of the content at `request.time_ns`."""
         if request.flat_wanted and not self._flat_wanted:
-            self._episode += 1
+            self.episode += 1
         self._flat_wanted = request.flat_wanted
         if request.paused and solved is not None:
             return Decision("nothing")
-        present = (state_version, revision, self._episode)
+        present = (state_version, revision, self.episode)
         wants_flat = flat is None or (
             request.flat_wanted and (flat.state_version, flat.revision, flat.episode) != present
         )

@@ -11,7 +11,6 @@ from runtime.config import PanelSettings
 from runtime.errors import InputError, PanelLost
 from runtime.panels.geometry import panel_size_px
 
-ASPECT_TOLERANCE = 0.01
 REFRESH_TOLERANCE_HZ = 0.05  # 59.94 and 60 Hz drift apart by a frame in 17 s
 
 
@@ -100,30 +99,19 @@ def _find(number: int, panel: PanelSettings, monitors: tuple[Monitor, ...]) -> M
     raise PanelLost(f"panel {number}: {problem} with {' and '.join(wanted)} (there are: {there})")
 
 
-def check_modes(
-    panels: Sequence[PanelSettings],
-    monitors: Sequence[Monitor],
-    *,
-    width_px: int,
-    height_px: int,
-    any_size: bool = False,
-) -> None:
-    """Raise PanelLost where a monitor's mode has another shape than the stack, or, unless `any_size`, other pixels.
+def check_modes(panels: Sequence[PanelSettings], monitors: Sequence[Monitor], *, width_px: int, height_px: int) -> None:
+    """Raise PanelLost where a monitor's mode has other pixels than the stack.
 
-    A picture of another shape is distorted. A phase between two pixels' phases is none that was solved for: a rescaled
-    layer shows neither eye its picture.
+    A phase between two pixels' phases is none that was solved for: a rescaled layer shows neither eye its picture.
     """
     for number, (panel, monitor) in enumerate(zip(panels, monitors, strict=True)):
         columns, rows = panel_size_px(
             screen_width_px=monitor.width_px, screen_height_px=monitor.height_px, rotation_deg=panel.rotation_deg
         )
-        shows = f"panel {number}: {monitor.connector} shows {columns}x{rows}"
-        if abs(columns * height_px / (rows * width_px) - 1.0) > ASPECT_TOLERANCE:
-            mounted = f"mounted at {panel.rotation_deg} degrees"
-            raise PanelLost(f"{shows} ({mounted}), the stack is {width_px}x{height_px}: set its mode or rotation_deg")
-        if (columns, rows) != (width_px, height_px) and not any_size:
+        if (columns, rows) != (width_px, height_px):
             raise PanelLost(
-                f"{shows}, the stack is {width_px}x{height_px}: phases would be rescaled. Set its mode, or "
+                f"panel {number}: {monitor.connector} shows {columns}x{rows} (mounted at {panel.rotation_deg} degrees),"
+                f" the stack is {width_px}x{height_px}: phases would be rescaled. Set its mode or rotation_deg, or "
                 "stack.width_px and height_px"
             )
 

@@ -18,19 +18,15 @@ def panel_settings(settings: OutputSettings, count: int) -> tuple[PanelSettings,
     return settings.panels or tuple(PanelSettings() for _ in range(count))
 
 
-def open_panels(
-    settings: OutputSettings, stack: PanelStack, clock: Clock, context: moderngl.Context, *, any_size: bool = False
-) -> PanelSink:
+def open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, context: moderngl.Context) -> PanelSink:
     """The sink that `[output]` asks for; `context` is current again whenever one of its methods has returned.
-
-    any_size: monitors may have other pixels than the stack.
 
     Raises InputError (settings that don't fit), PanelLost (a monitor is not there yet: wait and retry).
     """
     if settings.kind != "offscreen":
         from runtime.panels.window import WindowPanels
 
-        return WindowPanels(panel_settings(settings, stack.count), stack, clock, context, any_size=any_size)
+        return WindowPanels(panel_settings(settings, stack.count), stack, clock, context)
     from runtime.panels.offscreen import OffscreenPanels
 
     return OffscreenPanels(clock)

@@ -47,14 +47,13 @@ class WindowPanels(PanelSink):
 
     def __init__(
         self, panels: tuple[PanelSettings, ...], stack: PanelStack, clock: Clock, content: moderngl.Context, *,
-        any_size: bool = False, any_shape: bool = False,
+        any_shape: bool = False,
     ) -> None:  # fmt: skip
-        """What is filled, rather than refused: any_size: monitors of other pixels than the stack's, but of its shape;
-        any_shape: whatever there is (identify).
+        """any_shape: fill monitors whose mode is not the stack's (identify), rather than refuse them.
 
         Raises InputError (settings), PanelLost (a panel is missing or ambiguous, no X server: it may come).
         """
-        self._any_size, self._any_shape = any_size, any_shape
+        self._any_shape = any_shape
         self._panels, self._stack = panels, stack
         self._clock, self._content = clock, content
         self._display: Display | None = None
@@ -164,8 +163,7 @@ class WindowPanels(PanelSink):
         self.monitors = bind(self._panels, display.monitors())
         layer_px = self._stack.width_px, self._stack.height_px
         if not self._any_shape:
-            size = {"width_px": layer_px[0], "height_px": layer_px[1]}
-            check_modes(self._panels, self.monitors, **size, any_size=self._any_size)
+            check_modes(self._panels, self.monitors, width_px=layer_px[0], height_px=layer_px[1])
         if difference := refresh_difference(self.monitors):
             log.warning("%s", difference)
         display.root.make_current()

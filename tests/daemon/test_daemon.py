@@ -8,14 +8,17 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from signal import Signals
 from typing import Any
 
 import pytest
 
+from runtime.config import Settings
+from runtime.daemon.build import RunOptions, build_run
 from runtime.daemon.client import ask
+from runtime.errors import InputError
 from tests.daemon.test_notify import Supervisor
 from tests.waiting import PATIENT, eventually
 
@@ -172,6 +175,12 @@ def test_a_panel_that_is_missing_at_the_start_is_waited_for_and_more_time_asked_
     code, errors = daemon.ends()
     assert "Traceback" not in errors
     assert code == 0
+
+
+def test_monitors_do_not_take_a_scaled_stack() -> None:
+    settings = Settings.model_validate({"output": {"kind": "windows"}})
+    with pytest.raises(InputError, match="run: --scale: needs --headless"), ExitStack() as cleanup:
+        build_run(settings, RunOptions(scale=0.5), cleanup)
 
 
 def test_by_hand_a_missing_panel_is_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,10 +44,10 @@ def opened(x: xserver.XServer, context: moderngl.Context) -> Iterator[Callable[.
     """Opens windows that are closed at the end."""
     sinks = []
 
-    def open_(*panels: PanelSettings, any_size: bool = False) -> Any:
+    def open_(*panels: PanelSettings) -> Any:
         output = OutputSettings(kind="windows", panels=panels)
         stack = PanelStack(0.5, 0.28, (-0.06, 0.0, 0.06), xserver.WIDTH_PX, xserver.HEIGHT_PX)
-        sinks.append(open_panels(output, stack, MonotonicClock(), context, any_size=any_size))
+        sinks.append(open_panels(output, stack, MonotonicClock(), context))
         return sinks[-1]
 
     yield open_

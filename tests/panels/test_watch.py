@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import pytest
 
 from runtime.clock import NS_PER_S, SimulatedClock
@@ -88,19 +87,6 @@ def test_layers_follow_monitors_that_change_places(x: XServer, opened: Callable[
     assert "320x180+320+0, it was 320x180+0+0" in lost(sink)
     assert comes_back(x, sink, 2, 1, 0)  # panel 1 is on DUMMY0, which is in the middle now
     assert [monitor.connector for monitor in sink.monitors] == ["DUMMY2", "DUMMY0", "DUMMY1"]
-
-
-def test_a_monitor_in_another_mode_of_the_same_shape_is_bound_anew_where_any_will_do(
-    x: XServer, opened: Callable[..., Any]
-) -> None:
-    sink = opened(*BY_CONNECTOR, any_size=True)
-    assert presents(sink, 0)
-    x.set_mode(2, "half")
-    assert "160x90" in lost(sink)
-    assert eventually(lambda: presents(sink, 7))
-    assert (sink.monitors[0].width_px, sink.monitors[0].height_px) == (160, 90)
-    halved = picture(7, 0)[..., :3].reshape(90, 2, 160, 2, 3).mean(axis=(1, 3))
-    assert eventually(lambda: np.abs(x.screenshot()[:90, 640:800] - halved).max() <= 1.0)
 
 
 def test_a_monitor_in_a_mode_that_does_not_fit_is_held_and_named_until_it_is_put_right(

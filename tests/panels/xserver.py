@@ -21,7 +21,6 @@ MODE = f"{WIDTH_PX}x{HEIGHT_PX}p"
 TIMINGS = ("6.0", "320", "336", "368", "400", "180", "183", "188", "250")  # 60 Hz
 OTHER_MODES = {
     "slow": ("5.0", *TIMINGS[1:]),  # the same picture 50 times a second
-    "half": ("3.0", "160", "176", "208", "250", "90", "93", "98", "200"),  # the same shape
     "tall": ("3.0", "160", "176", "208", "250", "180", "183", "188", "200"),  # another one
 }
 CONFIG = """
