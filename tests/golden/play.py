@@ -116,9 +116,7 @@ def play(case: Case, out: Path) -> Played:
     return Played(rounded(told), rounded(refreshes), collector.panels, collector.light)
 
 
-def drawn_panels(
-    output: OutputSettings, stack: PanelStack, clock: Clock, context: moderngl.Context, **_: bool
-) -> DrawnPanels:
+def drawn_panels(output: OutputSettings, stack: PanelStack, clock: Clock, context: moderngl.Context) -> DrawnPanels:
     """In place of `open_panels`: what offscreen panels hold is looked at here."""
     size_px = stack.width_px, stack.height_px
     return DrawnPanels(context, clock=clock, size_px=size_px, panels=panel_settings(output, stack.count))
