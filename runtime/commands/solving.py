@@ -25,7 +25,7 @@ from runtime.model.trim import Savings, Scene, trim
 from runtime.optics.stack import PanelStack
 from runtime.plan.savings import Measured, network_items
 from runtime.records import F64
-from runtime.support.artifacts import OutputFolder, in_8_bits, read_picture, write_json
+from runtime.support.artifacts import OutputFolder, read_image, write_json
 from runtime.support.gl import offscreen_context
 
 SEPARATION_MIN_M = 0.005
@@ -49,8 +49,7 @@ def solve_pair(
     watch = Stopwatch()
     settings = with_options(Settings(), model=model, backend=backend).model
     cv2.setNumThreads(settings.threads)
-    stored = [read_picture(path) for path in files]
-    pictures = [in_8_bits(picture) for picture in stored]
+    pictures = [read_image(path) for path in files]
     if pictures[0].shape != pictures[1].shape:
         sizes = " and ".join(f"{p.shape[1]}x{p.shape[0]}" for p in pictures)
         raise InputError(files[1], "size", f"the two pictures differ: {sizes}")
@@ -93,7 +92,7 @@ def solve_pair(
         watch.lap("solve, warm-up included")
         with OutputFolder(out) as folder:
             try:
-                seen = judged(done.answer.layers, stored, stack, eyes_m=eyes_m, fov_deg=fov_deg)
+                seen = judged(done.answer.layers, pictures, stack, eyes_m=eyes_m, fov_deg=fov_deg)
             except ValueError as error:
                 why = f"{error}: nothing of the display can be seen from there"
                 raise InputError("solve", "--left-eye", why) from None

@@ -14,10 +14,10 @@ from runtime.optics.carried import expected_psnrs_db, intensities
 from runtime.optics.quality import Quality, quality
 from runtime.optics.retina import Retina, as_codes, seen_by
 from runtime.optics.stack import PanelStack
-from runtime.records import F32, F64, U8, U16
+from runtime.records import F32, F64, U8
 from runtime.support.artifacts import write_png
 
-Picture = U8 | U16 | F32  # (h, w, 3): code values, or intensities in [0, 1]
+Picture = U8 | F32  # (h, w, 3): code values, or intensities in [0, 1]
 SIGMAS_MM = (0.0, 1.0, 2.0)  # two points, a pupil alone, a pupil and a good tracker
 
 

@@ -17,14 +17,14 @@ from runtime.optics.light import RAYS, squared_error
 from runtime.optics.quality import psnr_db
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
-from runtime.records import F32, F64, U8, U16
+from runtime.records import F32, F64, U8
 
 PLENTY = 3_000_000  # numbers of a picture
 
 
 def carried_db(
     layers: U8,
-    drawn: Sequence[U8 | U16 | F32],
+    drawn: Sequence[U8 | F32],
     stack: PanelStack,
     *,
     solved_for_m: ArrayLike,
@@ -45,7 +45,7 @@ def carried_db(
 
 def expected_psnrs_db(
     layers: U8,
-    drawn: Sequence[U8 | U16 | F32],
+    drawn: Sequence[U8 | F32],
     stack: PanelStack,
     *,
     eyes_m: ArrayLike,
@@ -85,15 +85,15 @@ def expected_psnrs_db(
 
 
 def light_psnrs_db(
-    layers: U8, drawn: Sequence[U8 | U16 | F32], stack: PanelStack, *, rays: int = RAYS, **how: Any
+    layers: U8, drawn: Sequence[U8 | F32], stack: PanelStack, *, rays: int = RAYS, **how: Any
 ) -> dict[float, float]:
     """The same of the light that leaves real pixels (`light`): the figure to quote."""
     return expected_psnrs_db(layers, drawn, stack, rays=rays, **how)
 
 
-def intensities(picture: U8 | U16 | F32) -> F32:
+def intensities(picture: U8 | F32) -> F32:
     """(h, w, 3) float32 in [0, 1] of a picture: code values, or intensities already."""
     part = picture[..., :3].astype(np.float32)
-    if picture.dtype != np.float32:
-        part /= np.float32(255 if picture.dtype == np.uint8 else 65535)
+    if picture.dtype == np.uint8:
+        part /= np.float32(255)
     return part

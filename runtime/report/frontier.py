@@ -135,7 +135,7 @@ def pair_result(pair: StillPair, run: MethodRun) -> PairResult:
     """Displayed quality (docs/contracts.md, Error) at the eyes, expected of unsure ones, and at places beside them."""
     height_px, width_px = pair.images[0].shape[:2]
     step = max(1, math.isqrt(height_px * width_px // ENOUGH_PIXELS))
-    at_eyes = judged(run.layers, pair.wanted, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, step=step)
+    at_eyes = judged(run.layers, pair.images, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, step=step)
     off: dict[str, list[float]] = {}
     for view in pair.off:
         place = view.eye_m[None]

@@ -14,11 +14,10 @@ from pydantic import BaseModel, Field
 
 from runtime.config import StackGeometry, read_table, validated
 from runtime.errors import InputError
-from runtime.evaluation.displayed import Picture
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack, stack_from_eye
 from runtime.records import F64, U8
-from runtime.support.artifacts import in_8_bits, read_picture
+from runtime.support.artifacts import read_image
 from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG
 
 if TYPE_CHECKING:
@@ -36,7 +35,7 @@ class OffView:
 
     mm: float
     eye_m: F64  # (3,) frame `stack`
-    image: Picture  # (h, w, 3)
+    image: U8  # (h, w, 3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +48,6 @@ class StillPair:
     images: tuple[U8, U8]  # (h, w, 3)
     fov_deg: float  # horizontal
     off: tuple[OffView, ...] = ()
-    stored: tuple[Picture, Picture] | None = None  # `images` in their files' own bits, where those are more than 8
-
-    @property
-    def wanted(self) -> tuple[Picture, Picture]:
-        """(h, w, 3) for each eye: what it should see, in all the bits that are known of it."""
-        return self.stored or self.images
 
 
 class OffEntry(BaseModel):
@@ -94,7 +87,7 @@ def read_pairs(folder: Path) -> list[StillPair]:
 
 def _case(path: Path, table: dict[str, Any]) -> StillPair:
     case = validated(CaseFile, table, source=path)
-    left, right = (read_picture(path.parent / name) for name in case.images)
+    left, right = (read_image(path.parent / name) for name in case.images)
     if left.shape != right.shape:
         raise InputError(path, "images", f"differ in size: {left.shape[1::-1]} and {right.shape[1::-1]}")
     size = {"width_px": left.shape[1], "height_px": left.shape[0]}
@@ -104,12 +97,11 @@ def _case(path: Path, table: dict[str, Any]) -> StillPair:
         raise InputError(path, "eyes", "must be before every panel")
     off = []
     for view in case.off:
-        image = read_picture(path.parent / view.image)
+        image = read_image(path.parent / view.image)
         if image.shape != left.shape:
             raise InputError(path.parent / view.image, "", "differs in size from the pair")
         off.append(OffView(view.mm, np.array(view.eye), image))
-    images = (in_8_bits(left), in_8_bits(right))
-    return StillPair(path.stem, stack, eyes, images, case.fov, tuple(off), (left, right))
+    return StillPair(path.stem, stack, eyes, (left, right), case.fov, tuple(off))
 
 
 def eyes_at(*, distance_m: float, angle_deg: float = 0.0, height_m: float = 0.0, ipd_m: float = 0.063) -> F64:

@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from runtime.errors import InputError
-from runtime.records import U8, U16
+from runtime.records import U8
 from runtime.support.library_lines import held_back
 from runtime.support.picture_header import PNG, is_cut_off, read_coded
 
@@ -95,22 +95,7 @@ def write_png(path: Path, image: U8) -> None:
 
 
 def read_image(path: Path) -> U8:
-    """(h, w, 3) RGB in 8 bits of any common picture file; where it is transparent, white shows through.
-
-    Raises InputError, naming the file.
-    """
-    return in_8_bits(read_picture(path))
-
-
-def in_8_bits(picture: U8 | U16) -> U8:
-    """(...) the nearest 8-bit code values."""
-    if picture.dtype == np.uint8:
-        return np.asarray(picture, np.uint8)
-    return ((picture.astype(np.uint32) + 128) // 257).astype(np.uint8)
-
-
-def read_picture(path: Path) -> U8 | U16:
-    """(h, w, 3) RGB in the file's own 8 or 16 bits; where it is transparent, white shows through.
+    """(h, w, 3) RGB of any common picture file, of 16 bits the upper 8; where it is transparent, white shows through.
 
     Raises InputError, naming the file: also for one that would take too much memory, before it is unpacked.
     """
@@ -122,14 +107,15 @@ def read_picture(path: Path) -> U8 | U16:
     coded = np.frombuffer(data, np.uint8)
     stored: Any = None
     with held_back() as said:
-        image: Any = cv2.imdecode(coded, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+        image: Any = cv2.imdecode(coded, cv2.IMREAD_COLOR)
         if image is not None and _may_be_transparent(data):
             stored = cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)
-    if image is None or image.dtype not in (np.uint8, np.uint16):
+    if image is None:
         why = f" ({said.first_line})" if said.first_line else ""
         raise InputError(path, "", f"is not an image that can be decoded{why}")
     if stored is not None and stored.ndim == 3 and stored.shape[2] == 4:
-        if not np.array_equal(stored[..., :3], image):
+        stored = stored >> 8 if stored.dtype == np.uint16 else stored
+        if not np.allclose(stored[..., :3], image, rtol=0, atol=1):
             raise InputError(path, "orientation", "a transparent picture that its EXIF entry turns can't be read")
         image = _on_white(image, stored[..., 3:])
     return np.ascontiguousarray(image[..., ::-1])
@@ -141,12 +127,10 @@ def _may_be_transparent(data: bytes) -> bool:
     return not data.startswith(JPEG)
 
 
-def _on_white(colour: U8 | U16, alpha: U8 | U16) -> U8 | U16:
-    """colour·a + white·(1 - a), rounded to the picture's own codes."""
-    white = int(np.iinfo(colour.dtype).max)
-    mixed = colour.astype(np.uint64) * alpha + np.uint64(white) * (white - alpha.astype(np.uint64))
-    codes = (mixed + white // 2) // white
-    return codes.astype(np.uint8) if colour.dtype == np.uint8 else codes.astype(np.uint16)
+def _on_white(colour: U8, alpha: Any) -> U8:
+    """colour·a + white·(1 - a), rounded."""
+    mixed = colour.astype(np.uint32) * alpha + 255 * (255 - alpha.astype(np.uint32))
+    return np.asarray((mixed + 127) // 255, np.uint8)
 
 
 class OutputFolder:
