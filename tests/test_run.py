@@ -69,7 +69,7 @@ def recorded(path: Path, times_s: Any, *, motion: str = "lean") -> Path:
     times_s = np.asarray(times_s, float)
     truth, random = true_eyes(motion, times_s - times_s[0]), np.random.default_rng(7)
     sensor_from_stack = demo_sensor_from_stack()
-    with recording_to(path, RecordingHeader(driver="test", serial="demo", truth=True)) as writer:
+    with recording_to(path, RecordingHeader(driver="test", serial="demo")) as writer:
         for number, (time_s, eyes_m) in enumerate(zip(times_s, truth, strict=True), start=1):
             seen = eyes_m + random.normal(0.0, 0.002, (2, 3))
             points = EyePoints(seen @ sensor_from_stack[:3, :3].T + sensor_from_stack[:3, 3], np.ones(2))

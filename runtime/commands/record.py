@@ -127,7 +127,6 @@ def record_to(out: Path, settings: Settings, *, images: bool, seconds: float | N
                         serial=worker.serial,
                         colour=pictures is not None and pictures.colour,
                         depth=pictures is not None and pictures.depth,
-                        truth=frame.true_eyes_m is not None,
                     )
                     writer = cleanup.enter_context(recording_to(out, header, max_s=max_s))
                 if not writer.write(frame):

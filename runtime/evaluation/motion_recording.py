@@ -49,7 +49,7 @@ def write_motion(
     observed = observe(motion, **how, seed=1 + seed, path=way)
     truth = true_eyes(motion, np.array([o.capture_ns for o in observed]) / NS_PER_S, path=way)
     sensor_from_stack = demo_sensor_from_stack()
-    header = RecordingHeader(driver="motion", serial="demo", truth=True)
+    header = RecordingHeader(driver="motion", serial="demo")
     with recording_to(path, header, max_s=2 * SECONDS_MAX) as writer:
         for number, (seen, eyes) in enumerate(zip(observed, truth, strict=True), start=1):
             points = None

@@ -138,26 +138,12 @@ class Recording:
 
     def __init__(self, path: Path) -> None:
         """Reads the header and the first sample. Raises InputError, naming the file."""
-        self.path = path
-        self.is_whole = self._ends_well()
+        self.path, self.is_whole = path, True  # as far as it was read
         self.header = self._read_header()
         first = next(self.samples(), None)
         if first is None:
             raise InputError(path, "", "holds no whole sample")
         self.first = first
-
-    def _ends_well(self) -> bool:
-        try:
-            with self._opened() as file:
-                if file.read(len(MAGIC)) != MAGIC:
-                    raise InputError(self.path, "", "is not an MCAP recording")
-                file.seek(-len(MAGIC), 2)
-                is_whole = file.tell() > 0 and file.read() == MAGIC
-        except OSError as error:
-            raise InputError(self.path, "", f"cannot be read ({error.strerror})") from None
-        if not is_whole:
-            log.warning("%s: is cut off; it is read up to its last whole chunk", self.path)
-        return is_whole
 
     def _opened(self) -> IO[bytes]:
         return untrusted_input.open_regular(self.path, most_bytes=LIMITS.file_bytes)
@@ -189,6 +175,9 @@ class Recording:
 
     def _to_the_break(self, file: IO[bytes]) -> Iterator[Any]:
         try:
+            if file.read(len(MAGIC)) != MAGIC:
+                raise InputError(self.path, "", "is not an MCAP recording")
+            file.seek(0)
             yield from mcap_records(file, source=self.path, max_bytes=LIMITS.chunk_bytes)
         except InputError:
             raise
@@ -196,7 +185,7 @@ class Recording:
             raise InputError(self.path, "", f"cannot be read ({error.strerror})") from None
         except Exception as error:  # mcap, lz4 and zstandard each raise their own for a broken file
             if self.is_whole:
-                log.warning("%s: is damaged; it is read up to the damage (%s)", self.path, error)
+                log.warning("%s: is cut off or damaged; it is read up to there (%s)", self.path, error)
             self.is_whole = False
 
     def samples(self) -> Iterator[SensorFrame]:

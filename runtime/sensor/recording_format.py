@@ -124,7 +124,6 @@ class RecordingHeader:
     serial: str = ""
     colour: bool = False
     depth: bool = False
-    truth: bool = False
 
     def metadata(self) -> dict[str, str]:
         """As MCAP metadata: text to text."""

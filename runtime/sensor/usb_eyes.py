@@ -18,7 +18,6 @@ from runtime.sensor.usb_devices import UDEV_RULE, UsbDevice, find_device, reset_
 READ_BYTES = 16384  # a whole number of USB packets of any speed, so that no transfer overflows
 READ_MS = 50  # one transfer at most: unplugging without an error is noticed, stopping is quick
 SILENT_READS = 2  # time-outs in a row after which a device is reset
-STALLS = 3  # stalls in a row after which a device is reset
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +34,7 @@ class UsbEyesDriver(Sensor):
         self._device: UsbDevice | None = None
         self._endpoint: Any = None
         self._reader, self._times = PacketReader(), DeviceClock()
-        self._silent = self._stalls = 0
+        self._silent = 0
 
     def open(self) -> None:
         import usb.core
@@ -59,7 +58,7 @@ class UsbEyesDriver(Sensor):
             raise SensorLost(f"{device.known.name}: has no bulk endpoint to read from")
         self._device, self._endpoint, self.serial = device, endpoint, device.serial
         self._reader, self._times = PacketReader(), DeviceClock()
-        self._silent = self._stalls = 0
+        self._silent = 0
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
         deadline_ns = self._clock.now_ns() + round(timeout_s * NS_PER_S)
@@ -89,23 +88,10 @@ class UsbEyesDriver(Sensor):
         except usb.core.USBTimeoutError:
             return []
         except usb.core.USBError as error:
-            if error.errno != errno.EPIPE:
-                raise SensorLost(f"{self._device.known.name}: {error.strerror or error}") from None
-            self._stalls += 1
-            if self._stalls >= STALLS:
-                self._reset(f"the endpoint stalled {STALLS} times")
-            self._unstall()
-            return []
-        self._stalls = 0
+            if error.errno == errno.EPIPE:
+                self._reset("the endpoint stalled")
+            raise SensorLost(f"{self._device.known.name}: {error.strerror or error}") from None
         return self._reader.feed(bytes(data))
-
-    def _unstall(self) -> None:
-        import usb.core
-
-        try:
-            self._endpoint.clear_halt()
-        except usb.core.USBError as error:
-            raise SensorLost(f"a stalled endpoint cannot be cleared ({error})") from None
 
     def _silence(self, timeout_s: float) -> None:
         """Raises SensorTimeout; the second time in a row, after a reset, SensorLost."""

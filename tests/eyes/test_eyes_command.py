@@ -40,7 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_png(folder / "eileen.png", eileen().picture)
     write_png(folder / "nobody.png", np.full((90, 120, 3), 77, np.uint8))
     film = cv2.VideoWriter(str(folder / "film.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 30, (640, 480))
-    header = RecordingHeader("openni2", "1", colour=True, depth=True, truth=False)
+    header = RecordingHeader("openni2", "1", colour=True, depth=True)
     with recording_to(folder / "record.mcap", header) as recording:
         for number, place in enumerate(places(5)):
             colour, depth, _ = scene(place, intrinsics=CAMERA)

@@ -87,7 +87,7 @@ def recordings() -> list[bytes]:
     camera = Intrinsics(16, 12, 60.0, 61.0, 8.0, 6.0)
     made = []
     for header, parts in (
-        (RecordingHeader(driver="a", truth=True), {"eyes": EYES, "true_eyes_m": np.zeros((2, 3))}),
+        (RecordingHeader(driver="a"), {"eyes": EYES, "true_eyes_m": np.zeros((2, 3))}),
         (
             RecordingHeader(driver="b", colour=True, depth=True),
             {"eyes": EYES, "colour": colour, "depth_mm": depth, "intrinsics": camera},

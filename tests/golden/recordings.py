@@ -64,7 +64,7 @@ def write(name: str, path: Path) -> None:
     )
     truth = true_eyes(head.motion, np.array([o.capture_ns for o in observed]) / NS_PER_S, path=way)
     sensor_from_stack = demo_sensor_from_stack()
-    with recording_to(path, RecordingHeader(driver="golden", serial="demo", truth=True)) as writer:
+    with recording_to(path, RecordingHeader(driver="golden", serial="demo")) as writer:
         for number, (seen, eyes_m) in enumerate(zip(observed, truth, strict=True), start=1):
             time_s, points = seen.capture_ns / NS_PER_S, None
             if head.silent_s[0] <= time_s < head.silent_s[1]:

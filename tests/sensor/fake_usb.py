@@ -61,7 +61,6 @@ class FakeDevice:
     transfers: list[bytes | int] = field(default_factory=list)
     stream: Callable[[], bytes] | None = None
     resets: int = 0
-    halts_cleared: int = 0
     on_reset: Callable[[], None] = lambda: None
     closed: int = 0
 
@@ -138,10 +137,6 @@ class FakeUsb(usb.backend.IBackend):
 
     def release_interface(self, dev_handle: FakeDevice, intf: int) -> None:
         self._check(dev_handle)
-
-    def clear_halt(self, dev_handle: FakeDevice, ep: int) -> None:
-        self._check(dev_handle)
-        dev_handle.halts_cleared += 1
 
     def reset_device(self, dev_handle: FakeDevice) -> None:
         self._check(dev_handle)
