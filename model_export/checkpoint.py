@@ -15,12 +15,11 @@ from model_export.eyereal import EyeRealNet
 from model_export.network import SpectralSolver
 from model_export.recipe import Recipe
 from runtime.config import validated
-from runtime.errors import InputError
+from runtime.errors import InputError, one_line
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_bytes
 
 FILE_BYTES_MAX = 4 << 30
-
 WIDTH_KEY = "subnets.in_conv.0.weight"
 
 
@@ -35,7 +34,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         with torch.serialization.safe_globals([argparse.Namespace]):
             table: dict[str, Any] = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged pickle can raise anything
-        raise InputError(path, "", f"is no checkpoint of plain weights ({_first_line(error)})") from None
+        raise InputError(path, "", f"is no checkpoint of plain weights ({one_line(str(error), most=120)})") from None
     state = table.get("model") if isinstance(table, dict) else None
     if not isinstance(state, Mapping) or not state or not all(isinstance(v, Tensor) for v in state.values()):
         raise InputError(path, "model", 'missing: a checkpoint is {"model": state_dict}')
@@ -112,7 +111,3 @@ def save_checkpoint(path: Path, table: dict[str, Any]) -> None:
     buffer = io.BytesIO()
     torch.save(table, buffer)
     write_bytes(path, buffer.getvalue())
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:120]

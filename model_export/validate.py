@@ -16,15 +16,13 @@ import onnx
 import onnxruntime
 
 from model_export.stress import ORDINARY, Feeds, picture_cases, spectral_cases
-from runtime.errors import InputError
+from runtime.errors import InputError, one_line
 from runtime.model.contract import VERSION, Contract, parse_contract
 from runtime.model.transfer import FULL
-from runtime.report.page import in_columns
 from runtime.support import untrusted_input
 from runtime.support.progress import tracked
 
 FILE_BYTES_MAX = 4 << 30
-
 LIMIT = 0.25 / 255  # largest difference in panel values: a quarter of a code
 SMALL = (96, 160)  # pictures for a model that takes any size
 
@@ -56,11 +54,10 @@ class Report:
 
     def table(self) -> str:
         """For a person: what was checked, found, wanted."""
-        rows = [["check", "found", "wanted", ""]]
-        rows += [[c.name, c.found, c.wanted, "ok" if c.passed else "FAILED"] for c in self.checks]
+        rows = [f"{'ok' if c.passed else 'FAILED':8}{c.name}: {c.found}; wanted: {c.wanted}" for c in self.checks]
         failed = sum(not check.passed for check in self.checks)
         end = f"{failed} of {len(self.checks)} checks failed" if failed else f"all {len(self.checks)} checks passed"
-        return "\n".join([self.file, in_columns(rows), end])
+        return "\n".join([self.file, *rows, end])
 
 
 Reference = Callable[[Feeds], Sequence[np.ndarray]]
@@ -80,13 +77,13 @@ def check_model(data: bytes, *, source: str, reference: Reference | None = None)
         model = onnx.load_from_string(data)
         onnx.checker.check_model(model)
     except Exception as error:  # protobuf and onnx raise their own
-        raise InputError(source, "", f"is no ONNX model ({_first_line(error)})") from None
+        raise InputError(source, "", f"is no ONNX model ({_said(error)})") from None
     contract = parse_contract({item.key: item.value for item in model.metadata_props}, source=source)
     checks = [Check("contract", f"{contract.arch} {contract.name}", f"version {VERSION}", True)]
     try:
         session = _session(data, optimised=True)
     except Exception as error:  # onnxruntime's own hierarchy
-        return Report(source, (*checks, Check("onnxruntime loads it", _first_line(error), "a session", False)))
+        return Report(source, (*checks, Check("onnxruntime loads it", _said(error), "a session", False)))
     checks += _ports(session, contract)
     if not all(check.passed for check in checks):
         return Report(source, tuple(checks))
@@ -102,6 +99,7 @@ def check_model(data: bytes, *, source: str, reference: Reference | None = None)
 def _session(data: bytes, *, optimised: bool) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.log_severity_level = 2, 3
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # two sessions and torch take turns
     levels = onnxruntime.GraphOptimizationLevel
     options.graph_optimization_level = levels.ORT_ENABLE_ALL if optimised else levels.ORT_DISABLE_ALL
     return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
@@ -140,7 +138,7 @@ def _compared(name: str, run: Reference, reference: Reference, feeds: Feeds) -> 
     try:
         found = _panels(run(feeds))
     except Exception as error:  # onnxruntime's own hierarchy
-        return Check(name, _first_line(error), "an answer", False)
+        return Check(name, _said(error), "an answer", False)
     wanted = _panels(reference(feeds))
     if found.shape != wanted.shape:
         return Check(name, f"shape {found.shape}", f"shape {wanted.shape}", False)
@@ -151,5 +149,5 @@ def _compared(name: str, run: Reference, reference: Reference, feeds: Feeds) -> 
     return Check(name, f"largest {value * 255:.3g} codes off the reference", limit, value <= LIMIT)
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [""])[0][:120]
+def _said(error: Exception) -> str:
+    return one_line(str(error), most=120)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from time import monotonic
 from typing import Any
 
 from runtime.config import StackGeometry
@@ -18,7 +17,6 @@ from runtime.report.pairs import StillPair, procedural_pairs, read_pairs
 from runtime.report.sections import focal_section, frontier_section, moving_section
 from runtime.report.worker import apart
 
-REWRITTEN_EVERY_S = 10.0
 QUOTE = "light_db of eyes sure to 1 mm: what both eyes make of the panels' pixels"
 Progress = Callable[[str], None]
 
@@ -29,7 +27,6 @@ class GrowingPage:
     def __init__(self, out: Path, command: str, progress: Progress) -> None:
         self._out, self._command, self._progress = out, command, progress
         self._sections: dict[str, Section] = {}
-        self._written_s = float("-inf")
         self.record: dict[str, Any] = {"machine": describe(), "command": command, "quote": QUOTE, "complete": False}
 
     def doing(self, what: str) -> None:
@@ -37,11 +34,10 @@ class GrowingPage:
         self._progress(what)
         self.record["measuring"] = what
 
-    def put(self, name: str, make: Callable[[], Section], *, last: bool = False) -> None:
-        """A section as it is now; drawn and written unless it was just before. last: it will not change any more."""
-        if last or monotonic() - self._written_s > REWRITTEN_EVERY_S:
-            self._sections[name] = make()
-            self.write()
+    def put(self, name: str, section: Section) -> None:
+        """A section as it is now, in place of what it was."""
+        self._sections[name] = section
+        self.write()
 
     def finished(self) -> None:
         """Nothing more will come."""
@@ -57,7 +53,6 @@ class GrowingPage:
         lead = "Light, of eyes sure to 1 mm, is the figure to quote; higher is better."
         page = Page("Error against run time", lead, sections, machine, self._command, notes)
         page.write(self._out, record="report.json", data=self.record)
-        self._written_s = monotonic()
 
 
 def whole_report(
@@ -108,16 +103,11 @@ def _frontier(
     title = f"Error against run time: {title}"
     page.doing(f"{title}: drawing")
     before, results = page.record.get(key, []), dict[str, MethodResult]()
-
-    def section() -> Section:
-        return frontier_section(list(results.values()), title=title, name=name)
-
     for done, result in measure(methods, pairs):
         page.doing(f"{title}: {done} is done")
         results[result.name] = result
         page.record[key] = before + [one.record() for one in results.values()]
-        page.put(name, section)
-    page.put(name, section, last=True)
+        page.put(name, frontier_section(list(results.values()), title=title, name=name))
 
 
 def _moving(page: GrowingPage, *, quick: bool) -> None:
@@ -127,8 +117,7 @@ def _moving(page: GrowingPage, *, quick: bool) -> None:
             page.doing(f"what a moving viewer sees: {motion}, {solver_ms:g} ms")
             found.append(apart(moving.moving_run, motion, solver_ms, scale=0.25 if quick else 0.5))
             page.record["moving"] = [asdict(one) for one in found]
-            page.put("moving", lambda: moving_section(found))
-    page.put("moving", lambda: moving_section(found), last=True)
+            page.put("moving", moving_section(found))
 
 
 def _focal(page: GrowingPage) -> None:
@@ -141,4 +130,4 @@ def _focal(page: GrowingPage) -> None:
         "model": stack.model,
         "cards": [asdict(card) for card in stack.cards],
     }
-    page.put("focal", lambda: focal_section(stack), last=True)
+    page.put("focal", focal_section(stack))

@@ -85,12 +85,6 @@ class Page:
                 write_bytes(folder.staging / f"{figure.name}.png", figure.png)
 
 
-def in_columns(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of equally many texts as lines for a terminal, flush right."""
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
-
-
 def section_of(title: str, rows: Sequence[Sequence[str]]) -> Section:
     """A section of one table, whose first row is its headings."""
     return Section(title, tables=[Table(rows[0], rows[1:])])

@@ -37,12 +37,9 @@ def test_mistakes_are_told_before_anything_is_measured_and_nothing_is_written(tm
         assert not (tmp_path / "out").exists()
 
 
-def test_a_report_that_is_stopped_is_a_page_with_what_was_measured(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_report_that_is_stopped_is_a_page_with_what_was_measured(tmp_path: Path) -> None:
     (tmp_path / "cases").mkdir()
     case_folder(tmp_path / "cases")
-    monkeypatch.setattr("runtime.report.assemble.REWRITTEN_EVERY_S", 0.0)
 
     def stop_after_two(what: str) -> None:
         if "fast" in what:
