@@ -23,7 +23,7 @@ from runtime.config import Settings, load_settings
 from runtime.errors import InputError
 from runtime.panels.monitors import Monitor
 from runtime.panels.mounting import Arrow, mounting_of
-from runtime.sensor.registry import driver_names
+from runtime.sensor.registry import DRIVERS
 from runtime.support import untrusted_input
 
 Figures = dict[str, Any]
@@ -264,7 +264,7 @@ def _measure_grey(setup: Setup, panel: int) -> float:
 def sensor(setup: Setup) -> Figures:
     """Which depth sensor sees the viewer; tried at once."""
     settings = setup.settings
-    names = [name for name in driver_names() if name not in ("replay", "fixed")]
+    names = [name for name in DRIVERS if name not in ("replay", "fixed")]
     if setup.hardware.simulated:
         names = ["replay"]
     chosen, problem = names.index(settings.sensor.driver) if settings.sensor.driver in names else 0, ""

@@ -409,15 +409,10 @@ def _uv_change(table: Table) -> F64:
 
 
 def smooth_normals(positions: F32, triangles: I32) -> F32:
-    """(v, 3) of vertices that have none: the mean of their faces', by area."""
-    corner = positions.astype(np.float64)[triangles]
-    faces = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    sums = np.zeros((len(positions), 3))
-    for place in range(3):
-        np.add.at(sums, triangles[:, place], faces)
-    length = np.linalg.norm(sums, axis=1, keepdims=True)
-    found: F32 = np.divide(sums, length, out=np.zeros_like(sums), where=length > 0).astype(np.float32)
-    return found
+    """(v, 3) of vertices that have none: the mean of their faces'."""
+    import trimesh
+
+    return np.asarray(trimesh.Trimesh(positions, triangles, process=False).vertex_normals, np.float32)
 
 
 def texture_of(image: Any) -> U8:

@@ -7,38 +7,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-STYLE: dict[str, Any] = {
-    "figure.dpi": 130,
-    "font.family": "DejaVu Sans",
-    "font.size": 9.5,
-    "axes.titlesize": 11,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": "#9aa3b5",
-    "axes.labelcolor": "#3a4357",
-    "axes.grid": True,
-    "grid.color": "#e6e9f0",
-    "grid.linewidth": 0.8,
-    "axes.axisbelow": True,
-    "xtick.color": "#5b6478",
-    "ytick.color": "#5b6478",
-    "legend.frameon": False,
-    "lines.linewidth": 1.8,
-}
-COLOURS = ("#2456c4", "#d9662b", "#1a8f6b", "#a23b8f", "#c9a227", "#5b6478", "#2b9ec9", "#8b1e3f")
+STYLE = ["seaborn-v0_8-whitegrid", {"figure.dpi": 130, "axes.spines.top": False, "axes.spines.right": False}]
 
 
 @contextmanager
 def drawing(width_in: float, height_in: float) -> Iterator[Any]:
     """A matplotlib figure in the reports' style, without pyplot's global state."""
-    import matplotlib as mpl
-    from cycler import cycler
+    from matplotlib import style
     from matplotlib.figure import Figure
 
-    settings: Any = STYLE | {"axes.prop_cycle": cycler(color=COLOURS)}
-    with mpl.rc_context(settings):
+    with style.context(STYLE):  # type: ignore[arg-type]
         yield Figure(figsize=(width_in, height_in), layout="constrained")
 
 

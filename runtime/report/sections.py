@@ -11,9 +11,9 @@ from runtime.report.focal import CARDS_M, DISTANCE_M, PUPIL_M, FocalStack
 from runtime.report.frontier import MethodResult
 from runtime.report.moving import Moving
 from runtime.report.page import Figure, Section, Table
-from runtime.report.plots import COLOURS, drawing, png
+from runtime.report.plots import drawing, png
 
-KINDS = {"network": ("o", COLOURS[0]), "iterative": ("s", COLOURS[1])}
+KINDS = {"network": ("o", "C0"), "iterative": ("s", "C1")}
 NAMES = ("behind the panels", "in the middle panel", "before the panels")
 
 
@@ -90,10 +90,10 @@ def moving_plot(found: Sequence[Moving]) -> Figure:
     motions, times = (list(dict.fromkeys(getattr(one, name) for one in found)) for name in ("motion", "solver_ms"))
     with drawing(9.6, 3.6) as figure:
         axes = figure.add_subplot()
-        for index, (time, colour) in enumerate(zip(times, COLOURS, strict=False)):
+        for index, time in enumerate(times):
             own = {one.motion: one.light_db for one in found if one.solver_ms == time}
             x = np.arange(len(motions)) + (index - (len(times) - 1) / 2) * 0.3
-            bars = axes.bar(x, [own.get(motion, 0.0) for motion in motions], width=0.28, color=colour)
+            bars = axes.bar(x, [own.get(motion, 0.0) for motion in motions], width=0.28)
             bars.set_label(f"solver of {time:g} ms")
             axes.bar_label(bars, fmt="%.1f", fontsize=8.5)
         axes.set_xticks(range(len(motions)), motions)

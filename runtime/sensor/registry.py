@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from runtime.clock import Clock
 from runtime.config import SensorSettings, validated
 from runtime.errors import InputError, PhasestackError
@@ -12,35 +10,13 @@ from runtime.support.crash import written
 from runtime.support.plausible import nearest
 from runtime.support.plugins import is_plugin, plugin_class, strict
 
-
-def _replay(settings: SensorSettings, clock: Clock, latency_ms: float) -> Sensor:
-    from runtime.sensor.replay import ReplayDriver
-
-    return ReplayDriver(settings.source, clock, loop=settings.loop, latency_ms=latency_ms)
-
-
-def _device(name: str) -> Callable[[SensorSettings, Clock, float], Sensor]:
-    """A driver whose class, `module:Class`, is imported when one is made."""
-
-    def make(settings: SensorSettings, clock: Clock, latency_ms: float) -> Sensor:
-        driver: Sensor = plugin_class(f"runtime.sensor.{name}", Sensor, field="sensor.driver")(settings, clock)
-        return driver
-
-    return make
-
-
-_FACTORIES: dict[str, Callable[[SensorSettings, Clock, float], Sensor]] = {
-    "replay": _replay,
-    "fixed": _device("fixed:FixedDriver"),
-    "openni2": _device("openni2:OpenNI2Driver"),
-    "usb-eyes": _device("usb_eyes:UsbEyesDriver"),
-    "usb-camera": _device("usb_camera:UsbCameraDriver"),
+DRIVERS = {  # that come with phasestack
+    "replay": "replay:ReplayDriver",
+    "fixed": "fixed:FixedDriver",
+    "openni2": "openni2:OpenNI2Driver",
+    "usb-eyes": "usb_eyes:UsbEyesDriver",
+    "usb-camera": "usb_camera:UsbCameraDriver",
 }
-
-
-def driver_names() -> tuple[str, ...]:
-    """The drivers that come with phasestack."""
-    return tuple(_FACTORIES)
 
 
 def open_sensor(settings: SensorSettings, clock: Clock, *, latency_ms: float = 0.0) -> Sensor:
@@ -54,10 +30,13 @@ def open_sensor(settings: SensorSettings, clock: Clock, *, latency_ms: float = 0
     name = settings.driver
     if is_plugin(name):
         return _plugin(name, settings, clock)
-    if name not in _FACTORIES:
-        known = f"{', '.join(_FACTORIES)}, or a class of yours: module:Class"
-        raise InputError("sensor", "driver", f"unknown: {name!r}{nearest(name, driver_names())}; known: {known}")
-    return _FACTORIES[name](settings, clock, latency_ms)
+    if name not in DRIVERS:
+        known = f"{', '.join(DRIVERS)}, or a class of yours: module:Class"
+        raise InputError("sensor", "driver", f"unknown: {name!r}{nearest(name, DRIVERS)}; known: {known}")
+    driver = plugin_class(f"runtime.sensor.{DRIVERS[name]}", Sensor, field="sensor.driver")
+    replayed = {"loop": settings.loop, "latency_ms": latency_ms}
+    sensor: Sensor = driver(settings.source, clock, **replayed) if name == "replay" else driver(settings, clock)
+    return sensor
 
 
 def _plugin(name: str, settings: SensorSettings, clock: Clock) -> Sensor:
