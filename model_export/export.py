@@ -110,8 +110,6 @@ def spectral_file(net: SpectralSolver, recipe: Recipe, *, trained: bool = True) 
         reduction=recipe.reduction,
         emphasis=recipe.emphasis,
         interpolation=recipe.interpolation,
-        least_spread_px=recipe.least_spread_px,
-        slope_floor=recipe.slope_floor,
         steps=recipe.steps,
         refining=recipe.refining,
     )

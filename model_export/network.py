@@ -53,8 +53,9 @@ class SpectralSolver(nn.Module):
         self.log_floor = nn.Parameter(torch.log(torch.tensor([0.01, 0.2])))  # λ of g and of h
         self.log_rough = nn.Parameter(torch.log(torch.tensor([0.05, 0.2])))  # and how they grow with w²
         self.log_doubt = nn.Parameter(torch.zeros(2))  # how much the doubt along the line and across it weighs
-        self.log_penalty = nn.Parameter(torch.full((iterations,), math.log(0.05)))
-        self.relaxation = nn.Parameter(torch.full((iterations,), 1.6))
+        # The first turn is nearly the unclipped solution, later ones hold on to the range; the last ends on it.
+        self.log_penalty = nn.Parameter(torch.linspace(math.log(0.02), math.log(0.2), iterations))
+        self.relaxation = nn.Parameter(torch.tensor([1.3] * (iterations - 1) + [1.0] * min(1, iterations)))
 
     def gains(self, spectrum: Tensor, doubt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(patterns, cells + 1) each: numerator and denominator of g, with what h takes over left out, and h's gain."""

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from runtime.config import Section, validated
 from runtime.errors import InputError
-from runtime.model.contract import LEAST_SPREAD_PX, LeastSpread, Refining, SlopeFloor, Steps, TrainedFor
+from runtime.model.contract import Refining, Steps, TrainedFor
 from runtime.model.predictor import SHIPPED
 from runtime.support import untrusted_input
 
@@ -46,13 +46,7 @@ class Recipe(Section):
         0.0,
         description="strength of the sharpening that undoes the blur of interpolation, on the way in and in the eye",
     )
-    interpolation: Literal["linear", "finer", "cubic"] = Field(
-        "linear",
-        description="how still pictures are warped: linear; finer: linear samples of a picture that a cubic kernel "
-        "makes twice as fine; cubic: its kernel on small rasters, and as finer on large ones",
-    )
-    least_spread_px: LeastSpread = LEAST_SPREAD_PX
-    slope_floor: SlopeFloor = 1.0
+    interpolation: Literal["linear", "finer"] = "linear"
     steps: Annotated[Steps, Field(min_length=1)]
     refining: Refining = ()
     training: Training = Training()

@@ -37,45 +37,24 @@ class Step(Section):
         description="where a joint step takes unsure eyes to be: where they are, or a standard deviation to either "
         "side, the right one higher or lower",
     )
-    reduction: Literal[1, 2, 4] = Field(1, description="the step works on a raster so much coarser than a panel")
 
 
 def checked_steps(steps: tuple[Step, ...]) -> tuple[Step, ...]:
     """Steps that can be carried out: one chain, first; never back to a coarser raster. Raises ValueError."""
     if steps and [index for index, step in enumerate(steps) if step.kind == "chain"] != [0]:
         raise ValueError("must begin with a chain step, the only one")
-    if any(after.reduction > before.reduction for before, after in pairwise(steps)):
-        raise ValueError("reduction must not grow from step to step")
     if any(before.kind == "joint" != after.kind for before, after in pairwise(steps)):
         raise ValueError("nothing but joint steps may follow a joint one")
-    if any(step.kind == "joint" and step.reduction != 1 for step in steps):
-        raise ValueError("joint steps work on every pixel: reduction must be 1")
     return steps
 
 
 Steps = Annotated[tuple[Step, ...], AfterValidator(checked_steps)]
 
 
-LEAST_SPREAD_PX = 0.5  # below, care for unsure eyes costs most models more time than it gains
-LeastSpread = Annotated[
-    float,
-    Field(
-        gt=0,
-        le=8,
-        description="corrections care for unsure eyes where those move an outer panel's picture by so many pixels, "
-        "one standard deviation",
-    ),
-]
-SlopeFloor = Annotated[
-    float,
-    Field(gt=0, le=1, description="corrections weigh a ray by the slope of sin² there, and by so much at least"),
-]
-
-
 def checked_refining(steps: tuple[Step, ...]) -> tuple[Step, ...]:
     """Joint steps alone. Raises ValueError."""
-    if any(step.kind != "joint" or step.reduction != 1 for step in steps):
-        raise ValueError("must be joint steps on every pixel")
+    if any(step.kind != "joint" for step in steps):
+        raise ValueError("must be joint steps")
     return steps
 
 
@@ -137,13 +116,11 @@ class Contract(Section):
     picture_fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
         0.0, description="horizontal view of the pictures it was trained on, black beside them; 0: whatever is drawn"
     )
-    interpolation: Literal["linear", "finer", "cubic"] = Field(
+    interpolation: Literal["linear", "finer"] = Field(
         "linear",
         description="how still pictures are warped: linear; finer: linear samples of a picture that a cubic kernel "
-        "makes twice as fine; cubic: its kernel on small rasters, and as finer on large ones",
+        "makes twice as fine",
     )
-    least_spread_px: LeastSpread = LEAST_SPREAD_PX
-    slope_floor: SlopeFloor = 1.0
     steps: Steps = ()
     refining: Refining = ()
 

@@ -12,17 +12,21 @@ from collections.abc import Sequence
 import numpy as np
 
 from runtime.model.channels import without_alpha
-from runtime.model.compiled.joint import FULL, INTENSITY, JointState, rays_of
+from runtime.model.compiled.joint import INTENSITY, JointState, fill, rays_of
 from runtime.model.compiled.loops import TILE
+from runtime.model.compiled.panels import show_panels
 from runtime.model.contract import Step
 from runtime.model.reprojection import CENTRE, reprojection
 from runtime.model.steps import PLACES
+from runtime.model.transfer import SUBCODE
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_raster, stack_from_eye
 from runtime.records import F64, U8
+from runtime.support.threads import at_once
 
-MAX_BEND_PX = 0.25  # of a row, from the parabola that the kernel takes for a tile of it
+DRIFT_PX = 1 / 4  # no row of rays lies like the next one: to lay each exactly would take a third of a step
+MAX_BEND_PX = 0.2  # of a row, from the parabola that the kernel takes for a tile of it
 MIN_WEIGHT = 0.05  # of a homography, beside its middle's: what is nearer to the eye's own plane is not looked along
 
 
@@ -66,26 +70,21 @@ def refined(
 
     sizes = np.array([(box.height_px, box.width_px)] * 3 + [(looked.height_px, looked.width_px)])
     state = JointState(sizes, channels=channels, threads=threads)
-    width = box.width_px * channels
-    for n, layer in enumerate(layers):
-        codes = without_alpha(layer[box.slices], channels).reshape(box.height_px, -1)
-        state.panels[n, : box.height_px, :width] = codes.astype(np.int16) * int(FULL / 255)
-    for side, picture in enumerate(pictures):
-        codes = without_alpha(picture[looked.slices], channels).reshape(looked.height_px, -1)
-        state.targets[side, : looked.height_px, : codes.shape[1]] = codes.astype(np.int16) * int(INTENSITY)
-    state.start()
     looks = [rays_of(rays(step), sizes) for step in steps]
     pixels = TILE // channels
     for look in looks:
         if max(bend_px(look.seen, looked.width_px, pixels), bend_px(look.back, box.width_px, pixels)) > MAX_BEND_PX:
             return layers
+    begun = [(numbers, layer[box.slices], SUBCODE) for numbers, layer in zip(state.panels, layers, strict=True)]
+    wanted = [
+        (numbers, picture[looked.slices], INTENSITY) for numbers, picture in zip(state.targets, pictures, strict=True)
+    ]
+    at_once(lambda of: fill(of[0], without_alpha(of[1], channels), of[2]), [*begun, *wanted])
+    state.start()
     for step, look in zip(steps, looks, strict=True):
-        state.step(look, size=step.size, momentum=step.momentum, floor=step.floor)
+        state.step(look, size=step.size, momentum=step.momentum, floor=step.floor, drift_px=DRIFT_PX)
     made = layers.copy()
-    half = int(FULL / 255) // 2
-    for layer, numbers in zip(made, state.last, strict=True):
-        codes = (numbers[: box.height_px, :width] + half) // int(FULL / 255)
-        layer[box.slices][..., :3] = codes.reshape(box.height_px, box.width_px, channels)
+    show_panels(dict(enumerate(state.last)), made, [box] * stack.count, channels=channels, threads=threads)
     return made
 
 

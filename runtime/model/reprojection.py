@@ -19,6 +19,7 @@ OUTER = (REAR, FRONT)
 START = FULL // 2  # of an outer panel, sixteenths of a code: the middle of its range
 NEUTRAL = (START + SUBCODE // 2) // SUBCODE  # the same in 8-bit codes, rounded as what is shown is
 MAX_SPREAD_PX = 8.0
+LEAST_SPREAD_PX = 0.5  # of an outer panel's picture: below, care for unsure eyes costs more time than it gains
 
 
 def reprojection(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: F64, *, of: int, on: int) -> F64:
@@ -38,9 +39,7 @@ def reprojection(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: F64, 
     return matrix
 
 
-def spreads(
-    rasters: Sequence[PlaneRaster], eyes_m: F64, *, eye_sigma_mm: float, least_px: float
-) -> dict[int, tuple[float, float]]:
+def spreads(rasters: Sequence[PlaneRaster], eyes_m: F64, *, eye_sigma_mm: float) -> dict[int, tuple[float, float]]:
     """Per outer panel whose pixels move by enough to be felt for eyes (2, 3) that err by so much: right and down."""
     eye_x_m, centre_x_m = eyes_m[:, 0].mean(), rasters[CENTRE].x_m
     found = {}
@@ -48,15 +47,13 @@ def spreads(
         raster = rasters[n]
         moved_m = eye_sigma_mm / 1e3 * abs(raster.x_m - centre_x_m) / (eye_x_m - centre_x_m)
         spread = min(moved_m / raster.pitch_u_m, MAX_SPREAD_PX), min(moved_m / raster.pitch_v_m, MAX_SPREAD_PX)
-        if max(spread) >= least_px:
+        if max(spread) >= LEAST_SPREAD_PX:
             found[n] = spread
     return found
 
 
 def coarser(raster: PlaneRaster, reduction: int) -> PlaneRaster:
     """The same rectangle in fewer pixels."""
-    if reduction == 1:
-        return raster
     width, height = max(1, raster.width_px // reduction), max(1, raster.height_px // reduction)
     return replace(
         raster,

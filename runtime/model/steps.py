@@ -19,7 +19,7 @@ from runtime.model.compiled.fade import fade_codes
 from runtime.model.contract import Contract, Places, Step
 from runtime.model.fade import Fade
 from runtime.model.job import Picture
-from runtime.model.reprojection import CENTRE, FRONT, OUTER, REAR, START, coarser, reprojection
+from runtime.model.reprojection import CENTRE, FRONT, OUTER, REAR, START, reprojection
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen
@@ -41,9 +41,10 @@ class Problem:
     channels: int  # 1 or 3
     fade: Fade | None  # how the panels end, where they are a part of larger ones
 
-    def rasters(self, reduction: int) -> tuple[PlaneRaster, ...]:
-        """The panels' pixels within their boxes, so much coarser."""
-        return tuple(coarser(box.cut(self.stack.panel(n)), reduction) for n, box in enumerate(self.boxes))
+    @property
+    def rasters(self) -> tuple[PlaneRaster, ...]:
+        """The panels' pixels within their boxes."""
+        return tuple(box.cut(self.stack.panel(n)) for n, box in enumerate(self.boxes))
 
     @property
     def reduced_size(self) -> tuple[int, int]:
@@ -94,7 +95,7 @@ class Problem:
         from where a joint step takes them to be."""
         sides = PLACES[places] if self.eye_sigma_mm > 0 else PLACES["middle"]
         right, up = stack_from_eye(self.eyes_m.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
-        rasters = self.rasters(1)
+        rasters = self.rasters
         found = []
         for across, down in sides:
             moved_m = self.eye_sigma_mm / 1e3 * (across * right + down * up)
@@ -121,33 +122,30 @@ class SolverState(Protocol):
     """The panels of one size on one device, and what changes them. Lives from frame to frame; one thread uses it."""
 
     def begin(self, pictures: Sequence[Picture], problem: Problem) -> AbstractContextManager[None]:
-        """Take two pictures (h, w, 4) of the centre panel's pixels: cut to its box, the target phase sums of both eyes,
-        on every raster that the steps need. The steps are done within what it answers."""
+        """Take two pictures (h, w, 4) of the centre panel's pixels: cut to its box, the target phase sums of both eyes.
+        The steps are done within what it answers."""
 
     def network_pictures(self) -> tuple[I16, I16]:
         """Each eye's residual while the outer panels are even, on the network's raster: (rows, columns[, 3])."""
 
-    def set_panel(self, reduction: int, panel: int, codes: I16, *, shown: bool) -> None:
+    def set_panel(self, panel: int, codes: I16, *, shown: bool) -> None:
         """An outer panel as the network has it; shown: rounded to what 8 bits can show."""
 
-    def project(self, reduction: int, panels: Sequence[int]) -> None:
+    def project(self, panels: Sequence[int]) -> None:
         """See outer panels anew through the centre panel's pixels."""
 
-    def correct(self, reduction: int, panel: int, *, size: float, shown: bool) -> None:
+    def correct(self, panel: int, *, size: float, shown: bool) -> None:
         """Change one outer panel by both eyes' residuals along the rays through each of its pixels, when the centre
         panel is the best one for the outer panels."""
 
     def start_joint(self) -> None:
-        """Joint steps go on from the outer panels on every pixel, and from the centre panel that suits them."""
+        """Joint steps go on from the outer panels, and from the centre panel that suits them."""
 
     def joint(self, step: Step) -> None:
         """Change all panels by what both eyes see wrong (`compiled.joint`)."""
 
-    def upsample(self, coarser_reduction: int, reduction: int, *, shown: bool) -> None:
-        """Take the outer panels over from a coarser raster."""
-
     def finish(self) -> Layers:
-        """(N, h, w, 4): the centre panel closed on every pixel, all of them in 8-bit codes, even beside the boxes;
+        """(N, h, w, 4): the centre panel closed, all of them in 8-bit codes, even beside the boxes;
         an array is the state's own until the next frame."""
 
     def close(self) -> None:
@@ -176,19 +174,15 @@ def run_steps(
     """The layers of the problem that was begun, every step in its order, but for those after the deadline; and how many
     were done.
 
-    The first steps may work on coarser rasters. An outer panel is rounded to what 8 bits show where it is changed
-    last, so that the centre panel, closed at the end, answers to what the eyes will really see.
+    An outer panel is rounded to what 8 bits show where it is changed last, so that the centre panel, closed at the end,
+    answers to what the eyes will really see.
     """
     last = {n: _last_change(steps, n) for n in OUTER}
-    reduction, done = steps[0].reduction, 0
+    done = 0
     for index, step in enumerate(steps):
         if index and deadline_ns is not None and perf_counter_ns() >= deadline_ns:
             break
         done += 1
-        if step.reduction != reduction:
-            state.upsample(reduction, step.reduction, shown=False)
-            reduction = step.reduction
-            state.project(reduction, OUTER)
         if step.kind == "joint":
             if steps[index - 1].kind != "joint":
                 state.start_joint()
@@ -198,23 +192,15 @@ def run_steps(
         changed: tuple[int, ...] = OUTER
         if step.kind == "chain":
             for n, codes in network(state.network_pictures()).items():
-                state.set_panel(reduction, n, codes, shown=shown[n])
+                state.set_panel(n, codes, shown=shown[n])
         else:
             changed = (FRONT if step.kind == "front" else REAR,)
-            state.correct(reduction, changed[0], size=step.size, shown=shown[changed[0]])
-        state.project(reduction, changed)
-    if reduction != 1:
-        state.upsample(reduction, 1, shown=True)
-        state.project(1, OUTER)
+            state.correct(changed[0], size=step.size, shown=shown[changed[0]])
+        state.project(changed)
     return state.finish(), done
 
 
-def reductions(contract: Contract) -> frozenset[int]:
-    """Those of the rasters that a model's steps work on, and the panels' own."""
-    return frozenset({1} | {step.reduction for step in contract.steps})
-
-
 def _last_change(steps: Sequence[Step], panel: int) -> int:
-    """The last step that changes an outer panel on every pixel; none if all are coarser."""
+    """The last step that changes an outer panel before joint ones do."""
     kinds = {"chain", "front" if panel == FRONT else "rear"}
-    return max((index for index, step in enumerate(steps) if step.kind in kinds and step.reduction == 1), default=-1)
+    return max(index for index, step in enumerate(steps) if step.kind in kinds)

@@ -20,7 +20,6 @@ from runtime.records import F64, U8
 from runtime.support.threads import at_once
 
 FINE_ENOUGH = 1.5  # pixels of a picture for one of the raster: finer ones are sampled as they are
-SMALL_PX = 960 * 540 // 2  # of a raster: below, OpenCV's cubic kernel takes a few milliseconds
 MIN_RAYS, MAX_RAYS = 0.5, 2.0  # pixels of a picture for one of the raster, between which its rays are looked along
 EDGE_PX = 2.0  # of a raster, beside a picture, that its outermost rays are interpolated from: its edge goes on there
 KERNEL_PX = 4  # of a picture, that interpolation reads around what is shown
@@ -148,9 +147,6 @@ def _warped(
     """
     whole = (rows.stop - rows.start, columns.stop - columns.start) == (raster.height_px, raster.width_px)
     out: U8 = (np.empty if whole else np.zeros)((raster.height_px, raster.width_px, 4), np.uint8)
-    large = (rows.stop - rows.start) * (columns.stop - columns.start) > SMALL_PX
-    kernel = interpolation == "cubic" and not large
-    finer = interpolation != "linear" and not kernel
     source_px = _source_px(image_from_raster, rows=rows, columns=columns)
     # OpenCV puts pixel centres at integers.
     matrix = _shifted(-0.5, -0.5) @ image_from_raster @ _shifted(columns.start + 0.5, rows.start + 0.5)
@@ -167,7 +163,7 @@ def _warped(
         ):
             warped(rgba, place, out=out, rows=rows, columns=columns, linear=linear)
             return out
-    if finer and source_px < FINE_ENOUGH:
+    if not linear and source_px < FINE_ENOUGH:
         rgba, finer_from_image = _finer(rgba, image_from_raster, rows=rows, columns=columns)
         matrix = _shifted(-0.5, -0.5) @ finer_from_image @ _shifted(0.5, 0.5) @ matrix
     cv2.warpPerspective(
@@ -175,7 +171,7 @@ def _warped(
         matrix,
         (columns.stop - columns.start, rows.stop - rows.start),
         dst=out[rows, columns],
-        flags=(cv2.INTER_CUBIC if kernel else cv2.INTER_LINEAR) | cv2.WARP_INVERSE_MAP,
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_CONSTANT if black_beside else cv2.BORDER_REPLICATE,
     )
     return out

@@ -13,6 +13,7 @@ from runtime.records import U8
 
 SUBCODE = 16  # fixed point: sixteenths of an 8-bit panel code
 FULL = 255 * SUBCODE  # one panel's whole range, a quarter turn
+SLOPE_FLOOR = 0.25  # the least weight of a ray beside the slope of sin² where it is wanted
 
 
 @lru_cache(maxsize=4)

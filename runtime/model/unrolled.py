@@ -50,7 +50,7 @@ class UnrolledPredictor(Predictor):
         self._assemblies: dict[tuple[int, int], Assembly] = {}
 
     def warm_up(self, eyes_m: F64) -> None:
-        from runtime.model.compiled.level import warm_up  # noqa: PLC0415 - other backends need none
+        from runtime.model.compiled.panels import warm_up  # noqa: PLC0415 - other backends need none
 
         warm_up()  # whatever a later eye, scene or setting needs
         super().warm_up(eyes_m)

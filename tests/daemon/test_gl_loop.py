@@ -25,7 +25,7 @@ from runtime.records import PanelFrame, SolveRequest
 from runtime.support.gl import offscreen_context
 from runtime.support.gl_sharing import LayerTextures
 from runtime.support.memory import give_back
-from tests.model.plain_level import hold_exactly
+from tests.model.plain_panels import hold_exactly
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 240, 136)
 SMALL = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 128, 72)

@@ -67,9 +67,9 @@ class Crossing:
             self.rasters.extend((image.shape[1], image.shape[0]) for image in seen)
             return seen
 
-        def noted_panel(surround: GlState, reduction: int, panel: int, codes: Any, *, shown: bool) -> None:
+        def noted_panel(surround: GlState, panel: int, codes: Any, *, shown: bool) -> None:
             self.answers.append((codes.shape[1], codes.shape[0]))
-            set_panel(surround, reduction, panel, codes, shown=shown)
+            set_panel(surround, panel, codes, shown=shown)
 
         monkeypatch.setattr(GlState, "network_pictures", noted_pictures)
         monkeypatch.setattr(GlState, "set_panel", noted_panel)

@@ -1,4 +1,4 @@
-"""Compiled corrections do what the definition says (`plain_level`): code for code, and no byte beside."""
+"""Compiled corrections do what the definition says (`plain_panels`): code for code, and no byte beside."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import runtime.model.workspace
+import runtime.model.cpu
 from runtime.config import ModelSettings
 from runtime.evaluation.displayed import displayed, expected_db
 from runtime.model import compiled
 from runtime.model.compiled import along, passes, warp
 from runtime.model.compiled.fade import fade_codes
-from runtime.model.compiled.level import Level, warm_up
 from runtime.model.compiled.loops import TILE
+from runtime.model.compiled.panels import Panels, warm_up
 from runtime.model.compiled.unseen import extrapolate_rows
 from runtime.model.predictor import SHIPPED, load_predictor
 from runtime.model.reprojection import CENTRE, FRONT, OUTER, REAR
@@ -28,7 +28,7 @@ from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.records import F32, F64, U8
 from tests.model.exact import exact_resample
-from tests.model.plain_level import PlainLevel
+from tests.model.plain_panels import PlainPanels
 from tests.model.scenes import FOV_DEG, card_scene, eyes
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 200, 112)
@@ -55,37 +55,37 @@ TILT = Tilt(((0.001, 0.012, -0.006), (0.0, 0.0, 0.0), (-0.002, 0.004, 0.015)), (
 
 @pytest.fixture(params=[1, 3], ids=["one thread", "three threads"])
 def threads(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr("runtime.model.compiled.level.WORTH_A_THREAD", 0)
+    monkeypatch.setattr("runtime.model.compiled.panels.WORTH_A_THREAD", 0)
     return int(request.param)
 
 
-def filled(kind: type[Level], threads: int, stack: PanelStack, *, boxes: str, channels: int) -> Level:
-    """A level with outer panels and pictures of smooth noise, the same for every kind."""
-    level = kind(stack, reduction=1, threads=threads, channels=channels)
-    level.crop(BOXES[boxes], stack)
+def filled(kind: type[Panels], threads: int, stack: PanelStack, *, boxes: str, channels: int) -> Panels:
+    """A panels with outer panels and pictures of smooth noise, the same for every kind."""
+    panels = kind(stack, threads=threads, channels=channels)
+    panels.crop(BOXES[boxes], stack)
     noise = np.random.default_rng(5)
-    for image in (*(level.outer[n] for n in OUTER), *level.target):
-        most = 2 * FULL if any(image is target for target in level.target) else FULL
+    for image in (*(panels.outer[n] for n in OUTER), *panels.target):
+        most = 2 * FULL if any(image is target for target in panels.target) else FULL
         coarse = noise.integers(0, most, (image.shape[0] // 4 + 2, image.shape[1] // 4 + 2, *image.shape[2:]))
         fine = coarse.repeat(4, 0).repeat(4, 1)[: image.shape[0], : image.shape[1]]
         image[...] = (fine + np.roll(fine, 2, 0) + np.roll(fine, 2, 1)) // 3
-    return level
+    return panels
 
 
-def both(threads: int, stack: PanelStack = STACK, *, boxes: str = "whole", channels: int = 3) -> list[Level]:
-    return [filled(kind, threads, stack, boxes=boxes, channels=channels) for kind in (PlainLevel, Level)]
+def both(threads: int, stack: PanelStack = STACK, *, boxes: str = "whole", channels: int = 3) -> list[Panels]:
+    return [filled(kind, threads, stack, boxes=boxes, channels=channels) for kind in (PlainPanels, Panels)]
 
 
-def solved(level: Level, pair: F64, *, sigma_mm: float = 0.0, fading: tuple[F32, F32] | None = None) -> U8:
+def solved(panels: Panels, pair: F64, *, sigma_mm: float = 0.0, fading: tuple[F32, F32] | None = None) -> U8:
     """Layers after three corrections, of which two are shown."""
-    boxes = BOXES["whole"] if level.size == (200, 112) else BOXES["parts"]
-    level.set_eyes(pair, eye_sigma_mm=sigma_mm)
-    level.project(OUTER)
+    boxes = BOXES["whole"] if panels.size == (200, 112) else BOXES["parts"]
+    panels.set_eyes(pair, eye_sigma_mm=sigma_mm)
+    panels.project(OUTER)
     for panel, shown in ((FRONT, False), (REAR, True), (FRONT, True)):
-        level.step(panel, size=0.75, shown=shown, fading=fading)
-        level.project((panel,))
+        panels.step(panel, size=0.75, shown=shown, fading=fading)
+        panels.project((panel,))
     layers = np.full((3, 112, 200, 4), 255, np.uint8)
-    level.show(layers, boxes)
+    panels.show(layers, boxes)
     return layers
 
 
@@ -97,7 +97,7 @@ def within_one(first: U8, second: U8) -> float:
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("pose", POSES)
 def test_codes_are_those_of_the_definition(pose: str, channels: int, boxes: str, threads: int) -> None:
-    expected, found = (solved(level, POSES[pose]) for level in both(threads, boxes=boxes, channels=channels))
+    expected, found = (solved(panels, POSES[pose]) for panels in both(threads, boxes=boxes, channels=channels))
     assert within_one(expected, found) >= WITHIN_ONE
     assert (found[..., 3] == 255).all()
     beside = np.ones((3, 112, 200), bool)
@@ -111,25 +111,20 @@ def test_codes_are_those_of_the_definition(pose: str, channels: int, boxes: str,
 def test_codes_on_tilted_panels_are_those_of_the_definition(pose: str, channels: int, threads: int) -> None:
     """Where rays cross every panel. Pieces that are laid for a row serve others, a sixteenth of a pixel off at most."""
     expected, found = (
-        solved(level, POSES[pose]) for level in both(threads, replace(STACK, tilt=TILT), channels=channels)
+        solved(panels, POSES[pose]) for panels in both(threads, replace(STACK, tilt=TILT), channels=channels)
     )
     inner = np.s_[:, 24:-24, 24:-24]
     assert within_one(expected[inner], found[inner]) >= 0.994
     assert np.abs(expected[inner].astype(np.int16) - found[inner]).max() <= 8
-    even = solved(filled(Level, threads, STACK, boxes="whole", channels=channels), POSES[pose])
+    even = solved(filled(Panels, threads, STACK, boxes="whole", channels=channels), POSES[pose])
     assert within_one(even, found) < 0.9
 
 
-@pytest.mark.parametrize("floor", [0.25, 1.0])
 @pytest.mark.parametrize("channels", [1, 3])
-def test_a_rolled_heads_eyes_see_a_strip_through_rows_that_lie_far_apart(
-    channels: int, floor: float, threads: int
-) -> None:
+def test_a_rolled_heads_eyes_see_a_strip_through_rows_that_lie_far_apart(channels: int, threads: int) -> None:
     """More rows apart than one eye's share of the residual has: they were written behind its end."""
-    levels = both(threads, PanelStack(0.2592, 0.1458, (-0.15, 0.0, 0.15), 200, 112), channels=channels)
-    for level in levels:
-        level.slope_floor = floor
-    expected, found = (solved(level, eyes(0.25, roll_deg=40)) for level in levels)
+    kinds = both(threads, PanelStack(0.2592, 0.1458, (-0.15, 0.0, 0.15), 200, 112), channels=channels)
+    expected, found = (solved(panels, eyes(0.25, roll_deg=40)) for panels in kinds)
     assert within_one(expected, found) >= WITHIN_ONE
 
 
@@ -141,8 +136,8 @@ def test_the_eyes_see_no_less_however_unsure_they_are(
     """What is blurred before it is sampled here is blurred after it there: not the same codes, but the same quality."""
     pair, found = eyes(0.6, 0.05, 0.03), []
     pictures = tuple(card_scene(eye) for eye in pair)
-    for level in (PlainLevel, Level):
-        monkeypatch.setattr(runtime.model.workspace, "Level", level)
+    for kind in (PlainPanels, Panels):
+        monkeypatch.setattr(runtime.model.cpu, "Panels", kind)
         predictor = load_predictor(name, CARDS, ModelSettings(threads=1))
         made = solve_still(*pictures, eyes_m=pair, fov_deg=FOV_DEG, predictor=predictor, eye_sigma_mm=sigma_mm).layers
         views = displayed(made, pictures, CARDS, eyes_m=pair, fov_deg=FOV_DEG, similarity=False)
@@ -152,25 +147,13 @@ def test_the_eyes_see_no_less_however_unsure_they_are(
     assert found[1] - found[0] >= LEAST_DB
 
 
-@pytest.mark.parametrize("channels", [1, 3])
-@pytest.mark.parametrize("pose", ["straight", "near", "far beside"])
-def test_rays_are_weighed_alike(pose: str, channels: int, threads: int) -> None:
-    levels = both(threads, boxes="parts", channels=channels)
-    for level in levels:
-        level.slope_floor = 0.25
-    expected, found = (solved(level, POSES[pose]) for level in levels)
-    assert within_one(expected, found) >= WITHIN_ONE
-    even = solved(filled(Level, threads, STACK, boxes="parts", channels=channels), POSES[pose])
-    assert within_one(even, found) < 0.99
-
-
 def test_corrections_fade_out_alike(threads: int) -> None:
     columns, down = np.linspace(0, 1, 200, dtype=np.float32), np.ones(112, np.float32)
     down[:20] = 0.25
     fading = np.rint(columns * 4) / np.float32(4), down
-    expected, found = (solved(level, eyes(0.6), fading=fading) for level in both(threads))
+    expected, found = (solved(panels, eyes(0.6), fading=fading) for panels in both(threads))
     assert (np.abs(expected.astype(np.int16) - found) <= 2).mean() >= WITHIN_ONE
-    whole = solved(filled(Level, threads, STACK, boxes="whole", channels=3), eyes(0.6))
+    whole = solved(filled(Panels, threads, STACK, boxes="whole", channels=3), eyes(0.6))
     assert within_one(whole, found) < 0.9
 
 
@@ -208,18 +191,18 @@ def test_samples_are_those_of_the_definition_wherever_the_rasters_are(
 
 
 def test_nothing_is_written_beside_the_images(threads: int) -> None:
-    level = filled(Level, threads, STACK, boxes="parts", channels=3)
+    panels = filled(Panels, threads, STACK, boxes="parts", channels=3)
     sizes = {}
-    for (name, n), image in level._whole.items():
+    for (name, n), image in panels._whole.items():
         panel = {"target": CENTRE, "spare": FRONT, "moved": REAR}.get(name, n)
         shared = name in {"outer", "spare", "moved"}  # for whichever panel
-        raster = level.rasters[panel]
+        raster = panels.rasters[panel]
         sizes[id(image)] = height, width = (96, 160) if shared else (raster.height_px, raster.width_px)
         image.base[height:] = -77
         image.base[:, width:] = -77
     for sigma_mm in (0.0, 30.0):
-        solved(level, eyes(0.6), sigma_mm=sigma_mm)
-    for name, image in level._whole.items():
+        solved(panels, eyes(0.6), sigma_mm=sigma_mm)
+    for name, image in panels._whole.items():
         height, width = sizes[id(image)]
         assert (image.base[height:] == -77).all(), name
         assert (image.base[:, width:] == -77).all(), name
@@ -230,10 +213,10 @@ def test_what_was_compiled_at_the_start_serves_every_case(threads: int) -> None:
     kernels = (passes.correct, passes.blur, passes.close_centre, passes.show, warp.warp, extrapolate_rows, fade_codes)
     for boxes in BOXES:
         for channels in (1, 3):
-            level = filled(Level, threads, STACK, boxes=boxes, channels=channels)
+            panels = filled(Panels, threads, STACK, boxes=boxes, channels=channels)
             for sigma_mm in (0.0, 30.0):
-                fading = np.ones(level.size[0], np.float32), np.ones(level.size[1], np.float32)
-                solved(level, POSES["rolled"], sigma_mm=sigma_mm, fading=fading)
+                fading = np.ones(panels.size[0], np.float32), np.ones(panels.size[1], np.float32)
+                solved(panels, POSES["rolled"], sigma_mm=sigma_mm, fading=fading)
     assert [len(function.signatures) for function in kernels] == [1] * len(kernels)
 
 
@@ -298,6 +281,6 @@ def test_compiled_code_is_kept_by_what_it_follows_from(monkeypatch: pytest.Monke
 
 def test_shown_codes_are_whole(threads: int) -> None:
     for sigma_mm in (0.0, 30.0):
-        level = filled(Level, threads, STACK, boxes="whole", channels=3)
-        solved(level, eyes(0.6), sigma_mm=sigma_mm)
-        assert all((level.outer[n] % SUBCODE == 0).all() and level.outer[n].max() <= FULL for n in OUTER)
+        panels = filled(Panels, threads, STACK, boxes="whole", channels=3)
+        solved(panels, eyes(0.6), sigma_mm=sigma_mm)
+        assert all((panels.outer[n] % SUBCODE == 0).all() and panels.outer[n].max() <= FULL for n in OUTER)

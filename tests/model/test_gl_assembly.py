@@ -26,7 +26,7 @@ from runtime.plan.drawing import drawn_for, raster_views
 from runtime.records import F64, U8
 from runtime.support.gl import offscreen_context
 from runtime.support.gl_sharing import LayerPool, LayerTextures, ShareGroup
-from tests.model.plain_level import hold_exactly
+from tests.model.plain_panels import hold_exactly
 from tests.model.scenes import eyes
 from tests.support.left_in_textures import written
 

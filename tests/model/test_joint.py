@@ -176,6 +176,7 @@ def test_equal_grey_pictures_and_panels_that_show_them_stay() -> None:
     """Nothing is wrong, so that nothing moves; and what lies beside the box is let be."""
     pair = eyes(0.6)
     layers = np.full((3, 270, 480, 4), 128, np.uint8)
+    layers[..., 3] = 255
     intensity = np.sin(np.pi / 2 * 3 * 128 / 255) ** 2
     picture = np.full((270, 480, 4), round(255 * intensity), np.uint8)
     projections = [image_from_stack(eye, width_px=480, height_px=270, fov_deg=FOV_DEG) for eye in pair]

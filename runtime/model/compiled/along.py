@@ -18,7 +18,7 @@ from runtime.records import F32
 
 ANYWHERE_PX = -1e6  # as `near`: an image's edges go on
 EDGE_PX = 1e-3  # a place on an image's very edge is within, however it was rounded
-MAX_DRIFT_PX = 1 / 16  # of a row from the one that its pieces were laid for; their weights follow it
+DRIFT_PX = 1 / 16  # of a row from the one that its pieces were laid for, at most; their weights follow it
 RUN = 480  # numbers of a row whose height in an image counts as a line
 
 
@@ -56,6 +56,7 @@ class Layout(NamedTuple):
     starts: Any  # (images, tiles, pieces) int32, numbers in the tile
     sources: Any  # (images, tiles, pieces) int32, numbers in the image
     weights: Any  # (images, tiles, pieces, 2) float32, of the right neighbour at a piece's first pixel, and its growth
+    drift_px: float  # of a row from the one that its pieces were laid for, at most
 
 
 @njit(**OPTIONS)
@@ -122,7 +123,7 @@ def sample(
         bend = 0.0
     shift, grown = xa - layout.keys[n, tile, 1], scale - layout.keys[n, tile, 0]
     bent = abs(bend - layout.keys[n, tile, 2]) * ends * ends
-    if not abs(shift) + abs(grown) * ends + bent <= MAX_DRIFT_PX:  # of the first row, nothing is laid
+    if not abs(shift) + abs(grown) * ends + bent <= layout.drift_px:  # of the first row, nothing is laid
         _lay(scale, bend, xa, pixels, width, near, channels, n, tile, layout)
         shift, grown = 0.0, 0.0
     first, last, count = layout.spans[n, tile, 0], layout.spans[n, tile, 1], layout.spans[n, tile, 2]
@@ -142,9 +143,11 @@ def sample(
         fall, sag = (yb - ya) / ends, 2.0 * (ya + yb - 2.0 * ym) / (ends * ends)
         at, none, one = 0, np.float32(0), np.float32(1)
         while at < numbers:
+            place = (source + at) / channels
             k = first + at / (channels * scale)
+            k -= (xa + k * (scale + bend * (k - ends)) - place) / (scale + bend * (2.0 * k - ends))
             here = ya + k * (fall + sag * (k - ends))
-            slope = (fall + sag * (2.0 * k - ends)) / (channels * scale)
+            slope = (fall + sag * (2.0 * k - ends)) / (channels * (scale + bend * (2.0 * k - ends)))
             length, top = min(numbers - at, RUN), min(int(max(here, 0.0)), max(height - 2, 0))
             if here < 0.0 or here > height - 1.0:  # an edge goes on, until the row crosses it
                 edge = 0.0 if here < 0.0 else height - 1.0
@@ -189,13 +192,13 @@ def sample_or(
         out[U(k)] = outside
 
 
-def new_layout(images: int, columns: int, channels: int) -> Layout:
+def new_layout(images: int, columns: int, channels: int, *, drift_px: float = DRIFT_PX) -> Layout:
     """Of so many images, for rows of so many pixels: nothing is laid yet."""
     spans = (images, -(-columns // (TILE // channels)))
     pieces = (*spans, TILE // channels)
     return Layout(
         np.full((*spans, 3), np.nan), np.zeros((*spans, 3), np.int32), np.zeros(pieces, np.int32),
-        np.zeros(pieces, np.int32), np.zeros((*pieces, 2), np.float32),
+        np.zeros(pieces, np.int32), np.zeros((*pieces, 2), np.float32), drift_px,
     )  # fmt: skip
 
 

@@ -27,13 +27,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from runtime.model.compiled.along import new_layout, sample, sample_or, work_row, work_tiles
+from runtime.model.compiled.along import DRIFT_PX, new_layout, sample, sample_or, work_row, work_tiles
 from runtime.model.compiled.loops import PASS, PIECE, TILE, U
-from runtime.records import F32, F64
+from runtime.records import F32, F64, I16, U8
 from runtime.support.threads import at_once
 
 CENTRE = 1
@@ -201,6 +202,12 @@ def rays_of(seen: F64, sizes: NDArray[np.int64]) -> Rays:
     return Rays(np.ascontiguousarray(seen), back, needs)
 
 
+def fill(numbers: I16, codes: U8, unit: float) -> None:
+    """(rows, numbers) of panels or targets by codes (h, w[, 3]) of so many of their units."""
+    height, width = codes.shape[0], codes[0].size
+    numbers[:height, :width] = cv2.LUT(codes, (np.arange(256) * unit).astype(np.int16)).reshape(height, width)
+
+
 class JointState:
     """The panels between steps, and what steps work in."""
 
@@ -217,8 +224,17 @@ class JointState:
         self.last[...] = self.panels
 
     def step(
-        self, rays: Rays, *, size: float, momentum: float, floor: float, fade: tuple[F32, F32] | None = None
+        self,
+        rays: Rays,
+        *,
+        size: float,
+        momentum: float,
+        floor: float,
+        fade: tuple[F32, F32] | None = None,
+        drift_px: float = DRIFT_PX,
     ) -> None:
+        """fade: what errors are multiplied with, along the rays' columns and rows; drift_px: how far a ray may be taken
+        to lie from its place, so that pieces of rows that are laid for one serve the next."""
         height = int(self.sizes[3, 0])
         count, threads = len(rays.seen), self.threads
         ring_rows = int((rays.needs[..., 1] - rays.needs[..., 0]).max()) + 2
@@ -240,11 +256,12 @@ class JointState:
                 )
                 if of[n, 0] < of[n, 1]:
                     begin = min(begin, int(rays.needs[n, of[n, 0] : of[n, 1], 0].min()))
+            layouts = (new_layout(3 * count, self._columns, self.channels, drift_px=drift_px) for _ in range(2))
             move_rows(
                 self.panels, self._moved, self.last, self.sizes, self.targets, rays.seen, rays.back, same, rays.needs,
                 columns, rows, size, momentum, floor, self.channels, begin, end, of,
                 np.zeros((count, 2, ring_rows, numbers), np.int16),
-                *(new_layout(3 * count, self._columns, self.channels) for _ in range(2)), work_row(scale), work_tiles(),
+                *layouts, work_row(scale), work_tiles(),
             )  # fmt: skip
 
         at_once(share, range(threads))

@@ -7,33 +7,30 @@ from numba import njit
 
 from runtime.model.compiled.along import sample_or
 from runtime.model.compiled.loops import OPTIONS, PASS, TILE, U
+from runtime.model.transfer import SLOPE_FLOOR
 
 WHOLE = 4096  # of a weight, in 16 bits
+FLOOR = np.float32(SLOPE_FLOOR)
 
 
 @njit(**OPTIONS)
-def _weigh(wanted, row, begin, count, floor, full, weights):  # pragma: no cover
-    """The slope of sin² at wanted phase sums, 1 at its steepest, as a parabola; floor at least."""
-    slope = np.float32(4) * (np.float32(1) - floor)
+def _weigh(wanted, row, begin, count, full, weights):  # pragma: no cover
+    """The slope of sin² at wanted phase sums, 1 at its steepest, as a parabola; `SLOPE_FLOOR` at least."""
+    slope = np.float32(4) * (np.float32(1) - FLOOR)
     for k in range(count):
         turns = np.float32(wanted[row, U(k) + begin]) * (np.float32(1) / full)
         share = turns - np.floor(turns)
-        weights[U(k)] = floor + slope * share * (np.float32(1) - share)
+        weights[U(k)] = FLOOR + slope * share * (np.float32(1) - share)
 
 
 @njit(**OPTIONS)
-def _best(left, right, weights, weighed, most, count, best):  # pragma: no cover
+def _best(left, right, weights, most, count, best):  # pragma: no cover
     """The centre panel that leaves both eyes least, where left and right lack so much."""
-    none, half = np.float32(0), np.float32(0.5)
-    if weighed:
-        for k in range(count):
-            lacks = left[U(k)] * weights[0, U(k)] + right[U(k)] * weights[1, U(k)]
-            best[U(k)] = lacks / (weights[0, U(k)] + weights[1, U(k)])
-        for k in range(count):
-            best[U(k)] = min(max(best[U(k)], none), most)
-    else:
-        for k in range(count):
-            best[U(k)] = min(max((left[U(k)] + right[U(k)]) * half, none), most)
+    for k in range(count):
+        lacks = left[U(k)] * weights[0, U(k)] + right[U(k)] * weights[1, U(k)]
+        best[U(k)] = lacks / (weights[0, U(k)] + weights[1, U(k)])
+    for k in range(count):
+        best[U(k)] = min(max(best[U(k)], np.float32(0)), most)
 
 
 @njit(**OPTIONS)
@@ -67,7 +64,6 @@ def correct(
     back,
     needs,
     size,
-    floor,
     low,
     high,
     shown,
@@ -90,8 +86,8 @@ def correct(
     panels: the panel to be corrected and the other one, (rows, numbers) int16, as the eyes see them in the mean; moved:
     what is left of the other for an eye that is off by as much again (used where `unsure`). sizes (3, 2): rows and
     pixels of this panel, of the other, and of the centre one; near: how images end (`along.sample`). out: this panel
-    and `size` times what both eyes lack, between low and high; a ray weighs as much as the slope of sin² there, and
-    `floor` at least. targets: two of (rows, numbers) int16. seen: (2, 2, 3, 3), for each eye, this panel's and the
+    and `size` times what both eyes lack, between low and high; a ray weighs as much as the slope of sin² there
+    (`_weigh`). targets: two of (rows, numbers) int16. seen: (2, 2, 3, 3), for each eye, this panel's and the
     other's pixels from the centre's; back: (2, 3, 3) the centre's from this panel's. needs: (rows, 2) first and last of
     the centre's rows that either eye sees a row of this panel through. fade_columns (numbers,), fade_rows (rows,): what
     the residual is multiplied with. seen_layout, back_layout, row, tiles (10, numbers), ring (4, rows, numbers) int16:
@@ -101,9 +97,6 @@ def correct(
     height, width = sizes[2, 0], sizes[2, 1]
     none, one, most, half = np.float32(0), np.float32(1), np.float32(full), np.float32(0.5)
     codes, whole, weights = one / step, np.float32(WHOLE), tiles[6:8]
-    for k in range(TILE):
-        weights[0, U(k)] = one
-        weights[1, U(k)] = one
     outer, done = (panels, (panels[0], moved)), needs[first, 0]
     for q in range(first, last):
         for r in range(max(done, needs[q, 0]), needs[q, 1] + 1):
@@ -118,35 +111,32 @@ def correct(
                             outer[part], sizes, near, targets[side], seen[side], r, tile, pixels, channels, 2 * side,
                             start, seen_layout, row, tiles, tiles[2 + 2 * part + side],
                         )  # fmt: skip
-                if floor < one:
-                    _weigh(targets[0], U(r), begin, count, floor, most, weights[0])
-                    _weigh(targets[1], U(r), begin, count, floor, most, weights[1])
+                _weigh(targets[0], U(r), begin, count, most, weights[0])
+                _weigh(targets[1], U(r), begin, count, most, weights[1])
                 best = tiles[8]
-                _best(tiles[2], tiles[3], weights, floor < one, most, count, best)
+                _best(tiles[2], tiles[3], weights, most, count, best)
                 for side in range(2):
                     lacks = tiles[(4 if unsure else 2) + side]
                     for k in range(count):
                         weight = fade_columns[U(k) + begin] * down * weights[U(side), U(k)]
                         ring[U(side), line, U(k) + begin] = np.int16(np.int32((lacks[U(k)] - best[U(k)]) * weight))
-                    if floor < one:
-                        for k in range(count):
-                            ring[U(2 + side), line, U(k) + begin] = np.int16(np.int32(weights[U(side), U(k)] * whole))
+                    for k in range(count):
+                        ring[U(2 + side), line, U(k) + begin] = np.int16(np.int32(weights[U(side), U(k)] * whole))
         done = max(done, needs[q, 1] + 1)
         for tile in range((sizes[0, 1] + size_of_tile - 1) // size_of_tile):
             begin, at = U(tile * size_of_tile * channels), U(q)
             pixels = min(size_of_tile, sizes[0, 1] - tile * size_of_tile)
             count, lacked, weight = pixels * channels, tiles[3], tiles[5]
-            for part in range(2 if floor < one else 1):  # residuals, and what they weigh
+            for part in range(2):  # residuals, and what they weigh
                 for side in range(2):
                     sample_or(
                         ring[2 * part + side], ring_rows, height, width, near, back[side], q, tile, pixels, channels,
                         side, whole if part else none, back_layout, row, tiles[2 + 2 * part + side],
                     )  # fmt: skip
             for k in range(count):
-                lacked[U(k)] += tiles[2, U(k)]
-            if floor < one:
-                for k in range(count):
-                    lacked[U(k)] *= np.float32(2) * whole / (tiles[4, U(k)] + weight[U(k)])
+                lacked[U(k)] = (lacked[U(k)] + tiles[2, U(k)]) * (
+                    np.float32(2) * whole / (tiles[4, U(k)] + weight[U(k)])
+                )
             if shown:
                 for k in range(count):
                     code = min(max(np.float32(panels[0][at, U(k) + begin]) + lacked[U(k)] * size, low), high)
@@ -236,7 +226,6 @@ def close_centre(
     start,
     full,
     step,
-    floor,
     layout,
     row,
     tiles,
@@ -248,7 +237,7 @@ def close_centre(
     at pixel u0 of row v0. layout, row, tiles: to work in.
     """
     width, size_of_tile = sizes[2, 1], TILE // channels
-    share, half, one, weights = np.float32(1) / step, np.float32(0.5), np.float32(1), tiles[6:8]
+    share, half, weights = np.float32(1) / step, np.float32(0.5), tiles[6:8]
     for v in range(first, last):
         for tile in range((width + size_of_tile - 1) // size_of_tile):
             pixels = min(size_of_tile, width - tile * size_of_tile)
@@ -258,11 +247,10 @@ def close_centre(
                     panels, sizes, near, targets[side], seen[side], v, tile, pixels, channels, 2 * side, start, layout,
                     row, tiles, tiles[2 + side],
                 )  # fmt: skip
-            if floor < one:
-                _weigh(targets[0], U(v), begin, count, floor, full, weights[0])
-                _weigh(targets[1], U(v), begin, count, floor, full, weights[1])
+            _weigh(targets[0], U(v), begin, count, full, weights[0])
+            _weigh(targets[1], U(v), begin, count, full, weights[1])
             best = tiles[8]
-            _best(tiles[2], tiles[3], weights, floor < one, full, count, best)
+            _best(tiles[2], tiles[3], weights, full, count, best)
             for k in range(count):
                 best[U(k)] = best[U(k)] * share + half
             row_out, to = U(v + v0), U(u0 + tile * size_of_tile)

@@ -62,8 +62,7 @@ class Account:
 
 
 def source(name: str, *, defines: Sequence[str] = ()) -> str:
-    """A shader with what it includes. defines: PACKED, images of three numbers in one (`sample.glsl`); SLOPED, rays
-    weigh by the slope of sin² (`slope.glsl`)."""
+    """A shader with what it includes. defines: PACKED, images of three numbers in one (`sample.glsl`)."""
 
     def read(file: str) -> str:
         return (resources.files(SHADERS) / "shaders" / file).read_text(encoding="ascii")

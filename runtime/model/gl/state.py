@@ -26,8 +26,8 @@ from runtime.model.gl.assembly import left_in
 from runtime.model.gl.joint import RAYS, GlJoint
 from runtime.model.gl.programs import Image, Passes
 from runtime.model.job import Picture
-from runtime.model.reprojection import CENTRE, FRONT, NEUTRAL, OUTER, REAR, START, reprojection, spreads
-from runtime.model.steps import Problem, reductions
+from runtime.model.reprojection import CENTRE, FRONT, NEUTRAL, OUTER, REAR, START, coarser, reprojection, spreads
+from runtime.model.steps import Problem
 from runtime.model.transfer import phase_codes
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, I16, U8, Layers
@@ -65,43 +65,35 @@ class GlState:
         self._layers: U8 | None = None  # where they are read back
         self._read: dict[tuple[int, ...], tuple[I16, I16]] = {}
         self._closed = False
-        self._outer: dict[tuple[int, int], str] = {}  # which of two images a panel is in
+        self._outer: dict[int, str] = {}  # which of two images a panel is in
 
     @contextmanager
     def begin(self, pictures: Sequence[Picture], problem: Problem) -> Iterator[None]:
         with self._passes.drawing():
             self._problem = problem
             self._grey = problem.channels == 1
-            needed = reductions(self._contract) | {self._contract.reduction}
-            self._rasters = {reduction: problem.rasters(reduction) for reduction in needed}
-            self._spread: dict[int, Spread] = {
-                reduction: spreads(
-                    rasters,
-                    problem.eyes_m,
-                    eye_sigma_mm=problem.eye_sigma_mm,
-                    least_px=self._contract.least_spread_px,
-                )
-                for reduction, rasters in self._rasters.items()
-            }
+            self._rasters = problem.rasters
+            self._spread: Spread = spreads(self._rasters, problem.eyes_m, eye_sigma_mm=problem.eye_sigma_mm)
             self._stepped: GlJoint | None = None
             joint = any(step.kind == "joint" for step in self._contract.steps)
             self._packed = not (self._grey or joint) and all(
-                n in self._spread[1] and min(self._spread[1][n]) >= PACKED_SPREAD_PX for n in OUTER
+                n in self._spread and min(self._spread[n]) >= PACKED_SPREAD_PX for n in OUTER
             )
-            sloped = self._contract.slope_floor < 1
-            self._defines = tuple(name for name, on in (("PACKED", self._packed), ("SLOPED", sloped)) if on)
+            self._defines = ("PACKED",) if self._packed else ()
             self._outer = {}
-            self._want(self._taken(pictures), tuple(self._rasters))
+            taken = self._taken(pictures)
+            self._want(taken, self._wanted())
+            self._want(taken, self._reduced())
             yield
 
     def network_pictures(self) -> tuple[I16, I16]:
-        problem, frame, reduction = self._problem, self._problem.frame, self._contract.reduction
+        problem, frame = self._problem, self._problem.frame
         seen = tuple(self._grown(f"network {side}", frame.width_px, frame.rows) for side in EYES)
         matrices = [problem.reduced_from_frame(side) for side in range(2)]
         self._draw(
             "network",
             seen,
-            self._wanted(reduction),
+            self._reduced(),
             {
                 "size": problem.reduced_size,
                 "left_from_raster": _mat3(matrices[0]),
@@ -111,66 +103,61 @@ class GlState:
         )
         return self._read_back(seen)
 
-    def set_panel(self, reduction: int, panel: int, codes: I16, *, shown: bool) -> None:
+    def set_panel(self, panel: int, codes: I16, *, shown: bool) -> None:
         rows, columns = codes.shape[:2]
         answer = self._grown(f"answer {panel}", columns, rows, components=self._problem.channels)
         answer.texture.write(np.ascontiguousarray(codes), viewport=(0, 0, columns, rows), alignment=1)
         self._passes.crossed("answer up", answer, bytes_px=2 * self._problem.channels, to_gpu=True)
-        matrix = self._problem.answer_from_raster(panel, self._rasters[reduction][panel])
+        raster = coarser(self._rasters[panel], self._contract.reduction)  # as the processor does it
+        coarse = self._coarse(("answer", panel), _size(raster), dtype="u4" if self._packed else "i2")
+        matrix = self._problem.answer_from_raster(panel, raster)
         place = {"size": answer.size, "image_from_panel": _mat3(matrix), **_columns(self._problem.answer_columns)}
-        self._draw("resample", (self._spare(reduction, panel),), {"image": answer}, {**place, "shown": shown})
-        self._swap(reduction, panel)
+        self._draw("resample", (coarse,), {"image": answer}, {**place, "shown": False})
+        fine = self._spare(panel)
+        scale = (coarse.width_px / fine.width_px, coarse.height_px / fine.height_px)
+        how = {"size": coarse.size, "image_from_panel": scale, "shown": shown}
+        self._draw("finer", (fine,), {"image": coarse}, how)
+        self._swap(panel)
 
-    def project(self, reduction: int, panels: Sequence[int]) -> None:
+    def project(self, panels: Sequence[int]) -> None:
         for n in panels:
-            if n in (spread := self._spread[reduction]):
-                half, mean = self._image(reduction, n, "half"), self._image(reduction, n, "mean")
-                self._blur({"image": self._panel(reduction, n)}, (half,), spread[n])
-                self._blur({"image": half}, (mean,), spread[n], down=True)
+            if n in self._spread:
+                half, mean = self._image(n, "half"), self._image(n, "mean")
+                self._blur({"image": self._panel(n)}, (half,), self._spread[n])
+                self._blur({"image": half}, (mean,), self._spread[n], down=True)
 
-    def correct(self, reduction: int, panel: int, *, size: float, shown: bool) -> None:
+    def correct(self, panel: int, *, size: float, shown: bool) -> None:
         places: dict[str, Any] = {
-            f"centre_from_{eye}": _mat3(
-                reprojection(self._problem.stack, self._rasters[reduction], eye_m, of=CENTRE, on=panel)
-            )
+            f"centre_from_{eye}": _mat3(reprojection(self._problem.stack, self._rasters, eye_m, of=CENTRE, on=panel))
             for eye, eye_m in zip(EYES, self._problem.eyes_m, strict=True)
         }
-        places["size"] = _size(self._rasters[reduction][CENTRE])
-        result, outer = (self._spare(reduction, panel),), {"panel": self._panel(reduction, panel)}
-        how = {"eighths": round(size * 8), "shown": shown}
-        if spread := self._spread[reduction]:
-            outer["mean"] = self._mean(reduction, panel)
-            half = self._joined(reduction, panel, outer, places, spread.get(panel, SURE))
+        places["size"] = _size(self._rasters[CENTRE])
+        result, outer = (self._spare(panel),), {"panel": self._panel(panel)}
+        how = {"share": size, "shown": shown}
+        if spread := self._spread:
+            outer["mean"] = self._mean(panel)
+            half = self._joined(panel, outer, places, spread.get(panel, SURE))
             kernel = {**_kernel(spread.get(panel, SURE), down=True), "size": half.size}
             self._draw("correct_unsure", result, {**outer, "half_blurred": half}, {**how, **kernel})
         else:
-            images, seen = self._seen(reduction)
-            lacks = {eye: self._image(reduction, CENTRE, f"lacks {eye}") for eye in EYES}
+            images, seen = self._seen()
+            lacks = {eye: self._image(CENTRE, f"lacks {eye}") for eye in EYES}
             self._draw("residual", tuple(lacks.values()), images, seen)
-            self._draw("correct", result, {**lacks, **outer, **self._weighing(reduction)}, {**places, **how})
-        self._swap(reduction, panel)
+            self._draw("correct", result, {**lacks, **outer, **self._wanted()}, {**places, **how})
+        self._swap(panel)
 
     def start_joint(self) -> None:
-        centre = self._image(1, CENTRE, "begun")
-        images = {**self._wanted(1), **{NAMES[n]: self._panel(1, n) for n in OUTER}}
-        self._draw("centre", (centre,), images, self._through(1))
+        centre = self._image(CENTRE, "begun")
+        images = {**self._wanted(), **{NAMES[n]: self._panel(n) for n in OUTER}}
+        self._draw("centre", (centre,), images, self._through())
         self._stepped = GlJoint(self._passes, self._joint_image)
-        self._stepped.start({REAR: self._panel(1, REAR), CENTRE: centre, FRONT: self._panel(1, FRONT)})
+        self._stepped.start({REAR: self._panel(REAR), CENTRE: centre, FRONT: self._panel(FRONT)})
 
     def joint(self, step: Step) -> None:
         assert self._stepped is not None
-        targets = {eye: self._image(1, CENTRE, f"wanted {eye}", dtype="f1") for eye in EYES}
+        targets = {eye: self._image(CENTRE, f"wanted {eye}", dtype="f1") for eye in EYES}
         how = {"size": step.size, "momentum": step.momentum, "floor": step.floor}
-        self._stepped.step(self._problem.rays(step.places), targets, **how, ends=self._fade(1))
-
-    def upsample(self, coarser_reduction: int, reduction: int, *, shown: bool) -> None:
-        for n in OUTER:
-            coarse = self._panel(coarser_reduction, n)
-            fine = self._rasters[reduction][n]
-            scale = (coarse.width_px / fine.width_px, coarse.height_px / fine.height_px)
-            how = {"size": coarse.size, "image_from_panel": scale, "shown": shown}
-            self._draw("finer", (self._spare(reduction, n),), {"image": coarse}, how)
-            self._swap(reduction, n)
+        self._stepped.step(self._problem.rays(step.places), targets, **how, ends=self._fade())
 
     def finish(self) -> Layers:
         width, height = self._stack.width_px, self._stack.height_px
@@ -209,16 +196,16 @@ class GlState:
             places = {f"{name}_origin": (boxes[n].u0, boxes[n].v0) for n, name in names}
             self._draw("show", images, panels, {**sizes, **places})
             return
-        outer = {NAMES[n]: self._panel(1, n) for n in OUTER} | {f"{NAMES[n]}_mean": self._mean(1, n) for n in OUTER}
+        outer = {NAMES[n]: self._panel(n) for n in OUTER} | {f"{NAMES[n]}_mean": self._mean(n) for n in OUTER}
         where: dict[str, Any] = {
             f"{name}_origin": (boxes[n].u0, boxes[n].v0) for n, name in ((CENTRE, "centre"), *NAMES.items())
         }
-        where["centre_size"] = _size(self._rasters[1][CENTRE])
+        where["centre_size"] = _size(self._rasters[CENTRE])
         self._draw(
             "close",
             images,
-            {**self._wanted(1), **outer},
-            {**self._through(1), **where, "neutral": NEUTRAL},
+            {**self._wanted(), **outer},
+            {**self._through(), **where, "neutral": NEUTRAL},
         )
 
     def _taken(self, pictures: Sequence[Picture]) -> list[Image]:
@@ -238,27 +225,17 @@ class GlState:
             taken.append(image)
         return taken
 
-    def _want(self, pictures: Sequence[Image], coarser_by: Sequence[int]) -> None:
-        """Both eyes' phase sums on some rasters."""
-        box = self._problem.boxes[CENTRE]
-        for reduction in coarser_by:
-            width, height = _size(self._rasters[reduction][CENTRE])
-            wanted = self._wanted(reduction)
-            self._draw(
-                "wanted",
-                (wanted["wanted_left"], wanted["wanted_right"]),
-                {"left": pictures[0], "right": pictures[1]},
-                {
-                    "origin": self._origin,
-                    "box": (box.width_px, box.height_px),
-                    "reduction": (box.width_px / width, box.height_px / height),
-                    "emphasis": self._contract.emphasis,
-                },
-            )
+    def _want(self, pictures: Sequence[Image], wanted: dict[str, Image]) -> None:
+        """What both eyes want, into images that may be coarser than the box."""
+        box, left, right = self._problem.boxes[CENTRE], wanted["wanted_left"], wanted["wanted_right"]
+        reduction = (box.width_px / left.width_px, box.height_px / left.height_px)
+        how = {"origin": self._origin, "box": (box.width_px, box.height_px), "emphasis": self._contract.emphasis}
+        self._draw(
+            "wanted", (left, right), {"left": pictures[0], "right": pictures[1]}, {**how, "reduction": reduction}
+        )
 
     def _joined(
         self,
-        reduction: int,
         panel: int,
         outer: dict[str, Image],
         places: dict[str, Any],
@@ -270,29 +247,26 @@ class GlState:
         B(lacks + 2 (m - p)) + 2 (m - p): one blur for two, of numbers that are small.
         """
         lacks, moving, half = (
-            tuple(self._image(reduction, CENTRE, f"{name} {eye}") for eye in EYES)
-            for name in ("lacks", "moving", "half")
+            tuple(self._image(CENTRE, f"{name} {eye}") for eye in EYES) for name in ("lacks", "moving", "half")
         )
-        images, seen = self._seen(reduction)
+        images, seen = self._seen()
         self._draw("residual_unsure", (*lacks, *moving), images, {**seen, "of_front": panel == REAR})
         self._blur({"first": moving[0], "second": moving[1]}, half, spread, name="blur_both", twice=True)
-        joined, blurred = (self._image(reduction, panel, name) for name in ("joined", "half"))
+        joined, blurred = (self._image(panel, name) for name in ("joined", "half"))
         lacked = dict(zip((*EYES, *(f"half_blurred_{eye}" for eye in EYES)), (*lacks, *half), strict=True))
-        lacked |= self._weighing(reduction)
+        lacked |= self._wanted()
         self._draw("back", (joined,), {**lacked, **outer}, {**places, **_kernel(spread, twice=True, down=True)})
         self._blur({"image": joined}, (blurred,), spread)
         return blurred
 
-    def _seen(self, reduction: int) -> tuple[dict[str, Image], dict[str, Any]]:
+    def _seen(self) -> tuple[dict[str, Image], dict[str, Any]]:
         """What the eyes want and see at the centre panel's pixels."""
-        return {**self._wanted(reduction), **self._means(reduction)}, {
-            **self._through(reduction),
-            **self._fade(reduction),
-        }
+        means = {NAMES[n]: self._mean(n) for n in OUTER}
+        return {**self._wanted(), **means}, {**self._through(), **self._fade()}
 
-    def _through(self, reduction: int) -> dict[str, Any]:
+    def _through(self) -> dict[str, Any]:
         """How the eyes see the outer panels through the centre panel's pixels."""
-        rasters = self._rasters[reduction]
+        rasters = self._rasters
         found: dict[str, Any] = {}
         for n, name in NAMES.items():
             found[f"{name}_size"] = _size(rasters[n])
@@ -300,12 +274,12 @@ class GlState:
                 found[f"{name}_from_{eye}"] = _mat3(reprojection(self._problem.stack, rasters, eye_m, of=n, on=CENTRE))
         return found
 
-    def _fade(self, reduction: int) -> dict[str, Any]:
+    def _fade(self) -> dict[str, Any]:
         fade = self._problem.fade
         if fade is None:
             return {"over": (0.0, 0.0, 0.0, 0.0)}
         along, down = (float(over_px * CORRECTED_SHARE) for over_px in fade.over_px)
-        raster = self._rasters[reduction][CENTRE]
+        raster = self._rasters[CENTRE]
         matrix = self._problem.centre_from(raster.plane_from_raster())
         return {
             "kept_box": tuple(map(float, (fade.kept.u0, fade.kept.v0, fade.kept.u1, fade.kept.v1))),
@@ -329,48 +303,50 @@ class GlState:
     def _draw(
         self, name: str, outputs: tuple[Image, ...], inputs: dict[str, Image], uniforms: Mapping[str, Any]
     ) -> None:
-        always = {"even": START, "grey": self._grey, "slope_floor": self._contract.slope_floor}
+        always = {"even": START, "grey": self._grey}
         self._passes.draw(name, outputs, inputs, {**uniforms, **always}, defines=self._defines)
 
-    def _wanted(self, reduction: int) -> dict[str, Image]:
+    def _wanted(self) -> dict[str, Image]:
         """What the eyes want, with the table that makes phase sums of it."""
-        images = {f"wanted_{eye}": self._image(reduction, CENTRE, f"wanted {eye}", dtype="f1") for eye in EYES}
+        images = {f"wanted_{eye}": self._image(CENTRE, f"wanted {eye}", dtype="f1") for eye in EYES}
         return {**images, "table": self._table}
 
-    def _weighing(self, reduction: int) -> dict[str, Image]:
-        """What rays are weighed by, where they are."""
-        return self._wanted(reduction) if self._contract.slope_floor < 1 else {}
+    def _reduced(self) -> dict[str, Image]:
+        """The same as coarse as the network's pictures are taken from it."""
+        size = self._problem.reduced_size
+        images = {f"wanted_{eye}": self._coarse(("reduced", eye), size, dtype="f1") for eye in EYES}
+        return {**images, "table": self._table}
 
-    def _mean(self, reduction: int, panel: int) -> Image:
+    def _coarse(self, key: tuple[str, Any], size: tuple[int, int], *, dtype: str) -> Image:
+        """An image of the model's coarser raster."""
+        width, height = (-(-px // self._contract.reduction) for px in (self._stack.width_px, self._stack.height_px))
+        components = 1 if self._grey or dtype == "u4" else 4
+        return Image(self._texture(key, width, height, components, dtype=dtype), *size)
+
+    def _mean(self, panel: int) -> Image:
         """An outer panel as eyes that are unsure see it."""
-        if panel in self._spread[reduction]:
-            return self._image(reduction, panel, "mean")
-        return self._panel(reduction, panel)
+        return self._image(panel, "mean") if panel in self._spread else self._panel(panel)
 
-    def _means(self, reduction: int) -> dict[str, Image]:
-        return {NAMES[n]: self._mean(reduction, n) for n in OUTER}
+    def _panel(self, panel: int) -> Image:
+        return self._image(panel, self._outer.get(panel, "outer"))
 
-    def _panel(self, reduction: int, panel: int) -> Image:
-        return self._image(reduction, panel, self._outer.get((reduction, panel), "outer"))
-
-    def _spare(self, reduction: int, panel: int) -> Image:
+    def _spare(self, panel: int) -> Image:
         """Where a panel is drawn that is made from itself."""
-        return self._image(reduction, panel, _other(self._outer.get((reduction, panel), "outer")))
+        return self._image(panel, _other(self._outer.get(panel, "outer")))
 
-    def _swap(self, reduction: int, panel: int) -> None:
-        self._outer[reduction, panel] = _other(self._outer.get((reduction, panel), "outer"))
+    def _swap(self, panel: int) -> None:
+        self._outer[panel] = _other(self._outer.get(panel, "outer"))
 
-    def _image(self, reduction: int, panel: int, name: str, *, dtype: str | None = None) -> Image:
+    def _image(self, panel: int, name: str, *, dtype: str | None = None) -> Image:
         """The box's part of an image as large as a whole panel: boxes follow the viewer, textures don't."""
-        width, height = -(-self._stack.width_px // reduction), -(-self._stack.height_px // reduction)
         dtype = dtype or ("u4" if self._packed else "i2")
         components = 1 if self._grey or dtype == "u4" else 4
-        texture = self._texture((name, reduction, panel), width, height, components, dtype=dtype)
-        return Image(texture, *_size(self._rasters[reduction][panel]))
+        size = self._stack.width_px, self._stack.height_px
+        return Image(self._texture((name, panel), *size, components, dtype=dtype), *_size(self._rasters[panel]))
 
     def _joint_image(self, panel: int, name: str, dtype: str) -> Image:
         """Rays go through the centre panel's pixels."""
-        return self._image(1, CENTRE if panel == RAYS else panel, name, dtype=dtype)
+        return self._image(CENTRE if panel == RAYS else panel, name, dtype=dtype)
 
     def _grown(self, name: str, width_px: int, height_px: int, *, components: int | None = None) -> Image:
         """An image of the network's raster, whose size follows the viewer; its texture only grows."""

@@ -3,9 +3,7 @@
 // mean over where the eyes may be, and joined by what moves of the panel itself: the next blur is of all of that.
 #include "sample.glsl"
 #include "blur.glsl"
-#ifdef SLOPED
 #include "wanted.glsl"
-#endif
 #include "slope.glsl"
 uniform IMAGE left, right;                              // what is lacked, and the other panel as it is seen
 uniform IMAGE half_blurred_left, half_blurred_right;    // that panel alone, blurred across
@@ -13,7 +11,6 @@ uniform IMAGE mean, panel;
 uniform mat3 centre_from_left, centre_from_right;
 out STORED joined;
 
-#ifdef SLOPED
 Weighed lacked(IMAGE image, IMAGE half_blurred, sampler2D wanted, mat3 centre_from_here) {
     vec2 place = moved(centre_from_here, gl_FragCoord.xy);
     if (beside(place, size) && !sheared(centre_from_here)) return BESIDE;
@@ -29,22 +26,10 @@ Weighed lacked(IMAGE image, IMAGE half_blurred, sampler2D wanted, mat3 centre_fr
         }
     return sum;
 }
-#else
-vec4 lacked(IMAGE image, IMAGE half_blurred, mat3 centre_from_here) {
-    vec2 place = moved(centre_from_here, gl_FragCoord.xy);
-    if (beside(place, size) && !sheared(centre_from_here)) return vec4(0.0);
-    return vec4(bilinear(image, size, place)) - blurred_down_at(half_blurred, place);
-}
-#endif
 
 void main() {
-#ifdef SLOPED
     Weighed by_left = lacked(left, half_blurred_left, wanted_left, centre_from_left);
     vec4 lacks = answered(by_left, lacked(right, half_blurred_right, wanted_right, centre_from_right));
-#else
-    vec4 lacks = lacked(left, half_blurred_left, centre_from_left);
-    lacks += lacked(right, half_blurred_right, centre_from_right);
-#endif
     ivec2 place = ivec2(gl_FragCoord.xy);
     joined = stored(lacks + 2.0 * vec4(value(mean, place) - value(panel, place)));
 }

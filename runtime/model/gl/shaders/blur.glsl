@@ -11,21 +11,6 @@ vec4 blurred(IMAGE image) {
     return sum;
 }
 
-// Between pixels: blurred down, and bilinear across and down, at once. Of 0 pixels' reach it is bilinear.
-vec4 blurred_down_at(IMAGE image, vec2 place) {
-    vec2 low = floor(place - 0.5), weight = place - 0.5 - low;
-    ivec2 first = clamp(ivec2(low), ivec2(0), size - 1), next = clamp(ivec2(low) + 1, ivec2(0), size - 1);
-    if (next.y == first.y) weight.y = 0.0;
-    vec4 sum = vec4(0.0);
-    for (int step = -reach; step <= reach + 1; step++) {
-        int row = clamp(first.y + step, 0, size.y - 1);
-        float above = step <= reach ? kernel[abs(step)] : 0.0, below = step > -reach ? kernel[abs(step - 1)] : 0.0;
-        vec4 across = mix(vec4(value(image, ivec2(first.x, row))), vec4(value(image, ivec2(next.x, row))), weight.x);
-        sum += mix(above, below, weight.y) * across;
-    }
-    return sum;
-}
-
 // Blurred down at the four pixels around a place, line by line; `at` is the first of them.
 void blurred_down_around(IMAGE image, ivec2 at, out vec4 found[4]) {
     ivec2 first = clamp(at, ivec2(0), size - 1), next = clamp(at + 1, ivec2(0), size - 1);

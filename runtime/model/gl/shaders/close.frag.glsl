@@ -29,7 +29,6 @@ vec4 outer(IMAGE image, ivec2 place, ivec2 size) {
 vec4 centre(ivec2 place) {
     if (!within(place, centre_size)) return coloured(ivec4(neutral));
     vec2 at = vec2(place) + 0.5;
-#ifdef SLOPED
     ivec4 left_wanted = phases(wanted_left, place), right_wanted = phases(wanted_right, place);
     ivec4 left = left_wanted - 2 * even - crossed(rear_mean, rear_size, rear_from_left, at);
     ivec4 right = right_wanted - 2 * even - crossed(rear_mean, rear_size, rear_from_right, at);
@@ -37,12 +36,6 @@ vec4 centre(ivec2 place) {
     right -= crossed(front_mean, front_size, front_from_right, at);
     vec4 mean = weighed_best(left, right, slope(left_wanted), slope(right_wanted));
     return coloured(ivec4(floor(mean / 16.0 + 0.5)));
-#else
-    ivec4 best = phases(wanted_left, place) + phases(wanted_right, place) + 16 - 4 * even;
-    best -= crossed(rear_mean, rear_size, rear_from_left, at) + crossed(rear_mean, rear_size, rear_from_right, at);
-    best -= crossed(front_mean, front_size, front_from_left, at) + crossed(front_mean, front_size, front_from_right, at);
-    return coloured(clamp(best >> 5, 0, 255));
-#endif
 }
 
 void main() {

@@ -1,18 +1,15 @@
 #version 330 core
 // One outer panel changed by what both eyes lack along the rays through each of its pixels.
 #include "sample.glsl"
-#ifdef SLOPED
 #include "wanted.glsl"
-#endif
 #include "slope.glsl"
 #include "shown.glsl"
 uniform IMAGE left, right, panel;
 uniform ivec2 size;         // of the centre panel's raster
 uniform mat3 centre_from_left, centre_from_right;
-uniform int eighths;
+uniform float share;        // of what is lacked
 out STORED corrected;
 
-#ifdef SLOPED
 Weighed lacked(IMAGE image, sampler2D wanted, mat3 centre_from_here) {
     vec2 place = moved(centre_from_here, gl_FragCoord.xy);
     if (beside(place, size) && !sheared(centre_from_here)) return BESIDE;
@@ -25,15 +22,10 @@ Weighed lacked(IMAGE image, sampler2D wanted, mat3 centre_from_here) {
         }
     return sum;
 }
-#endif
 
 void main() {
     vec2 at = gl_FragCoord.xy;
-#ifdef SLOPED
     Weighed by_left = lacked(left, wanted_left, centre_from_left);
     ivec4 lacks = rounded(answered(by_left, lacked(right, wanted_right, centre_from_right)));
-#else
-    ivec4 lacks = crossed(left, size, centre_from_left, at) + crossed(right, size, centre_from_right, at);
-#endif
-    corrected = kept(value(panel, ivec2(at)) + times(lacks, eighths));
+    corrected = kept(value(panel, ivec2(at)) + times(lacks, share));
 }

@@ -6,12 +6,12 @@
 #include "shown.glsl"
 uniform IMAGE panel, mean;
 uniform IMAGE half_blurred; // `back`, blurred across
-uniform int eighths;
+uniform float share;        // of what is lacked
 out STORED corrected;
 
 void main() {
     ivec2 place = ivec2(gl_FragCoord.xy);
     ivec4 outer = value(panel, place);
     ivec4 change = rounded(blurred(half_blurred)) + 2 * (value(mean, place) - outer);
-    corrected = kept(outer + times(change, eighths));
+    corrected = kept(outer + times(change, share));
 }

@@ -10,9 +10,7 @@ uniform vec4 centre_from_here;  // the whole centre panel's pixels: scale, shift
 struct Look {
     ivec4 left, right;  // what the eyes lack
     ivec4 rear_left, rear_right, front_left, front_right;  // how they see the outer panels
-#ifdef SLOPED
     vec4 left_slope, right_slope;  // what they weigh; not yet in what they lack, which is rounded
-#endif
 };
 
 ivec4 faded(ivec4 value, ivec2 place) {
@@ -35,13 +33,9 @@ Look look(ivec2 place) {
     ivec4 left_wanted = phases(wanted_left, place), right_wanted = phases(wanted_right, place);
     ivec4 left = left_wanted - 2 * even - found.rear_left - found.front_left;
     ivec4 right = right_wanted - 2 * even - found.rear_right - found.front_right;
-#ifdef SLOPED
     found.left_slope = slope(left_wanted);
     found.right_slope = slope(right_wanted);
     ivec4 best = rounded(weighed_best(left, right, found.left_slope, found.right_slope));
-#else
-    ivec4 best = clamp((left + right) >> 1, 0, 2 * even);
-#endif
     found.left = faded(left - best, place);
     found.right = faded(right - best, place);
     return found;

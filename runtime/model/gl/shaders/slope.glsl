@@ -1,7 +1,6 @@
-// SLOPED: a ray weighs by the slope of sin^2 at the phase sum that is wanted of it: before white and black that is
+// A ray weighs by the slope of sin^2 at the phase sum that is wanted of it: before white and black that is
 // level, so that errors there are not seen.
-#ifdef SLOPED
-uniform float slope_floor;  // the least weight
+const float FLOOR = 0.25;   // the least weight, as `transfer.SLOPE_FLOOR`
 
 struct Weighed {
     vec4 lacks, slope;      // what an eye lacks, times its weight; the weight
@@ -11,7 +10,7 @@ const Weighed BESIDE = Weighed(vec4(0.0), vec4(1.0));  // the centre panel
 
 vec4 slope(ivec4 phase) {
     vec4 part = fract(vec4(phase) / float(2 * even));
-    return slope_floor + (1.0 - slope_floor) * 4.0 * part * (1.0 - part);
+    return FLOOR + (1.0 - FLOOR) * 4.0 * part * (1.0 - part);
 }
 
 // The best centre panel for what both eyes lack there.
@@ -31,12 +30,6 @@ vec4 answered(Weighed left, Weighed right) {
     return 2.0 * (left.lacks + right.lacks) / (left.slope + right.slope);
 }
 
-ivec4 times(ivec4 lacks, int eighths) {
-    return rounded(vec4(lacks) * float(eighths) / 8.0);
+ivec4 times(ivec4 lacks, float share) {
+    return rounded(vec4(lacks) * share);
 }
-#else
-// Rounded down as 16 bits need it that must hold the product.
-ivec4 times(ivec4 lacks, int eighths) {
-    return (lacks >> 3) * eighths;
-}
-#endif

@@ -9,12 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-import runtime.model.compiled.level
 import runtime.model.cpu
-import runtime.model.workspace
-from runtime.model.compiled.level import Level
+from runtime.model.compiled.panels import Panels, show_panels
 from runtime.model.reprojection import CENTRE, EYES, FRONT, OUTER, REAR, START, reprojection
-from runtime.model.transfer import FULL, SUBCODE
+from runtime.model.transfer import FULL, SLOPE_FLOOR, SUBCODE
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64, I16, U8
 from tests.model.exact import exact_resample
@@ -22,11 +20,11 @@ from tests.model.exact import exact_resample
 WHOLE = 1 << 14  # of a weight, in whole numbers
 
 
-class PlainLevel(Level):
-    """A `Level` whose corrections and closing are slow and plain."""
+class PlainPanels(Panels):
+    """`Panels` whose corrections and closing are slow and plain."""
 
-    def set_eyes(self, eyes_m: F64, *, eye_sigma_mm: float = 0.0, least_px: float = 0.5) -> None:
-        super().set_eyes(eyes_m, eye_sigma_mm=eye_sigma_mm, least_px=least_px)
+    def set_eyes(self, eyes_m: F64, *, eye_sigma_mm: float = 0.0) -> None:
+        super().set_eyes(eyes_m, eye_sigma_mm=eye_sigma_mm)
         self._eyes_m = eyes_m
 
     def project(self, panels: Sequence[int]) -> None:
@@ -37,7 +35,7 @@ class PlainLevel(Level):
         weights, lacks, residual = self._weights(), self._lacks(), []
         best = _best(lacks, weights)
         for side in EYES:
-            left = lacks[side] - (np.floor(best) if self.slope_floor == 1 else best)
+            left = lacks[side] - best
             if self.spread:
                 seen = self._seen(other, side)
                 left = left + seen - self._blurred(seen, panel, twice=True)
@@ -52,15 +50,14 @@ class PlainLevel(Level):
         if self.spread:
             noise = outer - self._blurred(self._blurred(outer, panel), panel)
             change = self._blurred(change, panel) - 2 * noise
-        if self.slope_floor == 1:  # whole numbers of eighths
-            change = np.floor(change / 8) * 8
         codes = np.clip(outer + np.clip(size * change, -FULL, FULL), 0, FULL)
         codes = np.floor(codes / SUBCODE + 0.5) * SUBCODE if shown else np.rint(codes)
         self.outer[panel][...] = codes.reshape(self.outer[panel].shape)
 
     def show(self, layers: U8, boxes: Sequence[PixelRect]) -> None:
         outer = {n: np.ascontiguousarray(self.outer[n]) for n in OUTER}
-        self.show_panels({n: codes.reshape(codes.shape[0], -1) for n, codes in outer.items()}, layers, boxes)
+        numbers = {n: codes.reshape(codes.shape[0], -1) for n, codes in outer.items()}
+        show_panels(numbers, layers, boxes, channels=self._channels, threads=self._threads)
         layers[CENTRE][boxes[CENTRE].slices] = 255
         layers[CENTRE][boxes[CENTRE].slices][..., :3] = np.floor(_best(self._lacks(), self._weights()) / SUBCODE + 0.5)
 
@@ -71,7 +68,7 @@ class PlainLevel(Level):
     def _weights(self) -> list[F64]:
         """Of both eyes' rays: the slope of sin² at the phase sums that are to be seen, 1 at its steepest."""
         part = [np.mod(self._image(image) / FULL, 1) for image in self.target]
-        return [self.slope_floor + (1 - self.slope_floor) * 4 * one * (1 - one) for one in part]
+        return [SLOPE_FLOOR + (1 - SLOPE_FLOOR) * 4 * one * (1 - one) for one in part]
 
     def _seen(self, panel: int, side: int) -> F64:
         """How an eye sees an outer panel through the centre panel's pixels, in the mean."""
@@ -108,6 +105,5 @@ def _best(lacks: Sequence[F64], weights: Sequence[F64]) -> F64:
 
 def hold_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the processor sample by the definition: its own sampling is off by up to a twelfth of a pixel."""
-    for module in (runtime.model.cpu, runtime.model.compiled.level):
-        monkeypatch.setattr(module, "resample", exact_resample)
-    monkeypatch.setattr(runtime.model.workspace, "Level", PlainLevel)
+    monkeypatch.setattr(runtime.model.cpu, "resample", exact_resample)
+    monkeypatch.setattr(runtime.model.cpu, "Panels", PlainPanels)

@@ -1,4 +1,4 @@
-"""The three panels on one raster, whole or coarser, with whole corrections in one compiled pass.
+"""The three panels of a solution, with whole corrections in one compiled pass.
 
 Phases are fixed-point (sixteenths of an 8-bit code). Nothing is kept between corrections but the panels: to look at
 both outer ones anew takes less time than to write what was seen and read it again.
@@ -13,7 +13,6 @@ from math import log, sqrt
 import cv2
 import numpy as np
 
-from runtime.model.chain import EVEN_COLUMNS, ColumnLaw
 from runtime.model.compiled.along import ANYWHERE_PX, EDGE_PX, new_layout, work_row, work_tiles
 from runtime.model.compiled.fade import fade_codes
 from runtime.model.compiled.joint import JointState, rays_of
@@ -21,10 +20,8 @@ from runtime.model.compiled.loops import PIECE, numbers_of
 from runtime.model.compiled.passes import blur, close_centre, correct, show
 from runtime.model.compiled.unseen import extrapolate_rows
 from runtime.model.compiled.warp import warped
-from runtime.model.contract import LEAST_SPREAD_PX
 from runtime.model.reprojection import CENTRE, EYES, FRONT, MAX_SPREAD_PX, OUTER, REAR, START, reprojection, spreads
-from runtime.model.reprojection import coarser as coarser_raster
-from runtime.model.resample import buffer, resample
+from runtime.model.resample import buffer
 from runtime.model.transfer import FULL, SUBCODE
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
@@ -39,38 +36,39 @@ SMALL_PX = 8  # of a raster, either way
 WORTH_A_THREAD = 384 * 1024  # numbers; an image of fewer is done before another thread has woken
 
 
-class Level:
-    """Buffers for one stack at `1 / reduction` of its columns and rows; state lives from frame to frame.
+class Panels:
+    """Buffers for one stack; state lives from frame to frame.
 
     Images are (h, w, 3), or (h, w) where there is one channel.
     """
 
-    def __init__(self, stack: PanelStack, *, reduction: int, threads: int, channels: int = 3) -> None:
-        self.reduction = reduction
+    def __init__(self, stack: PanelStack, *, threads: int, channels: int = 3) -> None:
         self._stack, self._threads, self._channels = stack, threads, channels
-        height, width = -(-stack.height_px // reduction), -(-stack.width_px // reduction)
+        height, width = stack.height_px, stack.width_px
         names = (*(("outer", n) for n in OUTER), *(("mean", n) for n in OUTER), *(("target", e) for e in EYES))
         self._whole = {name: buffer(height, width, channels=channels) for name in (*names, ("moved", 0), ("spare", 0))}
         self.rasters: tuple[PlaneRaster, ...] = ()
         self.spread: dict[int, tuple[float, float]] = {}  # per outer panel, right and down, pixels
-        self.slope_floor = 1.0  # the least weight of a ray, beside the slope of sin² there; 1: all weigh alike
+        self._cropped: tuple[tuple[PixelRect, ...], PanelStack] | None = None
 
     @property
     def size(self) -> tuple[int, int]:
         """(width, height) of the centre panel's raster."""
         return self.rasters[CENTRE].width_px, self.rasters[CENTRE].height_px
 
-    def crop(self, boxes: Sequence[PixelRect], stack: PanelStack) -> None:
-        """Cut every raster and buffer to what the eyes look through."""
-        self._stack = stack
-        self.rasters = tuple(coarser_raster(box.cut(stack.panel(n)), self.reduction) for n, box in enumerate(boxes))
+    def crop(self, boxes: tuple[PixelRect, ...], stack: PanelStack) -> None:
+        """Cut every raster and buffer to what the eyes look through, of a stack of this size."""
+        if (boxes, stack) == self._cropped:
+            return
+        self._cropped, self._stack = (boxes, stack), stack
+        self.rasters = tuple(box.cut(stack.panel(n)) for n, box in enumerate(boxes))
         self.outer = {n: self._view("outer", n, on=n) for n in OUTER}
         self.target = tuple(self._view("target", side, on=CENTRE) for side in EYES)  # phase sums
 
-    def set_eyes(self, eyes_m: F64, *, eye_sigma_mm: float = 0.0, least_px: float = LEAST_SPREAD_PX) -> None:
+    def set_eyes(self, eyes_m: F64, *, eye_sigma_mm: float = 0.0) -> None:
         """Correct for eyes (2, 3) that err by so much, an axis: what is left of the outer panels in the mean counts,
         and what moves of them is noise. Spreads too small to be felt on this raster are none."""
-        self.spread = spreads(self.rasters, eyes_m, eye_sigma_mm=eye_sigma_mm, least_px=least_px)
+        self.spread = spreads(self.rasters, eyes_m, eye_sigma_mm=eye_sigma_mm)
         places = np.tile(np.eye(3), (2, 3, 1, 1))
         for side in EYES:
             for n in OUTER:
@@ -104,29 +102,18 @@ class Level:
         spread, target = self.spread[panel], self.outer[panel]
         self._blur(self._whole["spare", 0], target, panel, spread, gain=2 * size, most=FULL, shown=shown)
 
-    def set_panel(
-        self, panel: int, codes: I16, codes_from_raster: F64, *, columns: ColumnLaw = EVEN_COLUMNS, shown: bool
-    ) -> None:
-        """An outer panel as it was drawn on a raster of its own, with columns by a law."""
+    def set_panel(self, panel: int, coarse: I16, *, shown: bool) -> None:
+        """An outer panel as it was drawn on a coarser raster of its box."""
         outer = self.outer[panel]
-        resample(
-            codes, image_from_result=codes_from_raster, out=outer, outside=START, cubic=True, image_columns=columns
-        )
+        cv2.resize(coarse, outer.shape[1::-1], dst=outer, interpolation=cv2.INTER_CUBIC)
         clamp_and_quantise(outer, shown=shown)
-
-    def upsample(self, coarser: Level, *, shown: bool) -> None:
-        """Take the outer panels over from a coarser raster of the same boxes."""
-        for n in OUTER:
-            image, fine = coarser.outer[n], self.outer[n]
-            cv2.resize(image, fine.shape[1::-1], dst=fine, interpolation=cv2.INTER_CUBIC)
-            clamp_and_quantise(fine, shown=shown)
 
     def show(self, layers: U8, boxes: Sequence[PixelRect]) -> None:
         """All panels in 8-bit codes, the centre closed, into layers (N, H, W, 4), each within its box."""
         box, pixels = boxes[CENTRE], layers[CENTRE].view(np.uint32)[..., 0]
         panels, targets = tuple(numbers_of(self._mean(n)) for n in OUTER), tuple(map(numbers_of, self.target))
         sizes, seen = self._sizes[[REAR, FRONT, CENTRE]], np.ascontiguousarray(self._rays.seen[:, OUTER])
-        constants = *self._constants(), np.float32(self.slope_floor)
+        constants = self._constants()
 
         def close(first: int, last: int) -> None:
             place = pixels, box.v0, box.u0, first, last
@@ -134,18 +121,8 @@ class Level:
             close_centre(panels, sizes, self._near, targets, seen, *place, *constants, *work)
 
         self._on_rows(CENTRE, close)
-        self.show_panels({n: numbers_of(self.outer[n]) for n in OUTER}, layers, boxes)
-
-    def show_panels(self, panels: dict[int, I16], layers: U8, boxes: Sequence[PixelRect]) -> None:
-        """Panels (rows, numbers) in 8-bit codes, into layers (N, H, W, 4), each within its box."""
-        bits = SUBCODE.bit_length() - 1
-        for n, numbers in panels.items():
-            box, pixels = boxes[n], layers[n].view(np.uint32)[..., 0]
-
-            def copy(first: int, last: int, numbers: I16 = numbers, box: PixelRect = box, pixels: U8 = pixels) -> None:
-                show(numbers, pixels, box.v0, box.u0, box.width_px, first, last, self._channels, bits)
-
-            self._on_rows(n, copy)
+        outer = {n: numbers_of(self.outer[n]) for n in OUTER}
+        show_panels(outer, layers, boxes, channels=self._channels, threads=self._threads)
 
     def _correct(
         self, panel: int, *, size: float, limits: tuple[float, float], shown: bool, fading: tuple[F32, F32] | None
@@ -167,7 +144,7 @@ class Level:
             np.ascontiguousarray(self._rays.seen[:, (panel, other)]),
             np.ascontiguousarray(self._rays.back[:, panel]),
             needs,
-            *(np.float32(value) for value in (size, self.slope_floor, *limits)),
+            *(np.float32(value) for value in (size, *limits)),
             shown,
             np.repeat(columns, channels),
             rows,
@@ -221,11 +198,8 @@ class Level:
         return float(np.abs(np.concatenate([self._rays.seen, self._rays.back])[..., 0, 0]).max())
 
     def _on_rows(self, panel: int, work: Callable[[int, int], None]) -> None:
-        """`work` on as many of a panel's rows for each thread."""
         raster = self.rasters[panel]
-        large = raster.height_px * raster.width_px * self._channels > WORTH_A_THREAD
-        parts = shares(raster.height_px, self._threads if large else 1)
-        at_once(lambda rows: work(*rows), parts)
+        on_rows(work, raster.height_px, numbers=raster.width_px * self._channels, threads=self._threads)
 
     def _view(self, name: str, n: int, *, on: int) -> I16:
         """The first rows and columns of a buffer, with margins of its own."""
@@ -237,23 +211,39 @@ class Level:
         return self._channels, np.float32(START), np.float32(FULL), np.float32(SUBCODE)
 
 
+def on_rows(work: Callable[[int, int], None], rows: int, *, numbers: int, threads: int) -> None:
+    """`work` on as many rows of so many numbers for each thread."""
+    parts = shares(rows, threads if rows * numbers > WORTH_A_THREAD else 1)
+    at_once(lambda part: work(*part), parts)
+
+
+def show_panels(panels: dict[int, I16], layers: U8, boxes: Sequence[PixelRect], *, channels: int, threads: int) -> None:
+    """Panels (rows, numbers) in 8-bit codes, into layers (N, H, W, 4), each within its box."""
+    bits = SUBCODE.bit_length() - 1
+    for n, numbers in panels.items():
+        box, pixels = boxes[n], layers[n].view(np.uint32)[..., 0]
+
+        def copy(first: int, last: int, numbers: I16 = numbers, box: PixelRect = box, pixels: U8 = pixels) -> None:
+            show(numbers, pixels, box.v0, box.u0, box.width_px, first, last, channels, bits)
+
+        on_rows(copy, box.height_px, numbers=box.width_px * channels, threads=threads)
+
+
 @cache
 def warm_up() -> None:
     """Compile every pass, or load what was compiled before."""
     stack, eyes_m = PanelStack(0.5, 0.25, (-0.06, 0.0, 0.06), 64, 32), np.array([[0.6, -0.03, 0.0], [0.6, 0.03, 0.0]])
     boxes = (PixelRect(0, 0, 64, 32),) * 3
-    coarse, level = (Level(stack, reduction=reduction, threads=1) for reduction in (2, 1))
-    coarse.crop(boxes, stack)
-    level.crop(boxes, stack)
-    level.upsample(coarse, shown=True)
+    panels = Panels(stack, threads=1)
+    panels.crop(boxes, stack)
     for sigma_mm in (0.0, 100.0):
-        level.set_eyes(eyes_m, eye_sigma_mm=sigma_mm)
-        level.project(OUTER)
-        level.step(FRONT, size=1.0, shown=True)
+        panels.set_eyes(eyes_m, eye_sigma_mm=sigma_mm)
+        panels.project(OUTER)
+        panels.step(FRONT, size=1.0, shown=True)
     layers = np.zeros((3, 32, 64, 4), np.uint8)
-    level.show(layers, boxes)
+    panels.show(layers, boxes)
     joint = JointState(np.array([(32, 64)] * 4), channels=3, threads=1)
-    joint.step(level._rays, size=1.0, momentum=0.5, floor=0.1)
+    joint.step(panels._rays, size=1.0, momentum=0.5, floor=0.1)
     whole, same = (slice(0, 32), slice(0, 64)), np.eye(3)
     for linear in (False, True):
         warped(layers[0], same, out=layers[1], rows=whole[0], columns=whole[1], linear=linear)
