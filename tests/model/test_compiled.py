@@ -190,6 +190,23 @@ def test_samples_are_those_of_the_definition_wherever_the_rasters_are(
     assert np.abs(found.reshape(expected.shape) - expected).max() < 0.51 + 8000 * 2e-4
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+def test_rows_of_rays_that_are_bent_are_sampled_in_their_own_rows(channels: int) -> None:
+    """A picture of who looks from above and aside: rows that fall while they grow denser. Seen: half a pixel beside, in wider tiles two."""
+    matrix = np.array([[1.20441, -0.196946, -34.6], [-0.072058, 1.112023, 34.578], [0.000381, -0.000864, 1.025213]])
+    height, width, pixels = 270, 480, TILE // 3
+    held = np.zeros((height + 3, (width + 4) * channels + along.PIECE * 4), np.int16)
+    held[:height, : width * channels] = 8 * np.arange(height)[:, None]
+    row, tiles, layout = along.work_row(4.0), along.work_tiles(), along.new_layout(1, pixels, channels)
+    for v in (20, 100, 150):
+        place = held, height, height, width, 0.5, matrix, v, 0, pixels, channels, 0
+        first, last = along.sample(*place, layout, row, tiles[1])
+        u = np.arange(first, last) + 0.5
+        y = (matrix[1] @ [u, v + 0.5 + 0 * u, 1 + 0 * u]) / (matrix[2] @ [u, v + 0.5 + 0 * u, 1 + 0 * u]) - 0.5
+        assert last - first > 200
+        assert np.abs(tiles[1, first * channels : last * channels : channels] / 8 - y).max() < 0.2
+
+
 def test_nothing_is_written_beside_the_images(threads: int) -> None:
     panels = filled(Panels, threads, STACK, boxes="parts", channels=3)
     sizes = {}
