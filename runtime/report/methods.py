@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from runtime.errors import InputError
-
 if TYPE_CHECKING:
     from runtime.model.predictor import Predictor
     from runtime.optics.stack import PanelStack
@@ -43,14 +41,3 @@ def shipped_and_references(models: Sequence[str] = (), *, quick: bool = False) -
     methods = [Method(name, "network", name) for name in SHIPPED]
     methods += [Method(Path(name).stem, "network", name) for name in models]
     return methods + [Method(f"SART-{n}", "iterative", "sart", n) for n in (SART[:-1] if quick else SART)]
-
-
-def check_models(names: Sequence[str]) -> None:
-    """Raises InputError for an ONNX file that isn't there or isn't ours, before anything is measured."""
-    from runtime.model.session import ModelSession
-
-    for name in names:
-        path = Path(name)
-        if not path.is_file():
-            raise InputError(path, "", "is not a file")
-        ModelSession(path, provider="cpu", threads=1)

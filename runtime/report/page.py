@@ -33,14 +33,6 @@ class Table:
     rows: Sequence[Sequence[str]]
     caption: str = ""
 
-    def numeric(self) -> list[bool]:
-        """Which columns hold numbers: they are set flush right."""
-        return [
-            any(row[index] for row in self.rows)
-            and all(not row[index] or row[index][0] in "-+0123456789.∞" for row in self.rows)
-            for index in range(len(self.headings))
-        ]
-
 
 @dataclass(frozen=True, slots=True)
 class Section:
