@@ -30,17 +30,6 @@ SHARES = {"render": 0.3, "prepare": 0.2, "inference": 0.1, "finish": 0.4}
 
 
 @dataclass(frozen=True, slots=True)
-class Light:
-    """What the panels showed at one refresh, and to whom."""
-
-    frame: int
-    layers: U8  # (N, h, w, 4)
-    drawn: tuple[U8, U8]  # (h, w, 3) what the eyes solved for should see
-    solved_for_m: F64  # (2, 3)
-    true_eyes_m: F64  # (2, 3)
-
-
-@dataclass(frozen=True, slots=True)
 class Moving:
     """One motion with a solver of some speed."""
 
@@ -57,14 +46,16 @@ class Watched:
 
     def __init__(self) -> None:
         self.lines: list[Mapping[str, Any]] = []  # of frames.jsonl
-        self.lights: list[Light] = []  # of which all is known
+        # Number of a refresh, its layers (N, h, w, 4), what the eyes solved for should see (h, w, 3 each), and where
+        # eyes were: of refreshes of which all is known.
+        self.lights: list[tuple[int, U8, tuple[U8, U8], Mapping[str, Any]]] = []
 
     def refresh(self, line: Mapping[str, Any]) -> None:
         self.lines.append(line)
 
     def light(self, frame: int, *, layers: U8, drawn: tuple[U8, U8] | None, info: Mapping[str, Any]) -> None:
         if drawn is not None and info["solved_for_m"] is not None and info["true_eyes_m"] is not None:
-            self.lights.append(Light(frame, layers, drawn, info["solved_for_m"], info["true_eyes_m"]))
+            self.lights.append((frame, layers, drawn, info))
 
 
 def simulated_run(settings: Settings, *, scale: float, keep_light: int) -> Watched:
@@ -100,10 +91,10 @@ def moving_run(motion: str, solver_ms: float, *, seconds: float = SECONDS, scale
     where: Any = {"stack": scaled_stack(settings, scale), "fov_deg": settings.content.fov_deg}
     where |= {"sigmas_mm": (0.0,), "step": STEP}
     seen = []
-    for light in (light for light in watched.lights if light.frame >= first):
-        where |= {"eyes_m": light.solved_for_m, "seen_from_m": light.true_eyes_m}
+    for _, layers, drawn, info in (light for light in watched.lights if light[0] >= first):
+        where |= {"eyes_m": info["solved_for_m"], "seen_from_m": info["true_eyes_m"]}
         with contextlib.suppress(ValueError):  # they see nothing
-            seen.append(light_psnrs_db(light.layers, light.drawn, **where)[0.0])
+            seen.append(light_psnrs_db(layers, drawn, **where)[0.0])
     lines = [line for line in watched.lines if line["frame"] >= first and line["true_eyes_m"] is not None]
     tracked, behind = (
         [_apart_mm(line[place], line["true_eyes_m"]) for line in lines if line[place] is not None]
