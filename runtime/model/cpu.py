@@ -12,14 +12,13 @@ from runtime.model.assembly import ArrayAssembly
 from runtime.model.channels import without_alpha
 from runtime.model.compiled.joint import INTENSITY, JointState, fill, rays_of
 from runtime.model.compiled.panels import Panels, show_panels
-from runtime.model.compiled.wanted import fill_targets
 from runtime.model.contract import Contract, Step
 from runtime.model.job import Picture
 from runtime.model.reprojection import CENTRE, NEUTRAL, OUTER, START, coarser
 from runtime.model.resample import buffer, resample
 from runtime.model.steps import Problem
 from runtime.model.transfer import FULL, SUBCODE, phase_codes
-from runtime.model.wanted import Pictures
+from runtime.model.wanted import Pictures, fill_targets
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, I16, U8
@@ -65,7 +64,7 @@ class CpuState:
         contract, box = self._contract, problem.boxes[CENTRE]
         self._pictures = Pictures(arrays, box, problem.channels, contract.emphasis, phase_codes(contract.branch))
         self._reduced = self._pair("reduced", *problem.reduced_size)
-        fill_targets(self._pictures, [panels.target, self._reduced], threads=self._threads)
+        fill_targets(self._pictures, [panels.target, self._reduced])
         return nullcontext()
 
     def network_pictures(self) -> tuple[I16, I16]:
@@ -110,7 +109,7 @@ class CpuState:
         asked = self._pair("asked", *panels.size)
         intensities = (np.arange(256) * INTENSITY).astype(np.int16)
         width, height = panels.size
-        fill_targets(replace(self._pictures, table=intensities), [asked], threads=self._threads)
+        fill_targets(replace(self._pictures, table=intensities), [asked])
         for image, numbers in zip(asked, joint.targets, strict=True):
             numbers[:height, : width * problem.channels] = image.reshape(height, -1)
         joint.start()

@@ -151,17 +151,12 @@ def _warped(
     # OpenCV puts pixel centres at integers.
     matrix = _shifted(-0.5, -0.5) @ image_from_raster @ _shifted(columns.start + 0.5, rows.start + 0.5)
     linear = interpolation == "linear"
-    wide = rgba.shape[1] > 1  # compiled loops read two pixels of a row at once
-    if wide and not black_beside and (linear or source_px < FINE_ENOUGH):
-        from runtime.model.compiled.warp import is_before_the_eye, is_level, warped  # noqa: PLC0415 - imports numba
+    if not linear and not black_beside and source_px < FINE_ENOUGH:
+        from runtime.model.compiled.warp import is_level, warped  # noqa: PLC0415 - imports numba
 
-        size, place = (rgba.shape[1], rgba.shape[0]), matrix / matrix[2, 2]
-        if (
-            is_before_the_eye(place, rows=rows, columns=columns)
-            if linear
-            else is_level(place, rows=rows, columns=columns, size=size)
-        ):
-            warped(rgba, place, out=out, rows=rows, columns=columns, linear=linear)
+        place = matrix / matrix[2, 2]
+        if is_level(place, rows=rows, columns=columns, size=(rgba.shape[1], rgba.shape[0])):
+            warped(rgba, place, out=out, rows=rows, columns=columns)
             return out
     if not linear and source_px < FINE_ENOUGH:
         rgba, finer_from_image = _finer(rgba, image_from_raster, rows=rows, columns=columns)

@@ -192,7 +192,7 @@ def test_samples_are_those_of_the_definition_wherever_the_rasters_are(
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_rows_of_rays_that_are_bent_are_sampled_in_their_own_rows(channels: int) -> None:
-    """A picture of who looks from above and aside: rows that fall while they grow denser. Seen: half a pixel beside, in wider tiles two."""
+    """A picture seen from above and aside: rows fall while they grow denser. Seen: half a pixel beside, or more."""
     matrix = np.array([[1.20441, -0.196946, -34.6], [-0.072058, 1.112023, 34.578], [0.000381, -0.000864, 1.025213]])
     height, width, pixels = 270, 480, TILE // 3
     held = np.zeros((height + 3, (width + 4) * channels + along.PIECE * 4), np.int16)

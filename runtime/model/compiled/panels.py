@@ -245,8 +245,7 @@ def warm_up() -> None:
     joint = JointState(np.array([(32, 64)] * 4), channels=3, threads=1)
     joint.step(panels._rays, size=1.0, momentum=0.5, floor=0.1)
     whole, same = (slice(0, 32), slice(0, 64)), np.eye(3)
-    for linear in (False, True):
-        warped(layers[0], same, out=layers[1], rows=whole[0], columns=whole[1], linear=linear)
+    warped(layers[0], same, out=layers[1], rows=whole[0], columns=whole[1])
     fade_codes(np.zeros((2, 6), np.int16), np.zeros((1, 2), np.float32), START, 3)
     every = np.zeros(32, np.int64), np.full(32, 64)
     extrapolate_rows(*(layer.view(np.uint32)[..., 0] for layer in layers[:2]), *every, *every, 0, 0, 64)

@@ -7,15 +7,12 @@ picture for one of the raster instead of sixteen. A pixel's four numbers are wei
 
 from __future__ import annotations
 
-from itertools import product
-
 import numpy as np
 from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 
 from runtime.model.compiled.loops import CHANNELS, OPTIONS, PASS, U
-from runtime.model.compiled.pixels import LEAST_WEIGHT, locate, sample_pixels
 from runtime.records import F64, U8
 from runtime.support.threads import on_rows
 
@@ -175,41 +172,17 @@ def warp(
             _weigh_pixels(columns, source, weights, U(i), stride, out, to + U(i) * U(CHANNELS))
 
 
-@njit(**PASS)
-def warp_linear(
-    picture, height, picture_width, matrix, out, first, last, v0, u0, width, sums, shares, places, within
-):  # pragma: no cover
-    """The same by linear samples, of rows that may lie in any way. sums (numbers,), shares (2, pixels), places
-    (2, pixels), within (pixels,): to work in."""
-    half, opaque = np.float32(0.5), np.float32(255)
-    for v in range(first, last):
-        locate(matrix, v, 0, width, picture_width, height, places[0], places[1], shares[0], shares[1], within)
-        for k in range(width * CHANNELS):
-            sums[U(k)] = half
-        sample_pixels(picture, places[0], places[1], shares[0], shares[1], width, sums)
-        for k in range(width):
-            sums[U(k * CHANNELS + CHANNELS - 1)] = opaque
-        row, begin = U(v + v0), U(u0) * U(CHANNELS)
-        for k in range(width * CHANNELS):
-            out[row, begin + U(k)] = np.uint8(np.int32(sums[U(k)]))
-
-
-def warped(picture: U8, matrix: F64, *, out: U8, rows: slice, columns: slice, linear: bool = False) -> None:
+def warped(picture: U8, matrix: F64, *, out: U8, rows: slice, columns: slice) -> None:
     """A picture (h, w, 4) on rows and columns of a raster: into out (rows, columns, 4), opaque.
 
-    matrix: 3x3, last entry 1, the picture's pixels from those of the drawn rows and columns, pixel centres at integers.
-    linear: by linear samples, where cubic ones take rows that are nearly level.
+    matrix: 3x3, last entry 1, the picture's pixels from those of the drawn rows and columns, pixel centres at integers;
+    rows are nearly level in the picture (`is_level`).
     """
     height, width = rows.stop - rows.start, columns.stop - columns.start
     source = np.ascontiguousarray(picture).reshape(-1), *picture.shape[:2], matrix, out.reshape(out.shape[0], -1)
     place = rows.start, columns.start, width
 
     def share(first: int, last: int) -> None:
-        if linear:
-            sums, within = np.zeros(width * CHANNELS, np.float32), np.zeros(width, np.float32)
-            work = sums, np.zeros((2, width), np.float32), np.zeros((2, width), np.int32), within
-            warp_linear(*source, first, last, *place, *work)
-            return
         pixels = max(width, picture.shape[1] + 2 * MARGIN_PX) + TAPS
         sampled, shares = np.zeros(pixels * CHANNELS, np.float32), np.zeros(pixels, np.float32)
         weights, places = np.zeros((TAPS, pixels), np.float32), np.zeros(pixels, np.int32)
@@ -229,9 +202,3 @@ def is_level(matrix: F64, *, rows: slice, columns: slice, size: tuple[int, int])
     across = x[1::2] - x[::2]
     far = x.min() < -MARGIN_PX or x.max() > size[0] + MARGIN_PX or x[::2].max() >= size[0] or x[1::2].min() <= 0
     return not far and across.min() > 0 and bool((np.abs(y[1::2] - y[::2]) < RISE_MOST * across).all())
-
-
-def is_before_the_eye(matrix: F64, *, rows: slice, columns: slice) -> bool:
-    """Whether all of a raster (3x3 as above) is."""
-    right, down = columns.stop - columns.start - 1.0, rows.stop - rows.start - 1.0
-    return bool(min(matrix[2] @ corner for corner in product((0.0, right), (0.0, down), (1.0,))) > LEAST_WEIGHT)
