@@ -23,10 +23,9 @@ def at_once(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Resul
     return list(_pool(threads).map(work, items))
 
 
-def on_rows(work: Callable[[int, int], None], first: int, last: int) -> None:
-    """`work(first, last)` on as many rows for each of OpenCV's threads."""
-    threads = max(1, cv2.getNumThreads())
-    at_once(lambda rows: work(first + rows[0], first + rows[1]), shares(last - first, threads))
+def on_rows(work: Callable[[int, int], None], rows: int, *, threads: int | None = None) -> None:
+    """`work(first, last)` on as many of so many rows for each thread; None: for each of OpenCV's."""
+    at_once(lambda part: work(*part), shares(rows, threads or max(1, cv2.getNumThreads())))
 
 
 def shares(count: int, threads: int) -> list[tuple[int, int]]:

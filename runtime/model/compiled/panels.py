@@ -26,7 +26,7 @@ from runtime.model.transfer import FULL, SUBCODE
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F32, F64, I16, U8
-from runtime.support.threads import at_once, shares
+from runtime.support.threads import on_rows
 
 LEAST_TAP = 1e-3  # of a blur's middle one: what weighs less is left out
 MAX_TAPS = int(MAX_SPREAD_PX * sqrt(2) * sqrt(2 * log(1 / LEAST_TAP))) + 2  # pixels to either side
@@ -199,7 +199,8 @@ class Panels:
 
     def _on_rows(self, panel: int, work: Callable[[int, int], None]) -> None:
         raster = self.rasters[panel]
-        on_rows(work, raster.height_px, numbers=raster.width_px * self._channels, threads=self._threads)
+        large = raster.height_px * raster.width_px * self._channels > WORTH_A_THREAD
+        on_rows(work, raster.height_px, threads=self._threads if large else 1)
 
     def _view(self, name: str, n: int, *, on: int) -> I16:
         """The first rows and columns of a buffer, with margins of its own."""
@@ -211,12 +212,6 @@ class Panels:
         return self._channels, np.float32(START), np.float32(FULL), np.float32(SUBCODE)
 
 
-def on_rows(work: Callable[[int, int], None], rows: int, *, numbers: int, threads: int) -> None:
-    """`work` on as many rows of so many numbers for each thread."""
-    parts = shares(rows, threads if rows * numbers > WORTH_A_THREAD else 1)
-    at_once(lambda part: work(*part), parts)
-
-
 def show_panels(panels: dict[int, I16], layers: U8, boxes: Sequence[PixelRect], *, channels: int, threads: int) -> None:
     """Panels (rows, numbers) in 8-bit codes, into layers (N, H, W, 4), each within its box."""
     bits = SUBCODE.bit_length() - 1
@@ -226,7 +221,7 @@ def show_panels(panels: dict[int, I16], layers: U8, boxes: Sequence[PixelRect], 
         def copy(first: int, last: int, numbers: I16 = numbers, box: PixelRect = box, pixels: U8 = pixels) -> None:
             show(numbers, pixels, box.v0, box.u0, box.width_px, first, last, channels, bits)
 
-        on_rows(copy, box.height_px, numbers=box.width_px * channels, threads=threads)
+        on_rows(copy, box.height_px, threads=threads)
 
 
 @cache

@@ -188,7 +188,7 @@ def warped(picture: U8, matrix: F64, *, out: U8, rows: slice, columns: slice) ->
         weights, places = np.zeros((TAPS, pixels), np.float32), np.zeros(pixels, np.int32)
         warp(*source, first, last, *place, sampled, shares, weights, places)
 
-    on_rows(share, 0, height)
+    on_rows(share, height)
 
 
 def is_level(matrix: F64, *, rows: slice, columns: slice, size: tuple[int, int]) -> bool:
