@@ -40,7 +40,7 @@ class Step(Section):
 
 
 def checked_steps(steps: tuple[Step, ...]) -> tuple[Step, ...]:
-    """Steps that can be carried out: one chain, first; never back to a coarser raster. Raises ValueError."""
+    """Steps that can be carried out: one chain, first; joint ones last. Raises ValueError."""
     if steps and [index for index, step in enumerate(steps) if step.kind == "chain"] != [0]:
         raise ValueError("must begin with a chain step, the only one")
     if any(before.kind == "joint" != after.kind for before, after in pairwise(steps)):
