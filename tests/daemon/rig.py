@@ -11,13 +11,13 @@ from unittest.mock import patch
 
 import numpy as np
 
-from runtime.config import Settings
+from runtime.config import SensorSettings, Settings
 from runtime.daemon.build import Host, Run, RunOptions, build_run
 from runtime.errors import PanelLost
 from runtime.frame.presenter import Presenter
 from runtime.records import EyePoints, PanelFrame, PresentReport, RefreshAccount, SensorFrame, State
-from runtime.sensor import registry
 from runtime.sensor.base import Capabilities, Sensor
+from runtime.sensor.registry import open_sensor
 
 SMALL: dict[str, Any] = {
     "stack": {"width_px": 192, "height_px": 108},
@@ -103,7 +103,6 @@ class Rig:
             "sensor.worker.OPEN_TIMEOUT_S": open_timeout_s,
         }
         self.plan = Plan()
-        registry._FACTORIES["fragile"] = lambda settings, clock, latency_ms: FragileDriver(self.plan, clock)
         tables = {name: {**SMALL.get(name, {}), **changes.get(name, {})} for name in {**SMALL, **changes}}
         self.settings = Settings.model_validate(tables)
         self.host = host or Host()
@@ -115,6 +114,7 @@ class Rig:
         try:
             for name, seconds in self._times.items():
                 self._cleanup.enter_context(patch(f"runtime.{name}", seconds))
+            self._cleanup.enter_context(patch("runtime.daemon.build.open_sensor", self._opened))
             self.run: Run = build_run(
                 self.settings,
                 RunOptions(),
@@ -127,6 +127,9 @@ class Rig:
             raise
         self._well = self.presenter.panels, self.predictor
         return self
+
+    def _opened(self, settings: SensorSettings, clock: Any, **how: Any) -> Sensor:
+        return FragileDriver(self.plan, clock) if settings.driver == "fragile" else open_sensor(settings, clock, **how)
 
     def mend(self) -> None:
         """What was broken is as it was at the beginning."""
