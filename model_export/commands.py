@@ -22,11 +22,11 @@ def require(*modules: str) -> None:
 def train(
     out: Annotated[Path, typer.Option(help="folder for checkpoint.pth, recipe.json and validation.csv")],
     recipe: Annotated[str, typer.Option(help="fast, balanced, best or a recipe file (JSON)")] = "balanced",
-    iterations: Annotated[int | None, typer.Option(min=1, help="steps of the optimiser; without: the recipe's")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="of data and weights; without: the recipe's")] = None,
+    iterations: Annotated[int | None, typer.Option(min=1, help="numbers tried, at most; without: the recipe's")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="of the pairs; without: the recipe's")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="the result as one object on stdout")] = False,
 ) -> None:
-    """Train a model on endless procedural pairs.
+    """Train a model on procedural pairs: its weights and steps, by the light that eyes get of what it solves.
 
     Example: phasestack train --recipe balanced --out out/balanced
     """
@@ -38,7 +38,7 @@ def train(
         typer.echo(json.dumps(result))
     else:
         typer.echo(
-            f"{result['name']}: {result['iterations']} steps in {result['seconds']:.0f} s; held-out pairs "
+            f"{result['name']}: {result['iterations']} trials in {result['seconds']:.0f} s; light of held-out pairs "
             f"{result['start_db']:.2f} -> {result['held_out_db']:.2f} dB; {out / 'checkpoint.pth'}"
         )
 

@@ -11,11 +11,12 @@ import numpy as np
 
 from model_export.scene import Random, draw, random_scene
 from runtime.optics.stack import PanelStack
-from runtime.optics.views import raster_from_stack, stack_from_eye
+from runtime.optics.views import image_from_stack, stack_from_eye
 from runtime.records import F64, U8
 
 PITCH_WIDTH_M = 0.5184  # of the prototype's panels
 CENTRE = 1
+WIDEST_DEG = 100.0
 LEAST_COMMON = 0.4  # of the centre panel's width that both eyes must see through all panels
 
 
@@ -25,7 +26,8 @@ class TrainingPair:
 
     stack: PanelStack
     eyes_m: F64  # (2, 3) left, right; frame `stack`
-    images: tuple[U8, U8]  # (h, w, 3) on the centre panel's raster
+    images: tuple[U8, U8]  # (h, w, 3), each eye's own
+    fov_deg: float  # of both, horizontal
     eye_sigma_mm: float
 
 
@@ -91,9 +93,16 @@ def random_pair(
     scene = random_scene(random, stack, eyes.mean(axis=0))
     low, high = eye_sigma_mm
     sigma_mm = low if random.random() < 0.25 else random.uniform(low, high)
-    projections = [raster_from_stack(eye, stack.panel(CENTRE)) for eye in eyes]
-    left, right = (draw(scene, projection, width_px=width_px, height_px=height_px) for projection in projections)
-    return TrainingPair(stack, eyes, (left, right), sigma_mm)
+    fov_deg = filling_fov_deg(stack, eyes.mean(axis=0))
+    size = {"width_px": width_px, "height_px": height_px}
+    left, right = (draw(scene, image_from_stack(eye, **size, fov_deg=fov_deg), **size) for eye in eyes)
+    return TrainingPair(stack, eyes, (left, right), fov_deg, sigma_mm)
+
+
+def filling_fov_deg(stack: PanelStack, eye_m: F64) -> float:
+    """The horizontal field of view that the panels fill as seen from before them, WIDEST_DEG at most."""
+    distance_m = float(np.linalg.norm(eye_m))
+    return min(WIDEST_DEG, math.degrees(2 * math.atan(stack.width_m / 2 / distance_m)))
 
 
 def endless_pairs(

@@ -87,8 +87,12 @@ def spectral_model(
 
 def spectral_file(net: SpectralSolver, recipe: Recipe, *, trained: bool = True) -> bytes:
     """The ONNX file of a recipe's network, with its contract; `trained`: on the pairs of `phasestack train`."""
-    data = spectral_bytes(net, cell_px=recipe.cell_px)
-    contract = Contract(
+    return with_contract(spectral_bytes(net, cell_px=recipe.cell_px), spectral_contract(net, recipe, trained=trained))
+
+
+def spectral_contract(net: SpectralSolver, recipe: Recipe, *, trained: bool = True) -> Contract:
+    """What the file of a recipe's network says about itself."""
+    return Contract(
         version=2,
         arch="spectral",
         name=recipe.name,
@@ -113,7 +117,6 @@ def spectral_file(net: SpectralSolver, recipe: Recipe, *, trained: bool = True) 
         steps=recipe.steps,
         refining=recipe.refining,
     )
-    return with_contract(data, contract)
 
 
 def eyereal_model(

@@ -80,21 +80,17 @@ class SpectralSolver(nn.Module):
         return share * m * spectrum[None], share * alpha2 + cost_g, gain_h
 
     def forward(self, *feeds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """`panels` of `INPUTS` in 16-bit codes, and one number that is finite where all that was worked out is."""
-        rear, front, check = self._solved(feeds, added=0.5)
-        # Nothing is below zero once it is clamped, and a cast cuts off what follows the point: the half makes it round.
-        codes = (_by_rows(torch.clamp(x, 0, FULL + 0.5), like=feeds[0]).to(torch.int16) for x in (rear, front))
-        return (*codes, check)  # type: ignore[return-value]
-
-    def panels(self, *feeds: Tensor) -> tuple[Tensor, Tensor]:
-        """Rear and front panel (rows, cells + 1, 2K·C), from one parallax before the first column; not clamped.
+        """Rear and front panel (rows, cells + 1, 2K·C) in 16-bit codes, from one parallax before the first column, and
+        one number that is finite where all that was worked out is.
 
         feeds: `INPUTS`. left, right (rows, cells, 2K·C), 16-bit codes: what each eye lacks along its rays through the
         raster; waves (cells + 1, cells + 1) V, shifted_waves Ũ, spectrum (cells + 1,) s and modes_in
         (cells + 1, cells) U^T (`runtime.model.chain.chain_modes`); doubt (3,): c columns, r rows, e columns.
         """
-        rear, front, _ = self._solved(feeds, added=0.0)
-        return _by_rows(rear, like=feeds[0]) / FULL, _by_rows(front, like=feeds[0]) / FULL
+        rear, front, check = self._solved(feeds, added=0.5)
+        # Nothing is below zero once it is clamped, and a cast cuts off what follows the point: the half makes it round.
+        codes = (_by_rows(torch.clamp(x, 0, FULL + 0.5), like=feeds[0]).to(torch.int16) for x in (rear, front))
+        return (*codes, check)  # type: ignore[return-value]
 
     def _solved(self, feeds: tuple[Tensor, ...], *, added: float) -> tuple[Tensor, Tensor, Tensor]:
         """Rear and front panel (1, block's rows, all else), codes with a number added to them, and the check.

@@ -24,13 +24,12 @@ DESIGN_RANGE = TrainedFor(
 class Training(Section):
     """What `phasestack train` does with a recipe."""
 
-    iterations: Annotated[int, Field(ge=1)] = 400
-    learning_rate: Annotated[float, Field(gt=0)] = 0.02
+    iterations: Annotated[int, Field(ge=1)] = Field(400, description="solutions of all training pairs, at most")
     seed: Annotated[int, Field(ge=0)] = 1
     width_px: Annotated[int, Field(ge=64)] = Field(480, description="raster of the training pairs")
     height_px: Annotated[int, Field(ge=64)] = 270
     eye_sigma_mm: tuple[float, float] = Field((0.0, 4.0), description="range of the uncertainties that are drawn")
-    validate_every: Annotated[int, Field(ge=1)] = 50
+    pairs: Annotated[int, Field(ge=1)] = 12
     validation_pairs: Annotated[int, Field(ge=1)] = 12
 
 

@@ -1,29 +1,24 @@
-"""Training: exact geometry of the data, a loss that agrees with the runtime's rays, and determinism."""
+"""Training: exact geometry of the data, a loss that is the runtime's own light, and determinism."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
-from model_export.checkpoint import load_spectral, solver_of  # noqa: E402
+from model_export.checkpoint import load_spectral, plain_weights, solver_of  # noqa: E402
 from model_export.data import TrainingPair, endless_pairs  # noqa: E402
 from model_export.recipe import Recipe, read_recipe  # noqa: E402
 from model_export.scene import Plane, Scene, draw  # noqa: E402
-from model_export.sight import displayed_mse, sight_of  # noqa: E402
-from model_export.train import pair_loss, run_training  # noqa: E402
-from runtime.config import ModelSettings  # noqa: E402
-from runtime.model.job import Job  # noqa: E402
+from model_export.train import light_db, numbers_of, recipe_with, run_training  # noqa: E402
 from runtime.model.predictor import load_predictor  # noqa: E402
-from runtime.model.resample import target_from_source  # noqa: E402
+from runtime.model.still import solve_still  # noqa: E402
+from runtime.optics.carried import light_psnrs_db  # noqa: E402
 from runtime.optics.stack import PanelStack  # noqa: E402
 from runtime.optics.views import raster_from_stack  # noqa: E402
-from tests.model.scenes import sampled  # noqa: E402
 
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
 EYES = np.array([[0.7, -0.0315, 0.02], [0.7, 0.0315, 0.02]])
@@ -81,57 +76,28 @@ def test_poses_stay_within_the_design_range() -> None:
         assert 0 <= pair.eye_sigma_mm <= 4
 
 
-def test_the_raster_s_own_sight_is_what_eyes_see_of_panels_that_are_drawn_on_it() -> None:
-    """Against the runtime's rays: the network's answer, drawn on the panels, no correction."""
-    recipe = read_recipe("balanced").model_copy(update={"emphasis": 0.0})
-    net = solver_of(recipe, source="test")
+def test_what_is_learned_is_the_light_that_the_runtime_gives_of_the_shipped_file() -> None:
+    """The training's network and contract are those of the exported model: the same layers, the same figure."""
     pair = first_pairs(1, seed=3, width_px=480, height_px=270)[0]
-    # Detail that the raster, half as fine as the panels, can't hold is none of its business.
-    smooth = tuple(cv2.GaussianBlur(picture, (0, 0), 3.0) for picture in pair.images)
-    pair = replace(pair, images=smooth, eye_sigma_mm=4.0)
-    with torch.no_grad():
-        sight = sight_of(pair, recipe)
-        ours = displayed_mse(net, sight)
-    predictor = load_predictor("balanced", pair.stack, ModelSettings(threads=1))
-    session = predictor.session  # type: ignore[attr-defined]
-    alone = {"steps": session.contract.steps[:1], "emphasis": 0.0}
-    session.contract = session.contract.model_copy(update=alone)
-    rgba = [[cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA)] for picture in pair.images]
-    layers = predictor.solve(Job(rgba, pair.eyes_m, eye_sigma_mm=4.0)).layers[..., :3].astype(np.float64) / 255
+    predictor = load_predictor("best", pair.stack)
+    how = {"eyes_m": pair.eyes_m, "fov_deg": pair.fov_deg}
+    solved = solve_still(*pair.images, **how, predictor=predictor, eye_sigma_mm=pair.eye_sigma_mm)
     predictor.close()
-    errors = []
-    for eye, picture in zip(pair.eyes_m, pair.images, strict=True):
-        phase, counts = layers[1].copy(), np.ones(picture.shape[:2], bool)
-        v, u = np.mgrid[0:270, 0:480] + 0.5
-        for n in (0, 2):
-            m = target_from_source(eye, source=pair.stack.panel(1), target=pair.stack.panel(n))
-            x, y = m[0, 0] * u + m[0, 2], m[1, 1] * v + m[1, 2]
-            counts &= (x > 2) & (x < 478) & (y > 2) & (y < 268)
-            x, y = np.broadcast_arrays(x, y)
-            phase += sampled(layers[n], x, y)
-        errors.append(np.square(np.sin(phase * np.pi / 2) ** 2 - picture / 255)[counts].mean())
-    theirs_db, ours_db = -10 * np.log10(np.mean(errors)), -10 * np.log10(float(ours[0]))
-    mirrored = replace(sight, wanted=sight.wanted[::-1])
-    with torch.no_grad():
-        wrong_db = -10 * np.log10(float(displayed_mse(net, mirrored)[0]))
-    assert ours_db == pytest.approx(theirs_db, abs=8.0)  # eight bits and the panels' own pixels
-    assert wrong_db < ours_db - 15, "the wrong eye's sight would be no better"
-    assert float(ours[1]) > float(ours[0])
+    seen = light_psnrs_db(solved.layers, pair.images, pair.stack, **how, sigmas_mm=(pair.eye_sigma_mm,))
+    assert light_db(read_recipe("best"), [pair]) == pytest.approx(seen[pair.eye_sigma_mm], abs=0.02)
 
 
-def test_what_is_learned_gets_gradients_and_steps_down_the_loss() -> None:
-    recipe = read_recipe("balanced").model_copy(update={"weights": None})
-    model = solver_of(recipe, source="test")
-    pair = first_pairs(1, seed=4, width_px=320, height_px=180)[0]
-    loss = pair_loss(model, pair, recipe)
-    loss.backward()
-    gradient = torch.cat([p.grad.reshape(-1) for p in model.parameters() if p.grad is not None])
-    assert torch.isfinite(gradient).all() and gradient.norm() > 0
-    with torch.no_grad():
-        for p in model.parameters():
-            if p.grad is not None:
-                p -= 0.02 * p.grad / gradient.norm()
-        assert pair_loss(model, pair, recipe) < loss
+def test_a_number_goes_where_light_is_and_no_further_than_a_step_can() -> None:
+    recipe = read_recipe("fast")
+    recipe = recipe.model_copy(update={"weights": plain_weights(solver_of(recipe, source="test"))})
+    numbers = numbers_of(recipe)
+    assert {"weights.log_floor.0", "steps.1.size", "steps.2.size"} <= set(numbers)
+    assert recipe_with(recipe, numbers) == recipe
+    assert recipe_with(recipe, numbers | {"steps.1.size": 2.1}) is None
+    pairs = first_pairs(1, seed=4, width_px=320, height_px=180)
+    assert (
+        light_db(recipe, pairs) > light_db(recipe_with(recipe, numbers | {"steps.2.size": 0.1}) or recipe, pairs) + 0.3
+    )
 
 
 @pytest.fixture
@@ -139,7 +105,7 @@ def tiny(tmp_path: Path) -> Path:
     """A recipe that trains in seconds."""
     table = json.loads(read_recipe("fast").text())
     table.pop("weights", None)
-    table["training"] |= SMALL | {"iterations": 2, "validate_every": 1, "validation_pairs": 2}
+    table["training"] |= SMALL | {"iterations": 8, "pairs": 2, "validation_pairs": 2}
     path = tmp_path / "tiny.json"
     path.write_text(json.dumps(table))
     return path
@@ -155,5 +121,6 @@ def test_training_is_the_same_twice_and_leaves_its_files(tmp_path: Path, tiny: P
     assert trained(tmp_path / "b", tiny).weights == first.weights
     _, recipe = load_spectral(tmp_path / "a" / "checkpoint.pth", name="fast")
     assert recipe.steps == first.steps and recipe.weights == first.weights
-    rows = (tmp_path / "a" / "validation.csv").read_text().splitlines()
-    assert [row.split(",")[0] for row in rows] == ["iteration", "0", "1", "2"]
+    rows = [row.split(",") for row in (tmp_path / "a" / "validation.csv").read_text().splitlines()]
+    assert rows[0] == ["iteration", "light_db", "held_out_light_db"] and [row[0] for row in rows[1:]] == ["0", "8"]
+    assert float(rows[2][1]) > float(rows[1][1])
