@@ -45,7 +45,7 @@ class Recipe(Section):
         0.0,
         description="strength of the sharpening that undoes the blur of interpolation, on the way in and in the eye",
     )
-    interpolation: Literal["linear", "finer"] = "linear"
+    interpolation: Literal["linear", "cubic"] = "linear"
     steps: Annotated[Steps, Field(min_length=1)]
     refining: Refining = ()
     training: Training = Training()

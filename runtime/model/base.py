@@ -62,7 +62,7 @@ class Predictor(ABC):
 
     @property
     def interpolation(self) -> str:
-        """How still pictures are to be warped for it: `linear` or `finer` (`Contract.interpolation`)."""
+        """How still pictures are to be warped for it: `linear` or `cubic` (`Contract.interpolation`)."""
         return "linear"
 
     @property

@@ -116,11 +116,7 @@ class Contract(Section):
     picture_fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
         0.0, description="horizontal view of the pictures it was trained on, black beside them; 0: whatever is drawn"
     )
-    interpolation: Literal["linear", "finer"] = Field(
-        "linear",
-        description="how still pictures are warped: linear; finer: linear samples of a picture that a cubic kernel "
-        "makes twice as fine",
-    )
+    interpolation: Literal["linear", "cubic"] = Field("linear", description="how still pictures are warped")
     steps: Steps = ()
     refining: Refining = ()
 
