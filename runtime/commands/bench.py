@@ -40,23 +40,6 @@ def bench(
 
 
 @app.command()
-def eyes(
-    folder: Annotated[Path, typer.Argument(help="pictures of faces and truth.json: file, left, right, px; yaw_deg")],
-    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
-) -> None:
-    """How well pupils are found and followed: simulated cameras look at faces whose pupils are known.
-
-    Example: phasestack bench eyes faces
-    """
-    from runtime.eyes import benchmark
-    from runtime.support.artifacts import to_json
-    from runtime.support.figures import lines_of
-
-    measured = benchmark.measure(folder)
-    print(to_json(measured) if as_json else "\n".join(lines_of(measured)))
-
-
-@app.command()
 def compare(
     old: Annotated[Path, typer.Argument(help="the earlier regression file")],
     new: Annotated[Path, typer.Argument(help="the later one")],

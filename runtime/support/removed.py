@@ -28,7 +28,7 @@ REMOVED_COMMANDS: dict[str, str] = {
     "ctl budget": "set model.budget_ms in the configuration, then `ctl reload`",
     "ctl next": "`ctl scene next`",
     "plan --eyes": "set sensor.fixed_eyes_m in the configuration",
-    "bench eyes --chain": "`bench eyes FOLDER` says in mm how far off the eyes are; `run --out` measures dB",
+    "bench eyes": "`python -m tests.eyes.benchmark FOLDER`, in the repository",
     **dict.fromkeys(
         ("train --data", "train --scene"), "take it out: 6 to 18 numbers are trained, on endless pairs that are drawn"
     ),

@@ -14,10 +14,10 @@ from typer.testing import CliRunner, Result
 from runtime.commands.eyes import eyes as command
 from runtime.errors import InputError
 from runtime.evaluation.motion_recording import write_motion
-from runtime.eyes.benchmark import measure
 from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.support.artifacts import read_image, write_png
+from tests.eyes.benchmark import measure
 from tests.eyes.scene import camera, eileen, frame, grace, scene
 
 CAMERA = camera(640, 480, 65.0)
@@ -100,7 +100,7 @@ def test_without_a_file_the_sensor_is_looked_at(tmp_path: Path) -> None:
 def test_the_benchmark_measures_detection_error_sigma_jitter_and_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("runtime.eyes.benchmark.TRACKS_MAX", 1)
+    monkeypatch.setattr("tests.eyes.benchmark.TRACKS_MAX", 1)
     for portrait, name in ((eileen(), "eileen.png"), (grace(), "grace.png")):
         write_png(tmp_path / name, portrait.picture)
     rows = [

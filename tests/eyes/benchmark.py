@@ -6,6 +6,7 @@ it is known, `yaw_deg`, by which the head is turned. Errors are millimetres at e
 
 from __future__ import annotations
 
+import sys
 import time
 from dataclasses import dataclass
 from math import cos, pi, radians, sin, tan
@@ -20,8 +21,9 @@ from runtime.errors import InputError
 from runtime.eyes.networks import resampled
 from runtime.eyes.pupils import PupilFinder, Pupils
 from runtime.records import F64, U8
-from runtime.support import progress, untrusted_input
+from runtime.support import untrusted_input
 from runtime.support.artifacts import read_image
+from runtime.support.figures import lines_of
 
 EYE_DISTANCE_M = 0.063
 FOV_DEG = 65.0
@@ -97,10 +99,7 @@ def measure(folder: Path) -> dict[str, Any]:
             spent["followed" if number else "found"].append(1e3 * (time.thread_time() - begin))
         return pupils
 
-    cameras = []
-    for number, (distance_m, light) in enumerate(CASES):
-        progress.tell("cameras", number, len(CASES))
-        cameras.append(_found(faces, find, finder, distance_m, light))
+    cameras = [_found(faces, find, finder, distance_m, light) for distance_m, light in CASES]
     steady = _followed(faces[:: max(1, len(faces) // TRACKS_MAX)], find, finder)
     ms = {name: _percentiles(values) for name, values in spent.items()}
     return {"faces": len(faces), "cameras": cameras, "steady": steady, "processor_ms": ms}
@@ -165,3 +164,10 @@ def _followed(faces: list[Face], find: Any, finder: PupilFinder) -> dict[str, An
         "up_mm": up,
         "lag_frames": float(np.median(lags)) if lags else None,
     }
+
+
+if __name__ == "__main__":
+    try:
+        print("\n".join(lines_of(measure(Path(sys.argv[1])))))
+    except InputError as error:
+        sys.exit(str(error))
