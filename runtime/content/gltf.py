@@ -15,7 +15,7 @@ from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from runtime.content.rig import Binding, Channel, Node, Rig, Skin
 from runtime.content.shapes import I32, Shape
@@ -129,7 +129,7 @@ class _Reader:
             for part, binding in self._mesh(table["mesh"]):
                 triangles += len(part.shape.triangles)
                 self._within(triangles, LIMITS.triangles, "meshes")
-                placed.append((part, _bound(binding, number, table.get("weights"), skin)))
+                placed.append((part, _bound(binding, number, skin)))
             self._within(len(placed), LIMITS.instances, "nodes")
         rig = Rig(tuple(nodes), tuple(order), tuple(binding for _, binding in placed), channels)
         return [part for part, _ in placed], rig
@@ -236,10 +236,10 @@ class _Reader:
     def _mesh_of(self, index: Any) -> list[tuple[Part, Binding]]:
         """The parts of a mesh, which all its instances share."""
         mesh = self._at("meshes", index)
-        made = [self._primitive(primitive, mesh.get("weights")) for primitive in mesh["primitives"]]
+        made = [self._primitive(primitive) for primitive in mesh["primitives"]]
         return [item for item in made if item is not None]
 
-    def _primitive(self, primitive: Table, weights: ArrayLike | None) -> tuple[Part, Binding] | None:
+    def _primitive(self, primitive: Table) -> tuple[Part, Binding] | None:
         attributes, mode = primitive["attributes"], primitive.get("mode", TRIANGLES)
         if mode in (STRIP, FAN):
             raise InputError(self._path, "mode", "strips and fans of triangles are not read: export triangles")
@@ -269,8 +269,6 @@ class _Reader:
             vertex_colours=None if colours is None else np.clip(colours[:, :3], 0.0, 1.0),
             lit=look.lit,
         )
-        targets = primitive.get("targets", [])
-        morphs = [self._floats(target["POSITION"], "VEC3", count=count) for target in targets]
         joints, shares = attribute("JOINTS_0", "VEC4"), attribute("WEIGHTS_0", "VEC4")
         if joints is not None and shares is not None:
             total = shares.sum(1, keepdims=True)
@@ -279,8 +277,6 @@ class _Reader:
             node=-1,
             joints=None if joints is None or shares is None else joints.astype(np.int32),
             weights=shares,
-            morphs=np.stack(morphs) if morphs else None,
-            rest_weights=np.zeros(len(morphs)) if weights is None else np.asarray(weights, dtype=np.float64),
         )
 
     def _triangles(self, primitive: Table, count: int) -> I32:
@@ -358,14 +354,14 @@ class _Reader:
 
     def _channel(self, target: Table, sampler: Table) -> Channel | None:
         node, path = target.get("node"), target["path"]
-        if node is None or path not in ("translation", "rotation", "scale", "weights"):
-            return None  # of an extension
+        if node is None or path not in ("translation", "rotation", "scale"):
+            return None  # morph targets, or of an extension
         times = self._floats(sampler["input"], "SCALAR")[:, 0].astype(np.float64)
         if not len(times) or (np.diff(times) < 0).any() or times[0] < 0:
             raise ValueError("the times of an animation must ascend from 0")
-        values = self._floats(sampler["output"], {"rotation": "VEC4", "weights": "SCALAR"}.get(path, "VEC3"))
+        values = self._floats(sampler["output"], "VEC4" if path == "rotation" else "VEC3")
         kind = sampler.get("interpolation", "LINEAR")
-        shape = (len(times), 3 if kind == "CUBICSPLINE" else 1, -1 if path == "weights" else values.shape[1])
+        shape = (len(times), 3 if kind == "CUBICSPLINE" else 1, values.shape[1])
         return Channel(_index(node), path, kind, times, values.astype(np.float64).reshape(shape))
 
 
@@ -390,15 +386,13 @@ def _node(table: Table) -> Node:
     return Node(_row(table.get("translation", (0, 0, 0)), 3), turn, scale)
 
 
-def _bound(binding: Binding, node: int, weights: ArrayLike | None, skin: Skin | None) -> Binding:
-    """A part's binding where it stands. weights: of the node, which go before the mesh's."""
+def _bound(binding: Binding, node: int, skin: Skin | None) -> Binding:
+    """A part's binding where it stands."""
     if binding.joints is None:
         skin = None
     elif skin is not None and binding.joints.max(initial=0) >= len(skin.joints):
         raise ValueError(f"JOINTS_0 names bones beyond the {len(skin.joints)} there are")
-    count = 0 if binding.morphs is None else len(binding.morphs)
-    rest = binding.rest_weights if weights is None else np.asarray(weights, dtype=np.float64)
-    return replace(binding, node=node, skin=skin, rest_weights=_row(rest if count else (), count))
+    return replace(binding, node=node, skin=skin)
 
 
 def _uv_change(table: Table) -> F64:

@@ -1,4 +1,4 @@
-"""What moves a loaded model: nodes in a tree, keys over time, bones and morph targets. Pure functions of a time.
+"""What moves a loaded model: nodes in a tree, keys over time, and bones. Pure functions of a time.
 
 The equations are glTF 2.0's (appendix C for the interpolations, 3.7.3 for skins).
 """
@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from runtime.content.shapes import Shape
 from runtime.records import F32, F64
 
-Path = Literal["translation", "rotation", "scale", "weights"]
+Path = Literal["translation", "rotation", "scale"]
 Interpolation = Literal["LINEAR", "STEP", "CUBICSPLINE"]
 TRIED = 24  # times of an animation at which its extent is looked at
 
@@ -48,13 +48,11 @@ class Binding:
     skin: Skin | None = None
     joints: NDArray[np.int32] | None = None  # (v, 4) indices into the skin's joints
     weights: F32 | None = None  # (v, 4) sum 1
-    morphs: F32 | None = None  # (m, v, 3) offsets of positions
-    rest_weights: F64 | None = None  # (m,)
 
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """Keys of one node's translation, rotation, scale or morph weights."""
+    """Keys of one node's translation, rotation or scale."""
 
     node: int
     path: Path
@@ -128,8 +126,6 @@ class Rig:
             world[number] = local if node.parent < 0 else world[node.parent] @ local
         placed = []
         for shape, binding in zip(shapes, self.bindings, strict=True):
-            if binding.morphs is not None:
-                shape = _morphed(shape, binding, values.get((binding.node, "weights")))
             if binding.skin is not None:
                 shape = _bent(shape, binding, _bones(binding.skin, world))
             placed.append((shape, np.eye(4) if binding.skin is not None else world[binding.node]))
@@ -138,15 +134,6 @@ class Rig:
     def times_s(self) -> list[float]:
         """Times over which its extent is looked at."""
         return [self.duration_s * step / TRIED for step in range(TRIED + 1)] if self.moves else [0.0]
-
-
-def _morphed(shape: Shape, binding: Binding, weights: F64 | None) -> Shape:
-    """weights: (m,) of an animation; others than there are targets, or none: those at rest."""
-    assert binding.morphs is not None and binding.rest_weights is not None
-    if weights is None or len(weights) != len(binding.morphs):
-        weights = binding.rest_weights
-    points = shape.positions_m + np.tensordot(weights.astype(np.float32), binding.morphs, axes=1)
-    return replace(shape, positions_m=points)
 
 
 def _bent(shape: Shape, binding: Binding, bones: F64) -> Shape:

@@ -99,17 +99,3 @@ def bending_bar(path: Path) -> Path:
         skins=[{"joints": [1, 2], "inverseBindMatrices": bound}],
         animations=[{"samplers": [sampler], "channels": [{"sampler": 0, "target": {"node": 2, "path": "rotation"}}]}],
     )
-
-
-def growing_square(path: Path) -> Path:
-    """A square whose upper edge rises by 3 in a second: a morph target."""
-    b = Buffer()
-    rise = [[0, 0, 0], [0, 0, 0], [0, 3, 0], [0, 3, 0]]
-    primitive = {
-        "attributes": {"POSITION": b.add(SQUARE)},
-        "indices": b.add(SQUARE_FACES, np.uint16),
-        "targets": [{"POSITION": b.add(rise)}],
-    }
-    sampler = {"input": b.add([0.0, 1.0]), "output": b.add([0.0, 1.0])}
-    channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
-    return b.write(path, primitive, animations=[{"samplers": [sampler], "channels": [channel]}])

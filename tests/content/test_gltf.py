@@ -1,4 +1,4 @@
-"""glTF: what moves (nodes, bones, morph targets), materials as OBJ has them, and what a hostile file is told."""
+"""glTF: what moves (nodes, bones), materials as OBJ has them, and what a hostile file is told."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from runtime.content.rig import Channel, slerp
 from runtime.errors import InputError
 from runtime.optics.stack import PanelStack
 from tests.content.conftest import panel_view
-from tests.content.gltf_files import SQUARE, SQUARE_FACES, Buffer, bending_bar, growing_square, moving_square
+from tests.content.gltf_files import SQUARE, SQUARE_FACES, Buffer, bending_bar, moving_square
 
 EYE = (0.6, 0.0, 0.0)
 
@@ -98,13 +98,6 @@ def test_a_bent_model_is_drawn_where_its_vertices_are(tmp_path: Path, context: A
     tip = project(view.pixels_from_stack, np.array([[0.0, -0.04, 0.04]]))[0][0]
     assert columns.min() == pytest.approx(tip[0], abs=2)
     assert np.abs(rows[columns < columns.min() + 3].mean() - tip[1]) < 3
-
-
-def test_a_morph_target_moves_its_vertices(tmp_path: Path) -> None:
-    data = load_mesh(growing_square(tmp_path / "a.gltf"))
-    half = data.rig.posed([data.parts[0].shape], 0.5)[0][0].positions_m
-    assert half[:, 1].tolist() == [-1, -1, 2.5, 2.5]
-    assert data.high[1] > 3.5  # the box holds what it grows to
 
 
 def test_a_still_scene_is_as_the_mesh_library_reads_it(tmp_path: Path) -> None:

@@ -46,7 +46,7 @@ from runtime.sensor.recording import RecordingWriter
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import ReplayDriver
 from runtime.support.untrusted_input import parsed_json
-from tests.content.gltf_files import bending_bar, growing_square, moving_square
+from tests.content.gltf_files import bending_bar, moving_square
 from tests.content.test_hostile import PNG_URI, gltf, textured
 from tests.panels.edids import block
 from tests.sensor.fake_usb import encode
@@ -236,10 +236,10 @@ def gltfs() -> list[bytes]:
 
 
 def rigs() -> list[bytes]:
-    """Nodes that move, bones, morph targets."""
+    """Nodes that move, bones."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.gltf"
-        return [make(path).read_bytes() for make in (moving_square, bending_bar, growing_square)]
+        return [make(path).read_bytes() for make in (moving_square, bending_bar)]
 
 
 def mesh(path: Path) -> object:
