@@ -7,7 +7,7 @@ import numpy as np
 from model_export.data import endless_pairs
 from runtime.model.chain import chain_modes
 from runtime.model.contract import Contract
-from runtime.model.transfer import FULL
+from runtime.model.targets import FULL
 from runtime.optics.malus import phase_from_intensity
 from runtime.records import F32
 

@@ -18,7 +18,7 @@ import onnxruntime
 from model_export.stress import ORDINARY, Feeds, picture_cases, spectral_cases
 from runtime.errors import InputError, one_line
 from runtime.model.contract import VERSION, Contract, parse_contract
-from runtime.model.transfer import FULL
+from runtime.model.targets import FULL
 from runtime.support import untrusted_input
 from runtime.support.progress import tracked
 

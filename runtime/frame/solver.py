@@ -15,7 +15,7 @@ from runtime.errors import ContentFailure, ContextLost, ModelFailure
 from runtime.frame.buffers import LayerBuffers
 from runtime.frame.policy import FramePolicy, SolutionKey
 from runtime.frame.run_state import RunCell, RunState
-from runtime.model.flat import flat_layers
+from runtime.model.assembly import flat_layers
 from runtime.model.job import Part
 from runtime.model.trim import Savings
 from runtime.optics.pupil import configured_sigma_mm

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from runtime.model.reprojection import NEUTRAL
-from runtime.model.transfer import SUBCODE, phase_codes, pre_emphasised
+from runtime.model.targets import SUBCODE, phase_codes, pre_emphasised
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import U8, Layers, pixels_of
@@ -30,7 +30,7 @@ class Shared:
     """Both eyes see one picture."""
 
     picture: U8  # (h, w, 4) RGBA of the whole centre panel
-    emphasis: float  # how strongly it is sharpened (`transfer.pre_emphasised`)
+    emphasis: float  # how strongly it is sharpened (`targets.pre_emphasised`)
 
 
 Rest = Uniform | Shared  # beside a window: the outer panels are even, the centre panel carries it
@@ -161,3 +161,17 @@ def _fill(layer: U8, area: PixelRect, codes: Sequence[int]) -> None:
     """One colour in a part of an RGBA layer; whole pixels at a time, which is many times as fast as bytes."""
     pixel = np.array([*codes, 255], np.uint8).view(np.uint32)
     layer.view(np.uint32)[area.v0 : area.v1, area.u0 : area.u1, 0] = pixel
+
+
+def flat_layers(image: U8, stack: PanelStack) -> U8:
+    """(N, h, w, 4) layers that show a picture (h, w, 4), drawn on the middle panel's raster, to every eye."""
+    middle = stack.count // 2
+    layers = np.full((stack.count, stack.height_px, stack.width_px, 4), 255, np.uint8)
+    # On the second branch the sum is at least one panel's range: the other panels share it, and the middle
+    # one carries the picture.
+    even = 255 // (stack.count - 1)
+    layers[..., :3] = even
+    phase = cv2.LUT(cv2.cvtColor(image, cv2.COLOR_RGBA2RGB), phase_codes(2))
+    rest = np.clip((phase + SUBCODE // 2) // SUBCODE - even * (stack.count - 1), 0, 255).astype(np.uint8)
+    layers[middle, ..., :3] = rest
+    return layers

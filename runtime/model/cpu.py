@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from runtime.model.assembly import ArrayAssembly
-from runtime.model.channels import without_alpha
 from runtime.model.compiled.joint import INTENSITY, JointState, fill, rays_of
 from runtime.model.compiled.panels import Panels, show_panels
 from runtime.model.contract import Contract, Step
@@ -17,8 +16,7 @@ from runtime.model.job import Picture
 from runtime.model.reprojection import CENTRE, NEUTRAL, OUTER, START, coarser
 from runtime.model.resample import buffer, resample
 from runtime.model.steps import Problem
-from runtime.model.transfer import FULL, SUBCODE, phase_codes
-from runtime.model.wanted import Pictures, fill_targets
+from runtime.model.targets import FULL, SUBCODE, Pictures, fill_targets, phase_codes, without_alpha
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, I16, U8

@@ -11,14 +11,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from runtime.model.channels import without_alpha
 from runtime.model.compiled.joint import INTENSITY, JointState, fill, rays_of
 from runtime.model.compiled.loops import TILE
 from runtime.model.compiled.panels import show_panels
 from runtime.model.contract import Step
 from runtime.model.reprojection import CENTRE, reprojection
 from runtime.model.steps import PLACES
-from runtime.model.transfer import SUBCODE
+from runtime.model.targets import SUBCODE, without_alpha
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_raster, stack_from_eye

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from runtime.config import ModelSettings
 from runtime.errors import InputError
-from runtime.model.allocator import keep_freed_memory
 from runtime.model.base import Prediction, Predictor
 from runtime.optics.stack import PanelStack
+from runtime.support.memory import keep_freed_memory
 
 __all__ = ["SHIPPED", "Prediction", "Predictor", "load_predictor", "model_path"]
 

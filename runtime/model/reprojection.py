@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from runtime.model.resample import target_from_source
-from runtime.model.transfer import FULL, SUBCODE
+from runtime.model.targets import FULL, SUBCODE
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen, layer_pixels_from_seen
 from runtime.records import F64

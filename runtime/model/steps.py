@@ -15,7 +15,7 @@ import numpy as np
 
 from runtime.model.assembly import Assembly
 from runtime.model.chain import ChainFrame, ColumnLaw
-from runtime.model.compiled.fade import fade_codes
+from runtime.model.compiled.passes import fade_codes
 from runtime.model.contract import Contract, Places, Step
 from runtime.model.fade import Fade
 from runtime.model.job import Picture

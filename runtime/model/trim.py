@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from runtime.model.channels import is_grey
 from runtime.model.job import Job, Part, Picture
+from runtime.model.targets import is_grey
 from runtime.optics.rect import PixelRect, union
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8

@@ -65,7 +65,7 @@ def extrapolate_border(images: Sequence[U8], shown: Sequence[Shown], *, rows: sl
     if not known.any():
         return
     pixels = [image.view(np.uint32)[..., 0] for image in images]
-    from runtime.model.compiled.unseen import extrapolate_rows  # noqa: PLC0415 - imports numba
+    from runtime.model.compiled.passes import extrapolate_rows  # noqa: PLC0415 - imports numba
 
     extrapolate_rows(*pixels, *shown[0], *shown[1], rows.start, columns.start, columns.stop)
     there = np.flatnonzero(known)

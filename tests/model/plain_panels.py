@@ -12,7 +12,7 @@ import pytest
 import runtime.model.cpu
 from runtime.model.compiled.panels import Panels, show_panels
 from runtime.model.reprojection import CENTRE, EYES, FRONT, OUTER, REAR, START, reprojection
-from runtime.model.transfer import FULL, SLOPE_FLOOR, SUBCODE
+from runtime.model.targets import FULL, SLOPE_FLOOR, SUBCODE
 from runtime.optics.rect import PixelRect
 from runtime.records import F32, F64, I16, U8
 from tests.model.exact import exact_resample

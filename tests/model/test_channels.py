@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from runtime.config import ModelSettings
-from runtime.model.channels import is_grey
 from runtime.model.job import Job
 from runtime.model.predictor import load_predictor
+from runtime.model.targets import is_grey
 from runtime.model.trim import Savings, Scene, trim
 from runtime.optics.stack import PanelStack
 from runtime.records import U8

@@ -16,14 +16,13 @@ from runtime.config import ModelSettings
 from runtime.evaluation.displayed import displayed, expected_db
 from runtime.model import compiled
 from runtime.model.compiled import along, passes, warp
-from runtime.model.compiled.fade import fade_codes
 from runtime.model.compiled.loops import TILE
 from runtime.model.compiled.panels import Panels, warm_up
-from runtime.model.compiled.unseen import extrapolate_rows
+from runtime.model.compiled.passes import extrapolate_rows, fade_codes
 from runtime.model.predictor import SHIPPED, load_predictor
 from runtime.model.reprojection import CENTRE, FRONT, OUTER, REAR
 from runtime.model.still import solve_still
-from runtime.model.transfer import FULL, SUBCODE
+from runtime.model.targets import FULL, SUBCODE
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.records import F32, F64, U8

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from runtime.config import ModelSettings
-from runtime.model.compiled.fade import fade_codes
+from runtime.model.compiled.passes import fade_codes
 from runtime.model.fade import Fade
 from runtime.model.job import Job, Part
 from runtime.model.predictor import load_predictor

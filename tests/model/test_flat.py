@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from runtime.model.flat import flat_layers
-from runtime.model.transfer import FULL, SUBCODE, phase_codes, pre_emphasised
+from runtime.model.assembly import flat_layers
+from runtime.model.targets import FULL, SUBCODE, phase_codes, pre_emphasised
 from runtime.optics.malus import intensity_from_phase
 from runtime.optics.stack import PanelStack
 

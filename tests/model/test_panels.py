@@ -7,7 +7,7 @@ import pytest
 
 from runtime.model.compiled.panels import Panels
 from runtime.model.reprojection import CENTRE, FRONT, LEAST_SPREAD_PX, MAX_SPREAD_PX, OUTER, REAR, START
-from runtime.model.transfer import FULL, SLOPE_FLOOR, SUBCODE
+from runtime.model.targets import FULL, SLOPE_FLOOR, SUBCODE
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from tests.model.scenes import eyes

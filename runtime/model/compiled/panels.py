@@ -14,15 +14,13 @@ import cv2
 import numpy as np
 
 from runtime.model.compiled.along import ANYWHERE_PX, EDGE_PX, new_layout, work_row, work_tiles
-from runtime.model.compiled.fade import fade_codes
 from runtime.model.compiled.joint import JointState, rays_of
 from runtime.model.compiled.loops import PIECE, numbers_of
-from runtime.model.compiled.passes import blur, close_centre, correct, show
-from runtime.model.compiled.unseen import extrapolate_rows
+from runtime.model.compiled.passes import blur, close_centre, correct, extrapolate_rows, fade_codes, show
 from runtime.model.compiled.warp import warped
 from runtime.model.reprojection import CENTRE, EYES, FRONT, MAX_SPREAD_PX, OUTER, REAR, START, reprojection, spreads
 from runtime.model.resample import buffer
-from runtime.model.transfer import FULL, SUBCODE
+from runtime.model.targets import FULL, SUBCODE
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F32, F64, I16, U8

@@ -7,7 +7,7 @@ from numba import njit
 
 from runtime.model.compiled.along import sample_or
 from runtime.model.compiled.loops import OPTIONS, PASS, TILE, U
-from runtime.model.transfer import SLOPE_FLOOR
+from runtime.model.targets import SLOPE_FLOOR
 
 WHOLE = 4096  # of a weight, in 16 bits
 FLOOR = np.float32(SLOPE_FLOOR)
@@ -290,3 +290,41 @@ def show(panel, layer, v0, u0, width, first, last, channels, bits):  # pragma: n
             for u in range(width):
                 code = (np.int32(panel[line, U(u)]) + half) >> bits
                 layer[row, U(u) + begin] = _pixel(code, code, code)
+
+
+@njit(**PASS)
+def fade_codes(codes, weights, start, channels):  # pragma: no cover
+    """codes (rows, numbers) towards `start`, as far as weights (rows or 1, pixels) are below 1; in place."""
+    one, half, end = np.float32(1), np.float32(0.5), np.float32(start)
+    for v in range(codes.shape[0]):
+        row = min(v, weights.shape[0] - 1)
+        for u in range(weights.shape[1]):
+            weight = weights[row, u]
+            if weight < one:
+                rest = end * (one - weight) + half
+                for k in range(u * channels, (u + 1) * channels):
+                    codes[v, k] = np.int16(np.int32(np.float32(codes[v, k]) * weight + rest))
+
+
+@njit(**PASS)
+def extrapolate_rows(left, right, left_first, left_last, right_first, right_last, v0, start, stop):  # pragma: no cover
+    """As `runtime.model.unseen.extrapolate_border`, of rows from v0 on that a picture shows a part of: RGBA (rows,
+    pixels) uint32, of which pixels start to stop are drawn."""
+    for row in range(left_first.shape[0]):
+        a, b, c, d = left_first[row], left_last[row], right_first[row], right_last[row]
+        if b <= a and d <= c:
+            continue
+        v = row + v0
+        for k in range(c, d):
+            if k < a or k >= b:
+                left[v, k] = right[v, k]
+        for k in range(a, b):
+            if k < c or k >= d:
+                right[v, k] = left[v, k]
+        by_left, by_right = b > a and (d <= c or a <= c), b > a and (d <= c or b >= d)
+        begin, low = (a, left[v, a]) if by_left else (c, right[v, c])
+        end, high = (b, left[v, b - 1]) if by_right else (d, right[v, d - 1])
+        for k in range(start, begin):
+            left[v, k], right[v, k] = low, low
+        for k in range(end, stop):
+            left[v, k], right[v, k] = high, high

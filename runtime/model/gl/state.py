@@ -28,7 +28,7 @@ from runtime.model.gl.programs import Image, Passes
 from runtime.model.job import Picture
 from runtime.model.reprojection import CENTRE, FRONT, NEUTRAL, OUTER, REAR, START, coarser, reprojection, spreads
 from runtime.model.steps import Problem
-from runtime.model.transfer import phase_codes
+from runtime.model.targets import phase_codes
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, I16, U8, Layers
 from runtime.support.gl import DrawnPicture, finish

@@ -16,7 +16,7 @@ from runtime.model.chain import chain_modes
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.model.session import ModelSession
 from runtime.model.still import solve_still
-from runtime.model.transfer import FULL
+from runtime.model.targets import FULL
 from runtime.model.unrolled import UnrolledPredictor
 from runtime.optics.stack import PanelStack
 from runtime.records import F32, F64, U8

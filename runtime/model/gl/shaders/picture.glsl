@@ -1,4 +1,4 @@
-// A picture of 8-bit codes, sharpened as `transfer.pre_emphasised` does it.
+// A picture of 8-bit codes, sharpened as `targets.pre_emphasised` does it.
 uniform ivec2 origin;       // of the box, in the picture
 uniform ivec2 box;          // its size
 uniform float emphasis;

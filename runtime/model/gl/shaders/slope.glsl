@@ -1,6 +1,6 @@
 // A ray weighs by the slope of sin^2 at the phase sum that is wanted of it: before white and black that is
 // level, so that errors there are not seen.
-const float FLOOR = 0.25;   // the least weight, as `transfer.SLOPE_FLOOR`
+const float FLOOR = 0.25;   // the least weight, as `targets.SLOPE_FLOOR`
 
 struct Weighed {
     vec4 lacks, slope;      // what an eye lacks, times its weight; the weight
