@@ -1,16 +1,19 @@
-"""Where panels' pixels lie on each other, as an eye sees them in line; and the panels' names and units."""
+"""Where panels lie on each other, as an eye sees them in line, and what is seen through all; panels' names, units."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import ceil, floor
 
 import numpy as np
 
 from runtime.model.resample import target_from_source
 from runtime.model.targets import FULL, SUBCODE
+from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen, layer_pixels_from_seen
+from runtime.optics.views import relative_scale_shift
 from runtime.records import F64
 
 EYES = (0, 1)  # left, right
@@ -20,6 +23,9 @@ START = FULL // 2  # of an outer panel, sixteenths of a code: the middle of its 
 NEUTRAL = (START + SUBCODE // 2) // SUBCODE  # the same in 8-bit codes, rounded as what is shown is
 MAX_SPREAD_PX = 8.0
 LEAST_SPREAD_PX = 0.5  # of an outer panel's picture: below, care for unsure eyes costs more time than it gains
+PAD_PX = 2  # of what is visible
+ALIGN_PX = 8  # boxes begin and end at multiples of this, so that a half or a quarter of them is whole
+LEAST_PX = 32
 
 
 def reprojection(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: F64, *, of: int, on: int) -> F64:
@@ -62,3 +68,49 @@ def coarser(raster: PlaneRaster, reduction: int) -> PlaneRaster:
         width_px=width,
         height_px=height,
     )
+
+
+def visible_boxes(eyes_m: F64, stack: PanelStack) -> tuple[PixelRect, ...]:
+    """For each panel the pixels on rays of either eye (2, 3) that cross every panel, a little padded.
+
+    Where an eye sees nothing through all panels, a small box in the middle: there is nothing to solve.
+    """
+    middle = stack.count // 2
+    half = np.array([stack.width_m, stack.height_m]) / 2
+    lows, highs = [], []
+    for eye_m in eyes_m:
+        per_panel = [
+            [corner * scale + shift for corner in (-half, half)]
+            for scale, shift in (
+                relative_scale_shift(eye_m, from_x_m=x_m, to_x_m=stack.x_m[middle]) for x_m in stack.x_m
+            )
+        ]
+        lows.append(np.max([low for low, _ in per_panel], axis=0))
+        highs.append(np.min([high for _, high in per_panel], axis=0))
+    low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+    boxes = []
+    for x_m in stack.x_m:
+        corners = [
+            corner * scale + shift
+            for eye_m in eyes_m
+            for scale, shift in (relative_scale_shift(eye_m, from_x_m=stack.x_m[middle], to_x_m=x_m),)
+            for corner in (low, high)
+        ]
+        boxes.append(_box(np.min(corners, axis=0), np.max(corners, axis=0), stack))
+    return tuple(boxes)
+
+
+def _box(low_m: F64, high_m: F64, stack: PanelStack) -> PixelRect:
+    u0, u1 = _span(low_m[0] / stack.width_m + 0.5, high_m[0] / stack.width_m + 0.5, stack.width_px)
+    v0, v1 = _span(0.5 - high_m[1] / stack.height_m, 0.5 - low_m[1] / stack.height_m, stack.height_px)
+    return PixelRect(u0, v0, u1, v1)
+
+
+def _span(low: float, high: float, size: int) -> tuple[int, int]:
+    first, last = max(0, floor(low * size) - PAD_PX), min(size, ceil(high * size) + PAD_PX)
+    first, last = first // ALIGN_PX * ALIGN_PX, min(size, -(-last // ALIGN_PX) * ALIGN_PX)
+    least = min(LEAST_PX, size)
+    if last - first < least:
+        first = min(max(0, (first + last - least) // 2), size - least)
+        last = first + least
+    return first, last

@@ -20,10 +20,9 @@ from runtime.model.contract import Step
 from runtime.model.cpu import CpuBackend
 from runtime.model.fade import Fade
 from runtime.model.job import Job, Picture
-from runtime.model.reprojection import CENTRE, FRONT, REAR
+from runtime.model.reprojection import CENTRE, FRONT, REAR, visible_boxes
 from runtime.model.session import ModelSession
 from runtime.model.steps import Answer, Problem, SolverBackend, SolverState, run_steps
-from runtime.model.visible import visible_boxes
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import F64, I16, Layers
 from runtime.support.threads import at_once

@@ -9,10 +9,9 @@ from runtime.config import ModelSettings
 from runtime.errors import EyesNotServed, ModelFailure
 from runtime.model.job import Job
 from runtime.model.predictor import load_predictor
-from runtime.model.reprojection import NEUTRAL
+from runtime.model.reprojection import NEUTRAL, visible_boxes
 from runtime.model.sart import SartPredictor
 from runtime.model.still import solve_still
-from runtime.model.visible import visible_boxes
 from runtime.optics.carried import expected_psnrs_db
 from runtime.optics.retina import panel_positions
 from runtime.optics.stack import PanelStack
