@@ -21,8 +21,8 @@ from calib.solve_run import solve_file
 from calib.viewpoints import IPD_M
 from runtime.config import Settings, load_settings
 from runtime.errors import InputError
+from runtime.panels.geometry import Arrow, mounting_of
 from runtime.panels.monitors import Monitor
-from runtime.panels.mounting import Arrow, mounting_of
 from runtime.sensor.registry import DRIVERS
 from runtime.support import untrusted_input
 

@@ -21,13 +21,14 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from runtime.blackbox import messages
-from runtime.clock import NS_PER_S
+from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.errors import InputError, Stopped, one_line
+from runtime.frame.observer import line_of
 from runtime.frame.presenter import Presenter, Refresh
-from runtime.records import F64, SensorFrame
+from runtime.records import F64, RefreshAccount, SensorFrame
 from runtime.sensor import recording_format as fmt
 from runtime.sensor.recording_format import RecordingHeader
+from runtime.support.artifacts import to_json
 from runtime.support.background import Job
 from runtime.support.logs import ROOTS
 from runtime.support.version import version
@@ -46,6 +47,60 @@ LINES_KEPT, STATES_KEPT = 200, 50  # for the operator's page
 FILES_MAX = 20  # in the folder
 PREFIX = "blackbox-"
 ASKED = "asked"
+
+
+LOG, REFRESH, STATE = "/log", "/refresh", "/state"
+# Viewers plot a number wherever it stands; only what they show in a way of its own needs its fields named.
+SCHEMAS: dict[str, dict[str, Any]] = {
+    **fmt.SCHEMAS,
+    LOG: {
+        "title": "foxglove.Log",
+        "type": "object",
+        "properties": {
+            "timestamp": {"type": "object"},
+            "level": {"type": "integer"},
+            "message": {"type": "string"},
+            "name": {"type": "string"},
+        },
+    },
+    REFRESH: {"title": "phasestack.Refresh", "type": "object"},
+    STATE: {"title": "phasestack.State", "type": "object"},
+}
+
+
+def refresh_message(account: RefreshAccount) -> bytes:
+    """A refresh, as `frames.jsonl` has it, and its latency."""
+    latency_ms = None
+    if account.eyes_m is not None and account.capture_ns:
+        latency_ms = round((account.photon_ns - account.capture_ns) / NS_PER_MS, 4)
+    return to_json(line_of(account) | {"photon_ns": account.photon_ns, "capture_to_light_ms": latency_ms}).encode()
+
+
+def state_message(name: str, reason: str, *, monotonic_ns: int) -> bytes:
+    """A state as people read it (`degraded: sensor, panel`), taken apart."""
+    plain, _, missing = name.partition(": ")
+    parts = missing.split(", ") if missing else []
+    return to_json({"monotonic_ns": monotonic_ns, "state": plain, "missing": parts, "reason": reason}).encode()
+
+
+def log_message(record: logging.LogRecord) -> bytes:
+    """A log line."""
+    seconds, nanoseconds = divmod(round(record.created * NS_PER_S), NS_PER_S)
+    line = {
+        "timestamp": {"sec": seconds, "nsec": nanoseconds},
+        "level": record.levelno // 10,  # Foxglove's levels are Python's by ten
+        "message": text_of(record),
+        "name": record.name,
+    }
+    return to_json(line).encode()
+
+
+def text_of(record: logging.LogRecord) -> str:
+    """A log record's message on one line, with the exception that it is about."""
+    text = record.getMessage()
+    if record.exc_info and record.exc_info[1] is not None:
+        text += f": {type(record.exc_info[1]).__name__}: {record.exc_info[1]}"
+    return one_line(text)
 
 
 class Message(NamedTuple):
@@ -101,8 +156,8 @@ class Recorder(logging.Handler):
             if machine.name != self._state[0]:
                 self._state_changed(machine.name, machine.reason, at_ns)
             self._state, self._state_ns = state, at_ns
-            self._keep(messages.STATE, messages.state(*state, monotonic_ns=at_ns))
-        self._keep(messages.REFRESH, messages.refresh(account), account.frame)
+            self._keep(STATE, state_message(*state, monotonic_ns=at_ns))
+        self._keep(REFRESH, refresh_message(account), account.frame)
         if self._fault is not None and at_ns - self._fault[0] >= AFTER_FAULT_NS:
             kind, self._fault = self._fault[1], None
             self.save(kind)
@@ -119,8 +174,8 @@ class Recorder(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """A log line, on whichever thread logs."""
         line = {"time_s": round(record.created, 3), "level": record.levelname.lower()}
-        self._lines.append(line | {"text": messages.text_of(record)})
-        self._keep(messages.LOG, messages.log(record))
+        self._lines.append(line | {"text": text_of(record)})
+        self._keep(LOG, log_message(record))
 
     def _keep(self, topic: str, data: bytes, sequence: int = 0) -> None:
         assert self._presenter is not None
@@ -213,7 +268,7 @@ def write_file(folder: Path, kind: str, kept: list[Message], header: RecordingHe
             for message in kept:
                 topic = message.topic
                 if topic not in channels:
-                    schema = messages.SCHEMAS[topic]
+                    schema = SCHEMAS[topic]
                     number = writer.register_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
                     channels[topic] = writer.register_channel(topic, "json", number)
                 writer.add_message(channels[topic], message.wall_ns, message.data, message.wall_ns, message.sequence)

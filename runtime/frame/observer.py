@@ -16,13 +16,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from runtime.clock import NS_PER_S
 from runtime.content.base import ContentSource
 from runtime.errors import ContextLost
 from runtime.evaluation.contact_sheet import Moment
 from runtime.evaluation.displayed import EyeViews, displayed
 from runtime.frame.presenter import Refresh
 from runtime.frame.solver_host import SolverHost
-from runtime.frame.truth import TrueEyes
 from runtime.optics.alignment import shown_layers
 from runtime.optics.carried import carried_db, light_psnrs_db
 from runtime.optics.pupil import PUPIL_SIGMA_MM
@@ -44,6 +44,48 @@ LINE = (
     "solution", "solved_for_m", "solution_age_ms", "true_eyes_m", "inference", "presented", "stage_ms", "skew_ms",
 )  # fmt: skip
 Pictures = dict[str, tuple[U8, U8]]  # of both eyes: `solved`, `used`, `true`
+
+
+GAP_NS = NS_PER_S // 5  # a longer gap says nothing of what happened in it
+KEPT = 512
+
+
+class TrueEyes:
+    """The recorded truth at samples' captures, interpolated between them."""
+
+    def __init__(self) -> None:
+        self._known: deque[tuple[int, F64]] = deque(maxlen=KEPT)
+        self._ended = False
+
+    def add(self, capture_ns: int, eyes_m: F64) -> None:
+        """A sample's truth, (2, 3), frame `stack`."""
+        if not self._known or capture_ns > self._known[-1][0]:
+            self._known.append((capture_ns, eyes_m))
+
+    def end(self) -> None:
+        """No more samples will come."""
+        self._ended = True
+
+    def may_come(self, time_ns: int) -> bool:
+        """Whether the truth of an instant is not known yet, and may be once later samples have come."""
+        return bool(self._known) and time_ns > self._known[-1][0] and not self._ended
+
+    def at(self, time_ns: int) -> F64 | None:
+        """(2, 3) at an instant; None: it is not known."""
+        if not self._known or time_ns > self._known[-1][0]:
+            return None
+        after_ns, after_m = self._known[-1]
+        for before_ns, before_m in reversed(self._known):
+            if before_ns <= time_ns:
+                if before_ns == time_ns:
+                    return before_m
+                if after_ns - before_ns > GAP_NS:
+                    return None
+                weight = (time_ns - before_ns) / (after_ns - before_ns)
+                eyes: F64 = (1 - weight) * before_m + weight * after_m
+                return eyes
+            after_ns, after_m = before_ns, before_m
+        return None
 
 
 class Output(Protocol):

@@ -7,23 +7,22 @@ aligned to where the eyes will be at its display time.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from time import perf_counter_ns
 from typing import Any, Protocol
 
 import numpy as np
 
-from runtime.clock import NS_PER_MS, Clock
+from runtime.clock import NS_PER_MS, Clock, SimulatedClock, Stopwatch
 from runtime.errors import EndOfRecording, PanelLost
-from runtime.frame.lateness import Lateness
 from runtime.frame.pacing import Pacer
 from runtime.frame.policy import Flatness, wants_flat
 from runtime.frame.run_state import RunCell
 from runtime.frame.solver import SolverStep
-from runtime.frame.solver_host import SolverHost, still_there
-from runtime.frame.states import Conditions, Part, StateMachine
+from runtime.frame.solver_host import SOLVING_STAGES, SolverHost, still_there
+from runtime.frame.states import Conditions, Lateness, Part, StateMachine
 from runtime.frame.stats import RunStats
-from runtime.frame.timing import SOLVING_STAGES, RefreshTimes
 from runtime.frame.viewer import Viewer
 from runtime.optics.alignment import align
 from runtime.optics.stack import PanelStack
@@ -77,6 +76,37 @@ class Observer(Protocol):
 
     def refreshed(self, refresh: Refresh) -> None:
         """A refresh is complete."""
+
+
+class RefreshTimes:
+    """Laps of one refresh. On a simulated clock each stage takes what the configuration says, and time passes."""
+
+    def __init__(self, clock: Clock, simulated_ms: Mapping[str, float]) -> None:
+        self._simulated = clock if isinstance(clock, SimulatedClock) else None
+        self._simulated_ms = simulated_ms
+        self.stage_ms: dict[str, float] = {}
+        self._watch, self._start_ns = Stopwatch(), perf_counter_ns()
+
+    @property
+    def simulated(self) -> bool:
+        """True where time passes only as the configuration says."""
+        return self._simulated is not None
+
+    def lap(self, stage: str) -> None:
+        """What happened since the last lap was `stage`."""
+        self._watch.lap(stage)
+        if self._simulated is None:
+            self.stage_ms[stage] = self._watch.stage_ms[stage]
+        elif stage not in self.stage_ms:
+            cost_ms = self._simulated_ms.get(stage, 0.0)
+            if stage != "wait":  # waiting passes on the simulated clock by itself
+                self._simulated.advance_ns(round(cost_ms * NS_PER_MS))
+            self.stage_ms[stage] = cost_ms
+
+    def overhead_ms(self) -> float:
+        """The refresh so far, less presenting and waiting; on the machine's clock."""
+        whole_ms = (perf_counter_ns() - self._start_ns) / NS_PER_MS
+        return max(0.0, whole_ms - sum(self._watch.stage_ms.get(stage, 0.0) for stage in ("present", "wait")))
 
 
 class Presenter:

@@ -11,10 +11,10 @@ import numpy as np
 
 from runtime.clock import NS_PER_MS, Clock
 from runtime.frame.solver import SolverStep
-from runtime.frame.timing import SOLVING_STAGES
 from runtime.records import SolveRequest
 
 FIRST_REQUEST = SolveRequest(0, None, "none", 0.0, flat_wanted=True)  # before the first refresh: the flat picture
+SOLVING_STAGES = ("render", "prepare", "inference", "finish")
 COST_GAIN = 0.2  # of the newest solution in the running mean of what one costs
 
 

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S
-from runtime.frame.timing import SOLVING_STAGES, STAGES
+from runtime.frame.solver_host import SOLVING_STAGES
 from runtime.records import RefreshAccount, State
 
 WINDOW = 8192  # values that quantiles are taken over
 NOW_NS = NS_PER_S  # rates "now" are those of the last second
 NOW_KEPT = 1024
+STAGES = ("sensor", "track", *SOLVING_STAGES, "present", "wait")
 OVERHEAD_STAGES = ("sensor", "track")
 
 

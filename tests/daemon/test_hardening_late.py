@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 
 from runtime.clock import NS_PER_S
-from runtime.frame.lateness import Lateness
-from runtime.frame.states import Conditions, judge
+from runtime.frame.states import Conditions, Lateness, judge
 from runtime.records import State
 from tests.frame.fakes import PERIOD_NS, Stage, solution
 

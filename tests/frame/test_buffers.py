@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.frame.buffers import LayerBuffers
+from runtime.frame.solver import LayerBuffers
 
 SHAPE = (3, 4, 5, 4)
 

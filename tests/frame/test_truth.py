@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from runtime.clock import NS_PER_MS
-from runtime.frame.truth import GAP_NS, TrueEyes
+from runtime.frame.observer import GAP_NS, TrueEyes
 
 
 def eyes(y_m: float) -> np.ndarray:

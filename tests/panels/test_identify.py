@@ -20,8 +20,7 @@ from runtime.commands.doctor import doctor, monitors
 from runtime.commands.identify import identify
 from runtime.errors import InputError
 from runtime.panels.card import BARS
-from runtime.panels.geometry import panel_from_screen
-from runtime.panels.mounting import mounting_of
+from runtime.panels.geometry import mounting_of, panel_from_screen
 from tests.panels.edids import block
 from tests.panels.xserver import HEIGHT_PX, WIDTH_PX, XServer
 from tests.waiting import eventually
