@@ -104,14 +104,6 @@ def extents(points_m: F64) -> F64:
     return np.concatenate([values, np.zeros(3 - len(values))])
 
 
-def rotation_rounding_rad(*, second_extent_m: float, magnitude_m: float) -> float:
-    """By how much rounding can turn a fit of points of that second extent and largest coordinate, radians.
-
-    Measured against 50-digit arithmetic: `phasestack stability`.
-    """
-    return float(np.inf) if second_extent_m == 0.0 else 4 * EPSILON * magnitude_m / second_extent_m
-
-
 def fit(sensor_m: F64, stack_m: F64, *, rule: ScaleRule) -> Similarity:
     """The similarity of K >= 3 pairs, (K, 3) each, to the digits that float64 can give.
 
@@ -143,7 +135,7 @@ def _refuse_degenerate(name: str, points_m: F64) -> tuple[float, float]:
         raise Degenerate(f"the {name} points coincide")
     if second <= 4 * EPSILON * magnitude or second <= 1e-13 * first:
         raise Degenerate(f"the {name} points lie on one line: the rotation about it is unknown")
-    bound = rotation_rounding_rad(second_extent_m=second, magnitude_m=magnitude)
+    bound = 4 * EPSILON * magnitude / second  # measured against 50-digit arithmetic: `phasestack stability`
     if bound > ROTATION_BOUND_RAD:
         raise Degenerate(
             f"the {name} points are too thin or too far from the origin for double precision: "

@@ -21,18 +21,14 @@ def rgba_from_rgb(rgb: U8) -> U8:
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA))
 
 
-def plane_metres(x_m: float) -> PlaneRaster:
-    """A plane x = x_m whose `pixels` are metres: u is y, v is -z. For homographies that go by way of a plane."""
-    return PlaneRaster(x_m=x_m, left_m=0.0, top_m=0.0, pitch_u_m=1.0, pitch_v_m=1.0, width_px=1, height_px=1)
-
-
 def image_from_view(image_from_stack: F64, pixels_from_stack: F64, *, x_m: float) -> F64 | None:
     """3x3 picture pixels from a view's pixels by way of the plane x = x_m; None where the view's eye lies in it.
 
     Where picture and view are of the same eye, every plane gives the same matrix; otherwise the plane is where
     the picture hangs.
     """
-    plane = plane_metres(x_m)
+    # Its `pixels` are metres: u is y, v is -z.
+    plane = PlaneRaster(x_m=x_m, left_m=0.0, top_m=0.0, pitch_u_m=1.0, pitch_v_m=1.0, width_px=1, height_px=1)
     plane_from_view = plane_from_pixels(pixels_from_stack, plane)
     return None if plane_from_view is None else image_from_raster(image_from_stack, plane) @ plane_from_view
 

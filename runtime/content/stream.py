@@ -44,8 +44,8 @@ STALLED_S = 2.0  # without a new picture it is reported
 AGAIN_S, AGAIN_MAX_S = 0.5, 8.0  # between attempts; doubles
 
 
-class Feed:
-    """A source that is being read, from when this is made until it is closed or forgotten."""
+class Reader:
+    """The decoding thread, and the newest picture that it has. Holds no source: who forgets that ends this."""
 
     def __init__(self, settings: ContentSettings) -> None:
         """Raises MissingPart without PyAV."""
@@ -54,16 +54,6 @@ class Feed:
         except ImportError:
             raise MissingPart("live pictures need PyAV: pip install av") from None
         av.logging.set_level(av.logging.PANIC)
-        self.reader = Reader(settings)
-        threading.Thread(target=self.reader.run, name="stream", daemon=True).start()
-        # A scene that was skipped while it was loaded is dropped, and its thread ends with it.
-        self.close = weakref.finalize(self, self.reader.ending.set)
-
-
-class Reader:
-    """The decoding thread, and the newest picture that it has. Holds no Feed: who forgets that ends this."""
-
-    def __init__(self, settings: ContentSettings) -> None:
         self._url, self._options = settings.scene, settings.stream_options
         # A password must not be in the status, nor in a log.
         self.shown = re.sub(r"//[^/@]*@", "//", self._url)
@@ -147,40 +137,43 @@ def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
     layout = layout_of(Path(re.sub(r"[?#].*", "", url)), file.settings)
     if layout.kind == "rgbd":
         raise InputError("content", "layout", "rgbd is not for live pictures")
-    feed = Feed(file.settings)
-    feed.reader.first.wait(FIRST_PICTURE_S)
-    return lambda context: LiveSource(feed, layout=layout, file=file)
+    source = LiveSource(Reader(file.settings), layout=layout, file=file)
+    source.reader.first.wait(FIRST_PICTURE_S)
+    return lambda context: source
 
 
 class LiveSource(ScreenSource):
-    """The newest picture of a feed."""
+    """The newest picture that a reader has, from when this is made until it is closed or forgotten."""
 
-    def __init__(self, feed: Feed, *, layout: Layout, file: SceneFile) -> None:
+    def __init__(self, reader: Reader, *, layout: Layout, file: SceneFile) -> None:
         super().__init__(layout=layout, file=file)
-        self._feed, self._reader = feed, feed.reader
+        self.reader = reader
         self._number, self._newest = 0, np.empty((0, 0, 4), np.uint8)  # that is shown
         self._looked_ns: int | None = None
-        self.info = ContentInfo(name=feed.reader.shown, moving=True, background=file.background)
+        self.info = ContentInfo(name=reader.shown, moving=True, background=file.background)
+        threading.Thread(target=reader.run, name="stream", daemon=True).start()
+        # A scene that was skipped while it was loaded is dropped, and its thread ends with it.
+        weakref.finalize(self, reader.ending.set)
 
     @property
     def problem(self) -> str:
-        if self._reader.problem:
-            return f"{self._reader.shown}: {self._reader.problem}"
-        silent_s = (time.monotonic_ns() - self._reader.arrived_ns) / NS_PER_S
-        return f"{self._reader.shown}: no new picture for {silent_s:.0f} s" if silent_s > STALLED_S else ""
+        if self.reader.problem:
+            return f"{self.reader.shown}: {self.reader.problem}"
+        silent_s = (time.monotonic_ns() - self.reader.arrived_ns) / NS_PER_S
+        return f"{self.reader.shown}: no new picture for {silent_s:.0f} s" if silent_s > STALLED_S else ""
 
     def revision(self, *, time_ns: int) -> int:
         # Both eyes of one frame see one picture: two would be depth that isn't there.
         if time_ns != self._looked_ns:
             self._looked_ns = time_ns
-            if self._reader.newest is not None:
-                self._number, self._newest = self._reader.newest
+            if self.reader.newest is not None:
+                self._number, self._newest = self.reader.newest
         return self._number
 
     def picture(self, number: int) -> U8:
         if not number:
-            raise ContentFailure(f"{self._reader.shown}: {self._reader.problem}")
+            raise ContentFailure(f"{self.reader.shown}: {self.reader.problem}")
         return self._newest
 
     def close(self) -> None:
-        self._feed.close()
+        self.reader.ending.set()
