@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import logging
 import math
+import queue
+import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -18,7 +21,6 @@ from runtime.records import U8, U16, Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
 from runtime.sensor.device_clock import DeviceClock
 from runtime.sensor.openni2_library import load
-from runtime.sensor.persistent_thread import PersistentThread, borrowed, give_back
 
 SERIAL_PROPERTY = 3
 DEPTH_1_MM, DEPTH_100_UM, RGB888, GRAY8 = 100, 101, 200, 202
@@ -28,6 +30,9 @@ THREADS_STOP_S = 0.5  # fifteen periods of a file's threads: on a busy machine t
 DRAIN_MAX = 32  # frames that are passed over in one call: a queue can't keep us
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
+_idle: list[_PersistentThread] = []
+_lock = threading.Lock()
 
 
 class _Picture(NamedTuple):
@@ -39,7 +44,7 @@ class _Picture(NamedTuple):
 class OpenNI2Driver(Sensor):
     """Depth in millimetres and colour, registered by the camera where it can.
 
-    The library is called on a thread that outlives whoever reads (`persistent_thread`).
+    The library is called on a thread that outlives whoever reads (`_PersistentThread`).
     """
 
     name = "openni2"
@@ -48,7 +53,7 @@ class OpenNI2Driver(Sensor):
     def __init__(self, settings: SensorSettings, clock: Clock) -> None:
         """settings.source: `demo` or empty for the only camera, a serial number, a device URI, or a .oni."""
         self._settings, self._clock = settings, clock
-        self._thread: PersistentThread | None = None  # while it is open
+        self._thread: _PersistentThread | None = None  # while it is open
         self._openni: Any = None
         self._device: Any = None
         self._streams: dict[str, Any] = {}
@@ -59,7 +64,7 @@ class OpenNI2Driver(Sensor):
 
     def open(self) -> None:
         self.close()
-        self._thread = thread = borrowed("openni2")
+        self._thread = thread = _borrowed("openni2")
         try:
             thread(self._open)
         except BaseException:
@@ -210,7 +215,7 @@ class OpenNI2Driver(Sensor):
         thread, self._thread = self._thread, None
         if thread is not None:
             thread(self._close)
-            give_back(thread)
+            _give_back(thread)
 
     def _close(self) -> None:
         streams, self._streams = self._streams, {}
@@ -266,3 +271,43 @@ def _pixels(frame: Any) -> U8 | U16:
     if channels == 1:
         return np.repeat(rows[..., None], 3, axis=2)
     return rows.reshape(height, width, 3).copy()
+
+
+class _PersistentThread:
+    """Calls on a thread that lives as long as the process, one at a time; whoever calls waits for it.
+
+    OpenNI2 asks, on its way out, after every thread that called it: of one that has ended and whose stack the system
+    took back, that is a crash. A `ThreadPoolExecutor`'s would not do: Python ends them before that, and waits for one
+    that hangs in a call.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._asked: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = queue.SimpleQueue()
+        threading.Thread(target=self._run, name=name, daemon=True).start()
+
+    def __call__(self, call: Callable[[], T]) -> T:
+        """The answer; raises what the call raises."""
+        answer: Future[T] = Future()
+        self._asked.put((answer, call))
+        return answer.result()
+
+    def _run(self) -> None:
+        while True:
+            answer, call = self._asked.get()
+            try:
+                answer.set_result(call())
+            except BaseException as error:  # it belongs to who asked
+                answer.set_exception(error)
+            del answer, call  # nothing of the last call is kept until the next
+
+
+def _borrowed(name: str) -> _PersistentThread:
+    """A thread that nobody uses; one that hangs in a call is never given back, and another is made."""
+    with _lock:
+        return _idle.pop() if _idle else _PersistentThread(name)
+
+
+def _give_back(thread: _PersistentThread) -> None:
+    """For the next one who asks."""
+    with _lock:
+        _idle.append(thread)

@@ -16,10 +16,9 @@ from runtime.clock import NS_PER_S
 from runtime.errors import InputError
 from runtime.records import Intrinsics, SensorFrame
 from runtime.sensor import recording_format as fmt
-from runtime.sensor.mcap_records import mcap_records
 from runtime.sensor.recording_format import RecordingHeader
 from runtime.support import untrusted_input
-from runtime.support.untrusted_input import LIMITS
+from runtime.support.untrusted_input import LIMITS, MIB
 
 CHUNK_BYTES = 4096  # some 20 eye samples
 INDEX_SHARE = 1.1  # a file with the indices of its chunks, beside without
@@ -178,7 +177,7 @@ class Recording:
             if file.read(len(MAGIC)) != MAGIC:
                 raise InputError(self.path, "", "is not an MCAP recording")
             file.seek(0)
-            yield from mcap_records(file, source=self.path, max_bytes=LIMITS.chunk_bytes)
+            yield from _mcap_records(file, source=self.path, max_bytes=LIMITS.chunk_bytes)
         except InputError:
             raise
         except OSError as error:
@@ -208,3 +207,42 @@ class Recording:
                     parts = {}
             except ValueError as error:
                 raise InputError(self.path, topic, f"malformed message: {error}") from None
+
+
+def _mcap_records(file: IO[bytes], *, source: Path, max_bytes: int) -> Iterator[Any]:
+    """Records in order, those within chunks too, until the footer: what a chunk unpacks to is not taken on trust.
+
+    max_bytes: of one record, and of one chunk unpacked. Raises InputError for a chunk over the limit, and what mcap or
+    an unpacker raises for a damaged file.
+    """
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader, breakup_chunk
+
+    for record in StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=max_bytes).records:
+        if isinstance(record, Chunk):
+            data = _unpacked(record, source=source, max_bytes=max_bytes)
+            yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
+        else:
+            yield record
+
+
+def _unpacked(chunk: Any, *, source: Path, max_bytes: int) -> bytes:
+    """A chunk's records as bytes. Raises InputError over the limit, else what the unpacker raises."""
+    says: int = chunk.uncompressed_size
+    room = min(says, max_bytes) + 1  # unpackers take the memory that they are allowed
+    data: bytes = chunk.data
+    if chunk.compression == "lz4":
+        import lz4.frame
+
+        data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=room)
+    elif chunk.compression == "zstd":
+        import zstandard
+
+        with zstandard.ZstdDecompressor(max_window_size=max(1024, max_bytes)).stream_reader(data) as stream:
+            data = stream.read(room)
+    if len(data) > max_bytes:
+        told = f"a chunk of {len(chunk.data)} bytes unpacks to {max(says, len(data)) / MIB:.1f} MiB"
+        raise InputError(source, "", f"{told}; at most {max_bytes / MIB:g}")
+    if len(data) != says:
+        raise ValueError(f"a chunk does not unpack to the {says} bytes that it says")
+    return data

@@ -1,18 +1,41 @@
-"""USB depth cameras: finding, watching and resetting them, and a doctor's view of what is plugged in."""
+"""USB depth cameras and eye trackers that are known: finding and resetting them, and a doctor's view of them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from runtime.errors import MissingPart, SensorLost
-from runtime.sensor.known_devices import BY_ID, KnownDevice
 
 UDEV_RULE = "70-phasestack-sensors.rules"
 SPEEDS = {1: "low speed (1.5 Mbit/s)", 2: "full speed (12 Mbit/s)", 3: "high speed, USB 2 (480 Mbit/s)"}
 SPEEDS |= {4: "SuperSpeed, USB 3 (5 Gbit/s)", 5: "SuperSpeed+, USB 3 (10 Gbit/s)"}
 SUPER_SPEED = 4
+
+
+class KnownDevice(NamedTuple):
+    """One USB device, and the driver of ours that opens it."""
+
+    vendor_id: int
+    product_id: int
+    name: str
+    driver: str
+    needs_usb3: bool = False
+
+
+KNOWN_DEVICES: tuple[KnownDevice, ...] = (
+    KnownDevice(0x045E, 0x02D8, "Microsoft Kinect v2 (Kinect for Windows)", "openni2", needs_usb3=True),
+    KnownDevice(0x045E, 0x02C4, "Microsoft Kinect v2 (Xbox One)", "openni2", needs_usb3=True),
+    KnownDevice(0x1D27, 0x0600, "ASUS Xtion", "openni2"),
+    KnownDevice(0x1D27, 0x0601, "ASUS Xtion / PrimeSense", "openni2"),
+    KnownDevice(0x1D27, 0x0609, "PrimeSense Carmine", "openni2"),
+    KnownDevice(0x2BC5, 0x0401, "Orbbec Astra", "openni2"),
+    KnownDevice(0x2BC5, 0x0403, "Orbbec Astra Pro", "openni2"),
+    KnownDevice(0x2BC5, 0x0407, "Orbbec Astra Mini S", "openni2"),
+    KnownDevice(0x1209, 0x0001, "phasestack eye tracker (pid.codes test number)", "usb-eyes"),
+)
+_BY_ID = {(device.vendor_id, device.product_id): device for device in KNOWN_DEVICES}
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +87,7 @@ def find_devices(backend: Any = None) -> list[UsbDevice]:
 
     try:
         devices: Iterable[Any] = usb.core.find(find_all=True, backend=backend)
-        pairs = [(device, BY_ID.get((device.idVendor, device.idProduct))) for device in devices]
+        pairs = [(device, _BY_ID.get((device.idVendor, device.idProduct))) for device in devices]
     except usb.core.NoBackendError:
         raise MissingPart("libusb is not installed (Debian: apt install libusb-1.0-0)") from None
     except usb.core.USBError as error:

@@ -15,7 +15,7 @@ import pytest
 
 from runtime.config import ServiceSettings, load_settings
 from runtime.daemon.server import GROUP
-from runtime.sensor.known_devices import KNOWN_DEVICES
+from runtime.sensor.usb_devices import KNOWN_DEVICES
 
 ROOT = Path(__file__).parents[2]
 UNITS = ROOT / "systemd"
