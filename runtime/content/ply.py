@@ -61,7 +61,7 @@ def read_header(path: Path) -> Header:
                 order = name
             case ["element", name, number]:
                 field = f"element {untrusted_input.shown(name)}"
-                counts[name] = untrusted_input.whole_from_text(number, least=0, most=1 << 62, source=path, field=field)
+                counts[name] = untrusted_input.whole_from_text(number, source=path, field=field)
             case ["property", "list", _, _, name]:
                 fields += [(name, "list")] if [*counts][-1:] == ["vertex"] else []
             case ["property", kind, name] if kind in TYPES:

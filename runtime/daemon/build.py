@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import sys
 from collections.abc import Callable
@@ -34,7 +35,6 @@ from runtime.sensor.registry import open_sensor
 from runtime.sensor.samples import FindEyes, RecordedSamples, Samples
 from runtime.sensor.worker import SensorWorker
 from runtime.support.gl import offscreen_context
-from runtime.support.memory import gc_frozen
 from runtime.support.priority import PRESENTER_NICENESS, niceness
 from runtime.support.untrusted_input import LIMITS
 
@@ -209,7 +209,10 @@ def build_run(
     if host.recorder is not None:
         host.recorder.watches(presenter, in_stack_frame=in_stack_frame)
     if not simulated:
-        cleanup.enter_context(gc_frozen())
+        # Looking through all that the libraries have made stops every Python thread for several refreshes.
+        gc.collect()
+        gc.freeze()
+        cleanup.callback(gc.unfreeze)
         cleanup.enter_context(niceness(PRESENTER_NICENESS))  # this thread's, once all others have been started
     run = Run(presenter, observer, solver, maker, simulated)
     host.watches(run)

@@ -18,11 +18,9 @@ from runtime.eyes.motions import MOTIONS, observe, path_of, true_eyes
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.recording import recording_to
 from runtime.sensor.recording_format import RecordingHeader
-from runtime.support.untrusted_input import real, whole
 
 SECONDS, RATE_HZ, NOISE_MM = 12.0, 30.0, 3.0
 SECONDS_MAX, NOISE_MAX_MM = 3600.0, 100.0
-RATE_LEAST_HZ, RATE_MOST_HZ = 15.0, 240.0
 
 
 def write_motion(
@@ -36,14 +34,12 @@ def write_motion(
 ) -> dict[str, Any]:
     """Answers what was written. `seed`: of the head's path and of the noise; 0 is the benchmark's own.
 
-    Raises InputError for a motion that is not known, a number out of range, or a file that can't be written.
+    Raises InputError for a motion that is not known, a length out of range, or a file that can't be written.
     """
     if motion not in MOTIONS:
         raise InputError("record", "--motion", f"unknown: {motion!r}; known: {', '.join(MOTIONS)}")
-    rate_hz = real(rate_hz, least=RATE_LEAST_HZ, most=RATE_MOST_HZ, source="record", field="--rate-hz")
-    seconds = real(seconds, least=2 / rate_hz, most=SECONDS_MAX, source="record", field="--seconds")
-    noise_mm = real(noise_mm, least=0.0, most=NOISE_MAX_MM, source="record", field="--noise-mm")
-    seed = whole(seed, least=0, most=(1 << 63) - 1, source="record", field="--seed")
+    if not 2 / rate_hz <= seconds <= SECONDS_MAX:
+        raise InputError("record", "--seconds", f"is {seconds:g}; must be {2 / rate_hz:g} to {SECONDS_MAX:g}")
     way = path_of(seed)
     how = {"seconds": seconds, "rate_hz": rate_hz, "noise_m": noise_mm / 1000}
     observed = observe(motion, **how, seed=1 + seed, path=way)

@@ -318,17 +318,10 @@ class RunObserver:
 def _where(account: RefreshAccount) -> tuple[str, ...]:
     """Where the eyes are in a moment, what they do, and how well that is known."""
     assert account.eyes_m is not None and account.solved_for_m is not None
-    x, y, z = 100 * account.eyes_m.mean(axis=0)
-    where = f"{x:.0f} cm before the panels, {abs(y):.0f} cm to the {'right' if y > 0 else 'left'}, "
-    where += f"{abs(z):.0f} cm {'above' if z > 0 else 'below'} their middle"
-    sure = "" if account.eye_sigma_mm is None else f" to {account.eye_sigma_mm:.1f} mm"
-    line = f"This moment (refresh {account.frame}) is the best of those looked at. The eyes are followed{sure}: {where}"
-    if account.solution_age_ms is None:
-        return (line,)
+    sure = "" if account.eye_sigma_mm is None else f", sure to {account.eye_sigma_mm:.1f} mm"
     moved_mm = 1000 * float(np.linalg.norm((account.eyes_m - account.solved_for_m).mean(axis=0)))
-    after = f"{abs(account.solution_age_ms):.0f} ms {'before' if account.solution_age_ms < 0 else 'after'}"
-    solved = f"This is {after} the instant that the layers were solved for, {moved_mm:.0f} mm from there"
-    return line, f"{solved}; the outer panels were shifted along"
+    line = f"Refresh {account.frame}, the best of those looked at; eyes {account.eyes_label}{sure}"
+    return (f"{line}, {moved_mm:.0f} mm from where the layers were solved for: the outer panels were shifted along",)
 
 
 def _has_picture(refresh: Refresh) -> bool:

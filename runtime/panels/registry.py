@@ -1,4 +1,4 @@
-"""Which panels the settings ask for."""
+"""Which panels the settings ask for, and those without a screen: for replay, tests and `demo`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,32 @@ from runtime.clock import Clock
 from runtime.config import OutputSettings, PanelSettings
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
+from runtime.records import PanelFrame, PresentReport
+from runtime.support.gl_sharing import ShareGroup, shared
 
 if TYPE_CHECKING:
     import moderngl
+
+
+class OffscreenPanels(PanelSink):
+    """Panels that nobody looks at: a frame is taken and not drawn."""
+
+    name = "offscreen"
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._group = shared()
+
+    @property
+    def group(self) -> ShareGroup | None:
+        return self._group
+
+    def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
+        return PresentReport(frame.number, self._clock.now_ns(), 0.0)
+
+    def close(self) -> None:
+        if self._group is not None:
+            self._group.close()
 
 
 def panel_settings(settings: OutputSettings, count: int) -> tuple[PanelSettings, ...]:
@@ -27,6 +50,4 @@ def open_panels(settings: OutputSettings, stack: PanelStack, clock: Clock, conte
         from runtime.panels.window import WindowPanels
 
         return WindowPanels(panel_settings(settings, stack.count), stack, clock, context)
-    from runtime.panels.offscreen import OffscreenPanels
-
     return OffscreenPanels(clock)

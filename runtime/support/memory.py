@@ -1,12 +1,10 @@
-"""Freed memory: kept for the next frame, or back to the system; and a garbage collector that holds nothing up."""
+"""Freed memory: kept for the next frame, or back to the system."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
-import gc
 import sys
-from collections.abc import Iterator
 from functools import cache
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # malloc.h of glibc
@@ -21,20 +19,6 @@ def give_back() -> None:
     """
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
-
-
-@contextlib.contextmanager
-def gc_frozen() -> Iterator[None]:
-    """Within: what there is already is not looked through for garbage.
-
-    Looking through all of what the libraries have made stops every Python thread for several refreshes.
-    """
-    gc.collect()
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
 
 
 @cache

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import errno
 import json
-import math
 import os
 import stat
 from dataclasses import dataclass
@@ -159,52 +158,14 @@ def _whole(digits: str) -> int | float:
     return int(digits) if len(digits) <= 400 else float(digits)
 
 
-def whole(
-    value: Any,
-    *,
-    least: int,
-    most: int,
-    source: str | Path = "",
-    field: str = "",
-) -> int:
-    """A whole number within bounds from JSON: an int, or a float without a fraction. Raises InputError."""
-    # Infinity has no fraction, and is no whole number either.
-    is_float = isinstance(value, float) and math.isfinite(value) and value.is_integer()
-    if not is_float and (isinstance(value, bool) or not isinstance(value, int)):
-        raise InputError(source, field, f"is not a whole number: {shown(value)}")
-    number = int(value)
-    if not least <= number <= most:
-        raise InputError(source, field, f"is {shown(value)}; must be {least} to {most}")
-    return number
-
-
-def whole_from_text(text: str, *, least: int, most: int, source: str | Path, field: str) -> int:
-    """The same from decimal digits. Raises InputError."""
-    stripped = text.strip()
-    digits = stripped[1:] if stripped[:1] in ("-", "+") else stripped
+def whole_from_text(text: str, *, source: str | Path, field: str) -> int:
+    """A whole number, not negative, in decimal digits. Raises InputError."""
     # `isdigit` is true of a superscript two, and `int` takes other scripts' digits.
-    if not (digits.isascii() and digits.isdigit()):
+    if not (text.isascii() and text.isdigit()):
         raise InputError(source, field, f"is not a whole number: {shown(text)}")
-    if len(digits) > DIGITS_MAX:
-        raise InputError(source, field, f"is a number of {len(digits)} digits; must be {least} to {most}")
-    return whole(int(stripped), least=least, most=most, source=source, field=field)
-
-
-def real(
-    value: Any,
-    *,
-    least: float,
-    most: float,
-    source: str | Path = "",
-    field: str = "",
-) -> float:
-    """A finite number within bounds, from JSON. Raises InputError."""
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not is_number or (isinstance(value, float) and not math.isfinite(value)):
-        raise InputError(source, field, f"is not a finite number: {shown(value)}")
-    if not least <= value <= most:
-        raise InputError(source, field, f"is {shown(value)}; must be {least:g} to {most:g}")
-    return float(value)
+    if len(text) > DIGITS_MAX:
+        raise InputError(source, field, f"is a number of {len(text)} digits")
+    return int(text)
 
 
 def within(count: int | float, most: int | float, *, source: str | Path, field: str) -> None:

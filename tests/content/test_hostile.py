@@ -146,7 +146,7 @@ def ply(folder: Path, vertices: Any, faces: Any, form: str = "binary_little_endi
         ("²", 1, "element vertex: is not a whole number: ²"),
         (9, "²", "element face: is not a whole number: ²"),
         ("9" * 5000, 1, "element vertex: is a number of 5000 digits"),
-        (9, "-4", "element face: is -4"),
+        (9, "-4", "element face: is not a whole number: -4"),
     ],
 )
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])

@@ -185,7 +185,7 @@ def test_a_context_that_the_panels_lost_is_made_anew_with_the_solver(
 
 
 def test_where_the_driver_can_t_share_solutions_are_read_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("panels.offscreen", "panels.display"):
+    for module in ("panels.registry", "panels.display"):
         monkeypatch.setattr(f"runtime.{module}.shared", lambda: None)
     with Rig(model=MODEL) as rig:
         rig.refresh_until_solved()

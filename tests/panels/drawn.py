@@ -7,9 +7,9 @@ import numpy as np
 
 from runtime.clock import Clock
 from runtime.config import PanelSettings
-from runtime.panels.offscreen import OffscreenPanels
 from runtime.panels.presentation import FrameTextures, Painter
-from runtime.records import U8
+from runtime.panels.registry import OffscreenPanels
+from runtime.records import U8, PanelFrame, PresentReport
 
 
 class DrawnPanels(OffscreenPanels):
@@ -28,9 +28,12 @@ class DrawnPanels(OffscreenPanels):
             self._painters.append(Painter(context, settings, screen_px=screen, layer_px=size_px))
             self._targets.append(context.framebuffer([context.texture(screen, 4)]))
 
+    def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
+        self._frame = frame
+        return super().present(frame, unchanged=unchanged)
+
     def read_back(self) -> tuple[U8, ...]:
         """The monitors' pictures of the last frame, rear to front: (h, w, 4) RGBA each, top row first."""
-        assert self._frame is not None
         pictures = []
         self._textures.upload(self._frame)
         for index, (target, painter) in enumerate(zip(self._targets, self._painters, strict=True)):

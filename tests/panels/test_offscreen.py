@@ -204,15 +204,6 @@ def test_a_new_solution_is_shown_where_only_its_version_tells_it_from_the_old(si
         assert np.array_equal(codes(sink.read_back()), codes(smooth(version)))
 
 
-def test_an_unchanged_frame_costs_nothing_and_stays(context: moderngl.Context, layers: NDArray[np.uint8]) -> None:
-    sink = offscreen(context, TINY, *(PanelSettings(),) * 3)
-    other = np.zeros_like(layers)
-    sink.present(PanelFrame(0, layers, 0), unchanged=True)  # nothing was shown before: it must be uploaded all the same
-    assert sink.present(PanelFrame(1, other, 1), unchanged=True).number == 1
-    assert np.array_equal(sink.read_back()[0][..., :3], layers[0, ..., :3])
-    sink.close()
-
-
 def test_layers_that_another_thread_left_in_textures_are_shown_as_arrays_are(
     sink: DrawnPanels, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from runtime.errors import InputError
 from runtime.support import untrusted_input
-from runtime.support.untrusted_input import parsed_json, real, whole, whole_from_text
+from runtime.support.untrusted_input import parsed_json, whole_from_text
 
 HANG_S = 20  # on a busy machine; what hangs takes minutes, or for ever
 
@@ -114,19 +114,6 @@ def test_what_is_no_json_is_refused(text: str | bytes) -> None:
     refused(parsed_json, text, source="a")
 
 
-@pytest.mark.parametrize(
-    "value", [float("inf"), float("nan"), 1.5, "5", "²", None, True, [], 2**70, 1e300, -1, int("9" * 4000)]
-)
-def test_what_is_no_whole_number_in_its_range_is_refused_briefly(value: object) -> None:
-    line = refused(whole, value, least=0, most=1 << 62, source="a", field="n")
-    assert line.startswith("a: n: is ") and len(line) < 200
-
-
 @pytest.mark.parametrize("text", ["²", "٣", "", "-", "1_0", "0x1", "1.0", "9" * 5000, "-1", " ", "½"])
 def test_digits_are_ascii_ones_and_not_too_many(text: str) -> None:
-    assert len(refused(whole_from_text, text, least=0, most=10**15, source="a", field="n")) < 200
-
-
-@pytest.mark.parametrize("value", [float("inf"), float("nan"), "1", None, True, 1e300, 10**400, -2])
-def test_what_is_no_number_in_its_range_is_refused(value: object) -> None:
-    refused(real, value, least=-1, most=1e6, source="a", field="n")
+    assert len(refused(whole_from_text, text, source="a", field="n")) < 200
