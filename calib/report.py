@@ -15,8 +15,7 @@ from calib.viewpoints import viewing_volume_m
 from runtime.config import CalibrationSettings, read_table, validated
 from runtime.eyes.calibration import Calibration, Lenient, Vector3, load_calibration, similarity_defect
 from runtime.records import F64
-from runtime.report.page import Figure, Page, Section, section_of
-from runtime.report.plots import drawing, png
+from runtime.report.page import Figure, Page, Section, drawing, png, section_of
 from runtime.support.figures import in_words
 
 COLOURS = {"X": "#c0392b", "Y": "#27803b", "Z": "#2260a8"}

@@ -30,7 +30,7 @@ def stability(
     import time
     from dataclasses import asdict
 
-    from runtime.report.machine import describe
+    from runtime.report.page import describe
     from runtime.report.stability import suite
     from runtime.support.artifacts import OutputFolder, to_json, write_json
     from runtime.support.progress import progress_bar

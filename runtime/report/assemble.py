@@ -10,10 +10,8 @@ from typing import Any
 from runtime.config import StackGeometry
 from runtime.model.session import ModelSession
 from runtime.report import focal, moving
-from runtime.report.frontier import MethodResult, measure
-from runtime.report.machine import describe
-from runtime.report.methods import Method, shipped_and_references
-from runtime.report.page import Page, Section
+from runtime.report.frontier import Method, MethodResult, measure, shipped_and_references
+from runtime.report.page import Page, Section, describe
 from runtime.report.pairs import StillPair, procedural_pairs, read_pairs
 from runtime.report.sections import focal_section, frontier_section, moving_section
 from runtime.report.worker import apart

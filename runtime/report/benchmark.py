@@ -13,9 +13,8 @@ from pydantic import BaseModel, Field, PositiveFloat
 
 from runtime.config import StackGeometry, read_table, validated
 from runtime.evaluation.trials import timed
-from runtime.report.frontier import MethodResult, measure
-from runtime.report.machine import describe
-from runtime.report.methods import SHIPPED, Method
+from runtime.report.frontier import SHIPPED, Method, MethodResult, measure
+from runtime.report.page import describe
 from runtime.report.pairs import FOV_DEG, Painter, eyes_at
 
 SIZES = ((960, 540), (1920, 1080))

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -17,10 +17,16 @@ from runtime.optics.carried import intensities
 from runtime.optics.light import squared_error
 from runtime.optics.quality import psnr_db
 from runtime.records import U8
-from runtime.report.methods import Kind, Method
 from runtime.report.pairs import StillPair
 from runtime.report.worker import apart
 
+if TYPE_CHECKING:
+    from runtime.model.predictor import Predictor
+    from runtime.optics.stack import PanelStack
+
+Kind = Literal["network", "iterative"]
+SHIPPED = ("balanced", "fast", "best")  # the default first: a report's first figure
+SART = (1, 3, 10, 30)
 ENOUGH_S = 2.0  # of timed runs on one pair; slow methods run once
 MOST_RUNS = 25
 FEWEST_RUNS = 3
@@ -28,6 +34,33 @@ SLOW_S = 4.0  # a first run that takes longer counts, and is the only one
 ENOUGH_PIXELS = 200_000  # of an eye's picture, for an expected error: within some hundredths of a decibel
 OFF_STEP = 3  # away from the eyes, every third ray of every third row is enough
 QUOTED = "1"  # of `light_db`: eyes sure to 1 mm, a pupil
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """A way to layers."""
+
+    name: str
+    kind: Kind
+    source: str  # what `load_predictor` takes
+    iterations: int = 0  # of SART
+
+    def opened(self, stack: PanelStack, *, threads: int) -> Predictor:
+        """Ready for pairs on a stack. Raises InputError, MissingPart."""
+        from runtime.config import ModelSettings
+        from runtime.model.predictor import load_predictor
+        from runtime.model.sart import SartPredictor
+
+        if self.iterations:
+            return SartPredictor(stack, iterations=self.iterations)
+        return load_predictor(self.source, stack, ModelSettings(threads=threads))
+
+
+def shipped_and_references(models: Sequence[str] = (), *, quick: bool = False) -> list[Method]:
+    """The shipped sizes, further ONNX files, and the iterative reference. `quick` leaves out the slowest."""
+    methods = [Method(name, "network", name) for name in SHIPPED]
+    methods += [Method(Path(name).stem, "network", name) for name in models]
+    return methods + [Method(f"SART-{n}", "iterative", "sart", n) for n in (SART[:-1] if quick else SART)]
 
 
 @dataclass(frozen=True, slots=True)

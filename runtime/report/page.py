@@ -1,14 +1,25 @@
-"""One self-contained HTML page out of sections (text, pictures and tables), and the folder that it is written to."""
+"""What the reports share: self-contained HTML pages of sections, how plots look, and what they were measured on."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+import io
+import os
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from runtime.support.artifacts import OutputFolder, write_bytes, write_json, write_text
+
+STYLE = ["seaborn-v0_8-whitegrid", {"figure.dpi": 130, "axes.spines.top": False, "axes.spines.right": False}]
+PACKAGES = (
+    "phasestack", "numpy", "scipy", "onnxruntime", "opencv-contrib-python-headless", "moderngl", "matplotlib", "mpmath",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,3 +91,45 @@ class Page:
 def section_of(title: str, rows: Sequence[Sequence[str]]) -> Section:
     """A section of one table, whose first row is its headings."""
     return Section(title, tables=[Table(rows[0], rows[1:])])
+
+
+@contextmanager
+def drawing(width_in: float, height_in: float) -> Iterator[Any]:
+    """A matplotlib figure in the reports' style, without pyplot's global state."""
+    from matplotlib import style
+    from matplotlib.figure import Figure
+
+    with style.context(STYLE):  # type: ignore[arg-type]
+        yield Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+def png(figure: Any) -> bytes:
+    """A figure as PNG, without time stamps: the same data give the same bytes."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def describe() -> dict[str, str]:
+    """Names and values, in the order in which a page shows them. What isn't installed is left out."""
+    facts = {
+        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "processor": _processor(),
+        "cores": str(len(os.sched_getaffinity(0))),
+        "memory": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.1f} GiB",
+        "system": f"{platform.system()} {platform.release()}",
+        "seed": "0",  # of whatever is drawn at random
+        "Python": platform.python_version(),
+    }
+    for name in PACKAGES:
+        try:
+            facts[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return facts
+
+
+def _processor() -> str:
+    lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()

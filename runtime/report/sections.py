@@ -10,8 +10,7 @@ import numpy as np
 from runtime.report.focal import CARDS_M, DISTANCE_M, PUPIL_M, FocalStack
 from runtime.report.frontier import MethodResult
 from runtime.report.moving import Moving
-from runtime.report.page import Figure, Section, Table
-from runtime.report.plots import drawing, png
+from runtime.report.page import Figure, Section, Table, drawing, png
 
 KINDS = {"network": ("o", "C0"), "iterative": ("s", "C1")}
 NAMES = ("behind the panels", "in the middle panel", "before the panels")

@@ -14,8 +14,7 @@ from runtime.optics.carried import expected_psnrs_db, intensities, light_psnrs_d
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
-from runtime.report.frontier import MethodRun, measure, pair_result
-from runtime.report.methods import Method
+from runtime.report.frontier import Method, MethodRun, measure, pair_result
 from runtime.report.pairs import Painter, StillPair, eyes_at
 from runtime.report.worker import apart
 

@@ -6,9 +6,8 @@ import re
 
 from runtime.evaluation.solved import PairQuality
 from runtime.report.frontier import MethodResult, PairResult
-from runtime.report.machine import describe
 from runtime.report.moving import Moving
-from runtime.report.page import Page, Section, Table
+from runtime.report.page import Page, Section, Table, describe
 from runtime.report.sections import frontier_section, moving_section
 
 

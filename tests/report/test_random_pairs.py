@@ -11,7 +11,7 @@ from model_export.scene import Plane, draw
 from runtime.evaluation.displayed import displayed
 from runtime.model.still import solve_still
 from runtime.optics.views import image_from_stack
-from runtime.report.methods import SHIPPED, Method
+from runtime.report.frontier import SHIPPED, Method
 from runtime.report.pairs import StillPair
 from tests.model_export.stills import random_still
 
