@@ -195,7 +195,6 @@ def _settings(config: Path | None) -> Settings:
 def _report(summary: dict[str, Any], as_json: bool) -> None:
     """Print a command's summary as one JSON object, or a line a field."""
     from runtime.support.artifacts import to_json
-    from runtime.support.figures import lines_of
+    from runtime.support.figures import shown
 
-    text = to_json(summary)
-    typer.echo(text if as_json else "\n".join(lines_of(json.loads(text))))
+    typer.echo(shown(json.loads(to_json(summary)), as_json=as_json))

@@ -28,8 +28,8 @@ from runtime.eyes.detect import EyeFinder
 from runtime.optics.malus import phase_from_intensity
 from runtime.optics.stack import PanelStack
 from runtime.panels.card import alone, identity_card
-from runtime.panels.every_monitor import every_monitor
 from runtime.panels.monitors import Monitor
+from runtime.panels.window import every_monitor
 from runtime.records import F64, U8, EyePoints
 from runtime.sensor.registry import open_sensor
 from runtime.sensor.worker import OPEN_TIMEOUT_S, SensorWorker

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -32,15 +31,10 @@ def train(
     """
     require("torch")
     from model_export.train import run_training
+    from runtime.support.figures import shown
 
     result = run_training(out, recipe, iterations=iterations, seed=seed)
-    if as_json:
-        typer.echo(json.dumps(result))
-    else:
-        typer.echo(
-            f"{result['name']}: {result['iterations']} trials in {result['seconds']:.0f} s; light of held-out pairs "
-            f"{result['start_db']:.2f} -> {result['held_out_db']:.2f} dB; {out / 'checkpoint.pth'}"
-        )
+    typer.echo(shown(result, as_json=as_json))
 
 
 def export(

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from phasestack.eyes import find_eyes
 from phasestack.pair import Result, solve
+from phasestack.pictures import find_eyes
 from runtime.content.base import ContentSource
 from runtime.errors import SensorLost, SensorTimeout
 from runtime.evaluation.solved import PairQuality as Quality
 from runtime.eyes.pupils import Pupils
 from runtime.optics.stack import PanelStack as Stack
 from runtime.records import EyePoints, SensorFrame
-from runtime.sensor.base import Capabilities, Sensor
-from runtime.sensor.device_clock import DeviceClock
+from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 
 __all__ = [
     "Capabilities",

@@ -1,4 +1,4 @@
-"""Pictures as programs have them: arrays of codes or of intensities."""
+"""Pictures as programs have them (arrays of codes or of intensities), and the eyes in them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from runtime.evaluation.displayed import Picture
+from runtime.eyes import pupils
+from runtime.eyes.pupils import Pupils
 from runtime.records import U8
 
 LEAST_PX = 16
@@ -39,3 +41,12 @@ def as_codes(picture: Picture) -> U8:
     """The nearest 8-bit codes."""
     codes: Any = picture if picture.dtype == np.uint8 else np.rint(picture * 255).astype(np.uint8)
     return np.asarray(codes, np.uint8)
+
+
+def find_eyes(picture: ArrayLike) -> Pupils | None:
+    """The foremost viewer's pupils in an (h, w, 3|4) picture, uint8 or float in 0..1; None where nobody is.
+
+    `eyes_px` is (2, 2): the viewer's left eye first, which is on the right of an unmirrored picture; continuous pixels,
+    centres at half-integers. `sigma_px` says how sure they are. Raises ValueError for what is no picture.
+    """
+    return pupils.find_eyes(as_codes(as_picture("picture", picture)))

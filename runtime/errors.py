@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 PART_CHARACTERS_MAX = 300  # of a message: an untrusted name must not fill the screen, nor forge a line of the log
 PROBLEM_CHARACTERS_MAX = 1500  # of what is wrong with a file, all its fields together
+# The system has none left, or its hardware failed this once.
+PASSING = frozenset(
+    (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.ENOBUFS, errno.EINTR)
+)
 
 
 def one_line(text: str, *, most: int = PART_CHARACTERS_MAX) -> str:
@@ -83,3 +90,27 @@ class PanelLost(TransientError):
 
 class Stopped(PhasestackError):
     """Told to stop before there was anything to stop."""
+
+
+@contextmanager
+def retry_advised() -> Iterator[None]:
+    """What may pass becomes a TransientError: exit 75, start again."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, TransientError) or not is_retryable(error):
+            raise
+        raise TransientError(f"{str(error) or type(error).__name__} (this may pass: start again)") from error
+
+
+def is_retryable(error: BaseException | None) -> bool:
+    """Whether anything in an exception's chain is the machine's trouble of the moment, and not its input.
+
+    Readers turn what the system refuses into an InputError that names the file; the system's own error is still its
+    context.
+    """
+    while error is not None:
+        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno in PASSING):
+            return True
+        error = error.__cause__ or error.__context__
+    return False

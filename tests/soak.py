@@ -29,9 +29,8 @@ from runtime.blackbox.recorder import Recorder
 from runtime.clock import NS_PER_S
 from runtime.content.presets import preset_names
 from runtime.content.scenes import SCENES as BUILT_IN
-from runtime.daemon.client import ask
+from runtime.daemon.client import LOOKED_UP_AGAIN_S, Daemon, ask
 from runtime.errors import SensorLost
-from runtime.page.daemon import LOOKED_UP_AGAIN_S, Daemon
 from tests.daemon.rig import TRACKING
 from tests.daemon.test_changes import Served
 from tests.waiting import eventually

@@ -13,7 +13,7 @@ import pytest
 from runtime.commands.app import app
 from runtime.config import Settings, load_settings, load_stack, with_options
 from runtime.errors import InputError
-from runtime.support import cache
+from runtime.support import folders
 from runtime.support.removed import REMOVED_COMMANDS, removed_command
 from tests.test_cli import phasestack
 
@@ -159,9 +159,9 @@ def test_a_cache_that_can_not_be_written_is_told_once_and_kept_elsewhere(tmp_pat
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     told: list[str] = []
-    monkeypatch.setattr(cache.log, "warning", lambda text, *what: told.append(text % what))
-    assert [cache.user_cache(name).parent for name in "ab"] == [tmp_path / f"phasestack-{os.geteuid()}"] * 2
+    monkeypatch.setattr(folders.log, "warning", lambda text, *what: told.append(text % what))
+    assert [folders.user_cache(name).parent for name in "ab"] == [tmp_path / f"phasestack-{os.geteuid()}"] * 2
     assert len(told) == 1 and "can't be written" in told[0]
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file" / "other"))
     (tmp_path / f"phasestack-{os.geteuid()}").chmod(0o755)
-    assert cache.user_cache("a").is_relative_to(tmp_path / "file"), "what others may write is not loaded"
+    assert folders.user_cache("a").is_relative_to(tmp_path / "file"), "what others may write is not loaded"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from runtime.support.cache import user_cache
+from runtime.support.folders import user_cache
 
 ROOT = Path(__file__).resolve().parents[1]
 CALLS = (

@@ -12,6 +12,7 @@ from model_export.commands import export, train, validate
 from runtime.commands.bench import app as bench_app
 from runtime.commands.config import config
 from runtime.commands.ctl import app as ctl_app
+from runtime.commands.ctl import status
 from runtime.commands.demo import demo
 from runtime.commands.doctor import doctor
 from runtime.commands.eyes import eyes
@@ -24,7 +25,6 @@ from runtime.commands.run import run
 from runtime.commands.setup import setup
 from runtime.commands.solve import solve
 from runtime.commands.stability import stability
-from runtime.commands.status import status
 
 app = typer.Typer(
     name="phasestack",

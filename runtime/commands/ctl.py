@@ -1,7 +1,8 @@
-"""`phasestack ctl`: tells the running daemon what to do between two of its turns."""
+"""`phasestack ctl` tells the running daemon what to do between two of its turns; `status` asks what it does and why."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,6 +16,7 @@ app = typer.Typer(
     "Example: phasestack ctl scene demo",
 )
 
+HUNG_AFTER_S = 5.0
 ANSWERS_WITHIN_S = 70.0  # a scene or a model is loaded first: longer than the daemon itself waits for that
 
 Config = Annotated[Path | None, typer.Option(help="configuration of the daemon: says where its socket is")]
@@ -117,3 +119,27 @@ def tell(request: dict[str, Any], config: Path | None) -> None:
         raise InputError(f"ctl {request['command']}", "", str(answer.get("error", "refused")))
     answer.pop("ok")
     typer.echo(answer.get("note") or answer.get("file") or "\n".join(lines_of(answer)))
+
+
+def status(
+    config: Config = None,
+    as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
+) -> None:
+    """Ask the running daemon: its state and why, rates now, eyes and how sure they are, times, faults.
+
+    Exits with 1 where no daemon answers, or its loop has stood still for five seconds.
+
+    Example: phasestack status --json
+    """
+    from runtime.daemon.client import NotRunning, ask, sockets
+    from runtime.support.figures import shown
+
+    try:
+        answer = ask(sockets(config), {"command": "status"})
+    except NotRunning as error:
+        typer.echo(json.dumps({"ok": False, "error": str(error)}) if as_json else str(error), err=not as_json)
+        raise typer.Exit(1) from None
+    typer.echo(shown(answer, as_json=as_json))
+    if float(answer.get("turn_age_s", 0.0)) > HUNG_AFTER_S:
+        typer.echo(f"the loop has not completed a turn for {answer['turn_age_s']:.0f} s", err=True)
+        raise typer.Exit(1)

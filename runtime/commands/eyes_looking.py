@@ -22,8 +22,7 @@ from runtime.records import U8, SensorFrame
 from runtime.sensor.recording import Recording
 from runtime.sensor.registry import open_sensor
 from runtime.support import untrusted_input
-from runtime.support.artifacts import OutputFolder, png_bytes, read_image
-from runtime.support.library_lines import held_back
+from runtime.support.artifacts import OutputFolder, held_back, png_bytes, read_image
 
 FILMS = (".mp4", ".mkv", ".avi", ".mov", ".webm", ".m4v")
 RECORDING = ".mcap"

@@ -32,7 +32,7 @@ def identify(
     from calib.keys import TerminalKeys, WindowKeys
     from runtime.config import load_settings
     from runtime.errors import InputError, PanelLost
-    from runtime.panels.every_monitor import every_monitor
+    from runtime.panels.window import every_monitor
 
     settings = load_settings(config)
     try:

@@ -36,11 +36,10 @@ def page(
     except ImportError as error:
         raise MissingPart(f"page: {error.name} is not installed: pip install starlette uvicorn") from None
 
-    from runtime.daemon.client import sockets
-    from runtime.page.daemon import Daemon
+    from runtime.daemon.client import Daemon, sockets
     from runtime.page.token import token_of
+    from runtime.support.background import BACKGROUND_NICENESS, set_niceness
     from runtime.support.folders import state_folder
-    from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
 
     set_niceness(BACKGROUND_NICENESS)  # the display comes first; its threads are started after this
     places = sockets(config)

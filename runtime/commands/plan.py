@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -25,12 +24,9 @@ def plan(
     from rich.console import Console
 
     from runtime.plan.planning import plan_for
-    from runtime.support.figures import lines_of
+    from runtime.support.figures import shown
 
     status = Console(stderr=True, quiet=as_json).status("measuring with and without the plan")
     with blame_option("plan", scene=scene, model=model), status:
         result = plan_for(config, scene=scene, model=model, scale=scale)
-    if as_json:
-        typer.echo(json.dumps(result))
-    else:
-        typer.echo("\n".join(lines_of(result)))
+    typer.echo(shown(result, as_json=as_json))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -40,7 +39,7 @@ def solve(
     --panels panels.json --out out/solve
     """
     from runtime.commands.solving import solve_pair
-    from runtime.support.figures import lines_of
+    from runtime.support.figures import shown
 
     with blame_option("solve", model=model):
         result = solve_pair(
@@ -55,10 +54,7 @@ def solve(
             backend=backend,
             plan=not no_plan,
         )
-    if as_json:
-        typer.echo(json.dumps(result))
-    else:
-        for line in lines_of(result):
-            typer.echo(line)
+    typer.echo(shown(result, as_json=as_json))
+    if not as_json:
         typer.echo("light_db of eyes sure to 1 mm (a pupil) is the figure to quote")
         typer.echo(f"see {out / 'contact-sheet.png'}")

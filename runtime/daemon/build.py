@@ -34,8 +34,8 @@ from runtime.sensor.base import Sensor
 from runtime.sensor.registry import open_sensor
 from runtime.sensor.samples import FindEyes, RecordedSamples, Samples
 from runtime.sensor.worker import SensorWorker
+from runtime.support.background import PRESENTER_NICENESS, niceness
 from runtime.support.gl import offscreen_context
-from runtime.support.priority import PRESENTER_NICENESS, niceness
 from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.build")

@@ -6,6 +6,8 @@ import contextlib
 import json
 import os
 import socket
+import threading
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,9 @@ from runtime.errors import TransientError
 
 # Where the daemon listens without a configuration: `ServiceSettings().socket`, without loading all settings.
 DEFAULT_SOCKET = "/run/phasestack/status.sock"
+LOOKED_UP_AGAIN_S = {"status": 0.2, "pictures": 0.3, "log": 0.5, "about": 2.0}
+LOOKED_UP_WITHIN_S = 3.0
+TOLD_WITHIN_S = 70.0  # a scene or a model is loaded first
 
 
 def user_socket() -> Path | None:
@@ -78,3 +83,33 @@ def _advice(error: Exception) -> str:
         case TimeoutError():
             return "no answer in time (the daemon hangs)"
     return str(error) or type(error).__name__
+
+
+class Daemon:
+    """Any thread may ask."""
+
+    def __init__(self, sockets: tuple[Path, ...]) -> None:
+        """sockets: where it may listen."""
+        self._sockets = sockets
+        self._locks = {name: threading.Lock() for name in LOOKED_UP_AGAIN_S}
+        self._answers: dict[str, tuple[float, dict[str, Any]]] = {}
+
+    def look_up(self, name: str) -> dict[str, Any]:
+        """`status`, `pictures`, `log` or `about`; where no daemon answers, `ok` is False and `error` says why."""
+        with self._locks[name]:
+            asked_s, answer = self._answers.get(name, (float("-inf"), {}))
+            if time.monotonic() - asked_s < LOOKED_UP_AGAIN_S[name]:
+                return answer
+            answer = self._asked({"command": name}, timeout_s=LOOKED_UP_WITHIN_S)
+            self._answers[name] = time.monotonic(), answer
+        return answer
+
+    def tell(self, command: str, value: Any) -> dict[str, Any]:
+        """One wish; what became of it."""
+        return self._asked({"command": command, "value": value}, timeout_s=TOLD_WITHIN_S)
+
+    def _asked(self, request: dict[str, Any], *, timeout_s: float) -> dict[str, Any]:
+        try:
+            return ask(self._sockets, request, timeout_s=timeout_s)
+        except NotRunning as error:
+            return {"ok": False, "running": False, "error": str(error)}

@@ -28,7 +28,7 @@ from runtime.daemon.client import DEFAULT_SOCKET, user_socket
 from runtime.daemon.commands import Command, parse
 from runtime.errors import InputError, TransientError
 from runtime.support.artifacts import to_json
-from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
+from runtime.support.background import BACKGROUND_NICENESS, set_niceness
 
 log = logging.getLogger("phasestack.service")
 

@@ -24,12 +24,11 @@ from runtime.daemon.notify import Notifier
 from runtime.daemon.reconfigure import Reconfiguration, moved_since
 from runtime.daemon.server import StatusServer, open_status_server
 from runtime.daemon.signals import Signals
-from runtime.errors import InputError, PanelLost, PhasestackError, Stopped
+from runtime.errors import InputError, PanelLost, PhasestackError, Stopped, retry_advised
 from runtime.frame.presenter import Presenter
 from runtime.records import RefreshAccount, State
 from runtime.support import logs
 from runtime.support.folders import state_folder
-from runtime.support.transient import retry_advised
 
 log = logging.getLogger("phasestack.daemon")
 

@@ -15,8 +15,8 @@ from runtime.errors import ContextLost, FatalError, PhasestackError
 from runtime.frame.solver import SolverStep
 from runtime.frame.solver_host import COST_GAIN, FIRST_REQUEST, SolverHost, SolverParts, Task, taken_in, total_ns
 from runtime.records import SolveRequest
+from runtime.support.background import SOLVER_NICENESS, set_niceness
 from runtime.support.memory import give_back
-from runtime.support.priority import SOLVER_NICENESS, set_niceness
 
 log = logging.getLogger("phasestack.solver")
 

@@ -35,7 +35,6 @@ def pre_emphasised(picture: U8, strength: float) -> U8:
     """
     if not strength:
         return picture
-
     kernel = np.array([-strength, 1 + 2 * strength, -strength], np.float32)
     return np.asarray(cv2.sepFilter2D(picture, -1, kernel, kernel), np.uint8)
 

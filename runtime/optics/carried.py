@@ -7,8 +7,9 @@ the parallax that a late picture lacks does not.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +21,7 @@ from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
 PLENTY = 3_000_000  # numbers of a picture
+PUPIL_SIGMA_MM = 1.0  # of a pupil alone, 4 mm wide: a disc's standard deviation along an axis is a quarter of that
 
 
 def carried_db(
@@ -97,3 +99,14 @@ def intensities(picture: U8 | F32) -> F32:
     if picture.dtype == np.uint8:
         part /= np.float32(255)
     return part
+
+
+def configured_sigma_mm(setting: Literal["auto"] | float, *, tracker_sigma_m: float) -> float:
+    """What `model.eye_sigma_mm` comes to: a number as it stands; `auto` the pupil and the tracker together.
+
+    Standard deviation along an axis, millimetres, of where light enters an eye. tracker_sigma_m: metres, an axis,
+    common to both eyes.
+    """
+    if setting == "auto":
+        return math.hypot(PUPIL_SIGMA_MM, tracker_sigma_m * 1e3)
+    return float(setting)

@@ -23,9 +23,9 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 from starlette.routing import Route
 
+from runtime.daemon.client import LOOKED_UP_AGAIN_S, Daemon
 from runtime.daemon.commands import NAMES
 from runtime.errors import InputError
-from runtime.page.daemon import LOOKED_UP_AGAIN_S, Daemon
 from runtime.page.token import cookie_of, same
 from runtime.support.artifacts import to_json
 from runtime.support.untrusted_input import parsed_json

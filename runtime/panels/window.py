@@ -8,16 +8,18 @@ from typing import Any
 
 import moderngl
 
-from runtime.clock import NS_PER_MS, NS_PER_S, Clock
+from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock
 from runtime.config import PanelSettings
 from runtime.errors import ContextLost, PanelLost
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
-from runtime.panels.display import Display, Window, glfw
+from runtime.panels.card import identity_card
+from runtime.panels.display import Display, Window, connected_monitors, glfw
 from runtime.panels.monitors import Monitor, bind, check_modes, refresh_difference
 from runtime.panels.presentation import FrameTextures, Painter
 from runtime.panels.watch import PlacementWatch
-from runtime.records import PanelFrame, PresentReport
+from runtime.records import U8, PanelFrame, PresentReport
+from runtime.support.gl import offscreen_context
 from runtime.support.gl_sharing import ShareGroup
 
 log = logging.getLogger("phasestack.panels")
@@ -237,3 +239,19 @@ def _reset_status() -> str:
         return ""
     status: int = ctypes.CFUNCTYPE(ctypes.c_uint)(address)()
     return f"was reset (0x{status:x})" if status else ""
+
+
+def every_monitor() -> tuple[WindowPanels, list[U8], tuple[Monitor, ...]]:
+    """Windows on all monitors whatever they are, their cards, and what they are called. Raises PanelLost."""
+    monitors = connected_monitors()
+    width, height = max(m.width_px for m in monitors), max(m.height_px for m in monitors)
+    bound = tuple(PanelSettings(connector=monitor.connector) for monitor in monitors)
+    # Only for this picture: monitors of any shape, each filled.
+    stack = PanelStack(1.0, 1.0, tuple(0.01 * index for index in range(len(monitors))), width, height)
+    panels = WindowPanels(bound, stack, MonotonicClock(), offscreen_context(), any_shape=True)
+    cards = []
+    for monitor in monitors:
+        lines = [monitor.model or "(no name in its EDID)", f"{monitor.width_px} x {monitor.height_px}",
+                 "in the configuration:", "[[output.panels]]", monitor.setting]  # fmt: skip
+        cards.append(identity_card(width, height, title=monitor.connector, lines=lines))
+    return panels, cards, monitors

@@ -18,8 +18,7 @@ from runtime.clock import NS_PER_S, Clock
 from runtime.config import SensorSettings
 from runtime.errors import EndOfRecording, InputError, SensorLost, SensorTimeout
 from runtime.records import U8, U16, Intrinsics, SensorFrame
-from runtime.sensor.base import Capabilities, Sensor
-from runtime.sensor.device_clock import DeviceClock
+from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 from runtime.sensor.openni2_library import load
 
 SERIAL_PROPERTY = 3

@@ -10,8 +10,7 @@ from runtime.clock import NS_PER_S, Clock
 from runtime.config import SensorSettings
 from runtime.errors import SensorLost, SensorTimeout
 from runtime.records import SensorFrame
-from runtime.sensor.base import Capabilities, Sensor
-from runtime.sensor.device_clock import DeviceClock
+from runtime.sensor.base import Capabilities, DeviceClock, Sensor
 from runtime.sensor.eye_packets import EyePacket, PacketReader
 from runtime.sensor.usb_devices import UDEV_RULE, UsbDevice, find_device, reset_device
 

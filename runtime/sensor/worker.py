@@ -10,11 +10,10 @@ from enum import StrEnum
 
 from runtime.clock import NS_PER_S, Clock
 from runtime.config import SensorSettings
-from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout, TransientError
+from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout, TransientError, is_retryable
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
 from runtime.sensor.samples import FindEyes, Samples, finder, searched
-from runtime.support.transient import is_retryable
 
 TIMEOUTS_TO_REOPEN = 2
 REOPEN_AFTER_S, REOPEN_AFTER_MAX_S = 0.25, 0.5  # the wait before a lost sensor is opened again doubles up to the second

@@ -1,4 +1,4 @@
-"""Files that are whole or not there: written under a temporary name and renamed."""
+"""Files that are whole or not there, written under a temporary name and renamed; pictures without a library's noise."""
 
 from __future__ import annotations
 
@@ -7,6 +7,10 @@ import json
 import os
 import shutil
 import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -15,7 +19,6 @@ import numpy as np
 
 from runtime.errors import InputError
 from runtime.records import U8
-from runtime.support.library_lines import held_back
 from runtime.support.picture_header import PNG, is_cut_off, read_coded
 
 STAGING = ".phasestack-"
@@ -202,3 +205,38 @@ def _check_free(place: Path, *, within: Path) -> None:
             raise InputError(folder, "", "is no folder: it is in the way of an output")
     if place.is_dir():
         raise InputError(place, "", "is a folder: it is in the way of an output")
+
+
+@dataclass(slots=True)
+class Held:
+    """What was written, once the block is left."""
+
+    text: str = ""
+
+    @property
+    def first_line(self) -> str:
+        """Empty where there is none."""
+        return next((line.strip() for line in self.text.splitlines() if line.strip()), "")
+
+
+@contextmanager
+def held_back() -> Iterator[Held]:
+    """Hold back what this block's libraries write to the file descriptor of stderr.
+
+    Only where this is the sole thread: the descriptor is the whole process's, and another's lines would be held too.
+    """
+    held = Held()
+    if threading.active_count() > 1:
+        yield held
+        return
+    kept = os.dup(2)
+    buffer = os.memfd_create("stderr")
+    os.dup2(buffer, 2)
+    try:
+        yield held
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        data = os.pread(buffer, 1 << 16, 0)
+        os.close(buffer)
+        held.text = data.decode(errors="replace")

@@ -1,18 +1,23 @@
-"""One piece of work on a thread of its own, asked about between two steps of whoever wants it."""
+"""Work on a thread of its own, asked about between two steps of whoever wants it; and whose turn comes first where
+threads compete for too few cores: the presenter's, then the solver's, then the rest."""
 
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Generic, TypeVar
 
 from runtime.errors import PhasestackError, one_line
-from runtime.support.priority import BACKGROUND_NICENESS, set_niceness
 
 log = logging.getLogger("phasestack.background")
 
+PRESENTER_NICENESS = -10
+SOLVER_NICENESS = 5
+BACKGROUND_NICENESS = 10
 T = TypeVar("T")
 
 
@@ -60,3 +65,20 @@ class Job(Generic[T]):
         finally:
             self.done = True
             _running.discard(self._thread)
+
+
+@contextmanager
+def niceness(value: int) -> Iterator[None]:
+    """The calling thread's niceness within a block; as it was afterwards."""
+    before = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+    set_niceness(value)
+    try:
+        yield
+    finally:
+        set_niceness(before)
+
+
+def set_niceness(niceness: int) -> None:
+    """Of the calling thread, and of those that it starts from now on; where the system allows it."""
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)

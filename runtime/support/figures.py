@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from runtime.errors import one_line
 
 LINE_MAX = 2000
+
+
+def shown(record: Mapping[str, Any], *, as_json: bool) -> str:
+    """What a command prints of its result."""
+    return json.dumps(record) if as_json else "\n".join(lines_of(record))
 
 
 def lines_of(record: Mapping[str, Any]) -> Iterator[str]:

@@ -1,10 +1,50 @@
-"""Where a run leaves what outlives it."""
+"""Folders: for what is kept since it takes long to make, named by what it follows from; and for what outlives a run."""
 
 from __future__ import annotations
 
+import hashlib
+import logging
 import os
+import stat
 import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
+
+log = logging.getLogger("phasestack.cache")
+
+
+def user_cache(name: str) -> Path:
+    """The folder for what is kept of one kind. It need not exist yet."""
+    return _root(os.environ.get("XDG_CACHE_HOME", "")) / name
+
+
+@cache
+def _root(base: str) -> Path:
+    """Under $XDG_CACHE_HOME, else ~/.cache; where that can't be written, this user's own in the temporary folder."""
+    own = (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "phasestack"
+    with suppress(OSError):
+        own.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if os.access(own, os.W_OK | os.X_OK):
+        return own
+    other = Path(tempfile.gettempdir()) / f"phasestack-{os.geteuid()}"
+    with suppress(OSError):
+        other.mkdir(mode=0o700, exist_ok=True)
+        found = other.lstat()
+        # Compiled code is loaded from it: what somebody else has put there is not ours.
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077:
+            log.warning("%s can't be written: what takes long to make is kept in %s", own, other)
+            return other
+    return own
+
+
+def digest(sources: Sequence[Path], *facts: object) -> str:
+    """Twelve hex digits of these files' contents and facts: a folder of that name never outlives what made it."""
+    total = hashlib.sha256(repr(facts).encode())
+    for path in sources:
+        total.update(path.read_bytes())
+    return total.hexdigest()[:12]
 
 
 def state_folder() -> Path:

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from runtime.clock import NS_PER_S, SimulatedClock
 from runtime.commands import ctl
-from runtime.commands.status import status
+from runtime.commands.ctl import status
 from runtime.daemon.server import StatusServer
 from runtime.errors import InputError
 

@@ -16,10 +16,9 @@ from runtime.clock import MonotonicClock
 from runtime.config import SensorSettings, Settings
 from runtime.daemon import supervise
 from runtime.daemon.build import RunOptions
-from runtime.errors import InputError, SensorLost, TransientError
+from runtime.errors import PASSING, InputError, SensorLost, TransientError, is_retryable
 from runtime.sensor.base import Capabilities
 from runtime.sensor.worker import SensorState, SensorWorker
-from runtime.support.transient import PASSING, is_retryable
 from tests.waiting import eventually
 
 ROOT = Path(__file__).parents[2]

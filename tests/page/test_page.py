@@ -15,9 +15,9 @@ import anyio
 import pytest
 
 from runtime.clock import MonotonicClock
+from runtime.daemon.client import Daemon
 from runtime.daemon.server import StatusServer
 from runtime.errors import InputError
-from runtime.page.daemon import Daemon
 from runtime.page.server import application
 from runtime.page.token import cookie_of, token_of
 from tests.page.rig import ROOT, Page, page_of, short_folder
@@ -219,7 +219,7 @@ def test_a_token_file_that_is_none_is_refused(tmp_path: Path, text: str, mode: i
 
 @pytest.mark.parametrize("option", ["--config", "--port"])
 def test_bad_options_are_one_line_and_exit_2(tmp_path: Path, option: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("runtime.support.priority.set_niceness", lambda niceness: None)  # of this very process
+    monkeypatch.setattr("runtime.support.background.set_niceness", lambda niceness: None)  # of this very process
     with socket.create_server(("127.0.0.1", 0)) as taken:
         value = "/nowhere.toml" if option == "--config" else str(taken.getsockname()[1])
         assert value in refusal("page", "--token-file", tmp_path / "t", option, value)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from runtime.sensor.device_clock import DeviceClock
+from runtime.sensor.base import DeviceClock
 
 MS = 1_000_000
 

@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 from runtime.errors import InputError
-from runtime.support.artifacts import OutputFolder, write_bytes
-from runtime.support.library_lines import held_back
+from runtime.support.artifacts import OutputFolder, held_back, write_bytes
 
 
 @pytest.mark.parametrize("name", [".", "..", "folder", "/", "", "x" * 300, "/".join(["d" * 200] * 40)])
@@ -76,7 +75,7 @@ def test_what_is_in_the_way_of_one_file_keeps_all_others_from_being_replaced(
 
 HELD = """
 import os
-from runtime.support.library_lines import held_back
+from runtime.support.artifacts import held_back
 with held_back() as held:
     os.write(2, b"\\n a warning\\nmore\\n")
 print(held.first_line)

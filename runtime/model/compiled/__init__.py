@@ -13,7 +13,7 @@ from pathlib import Path
 os.environ.setdefault("NUMBA_OPT", "2")
 import numba
 
-from runtime.support.cache import digest, user_cache
+from runtime.support.folders import digest, user_cache
 
 log = logging.getLogger("phasestack.model")
 ROOM = 32 << 20  # bytes free, where compiled code is kept: it takes three MiB

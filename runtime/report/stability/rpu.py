@@ -10,10 +10,7 @@ from typing import Any
 import numpy as np
 
 from runtime.optics.retina import panel_positions
-from runtime.optics.rpu import (
-    corners_in_front,
-    panel_from_image,
-)
+from runtime.optics.rpu import corners_in_front, panel_from_image
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
 from runtime.records import F64
