@@ -105,6 +105,13 @@ def test_a_full_disk_behind_the_output_is_told() -> None:
     assert answer.stderr == "phasestack: output: cannot be written (No space left on device)\n"
 
 
+def test_closed_descriptors_are_no_error_and_no_file_takes_their_place(tmp_path: Path) -> None:
+    out = tmp_path / "a.mcap"
+    command = f"{sys.executable} -c '{MAIN}' record --motion still --seconds 1 --out {out} >&- 2>&- <&-"
+    assert subprocess.run(["sh", "-c", command], capture_output=True, timeout=60).returncode == 0
+    assert out.read_bytes()[:5] == b"\x89MCAP" and out.read_bytes()[-8:] == b"\x89MCAP0\r\n"
+
+
 @pytest.mark.parametrize("wait_s", [0.0, 0.07, 0.18, 0.25])
 def test_an_interrupt_ends_it_with_130_and_not_a_word_from_its_first_module_on(wait_s: float) -> None:
     process = subprocess.Popen([sys.executable, "-X", "importtime", "-c", MAIN, "doctor"], stderr=subprocess.PIPE)

@@ -12,7 +12,6 @@ import os
 import signal
 import sys
 import threading
-from io import TextIOWrapper
 from typing import Any
 
 INTERRUPTED, BAD_INPUT, OWN_ERROR, MAY_PASS, NOBODY_READS = 130, 2, 70, 75, 141
@@ -20,9 +19,7 @@ INTERRUPTED, BAD_INPUT, OWN_ERROR, MAY_PASS, NOBODY_READS = 130, 2, 70, 75, 141
 
 def run_guarded(*, interrupts_leave: bool) -> None:
     """Run the command that the arguments name; never returns. interrupts_leave: until now (`cli`); then they raise."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a file's name need not be UTF-8
+    _fill_standard_descriptors()
     try:
         from runtime.commands.app import app
         from runtime.support.crash import watch_threads
@@ -115,3 +112,13 @@ def _flushed(code: int) -> int:
         code = code or _reported(error)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     return code
+
+
+def _fill_standard_descriptors() -> None:
+    """Where stdin, stdout or stderr is closed, it leads nowhere: no file that is opened later takes its place."""
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(number, True)
+    for name in ("stdout", "stderr"):
+        stream: Any = getattr(sys, name) or os.fdopen(number, "w", encoding="utf-8", closefd=False)
+        stream.reconfigure(errors="backslashreplace")  # a file's name need not be UTF-8
+        setattr(sys, name, stream)

@@ -12,14 +12,6 @@ from runtime.optics.views import image_from_raster
 from runtime.records import F64
 
 
-def corners_in_front(image_from_stack: F64, raster: PlaneRaster) -> bool:
-    """True where all four corners of a panel lie before the eye, so that its homography has one sign."""
-    width, height = raster.width_px, raster.height_px
-    corners = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1]])
-    depth_m = corners @ image_from_raster(image_from_stack, raster)[2]
-    return bool((depth_m > 0.0).all())
-
-
 def panel_from_image(image_from_stack: F64, raster: PlaneRaster) -> F64:
     """M_RPU (equation (47)): 3x3 panel pixels from an eye's image pixels; the inverse of the plane-induced homography.
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 
-from runtime.optics.rpu import corners_in_front, panel_from_image
+from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack
 from tests.optics import reference
@@ -73,12 +73,3 @@ def test_an_image_whose_pixels_are_the_panels_own_needs_no_warp() -> None:
     raster = PlaneRaster(0.0, 0.0, 0.0, 1.0, 1.0, 16, 16)
     from_above = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     assert np.array_equal(panel_from_image(from_above, raster), np.eye(3))
-
-
-def test_a_corner_behind_the_eye_is_told() -> None:
-    stack = PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 1920, 1080)
-    straight = image_from_stack([0.6, 0.0, 0.0], **IMAGE)
-    # The gaze of this eye, 5 cm before the panel and far aside, leaves the near edge behind its image plane.
-    aside = image_from_stack([0.065, 0.2, 0.0], **IMAGE)
-    assert corners_in_front(straight, stack.panel(2))
-    assert not corners_in_front(aside, stack.panel(2))
