@@ -1,1 +1,1 @@
-"""What may be left out: savings and their measurement, reuse, windows, quality levels and the time budget."""
+"""What may be left out: savings and their measurement; and drawing, where content, views and models meet."""
