@@ -86,7 +86,7 @@ def _advice(error: Exception) -> str:
 
 
 class Daemon:
-    """Any thread may ask."""
+    """The daemon as the page asks it: however many look, it is asked as often as news is wanted. Any thread may."""
 
     def __init__(self, sockets: tuple[Path, ...]) -> None:
         """sockets: where it may listen."""

@@ -1,4 +1,4 @@
-"""The daemon's state, a pure function of what is there; each transition is reported once, with its reason."""
+"""The daemon's state, a pure function of what is there, each transition reported once; and what came late."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What eyes see that are not where the layers were solved for: carried, expected and light quality (docs/contracts.md).
+"""What eyes see that are not where the layers were solved for: carried, expected, light (docs/contracts.md); a pupil.
 
 The picture that the layers were solved for is carried along on the centre panel: the ray of each of its pixels is
 replaced by the one from the true eye through the same point of that panel. So ghosts and colour fringes count, and

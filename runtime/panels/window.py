@@ -1,4 +1,4 @@
-"""Panels on monitors: one fullscreen window a panel; a frame is on all or on none."""
+"""Panels on monitors: one fullscreen window a panel, a frame on all or none; or cards on every monitor there is."""
 
 from __future__ import annotations
 

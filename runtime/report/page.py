@@ -97,10 +97,10 @@ def section_of(title: str, rows: Sequence[Sequence[str]]) -> Section:
 def drawing(width_in: float, height_in: float) -> Iterator[Any]:
     """A matplotlib figure in the reports' style, without pyplot's global state."""
     from matplotlib import style
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Drawing
 
     with style.context(STYLE):  # type: ignore[arg-type]
-        yield Figure(figsize=(width_in, height_in), layout="constrained")
+        yield Drawing(figsize=(width_in, height_in), layout="constrained")
 
 
 def png(figure: Any) -> bytes:

@@ -1,4 +1,4 @@
-"""The driver contract: open, capabilities, read the newest, close."""
+"""The driver contract: open, capabilities, read the newest, close; and a device's time on the host's clock."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runtime.errors import SensorTimeout
 from runtime.records import SensorFrame
 
 ARRIVED_MAX = 1024  # samples in one answer: who was away for long gets them in several
-WINDOW_NS = 5_000_000_000
+WINDOW_NS = 5_000_000_000  # of a device's clock
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ it is known, `yaw_deg`, by which the head is turned. Errors are millimetres at e
 
 from __future__ import annotations
 
-import sys
+import argparse
 import time
 from dataclasses import dataclass
 from math import cos, pi, radians, sin, tan
@@ -167,7 +167,9 @@ def _followed(faces: list[Face], find: Any, finder: PupilFinder) -> dict[str, An
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="How well pupils are found and followed in a folder of faces.")
+    parser.add_argument("folder", type=Path, help="pictures, and their pupils")
     try:
-        print("\n".join(lines_of(measure(Path(sys.argv[1])))))
+        print("\n".join(lines_of(measure(parser.parse_args().folder))))
     except InputError as error:
-        sys.exit(str(error))
+        parser.error(str(error))
