@@ -22,7 +22,7 @@ from model_export.data import TrainingPair, endless_pairs
 from model_export.export import in_torch, spectral_contract
 from model_export.network import SpectralSolver
 from model_export.recipe import Recipe, read_recipe
-from runtime.errors import ModelFailure
+from runtime.errors import InputError, ModelFailure
 from runtime.model.contract import Contract
 from runtime.model.still import solve_still
 from runtime.model.unrolled import UnrolledPredictor
@@ -60,7 +60,9 @@ def run_training(
         [pair for pair, _ in zip(endless_pairs(seed, **how), range(count), strict=False)]
         for seed, count in ((training.seed, training.pairs), (HELD_OUT_SEED, training.validation_pairs))
     )
-    start, best, at = time.monotonic(), light_db(recipe, pairs), numbers_of(recipe)
+    start, best, at, learned = time.monotonic(), light_db(recipe, pairs), numbers_of(recipe), recipe
+    if not math.isfinite(best):
+        raise InputError(recipe_name, "weights", "the network answers with what is no number")
     points = [Point(0, best, light_db(recipe, held_out))]
     moves, done = dict.fromkeys(at, FIRST_MOVE), 0
     with progress_bar(f"training {recipe.name}") as progress:
@@ -73,11 +75,11 @@ def run_training(
                     done += 1
                     progress(done, training.iterations)
                     if (light := light_db(found, pairs)) > best:
-                        best, at[name] = light, at[name] + towards * moves[name]
+                        best, at[name], learned = light, at[name] + towards * moves[name], found
+                        _save(out, learned, points)  # whoever stops it has the best so far
                         break
                 else:
                     moves[name] /= 2
-            learned = recipe_with(recipe, at) or recipe
             points.append(Point(done, best, light_db(learned, held_out)))
             _save(out, learned, points)
     return {

@@ -14,6 +14,7 @@ from model_export.data import TrainingPair, endless_pairs  # noqa: E402
 from model_export.recipe import Recipe, read_recipe  # noqa: E402
 from model_export.scene import Plane, Scene, draw  # noqa: E402
 from model_export.train import light_db, numbers_of, recipe_with, run_training  # noqa: E402
+from runtime.errors import InputError  # noqa: E402
 from runtime.model.predictor import load_predictor  # noqa: E402
 from runtime.model.still import solve_still  # noqa: E402
 from runtime.optics.carried import light_psnrs_db  # noqa: E402
@@ -114,6 +115,17 @@ def tiny(tmp_path: Path) -> Path:
 def trained(out: Path, recipe: Path) -> Recipe:
     run_training(out, str(recipe))
     return Recipe.model_validate_json((out / "recipe.json").read_text())
+
+
+def test_a_network_that_answers_with_no_number_is_refused_before_anything_is_written(
+    tmp_path: Path, tiny: Path
+) -> None:
+    table = json.loads(tiny.read_text())
+    weights = plain_weights(solver_of(read_recipe(str(tiny)), source="test"))
+    tiny.write_text(json.dumps(table | {"weights": weights | {"log_floor": [1000.0, 1000.0]}}))
+    with pytest.raises(InputError, match="weights: the network answers with what is no number"):
+        run_training(tmp_path / "out", str(tiny))
+    assert not (tmp_path / "out").exists()
 
 
 def test_training_is_the_same_twice_and_leaves_its_files(tmp_path: Path, tiny: Path) -> None:
