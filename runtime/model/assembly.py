@@ -108,7 +108,7 @@ class ArrayAssembly:
         if self._solved is None or self._solved == but:
             return
         for layer in layers:
-            _fill(layer, self._solved, (NEUTRAL, NEUTRAL, NEUTRAL))
+            fill_area(layer, self._solved, (NEUTRAL, NEUTRAL, NEUTRAL))
         self._solved, self._colour = None, None
 
     def _paint(self, layers: U8, colour: tuple[int, ...]) -> None:
@@ -116,10 +116,10 @@ class ArrayAssembly:
         codes = centre_codes(self._stack.count)[list(colour)].tolist()
         layer = layers[self._stack.count // 2]
         if self._colour != colour:
-            _fill(layer, PixelRect(0, 0, self._stack.width_px, self._stack.height_px), codes)
+            fill_area(layer, PixelRect(0, 0, self._stack.width_px, self._stack.height_px), codes)
             self._colour = colour
         elif self._solved is not None:
-            _fill(layer, self._solved, codes)
+            fill_area(layer, self._solved, codes)
 
     def _fill_with(self, layers: U8, rest: Shared, *, but: PixelRect | None) -> None:
         """The picture on the centre panel, as both eyes see it where they agree."""
@@ -157,7 +157,7 @@ def centre_codes(panels: int) -> U8:
     return np.clip((phases - (panels - 1) * NEUTRAL * SUBCODE + SUBCODE // 2) // SUBCODE, 0, 255).astype(np.uint8)
 
 
-def _fill(layer: U8, area: PixelRect, codes: Sequence[int]) -> None:
+def fill_area(layer: U8, area: PixelRect, codes: Sequence[int]) -> None:
     """One colour in a part of an RGBA layer; whole pixels at a time, which is many times as fast as bytes."""
     pixel = np.array([*codes, 255], np.uint8).view(np.uint32)
     layer.view(np.uint32)[area.v0 : area.v1, area.u0 : area.u1, 0] = pixel

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from runtime.model.assembly import ArrayAssembly
+from runtime.model.assembly import ArrayAssembly, fill_area
 from runtime.model.compiled.joint import INTENSITY, JointState, fill, rays_of
 from runtime.model.compiled.panels import Panels, show_panels
 from runtime.model.contract import Contract, Step
@@ -44,7 +44,7 @@ class CpuState:
 
     def __init__(self, contract: Contract, stack: PanelStack, *, threads: int) -> None:
         self._contract, self._size, self._threads = contract, stack, max(1, threads)
-        self._by_channels: dict[int, Panels] = {}
+        self._by_kind: dict[tuple[int, int], Panels] = {}  # by channels and reduction
         self._pairs: dict[str, tuple[I16, I16]] = {}  # of both eyes or outer panels; sizes follow the viewer
         self._joint: dict[int, JointState] = {}
         self._stepped: JointState | None = None
@@ -53,16 +53,15 @@ class CpuState:
 
     def begin(self, pictures: Sequence[Picture], problem: Problem) -> AbstractContextManager[None]:
         self._problem, self._stepped = problem, None
-        if problem.channels not in self._by_channels:
-            self._by_channels[problem.channels] = Panels(self._size, threads=self._threads, channels=problem.channels)
-        panels = self._panels = self._by_channels[problem.channels]
-        panels.crop(problem.boxes, problem.stack)
-        panels.set_eyes(problem.eyes_m, eye_sigma_mm=problem.eye_sigma_mm)
+        self._full = self._panels = self._panels_of(1)
+        if (reduction := problem.reduction) > 1:
+            self._panels = self._panels_of(reduction)
         arrays = [picture.pixels() if isinstance(picture, DrawnPicture) else picture for picture in pictures]
         contract, box = self._contract, problem.boxes[CENTRE]
         self._pictures = Pictures(arrays, box, problem.channels, contract.emphasis, phase_codes(contract.branch))
-        self._reduced = self._pair("reduced", *problem.reduced_size)
-        fill_targets(self._pictures, [panels.target, self._reduced])
+        coarse = self._panels is not self._full
+        self._reduced = self._panels.target if coarse else self._pair("reduced", *problem.reduced_size)
+        fill_targets(self._pictures, [self._full.target, self._reduced])
         return nullcontext()
 
     def network_pictures(self) -> tuple[I16, I16]:
@@ -78,7 +77,7 @@ class CpuState:
     def set_panel(self, panel: int, codes: I16, *, shown: bool) -> None:
         # By way of a raster as coarse as the answer: where columns are bent that is sampled linearly, whose kinks on
         # every pixel no correction could undo.
-        problem, raster = self._problem, coarser(self._panels.rasters[panel], self._contract.reduction)
+        problem, raster = self._problem, coarser(self._full.rasters[panel], self._contract.reduction)
         coarse = self._pair("answer", raster.width_px, raster.height_px)[OUTER.index(panel)]
         matrix, columns = problem.answer_from_raster(panel, raster), problem.answer_columns
         resample(codes, image_from_result=matrix, out=coarse, outside=START, cubic=True, image_columns=columns)
@@ -91,7 +90,7 @@ class CpuState:
         self._panels.step(panel, size=size, shown=shown, fading=self._fading())
 
     def start_joint(self) -> None:
-        panels, problem = self._panels, self._problem
+        panels, problem = self._whole(), self._problem
         joint = self._joint.get(problem.channels)
         if joint is None:
             sizes = np.array([(self._size.height_px, self._size.width_px)] * 4)
@@ -127,17 +126,38 @@ class CpuState:
     def finish(self) -> U8:
         boxes = self._problem.boxes
         if self._drawn != boxes:
-            self._layers[..., :3] = NEUTRAL
+            for layer, box in zip(self._layers, boxes, strict=True):
+                for area in box.beside(width_px=self._size.width_px, height_px=self._size.height_px):
+                    fill_area(layer, area, (NEUTRAL, NEUTRAL, NEUTRAL))
             self._drawn = boxes
         if self._stepped is None:
-            self._panels.show(self._layers, boxes)
+            self._whole().show(self._layers, boxes)
         else:
             panels = dict(enumerate(self._stepped.last))
             show_panels(panels, self._layers, boxes, channels=self._problem.channels, threads=self._threads)
         return self._layers
 
     def close(self) -> None:
-        self._by_channels, self._joint = {}, {}
+        self._by_kind, self._joint = {}, {}
+
+    def _panels_of(self, reduction: int) -> Panels:
+        """The problem's panels on rasters so many times coarser than their own."""
+        problem, size = self._problem, self._size
+        if (key := (problem.channels, reduction)) not in self._by_kind:
+            width_px, height_px = (-(-px // reduction) for px in (size.width_px, size.height_px))
+            size = replace(size, width_px=width_px, height_px=height_px)
+            self._by_kind[key] = Panels(size, threads=self._threads, channels=problem.channels)
+        panels = self._by_kind[key]
+        panels.crop(problem.boxes, problem.stack, reduction)
+        panels.set_eyes(problem.eyes_m, eye_sigma_mm=problem.eye_sigma_mm)
+        return panels
+
+    def _whole(self) -> Panels:
+        """The panels on their own pixels."""
+        if self._panels is not self._full:
+            self._full.take(self._panels)
+            self._panels = self._full
+        return self._full
 
     def _pair(self, name: str, width_px: int, height_px: int) -> tuple[I16, I16]:
         channels = self._problem.channels

@@ -45,15 +45,20 @@ def reprojection(stack: PanelStack, rasters: Sequence[PlaneRaster], eye_m: F64, 
     return matrix
 
 
-def spreads(rasters: Sequence[PlaneRaster], eyes_m: F64, *, eye_sigma_mm: float) -> dict[int, tuple[float, float]]:
-    """Per outer panel whose pixels move by enough to be felt for eyes (2, 3) that err by so much: right and down."""
+def spreads(
+    rasters: Sequence[PlaneRaster], eyes_m: F64, *, eye_sigma_mm: float, reduction: int = 1
+) -> dict[int, tuple[float, float]]:
+    """Per outer panel whose pixels move by enough to be felt for eyes (2, 3) that err by so much: right and down.
+
+    reduction: how many times coarser the rasters are than the panels.
+    """
     eye_x_m, centre_x_m = eyes_m[:, 0].mean(), rasters[CENTRE].x_m
     found = {}
     for n in OUTER:
         raster = rasters[n]
         moved_m = eye_sigma_mm / 1e3 * abs(raster.x_m - centre_x_m) / (eye_x_m - centre_x_m)
         spread = min(moved_m / raster.pitch_u_m, MAX_SPREAD_PX), min(moved_m / raster.pitch_v_m, MAX_SPREAD_PX)
-        if max(spread) >= LEAST_SPREAD_PX:
+        if max(spread) * reduction >= LEAST_SPREAD_PX:
             found[n] = spread
     return found
 

@@ -26,6 +26,16 @@ class PlainPanels(Panels):
     def set_eyes(self, eyes_m: F64, *, eye_sigma_mm: float = 0.0) -> None:
         super().set_eyes(eyes_m, eye_sigma_mm=eye_sigma_mm)
         self._eyes_m = eyes_m
+        self._means: dict[int, F64] = {}  # of the outer panels, taken from coarser ones
+
+    def take(self, coarse: Panels) -> None:
+        assert isinstance(coarse, PlainPanels)
+        for n in OUTER:
+            mean = coarse._blurred(coarse._image(coarse.outer[n]), n)
+            self.set_panel(n, coarse.outer[n], shown=True)
+            size = self.outer[n].shape[1::-1]
+            finer = cv2.resize(mean.astype(np.int16), size, interpolation=cv2.INTER_CUBIC)
+            self._means[n] = self._image(np.clip(finer, 0, FULL))
 
     def project(self, panels: Sequence[int]) -> None:
         """It looks anew in every step."""
@@ -72,7 +82,9 @@ class PlainPanels(Panels):
 
     def _seen(self, panel: int, side: int) -> F64:
         """How an eye sees an outer panel through the centre panel's pixels, in the mean."""
-        blurred = self._blurred(self._image(self.outer[panel]), panel)
+        blurred = self._means.get(panel)
+        if blurred is None:
+            blurred = self._blurred(self._image(self.outer[panel]), panel)
         return self._between(blurred, side, of=panel, on=CENTRE, outside=START)
 
     def _between(self, image: F64, side: int, *, of: int, on: int, outside: float) -> F64:

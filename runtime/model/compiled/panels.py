@@ -18,7 +18,18 @@ from runtime.model.compiled.joint import JointState, rays_of
 from runtime.model.compiled.loops import PIECE, numbers_of
 from runtime.model.compiled.passes import blur, close_centre, correct, extrapolate_rows, fade_codes, show
 from runtime.model.compiled.warp import warped
-from runtime.model.reprojection import CENTRE, EYES, FRONT, MAX_SPREAD_PX, OUTER, REAR, START, reprojection, spreads
+from runtime.model.reprojection import (
+    CENTRE,
+    EYES,
+    FRONT,
+    MAX_SPREAD_PX,
+    OUTER,
+    REAR,
+    START,
+    coarser,
+    reprojection,
+    spreads,
+)
 from runtime.model.resample import buffer
 from runtime.model.targets import FULL, SUBCODE
 from runtime.optics.rect import PixelRect
@@ -54,19 +65,19 @@ class Panels:
         """(width, height) of the centre panel's raster."""
         return self.rasters[CENTRE].width_px, self.rasters[CENTRE].height_px
 
-    def crop(self, boxes: tuple[PixelRect, ...], stack: PanelStack) -> None:
-        """Cut every raster and buffer to what the eyes look through, of a stack of this size."""
+    def crop(self, boxes: tuple[PixelRect, ...], stack: PanelStack, reduction: int = 1) -> None:
+        """Cut every raster and buffer to what the eyes look through, of a stack so many times finer than this size."""
         if (boxes, stack) == self._cropped:
             return
-        self._cropped, self._stack = (boxes, stack), stack
-        self.rasters = tuple(box.cut(stack.panel(n)) for n, box in enumerate(boxes))
+        self._cropped, self._stack, self._reduction = (boxes, stack), stack, reduction
+        self.rasters = tuple(coarser(box.cut(stack.panel(n)), reduction) for n, box in enumerate(boxes))
         self.outer = {n: self._view("outer", n, on=n) for n in OUTER}
         self.target = tuple(self._view("target", side, on=CENTRE) for side in EYES)  # phase sums
 
     def set_eyes(self, eyes_m: F64, *, eye_sigma_mm: float = 0.0) -> None:
         """Correct for eyes (2, 3) that err by so much, an axis: what is left of the outer panels in the mean counts,
         and what moves of them is noise. Spreads too small to be felt on this raster are none."""
-        self.spread = spreads(self.rasters, eyes_m, eye_sigma_mm=eye_sigma_mm)
+        self.spread = spreads(self.rasters, eyes_m, eye_sigma_mm=eye_sigma_mm, reduction=self._reduction)
         places = np.tile(np.eye(3), (2, 3, 1, 1))
         for side in EYES:
             for n in OUTER:
@@ -105,6 +116,13 @@ class Panels:
         outer = self.outer[panel]
         cv2.resize(coarse, outer.shape[1::-1], dst=outer, interpolation=cv2.INTER_CUBIC)
         clamp_and_quantise(outer, shown=shown)
+
+    def take(self, coarse: Panels) -> None:
+        """The outer panels of a coarser raster, rounded to what 8 bits show, and what unsure eyes see of them."""
+        for n in OUTER:
+            self.set_panel(n, coarse.outer[n], shown=True)
+            mean = self._view("mean", n, on=n)
+            cv2.resize(coarse._view("mean", n, on=n), mean.shape[1::-1], dst=mean, interpolation=cv2.INTER_CUBIC)
 
     def show(self, layers: U8, boxes: Sequence[PixelRect]) -> None:
         """All panels in 8-bit codes, the centre closed, into layers (N, H, W, 4), each within its box."""

@@ -31,7 +31,7 @@ class Image:
 
     @property
     def texel_bytes(self) -> int:
-        width = {"f1": 1, "i2": 2, "u4": 4}[self.texture.dtype]
+        width = {"f1": 1, "i2": 2}[self.texture.dtype]
         components: int = self.texture.components
         return components * width
 
@@ -62,7 +62,7 @@ class Account:
 
 
 def source(name: str, *, defines: Sequence[str] = ()) -> str:
-    """A shader with what it includes. defines: PACKED, images of three numbers in one (`sample.glsl`)."""
+    """A shader with what it includes. defines: what it asks for by `#ifdef`."""
 
     def read(file: str) -> str:
         return (resources.files(SHADERS) / "shaders" / file).read_text(encoding="ascii")

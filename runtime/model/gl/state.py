@@ -1,9 +1,8 @@
 """The steps around the network as passes of fragment shaders, and the images that live from frame to frame.
 
 Images are signed 16-bit sixteenths of a code, as OpenCV's are: one number a pixel where there is one channel, else
-four, of which one is unused (three can't be drawn into). Where the eyes are unsure three are packed into 32 bits.
-What the eyes want is held as 8-bit codes. Only the network's raster, its answer and, where they are asked for, the
-layers cross the bus.
+four, of which one is unused (three can't be drawn into). What the eyes want is held as 8-bit codes. Only the network's
+raster, its answer and, where they are asked for, the layers cross the bus.
 """
 
 from __future__ import annotations
@@ -38,7 +37,6 @@ EYES = ("left", "right")
 NAMES = {REAR: "rear", FRONT: "front"}
 KERNEL = 64  # entries of the blur's uniform
 SURE = (0.0, 0.0)  # a spread, pixels
-PACKED_SPREAD_PX = 0.5  # images are packed where blurs of so much, on every pixel, hide what that rounds
 
 Spread = dict[int, tuple[float, float]]
 
@@ -72,18 +70,16 @@ class GlState:
         with self._passes.drawing():
             self._problem = problem
             self._grey = problem.channels == 1
-            self._rasters = problem.rasters
-            self._spread: Spread = spreads(self._rasters, problem.eyes_m, eye_sigma_mm=problem.eye_sigma_mm)
+            self._rasters, self._reduction = problem.rasters, 1
             self._stepped: GlJoint | None = None
-            joint = any(step.kind == "joint" for step in self._contract.steps)
-            self._packed = not (self._grey or joint) and all(
-                n in self._spread and min(self._spread[n]) >= PACKED_SPREAD_PX for n in OUTER
-            )
-            self._defines = ("PACKED",) if self._packed else ()
             self._outer = {}
             taken = self._taken(pictures)
             self._want(taken, self._wanted())
             self._want(taken, self._reduced())
+            self._reduction, self._mean_in = problem.reduction, "mean"
+            self._rasters = tuple(coarser(raster, self._reduction) for raster in problem.rasters)
+            how: Any = {"eye_sigma_mm": problem.eye_sigma_mm, "reduction": self._reduction}
+            self._spread: Spread = spreads(self._rasters, problem.eyes_m, **how)
             yield
 
     def network_pictures(self) -> tuple[I16, I16]:
@@ -108,15 +104,14 @@ class GlState:
         answer = self._grown(f"answer {panel}", columns, rows, components=self._problem.channels)
         answer.texture.write(np.ascontiguousarray(codes), viewport=(0, 0, columns, rows), alignment=1)
         self._passes.crossed("answer up", answer, bytes_px=2 * self._problem.channels, to_gpu=True)
-        raster = coarser(self._rasters[panel], self._contract.reduction)  # as the processor does it
-        coarse = self._coarse(("answer", panel), _size(raster), dtype="u4" if self._packed else "i2")
+        raster = coarser(self._problem.rasters[panel], self._contract.reduction)  # as the processor does it
+        spare = self._spare(panel)
+        coarse = spare if self._reduction > 1 else self._coarse(("answer", panel), _size(raster), dtype="i2")
         matrix = self._problem.answer_from_raster(panel, raster)
         place = {"size": answer.size, "image_from_panel": _mat3(matrix), **_columns(self._problem.answer_columns)}
         self._draw("resample", (coarse,), {"image": answer}, {**place, "shown": False})
-        fine = self._spare(panel)
-        scale = (coarse.width_px / fine.width_px, coarse.height_px / fine.height_px)
-        how = {"size": coarse.size, "image_from_panel": scale, "shown": shown}
-        self._draw("finer", (fine,), {"image": coarse}, how)
+        if self._reduction == 1:
+            self._finer(coarse, spare, shown=shown)
         self._swap(panel)
 
     def project(self, panels: Sequence[int]) -> None:
@@ -147,6 +142,7 @@ class GlState:
         self._swap(panel)
 
     def start_joint(self) -> None:
+        self._whole()
         centre = self._image(CENTRE, "begun")
         images = {**self._wanted(), **{NAMES[n]: self._panel(n) for n in OUTER}}
         self._draw("centre", (centre,), images, self._through())
@@ -160,6 +156,7 @@ class GlState:
         self._stepped.step(self._problem.rays(step.places), targets, **how, ends=self._fade())
 
     def finish(self) -> Layers:
+        self._whole()
         width, height = self._stack.width_px, self._stack.height_px
         if self._pool is not None:
             left = left_in(self._pool, self._passes, self._stack)
@@ -185,6 +182,22 @@ class GlState:
                 for texture in self._textures.values():
                     self._passes.forget(texture)
             self._textures = {}
+
+    def _whole(self) -> None:
+        """Go on with the panels on their own pixels."""
+        if self._reduction == 1:
+            return
+        coarse = {n: (self._panel(n), self._mean(n)) for n in OUTER}
+        self._reduction, self._rasters, self._mean_in = 1, self._problem.rasters, "half"
+        for n, (panel, mean) in coarse.items():
+            self._finer(panel, self._spare(n), shown=True)
+            self._finer(mean, self._mean(n), shown=False)
+            self._swap(n)
+
+    def _finer(self, coarse: Image, fine: Image, *, shown: bool) -> None:
+        scale = (coarse.width_px / fine.width_px, coarse.height_px / fine.height_px)
+        how = {"size": coarse.size, "image_from_panel": scale, "shown": shown}
+        self._draw("finer", (fine,), {"image": coarse}, how)
 
     def _draw_layers(self, images: tuple[Image, ...]) -> None:
         """The solution: one image a panel, RGBA in 8 bits."""
@@ -304,10 +317,12 @@ class GlState:
         self, name: str, outputs: tuple[Image, ...], inputs: dict[str, Image], uniforms: Mapping[str, Any]
     ) -> None:
         always = {"even": START, "grey": self._grey}
-        self._passes.draw(name, outputs, inputs, {**uniforms, **always}, defines=self._defines)
+        self._passes.draw(name, outputs, inputs, {**uniforms, **always})
 
     def _wanted(self) -> dict[str, Image]:
         """What the eyes want, with the table that makes phase sums of it."""
+        if self._reduction > 1:
+            return self._reduced()
         images = {f"wanted_{eye}": self._image(CENTRE, f"wanted {eye}", dtype="f1") for eye in EYES}
         return {**images, "table": self._table}
 
@@ -320,12 +335,12 @@ class GlState:
     def _coarse(self, key: tuple[str, Any], size: tuple[int, int], *, dtype: str) -> Image:
         """An image of the model's coarser raster."""
         width, height = (-(-px // self._contract.reduction) for px in (self._stack.width_px, self._stack.height_px))
-        components = 1 if self._grey or dtype == "u4" else 4
+        components = 1 if self._grey else 4
         return Image(self._texture(key, width, height, components, dtype=dtype), *size)
 
     def _mean(self, panel: int) -> Image:
         """An outer panel as eyes that are unsure see it."""
-        return self._image(panel, "mean") if panel in self._spread else self._panel(panel)
+        return self._image(panel, self._mean_in) if panel in self._spread else self._panel(panel)
 
     def _panel(self, panel: int) -> Image:
         return self._image(panel, self._outer.get(panel, "outer"))
@@ -337,10 +352,9 @@ class GlState:
     def _swap(self, panel: int) -> None:
         self._outer[panel] = _other(self._outer.get(panel, "outer"))
 
-    def _image(self, panel: int, name: str, *, dtype: str | None = None) -> Image:
+    def _image(self, panel: int, name: str, *, dtype: str = "i2") -> Image:
         """The box's part of an image as large as a whole panel: boxes follow the viewer, textures don't."""
-        dtype = dtype or ("u4" if self._packed else "i2")
-        components = 1 if self._grey or dtype == "u4" else 4
+        components = 1 if self._grey else 4
         size = self._stack.width_px, self._stack.height_px
         return Image(self._texture((name, panel), *size, components, dtype=dtype), *_size(self._rasters[panel]))
 

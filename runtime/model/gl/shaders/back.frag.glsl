@@ -5,13 +5,13 @@
 #include "blur.glsl"
 #include "wanted.glsl"
 #include "slope.glsl"
-uniform IMAGE left, right;                              // what is lacked, and the other panel as it is seen
-uniform IMAGE half_blurred_left, half_blurred_right;    // that panel alone, blurred across
-uniform IMAGE mean, panel;
+uniform isampler2D left, right;                              // what is lacked, and the other panel as it is seen
+uniform isampler2D half_blurred_left, half_blurred_right;    // that panel alone, blurred across
+uniform isampler2D mean, panel;
 uniform mat3 centre_from_left, centre_from_right;
-out STORED joined;
+out ivec4 joined;
 
-Weighed lacked(IMAGE image, IMAGE half_blurred, sampler2D wanted, mat3 centre_from_here) {
+Weighed lacked(isampler2D image, isampler2D half_blurred, sampler2D wanted, mat3 centre_from_here) {
     vec2 place = moved(centre_from_here, gl_FragCoord.xy);
     if (beside(place, size) && !sheared(centre_from_here)) return BESIDE;
     vec2 low = floor(place - 0.5), weight = place - 0.5 - low;
@@ -31,5 +31,5 @@ void main() {
     Weighed by_left = lacked(left, half_blurred_left, wanted_left, centre_from_left);
     vec4 lacks = answered(by_left, lacked(right, half_blurred_right, wanted_right, centre_from_right));
     ivec2 place = ivec2(gl_FragCoord.xy);
-    joined = stored(lacks + 2.0 * vec4(value(mean, place) - value(panel, place)));
+    joined = rounded(lacks + 2.0 * vec4(value(mean, place) - value(panel, place)));
 }

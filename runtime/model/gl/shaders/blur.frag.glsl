@@ -2,9 +2,9 @@
 // The mean over where the eyes may be, along one direction.
 #include "sample.glsl"
 #include "blur.glsl"
-uniform IMAGE image;
-out STORED mean;
+uniform isampler2D image;
+out ivec4 mean;
 
 void main() {
-    mean = stored(blurred(image));
+    mean = rounded(blurred(image));
 }

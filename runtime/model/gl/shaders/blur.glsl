@@ -3,7 +3,7 @@ uniform int reach;
 uniform ivec2 along;        // (1, 0) or (0, 1)
 uniform ivec2 size;
 
-vec4 blurred(IMAGE image) {
+vec4 blurred(isampler2D image) {
     ivec2 place = ivec2(gl_FragCoord.xy);
     vec4 sum = kernel[0] * vec4(value(image, place));
     for (int step = 1; step <= reach; step++)
@@ -12,7 +12,7 @@ vec4 blurred(IMAGE image) {
 }
 
 // Blurred down at the four pixels around a place, line by line; `at` is the first of them.
-void blurred_down_around(IMAGE image, ivec2 at, out vec4 found[4]) {
+void blurred_down_around(isampler2D image, ivec2 at, out vec4 found[4]) {
     ivec2 first = clamp(at, ivec2(0), size - 1), next = clamp(at + 1, ivec2(0), size - 1);
     for (int corner = 0; corner < 4; corner++) found[corner] = vec4(0.0);
     for (int step = -reach; step <= reach + 1; step++) {

@@ -2,11 +2,11 @@
 // `blur` of two images of one size.
 #include "sample.glsl"
 #include "blur.glsl"
-uniform IMAGE first, second;
-layout(location = 0) out STORED first_mean;
-layout(location = 1) out STORED second_mean;
+uniform isampler2D first, second;
+layout(location = 0) out ivec4 first_mean;
+layout(location = 1) out ivec4 second_mean;
 
 void main() {
-    first_mean = stored(blurred(first));
-    second_mean = stored(blurred(second));
+    first_mean = rounded(blurred(first));
+    second_mean = rounded(blurred(second));
 }

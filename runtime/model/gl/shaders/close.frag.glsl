@@ -3,8 +3,8 @@
 #include "sample.glsl"
 #include "wanted.glsl"
 #include "slope.glsl"
-uniform IMAGE rear, front;                           // as they are
-uniform IMAGE rear_mean, front_mean;                 // as eyes that are unsure see them
+uniform isampler2D rear, front;                           // as they are
+uniform isampler2D rear_mean, front_mean;                 // as eyes that are unsure see them
 uniform ivec2 rear_size, front_size, centre_size;
 uniform ivec2 rear_origin, front_origin, centre_origin;
 uniform mat3 rear_from_left, rear_from_right, front_from_left, front_from_right;
@@ -21,7 +21,7 @@ vec4 coloured(ivec4 codes) {
     return vec4((grey ? vec3(codes.r) : vec3(codes.rgb)) / 255.0, 1.0);
 }
 
-vec4 outer(IMAGE image, ivec2 place, ivec2 size) {
+vec4 outer(isampler2D image, ivec2 place, ivec2 size) {
     if (!within(place, size)) return coloured(ivec4(neutral));
     return coloured(rounded(vec4(value(image, place) + even) / 16.0));
 }

@@ -4,13 +4,13 @@
 #include "wanted.glsl"
 #include "slope.glsl"
 #include "shown.glsl"
-uniform IMAGE left, right, panel;
+uniform isampler2D left, right, panel;
 uniform ivec2 size;         // of the centre panel's raster
 uniform mat3 centre_from_left, centre_from_right;
 uniform float share;        // of what is lacked
-out STORED corrected;
+out ivec4 corrected;
 
-Weighed lacked(IMAGE image, sampler2D wanted, mat3 centre_from_here) {
+Weighed lacked(isampler2D image, sampler2D wanted, mat3 centre_from_here) {
     vec2 place = moved(centre_from_here, gl_FragCoord.xy);
     if (beside(place, size) && !sheared(centre_from_here)) return BESIDE;
     vec2 low = floor(place - 0.5), weight = place - 0.5 - low;

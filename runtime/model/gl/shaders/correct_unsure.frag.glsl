@@ -4,10 +4,10 @@
 #include "blur.glsl"
 #include "slope.glsl"
 #include "shown.glsl"
-uniform IMAGE panel, mean;
-uniform IMAGE half_blurred; // `back`, blurred across
+uniform isampler2D panel, mean;
+uniform isampler2D half_blurred; // `back`, blurred across
 uniform float share;        // of what is lacked
-out STORED corrected;
+out ivec4 corrected;
 
 void main() {
     ivec2 place = ivec2(gl_FragCoord.xy);

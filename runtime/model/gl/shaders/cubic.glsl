@@ -9,7 +9,7 @@ vec4 cubic_weights(float t) {
     return w;
 }
 
-ivec4 cubic(SOURCE image, ivec2 size, vec2 place) {
+ivec4 cubic(isampler2D image, ivec2 size, vec2 place) {
     vec2 low = floor(place - 0.5), weight = place - 0.5 - low;
     ivec2 at = ivec2(low) - 1;
     vec4 across = cubic_weights(weight.x), down = cubic_weights(weight.y), sum = vec4(0.0);

@@ -3,10 +3,10 @@
 #include "sample.glsl"
 #include "cubic.glsl"
 #include "shown.glsl"
-uniform IMAGE image;
+uniform isampler2D image;
 uniform ivec2 size;
 uniform vec2 image_from_panel;  // scale
-out STORED panel;
+out ivec4 panel;
 
 void main() {
     panel = kept(cubic(image, size, gl_FragCoord.xy * image_from_panel));

@@ -1,5 +1,5 @@
 // What each eye lacks at a pixel of the centre panel when that panel is the best one for the outer ones.
-uniform IMAGE rear, front;
+uniform isampler2D rear, front;
 uniform ivec2 rear_size, front_size;
 uniform mat3 rear_from_left, rear_from_right, front_from_left, front_from_right;  // from the centre's pixels
 // How a part of larger panels ends: nothing beyond `kept_box` (left, top, right, bottom) drives the panels.

@@ -1,6 +1,5 @@
 #version 330 core
 // An outer panel as the network wants it, from the network's raster.
-#define SOURCE isampler2D
 #include "sample.glsl"
 #include "columns.glsl"
 #include "cubic.glsl"
@@ -8,7 +7,7 @@
 uniform isampler2D image;   // codes from 0 on
 uniform ivec2 size;
 uniform mat3 image_from_panel;
-out STORED panel;
+out ivec4 panel;
 
 void main() {
     vec2 place = moved(image_from_panel, gl_FragCoord.xy);

@@ -4,11 +4,11 @@
 #include "wanted.glsl"
 #include "slope.glsl"
 #include "lacks.glsl"
-layout(location = 0) out STORED left;
-layout(location = 1) out STORED right;
+layout(location = 0) out ivec4 left;
+layout(location = 1) out ivec4 right;
 
 void main() {
     Look found = look(ivec2(gl_FragCoord.xy));
-    left = stored(vec4(found.left));
-    right = stored(vec4(found.right));
+    left = found.left;
+    right = found.right;
 }

@@ -6,17 +6,17 @@
 #include "slope.glsl"
 #include "lacks.glsl"
 uniform bool of_front;      // which panel moves
-layout(location = 0) out STORED left;
-layout(location = 1) out STORED right;
-layout(location = 2) out STORED moving_left;
-layout(location = 3) out STORED moving_right;
+layout(location = 0) out ivec4 left;
+layout(location = 1) out ivec4 right;
+layout(location = 2) out ivec4 moving_left;
+layout(location = 3) out ivec4 moving_right;
 
 void main() {
     Look found = look(ivec2(gl_FragCoord.xy));
     ivec4 by_left = of_front ? found.front_left : found.rear_left;
     ivec4 by_right = of_front ? found.front_right : found.rear_right;
-    left = stored(vec4(found.left + by_left));
-    right = stored(vec4(found.right + by_right));
-    moving_left = stored(vec4(by_left));
-    moving_right = stored(vec4(by_right));
+    left = found.left + by_left;
+    right = found.right + by_right;
+    moving_left = by_left;
+    moving_right = by_right;
 }

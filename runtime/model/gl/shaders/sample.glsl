@@ -1,5 +1,4 @@
 // Images hold signed sixteenths of an 8-bit code; outer panels' from the middle of their range, so that 0 is even.
-// PACKED: three of ten bits in one number of 32, which share how far they are shifted: half as much to read and write.
 // Row 0 is the top, and places are pixels with centres at half-integers.
 // Weights have full precision, which hardware's filters (1/256) have not.
 uniform int even;  // of an outer panel
@@ -9,42 +8,7 @@ ivec4 value(isampler2D image, ivec2 place) {
     return texelFetch(image, place, 0);
 }
 
-#ifdef PACKED
-#define IMAGE usampler2D
-#define STORED uint
-
-// Steps of a sixteenth of a code within 32 codes, of a quarter within a panel's range, and up to one within 512 codes:
-// what is more than that drives a panel to the end of its range anyway.
-int shift_of(uint index) {
-    return index == 0u ? 0 : int(index) + 1;
-}
-
-ivec4 value(usampler2D image, ivec2 place) {
-    uint held = texelFetch(image, place, 0).r;
-    return ivec4((ivec3(int(held), int(held << 10), int(held << 20)) >> 22) << shift_of(held & 3u), 0);
-}
-
-uint stored(vec4 value) {
-    vec3 size = abs(value.rgb);
-    float most = max(max(size.r, size.g), size.b);
-    uint index = most < 511.5 ? 0u : most < 2046.0 ? 1u : most < 4092.0 ? 2u : 3u;
-    uvec3 bits = uvec3(ivec3(clamp(roundEven(value.rgb / float(1 << shift_of(index))), -512.0, 511.0))) & 1023u;
-    return bits.r << 22 | bits.g << 12 | bits.b << 2 | index;
-}
-#else
-#define IMAGE isampler2D
-#define STORED ivec4
-
-ivec4 stored(vec4 value) {
-    return ivec4(roundEven(value));
-}
-#endif
-
-#ifndef SOURCE
-#define SOURCE IMAGE  // what is sampled
-#endif
-
-ivec4 texel(SOURCE image, ivec2 place, ivec2 size) {
+ivec4 texel(isampler2D image, ivec2 place, ivec2 size) {
     return value(image, clamp(place, ivec2(0), size - 1));
 }
 
@@ -56,7 +20,7 @@ ivec4 rounded(vec4 value) {
     return ivec4(roundEven(value));
 }
 
-ivec4 bilinear(SOURCE image, ivec2 size, vec2 place) {
+ivec4 bilinear(isampler2D image, ivec2 size, vec2 place) {
     vec2 low = floor(place - 0.5), weight = place - 0.5 - low;
     ivec2 at = ivec2(low);
     vec4 above = mix(vec4(texel(image, at, size)), vec4(texel(image, at + ivec2(1, 0), size)), weight.x);
@@ -76,7 +40,7 @@ bool sheared(mat3 matrix) {
 
 // What a ray meets that leaves an image is even, or where that is sheared its repeated edge: nobody sees it, for it
 // does not cross every panel.
-ivec4 crossed(SOURCE image, ivec2 size, mat3 image_from_here, vec2 at) {
+ivec4 crossed(isampler2D image, ivec2 size, mat3 image_from_here, vec2 at) {
     vec2 place = moved(image_from_here, at);
     return beside(place, size) && !sheared(image_from_here) ? ivec4(0) : bilinear(image, size, place);
 }
