@@ -152,7 +152,7 @@ class SolverThread(SolverHost):
                 if request is not None:
                     self._step(attempt, parts, request)
         except ContextLost as error:
-            log.error("solver: %s", error)
+            log.error("solver: %s", _line(error))  # a record that held the error would hold its textures
             attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
         except Exception as error:  # what no step answers with: a bug of ours, or a library's
             log.exception("solver: unexpected error")
