@@ -67,4 +67,4 @@ def test_pictures_that_differ_everywhere_leave_nothing_out(tmp_path: Path) -> No
     for name in ("left", "right"):
         write_png(tmp_path / f"{name}.png", random.integers(0, 256, (270, 480, 3), np.uint8))
     result = solved(tmp_path)
-    assert result["plan"] == [] and result["steps"] == 4
+    assert result["plan"] == [] and result["steps"] == 5
