@@ -113,7 +113,7 @@ def within_one(first: U8, second: U8) -> float:
 @pytest.mark.parametrize("pose", POSES)
 @pytest.mark.parametrize("name", SHIPPED)
 def test_codes_are_those_of_exact_sampling(name: str, pose: str, sigma_mm: float, gl: GlBackend) -> None:
-    """Unsure eyes by whole images (8 mm) and by packed ones."""
+    """Sure eyes, unsure ones on every pixel (8 mm), and on coarser ones."""
     cpu, opengl = both(name, STACK, gl)
     pictures, pair = cards(POSES[pose], STACK), POSES[pose]
     wanted, found = (layers_of(p, pictures, pair, sigma_mm=sigma_mm) for p in (cpu, opengl))
@@ -215,7 +215,7 @@ def test_codes_on_random_pairs(number: int, sigma_mm: float, gl: GlBackend) -> N
 @pytest.mark.parametrize("spread_px", [0.4, 0.55, 1.0, 4.0, 8.0])
 @pytest.mark.parametrize("name", SHIPPED)
 def test_codes_for_eyes_that_are_less_and_more_unsure(name: str, spread_px: float, gl: GlBackend) -> None:
-    """What is held in fewer bits, and what is not."""
+    """On every pixel, and on coarser ones."""
     sigma_mm = spread_px * STACK.width_m / STACK.width_px * 1e3 * 0.6 / 0.06
     pictures = cards(eyes(0.6), STACK)
     found = [layers_of(p, pictures, eyes(0.6), sigma_mm=sigma_mm) for p in both(name, STACK, gl)]

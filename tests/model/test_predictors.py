@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from runtime.config import ModelSettings
 from runtime.errors import EyesNotServed, ModelFailure
+from runtime.model import steps
 from runtime.model.job import Job
-from runtime.model.predictor import load_predictor
+from runtime.model.predictor import SHIPPED, load_predictor
 from runtime.model.reprojection import NEUTRAL, visible_boxes
 from runtime.model.sart import SartPredictor
 from runtime.model.still import solve_still
-from runtime.optics.carried import expected_psnrs_db
+from runtime.optics.carried import expected_psnrs_db, light_psnrs_db
 from runtime.optics.retina import panel_positions
 from runtime.optics.stack import PanelStack
 from runtime.report.pairs import eyes_at
@@ -162,6 +165,22 @@ def test_what_is_solved_for_unsure_eyes_is_better_for_them_and_worse_for_two_poi
     assert expected[12.0] > expected[0.0] + 1
     exact = {s: displayed(layers, pair, STACK).psnr_db for s, layers in shown.items()}
     assert exact[0.0] > exact[12.0] + 1
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_eyes_that_see_nothing_fine_of_the_outer_panels_see_as_much_light_by_coarser_corrections(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair, sigma_mm = POSES["in front"], 12.0  # the outer panels' pictures move by 1.1 pixels
+    pictures, light_db = [card_scene(eye) for eye in pair], []
+    for blurred in (steps.BLURRED, np.inf):  # on every pixel
+        monkeypatch.setattr(steps, "BLURRED", blurred)
+        predictor = load_predictor(name, STACK, ModelSettings(threads=1))
+        how: Any = {"eyes_m": pair, "fov_deg": FOV_DEG}
+        layers = solve_still(*pictures, **how, predictor=predictor, eye_sigma_mm=sigma_mm).layers
+        light_db.append(light_psnrs_db(layers, pictures, STACK, **how, sigmas_mm=[sigma_mm])[sigma_mm])
+    assert light_db[0] != light_db[1]
+    assert light_db[0] > light_db[1] - 0.2
 
 
 @pytest.mark.parametrize("pose", POSES)
