@@ -17,7 +17,6 @@ from runtime.model.backends import choose
 from runtime.model.contract import Step
 from runtime.model.cpu import CpuBackend
 from runtime.model.gl.backend import GlBackend
-from runtime.model.gl.programs import Account
 from runtime.model.job import Job, Part
 from runtime.model.predictor import SHIPPED, Predictor, load_predictor
 from runtime.model.still import solve_still
@@ -27,6 +26,7 @@ from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, Tilt
 from runtime.records import F64, U8
 from runtime.support.gl import offscreen_context
+from tests.model.gl_account import counted
 from tests.model.plain_panels import hold_exactly
 from tests.model.scenes import FOV_DEG, card_scene, eyes
 from tests.model_export.stills import random_still
@@ -63,7 +63,6 @@ def made() -> Iterator[tuple[Any, GlBackend]]:
 def gl(made: tuple[Any, GlBackend]) -> Iterator[GlBackend]:
     context, backend = made
     with context:
-        backend.passes.account = None
         yield backend
 
 
@@ -265,10 +264,19 @@ def test_a_panel_wider_than_the_driver_allows_is_refused(gl: GlBackend) -> None:
 def test_only_the_network_s_raster_and_the_layers_cross(gl: GlBackend) -> None:
     """Down: what the network looks at, and the layers where arrays are asked for. Up: pictures, and its answer."""
     _, opengl = both("balanced", STACK, gl)
-    gl.passes.account = account = Account()
-    layers_of(opengl, cards(eyes(0.6), STACK), eyes(0.6))
-    crossed = [one.name for one in account.passes if one.crosses]
-    assert crossed == ["picture up"] * 2 + ["network down"] * 2 + ["answer up"] * 2 + ["layer down"] * 3
+    with counted() as account:
+        layers_of(opengl, cards(eyes(0.6), STACK), eyes(0.6))
+    assert account.crossed == ["codes up"] * 2 + ["numbers down"] * 2 + ["numbers up"] * 2 + ["codes down"] * 3
+
+
+@pytest.mark.parametrize("sigma_mm", [0.0, 8.0, UNSURE_MM])
+def test_a_gpu_of_200_gigabytes_a_second_has_the_bandwidth_for_60_solutions_at_1920x1080(
+    sigma_mm: float, gl: GlBackend
+) -> None:
+    _, opengl = both("balanced", STACK, gl)
+    with counted() as account:
+        layers_of(opengl, cards(eyes(0.6), STACK), eyes(0.6), sigma_mm=sigma_mm)
+    assert account.bytes * (1920 * 1080) / (STACK.width_px * STACK.height_px) < 200e9 / 60 / 1.5
 
 
 def test_automatic_takes_the_faster_one_and_says_what_was_measured(gl: GlBackend) -> None:

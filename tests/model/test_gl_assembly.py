@@ -15,7 +15,6 @@ from runtime.errors import ContextLost
 from runtime.model.assembly import ArrayAssembly, Placed, Rest, Shared, Uniform
 from runtime.model.gl.assembly import GlAssembly
 from runtime.model.gl.backend import GlBackend
-from runtime.model.gl.programs import Account
 from runtime.model.job import Job
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.model.reprojection import NEUTRAL
@@ -26,6 +25,7 @@ from runtime.plan.drawing import drawn_for, raster_views
 from runtime.records import F64, U8
 from runtime.support.gl import offscreen_context
 from runtime.support.gl_sharing import LayerPool, LayerTextures, ShareGroup
+from tests.model.gl_account import counted
 from tests.model.plain_panels import hold_exactly
 from tests.model.scenes import eyes
 from tests.support.left_in_textures import written
@@ -33,7 +33,7 @@ from tests.support.left_in_textures import written
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 240, 135)
 WITHIN_ONE = 0.999  # of all codes
 WALK = [eyes(0.6), eyes(0.6, 0.1, 0.02), eyes(0.7, -0.2), eyes(0.6, 0.1, roll_deg=15)]
-NETWORK = ["network down"] * 2 + ["answer up"] * 2
+NETWORK = ["numbers down"] * 2 + ["numbers up"] * 2
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,6 @@ def gl(made: tuple[Any, ShareGroup, GlBackend]) -> Iterator[GlBackend]:
     """Whose layers are left in textures."""
     context, _, backend = made
     with context:
-        backend.passes.account = None
         yield backend
 
 
@@ -101,10 +100,6 @@ def both(gl: GlBackend) -> tuple[Predictor, Predictor]:
     return cpu, opengl
 
 
-def crossed(account: Account) -> list[str]:
-    return [one.name for one in account.passes if one.crosses]
-
-
 def test_a_window_among_the_rest_is_put_there_as_the_processor_does_it(gl: GlBackend, pool: LayerPool) -> None:
     width, height = STACK.width_px, STACK.height_px
     picture = Shared(noise(width, height, seed=1), 0.1)
@@ -148,29 +143,28 @@ def test_windows_of_the_plan_stay_in_textures(aim: bool, gl: GlBackend) -> None:
     cpu, opengl = both(gl)
     for eyes_m in WALK:
         wanted = cpu.solve(drawn(cpu, content, eyes_m, aim=aim)).layers.copy()
-        gl.passes.account = account = Account()
-        job = drawn(opengl, content, eyes_m, aim=aim)
-        found = opengl.solve(job).made
-        gl.passes.account = None
+        with counted() as account:
+            job = drawn(opengl, content, eyes_m, aim=aim)
+            found = opengl.solve(job).made
         assert 0 < job.solved_share(STACK) < 0.6
         assert isinstance(found, LayerTextures)
         assert within_one(wanted, found.pixels()) >= WITHIN_ONE
-        # A picture that both eyes see besides goes up once, as every picture does that is no texture.
-        assert sorted(crossed(account)) == sorted(NETWORK + ([] if aim else ["picture up"] * 3))
+        # Pictures that are looked through are read; one that both eyes see besides goes up once, as the others do.
+        assert sorted(account.crossed) == sorted(NETWORK + ([] if aim else ["codes down"] * 2 + ["codes up"] * 3))
     content.close()
 
 
 def test_pictures_that_are_alike_are_shown_from_textures(gl: GlBackend) -> None:
     picture = noise(STACK.width_px, STACK.height_px)
     cpu, opengl = both(gl)
-    gl.passes.account = account = Account()
     job, savings = trim(Job([[picture], [picture]], eyes(0.6)), Scene(STACK))
-    wanted, found = (predictor.solve(job) for predictor in (cpu, opengl))
+    with counted() as account:
+        wanted, found = (predictor.solve(job) for predictor in (cpu, opengl))
     assert savings.solved_share == 0.0
     assert isinstance(found.made, LayerTextures)
     assert_alike(found.made, wanted.layers, exact=False)
     assert (found.layers[0, ..., :3] == NEUTRAL).all()
-    assert crossed(account) == ["picture up"]
+    assert account.crossed == ["codes up"]
 
 
 @pytest.mark.usefixtures("exactly")
@@ -181,14 +175,13 @@ def test_solutions_for_eyes_above_each_other_stay_in_textures(scene: str, gl: Gl
     for head in (0.0, 0.05, -0.05):
         eyes_m = np.array([[0.6, head, -0.031], [0.6, head, 0.031]])[:: -1 if head < 0 else 1]
         wanted = cpu.solve(drawn(cpu, content, eyes_m)).layers
-        gl.passes.account = account = Account()
-        job = drawn(opengl, content, eyes_m)
-        found = opengl.solve(job).made
-        gl.passes.account = None
+        with counted() as account:
+            job = drawn(opengl, content, eyes_m)
+            found = opengl.solve(job).made
         assert (job.solved_share(STACK) < 0.6) == (scene == "sparse")
         assert isinstance(found, LayerTextures)
         assert within_one(wanted, found.pixels()) >= WITHIN_ONE
-        assert crossed(account) == NETWORK
+        assert account.crossed == NETWORK
     content.close()
 
 

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from runtime.model.gl.joint import GlJoint
-from runtime.model.gl.programs import Account, Image, Passes
+from runtime.model.gl.programs import Image, Passes
 from runtime.optics.rect import PixelRect
 from runtime.records import F64
 from runtime.support.gl import offscreen_context
+from tests.model.gl_account import counted
 
 WIDTH, HEIGHT = 70, 40
 FULL = 4080
@@ -137,10 +138,9 @@ def test_a_part_s_end_drives_nothing(context: Any) -> None:
         "over": (5.0, 5.0, 5.0, 5.0),
         "centre_from_here": (1.0, 1.0, 0.0, 0.0),
     }
-    held.passes.account = account = Account()
-    with held.passes.drawing():
+    with counted() as account, held.passes.drawing():
         joint.step(seen_from((0.5, 0.0), (-0.5, 0.0)), targets, ends=ends, **HOW)
-    assert [one.name for one in account.passes] == ["compare", "move", "move", "move"]
+    assert account.passes == ["compare", "move", "move", "move"]
     centre = np.frombuffer(joint.panels[1].texture.read(), np.int16).reshape(HEIGHT, WIDTH, 4)[..., :3]
     assert (centre[12:28, 30:40] != 0).all()
     assert (centre[:9] == 0).all() and (centre[:, :19] == 0).all()

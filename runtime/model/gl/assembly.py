@@ -99,9 +99,7 @@ class GlAssembly:
             self._textures["picture"] = self._passes.context.texture((width, height), 4)
         texture = self._textures["picture"]
         texture.write(np.ascontiguousarray(picture))
-        image = Image(texture, width, height)
-        self._passes.crossed("picture up", image, bytes_px=4, to_gpu=True)
-        return image
+        return Image(texture, width, height)
 
     def _table(self, codes: U8) -> Image:
         if "codes" not in self._textures:

@@ -1,11 +1,11 @@
-"""Fragment shaders that draw from images into images, and an account of what they read and write."""
+"""Fragment shaders that draw from images into images."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import resources
 from typing import Any
 
@@ -29,37 +29,6 @@ class Image:
     def size(self) -> tuple[int, int]:
         return self.width_px, self.height_px
 
-    @property
-    def texel_bytes(self) -> int:
-        width = {"f1": 1, "i2": 2}[self.texture.dtype]
-        components: int = self.texture.components
-        return components * width
-
-    @property
-    def bytes(self) -> int:
-        return self.width_px * self.height_px * self.texel_bytes
-
-
-@dataclass(frozen=True, slots=True)
-class Pass:
-    """One draw, or one transfer between GPU and processor."""
-
-    name: str
-    width_px: int
-    height_px: int
-    read_bytes: int  # every image that is looked into, once
-    written_bytes: int
-    crosses: bool = False  # the bus
-    gpu_ms: float | None = None  # by a timer query, where asked for
-
-
-@dataclass
-class Account:
-    """What was drawn and what crossed the bus, one pass after the other."""
-
-    timed: bool = False  # by timer queries, which hold every pass up until it is complete
-    passes: list[Pass] = field(default_factory=list)
-
 
 def source(name: str, *, defines: Sequence[str] = ()) -> str:
     """A shader with what it includes. defines: what it asks for by `#ifdef`."""
@@ -76,7 +45,6 @@ class Passes:
 
     def __init__(self, context: moderngl.Context) -> None:
         self.context = context
-        self.account: Account | None = None
         self._vertex = source("whole.vert.glsl")
         self._programs: dict[tuple[str, tuple[str, ...]], tuple[Any, Any, dict[str, Any]]] = {}
         self._targets: dict[tuple[int, ...], Any] = {}
@@ -112,30 +80,17 @@ class Passes:
             self._set(program, held, key, unit)
         for key, value in uniforms.items():
             self._set(program, held, key, value)
-        target = self._target(outputs)
+        target = self.target(outputs)
         target.viewport = (0, 0, *outputs[0].size)
         target.use()
-        if self.account is not None and self.account.timed:
-            query = self.context.query(time=True)
-            with query:
-                array.render(moderngl.TRIANGLES, vertices=3)
-            self._enter(name, outputs, inputs, gpu_ms=query.elapsed / 1e6)
-            return
         array.render(moderngl.TRIANGLES, vertices=3)
-        if self.account is not None:
-            self._enter(name, outputs, inputs, gpu_ms=None)
-
-    def crossed(self, name: str, image: Image, *, bytes_px: int, to_gpu: bool) -> None:
-        """Note a transfer of so many bytes a pixel."""
-        if self.account is not None:
-            count = image.width_px * image.height_px * bytes_px
-            self.account.passes.append(
-                Pass(name, *image.size, 0 if to_gpu else count, count if to_gpu else 0, crosses=True)
-            )
 
     def target(self, outputs: Sequence[Image]) -> Any:
         """The framebuffer of some images."""
-        return self._target(outputs)
+        key = tuple(output.texture.glo for output in outputs)
+        if key not in self._targets:
+            self._targets[key] = self.context.framebuffer([output.texture for output in outputs])
+        return self._targets[key]
 
     def forget(self, texture: Any) -> None:
         """Release a texture and the framebuffers that it is in."""
@@ -168,15 +123,3 @@ class Passes:
         if key in program:
             program[key] = value
         held[key] = value
-
-    def _target(self, outputs: Sequence[Image]) -> Any:
-        key = tuple(output.texture.glo for output in outputs)
-        if key not in self._targets:
-            self._targets[key] = self.context.framebuffer([output.texture for output in outputs])
-        return self._targets[key]
-
-    def _enter(self, name: str, outputs: Sequence[Image], inputs: Mapping[str, Image], *, gpu_ms: float | None) -> None:
-        assert self.account is not None
-        looked = {image.texture.glo: image.bytes for image in inputs.values()}
-        written = sum(output.bytes for output in outputs)
-        self.account.passes.append(Pass(name, *outputs[0].size, sum(looked.values()), written, gpu_ms=gpu_ms))

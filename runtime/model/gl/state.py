@@ -103,7 +103,6 @@ class GlState:
         rows, columns = codes.shape[:2]
         answer = self._grown(f"answer {panel}", columns, rows, components=self._problem.channels)
         answer.texture.write(np.ascontiguousarray(codes), viewport=(0, 0, columns, rows), alignment=1)
-        self._passes.crossed("answer up", answer, bytes_px=2 * self._problem.channels, to_gpu=True)
         raster = coarser(self._problem.rasters[panel], self._contract.reduction)  # as the processor does it
         spare = self._spare(panel)
         coarse = spare if self._reduction > 1 else self._coarse(("answer", panel), _size(raster), dtype="i2")
@@ -172,7 +171,6 @@ class GlState:
             self._layers = np.empty((3, height, width, 4), np.uint8)
         for image, layer in zip(images, self._layers, strict=True):
             self._passes.target((image,)).read_into(layer, components=4)
-            self._passes.crossed("layer down", image, bytes_px=4, to_gpu=False)
         return self._layers
 
     def close(self) -> None:
@@ -234,7 +232,6 @@ class GlState:
             texture = self._texture(("picture", eye), self._stack.width_px, self._stack.height_px, 4, dtype="f1")
             image = Image(texture, box.width_px, box.height_px)
             texture.write(np.ascontiguousarray(picture[box.slices]), viewport=(0, 0, *image.size))
-            self._passes.crossed("picture up", image, bytes_px=4, to_gpu=True)
             taken.append(image)
         return taken
 
@@ -297,7 +294,7 @@ class GlState:
         return {
             "kept_box": tuple(map(float, (fade.kept.u0, fade.kept.v0, fade.kept.u1, fade.kept.v1))),
             "over": (along * fade.left, down * fade.top, along * fade.right, down * fade.bottom),
-            "centre_from_here": _as_scale_shift(matrix),
+            "centre_from_here": (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]),
         }
 
     def _blur(
@@ -392,11 +389,10 @@ class GlState:
         tail = () if channels == 1 else (channels,)
         if (key := (height, width, channels)) not in self._read:
             self._read = {key: (np.empty((height, width, *tail), np.int16), np.empty((height, width, *tail), np.int16))}
-        for index, (image, array) in enumerate(zip(seen, self._read[key], strict=True)):
+        for index, array in enumerate(self._read[key]):
             self._passes.target(seen).read_into(
                 array, viewport=(0, 0, width, height), components=channels, attachment=index, alignment=1, dtype="i2"
             )
-            self._passes.crossed("network down", image, bytes_px=2 * channels, to_gpu=False)
         return self._read[key]
 
 
@@ -441,7 +437,3 @@ def _columns(law: ColumnLaw) -> dict[str, float]:
 def _mat3(matrix: F64) -> tuple[float, ...]:
     """Column by column, as OpenGL has it."""
     return tuple(matrix.T.ravel().tolist())
-
-
-def _as_scale_shift(matrix: F64) -> tuple[float, float, float, float]:
-    return float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
