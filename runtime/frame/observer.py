@@ -24,7 +24,8 @@ from runtime.evaluation.displayed import EyeViews, displayed
 from runtime.frame.presenter import Refresh
 from runtime.frame.solver_host import SolverHost
 from runtime.optics.alignment import shown_layers
-from runtime.optics.carried import PUPIL_SIGMA_MM, carried_db, light_psnrs_db
+from runtime.optics.carried import carried_db, light_psnrs_db
+from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import retina_pictures
 from runtime.records import F64, U8, RefreshAccount, SensorFrame, State

@@ -19,7 +19,7 @@ from runtime.frame.run_state import RunCell, RunState
 from runtime.model.assembly import flat_layers
 from runtime.model.job import Part
 from runtime.model.trim import Savings
-from runtime.optics.carried import configured_sigma_mm
+from runtime.optics.pupil import configured_sigma_mm
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
 from runtime.plan.drawing import drawn_for

@@ -148,7 +148,7 @@ class CpuState:
             size = replace(size, width_px=width_px, height_px=height_px)
             self._by_kind[key] = Panels(size, threads=self._threads, channels=problem.channels)
         panels = self._by_kind[key]
-        panels.crop(problem.boxes, problem.stack, reduction)
+        panels.crop(problem.coarser_rasters(reduction), problem.stack, reduction)
         panels.set_eyes(problem.eyes_m, eye_sigma_mm=problem.eye_sigma_mm)
         return panels
 

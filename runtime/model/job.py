@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from runtime.model.fade import Fade
-from runtime.optics.carried import PUPIL_SIGMA_MM
+from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8

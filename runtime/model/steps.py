@@ -19,7 +19,7 @@ from runtime.model.compiled.passes import fade_codes
 from runtime.model.contract import Contract, Places, Step
 from runtime.model.fade import Fade
 from runtime.model.job import Picture
-from runtime.model.reprojection import CENTRE, FRONT, OUTER, REAR, START, reprojection, spreads
+from runtime.model.reprojection import CENTRE, FRONT, OUTER, REAR, START, coarser, reprojection, spreads
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.tilt import coarse_layer_from_seen
@@ -56,8 +56,13 @@ class Problem:
     def reduction(self) -> int:
         """How many times coarser than panels corrections are: as the network's pictures, where eyes are so unsure that
         they see nothing finer of the outer panels."""
-        least_px = min(spreads(self.rasters, self.eyes_m, eye_sigma_mm=self.eye_sigma_mm).values(), default=(0.0,))
-        return self.contract.reduction if min(least_px) >= BLURRED * self.contract.reduction else 1
+        spread = spreads(self.rasters, self.eyes_m, eye_sigma_mm=self.eye_sigma_mm)
+        least_px = min(px for n in OUTER for px in spread.get(n, (0.0,)))
+        return self.contract.reduction if least_px >= BLURRED_COARSE_PX * self.contract.reduction else 1
+
+    def coarser_rasters(self, reduction: int) -> tuple[PlaneRaster, ...]:
+        """`rasters`, of pixels so many times as wide."""
+        return tuple(coarser(raster, reduction) for raster in self.rasters)
 
     def reduced_from_frame(self, side: int) -> F64:
         """3x3: those pixels from the network's raster (`ChainFrame.columns`), as one eye sees them in line."""
@@ -116,7 +121,7 @@ class Problem:
         return self.stack.panel(CENTRE).raster_from_plane() @ plane_from_raster
 
 
-BLURRED = 0.4  # standard deviation of what unsure eyes see, of a coarse pixel: with less, light is lost
+BLURRED_COARSE_PX = 0.4  # standard deviation, coarse pixels, of what unsure eyes see: with less, light is lost
 PLACES: Mapping[Places, Sequence[tuple[float, float]]] = {  # right and up, standard deviations
     "middle": ((0.0, 0.0),),
     "rising": ((1.0, 1.0), (-1.0, -1.0)),

@@ -12,7 +12,7 @@ from runtime.model.base import Prediction, Predictor
 from runtime.model.job import Job
 from runtime.model.own_rays import refined
 from runtime.model.unseen import extrapolate_border, is_whole, shown_of
-from runtime.optics.carried import PUPIL_SIGMA_MM
+from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack

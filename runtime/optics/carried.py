@@ -1,4 +1,4 @@
-"""What eyes see that are not where the layers were solved for: carried, expected, light (docs/contracts.md); a pupil.
+"""What eyes see that are not where the layers were solved for: carried, expected and light quality (docs/contracts.md).
 
 The picture that the layers were solved for is carried along on the centre panel: the ray of each of its pixels is
 replaced by the one from the true eye through the same point of that panel. So ghosts and colour fringes count, and
@@ -7,9 +7,8 @@ the parallax that a late picture lacks does not.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +20,6 @@ from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
 PLENTY = 3_000_000  # numbers of a picture
-PUPIL_SIGMA_MM = 1.0  # of a pupil alone, 4 mm wide: a disc's standard deviation along an axis is a quarter of that
 
 
 def carried_db(
@@ -99,14 +97,3 @@ def intensities(picture: U8 | F32) -> F32:
     if picture.dtype == np.uint8:
         part /= np.float32(255)
     return part
-
-
-def configured_sigma_mm(setting: Literal["auto"] | float, *, tracker_sigma_m: float) -> float:
-    """What `model.eye_sigma_mm` comes to: a number as it stands; `auto` the pupil and the tracker together.
-
-    Standard deviation along an axis, millimetres, of where light enters an eye. tracker_sigma_m: metres, an axis,
-    common to both eyes.
-    """
-    if setting == "auto":
-        return math.hypot(PUPIL_SIGMA_MM, tracker_sigma_m * 1e3)
-    return float(setting)

@@ -11,7 +11,7 @@ from runtime.errors import ContextLost, PhasestackError
 from runtime.model.job import Job, Part, Picture
 from runtime.model.predictor import Predictor
 from runtime.model.trim import Scene, trim
-from runtime.optics.carried import PUPIL_SIGMA_MM
+from runtime.optics.pupil import PUPIL_SIGMA_MM
 from runtime.optics.rect import PixelRect, union
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack, raster_from_stack

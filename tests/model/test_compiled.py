@@ -61,7 +61,7 @@ def threads(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 def filled(kind: type[Panels], threads: int, stack: PanelStack, *, boxes: str, channels: int) -> Panels:
     """A panels with outer panels and pictures of smooth noise, the same for every kind."""
     panels = kind(stack, threads=threads, channels=channels)
-    panels.crop(BOXES[boxes], stack)
+    panels.crop(tuple(box.cut(stack.panel(n)) for n, box in enumerate(BOXES[boxes])), stack)
     noise = np.random.default_rng(5)
     for image in (*(panels.outer[n] for n in OUTER), *panels.target):
         most = 2 * FULL if any(image is target for target in panels.target) else FULL

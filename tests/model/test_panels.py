@@ -21,7 +21,7 @@ INNER = (slice(8, 40), slice(16, 80))  # far from every edge
 def panels_of(*, channels: int = 3, sigma_mm: float = 0.0) -> Panels:
     """Whole panels with even outer panels, seen by both eyes."""
     panels = Panels(STACK, threads=1, channels=channels)
-    panels.crop(WHOLE, STACK)
+    panels.crop(tuple(STACK.panel(n) for n in range(STACK.count)), STACK)
     panels.set_eyes(PAIR, eye_sigma_mm=sigma_mm)
     for n in OUTER:
         panels.outer[n][...] = START

@@ -173,8 +173,8 @@ def test_eyes_that_see_nothing_fine_of_the_outer_panels_see_as_much_light_by_coa
 ) -> None:
     pair, sigma_mm = POSES["in front"], 12.0  # the outer panels' pictures move by 1.1 pixels
     pictures, light_db = [card_scene(eye) for eye in pair], []
-    for blurred in (steps.BLURRED, np.inf):  # on every pixel
-        monkeypatch.setattr(steps, "BLURRED", blurred)
+    for blurred_px in (steps.BLURRED_COARSE_PX, np.inf):  # on every pixel
+        monkeypatch.setattr(steps, "BLURRED_COARSE_PX", blurred_px)
         predictor = load_predictor(name, STACK, ModelSettings(threads=1))
         how: Any = {"eyes_m": pair, "fov_deg": FOV_DEG}
         layers = solve_still(*pictures, **how, predictor=predictor, eye_sigma_mm=sigma_mm).layers

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from runtime.optics.carried import configured_sigma_mm
+from runtime.optics.pupil import configured_sigma_mm
 
 
 def test_a_pupil_of_four_millimetres_spreads_by_one() -> None:

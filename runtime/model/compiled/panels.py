@@ -18,18 +18,7 @@ from runtime.model.compiled.joint import JointState, rays_of
 from runtime.model.compiled.loops import PIECE, numbers_of
 from runtime.model.compiled.passes import blur, close_centre, correct, extrapolate_rows, fade_codes, show
 from runtime.model.compiled.warp import warped
-from runtime.model.reprojection import (
-    CENTRE,
-    EYES,
-    FRONT,
-    MAX_SPREAD_PX,
-    OUTER,
-    REAR,
-    START,
-    coarser,
-    reprojection,
-    spreads,
-)
+from runtime.model.reprojection import CENTRE, EYES, FRONT, MAX_SPREAD_PX, OUTER, REAR, START, reprojection, spreads
 from runtime.model.resample import buffer
 from runtime.model.targets import FULL, SUBCODE
 from runtime.optics.rect import PixelRect
@@ -58,19 +47,15 @@ class Panels:
         self._whole = {name: buffer(height, width, channels=channels) for name in (*names, ("moved", 0), ("spare", 0))}
         self.rasters: tuple[PlaneRaster, ...] = ()
         self.spread: dict[int, tuple[float, float]] = {}  # per outer panel, right and down, pixels
-        self._cropped: tuple[tuple[PixelRect, ...], PanelStack] | None = None
 
     @property
     def size(self) -> tuple[int, int]:
         """(width, height) of the centre panel's raster."""
         return self.rasters[CENTRE].width_px, self.rasters[CENTRE].height_px
 
-    def crop(self, boxes: tuple[PixelRect, ...], stack: PanelStack, reduction: int = 1) -> None:
-        """Cut every raster and buffer to what the eyes look through, of a stack so many times finer than this size."""
-        if (boxes, stack) == self._cropped:
-            return
-        self._cropped, self._stack, self._reduction = (boxes, stack), stack, reduction
-        self.rasters = tuple(coarser(box.cut(stack.panel(n)), reduction) for n, box in enumerate(boxes))
+    def crop(self, rasters: tuple[PlaneRaster, ...], stack: PanelStack, reduction: int = 1) -> None:
+        """Cut every buffer to what the eyes look through, of a stack so many times finer than the rasters."""
+        self.rasters, self._stack, self._reduction = rasters, stack, reduction
         self.outer = {n: self._view("outer", n, on=n) for n in OUTER}
         self.target = tuple(self._view("target", side, on=CENTRE) for side in EYES)  # phase sums
 
@@ -246,7 +231,7 @@ def warm_up() -> None:
     stack, eyes_m = PanelStack(0.5, 0.25, (-0.06, 0.0, 0.06), 64, 32), np.array([[0.6, -0.03, 0.0], [0.6, 0.03, 0.0]])
     boxes = (PixelRect(0, 0, 64, 32),) * 3
     panels = Panels(stack, threads=1)
-    panels.crop(boxes, stack)
+    panels.crop(tuple(stack.panel(n) for n in range(stack.count)), stack)
     for sigma_mm in (0.0, 100.0):
         panels.set_eyes(eyes_m, eye_sigma_mm=sigma_mm)
         panels.project(OUTER)

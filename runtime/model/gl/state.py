@@ -77,7 +77,7 @@ class GlState:
             self._want(taken, self._wanted())
             self._want(taken, self._reduced())
             self._reduction, self._mean_in = problem.reduction, "mean"
-            self._rasters = tuple(coarser(raster, self._reduction) for raster in problem.rasters)
+            self._rasters = problem.coarser_rasters(self._reduction)
             how: Any = {"eye_sigma_mm": problem.eye_sigma_mm, "reduction": self._reduction}
             self._spread: Spread = spreads(self._rasters, problem.eyes_m, **how)
             yield
