@@ -8,6 +8,7 @@ import re
 import shutil
 import stat
 import subprocess
+import tempfile
 import tomllib
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import pytest
 from runtime.config import ServiceSettings, load_settings
 from runtime.daemon.server import GROUP
 from runtime.sensor.usb_devices import KNOWN_DEVICES
+from tests.waiting import eventually
 
 ROOT = Path(__file__).parents[2]
 UNITS = ROOT / "systemd"
@@ -183,16 +185,32 @@ def test_the_installer_refuses_an_old_or_missing_python(tmp_path: Path) -> None:
     assert "no-such-python" in result.stderr
 
 
-@pytest.mark.skipif(shutil.which("xauth") is None or shutil.which("mcookie") is None, reason="no xauth or mcookie here")
-def test_the_authority_file_is_fresh_each_time_and_the_groups_alone(tmp_path: Path) -> None:
-    file = tmp_path / "authority"
-    cookies = []
-    for _ in range(2):
-        assert run("sh", str(UNITS / "x-authority"), str(file), ":7").returncode == 0
-        assert stat.S_IMODE(file.stat().st_mode) & 0o037 == 0
-        cookies.append(run("xauth", "-f", str(file), "list").stdout.split()[-1])
-    assert re.fullmatch("[0-9a-f]{32}", cookies[0])
-    assert cookies[0] != cookies[1]
+@pytest.mark.skipif(shutil.which("Xvfb") is None or os.getuid() != 0, reason="needs Xvfb, and root to be another user")
+def test_a_fresh_authority_lets_the_daemons_user_in_to_the_x_server_and_nobody_else() -> None:
+    """65534 (nobody): in the group or not, as the daemon's user is to root, who makes the file and runs the server."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o755)
+        file, number, cookies = Path(folder) / "authority", 99 + os.getpid() % 1000, []
+        for _ in range(2):
+            done = subprocess.run(["sh", str(UNITS / "x-authority"), str(file), f":{number}"], check=False, group=65534)
+            assert done.returncode == 0
+            cookies.append(file.read_bytes()[-16:])
+        assert cookies[0] != cookies[1]
+        assert stat.S_IMODE(file.stat().st_mode) == 0o640
+        server = subprocess.Popen(["Xvfb", f":{number}", "-auth", str(file)], stderr=subprocess.DEVNULL)
+        try:
+
+            def let_in(group: int) -> bool:
+                return subprocess.run(
+                    ["xrandr"], env={"DISPLAY": f":{number}", "XAUTHORITY": str(file), "PATH": os.environ["PATH"]},
+                    check=False, capture_output=True, user=65534, group=group, extra_groups=[], timeout=60,
+                ).returncode == 0  # fmt: skip
+
+            assert eventually(lambda: let_in(65534))
+            assert not let_in(12345)
+        finally:
+            server.kill()
+            server.wait()
 
 
 @pytest.mark.parametrize("unit", DAEMONS)
