@@ -32,7 +32,7 @@ lint: $(VENV)/.test
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/typos
-	$(BIN)/shellcheck .ci/run systemd/*.sh requirements/*.sh docs/*.sh systemd/x-authority
+	$(BIN)/shellcheck .ci/run systemd/*.sh requirements/*.sh docs/*.sh systemd/x-authority systemd/back-off
 
 types: $(VENV)/.test
 	$(BIN)/mypy

@@ -65,10 +65,7 @@ put 644 phasestack.sysusers.conf /usr/lib/sysusers.d/phasestack.conf
 put 644 phasestack.tmpfiles.conf /usr/lib/tmpfiles.d/phasestack.conf
 put 644 70-phasestack-sensors.rules /usr/lib/udev/rules.d/70-phasestack-sensors.rules
 put 755 x-authority /usr/lib/phasestack/x-authority
-version=$(systemctl --version 2>/dev/null | sed -n '1s/[^0-9]*\([0-9]*\).*/\1/p')
-if [ "${version:-0}" -ge 254 ]; then
-  put 644 50-backoff.conf /usr/lib/systemd/system/phasestack.service.d/50-backoff.conf
-fi
+put 755 back-off /usr/lib/phasestack/back-off
 put 644 ../docs/operation.md /usr/share/doc/phasestack/operation.md
 put 644 ../docs/page.md /usr/share/doc/phasestack/page.md
 put 644 ../docs/blackbox.md /usr/share/doc/phasestack/blackbox.md

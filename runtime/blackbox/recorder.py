@@ -164,8 +164,8 @@ class Recorder(logging.Handler):
 
     def _state_changed(self, name: str, reason: str, at_ns: int) -> None:
         self._passed.append({"time_s": round(time.time(), 3), "state": name, "reason": reason})
-        was_degraded = self._state[0].startswith("degraded")
-        if not name.startswith("degraded") or was_degraded or self._fault is not None or not self._most_ns:
+        was_well = self._state[0].partition(":")[0] not in ("", "starting", "degraded")  # a slow start is no fault
+        if not name.startswith("degraded") or not was_well or self._fault is not None or not self._most_ns:
             return
         kind = "fault-" + name.partition(": ")[2].replace(", ", "+")
         if at_ns - self._faults_ns.get(kind, -FAULTS_APART_NS) >= FAULTS_APART_NS:

@@ -106,14 +106,14 @@ for _name, _meaning in PLAIN.items():
 
 def tell(request: dict[str, Any], config: Path | None) -> None:
     """Send one request; prints what holds now. Exits with 1 where no daemon answers, 2 where it refuses."""
-    from runtime.daemon.client import NotRunning, ask, sockets
+    from runtime.daemon.client import NotRunning, ask, sockets, unit_advice
     from runtime.errors import InputError
     from runtime.support.figures import lines_of
 
     try:
         answer = ask(sockets(config), request, timeout_s=ANSWERS_WITHIN_S)
     except NotRunning as error:
-        typer.echo(str(error), err=True)
+        typer.echo("; ".join(filter(None, (str(error), unit_advice()))), err=True)
         raise typer.Exit(1) from None
     if not answer.get("ok"):
         raise InputError(f"ctl {request['command']}", "", str(answer.get("error", "refused")))
@@ -131,13 +131,14 @@ def status(
 
     Example: phasestack status --json
     """
-    from runtime.daemon.client import NotRunning, ask, sockets
+    from runtime.daemon.client import NotRunning, ask, sockets, unit_advice
     from runtime.support.figures import shown
 
     try:
         answer = ask(sockets(config), {"command": "status"})
     except NotRunning as error:
-        typer.echo(json.dumps({"ok": False, "error": str(error)}) if as_json else str(error), err=not as_json)
+        problem = "; ".join(filter(None, (str(error), unit_advice())))
+        typer.echo(json.dumps({"ok": False, "error": problem}) if as_json else problem, err=not as_json)
         raise typer.Exit(1) from None
     typer.echo(shown(answer, as_json=as_json))
     if float(answer.get("turn_age_s", 0.0)) > HUNG_AFTER_S:

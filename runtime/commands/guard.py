@@ -102,6 +102,10 @@ def _is_interrupt(error: BaseException | None) -> bool:
 def _say(line: str) -> None:
     with contextlib.suppress(OSError, ValueError):  # where nobody reads stderr either, the exit code has to do
         print(line, file=sys.stderr, flush=True)
+    if "NOTIFY_SOCKET" in os.environ:  # what `phasestack status` tells of a service that has failed
+        import sdnotify
+
+        sdnotify.SystemdNotifier().notify(f"STATUS={line}")
 
 
 def _flushed(code: int) -> int:

@@ -157,6 +157,7 @@ def build_run(
     if simulated:
         samples = RecordedSamples(driver)
         cleanup.callback(samples.close)
+    host.starting("opening OpenGL")
     context = offscreen_context()
     cleanup.callback(context.release)
     panels = _open_panels(settings, stack, clock, context, host)
@@ -221,6 +222,7 @@ def build_run(
 
 def _open_panels(settings: Settings, stack: PanelStack, clock: Clock, context: Any, host: Host) -> PanelSink:
     while True:
+        host.starting("opening panels")
         try:
             return open_panels(settings.output, stack, clock, context)
         except PanelLost as error:

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import socket
+import subprocess
 import threading
 import time
 from collections.abc import Iterable
@@ -16,6 +17,7 @@ from runtime.errors import TransientError
 
 # Where the daemon listens without a configuration: `ServiceSettings().socket`, without loading all settings.
 DEFAULT_SOCKET = "/run/phasestack/status.sock"
+UNIT = "phasestack"
 LOOKED_UP_AGAIN_S = {"status": 0.2, "pictures": 0.3, "log": 0.5, "about": 2.0}
 LOOKED_UP_WITHIN_S = 3.0
 TOLD_WITHIN_S = 70.0  # a scene or a model is loaded first
@@ -75,14 +77,39 @@ def _exchanged(path: Path, request: dict[str, Any], timeout_s: float) -> dict[st
 def _advice(error: Exception) -> str:
     match error:
         case FileNotFoundError():
-            return "no daemon (start it: systemctl start phasestack)"
+            return "no daemon"
         case PermissionError():
             return "not permitted (be a member of the service's group)"
         case ConnectionRefusedError():
-            return "nobody listens (the daemon has died: systemctl status phasestack)"
+            return "nobody listens (the daemon has died)"
         case TimeoutError():
             return "no answer in time (the daemon hangs)"
     return str(error) or type(error).__name__
+
+
+def unit_advice() -> str:
+    """How systemd's service is, in the words of its last error, and what to do; empty where there is none."""
+    wanted = ("LoadState", "ActiveState", "Result", "ExecMainStatus", "StatusText")
+    try:
+        shown = subprocess.run(
+            ["systemctl", "show", UNIT, f"--property={','.join(wanted)}"], capture_output=True, text=True, timeout=5.0
+        ).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    unit = {name: value for name, _, value in (line.partition("=") for line in shown.splitlines())}
+    if unit.get("LoadState") != "loaded":
+        return ""
+    why = f"{unit['Result']}, exit status {unit['ExecMainStatus']}: {unit['StatusText'] or 'no word of it'}"
+    match unit["ActiveState"], unit["Result"]:
+        case "failed", "start-limit-hit":
+            return f"{UNIT} was started too often: sudo systemctl reset-failed {UNIT}, then sudo systemctl start {UNIT}"
+        case "failed", _:
+            return f"{UNIT} has failed ({why}); mend it, then: sudo systemctl restart {UNIT}"
+        case "inactive", _:
+            return f"{UNIT} is stopped: sudo systemctl start {UNIT}"
+        case "activating" | "deactivating", _:
+            return f"{UNIT} is between two starts; why: journalctl -u {UNIT} -n 20"
+    return f"{UNIT} is {unit['ActiveState']}: does its configuration name another service.socket (--config)?"
 
 
 class Daemon:

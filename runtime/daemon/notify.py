@@ -12,6 +12,7 @@ from runtime.clock import Clock
 from runtime.records import State
 
 NS_PER_US = 1000
+START_STEP_S = 60.0  # that no step of a start takes, on the slowest machine
 
 
 class Notifier:
@@ -27,6 +28,7 @@ class Notifier:
             self._channel.socket.setblocking(False)
         self._watchdog_ns = watchdog_ns(environment)
         self._fed_ns = -self._watchdog_ns
+        self._is_lengthened = False  # the watchdog's period, while it starts
         self._status = ""
         self._ready = False
 
@@ -36,7 +38,7 @@ class Notifier:
         return self._channel is not None and self._channel.socket is not None
 
     def ready(self) -> None:
-        """The first frame is on the panels. Later calls do nothing."""
+        """The first frame is on the panels, or it waits for them, answering meanwhile. Later calls do nothing."""
         if not self._ready:
             self._ready = True
             self._send("READY=1")
@@ -48,10 +50,14 @@ class Notifier:
             self._status = line
             self._send(f"STATUS={line}")
 
-    def extend_start(self, seconds: float) -> None:
-        """Still starting, and for a good reason: give it this much more time. Call again well before it is over."""
+    def starting(self) -> None:
+        """Progress before the first frame: START_STEP_S more, of the start or, once it is ready, of the watchdog."""
+        step_us = round(START_STEP_S * 1e6)
         if not self._ready:
-            self._send(f"EXTEND_TIMEOUT_USEC={int(seconds * 1e6)}")
+            self._send(f"EXTEND_TIMEOUT_USEC={step_us}")
+        elif self._watchdog_ns:
+            self._is_lengthened = True
+            self._send(f"WATCHDOG_USEC={step_us}\nWATCHDOG=1")
 
     def refreshed(self, state: State, missing: tuple[str, ...], *, presented: bool) -> None:
         """One refresh is complete: feeds the watchdog, if it was presented.
@@ -64,6 +70,9 @@ class Notifier:
         alive = presented or (state is State.DEGRADED and "panel" in missing)
         if not (alive and self._watchdog_ns):
             return
+        if self._is_lengthened:
+            self._is_lengthened = False
+            self._send(f"WATCHDOG_USEC={self._watchdog_ns // NS_PER_US}")
         now_ns = self._clock.now_ns()
         if now_ns - self._fed_ns >= self._watchdog_ns // 4:
             self._fed_ns = now_ns

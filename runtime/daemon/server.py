@@ -82,7 +82,9 @@ class StatusServer:
         except OSError as error:
             raise InputError("service", "socket", f"{path} can't be made ({error.strerror or error})") from error
         try:
-            os.chown(path, -1, grp.getgrnam(GROUP).gr_gid)
+            wanted = grp.getgrnam(GROUP).gr_gid
+            if path.lstat().st_gid != wanted:  # a service's sandbox may refuse even what changes nothing
+                os.chown(path, -1, wanted)
         except (KeyError, PermissionError):
             log.info("the status socket is this user's alone: group %s is not there or not ours", GROUP)
         self._thread: threading.Thread | None = threading.Thread(target=self._run, name="status", daemon=True)

@@ -33,7 +33,6 @@ from runtime.support.folders import state_folder
 log = logging.getLogger("phasestack.daemon")
 
 PANEL_RETRY_S = 1.0
-START_EXTENSION_S = 10.0
 NEEDS_RESTART = ("stack", "sensor", "output", "service", "model.backend")
 Chosen = dict[tuple[str, str], Any]  # section and key of a setting: what an operator chose while it runs
 
@@ -69,6 +68,7 @@ class Daemon(Host):
         self._configured = Settings()  # as last read
         self._chosen: Chosen = {}  # by an operator, in force over the configuration
         self._change: _Change | None = None  # under way
+        self._waits_for = ""  # before the first refresh: which panel, and why
         self._refused = ""  # why the last change was refused, until one is taken
 
     def stop_reason(self) -> str:
@@ -124,17 +124,22 @@ class Daemon(Host):
             self._server.lookups |= {"log": self.recorder.look_at_log} if self.recorder is not None else {}
 
     def wait_for_panel(self, why: str) -> bool:
-        """Under a supervisor wait for it, by hand refuse."""
+        """Under a supervisor wait for it, as a state that others need not wait for; by hand refuse."""
         if not self._notifier.supervised or self._signals.stop:
             return False
-        log.warning("waiting for a panel: %s", why)
+        if why != self._waits_for:
+            self._waits_for = why
+            log.warning("waiting for a panel: %s", why)
         self.starting(f"waiting for a panel: {why}")
-        time.sleep(PANEL_RETRY_S)
+        self._notifier.ready()
+        again_s = time.monotonic() + PANEL_RETRY_S
+        while not self._signals.stop and time.monotonic() < again_s:
+            time.sleep(0.05)
         return not self._signals.stop
 
     def starting(self, doing: str) -> bool:
         """Asks for more time; before the first refresh there is no account yet, but a reason."""
-        self._notifier.extend_start(START_EXTENSION_S)
+        self._notifier.starting()
         self._notifier.status(f"starting ({doing})")
         if self._server is not None:
             self._server.publish(lambda: {"state": str(State.STARTING), "reason": doing})

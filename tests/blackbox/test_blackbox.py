@@ -152,6 +152,18 @@ def test_a_fault_writes_what_was_before_it_and_what_followed_for_its_owner_alone
     assert len(list(tmp_path.iterdir())) == 1  # nothing half-written beside it
 
 
+def test_a_start_without_a_sensor_is_no_fault(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(recording, "AFTER_FAULT_NS", 0)
+    recorder = Recorder(tmp_path, minutes=2.0)
+    rig = Rig(recorder=recorder)
+    rig.plan.refuse = SensorLost("not plugged in yet")
+    with rig:
+        rig.refresh_until("degraded: sensor")
+        rig.refreshes(3)
+        recorder.close()
+    assert not list(tmp_path.iterdir())
+
+
 def test_it_is_written_when_asked_and_the_samples_in_it_are_a_recording(tmp_path: Path) -> None:
     answers: list[tuple[str, Path | None]] = []
     recorder = Recorder(tmp_path, minutes=2.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import threading
 from pathlib import Path
 from typing import Any
@@ -79,6 +80,27 @@ def test_without_a_daemon_status_fails_with_one_line(tmp_path: Path) -> None:
     assert result.exit_code == 1
     assert result.stderr.count("\n") == 1
     assert "no daemon" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("state", "result", "told"),
+    [
+        ("inactive", "success", "is stopped: sudo systemctl start phasestack"),
+        ("failed", "exit-code", "exit status 2: a.toml: stack: no); mend it, then: sudo systemctl restart phasestack"),
+        ("failed", "start-limit-hit", "sudo systemctl reset-failed phasestack"),
+        ("activating", "success", "journalctl -u phasestack"),
+    ],
+)
+def test_where_the_service_does_not_run_status_says_how_it_is_and_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: str, result: str, told: str
+) -> None:
+    """What systemd 252 prints; the booted system's test asks it itself."""
+    lines = ["LoadState=loaded", f"ActiveState={state}", f"Result={result}", "ExecMainStatus=2",
+             "StatusText=a.toml: stack: no"]  # fmt: skip
+    (tmp_path / "systemctl").write_text("#!/bin/sh\ncat <<'E'\n" + "\n".join(lines) + "\nE\n")
+    (tmp_path / "systemctl").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    assert told in ask_status(tmp_path / "none.sock").stderr
 
 
 @pytest.mark.parametrize(

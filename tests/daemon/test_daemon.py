@@ -163,18 +163,26 @@ PANEL = '[[output.panels]]\nconnector = "HDMI-%d"\n'
 NO_SCREEN = CONFIG + '[output]\nkind = "windows"\n' + "".join(PANEL % n for n in range(3))
 
 
-def test_a_panel_that_is_missing_at_the_start_is_waited_for_and_more_time_asked_for(
+def test_a_panel_that_is_missing_at_the_start_is_waited_for_as_a_state_and_it_stops_at_once(
     started: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     daemon = started(config=NO_SCREEN, headless=False)
+    assert daemon.hears("READY=1")
     assert daemon.hears("EXTEND_TIMEOUT_USEC=")
     assert daemon.hears("waiting for a panel")
-    assert not daemon.hears("READY=1", within_s=0.5)
+    assert "no X server" in daemon.status()["reason"]
     daemon.process.send_signal(signal.SIGTERM)
     code, errors = daemon.ends()
     assert "Traceback" not in errors
     assert code == 0
+
+
+def test_why_it_cannot_start_is_its_last_word_to_the_supervisor(started: Callable[..., Any]) -> None:
+    daemon = started(config="[stack]\nwidth_px = 'wide'\n")
+    assert daemon.ends()[0] == 2
+    assert daemon.hears("STATUS=phasestack: ")
+    assert "width_px" in daemon.heard[-1]
 
 
 def test_monitors_do_not_take_a_scaled_stack() -> None:

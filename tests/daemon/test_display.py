@@ -101,11 +101,22 @@ def test_the_x_server_dies_and_the_daemon_that_is_started_again_waits_for_it(
     assert "the X server died" in errors
     again = tmp_path / "again"
     again.mkdir()
-    second = Daemon(again, config=CONFIG, headless=False)  # as systemd does
+    second = Daemon(again, config=CONFIG, headless=False, watchdog_s=2.0)  # as systemd does
     try:
-        assert second.hears("EXTEND_TIMEOUT_USEC=")
+        assert second.hears("READY=1")  # waiting is a state: nobody waits for the daemon
+        assert second.hears("WATCHDOG=1")
+        assert second.status()["state"] == "starting"
+        assert "no X server" in second.status()["reason"]
+        assert any("STATUS=starting (waiting for a panel: no X server" in heard for heard in second.heard)
+        second.heard.clear()
+        for _ in range(3):
+            assert second.hears("WATCHDOG=1")
+            second.heard.clear()
         x.append(xserver.XServer(tmp_path, display=x[0].number))
-        assert second.hears("READY=1")
         assert eventually(lambda: shows_something_on(x))
+        second.process.send_signal(signal.SIGTERM)
+        code, errors = second.ends()
+        assert code == 0
+        assert errors.count("waiting for a panel: no X server") == 1  # in the journal
     finally:
         second.close()

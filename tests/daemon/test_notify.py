@@ -69,11 +69,23 @@ def test_ready_is_said_once(supervisor: Supervisor, notifier_of: Callable[..., N
 def test_the_start_can_be_extended_until_it_is_over(
     supervisor: Supervisor, notifier_of: Callable[..., Notifier]
 ) -> None:
-    notifier = notifier_of()
-    notifier.extend_start(2.5)
+    notifier = notifier_of(environment=WATCHED)
+    notifier.starting()
     notifier.ready()
-    notifier.extend_start(2.5)
-    assert supervisor.heard() == ["EXTEND_TIMEOUT_USEC=2500000", "READY=1"]
+    assert supervisor.heard() == ["EXTEND_TIMEOUT_USEC=60000000", "READY=1"]
+
+
+def test_a_start_that_goes_on_once_it_is_ready_has_the_watchdogs_patience_until_the_first_frame(
+    supervisor: Supervisor, notifier_of: Callable[..., Notifier]
+) -> None:
+    notifier = notifier_of(environment=WATCHED)
+    notifier.ready()
+    notifier.starting()
+    for _ in range(2):
+        notifier.refreshed(State.TRACKING, (), presented=True)
+    assert supervisor.heard() == [
+        "READY=1", "WATCHDOG_USEC=60000000\nWATCHDOG=1", "WATCHDOG_USEC=1000000", "WATCHDOG=1",
+    ]  # fmt: skip
 
 
 def test_presented_frames_feed_the_watchdog_four_times_a_period_at_most(

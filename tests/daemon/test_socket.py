@@ -149,7 +149,7 @@ def test_by_hand_a_run_goes_on_without_its_socket_and_under_a_supervisor_it_does
 
 
 def test_without_a_daemon_the_client_says_what_to_do(path: Path) -> None:
-    with pytest.raises(NotRunning, match="systemctl start"):
+    with pytest.raises(NotRunning, match="no daemon"):
         status(path)
     path.parent.mkdir()
     with socket.socket(socket.AF_UNIX) as dead:
