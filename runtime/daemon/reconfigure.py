@@ -13,6 +13,7 @@ from runtime.daemon.commands import PLACING
 from runtime.daemon.solver_parts import RunningSolver, ready_predictor
 from runtime.errors import PhasestackError, Stopped
 from runtime.eyes.calibration import load_calibration
+from runtime.frame.run_state import LEFT_BEHIND
 from runtime.model.predictor import Predictor
 from runtime.optics.stack import PanelStack
 from runtime.support.background import Job
@@ -42,7 +43,8 @@ class Reconfiguration:
         self._abandoned = False
         self.progress = ""  # what is being made ready, for the status
         self.problem = ""  # one line, where it can't be done
-        self.finished = False
+        self._taker: RunningSolver | None = None  # that takes it over
+        self._finished = False
         self._job = Job("reconfiguration", self._make_ready)
 
     def abandon(self) -> None:
@@ -62,10 +64,18 @@ class Reconfiguration:
                 if predictor is not None:
                     predictor.close()
             else:
+                self._taker = parts
                 self._take_over(parts, opener, predictor)
         Job("memory", give_back)  # what was replaced is large, and nobody waits for it
-        self.finished = True
+        self._finished = True
         return True
+
+    @property
+    def finished(self) -> bool:
+        """Taken over or refused; also where the solver hangs in it and has been left behind."""
+        if not self._finished and self._taker is not None and not self._taker.is_newest:
+            self.problem, self._finished = LEFT_BEHIND, True
+        return self._finished
 
     def _make_ready(self) -> Ready:
         """On the job's thread: all that takes long."""
@@ -105,14 +115,14 @@ class Reconfiguration:
                         changes["content"] = placed_source(changes["content"], placing_of(placed))
                 if predictor is not None:
                     predictor.set_backend(parts.backend.backend)
+                before = parts.replace(**changes)
             except PhasestackError as error:
                 self.problem = str(error)
                 return
-            except Exception as error:  # a GL driver's or a library's own: what is shown goes on
+            except (Exception, SystemExit) as error:  # a GL driver's or a library's own: what is shown goes on
                 self.problem = f"{self.settings.content.scene}: {written(error)}"
                 return
             undo.pop_all()
-        before = parts.run.replace(**changes)
         if opener is not None:
             before.content.close()
         if predictor is not None:

@@ -5,17 +5,17 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from runtime.config import Settings
+from runtime.config import ContentSettings, Settings
 from runtime.content.base import ContentSource
-from runtime.content.registry import open_content
-from runtime.errors import ContextLost
+from runtime.content.registry import Opener, prepare_content
+from runtime.errors import ContextLost, Stopped
 from runtime.eyes.calibration import Calibration
-from runtime.frame.run_state import RunCell, RunState
+from runtime.frame.run_state import LEFT_BEHIND, RunCell, RunState
 from runtime.frame.solver import Solver, SolverStep
 from runtime.model.backends import Choice, Wanted, choose
 from runtime.model.predictor import Predictor, load_predictor
@@ -42,10 +42,22 @@ class RunningSolver:
     owns_context: bool  # it is released with the rest
     group: ShareGroup | None  # the context's
     panels_group: PanelsGroup
-    _held: RunState = field(init=False)
+    generation: int
+    _held: RunState = field(init=False)  # whose content and model are this solver's to close
 
     def __post_init__(self) -> None:
         self._held = self.run.state
+
+    @property
+    def is_newest(self) -> bool:
+        """False once another solver has begun: this one changes nothing any more."""
+        return self.run.generation == self.generation
+
+    def replace(self, **changes: Any) -> RunState:
+        """`RunCell.replace` by this solver; raises Stopped where another has begun."""
+        before = self.run.replace(self.generation, **changes)
+        self._held = replace(before, **changes)
+        return before
 
     @property
     def content(self) -> ContentSource:
@@ -55,15 +67,18 @@ class RunningSolver:
     def step(self, request: SolveRequest) -> SolverStep:
         if self.panels_group() is not self.group or (self.group is not None and self.group.lost):
             raise ContextLost("the panels have another OpenGL context")
-        self._held = self.run.state
-        return self.solver.step(request)
+        state = self.run.state  # before looking whether it is another solver's
+        if not self.is_newest:
+            raise Stopped(LEFT_BEHIND)
+        self._held = state
+        return self.solver.step(request, state)
 
     def simulated_stage_ms(self) -> Mapping[str, float]:
         return self.run.state.settings.loop.simulated_stage_ms
 
-    def close(self, *, abandoned: bool = False) -> None:
+    def close(self) -> None:
         stand_in = self._stand_in()
-        state = self._held if abandoned else self.run.state
+        state = self.run.state if self.is_newest else self._held
         own = [leave_context, self.context.release] if self.owns_context else []
         own += [] if stand_in is None else [stand_in.release]
         for release in (state.content.close, state.predictor.close, self.backend.backend.close, *own):
@@ -101,28 +116,33 @@ class SolverMaker:
         self.parts: RunningSolver | None = None  # the newest
         self._wanted: Wanted = settings.model.backend
         self._panels_group = panels_group
+        self._prepared: tuple[ContentSettings, Opener] | None = None  # read, and not made into a source yet
 
     def __call__(self, *, context: Any = None, simulated: bool = False) -> RunningSolver:
         """context: one to use together with the panels; None: one of this thread's own, which shares textures with
         theirs where that can be. Raises FatalError; leaves nothing open then."""
         own, group = context is None, self._shared_group()
+        generation = self.run.begin() if self.run is not None else 0
         settings = self.run.state.settings if self.run is not None else self._settings
         with ExitStack() as undo:
+            opener = self._opener(settings.content)
             if own:
                 context = offscreen_context() if group is None else group.context()
                 undo.callback(context.release)
             predictor = ready_predictor(settings, self._stack)
             undo.callback(predictor.close)
-            content = open_content(settings.content, self._stack, context)
+            self._prepared = None
+            content = opener(context)
             undo.callback(content.close)
             backend = self._chosen(predictor, context, group, simulated=simulated)
+            undo.callback(backend.backend.close)
             predictor.set_backend(backend.backend)
+            if self.run is None:
+                self.run = RunCell(settings, calibration=self._calibration, content=content, predictor=predictor)
+            else:
+                self.run.replace(generation, content=content, predictor=predictor)
             undo.pop_all()
-        if self.run is None:
-            self.run = RunCell(settings, calibration=self._calibration, content=content, predictor=predictor)
-        else:
-            self.run.replace(content=content, predictor=predictor)
-        self.parts = RunningSolver(
+        parts = RunningSolver(
             self.run,
             Solver(self.run, self._stack, timed=not simulated),
             backend,
@@ -130,8 +150,18 @@ class SolverMaker:
             owns_context=own,
             group=group,
             panels_group=self._shared_group,
+            generation=generation,
         )
-        return self.parts
+        if parts.is_newest:
+            self.parts = parts
+        return parts
+
+    def _opener(self, content: ContentSettings) -> Opener:
+        """What the settings name, read; not again where the solver before this one did not come to use it."""
+        prepared = self._prepared
+        if prepared is None or prepared[0] != content:
+            prepared = self._prepared = content, prepare_content(content, self._stack)
+        return prepared[1]
 
     def _shared_group(self) -> ShareGroup | None:
         """Of the panels, where solutions may be left in textures; a solver that never draws any is kept apart."""

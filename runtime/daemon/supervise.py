@@ -193,7 +193,7 @@ class Daemon(Host):
             state = parts.run.state
             settings = changed(state.settings, "content", values, source="place")
             source = placed_source(state.content, placing_of(settings.content))
-            parts.run.replace(settings=settings, content=source)
+            parts.replace(settings=settings, content=source)
             self._chosen = self._chosen | {("content", key): value for key, value in values.items()}
             self._answer(presenter, command, "")
             return True

@@ -58,12 +58,12 @@ class Solver:
         self._middle_m: F64 = np.array(FLAT_EYE_M)
         self._missing: dict[str, str] = {}
 
-    def step(self, request: SolveRequest) -> SolverStep:
+    def step(self, request: SolveRequest, state: RunState | None = None) -> SolverStep:
         """Do what the request calls for, if anything. A part that fails is named; what there is stays good.
 
-        Raises ContextLost: this solver is of no more use.
+        state: to draw and solve with; None: the newest. Raises ContextLost: this solver is of no more use.
         """
-        state = self.run.state
+        state = state or self.run.state
         self._replan(state, request.eyes_m)
         time_ns = request.time_ns
         try:

@@ -27,8 +27,8 @@ class SolverParts(Protocol):
     def simulated_stage_ms(self) -> Mapping[str, float]:
         """What each stage costs on a simulated clock at present."""
 
-    def close(self, *, abandoned: bool = False) -> None:
-        """Release everything, on the thread that made it; abandoned: only what no other solver uses by now."""
+    def close(self) -> None:
+        """Release everything that no other solver uses by now, on the thread that made it."""
 
 
 Task = Callable[[SolverParts], bool]  # done on the solver's thread between two steps, until it answers True

@@ -11,17 +11,19 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
-from runtime.errors import ContextLost, FatalError, PhasestackError
+from runtime.errors import ContextLost, FatalError, PhasestackError, Stopped
 from runtime.frame.solver import SolverStep
 from runtime.frame.solver_host import COST_GAIN, FIRST_REQUEST, SolverHost, SolverParts, Task, taken_in, total_ns
 from runtime.records import SolveRequest
 from runtime.support.background import SOLVER_NICENESS, set_niceness
 from runtime.support.memory import give_back
+from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.solver")
 
 LATE_S = 0.5  # a step that takes longer is late; one that takes twice as long is a fault by itself
 ABANDON_S = 10.0  # a step that does not return for so long is left behind, and the solver is made anew
+# Making it may take `LIMITS.start_s`, as at the start, and a task, which makes content, `LIMITS.load_s`.
 IDLE_S = 0.02  # between two looks at tasks while nothing is asked
 LATE_STEPS = 3  # in a row that are late begin a fault, so many in time end it: a busy processor is none
 ANSWER_STEP_MS = 500  # of how long no answer came, as it is reported
@@ -35,6 +37,7 @@ class _Attempt:
         self.number, self.abandoned = number, threading.Event()
         self.ready = threading.Event()
         self.busy_since_ns = 0  # 0: it waits
+        self.is_at_task = False
         self.took_ns: deque[int] = deque(maxlen=LATE_STEPS)  # the last steps
         self.error: BaseException | None = None
         self.thread: threading.Thread | None = None
@@ -109,16 +112,21 @@ class SolverThread(SolverHost):
             self._is_late = late == LATE_STEPS or (self._is_late and late > 0)
             took_ms, limit_ms = max(steps, default=0) / NS_PER_MS, self._late_ns / NS_PER_MS
             return f"solutions take {took_ms:.0f} ms (late: more than {limit_ms:.0f} ms)" if self._is_late else ""
-        if busy_ns > self._abandon_ns:
+        abandon_ns = self._abandon_ns
+        if not attempt.ready.is_set() or attempt.is_at_task:
+            limit_s = LIMITS.load_s if attempt.ready.is_set() else LIMITS.start_s
+            abandon_ns = max(abandon_ns, round(limit_s * NS_PER_S))
+        if busy_ns > abandon_ns:
             self._hung = [hung for hung in self._hung if hung.thread is not None and hung.thread.is_alive()]
-        if busy_ns > self._abandon_ns and len(self._hung) < ABANDONED_MAX:
+        if busy_ns > abandon_ns and len(self._hung) < ABANDONED_MAX:
             log.error("solver: no answer for %.1f s: left behind, and made anew", busy_ns / NS_PER_S)
-            attempt.abandoned.set()
+            with self._lock:
+                attempt.abandoned.set()
             self._hung.append(attempt)
             self.restarts += 1
             self._attempt = self._begin(attempt.number + 1)
         busy_ms = busy_ns // NS_PER_MS // ANSWER_STEP_MS * ANSWER_STEP_MS
-        return f"the solver has not answered for {busy_ms} ms"
+        return f"the solver {'has not answered' if attempt.ready.is_set() else 'is being made anew'} for {busy_ms} ms"
 
     def _begin(self, number: int) -> _Attempt:
         attempt = _Attempt(number)
@@ -135,14 +143,13 @@ class SolverThread(SolverHost):
             first = parts.step(FIRST_REQUEST)
         except BaseException as error:
             if parts is not None:
-                parts.close(abandoned=attempt.abandoned.is_set())
+                parts.close()
             attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
             attempt.ready.set()
             if attempt.number > 1 and not isinstance(error, PhasestackError):
                 log.exception("solver: it could not be made anew")
             return
-        if not attempt.abandoned.is_set():
-            self._news = taken_in(self._news, first)
+        self._publish(attempt, first)
         attempt.busy_since_ns = 0
         attempt.ready.set()
         try:
@@ -151,14 +158,14 @@ class SolverThread(SolverHost):
                 request = self._next_request()
                 if request is not None:
                     self._step(attempt, parts, request)
-        except ContextLost as error:
+        except (ContextLost, Stopped) as error:
             log.error("solver: %s", _line(error))  # a record that held the error would hold its textures
             attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
-        except Exception as error:  # what no step answers with: a bug of ours, or a library's
+        except BaseException as error:  # what no step answers with: a bug of ours, or a library's
             log.exception("solver: unexpected error")
             attempt.error, attempt.busy_since_ns = error, self._clock.now_ns()
         finally:
-            parts.close(abandoned=attempt.abandoned.is_set())
+            parts.close()
             if attempt.abandoned.is_set():  # what it held is hundreds of MiB
                 attempt.error = parts = None
                 give_back()
@@ -175,26 +182,32 @@ class SolverThread(SolverHost):
         step = parts.step(request)
         attempt.took_ns.append(self._clock.now_ns() - attempt.busy_since_ns)
         attempt.busy_since_ns = 0
-        if attempt.abandoned.is_set():
-            return
-        self._news = taken_in(self._news, step)
-        if step.solution is not None:
+        if self._publish(attempt, step) and step.solution is not None:
             cost_ns = total_ns(step.solution.stage_ms)
             gain = COST_GAIN if self.solve_cost_ns else 1.0
             self.solve_cost_ns += round(gain * (cost_ns - self.solve_cost_ns))
 
+    def _publish(self, attempt: _Attempt, step: SolverStep) -> bool:
+        """Take a step into the news; False: it was made by one that has been left behind."""
+        with self._lock:
+            if not attempt.abandoned.is_set():
+                self._news = taken_in(self._news, step)
+            return not attempt.abandoned.is_set()
+
     def _do_tasks(self, attempt: _Attempt, parts: SolverParts) -> None:
         """Each once; those that are not done come again after the next step."""
         for _ in range(self._tasks.qsize()):
+            if attempt.abandoned.is_set():
+                return
             task = self._tasks.get()
-            attempt.busy_since_ns = self._clock.now_ns()
+            attempt.busy_since_ns, attempt.is_at_task = self._clock.now_ns(), True
             try:
                 done = task(parts)
             except Exception:
                 log.exception("solver: a task failed")
                 done = True
-            attempt.busy_since_ns = 0
-            if not done and not attempt.abandoned.is_set():
+            attempt.busy_since_ns, attempt.is_at_task = 0, False
+            if not done:
                 self._tasks.put(task)
 
 

@@ -5,6 +5,8 @@ Whatever changes, no refresh is lost: the presenter goes on with the solution th
 
 from __future__ import annotations
 
+import importlib
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from runtime.clock import MonotonicClock
+from runtime.clock import NS_PER_S, MonotonicClock
 from runtime.config import Settings, load_settings
 from runtime.content.placed import PlacedSource
 from runtime.daemon import reconfigure
@@ -23,6 +25,7 @@ from runtime.daemon.server import StatusServer
 from runtime.daemon.signals import Signals
 from runtime.daemon.supervise import Daemon
 from runtime.support import progress
+from runtime.support.untrusted_input import LIMITS
 from tests.daemon.rig import SMALL, TRACKING, Rig
 
 STEADY: dict[str, Any] = {"sensor": {"timeout_s": 5.0}, "tracker": {"hold_s": 20.0}}  # on a busy machine too
@@ -235,3 +238,74 @@ def test_a_command_that_fails_in_a_way_that_nobody_expected_is_refused_and_the_r
     assert "place: unexpected error" in caplog.text
     assert all(account.presented for account in served.rig.refreshes(3))
     assert served.asked("pause")["paused"] is True
+
+
+SLOW = """
+import threading
+import numpy as np
+from phasestack import ContentSource
+
+GATE, MADE, CLOSED = threading.Event(), threading.Event(), []
+
+
+class Scene(ContentSource):
+    def __init__(self, options, *, stack, context):
+        super().__init__(options, stack=stack, context=context)
+        MADE.set()
+        assert GATE.wait(60.0)
+
+    def render(self, view, *, time_ns):
+        return np.full((view.height_px, view.width_px, 4), 200, np.uint8)
+
+    def close(self):
+        CLOSED.append(threading.current_thread().name)
+"""
+
+
+@pytest.fixture
+def slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """A module with a scene's class that is made once its gate is open."""
+    (tmp_path / "slow_scene.py").write_text(SLOW)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    module = importlib.import_module("slow_scene")
+    yield module
+    module.GATE.set()
+    del sys.modules["slow_scene"]
+
+
+def test_a_scene_whose_making_never_ends_is_refused_and_what_it_makes_after_all_is_shown_nowhere(
+    served: Served, slow: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its thread is left behind; when it goes on, it neither publishes its scene nor closes the new solver's."""
+    rig, solver = served.rig, served.rig.presenter.solver
+
+    def meanwhile() -> None:
+        patient = not slow.MADE.is_set() or solver.restarts
+        solver._late_ns = solver._abandon_ns = 60 * NS_PER_S if patient else 1
+
+    monkeypatch.setattr(LIMITS, "load_s", 0.0)
+    answer = served.asked("scene", "slow_scene:Scene", meanwhile=meanwhile)
+    assert not answer["ok"] and "the solver was made anew: nothing has changed" in answer["error"]
+    rig.refresh_until_solved()
+    content, (hung,) = rig.content, solver._hung
+    slow.GATE.set()
+    hung.thread.join(30.0)
+    assert [hung.thread.name] == slow.CLOSED
+    assert rig.content is content and rig.content.info.name == "demo" and rig.run.maker.parts.is_newest
+    accounts = rig.refreshes_for(0.5)
+    assert all(account.solution is not None for account in accounts) and rig.presenter.missing == {}
+    assert served.asked("scene", "sparse")["scene"] == "sparse"
+
+
+def test_a_scene_whose_making_takes_longer_than_a_step_may_is_shown_when_it_is_there(served: Served, slow: Any) -> None:
+    solver = served.rig.presenter.solver
+    before = len(served.rig.accounts)
+
+    def meanwhile() -> None:
+        solver._late_ns = solver._abandon_ns = 1 if slow.MADE.is_set() else 60 * NS_PER_S
+        if slow.MADE.is_set() and len(served.rig.accounts) > before + 50:
+            solver._late_ns = solver._abandon_ns = 60 * NS_PER_S
+            slow.GATE.set()
+
+    assert served.asked("scene", "slow_scene:Scene", meanwhile=meanwhile)["scene"] == "slow_scene:Scene"
+    assert solver.restarts == 0

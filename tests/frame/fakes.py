@@ -135,7 +135,7 @@ class FakeParts:
     def __init__(self, step: Callable[[SolveRequest], SolverStep], stage_ms: dict[str, float] | None = None) -> None:
         self.behave, self.stage_ms = step, stage_ms or {}
         self.asked: list[SolveRequest] = []
-        self.closed: list[bool] = []  # with `abandoned`, each time
+        self.closed = 0  # times
 
     def step(self, request: SolveRequest) -> SolverStep:
         self.asked.append(request)
@@ -144,8 +144,8 @@ class FakeParts:
     def simulated_stage_ms(self) -> dict[str, float]:
         return self.stage_ms
 
-    def close(self, *, abandoned: bool = False) -> None:
-        self.closed.append(abandoned)
+    def close(self) -> None:
+        self.closed += 1
 
 
 class Watching:

@@ -14,6 +14,7 @@ from runtime.errors import FatalError, InputError
 from runtime.frame.solver import SolverStep
 from runtime.frame.solver_thread import ABANDON_S, ABANDONED_MAX, LATE_S, SolverThread
 from runtime.records import SolveRequest
+from runtime.support.untrusted_input import LIMITS
 from tests.frame.fakes import FakeParts, aside, solution
 from tests.waiting import eventually
 
@@ -115,8 +116,8 @@ class _Announced(FakeParts):
         super().__init__(step)
         self._announce = closed
 
-    def close(self, *, abandoned: bool = False) -> None:
-        super().close(abandoned=abandoned)
+    def close(self) -> None:
+        super().close()
         self._announce.put(threading.current_thread().name)
 
 
@@ -135,7 +136,7 @@ def test_parts_are_made_used_and_closed_on_one_thread_that_is_not_the_presenter_
     shop.host.close(PATIENCE_S)
     shop.host.close(PATIENCE_S)
     assert [*threads, shop.closed.get(timeout=PATIENCE_S)] == ["solver-1", "solver-1"]
-    assert shop.all[0].closed == [False]
+    assert shop.all[0].closed == 1
     assert not shop.hung
 
 
@@ -246,7 +247,6 @@ def test_what_a_step_that_was_left_behind_makes_after_all_counts_no_more(shop: W
     shop.solve(2)
     shop.gates[0].set()
     assert shop.closed.get(timeout=PATIENCE_S) == "solver-1"
-    assert shop.all[0].closed == [True]  # and only what no other solver uses is closed
     assert shop.host.news().solution.solved_for_ns == 2
 
 
@@ -348,3 +348,37 @@ def test_closing_does_not_wait_for_ever_for_a_step_that_hangs(shop: Workshop) ->
     assert [thread.is_alive() for thread in shop.hung] == [True]
     shop.gates[0].set()
     assert shop.closed.get(timeout=PATIENCE_S) == "solver-1"
+
+
+def test_making_it_anew_may_take_as_long_as_at_the_start(shop: Workshop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Content of two minutes was begun again every ten seconds, for ever, each time on one more thread."""
+
+    def fail(request: SolveRequest) -> SolverStep:
+        raise RuntimeError("its context was lost")
+
+    shop.behave = fail
+    shop.post(1)
+    shop.closed.get(timeout=PATIENCE_S)
+    shop.behave = solves
+    shop.open.clear()
+    for _ in range(12):
+        shop.pass_s(ABANDON_S + 0.1)
+        shop.host.news()
+    assert "the solver is being made anew for 1" in shop.host.news().missing["model"]
+    shop.open.set()
+    shop.made.get(timeout=PATIENCE_S)
+    shop.solve(2)
+    assert (len(shop.all), shop.host.restarts, shop.host.news().solution.solved_for_ns) == (2, 0, 2)
+
+
+def test_a_task_may_take_longer_than_a_step(shop: Workshop, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, gate = threading.Event(), threading.Event()
+    shop.host.do(lambda parts: bool(begun.set()) or gate.wait(PATIENCE_S))
+    assert begun.wait(PATIENCE_S)
+    shop.pass_s(LIMITS.load_s - 1.0)
+    shop.host.news()
+    assert shop.host.restarts == 0
+    shop.pass_s(2.0)
+    shop.host.news()
+    assert shop.host.restarts == 1
+    gate.set()
