@@ -164,4 +164,8 @@ def test_a_cache_that_can_not_be_written_is_told_once_and_kept_elsewhere(tmp_pat
     assert len(told) == 1 and "can't be written" in told[0]
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file" / "other"))
     (tmp_path / f"phasestack-{os.geteuid()}").chmod(0o755)
-    assert folders.user_cache("a").is_relative_to(tmp_path / "file"), "what others may write is not loaded"
+    assert folders.user_cache("a").parent == folders.NOWHERE, "what others may write is not loaded"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "shared"))
+    (tmp_path / "shared" / "phasestack").mkdir(mode=0o777, parents=True)
+    (tmp_path / "shared" / "phasestack").chmod(0o777)
+    assert folders.user_cache("a").parent == folders.NOWHERE, "what others may write is not loaded"

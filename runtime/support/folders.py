@@ -14,6 +14,8 @@ from pathlib import Path
 
 log = logging.getLogger("phasestack.cache")
 
+NOWHERE = Path(os.devnull) / "phasestack"  # a folder that is not there, nor can be made
+
 
 def user_cache(name: str) -> Path:
     """The folder for what is kept of one kind. It need not exist yet."""
@@ -22,21 +24,25 @@ def user_cache(name: str) -> Path:
 
 @cache
 def _root(base: str) -> Path:
-    """Under $XDG_CACHE_HOME, else ~/.cache; where that can't be written, this user's own in the temporary folder."""
+    """Under $XDG_CACHE_HOME, else ~/.cache; where that is not this user's to write, their own in the
+    temporary folder; `NOWHERE` where that is not theirs either."""
     own = (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "phasestack"
     with suppress(OSError):
         own.mkdir(mode=0o700, parents=True, exist_ok=True)
-    if os.access(own, os.W_OK | os.X_OK):
+    if os.access(own, os.W_OK | os.X_OK) and _is_ours(own.stat(), others_may=0o055):
         return own
     other = Path(tempfile.gettempdir()) / f"phasestack-{os.geteuid()}"
     with suppress(OSError):
         other.mkdir(mode=0o700, exist_ok=True)
-        found = other.lstat()
-        # Compiled code is loaded from it: what somebody else has put there is not ours.
-        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077:
-            log.warning("%s can't be written: what takes long to make is kept in %s", own, other)
+        if _is_ours(other.lstat(), others_may=0):
+            log.warning("%s can't be written, or not by us alone: what takes long to make is kept in %s", own, other)
             return other
-    return own
+    return NOWHERE
+
+
+def _is_ours(found: os.stat_result, *, others_may: int) -> bool:
+    """Compiled code is loaded from a cache: what somebody else has put there is not ours."""
+    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077 & ~others_may
 
 
 def digest(sources: Sequence[Path], *facts: object) -> str:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -300,3 +303,31 @@ def test_shown_codes_are_whole(threads: int) -> None:
         panels = filled(Panels, threads, STACK, boxes="whole", channels=3)
         solved(panels, eyes(0.6), sigma_mm=sigma_mm)
         assert all((panels.outer[n] % SUBCODE == 0).all() and panels.outer[n].max() <= FULL for n in OUTER)
+
+
+ONE_KERNEL = """
+import logging, numpy as np
+logging.basicConfig(level=logging.WARNING, format="%(message)s")
+from runtime.model.compiled.passes import fade_codes
+fade_codes(np.full((2, 6), 8, np.int16), np.zeros((1, 2), np.float32), 5, 3)
+print(len(fade_codes.stats.cache_hits), "loaded")
+"""
+
+
+@pytest.mark.parametrize("broken", [b"", b"\x80\x04\x95 no kernel of ours" * 100], ids=["no bytes", "other bytes"])
+@pytest.mark.parametrize("which", ["nbi", "nbc"])
+def test_kept_kernels_that_a_power_cut_or_a_disk_broke_are_compiled_anew_and_one_line_tells_it(
+    tmp_path: Path, which: str, broken: bytes
+) -> None:
+    def start() -> subprocess.CompletedProcess[str]:
+        environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
+        return subprocess.run([sys.executable, "-c", ONE_KERNEL], env=environment, capture_output=True, text=True)
+
+    assert start().stdout == "0 loaded\n" and start().stdout == "1 loaded\n"
+    (file,) = tmp_path.rglob(f"passes.fade_codes*.{which}")
+    file.write_bytes(broken)
+    done = start()
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (0, "0 loaded\n", 1), done.stderr
+    assert f"{file} can't be used ({len(broken)} bytes" in done.stderr
+    again = start()
+    assert (again.stdout, again.stderr) == ("1 loaded\n", "")
