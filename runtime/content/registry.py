@@ -149,7 +149,7 @@ def _plugin(name: str, file: SceneFile) -> Opener:
             picture = source.render(View(eye, 0, raster_from_stack(eye, plane), *TRIED_PX), time_ns=0)
         except PhasestackError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise InputError(name, "", written(error)) from error
         if getattr(picture, "shape", None) != (*TRIED_PX[::-1], 4) or picture.dtype != np.uint8:
             source.close()

@@ -26,6 +26,7 @@ from runtime.content.placing import SceneFile
 from runtime.errors import ContentFailure, InputError, MissingPart, one_line
 from runtime.records import U8
 from runtime.support import untrusted_input
+from runtime.support.background import begin
 from runtime.support.picture_header import check_size
 
 log = logging.getLogger("phasestack.content")
@@ -151,7 +152,7 @@ class LiveSource(ScreenSource):
         self._number, self._newest = 0, np.empty((0, 0, 4), np.uint8)  # that is shown
         self._looked_ns: int | None = None
         self.info = ContentInfo(name=reader.shown, moving=True, background=file.background)
-        threading.Thread(target=reader.run, name="stream", daemon=True).start()
+        begin("stream", reader.run)
         # A scene that was skipped while it was loaded is dropped, and its thread ends with it.
         weakref.finalize(self, reader.ending.set)
 

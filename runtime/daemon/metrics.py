@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
+from asyncio import StreamReader, StreamWriter
 from typing import Any
 
-from prometheus_client import CollectorRegistry, Counter, Enum, Histogram, start_http_server
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Enum, Histogram, generate_latest
 
 from runtime.clock import NS_PER_MS
+from runtime.daemon.listener import LIMITED, Listener
 from runtime.errors import InputError
 from runtime.records import RefreshAccount, State
 
@@ -38,7 +41,7 @@ class Metrics:
         self._state = Enum("state", "what the daemon is doing", states=[str(state) for state in State], **common)
         self._presented_ns = 0
         self._counted: dict[str, int] = {}
-        self._server: Any = None
+        self._scraped: _Scraped | None = None
 
     def refresh(self, account: RefreshAccount, *, faults: dict[str, int], missed_blanks: int) -> None:
         """One refresh; faults (of `sensor`, `content`, `model`, ...) and blanks that were missed since the start."""
@@ -72,13 +75,37 @@ class Metrics:
     def serve(self, port: int) -> None:
         """Answer on loopback, on a thread of its own. Raises InputError where the port is taken."""
         try:
-            self._server, _ = start_http_server(port, LOOPBACK, self.registry)
+            self._scraped = _Scraped(port, self.registry)
         except OSError as error:
             raise InputError("service", "metrics_port", f"{port} can't be used ({error.strerror})") from error
+        self._scraped.start()
 
     def close(self) -> None:
         """Stop answering. May be called twice."""
-        if self._server is not None:
-            self._server.shutdown()
-            self._server.server_close()
-            self._server = None
+        if self._scraped is not None:
+            self._scraped.close()
+
+
+class _Scraped(Listener):
+    """HTTP for who scrapes: any local user may ask."""
+
+    def __init__(self, port: int, registry: CollectorRegistry) -> None:
+        self._registry = registry
+        super().__init__("metrics", lambda serve: asyncio.start_server(serve, LOOPBACK, port, **LIMITED))
+
+    async def converse(self, reader: StreamReader, writer: StreamWriter) -> None:
+        asked = (await self.request(reader, b"\r\n\r\n")).split(b" ", 1)[0]
+        if asked in (b"GET", b"HEAD"):
+            text = generate_latest(self._registry)
+            await self.send(writer, _answer("200 OK", text if asked == b"GET" else b""))
+        elif asked:
+            await self.send(writer, _answer("405 Method Not Allowed"))
+
+    def refuse(self, writer: StreamWriter, why: str) -> None:
+        writer.write(_answer("503 Service Unavailable", why.encode()))
+
+
+def _answer(status: str, text: bytes = b"") -> bytes:
+    kind = CONTENT_TYPE_LATEST if status.startswith("200") else "text/plain"
+    head = f"HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {len(text)}\r\nConnection: close\r\n\r\n"
+    return head.encode() + text

@@ -1,8 +1,4 @@
-"""The status and control socket: JSON lines over a local socket of mode 0660, answered alongside the loop.
-
-Whoever trickles, hangs or comes in crowds holds up nobody: a request has so long to arrive, an answer so long to be
-read, and where all places are taken the client that has waited longest for a whole request goes.
-"""
+"""The status and control socket: JSON lines over a local socket of mode 0660, answered alongside the loop."""
 
 from __future__ import annotations
 
@@ -16,7 +12,6 @@ import queue
 import socket
 import stat
 import struct
-import threading
 from asyncio import StreamReader, StreamWriter
 from collections.abc import Callable
 from pathlib import Path
@@ -26,17 +21,13 @@ from runtime.clock import NS_PER_S, Clock
 from runtime.config import ServiceSettings
 from runtime.daemon.client import DEFAULT_SOCKET, user_socket
 from runtime.daemon.commands import Command, parse
+from runtime.daemon.listener import LIMITED, Listener, Refusal
 from runtime.errors import InputError, TransientError
 from runtime.support.artifacts import to_json
-from runtime.support.background import BACKGROUND_NICENESS, set_niceness
 
 log = logging.getLogger("phasestack.service")
 
 GROUP = "phasestack"  # that may use the socket
-LINE_MAX_BYTES = 65536
-BACKLOG = 64
-CLIENTS_MAX = 64
-REQUEST_S = 5.0  # for a whole request to come, and for its answer to be read
 LOOP_ANSWERS_WITHIN_S = 5.0
 LOADED_WITHIN_S = 60.0  # what has begun is waited for so long
 
@@ -45,11 +36,7 @@ class SocketInUse(TransientError):
     """Another phasestack has the socket; the text says which."""
 
 
-class _Refusal(Exception):
-    """Why a client is sent away."""
-
-
-class StatusServer:
+class StatusServer(Listener):
     """Answers `status` from the last published snapshot, and hands everything else to the loop.
 
     The loop publishes (`publish`) and drains (`commands`); it never waits for a client. Where the loop hangs,
@@ -64,18 +51,13 @@ class StatusServer:
         self._clock = clock
         self._started_ns = clock.now_ns()
         self._snapshot: tuple[int, Callable[[], dict[str, Any]]] = (self._started_ns, dict)
-        self._clients: set[asyncio.Task[None]] = set()
-        self._reading: dict[asyncio.Task[None], None] = {}  # who waits for a whole request, the longest first
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             _check_dead(path)
-            self._loop = asyncio.new_event_loop()
             # The mode must hold from the first moment, so it is the mask that makes it, not a later chmod.
             mask = os.umask(0o117)
             try:
-                self._server = self._loop.run_until_complete(
-                    asyncio.start_unix_server(self._serve, path, limit=LINE_MAX_BYTES, backlog=BACKLOG)
-                )
+                super().__init__("status", lambda serve: asyncio.start_unix_server(serve, path, **LIMITED))
             finally:
                 os.umask(mask)
             self._own = path.lstat().st_ino
@@ -87,8 +69,7 @@ class StatusServer:
                 os.chown(path, -1, wanted)
         except (KeyError, PermissionError):
             log.info("the status socket is this user's alone: group %s is not there or not ours", GROUP)
-        self._thread: threading.Thread | None = threading.Thread(target=self._run, name="status", daemon=True)
-        self._thread.start()
+        self.start()
 
     def publish(self, snapshot: Callable[[], dict[str, Any]]) -> None:
         """The newest account of the loop, once a turn; called (if ever) on the server's thread.
@@ -101,9 +82,7 @@ class StatusServer:
         """Answer what waits, stop, and remove the socket. May be called twice."""
         if self._thread is None:
             return
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(timeout=2.0)
-        self._thread = None
+        super().close()
         with contextlib.suppress(OSError):
             if self.path.lstat().st_ino == self._own:  # where it was deleted, another daemon's may be there
                 self.path.unlink()
@@ -137,70 +116,15 @@ class StatusServer:
 
     # On the server's thread.
 
-    def _run(self) -> None:
-        set_niceness(BACKGROUND_NICENESS)
-        self._loop.run_forever()
-        self._loop.run_until_complete(self._end())
-        self._loop.close()
+    async def converse(self, reader: StreamReader, writer: StreamWriter) -> None:
+        """As many requests as the client likes."""
+        while line := await self.request(reader, b"\n"):
+            await self.send(writer, await self._reply(line))
 
-    async def _end(self) -> None:
-        self._server.close()
-        for _ in range(16):  # who has just come in is served by then, and is told too
-            await asyncio.sleep(0)
-        clients = asyncio.all_tasks() - {asyncio.current_task()}
-        for client in clients:
-            client.cancel("the daemon stops")
-        await asyncio.gather(*clients, return_exceptions=True)
-        await asyncio.sleep(0)  # their channels are closed in the loop's next turn
+    def refuse(self, writer: StreamWriter, why: str) -> None:
+        writer.write(_line({"ok": False, "error": why}))
 
-    async def _serve(self, reader: StreamReader, writer: StreamWriter) -> None:
-        """One client, as many requests as it likes."""
-        task = asyncio.current_task()
-        assert task is not None
-        writer.transport.set_write_buffer_limits(high=0)  # `drain` waits until all of an answer is on its way
-        try:
-            self._make_room()
-            self._clients.add(task)
-            while line := await self._request(task, reader):
-                await self._reply(line, writer)
-        except _Refusal as error:
-            self._send(writer, {"ok": False, "error": str(error)})
-        except asyncio.CancelledError as error:
-            self._send(writer, {"ok": False, "error": error.args[0]})
-        except (OSError, TimeoutError):  # it is gone, or does not read
-            writer.transport.abort()
-        finally:
-            self._clients.discard(task)
-            if writer.transport.get_write_buffer_size():
-                writer.transport.abort()
-            writer.close()
-
-    def _make_room(self) -> None:
-        """Send away who has waited longest for a whole request; raises _Refusal where all are being answered."""
-        if len(self._clients) >= CLIENTS_MAX:
-            longest = next(iter(self._reading), None)
-            if longest is None:
-                raise _Refusal("too many clients")
-            self._reading.pop(longest)
-            self._clients.discard(longest)  # at once: many may come before it runs again
-            longest.cancel("too many clients")
-
-    async def _request(self, task: asyncio.Task[None], reader: StreamReader) -> bytes:
-        """The next line; what there is of it where nothing more will come."""
-        self._reading[task] = None
-        try:
-            async with asyncio.timeout(REQUEST_S):
-                return await reader.readuntil(b"\n")
-        except asyncio.IncompleteReadError as end:
-            return end.partial
-        except asyncio.LimitOverrunError:
-            raise _Refusal("the request is too long") from None
-        except TimeoutError:
-            raise _Refusal("the request did not come in time") from None
-        finally:
-            self._reading.pop(task, None)
-
-    async def _reply(self, line: bytes, writer: StreamWriter) -> None:
+    async def _reply(self, line: bytes) -> bytes:
         try:
             answer = self.answer(line)
         except Exception:
@@ -210,13 +134,11 @@ class StatusServer:
             log.info("asked for: %s %s", answer.name, "" if answer.value is None else answer.value)
             self.commands.put(answer)
             answer = await _outcome(answer)
-        self._send(writer, answer)
-        async with asyncio.timeout(REQUEST_S):
-            await writer.drain()
+        return _line(answer)
 
-    @staticmethod
-    def _send(writer: StreamWriter, answer: dict[str, Any]) -> None:
-        writer.write(to_json(answer).encode() + b"\n")
+
+def _line(answer: dict[str, Any]) -> bytes:
+    return to_json(answer).encode() + b"\n"
 
 
 async def _outcome(command: Command) -> dict[str, Any]:
@@ -229,7 +151,7 @@ async def _outcome(command: Command) -> dict[str, Any]:
             return {"ok": False, "error": problem}
         done, _ = await asyncio.wait({answer}, timeout=LOADED_WITHIN_S)
     except asyncio.CancelledError as stops:
-        raise _Refusal(stops.args[0] + (": nothing was done" if command.answer.cancel() else "")) from None
+        raise Refusal(stops.args[0] + (": nothing was done" if command.answer.cancel() else "")) from None
     if done:
         return answer.result()
     return {"ok": True, "note": f"still loading after {LOADED_WITHIN_S:g} s: ask `phasestack status`"}

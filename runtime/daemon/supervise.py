@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from runtime.daemon.notify import Notifier
 from runtime.daemon.reconfigure import Reconfiguration, moved_since
 from runtime.daemon.server import StatusServer, open_status_server
 from runtime.daemon.signals import Signals
-from runtime.errors import InputError, PanelLost, PhasestackError, Stopped, retry_advised
+from runtime.errors import FatalError, InputError, PanelLost, PhasestackError, Stopped, retry_advised
 from runtime.frame.presenter import Presenter
 from runtime.records import RefreshAccount, State
 from runtime.support import logs
@@ -79,11 +80,11 @@ class Daemon(Host):
             self._notifier.reloading()
             command = Command("reload")
             command.answer.add_done_callback(lambda _: self._notifier.reloaded())
-            self._attempt(presenter, command)
+            self._attempt(presenter, command, partial(self._carry_out, presenter, command))
         while self._server is not None and not self._server.commands.empty():
             command = self._server.commands.get()
             if command.take():  # else it was refused meanwhile: never done later
-                self._attempt(presenter, command)
+                self._attempt(presenter, command, partial(self._carry_out, presenter, command))
         if self._change is not None and self._change.loading.finished:
             change, self._change = self._change, None
             if not change.loading.problem:
@@ -94,13 +95,13 @@ class Daemon(Host):
                 log.info("changed: scene %s, model %s", state.content.info.name, state.predictor.name)
             self._answer(presenter, change.command, change.loading.problem)
 
-    def _attempt(self, presenter: Presenter, command: Command) -> None:
+    def _attempt(self, presenter: Presenter, command: Command, work: Callable[[], None]) -> None:
         """What is asked for; whatever goes wrong with one request does not end what everybody looks at."""
         try:
-            self._carry_out(presenter, command)
+            work()
         except PhasestackError as error:
             self._answer(presenter, command, str(error))
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             log.exception("%s: unexpected error", command.name)
             self._answer(presenter, command, f"unexpected error ({type(error).__name__}): see the log")
 
@@ -189,25 +190,31 @@ class Daemon(Host):
         values = command.value or status.placing_in(self._configured)
         changed(presenter.run_cell.state.settings, "content", values, source="place")
 
-        def place(parts: Any) -> bool:
+        def place(parts: Any) -> str:
             state = parts.run.state
             settings = changed(state.settings, "content", values, source="place")
             source = placed_source(state.content, placing_of(settings.content))
             parts.replace(settings=settings, content=source)
             self._chosen = self._chosen | {("content", key): value for key, value in values.items()}
-            self._answer(presenter, command, "")
-            return True
+            return ""
 
-        presenter.solver.do(place)
+        self._between_steps(presenter, command, place)
 
     def _skip(self, presenter: Presenter, command: Command) -> None:
-        def skip(parts: Any) -> bool:
+        def skip(parts: Any) -> str:
             done = parts.run.state.content.skip(time_ns=presenter.clock.now_ns())
-            problem = "" if done else "there is no next one: what is shown is no playlist, or its last"
-            self._answer(presenter, command, problem)
+            return "" if done else "there is no next one: what is shown is no playlist, or its last"
+
+        self._between_steps(presenter, command, skip)
+
+    def _between_steps(self, presenter: Presenter, command: Command, work: Callable[[Any], str]) -> None:
+        """Have it done on the solver's thread, which answers; work: why it was refused, empty: it was done."""
+
+        def task(parts: Any) -> bool:
+            self._attempt(presenter, command, lambda: self._answer(presenter, command, work(parts)))
             return True
 
-        presenter.solver.do(skip)
+        presenter.solver.do(task)
 
     def _write_black_box(self, command: Command) -> None:
         """What the black box keeps, to a file; the answer comes once it is there."""
@@ -293,6 +300,8 @@ def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> di
             summary = drive(settings, options, daemon)
         except Stopped as reason:
             summary = {"stopped": str(reason)}
+        except SystemExit as error:
+            raise FatalError(f"a configured class ended the run: sys.exit({error.code!r})") from error
         except PanelLost:
             if not signals.stop:
                 raise

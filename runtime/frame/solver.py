@@ -68,7 +68,7 @@ class Solver:
         time_ns = request.time_ns
         try:
             revision = state.content.revision(time_ns=time_ns)
-        except Exception as error:
+        except (Exception, SystemExit) as error:  # a vendor's `sys.exit()` too
             return SolverStep(missing=self._failed("content", error, expected=ContentFailure))
         job = self._policy.next_job(
             request,
@@ -105,14 +105,14 @@ class Solver:
             )
         except ContextLost:  # content and model are in it: whoever made this solver makes another
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             return SolverStep(missing=self._failed("content", error, expected=ContentFailure))
         watch.lap("render")
         try:
             prediction = state.predictor.solve(job)
         except ContextLost:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             return SolverStep(missing=self._failed("model", error, expected=ModelFailure))
         made = prediction.made
         if isinstance(made, np.ndarray):
@@ -145,7 +145,7 @@ class Solver:
             middle = self._middle_m
             view = View(middle, 0, raster_from_stack(middle, raster), raster.width_px, raster.height_px)
             picture = state.content.render(view, time_ns=time_ns)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             missing = self._failed("content", error, expected=ContentFailure)
             if self._flat is not None:
                 return SolverStep(missing=missing)
@@ -178,7 +178,7 @@ class Solver:
             state.content.info, state.settings, seeing=seeing, measured=measured, loaded_modules=sys.modules
         )
 
-    def _failed(self, part: str, error: Exception, *, expected: type[Exception]) -> dict[str, str]:
+    def _failed(self, part: str, error: BaseException, *, expected: type[Exception]) -> dict[str, str]:
         self._missing[part] = str(error).splitlines()[0] if str(error) else type(error).__name__
         if isinstance(error, expected):
             log.warning("%s: %s", part, error)

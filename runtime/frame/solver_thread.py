@@ -8,14 +8,15 @@ import queue
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock
-from runtime.errors import ContextLost, FatalError, PhasestackError, Stopped
+from runtime.errors import ContextLost, FatalError, PhasestackError, Stopped, TransientError
 from runtime.frame.solver import SolverStep
 from runtime.frame.solver_host import COST_GAIN, FIRST_REQUEST, SolverHost, SolverParts, Task, taken_in, total_ns
 from runtime.records import SolveRequest
-from runtime.support.background import SOLVER_NICENESS, set_niceness
+from runtime.support.background import SOLVER_NICENESS, begin, set_niceness
 from runtime.support.memory import give_back
 from runtime.support.untrusted_input import LIMITS
 
@@ -104,7 +105,8 @@ class SolverThread(SolverHost):
         busy_ns = self._clock.now_ns() - attempt.busy_since_ns if attempt.busy_since_ns else 0
         if attempt.error is not None:
             if busy_ns > self._abandon_ns:
-                self._attempt = self._begin(attempt.number + 1)
+                with suppress(TransientError):  # no thread at present
+                    self._attempt = self._begin(attempt.number + 1)
             return f"the solver failed, it is made anew by and by ({_line(attempt.error)})"
         if busy_ns <= 2 * self._late_ns:
             steps = tuple(attempt.took_ns)
@@ -119,20 +121,20 @@ class SolverThread(SolverHost):
         if busy_ns > abandon_ns:
             self._hung = [hung for hung in self._hung if hung.thread is not None and hung.thread.is_alive()]
         if busy_ns > abandon_ns and len(self._hung) < ABANDONED_MAX:
-            log.error("solver: no answer for %.1f s: left behind, and made anew", busy_ns / NS_PER_S)
-            with self._lock:
-                attempt.abandoned.set()
-            self._hung.append(attempt)
-            self.restarts += 1
-            self._attempt = self._begin(attempt.number + 1)
+            with suppress(TransientError):  # no thread at present: asked again at the next refresh
+                self._attempt = self._begin(attempt.number + 1)
+                with self._lock:
+                    attempt.abandoned.set()
+                self._hung.append(attempt)
+                self.restarts += 1
+                log.error("solver: no answer for %.1f s: left behind, and made anew", busy_ns / NS_PER_S)
         busy_ms = busy_ns // NS_PER_MS // ANSWER_STEP_MS * ANSWER_STEP_MS
         return f"the solver {'has not answered' if attempt.ready.is_set() else 'is being made anew'} for {busy_ms} ms"
 
     def _begin(self, number: int) -> _Attempt:
         attempt = _Attempt(number)
         attempt.busy_since_ns = self._clock.now_ns() if number > 1 else 0
-        attempt.thread = threading.Thread(target=self._run, args=(attempt,), name=f"solver-{number}", daemon=True)
-        attempt.thread.start()
+        attempt.thread = begin(f"solver-{number}", self._run, attempt)
         return attempt
 
     def _run(self, attempt: _Attempt) -> None:

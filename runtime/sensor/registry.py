@@ -46,6 +46,6 @@ def _plugin(name: str, settings: SensorSettings, clock: Clock) -> Sensor:
         sensor: Sensor = plugin(options, clock=clock)
     except PhasestackError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InputError(name, "", written(error)) from error
     return sensor

@@ -6,6 +6,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from enum import StrEnum
 
 from runtime.clock import NS_PER_S, Clock
@@ -14,6 +15,7 @@ from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
 from runtime.sensor.samples import FindEyes, Samples, finder, searched
+from runtime.support.background import begin
 
 TIMEOUTS_TO_REOPEN = 2
 REOPEN_AFTER_S, REOPEN_AFTER_MAX_S = 0.25, 0.5  # the wait before a lost sensor is opened again doubles up to the second
@@ -45,10 +47,11 @@ class _Attempt:
     """One thread with one driver. Once `abandoned`, nothing it says counts any more."""
 
     def __init__(self, number: int, run: Callable[[_Attempt], None], *, wait_s: float, deadline_ns: int) -> None:
+        """Raises TransientError: no thread at present."""
         self.number, self.abandoned = number, threading.Event()
         self.wait_s, self.deadline_ns = wait_s, deadline_ns
-        self.thread = threading.Thread(target=run, args=(self,), name=f"sensor-{number}", daemon=True)
         self.received = 0
+        self.thread = begin(f"sensor-{number}", run, self)
 
 
 class SensorWorker(Samples):
@@ -85,7 +88,6 @@ class SensorWorker(Samples):
         number = self._attempt.number + 1 if self._attempt else 1
         deadline_ns = self._clock.now_ns() + round((wait_s + OPEN_TIMEOUT_S) * NS_PER_S)
         self._attempt = _Attempt(number, self._run, wait_s=wait_s, deadline_ns=deadline_ns)
-        self._attempt.thread.start()
 
     def take(self) -> list[SensorFrame]:
         """All samples that arrived and were not read yet, oldest first."""
@@ -155,7 +157,8 @@ class SensorWorker(Samples):
             self._account(self._driver)
             self._hung.append(attempt)
         if len(self._hung) <= ABANDONED_MAX:
-            self._begin(REOPEN_AFTER_S)
+            with suppress(TransientError):  # no thread at present: asked again when it is looked at next
+                self._begin(REOPEN_AFTER_S)
 
     def _set(self, attempt: _Attempt, state: SensorState, reason: str) -> None:
         with self._lock:
@@ -197,21 +200,27 @@ class SensorWorker(Samples):
                 self._set(attempt, SensorState.LOST, str(error))  # no descriptor, no memory: there may be later
             except TransientError as error:
                 self._set(attempt, SensorState.LOST, str(error))
-            except Exception as error:
-                # An SDK's own exception must not end the daemon: what is broken may come back.
+            except BaseException as error:
+                # An SDK's own exception, or its `sys.exit()`, must not end the daemon: what is broken may come back.
                 log.exception("sensor: unexpected error")
                 self._set(attempt, SensorState.LOST, f"{type(error).__name__}: {error}")
             finally:
                 if driver is not None:
                     self._allow(attempt, OPEN_TIMEOUT_S)
-                    driver.close()
-                    self._account(driver)
+                    self._close(driver)
             if attempt.abandoned.is_set():
                 return
             if attempt.received:
                 backoff_s = REOPEN_AFTER_S
             wait_s, backoff_s = backoff_s, min(2 * backoff_s, REOPEN_AFTER_MAX_S)
             self._allow(attempt, wait_s + OPEN_TIMEOUT_S)
+
+    def _close(self, driver: Sensor) -> None:
+        try:
+            driver.close()
+        except BaseException:
+            log.exception("sensor: closing it")
+        self._account(driver)
 
     def _receive(self, attempt: _Attempt, driver: Sensor) -> None:
         """Read until the driver fails or the worker stops."""

@@ -9,9 +9,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
-from runtime.errors import PhasestackError, one_line
+from runtime.errors import PhasestackError, TransientError, one_line
 
 log = logging.getLogger("phasestack.background")
 
@@ -32,21 +32,34 @@ def wait_for_all(timeout_s: float) -> int:
     return sum(thread.is_alive() for thread in tuple(_running))
 
 
+def begin(name: str, run: Callable[..., None], *given: Any) -> threading.Thread:
+    """A thread that has been started. Raises TransientError where the system has none left."""
+    thread = threading.Thread(target=run, args=given, name=name, daemon=True)
+    try:
+        thread.start()
+    except RuntimeError as error:
+        raise TransientError(f"{name}: {error}") from error
+    return thread
+
+
 class Job(Generic[T]):
-    """Begins at once. `done`, `problem` and `take` never wait."""
+    """Begins at once. `done`, `problem` and `take` never wait; one that could not begin has a problem."""
 
     def __init__(self, name: str, work: Callable[[], T]) -> None:
         self._name, self._work = name, work
         self._result: T | None = None
         self.done = False
         self.problem = ""  # one line, where it failed
-        self._thread = threading.Thread(target=self._run, name=f"job {name}", daemon=True)
-        _running.add(self._thread)
-        self._thread.start()
+        self._thread: threading.Thread | None = None
+        try:
+            self._thread = begin(f"job {name}", self._run)
+        except TransientError as error:
+            self.problem, self.done = str(error), True
 
     def wait(self, timeout_s: float) -> None:
         """Until its thread has ended, so long at most."""
-        self._thread.join(timeout_s)
+        if self._thread is not None:
+            self._thread.join(timeout_s)
 
     def take(self) -> T | None:
         """The result, which is the caller's from now on; None where there is none (yet)."""
@@ -54,17 +67,18 @@ class Job(Generic[T]):
         return result
 
     def _run(self) -> None:
+        _running.add(threading.current_thread())
         set_niceness(BACKGROUND_NICENESS)
         try:
             self._result = self._work()
         except PhasestackError as error:
             self.problem = str(error)
-        except Exception as error:  # whatever a library raises, the loop goes on with what it has
+        except BaseException as error:  # whatever a library raises, or a vendor's `sys.exit()`
             self.problem = one_line(f"{self._name}: {type(error).__name__}: {error}")
             log.exception("%s: unexpected error", self._name)
         finally:
             self.done = True
-            _running.discard(self._thread)
+            _running.discard(threading.current_thread())
 
 
 @contextmanager

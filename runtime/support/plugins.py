@@ -39,7 +39,7 @@ def plugin_class(name: str, base: type, *, field: str) -> Any:
     module, _, attribute = name.partition(":")
     try:
         found = getattr(importlib.import_module(module), attribute, None)
-    except Exception as error:  # whatever a module does when it is imported
+    except (Exception, SystemExit) as error:  # whatever a module does when it is imported
         problem = one_line(f"{type(error).__name__}: {error}")
         raise InputError(field, "", f"`{module}` cannot be imported from Python's path ({problem})") from error
     if not (isinstance(found, type) and issubclass(found, base)):

@@ -309,3 +309,34 @@ def test_a_scene_whose_making_takes_longer_than_a_step_may_is_shown_when_it_is_t
 
     assert served.asked("scene", "slow_scene:Scene", meanwhile=meanwhile)["scene"] == "slow_scene:Scene"
     assert solver.restarts == 0
+
+
+@pytest.mark.parametrize("where", ["imported", "made", "drawn"])
+def test_a_scene_that_ends_the_process_is_refused_or_a_fault_and_later_changes_are_made(
+    served: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    """`sys.exit()`, as vendors' kits do: ctl said ok, and ok to all that came later, and did nothing."""
+    calls = {name: "sys.exit('no licence')" if name == where else "pass" for name in ("imported", "made", "drawn")}
+    (tmp_path / "leaving.py").write_text(
+        "import sys\nimport numpy as np\nfrom phasestack import ContentSource\n"
+        f"{calls['imported']}\n"
+        "class Scene(ContentSource):\n"
+        "    def __init__(self, options, **more):\n        super().__init__(options, **more)\n"
+        f"        {calls['made']}\n"
+        "    def render(self, view, *, time_ns):\n"
+        f"        if view.width_px > 32:\n            {calls['drawn']}\n"
+        "        return np.full((view.height_px, view.width_px, 4), 200, np.uint8)\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "leaving", raising=False)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    answer = served.asked("scene", "leaving:Scene")
+    assert answer["ok"] is (where == "drawn")
+    if where == "drawn":
+        served.rig.refresh_until("degraded: content")
+        assert "no licence" in served.rig.presenter.machine.reason
+    else:
+        assert "SystemExit" in answer["error"] and "no licence" in answer["error"]
+    assert served.asked("scene", "sparse")["scene"] == "sparse"
+    assert served.asked("model", "sart")["model"] == "sart"
+    served.rig.refresh_until(TRACKING)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import resource
 import socket
+import threading
 import urllib.request
 from contextlib import ExitStack
 from typing import Any
 
 import pytest
 
-from runtime.daemon import supervise
+from runtime.daemon import listener, supervise
 from runtime.daemon.metrics import LOOPBACK, Metrics
 from runtime.records import RefreshAccount, State
+from tests.waiting import eventually
 
 
 def account(**changes: Any) -> Any:
@@ -79,6 +83,48 @@ def test_nothing_is_told_that_was_not_measured(metrics: Metrics) -> None:
     for name in ("solution_age_milliseconds", "eye_sigma_millimetres", "photon_latency_milliseconds"):
         assert told[f"phasestack_{name}_count"] == 0
     assert not [name for name in told if "psnr" in name or "fps" in name or "per_second" in name]
+
+
+def test_connections_that_ask_nothing_cost_no_thread_and_hold_nobody_up(metrics: Metrics) -> None:
+    """Any local user may connect: a thousand of them took the presenter its turns and the service its threads."""
+    metrics.serve(port := free_port())
+    threads = threading.active_count()
+    held = [socket.create_connection((LOOPBACK, port), timeout=20.0) for _ in range(4 * listener.CLIENTS_MAX)]
+    try:
+        refreshed(metrics, account())
+        assert scraped(port)['phasestack_solutions_total{result="ran"}'] == 1
+        assert threading.active_count() == threads
+        assert held[0].recv(100).startswith(b"HTTP/1.1 503 "), "who has waited longest was sent away"
+    finally:
+        for client in held:
+            client.close()
+
+
+def test_a_connection_that_never_ends_its_request_is_let_go(metrics: Metrics, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(listener, "REQUEST_S", 0.2)
+    metrics.serve(port := free_port())
+    with socket.create_connection((LOOPBACK, port), timeout=20.0) as client:
+        client.sendall(b"GET /metrics HTTP/1.1\r\n")
+        assert client.makefile("rb").read().startswith(b"HTTP/1.1 503 ")
+
+
+def test_without_descriptors_who_comes_is_served_later_and_a_line_tells_it(
+    metrics: Metrics, caplog: pytest.LogCaptureFixture
+) -> None:
+    metrics.serve(port := free_port())
+    with socket.socket() as client:
+        client.settimeout(20.0)
+        os.close(free := os.dup(0))
+        before = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (free, before[1]))
+        try:
+            client.connect((LOOPBACK, port))
+            client.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
+            assert eventually(lambda: "metrics: socket.accept() out of system resource" in caplog.text)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, before)
+        assert client.recv(100).startswith(b"HTTP/1.1 200 ")
+    assert "Traceback" not in caplog.text
 
 
 def test_a_port_that_is_taken_costs_the_figures_and_not_the_display(metrics: Metrics) -> None:

@@ -17,6 +17,7 @@ import pytest
 
 from runtime.clock import NS_PER_S, SimulatedClock
 from runtime.config import ServiceSettings
+from runtime.daemon import listener
 from runtime.daemon import server as server_module
 from runtime.daemon.client import NotRunning, ask
 from runtime.daemon.server import SocketInUse, StatusServer, open_status_server
@@ -88,12 +89,12 @@ def test_nonsense_is_refused_and_never_reaches_the_loop(server: StatusServer, li
 
 def test_a_request_without_end_is_cut_off(server: StatusServer, path: Path) -> None:
     with connected(path) as client:
-        client.sendall(b"x" * (server_module.LINE_MAX_BYTES + 1))
+        client.sendall(b"x" * (listener.REQUEST_MAX_BYTES + 1))
         assert b"too long" in client.makefile("rb").readline()
 
 
 def test_where_all_places_are_taken_the_one_that_has_waited_longest_goes(server: StatusServer, path: Path) -> None:
-    crowd = [connected(path) for _ in range(server_module.CLIENTS_MAX)]
+    crowd = [connected(path) for _ in range(listener.CLIENTS_MAX)]
     for client in crowd:
         client.sendall(b'{"command": "status"}\n')
         assert b"true" in client.makefile("rb").readline()
@@ -210,7 +211,7 @@ def test_tricklers_lock_out_nobody(server: StatusServer, path: Path) -> None:
             except OSError:
                 stop.wait(0.01)
 
-    threads = [threading.Thread(target=trickle) for _ in range(server_module.CLIENTS_MAX + 16)]
+    threads = [threading.Thread(target=trickle) for _ in range(listener.CLIENTS_MAX + 16)]
     for thread in threads:
         thread.start()
     try:
@@ -222,7 +223,7 @@ def test_tricklers_lock_out_nobody(server: StatusServer, path: Path) -> None:
             command.take()
             command.done()
             assert asked.result(timeout=60) == {"ok": True}
-        assert len(server._clients) <= server_module.CLIENTS_MAX
+        assert len(server._clients) <= listener.CLIENTS_MAX
     finally:
         stop.set()
         for thread in threads:
@@ -231,7 +232,7 @@ def test_tricklers_lock_out_nobody(server: StatusServer, path: Path) -> None:
 
 @pytest.fixture
 def hasty(path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[StatusServer]:
-    monkeypatch.setattr(server_module, "REQUEST_S", 0.3)
+    monkeypatch.setattr(listener, "REQUEST_S", 0.3)
     made = StatusServer(path, clock=SimulatedClock())
     yield made
     made.close()

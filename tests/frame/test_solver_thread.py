@@ -382,3 +382,25 @@ def test_a_task_may_take_longer_than_a_step(shop: Workshop, monkeypatch: pytest.
     shop.host.news()
     assert shop.host.restarts == 1
     gate.set()
+
+
+def test_where_no_thread_can_be_started_what_hangs_is_left_behind_later(
+    shop: Workshop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the limit of tasks the next fault ended the display."""
+
+    def refuse(*_: Any) -> None:
+        raise RuntimeError("can't start new thread")  # as the interpreter does
+
+    shop.solve(1)
+    shop.behave = shop.hang
+    shop.post(2)
+    with monkeypatch.context() as exhausted:
+        exhausted.setattr(threading, "_start_new_thread", refuse)
+        shop.pass_s(ABANDON_S + 0.1)
+        assert "has not answered" in shop.host.news().missing["model"]
+        assert (shop.host.restarts, shop.host.news().solution.solved_for_ns) == (0, 1)
+    shop.left()
+    shop.behave = solves
+    shop.solve(3)
+    assert shop.host.news().solution.solved_for_ns == 3

@@ -16,7 +16,7 @@ from runtime.config import SensorSettings
 from runtime.errors import EndOfRecording, FatalError, SensorLost, SensorTimeout
 from runtime.records import SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
-from runtime.sensor.worker import SensorWorker
+from runtime.sensor.worker import SensorState, SensorWorker
 from tests.waiting import eventually
 
 SETTINGS = SensorSettings(timeout_s=0.05)
@@ -250,3 +250,39 @@ def test_stamps_that_are_not_of_this_machine_s_clock_are_refused(ahead_s: float)
             worker.arrived(0)
     finally:
         worker.close()
+
+
+def test_a_kit_that_ends_the_process_or_fails_to_close_is_lost_and_opened_again(started: Callable[..., Any]) -> None:
+    """Its thread died of `sys.exit()`, and the status stayed well."""
+    calls: list[int] = []
+
+    def act() -> None:
+        calls.append(1)
+        if len(calls) < 3:
+            raise SystemExit("device lost")
+        time.sleep(0.002)
+
+    worker, log = started(act)
+    assert eventually(lambda: worker.reason == "SystemExit: device lost")
+    assert worker.state is SensorState.LOST and worker.fault() == "SystemExit: device lost"
+    assert eventually(lambda: worker.state is SensorState.RUNNING, within_s=20)
+    assert log.count("open") + log.count("open S7") == 3
+
+
+def test_where_no_thread_can_be_started_what_hangs_is_left_behind_later(
+    started: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate = threading.Event()
+    worker, _ = started(lambda: gate.wait(20.0))
+    with monkeypatch.context() as exhausted:
+        exhausted.setattr(threading, "_start_new_thread", _no_thread)
+        assert eventually(lambda: worker.state is SensorState.HUNG, within_s=20)
+        time.sleep(0.05)
+        assert worker.state is SensorState.HUNG  # asking raises nothing
+    assert eventually(lambda: worker.state and worker._attempt.number == 2, within_s=20)
+    gate.set()
+    assert eventually(lambda: worker.state is SensorState.RUNNING, within_s=20)
+
+
+def _no_thread(*_: Any) -> None:
+    raise RuntimeError("can't start new thread")  # as the interpreter does at the limit of tasks

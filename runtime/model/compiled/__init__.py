@@ -40,7 +40,7 @@ KEPT_IN = _kept()
 numba.config.CACHE_DIR = str(KEPT_IN or "")  # type: ignore[attr-defined]
 
 
-class CheckedFiles(caching.IndexDataCacheFile):  # type: ignore[misc]
+class CheckedFiles(caching.IndexDataCacheFile):
     """numba's two files of a function, each with what its bytes come to at its end.
 
     Files that a power cut left short, or that a disk returned otherwise, are no answer to unpickle, nor code to run:
@@ -80,4 +80,4 @@ class CheckedFiles(caching.IndexDataCacheFile):  # type: ignore[misc]
             file.write(written.getvalue() + sha256(written.getvalue()).digest())
 
 
-caching.IndexDataCacheFile = CheckedFiles
+caching.IndexDataCacheFile = CheckedFiles  # type: ignore[misc]
