@@ -32,6 +32,7 @@ def page(
     try:
         import uvicorn
 
+        from runtime.page.connections import LimitedConnection
         from runtime.page.server import application
     except ImportError as error:
         raise MissingPart(f"page: {error.name} is not installed: pip install starlette uvicorn") from None
@@ -47,7 +48,7 @@ def page(
     token = token_of(path)
     listening = _listening(port)
     daemon = Daemon(places)
-    app = application(daemon, token)
+    app = application(daemon, token, port=listening.getsockname()[1])
     settings = uvicorn.Config(
         app,
         log_level="warning",
@@ -55,7 +56,7 @@ def page(
         server_header=False,
         proxy_headers=False,
         timeout_graceful_shutdown=2,
-        limit_concurrency=64,
+        http=LimitedConnection,
     )
     typer.echo(f"the page is at http://{LOOPBACK}:{listening.getsockname()[1]}/ - its token is in {path}", err=True)
     uvicorn.Server(settings).run(sockets=[listening])

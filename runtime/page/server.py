@@ -6,6 +6,7 @@ gives the token in the request, which no other site can.
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import hashlib
 import re
@@ -26,11 +27,11 @@ from starlette.routing import Route
 from runtime.daemon.client import LOOKED_UP_AGAIN_S, Daemon
 from runtime.daemon.commands import NAMES
 from runtime.errors import InputError
+from runtime.page.connections import REQUEST_S
 from runtime.page.token import cookie_of, same
 from runtime.support.artifacts import to_json
 from runtime.support.untrusted_input import parsed_json
 
-COOKIE = "phasestack"
 BODY_MAX_BYTES = 65536
 ASSETS = {"page.js": "text/javascript", "page.css": "text/css"}
 Handler = Callable[[Request], Awaitable[Response]]
@@ -47,15 +48,18 @@ class TooLong(ValueError):
     """A request's body."""
 
 
-def application(daemon: Daemon, token: str) -> Starlette:
-    """The application, on loopback: by another name than this machine's own nobody reaches it."""
-    cookie = cookie_of(token)
+def application(daemon: Daemon, token: str, *, port: int) -> Starlette:
+    """The application, on loopback: by another name than this machine's own nobody reaches it.
+
+    port: that it is served on. Browsers know cookies by the host alone: another display's page has another name.
+    """
+    name, cookie = f"phasestack-{port}", cookie_of(token)
 
     def permitted(request: Request) -> bool:
         kind, _, given = request.headers.get("authorization", "").partition(" ")
         if kind.lower() == "bearer":
             return same(given.strip(), token)
-        return same(request.cookies.get(COOKIE, ""), cookie)
+        return same(request.cookies.get(name, ""), cookie)
 
     def guarded(handler: Handler) -> Handler:
         async def answer(request: Request) -> Response:
@@ -102,7 +106,7 @@ def application(daemon: Daemon, token: str) -> Starlette:
         if not same(fields.get("token", [""])[0].strip(), token):
             return HTMLResponse(_login("That is not the token."), 401)
         answer = RedirectResponse("/", 303)
-        answer.set_cookie(COOKIE, cookie, httponly=True, samesite="strict", path="/")
+        answer.set_cookie(name, cookie, httponly=True, samesite="strict", path="/")
         return answer
 
     routes = [
@@ -156,14 +160,15 @@ def _headers() -> dict[str, str]:
 
 
 async def _body(request: Request) -> bytes:
-    """Raises TooLong; ValueError where the client goes away."""
+    """Raises TooLong; ValueError where the client goes away, or trickles."""
     received = b""
     try:
-        async for piece in request.stream():
-            received += piece
-            if len(received) > BODY_MAX_BYTES:
-                raise TooLong
-    except ClientDisconnect:
+        async with asyncio.timeout(REQUEST_S):
+            async for piece in request.stream():
+                received += piece
+                if len(received) > BODY_MAX_BYTES:
+                    raise TooLong
+    except (ClientDisconnect, TimeoutError):
         raise ValueError from None
     return received
 

@@ -7,6 +7,7 @@ import hmac
 import os
 import secrets
 import stat
+import tempfile
 from pathlib import Path
 
 from runtime.errors import InputError
@@ -18,17 +19,23 @@ MOST_BYTES = 4096
 
 def token_of(path: Path) -> str:
     """The token in a file, which is made where there is none. Raises InputError, naming the file."""
+    token, name = secrets.token_urlsafe(TOKEN_BYTES), ""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        if not os.path.lexists(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)  # its owner's alone
+            with os.fdopen(file, "w", encoding="ascii") as opened:
+                opened.write(token + "\n")
+            os.link(name, path)  # whole, or not at all
+            return token
     except FileExistsError:
-        return _read(path)
+        pass  # another was quicker
     except OSError as error:
         raise InputError(path, "", f"cannot be made ({error.strerror})") from None
-    token = secrets.token_urlsafe(TOKEN_BYTES)
-    with os.fdopen(file, "w", encoding="ascii") as opened:
-        opened.write(token + "\n")
-    return token
+    finally:
+        if name:
+            Path(name).unlink(missing_ok=True)
+    return _read(path)
 
 
 def _read(path: Path) -> str:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import socket
 import stat
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from runtime.clock import MonotonicClock
 from runtime.daemon.client import Daemon
 from runtime.daemon.server import StatusServer
 from runtime.errors import InputError
+from runtime.page.connections import CONNECTIONS_MAX
 from runtime.page.server import application
 from runtime.page.token import cookie_of, token_of
 from tests.page.rig import ROOT, Page, page_of, short_folder
@@ -122,7 +125,7 @@ def test_a_wrong_token_in_the_form_gets_no_cookie(page: Page) -> None:
 
 
 def test_another_sites_request_is_refused_though_the_browser_gives_the_cookie(page: Page, loop: Loop) -> None:
-    cookie = f"phasestack={cookie_of(page.token)}"
+    cookie = f"phasestack-{page.port}={cookie_of(page.token)}"
     body = json.dumps({"command": "pause"})
     for headers in ({"Origin": "http://elsewhere.example"}, {"Origin": "null"}, {}):
         code, _, _ = page.ask("POST", "/do", body=body, Cookie=cookie, **headers)
@@ -137,7 +140,7 @@ def test_who_goes_away_while_asking_makes_no_error(tmp_path: Path, path: str) ->
     sent: list[Any] = []
 
     async def asked() -> None:
-        app = application(Daemon((tmp_path / "s.sock",)), "t" * 40)
+        app = application(Daemon((tmp_path / "s.sock",)), "t" * 40, port=1)
         host = b"localhost:8717"
         headers = [(b"host", host), (b"origin", b"http://" + host), (b"authorization", b"Bearer " + b"t" * 40)]
         scope = {"type": "http", "method": "POST", "path": path, "headers": headers, "query_string": b""}
@@ -203,6 +206,40 @@ def test_the_token_is_made_once_for_its_owner_alone(tmp_path: Path) -> None:
     token = token_of(path)
     assert len(token) >= 40 and token_of(path) == token
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+def test_a_disk_that_has_no_room_for_a_token_leaves_none_behind(tmp_path: Path) -> None:
+    """An empty file stayed, and was refused at every start."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8, before[1]))
+    try:
+        with pytest.raises(InputError, match="cannot be made"):
+            token_of(tmp_path / "token")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []
+    assert len(token_of(tmp_path / "token")) >= 40
+
+
+def test_connections_that_ask_nothing_shut_nobody_out(page: Page, loop: Loop) -> None:
+    """Seventy of them, by anybody on this machine, shut the page for as long as they liked."""
+    held = [socket.create_connection(("127.0.0.1", page.port), timeout=20.0) for _ in range(CONNECTIONS_MAX + 10)]
+    try:
+        assert page.look_up("status")["secret"] == "of the daemon"
+        with suppress(ConnectionResetError):
+            assert held[-1].recv(1) == b"", "none stays for long"
+    finally:
+        for client in held:
+            client.close()
+
+
+def test_another_displays_page_on_another_port_does_not_log_out_of_this_one(page: Page, loop: Loop) -> None:
+    """Browsers know cookies by the host alone."""
+    _, headers, _ = page.ask("POST", "/login", body=f"token={page.token}", Origin=page.origin)
+    own = headers["set-cookie"].partition(";")[0]
+    other = own.partition("=")[0].replace(str(page.port), "1") + "=" + "0" * 64
+    assert page.ask("GET", "/", Cookie=f"{other}; {own}")[0] == 200
+    assert page.ask("GET", "/", Cookie=own.replace(str(page.port), "1"))[0] == 401
 
 
 @pytest.mark.parametrize(
