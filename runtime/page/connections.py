@@ -29,8 +29,9 @@ class LimitedConnection(H11Protocol):
     @property
     def waits(self) -> bool:
         """For a request."""
-        return self.cycle is None or self.cycle.response_complete
+        cycle: Any = self.cycle  # None before the first request
+        return cycle is None or bool(cycle.response_complete)
 
     def _let_go(self) -> None:
-        if self.cycle is None and self in self.connections:  # it is another protocol's after an upgrade
+        if self.waits and self in self.connections:  # it is another protocol's after an upgrade
             self.transport.abort()
