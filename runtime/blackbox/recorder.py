@@ -28,7 +28,7 @@ from runtime.frame.presenter import Presenter, Refresh
 from runtime.records import F64, RefreshAccount, SensorFrame
 from runtime.sensor import recording_format as fmt
 from runtime.sensor.recording_format import RecordingHeader
-from runtime.support.artifacts import to_json
+from runtime.support.artifacts import put_in_place, to_json
 from runtime.support.background import Job
 from runtime.support.logs import ROOTS
 from runtime.support.version import version
@@ -273,7 +273,7 @@ def write_file(folder: Path, kind: str, kept: list[Message], header: RecordingHe
                     channels[topic] = writer.register_channel(topic, "json", number)
                 writer.add_message(channels[topic], message.wall_ns, message.data, message.wall_ns, message.sequence)
             writer.finish()
-        part.replace(path)
+        put_in_place(part, path)
     except BaseException:
         part.unlink(missing_ok=True)
         raise

@@ -14,7 +14,7 @@ from runtime.errors import MissingPart, PanelLost
 from runtime.panels import edid, xlib
 from runtime.panels.monitors import Monitor, Rectangle, in_order
 from runtime.support.gl import MINIMUM_VERSION
-from runtime.support.gl_sharing import ShareGroup, shared
+from runtime.support.gl_sharing import ShareGroup, gl_function, shared
 
 log = logging.getLogger("phasestack.panels")
 
@@ -32,7 +32,7 @@ class WindowContext:
 
     def load_opengl_function(self, name: str) -> int:
         """Address of an OpenGL function."""
-        return _address(glfw.get_proc_address(name))
+        return gl_function(name)
 
     load = load_opengl_function
 
@@ -59,34 +59,45 @@ class Window:
         glfw.make_context_current(self.handle)
 
 
-class Display:
-    """The connection to the X server, with a hidden root window whose objects all others share.
+watch: xlib.ServerWatch | None = None  # of the process's connection
 
-    Nothing of it outlives `close`. The X server's death ends the process (xlib.take_over_errors says why).
+
+def _connect() -> None:
+    """Have GLFW's connection to the X server, and EGL's display of it, for the process's life.
+
+    A thread that draws may have a context of that display current when the panels lose theirs; once GLFW had closed it,
+    Mesa would work on freed memory. Raises PanelLost, MissingPart.
+    """
+    global watch
+    if watch is not None:
+        glfw.poll_events()  # what monitors there are by now
+        return
+    try:
+        if glfw.platform_supported(glfw.PLATFORM_X11):
+            glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
+        glfw.init()
+    except glfw.GLFWError as error:
+        raise PanelLost(f"no X server: {_text(error)} (DISPLAY and XAUTHORITY say where)") from None
+    if glfw.get_platform() != glfw.PLATFORM_X11:
+        raise MissingPart("GLFW without X11: only X11 can put a window on a chosen monitor")
+    xlib.take_over_errors()
+    watch = xlib.ServerWatch(_pointer())
+
+
+class Display:
+    """Windows on the X server, with a hidden root window whose objects all others share.
+
+    No window outlives `close`. The X server's death ends the process (xlib.take_over_errors says why).
     """
 
     def __init__(self) -> None:
         """Raises PanelLost (no X server, or none that lets us in: it may come), MissingPart (no X11 library)."""
         self.faults: list[str] = []
         self._windows: list[Window] = []
-        self._closed = False
         self._outputs: dict[str, int] = {}
         self.group: ShareGroup | None = None  # of the root's context, once there is one
-        try:
-            if glfw.platform_supported(glfw.PLATFORM_X11):
-                glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
-            glfw.init()
-        except glfw.GLFWError as error:
-            raise PanelLost(f"no X server: {_text(error)} (DISPLAY and XAUTHORITY say where)") from None
-        try:
-            if glfw.get_platform() != glfw.PLATFORM_X11:
-                raise MissingPart("GLFW without X11: only X11 can put a window on a chosen monitor")
-            xlib.take_over_errors()
-            glfw.set_monitor_callback(self._monitor_changed)
-            self._watch = xlib.ServerWatch(self._pointer)
-        except BaseException:
-            glfw.terminate()
-            raise
+        _connect()
+        glfw.set_monitor_callback(self._monitor_changed)
 
     @property
     def root(self) -> Window:
@@ -126,28 +137,24 @@ class Display:
 
     def close_windows(self) -> None:
         """Close all but the root: its group's textures stay, and with them what a solver has in them."""
-        for window in self._windows[1:]:
-            window.context.release()
-            glfw.destroy_window(window.handle)
-        self._windows = self._windows[:1]
+        self._close_from(1)
         self.faults.clear()
         if self._windows:
             self._windows[0].make_current()
 
     def close(self) -> None:
-        """Close every window and the connection. May be called twice."""
-        if self._closed:
-            return
-        self._closed = True
-        self._watch.stop()
+        """Close every window. May be called twice."""
         if self.group is not None:
             self.group.close()
-        for window in self._windows:
-            window.context.release()
         if self._windows:
             glfw.make_context_current(None)
-        self._windows = []
-        glfw.terminate()
+        self._close_from(0)
+
+    def _close_from(self, first: int) -> None:
+        for window in self._windows[first:]:
+            window.context.release()
+            glfw.destroy_window(window.handle)
+        self._windows = self._windows[:first]
 
     def _adopt(self, handle: Any) -> Window:
         glfw.make_context_current(handle)
@@ -165,7 +172,7 @@ class Display:
     def output_state(self, connector: str) -> xlib.OutputState | None:
         """What an output sends now, and to which monitor; None: nothing, or it has gone."""
         output = self._outputs.get(connector)
-        return xlib.output_state(self._pointer, output) if output else None
+        return xlib.output_state(_pointer(), output) if output else None
 
     def window_state(self, window: Window) -> tuple[bool, Rectangle] | None:
         """Whether a window and all above it are mapped, and where it is now; None: somebody destroyed it."""
@@ -173,10 +180,6 @@ class Display:
         place = Rectangle(*glfw.get_window_pos(window.handle), *glfw.get_window_size(window.handle))
         is_viewable = bool(glfw.get_window_attrib(window.handle, glfw.VISIBLE))
         return (is_viewable, place) if xlib.refusals() == refused else None
-
-    @property
-    def _pointer(self) -> int:
-        return _address(glfw.get_x11_display())
 
     def _pairs(self) -> list[tuple[Monitor, Any]]:
         self._outputs, pairs = {}, []
@@ -242,9 +245,9 @@ def _hints() -> None:
     glfw.window_hint(glfw.RESIZABLE, False)
 
 
-def _address(pointer: Any) -> int:
-    value = getattr(pointer, "value", pointer)
-    return int(value or 0)
+def _pointer() -> int:
+    pointer = glfw.get_x11_display()
+    return int(getattr(pointer, "value", pointer) or 0)
 
 
 def _text(error: Exception) -> str:

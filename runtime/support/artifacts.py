@@ -1,4 +1,4 @@
-"""Files that are whole or not there, written under a temporary name and renamed; pictures without a library's noise."""
+"""Files that are whole and on the disk, or not there: written under a temporary name and renamed; pictures without a library's noise."""
 
 from __future__ import annotations
 
@@ -25,6 +25,22 @@ STAGING = ".phasestack-"
 JPEG = b"\xff\xd8\xff"
 
 
+def sync(path: Path) -> None:
+    """Have a file's data, or a folder's names, on the disk: until then a power cut undoes them. Raises OSError."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def put_in_place(part: Path, path: Path) -> None:
+    """Rename a file to its name for good. Raises OSError."""
+    sync(part)
+    part.replace(path)
+    sync(path.parent)
+
+
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a file atomically, making its parents. Raises InputError where it can't be written, or is a folder."""
     try:
@@ -38,7 +54,10 @@ def write_bytes(path: Path, data: bytes) -> None:
         with os.fdopen(handle, "wb") as file:
             file.write(data)
         Path(name).chmod(0o644)
-        Path(name).replace(path)
+        if any(part.startswith(STAGING) for part in path.parts):  # an OutputFolder has it on the disk at its end
+            Path(name).replace(path)
+        else:
+            put_in_place(Path(name), path)
     except BaseException as error:
         Path(name).unlink(missing_ok=True)
         if isinstance(error, OSError):  # a full or failing disk
@@ -184,12 +203,16 @@ class OutputFolder:
         places = {path: self.target / path.relative_to(self.staging) for path in files}
         for place in places.values():
             _check_free(place, within=self.target)
-        for path, place in places.items():
-            try:
+        try:
+            for path in files:
+                sync(path)
+            for path, place in places.items():
                 place.parent.mkdir(parents=True, exist_ok=True)
                 path.replace(place)
-            except OSError as error:
-                raise InputError(place, "", f"cannot be written ({error.strerror})") from None
+            for folder in {place.parent for place in places.values()}:
+                sync(folder)
+        except OSError as error:
+            raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
 
     def discard(self) -> None:
         """Remove what was staged so far, before the end."""

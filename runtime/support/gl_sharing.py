@@ -70,7 +70,7 @@ def _gl(name: str, answer: Any, *given: Any) -> Any:
 
 
 @cache
-def _address(name: str) -> int:
+def gl_function(name: str) -> int:
     """Of an OpenGL function, the same in every context; 0: there is none.
 
     Kept: moderngl never lets go of the numbers that it is given, 20 KiB a context.
@@ -101,7 +101,7 @@ class SharingContext:
 
     def load_opengl_function(self, name: str) -> int:
         """Address of an OpenGL function; 0: there is none."""
-        return _address(name)
+        return gl_function(name)
 
     load = load_opengl_function
 

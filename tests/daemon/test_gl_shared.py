@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,6 +14,7 @@ from runtime.clock import NS_PER_S
 from runtime.model.gl.state import GlState
 from runtime.model.reprojection import NEUTRAL
 from runtime.optics.alignment import shown_layers
+from runtime.panels.display import glfw
 from runtime.records import Solution
 from runtime.support.gl_sharing import LayerTextures, lies_in
 from tests.daemon.rig import Rig
@@ -167,7 +170,7 @@ def test_a_context_that_the_panels_lost_is_made_anew_with_the_solver(
     monkeypatch.setattr("runtime.panels.window.RETRY_NS", NS_PER_S // 20)
     with Rig(model=MODEL, abandon_s=0.2, loop={"rate_hz": 100.0}, **on_windows()) as rig:
         rig.refresh_until_solved()
-        parts, group = rig.run.parts, rig.presenter.panels.group
+        parts, group, connected = rig.run.parts, rig.presenter.panels.group, connection()
         monkeypatch.setattr("runtime.panels.window._reset_status", lambda: "was reset (0x8253)")
         rig.refresh_until(lambda: "panel" in rig.presenter.missing)
         monkeypatch.undo()
@@ -177,11 +180,18 @@ def test_a_context_that_the_panels_lost_is_made_anew_with_the_solver(
         rig.refresh_until(lambda: rig.run.parts is not parts and not rig.presenter.missing)
         account = rig.refresh_until_solved()
         assert account.presented
+        assert connection() == connected  # a thread that draws may have used it all the time
         # The first solution may have been under way while there was no context to share.
         rig.refresh_until(lambda: isinstance(rig.presenter.last.solution.made, LayerTextures))  # type: ignore[union-attr]
         made = rig.presenter.last.solution.made  # type: ignore[union-attr]
         assert isinstance(made, LayerTextures)
         assert made.group is rig.presenter.panels.group
+
+
+def connection() -> int:
+    """The X connection of this process's GLFW, by its socket's number: no two ever have the same."""
+    x11 = ctypes.CDLL("libX11.so.6")
+    return os.fstat(x11.XConnectionNumber(ctypes.c_void_p(glfw.get_x11_display()))).st_ino
 
 
 def test_where_the_driver_can_t_share_solutions_are_read_back(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -187,7 +187,13 @@ class XServer:
         x11.XCloseDisplay(display)
 
     def stop(self) -> None:
-        """End it, as a crash would: at once."""
+        """End it, as a crash would: at once. This process, which may be connected to it, lets go first."""
+        from runtime.panels import display
+
+        if display.watch is not None:
+            display.watch.stop()
+            display.watch = None
+            display.glfw.terminate()
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGKILL)
         self._process.wait(timeout=60)
