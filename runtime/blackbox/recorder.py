@@ -6,6 +6,7 @@ happens is made into bytes at once (the garbage collector never looks through th
 
 from __future__ import annotations
 
+import fcntl
 import json
 import logging
 import os
@@ -13,6 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -47,7 +49,7 @@ LINES_KEPT, STATES_KEPT = 200, 50  # for the operator's page
 FILES_MAX = 20  # in the folder
 PREFIX = "blackbox-"
 ASKED = "asked"
-
+PART = ".part"
 
 LOG, REFRESH, STATE = "/log", "/refresh", "/state"
 # Viewers plot a number wherever it stands; only what they show in a way of its own needs its fields named.
@@ -113,6 +115,20 @@ class Message(NamedTuple):
     sequence: int
 
 
+class _Asked(NamedTuple):
+    """A file that is to be written."""
+
+    kind: str
+    kept: list[Message]
+    header: RecordingHeader
+    settings: str
+    told: list[Saved]  # at its end
+
+    def tell(self, problem: str, path: Path | None) -> None:
+        for saved in self.told:
+            saved(problem, path)
+
+
 class Recorder(logging.Handler):
     """An observer of a run, and of its log. `watches` begins; `close` ends it."""
 
@@ -131,7 +147,10 @@ class Recorder(logging.Handler):
         self._last_file: Path | None = None
         self._lines: deque[dict[str, Any]] = deque(maxlen=LINES_KEPT)
         self._passed: deque[dict[str, Any]] = deque(maxlen=STATES_KEPT)
-        self._jobs: list[Job[None]] = []
+        self._waiting_lock, self._is_writing = threading.Lock(), False
+        self._waiting: deque[_Asked] = deque()  # for the writer
+        self._writer: Job[None] | None = None
+        _sweep(folder)
 
     def watches(self, presenter: Presenter, *, in_stack_frame: bool) -> None:
         """Begin. in_stack_frame: the sensor's points are in `stack`: they are written as a sensor would see them."""
@@ -191,24 +210,41 @@ class Recorder(logging.Handler):
         if not self._most_ns or self._presenter is None:
             saved("nothing is kept in memory (service.blackbox_minutes is 0)", None)
             return
-        with self._kept_lock:
-            kept = list(self._kept)
         settings = self._presenter.run_cell.state.settings
         header = RecordingHeader(settings.sensor.driver, self._presenter.samples.serial)
+        with self._kept_lock:
+            kept = list(self._kept)
+        with self._waiting_lock:
+            told = [saved]
+            if self._waiting and self._waiting[-1].kind == kind:  # not begun: one file is enough for both
+                told = [*self._waiting.pop().told, saved]
+            self._waiting.append(_Asked(kind, kept, header, settings.model_dump_json(), told))
+            if self._is_writing:
+                return
+            self._writer = Job("black box", self._write)
+            self._is_writing = not self._writer.problem
+            refused = self._waiting.pop() if self._writer.problem else None
+        if refused is not None:
+            refused.tell(self._writer.problem, None)
 
-        def work() -> None:
+    def _write(self) -> None:
+        """What waits, one file after the other; on the writer's thread."""
+        while True:
+            with self._waiting_lock:
+                self._is_writing = bool(self._waiting)
+                if not self._waiting:
+                    return
+                asked = self._waiting.popleft()
             try:
-                path = write_file(self._folder, kind, kept, header, settings.model_dump_json())
+                path = write_file(self._folder, asked.kind, asked.kept, asked.header, asked.settings)
                 make_room(self._folder)
             except OSError as error:
                 log.error("the black box could not be written: %s", error)
-                saved(f"{self._folder}: cannot be written ({error.strerror})", None)
-                return
+                asked.tell(f"{self._folder}: cannot be written ({error.strerror})", None)
+                continue
             self._last_file = path
             log.info("black box written: %s", path, extra={"always": True})
-            saved("", path)
-
-        self._jobs = [job for job in self._jobs if not job.done] + [Job("black box", work)]
+            asked.tell("", path)
 
     def look_at_log(self) -> dict[str, Any]:
         """The newest log lines and states, the oldest first; times since 1970."""
@@ -244,22 +280,27 @@ class Recorder(logging.Handler):
         if self._fault is not None:
             self.save(self._fault[1])
         self._fault = None
-        for job in self._jobs:
-            job.wait(WRITTEN_WITHIN_S)
+        if self._writer is not None:
+            self._writer.wait(WRITTEN_WITHIN_S)
         self._presenter = None
         super().close()
 
 
 def write_file(folder: Path, kind: str, kept: list[Message], header: RecordingHeader, settings: str) -> Path:
-    """A new file in a folder, whole or not there, for its owner alone: who was here is private. Raises OSError."""
+    """A new file in a folder, whole or not there, for its owner alone: who was here is private. Raises OSError.
+
+    Its number is above all others in the folder: the wall's clock may be set back.
+    """
     from mcap.writer import CompressionType, Writer
 
     folder.mkdir(parents=True, exist_ok=True)
-    stem = f"{PREFIX}{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{kind}"
-    path = next(path for n in range(1000) if not (path := folder / f"{stem}{f'~{n}' if n else ''}.mcap").exists())
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o600), "wb") as file:
+    others = (*folder.glob(f"{PREFIX}*.mcap"), *folder.glob(f".{PREFIX}*{PART}"))
+    number = 1 + max(map(_number, others), default=0)
+    path = folder / f"{PREFIX}{number:06}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{kind}.mcap"
+    part = path.with_name(f".{path.name}{PART}")
+    with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600), "wb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # a part that nobody holds is swept
+        try:
             writer: Any = Writer(file, compression=CompressionType.LZ4)
             writer.start(profile="phasestack", library=f"phasestack {version()}")
             writer.add_metadata(fmt.METADATA_NAME, header.metadata())
@@ -269,22 +310,40 @@ def write_file(folder: Path, kind: str, kept: list[Message], header: RecordingHe
                 topic = message.topic
                 if topic not in channels:
                     schema = SCHEMAS[topic]
-                    number = writer.register_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
-                    channels[topic] = writer.register_channel(topic, "json", number)
+                    schema_id = writer.register_schema(schema["title"], "jsonschema", json.dumps(schema).encode())
+                    channels[topic] = writer.register_channel(topic, "json", schema_id)
                 writer.add_message(channels[topic], message.wall_ns, message.data, message.wall_ns, message.sequence)
             writer.finish()
-        put_in_place(part, path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+            file.flush()
+            put_in_place(part, path)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
     return path
 
 
 def make_room(folder: Path) -> None:
-    """Of too many files the commonest kind makes way, all but its first: no kind's flood takes another kind's place."""
+    """Of too many files the commonest kind makes way, all but its first: no kind's flood takes another kind's place.
+    The newest of all stays."""
     kinds: dict[str, list[Path]] = {}
-    for file in sorted(folder.glob(f"{PREFIX}*.mcap")):
+    *earlier, _ = sorted(folder.glob(f"{PREFIX}*.mcap"), key=lambda path: (_number(path), path.name)) or [folder]
+    for file in earlier:
         kinds.setdefault(file.stem.partition("Z-")[2].partition("~")[0], []).append(file)
-    for _ in range(sum(map(len, kinds.values())) - FILES_MAX):
+    for _ in range(len(earlier) + 1 - FILES_MAX):
         largest = max(kinds.values(), key=len)
-        largest.pop(1 if len(largest) > 2 else 0).unlink(missing_ok=True)
+        largest.pop(1 if len(largest) > 1 else 0).unlink(missing_ok=True)
+    _sweep(folder)
+
+
+def _number(path: Path) -> int:
+    """Of a file by its name; 0: it has none."""
+    first = path.name.removeprefix(".").removeprefix(PREFIX).partition("-")[0]
+    return int(first) if first.isdecimal() else 0
+
+
+def _sweep(folder: Path) -> None:
+    """Parts that a killed process left."""
+    for part in folder.glob(f".{PREFIX}*{PART}"):
+        with suppress(OSError), part.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            part.unlink()

@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 import logging
 import stat
+import subprocess
+import sys
+import threading
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from datetime import datetime
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -18,7 +22,7 @@ import numpy as np
 import pytest
 
 from runtime.blackbox import recorder as recording
-from runtime.blackbox.recorder import Recorder, make_room
+from runtime.blackbox.recorder import Recorder, make_room, write_file
 from runtime.clock import NS_PER_S
 from runtime.config import Settings
 from runtime.daemon.build import Host, RunOptions, build_run
@@ -26,6 +30,7 @@ from runtime.errors import SensorLost
 from runtime.eyes.calibration import load_calibration
 from runtime.records import RefreshAccount
 from runtime.sensor.recording import Recording, recording_to
+from runtime.sensor.recording_format import RecordingHeader
 from runtime.sensor.replay import demo_recording_path
 from tests.daemon.rig import Rig
 
@@ -221,3 +226,78 @@ def test_a_flood_of_one_kind_keeps_its_first_and_last_and_takes_no_other_kinds_p
     assert kept[:2] == [earlier.name, "blackbox-20200102T000000Z-fault-model.mcap"]
     assert "blackbox-20200102T000099Z-fault-model.mcap" in kept
     assert "blackbox-20200103T000000Z-fault-panel.mcap" in kept and kept[-1] == file.name
+
+
+def test_many_who_ask_in_one_second_get_whole_files_and_each_an_answer(tmp_path: Path) -> None:
+    """Of a hundred 73 were refused, and 3 were told of a file that nothing could read."""
+    answers: list[tuple[str, Path | None]] = []
+    with Rig(recorder=(recorder := Recorder(tmp_path, minutes=1))) as rig:
+        rig.refreshes(50)
+        for _ in range(25):
+            asking = [
+                threading.Thread(target=recorder.save, args=("asked", lambda *answer: answers.append(answer)))
+                for _ in range(4)
+            ]
+            for one in asking:
+                one.start()
+            rig.presenter.refresh()
+        rig.refresh_until(lambda: len(answers) == 100)
+    assert [problem for problem, _ in answers if problem] == []
+    there = sorted(tmp_path.glob("blackbox-*.mcap"))
+    assert all(len(read(path)) > 50 for path in there) and there[-1] == answers[-1][1]
+    assert [path for path in tmp_path.iterdir() if path not in there] == []
+
+
+def test_a_clock_that_was_set_back_does_not_make_the_newest_the_oldest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class SetBack(datetime):
+        year_now = 2026
+
+        @classmethod
+        def now(cls, tz: Any = None) -> datetime:
+            return datetime(cls.year_now, 11, 20, tzinfo=tz)
+
+    monkeypatch.setattr(recording, "datetime", SetBack)
+    files = []
+    for number in range(recording.FILES_MAX + 5):
+        SetBack.year_now = 2026 if number < recording.FILES_MAX else 2000
+        files.append(write_file(tmp_path, "asked", [], RecordingHeader("replay", ""), "{}"))
+        make_room(tmp_path)
+        assert files[-1].exists()
+    assert sorted(tmp_path.glob("blackbox-*.mcap")) == [files[0], *files[6:]]
+
+
+WRITES = """
+import sys
+from pathlib import Path
+from runtime.blackbox.recorder import Message, write_file
+from runtime.sensor.recording_format import RecordingHeader
+
+
+def kept():
+    yield Message(1, 1, "/refresh", b'"' + b"x" * 4000000 + b'"', 1)
+    print("writing", flush=True)
+    sys.stdin.read()
+
+
+write_file(Path(sys.argv[1]), "asked", kept(), RecordingHeader("replay", ""), "{}")
+"""
+
+
+def test_what_a_killed_writer_left_is_swept_by_the_next_and_what_is_being_written_is_not(tmp_path: Path) -> None:
+    def writer() -> subprocess.Popen[str]:
+        command = [sys.executable, "-c", WRITES, str(tmp_path)]
+        begun = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert begun.stdout is not None and begun.stdout.readline() == "writing\n"
+        return begun
+
+    with writer() as killed:
+        killed.kill()
+    with writer() as busy:
+        assert len(list(tmp_path.iterdir())) == 2
+        Recorder(tmp_path, minutes=1)
+        (left,) = tmp_path.iterdir()
+        assert left.name.endswith(".part")
+    (whole,) = tmp_path.iterdir()
+    assert busy.returncode == 0 and len(read(whole)) == 1
