@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ from runtime.content.registry import Opener, prepare_content
 from runtime.daemon.commands import PLACING
 from runtime.daemon.solver_parts import RunningSolver, ready_predictor
 from runtime.errors import PhasestackError, Stopped
-from runtime.eyes.calibration import load_calibration
+from runtime.eyes.calibration import Calibration, load_calibration
 from runtime.frame.run_state import LEFT_BEHIND
 from runtime.model.predictor import Predictor
 from runtime.optics.stack import PanelStack
@@ -20,6 +22,7 @@ from runtime.support.background import Job
 from runtime.support.crash import written
 from runtime.support.memory import give_back
 from runtime.support.progress import listening
+from runtime.support.untrusted_input import LIMITS
 
 Ready = tuple[Opener | None, Predictor | None]  # None: stays as it is
 
@@ -31,16 +34,18 @@ class Reconfiguration:
     set, and `problem` says whether it was refused.
     """
 
-    def __init__(self, settings: Settings, old: Settings, stack: PanelStack, *, reload_content: bool = False) -> None:
-        """Begins to load; returns at once. reload_content: read it again, though its settings are the same.
+    def __init__(
+        self, read: Callable[[], Settings], old: Settings, stack: PanelStack, *, reload_content: bool = False
+    ) -> None:
+        """Begins to load; returns at once. read: the other settings, on another thread; may raise InputError.
 
-        Raises InputError for a bad calibration file, before anything has begun.
+        reload_content: read it again, though its settings are the same.
         """
-        self.settings, self._old, self._stack = settings, old, stack
-        self._calibration = load_calibration(Path(settings.calibration.file) if settings.calibration.file else None)
-        self._needs_content = reload_content or settings.content != old.content
-        self._needs_model = _model_part(settings) != _model_part(old)
-        self._abandoned = False
+        self._read, self._old, self._stack, self._reload_content = read, old, stack, reload_content
+        self.settings = old
+        self._calibration: Calibration
+        self.abandoned = False
+        self._begun_s = time.monotonic()
         self.progress = ""  # what is being made ready, for the status
         self.problem = ""  # one line, where it can't be done
         self._taker: RunningSolver | None = None  # that takes it over
@@ -49,7 +54,7 @@ class Reconfiguration:
 
     def abandon(self) -> None:
         """It is no longer wanted; nothing of it stays."""
-        self._abandoned = True
+        self.abandoned = True
 
     def advance(self, parts: Any) -> bool:
         """True once it was taken over, refused or abandoned. Uploads to GL: for the solver's thread."""
@@ -60,7 +65,7 @@ class Reconfiguration:
         ready = self._job.take()
         if ready is not None:
             opener, predictor = ready
-            if self._abandoned:
+            if self.abandoned:
                 if predictor is not None:
                     predictor.close()
             else:
@@ -72,25 +77,30 @@ class Reconfiguration:
 
     @property
     def finished(self) -> bool:
-        """Taken over or refused; also where the solver hangs in it and has been left behind."""
+        """Taken over or refused; also where the solver hangs in it and has been left behind, or nobody wants it and it
+        does not end."""
         if not self._finished and self._taker is not None and not self._taker.is_newest:
             self.problem, self._finished = LEFT_BEHIND, True
-        return self._finished
+        is_stuck = self.abandoned and time.monotonic() - self._begun_s > LIMITS.load_s
+        return self._finished or is_stuck
 
     def _make_ready(self) -> Ready:
         """On the job's thread: all that takes long."""
         opener = predictor = None
-        if self._needs_content:
+        self.settings = settings = self._read()
+        file = settings.calibration.file
+        self._calibration = load_calibration(Path(file) if file else None)
+        if self._reload_content or settings.content != self._old.content:
             self.progress = f"loading {self.settings.content.scene}"
             with listening(self._listen):
                 opener = prepare_content(self.settings.content, self._stack)
-        if self._needs_model:
+        if _model_part(settings) != _model_part(self._old):
             self.progress = f"loading model {self.settings.model.name}"
             predictor = ready_predictor(self.settings, self._stack)
         return opener, predictor
 
     def _listen(self, what: str, done: int, total: int | None) -> None:
-        if self._abandoned:
+        if self.abandoned:
             raise Stopped("a newer change came")
         if what:
             self.progress = f"{what}: {done} of {total}" if total else f"{what}: {done}" if done else what

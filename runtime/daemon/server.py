@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import grp
 import json
 import logging
 import os
 import queue
+import select
 import socket
 import stat
 import struct
+import time
 from asyncio import StreamReader, StreamWriter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +32,8 @@ log = logging.getLogger("phasestack.service")
 
 GROUP = "phasestack"  # that may use the socket
 LOOP_ANSWERS_WITHIN_S = 5.0
+LOOKED_AGAIN_S = 0.1  # whether who asks is still there
+ALONE_WITHIN_S = 2.0
 LOADED_WITHIN_S = 60.0  # what has begun is waited for so long
 
 
@@ -53,14 +58,15 @@ class StatusServer(Listener):
         self._snapshot: tuple[int, Callable[[], dict[str, Any]]] = (self._started_ns, dict)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            _check_dead(path)
-            # The mode must hold from the first moment, so it is the mask that makes it, not a later chmod.
-            mask = os.umask(0o117)
-            try:
-                super().__init__("status", lambda serve: asyncio.start_unix_server(serve, path, **LIMITED))
-            finally:
-                os.umask(mask)
-            self._own = path.lstat().st_ino
+            with _alone_in(path.parent):
+                _check_dead(path)
+                # The mode must hold from the first moment, so it is the mask that makes it, not a later chmod.
+                mask = os.umask(0o117)
+                try:
+                    super().__init__("status", lambda serve: asyncio.start_unix_server(serve, path, **LIMITED))
+                finally:
+                    os.umask(mask)
+                self._own = path.lstat().st_ino
         except OSError as error:
             raise InputError("service", "socket", f"{path} can't be made ({error.strerror or error})") from error
         try:
@@ -119,21 +125,23 @@ class StatusServer(Listener):
     async def converse(self, reader: StreamReader, writer: StreamWriter) -> None:
         """As many requests as the client likes."""
         while line := await self.request(reader, b"\n"):
-            await self.send(writer, await self._reply(line))
+            await self.send(writer, await self._reply(line, writer))
 
     def refuse(self, writer: StreamWriter, why: str) -> None:
         writer.write(_line({"ok": False, "error": why}))
 
-    async def _reply(self, line: bytes) -> bytes:
+    async def _reply(self, line: bytes, writer: StreamWriter) -> bytes:
         try:
             answer = self.answer(line)
         except Exception:
             log.exception("a request could not be answered")
             answer = {"ok": False, "error": "the request could not be answered: see the log"}
         if isinstance(answer, Command):
+            if _is_gone(writer):
+                raise Refusal("nothing was done")
             log.info("asked for: %s %s", answer.name, "" if answer.value is None else answer.value)
             self.commands.put(answer)
-            answer = await _outcome(answer)
+            answer = await _outcome(answer, writer)
         return _line(answer)
 
 
@@ -141,11 +149,24 @@ def _line(answer: dict[str, Any]) -> bytes:
     return to_json(answer).encode() + b"\n"
 
 
-async def _outcome(command: Command) -> dict[str, Any]:
-    """What becomes of a command. One that the loop has not taken in time is given up: it is never done."""
+def _is_gone(writer: StreamWriter) -> bool:
+    """Whether a client has gone; one that only sends no more has not."""
+    if writer.is_closing():
+        return True
+    hung_up = select.poll()
+    hung_up.register(writer.get_extra_info("socket"), 0)
+    return bool(hung_up.poll(0))
+
+
+async def _outcome(command: Command, writer: StreamWriter) -> dict[str, Any]:
+    """What becomes of a command. One that the loop has not taken in time, or before its asker went, is given up: it is
+    never done."""
     answer = asyncio.wrap_future(command.answer)
+    until_s = time.monotonic() + LOOP_ANSWERS_WITHIN_S
     try:
-        done, _ = await asyncio.wait({answer}, timeout=LOOP_ANSWERS_WITHIN_S)
+        done: set[Any] = set()
+        while not done and time.monotonic() < until_s and not _is_gone(writer):
+            done, _ = await asyncio.wait({answer}, timeout=min(LOOKED_AGAIN_S, LOOP_ANSWERS_WITHIN_S))
         if not done and command.answer.cancel():
             problem = f"the loop did not answer within {LOOP_ANSWERS_WITHIN_S:g} s: nothing was done"
             return {"ok": False, "error": problem}
@@ -155,6 +176,22 @@ async def _outcome(command: Command) -> dict[str, Any]:
     if done:
         return answer.result()
     return {"ok": True, "note": f"still loading after {LOADED_WITHIN_S:g} s: ask `phasestack status`"}
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Of several that look for a dead socket and put their own in its place, one at a time."""
+    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        until_s = time.monotonic() + ALONE_WITHIN_S
+        while time.monotonic() < until_s:  # for ever, where somebody holds it who need not
+            with contextlib.suppress(BlockingIOError):
+                fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            time.sleep(0.01)
+        yield
+    finally:
+        os.close(opened)
 
 
 def _check_dead(path: Path) -> None:

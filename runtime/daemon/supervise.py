@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -38,14 +38,23 @@ NEEDS_RESTART = ("stack", "sensor", "output", "service", "model.backend")
 Chosen = dict[tuple[str, str], Any]  # section and key of a setting: what an operator chose while it runs
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Change:
-    """What is being loaded for a command, and what holds once it is taken over."""
+    """What is to be loaded for a command, and what holds once it is taken over."""
 
-    loading: Reconfiguration
     command: Command
-    configured: Settings
-    chosen: Chosen
+    read: Callable[[], tuple[Settings, Chosen]]  # the configuration, and what is chosen over it
+    reload_content: bool = False
+    configured: Settings = field(default_factory=Settings)
+    chosen: Chosen = field(default_factory=dict)
+
+    def settings(self) -> Settings:
+        """That are to hold; on the loading thread. Raises InputError."""
+        self.configured, self.chosen = self.read()
+        settings = self.configured
+        for (section, key), value in self.chosen.items():
+            settings = changed(settings, section, {key: value}, source="ctl")
+        return settings
 
 
 class Daemon(Host):
@@ -68,7 +77,8 @@ class Daemon(Host):
         self.run: Run | None = None  # set when it has been put together
         self._configured = Settings()  # as last read
         self._chosen: Chosen = {}  # by an operator, in force over the configuration
-        self._change: _Change | None = None  # under way
+        self._change: tuple[_Change, Reconfiguration] | None = None  # under way
+        self._next: _Change | None = None  # begins once that is over
         self._waits_for = ""  # before the first refresh: which panel, and why
         self._refused = ""  # why the last change was refused, until one is taken
 
@@ -85,15 +95,23 @@ class Daemon(Host):
             command = self._server.commands.get()
             if command.take():  # else it was refused meanwhile: never done later
                 self._attempt(presenter, command, partial(self._carry_out, presenter, command))
-        if self._change is not None and self._change.loading.finished:
-            change, self._change = self._change, None
-            if not change.loading.problem:
-                state = presenter.run_cell.state
-                moved = moved_since(change.loading.settings.content, state.settings.content)  # while it was loading
-                self._configured = change.configured
-                self._chosen = change.chosen | {("content", key): value for key, value in moved.items()}
-                log.info("changed: scene %s, model %s", state.content.info.name, state.predictor.name)
-            self._answer(presenter, change.command, change.loading.problem)
+        if self._change is not None and self._change[1].finished:
+            (change, loading), self._change = self._change, None
+            if not loading.abandoned:
+                self._changed(presenter, change, loading)
+        if self._change is None and self._next is not None:
+            change, self._next = self._next, None
+            self._attempt(presenter, change.command, partial(self._load, presenter, change))
+
+    def _changed(self, presenter: Presenter, change: _Change, loading: Reconfiguration) -> None:
+        """It has been taken over, or refused."""
+        if not loading.problem:
+            state = presenter.run_cell.state
+            moved = moved_since(loading.settings.content, state.settings.content)  # while it was loading
+            self._configured = change.configured
+            self._chosen = change.chosen | {("content", key): value for key, value in moved.items()}
+            log.info("changed: scene %s, model %s", state.content.info.name, state.predictor.name)
+        self._answer(presenter, change.command, loading.problem)
 
     def _attempt(self, presenter: Presenter, command: Command, work: Callable[[], None]) -> None:
         """What is asked for; whatever goes wrong with one request does not end what everybody looks at."""
@@ -150,7 +168,7 @@ class Daemon(Host):
         """What is being loaded, why the last change was refused, and the black box; for the status."""
         change, news = self._change, {}
         if change is not None:
-            news["loading"] = change.loading.progress
+            news["loading"] = change[1].progress
         if self._refused:
             news["refused"] = self._refused
         return news | ({"blackbox": self.recorder.describe()} if self.recorder is not None else {})
@@ -167,7 +185,7 @@ class Daemon(Host):
                 presenter.paused = presenter.flat_asked = False
                 command.done(**status.holds(presenter))
             case "reload":
-                self._reload(presenter, command)
+                self._begin(presenter, _Change(command, self._reloaded))
             case "scene":
                 self._show(presenter, command.value, command)
             case "place":
@@ -175,15 +193,18 @@ class Daemon(Host):
             case "next":
                 self._skip(presenter, command)
             case "model":
-                self._begin(presenter, command, self._configured, self._chosen | {("model", "name"): command.value})
+                model: Chosen = {("model", "name"): command.value}
+                self._begin(presenter, _Change(command, lambda: (self._configured, self._chosen | model)))
             case "blackbox":
                 self._write_black_box(command)
 
     def _show(self, presenter: Presenter, scene: str, command: Command) -> None:
         # Another scene stands as the configuration has it, not as the one before it was moved.
-        chosen = {key: value for key, value in self._chosen.items() if key[1] not in PLACING}
-        chosen[("content", "scene")] = scene
-        self._begin(presenter, command, self._configured, chosen, reload_content=True)
+        def read() -> tuple[Settings, Chosen]:
+            chosen = {key: value for key, value in self._chosen.items() if key[1] not in PLACING}
+            return self._configured, chosen | {("content", "scene"): scene}
+
+        self._begin(presenter, _Change(command, read, reload_content=True))
 
     def _place(self, presenter: Presenter, command: Command) -> None:
         """Move the scene: settings and content change together, on the solver's thread."""
@@ -230,37 +251,35 @@ class Daemon(Host):
 
         self.recorder.save(ASKED, saved)
 
-    def _reload(self, presenter: Presenter, command: Command) -> None:
-        """Read the configuration again. What an operator chose stays, but where the file says something new."""
+    def _reloaded(self) -> tuple[Settings, Chosen]:
+        """The configuration read again. What an operator chose stays, but where the file says something new."""
         settings, before = self._read_settings(), self._configured
         frozen = [name for name in NEEDS_RESTART if attrgetter(name)(settings) != attrgetter(name)(before)]
         if frozen:
             raise InputError("reload", ", ".join(frozen), "a change needs a restart of the service")
-        chosen = {
+        return settings, {
             (section, key): value
             for (section, key), value in self._chosen.items()
             if getattr(getattr(settings, section), key) == getattr(getattr(before, section), key)
         }
-        self._begin(presenter, command, settings, chosen)
 
-    def _begin(
-        self,
-        presenter: Presenter,
-        command: Command,
-        configured: Settings,
-        chosen: Chosen,
-        *,
-        reload_content: bool = False,
-    ) -> None:
-        """Load what other settings, and what an operator chose over them, change. A change under way is skipped."""
-        settings, present = configured, presenter.run_cell.state.settings
-        for (section, key), value in chosen.items():
-            settings = changed(settings, section, {key: value}, source="ctl")
-        loading = Reconfiguration(settings, present, presenter.stack, reload_content=reload_content)
-        if self._change is not None:
-            self._change.loading.abandon()
-            self._answer(presenter, self._change.command, "skipped: a newer change came")
-        self._change = _Change(loading, command, configured, chosen)
+    def _begin(self, presenter: Presenter, change: _Change) -> None:
+        """One load at a time: what is under way is given up, and the newest waits for its end."""
+        if self._change is None:
+            self._load(presenter, change)
+            return
+        (now, loading), before = self._change, self._next
+        for skipped in (None if loading.abandoned else now, before):
+            if skipped is not None:
+                self._answer(presenter, skipped.command, "skipped: a newer change came")
+        loading.abandon()
+        self._next = change
+
+    def _load(self, presenter: Presenter, change: _Change) -> None:
+        """Load what other settings, and what an operator chose over them, change."""
+        present = presenter.run_cell.state.settings
+        loading = Reconfiguration(change.settings, present, presenter.stack, reload_content=change.reload_content)
+        self._change = change, loading
         presenter.solver.do(loading.advance)
 
     def _answer(self, presenter: Presenter, command: Command, problem: str) -> None:

@@ -8,7 +8,9 @@ from __future__ import annotations
 import importlib
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -340,3 +342,60 @@ def test_a_scene_that_ends_the_process_is_refused_or_a_fault_and_later_changes_a
     assert served.asked("scene", "sparse")["scene"] == "sparse"
     assert served.asked("model", "sart")["model"] == "sart"
     served.rig.refresh_until(TRACKING)
+
+
+def test_of_many_changes_one_is_loaded_at_a_time_and_only_the_newest_waits(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Twenty models were loaded side by side: 4 GB."""
+    real, at_once, begun = reconfigure.ready_predictor, [0, 0], []
+
+    def ready(settings: Settings, stack: Any) -> Any:
+        begun.append(settings.model.name)
+        at_once[0] += 1
+        at_once[1] = max(at_once)
+        try:
+            time.sleep(0.3)
+            return real(settings, stack)
+        finally:
+            at_once[0] -= 1
+
+    monkeypatch.setattr(reconfigure, "ready_predictor", ready)
+    answers: list[dict[str, Any]] = []
+    names = ["sart", "fast"] * 6 + ["sart"]
+
+    def ask_all() -> None:
+        for name in names:
+            threading.Thread(target=lambda name=name: answers.append(asked_by_itself(served, name))).start()
+            time.sleep(0.02)
+
+    asking = threading.Thread(target=ask_all)
+    asking.start()
+    served.rig.refresh_until(lambda: len(answers) == len(names))
+    assert at_once[1] == 1 and len(begun) <= 4
+    assert [answer.get("error", "") for answer in answers].count("skipped: a newer change came") == len(names) - 1
+    assert served.status()["model"] == "sart"
+
+
+def asked_by_itself(served: Served, model: str) -> dict[str, Any]:
+    return ask([served.server.path], {"command": "model", "value": model}, timeout_s=30.0)
+
+
+def test_a_configuration_that_takes_long_to_read_takes_no_refresh(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reading was done between two refreshes: a nested key took 17 seconds."""
+    on: list[str] = []
+    real = served.read_settings
+
+    def slow() -> Settings:
+        on.append(threading.current_thread().name)
+        time.sleep(1.0)
+        return real()
+
+    monkeypatch.setattr(served.daemon, "_read_settings", slow)
+    before = len(served.rig.accounts)
+    assert served.asked("reload")["ok"]
+    assert on == ["job reconfiguration"]
+    instants = [account.present_ns for account in served.rig.accounts[before:]]
+    assert max(after - before for before, after in pairwise(instants)) < 0.7 * NS_PER_S

@@ -6,6 +6,8 @@ import grp
 import os
 import socket
 import stat
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -257,3 +259,73 @@ def test_a_client_that_does_not_read_its_answers_is_let_go(hasty: StatusServer, 
                 client.sendall(b'{"command": "status"}\n' * 100)
         assert eventually(lambda: not hasty._clients, within_s=20)
     assert ask([path], STATUS)["ok"]
+
+
+def test_what_its_asker_did_not_wait_for_is_never_done(server: StatusServer, path: Path) -> None:
+    """A daemon that hung for a while did what somebody had asked for who had gone long ago."""
+    with connected(path) as client:
+        client.sendall(b'{"command": "flat"}\n')
+        waiting = server.commands.get(timeout=20)
+    assert eventually(waiting.answer.cancelled, within_s=4.0) and not waiting.take()
+    gate = threading.Event()
+    server._loop.call_soon_threadsafe(gate.wait, 20.0)
+    with connected(path) as client:
+        client.sendall(b'{"command": "flat"}\n')
+    gate.set()
+    assert ask([path], STATUS)["ok"] and server.commands.empty()
+
+
+def test_an_asker_that_only_sends_no_more_is_still_there(server: StatusServer, path: Path) -> None:
+    with connected(path) as client:
+        client.sendall(b'{"command": "flat"}')
+        client.shutdown(socket.SHUT_WR)
+        waiting = server.commands.get(timeout=20)
+        time.sleep(0.3)
+        assert waiting.take()
+        waiting.done(flat=True)
+        assert b'"flat": true' in client.recv(1000)
+
+
+TAKES_IT = """
+import sys
+from pathlib import Path
+from runtime.clock import MonotonicClock
+from runtime.daemon.server import SocketInUse, StatusServer
+print("there", flush=True)
+for line in sys.stdin:
+    try:
+        server = StatusServer(Path(line.strip()), clock=MonotonicClock())
+    except SocketInUse:
+        print("in use", flush=True)
+    else:
+        print("mine", flush=True)
+        sys.stdin.readline()
+        server.close()
+        print("closed", flush=True)
+"""
+
+
+def test_of_daemons_that_begin_at_once_one_has_the_socket(path: Path) -> None:
+    """Two had it in five of two hundred starts."""
+    command = [sys.executable, "-c", TAKES_IT]
+    begun = [
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1) for _ in range(4)
+    ]
+    try:
+        assert [one.stdout.readline() for one in begun] == ["there\n"] * 4
+        path.parent.mkdir()
+        for _ in range(50):
+            with socket.socket(socket.AF_UNIX) as dead:
+                dead.bind(str(path))
+            for one in begun:
+                one.stdin.write(f"{path}\n")
+            told = [one.stdout.readline() for one in begun]
+            assert sorted(told) == ["in use\n"] * 3 + ["mine\n"]
+            owner = begun[told.index("mine\n")]
+            owner.stdin.write("close\n")
+            assert owner.stdout.readline() == "closed\n"
+    finally:
+        for one in begun:
+            one.stdin.close()
+            one.wait(60)
+            one.stdout.close()
