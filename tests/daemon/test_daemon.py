@@ -146,6 +146,7 @@ def test_it_is_ready_once_it_presents_an_operator_steers_it_and_it_ends_in_order
     daemon.config.write_text("[loop]\nrate_hz = -1\n")
     daemon.process.send_signal(signal.SIGHUP)
     assert daemon.hears("RELOADING=1")
+    assert eventually(lambda: "rate_hz" in daemon.status().get("refused", ""))
     refused = ask([daemon.socket], {"command": "reload"})
     assert not refused["ok"] and "rate_hz" in refused["error"]
     assert eventually(lambda: daemon.status()["state"] == "tracking")  # a busy machine may have starved its sensor
