@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import html
+import tempfile
 import time
+import webbrowser
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -46,12 +49,27 @@ class Result:
         """(2, h, w, 3): what each eye sees, left first."""
         return np.stack(self._pair.seen)
 
+    @property
+    def _line(self) -> str:
+        line = f"model {self.model}, solved for eyes unsure by {self.eye_sigma_mm:g} mm; "
+        return line + f"one ray a pixel, as published: {self.quality.psnr_db:.1f} dB"
+
+    def show(self) -> Path:
+        """Open the solution's viewer in a browser; answers its file, which stays."""
+        path = Path(tempfile.mkdtemp(prefix="phasestack-")) / "viewer.html"
+        path.write_text(self._pair.viewer([self._line]), encoding="utf-8")
+        webbrowser.open(path.as_uri())
+        return path
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows of it: the viewer."""
+        page = html.escape(self._pair.viewer([self._line]))
+        return f'<iframe srcdoc="{page}" style="width: 100%; height: 640px; border: 0"></iframe>'
+
     def save(self, out: str | Path) -> None:
-        """Write what `phasestack solve --out` leaves: layers, pictures, contact sheet, solve.json."""
+        """Write what `phasestack solve --out` leaves: layers, pictures, contact sheet, viewer, solve.json."""
         with OutputFolder(Path(out)) as folder:
-            line = f"model {self.model}, solved for eyes unsure by {self.eye_sigma_mm:g} mm; "
-            line += f"one ray a pixel, as published: {self.quality.psnr_db:.1f} dB"
-            self._pair.write(folder.staging, lines=[line])
+            self._pair.write(folder.staging, lines=[self._line])
             told = {"model": self.model, "eye_sigma_mm": self.eye_sigma_mm, "total_ms": round(self.total_ms, 3)}
             write_json(folder.staging / "solve.json", self.quality.table() | told)
 

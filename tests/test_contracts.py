@@ -71,7 +71,7 @@ def test_solve_leaves_every_file_and_every_field(tmp_path: Path, capsys: pytest.
     assert fields_of("field of solve.json") <= solved.keys()
     names = {path.name for path in (pair / "out").iterdir()}
     assert names >= {"layer-0.png", "layer-1.png", "layer-2.png", "seen-left.png", "seen-right.png", "solve.json"}
-    assert "contact-sheet.png" in names and sum(solved["wall_s"].values()) > solved["total_ms"] / 1e3
+    assert {"contact-sheet.png", "viewer.html"} <= names and sum(solved["wall_s"].values()) > solved["total_ms"] / 1e3
     assert solved["psnr_db"] > 15
     assert solved["total_ms"] >= solved["inference_ms"] > 0
 

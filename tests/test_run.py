@@ -30,7 +30,15 @@ from tests.waiting import PATIENT
 
 FRAMES = 60
 LAYERS = ("layer-0.png", "layer-1.png", "layer-2.png")
-PICTURES = (*LAYERS, "seen-left.png", "seen-right.png", "wanted-left.png", "wanted-right.png", "contact-sheet.png")
+PICTURES = (
+    *LAYERS,
+    "seen-left.png",
+    "seen-right.png",
+    "wanted-left.png",
+    "wanted-right.png",
+    "contact-sheet.png",
+    "viewer.html",
+)
 REFRESH_STAGES = {"sensor", "track", "present", "wait"}
 SOLVING_STAGES = {"render", "prepare", "inference", "finish"}
 

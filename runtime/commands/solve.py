@@ -57,4 +57,4 @@ def solve(
     typer.echo(shown(result, as_json=as_json))
     if not as_json:
         typer.echo("light_db of eyes sure to 1 mm (a pupil) is the figure to quote")
-        typer.echo(f"see {out / 'contact-sheet.png'}")
+        typer.echo(f"see {out / 'contact-sheet.png'}; look into it: {out / 'viewer.html'}")

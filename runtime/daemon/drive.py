@@ -60,4 +60,4 @@ def print_summary(summary: dict[str, Any], out: Path | None) -> None:
     if summary["light_db"] is not None:
         print("light_db, of a pupil at the eyes used, is the figure to quote")
     if out is not None:
-        print(f"see {out}/contact-sheet.png")
+        print(f"see {out}/contact-sheet.png; look into it: {out}/viewer.html")

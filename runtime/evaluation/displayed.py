@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
+from runtime.browser.still import viewer_html
 from runtime.optics.carried import expected_psnrs_db, intensities
 from runtime.optics.quality import Quality, quality
 from runtime.optics.retina import Retina, as_codes, seen_by
@@ -28,6 +30,15 @@ class EyeViews:
     seen: tuple[Retina, ...]
     wanted: tuple[Picture, ...]
     quality: Quality  # exact, at the eyes that the layers were made (or aligned) for
+    stack: PanelStack
+    eyes_m: F64  # (2, 3)
+    fov_deg: float
+
+    def viewer(self, layers: U8, *, title: str, lines: Sequence[str]) -> str:
+        """The layers to look into, in a browser: one HTML page, with `lines` beside it."""
+        wanted = [as_codes(intensities(picture)) for picture in self.wanted]
+        eyes_m, fov_deg = np.asarray(self.eyes_m), self.fov_deg
+        return viewer_html(layers, wanted, self.stack, eyes_m=eyes_m, fov_deg=fov_deg, title=title, lines=lines)
 
     def write(self, folder: Path) -> None:
         """What each eye sees and should see, as pictures."""
@@ -58,7 +69,7 @@ def displayed(
     )
     targets = [intensities(picture) for picture in wanted]
     measured = quality([r.image for r in seen], targets, [r.mask for r in seen], similarity=similarity)
-    return EyeViews(seen, tuple(wanted), measured)
+    return EyeViews(seen, tuple(wanted), measured, stack, eyes_m, fov_deg)
 
 
 def expected_db(

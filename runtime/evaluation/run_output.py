@@ -13,7 +13,7 @@ from runtime.errors import InputError
 from runtime.evaluation.contact_sheet import Moment, contact_sheet, headline
 from runtime.evaluation.displayed import EyeViews
 from runtime.records import U8
-from runtime.support.artifacts import OutputFolder, to_json, write_json, write_png
+from runtime.support.artifacts import OutputFolder, to_json, write_json, write_png, write_text
 
 log = logging.getLogger("phasestack.output")
 
@@ -82,7 +82,7 @@ class RunOutput:
     def finish(
         self, summary: dict[str, Any], layers: U8 | None, eye_views: EyeViews | None, moment: Moment | None = None
     ) -> None:
-        """The pictures of the last frame, the summary, and the contact sheet: of a good moment, where one was seen."""
+        """The last frame, the summary; contact sheet and viewer, of a good moment where one was seen."""
 
         def write() -> None:
             folder = self._folder.staging
@@ -93,12 +93,16 @@ class RunOutput:
                 write_png(folder / f"layer-{n}.png", layer)
             if eye_views is not None:
                 eye_views.write(folder)
+            lines = [*(moment.lines if moment is not None else ()), in_one_line(summary)]
             if moment is None:
-                sheet = contact_sheet(layers, eye_views, headline=headline(None), lines=[in_one_line(summary)])
+                sheet = contact_sheet(layers, eye_views, headline=headline(None), lines=lines)
             else:
-                lines = [*moment.lines, in_one_line(summary)]
                 sheet = contact_sheet(moment.layers, moment.eye_views, headline=headline(moment.light_db), lines=lines)
             write_png(folder / "contact-sheet.png", sheet)
+            views, title = (eye_views, None) if moment is None else (moment.eye_views, moment.light_db)
+            if views is not None:
+                shown = layers if moment is None else moment.layers
+                write_text(folder / "viewer.html", views.viewer(shown, title=headline(title), lines=lines))
 
         self._work.put(write)
 

@@ -13,7 +13,7 @@ from runtime.optics.light import RAYS
 from runtime.optics.retina import as_codes
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
-from runtime.support.artifacts import write_png
+from runtime.support.artifacts import write_png, write_text
 
 BySigma = Mapping[str, float | None]
 
@@ -52,13 +52,18 @@ class SolvedPair:
         """Per eye (h, w, 3): what it sees."""
         return tuple(as_codes(retina.image) for retina in self.eye_views.seen)
 
+    def viewer(self, lines: Sequence[str]) -> str:
+        """The page to look into the layers."""
+        return self.eye_views.viewer(self.layers, title=headline(self.quality.light_db["1"]), lines=lines)
+
     def write(self, folder: Path, *, lines: Sequence[str]) -> None:
-        """Layers, what each eye sees and should see, and a contact sheet with `lines` below its headline."""
+        """Layers, what each eye sees and should see; contact sheet and viewer with `lines` below their headline."""
         for n, layer in enumerate(self.layers):
             write_png(folder / f"layer-{n}.png", layer)
         self.eye_views.write(folder)
         sheet = contact_sheet(self.layers, self.eye_views, headline=headline(self.quality.light_db["1"]), lines=lines)
         write_png(folder / "contact-sheet.png", sheet)
+        write_text(folder / "viewer.html", self.viewer(lines))
 
 
 def judged(

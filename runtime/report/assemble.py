@@ -24,7 +24,7 @@ class GrowingPage:
     """index.html, report.json and the plots: written anew as there is more, so that a stopped report is a page too."""
 
     def __init__(self, out: Path, command: str, progress: Progress) -> None:
-        self._out, self._command, self._progress = out, command, progress
+        self.out, self._command, self._progress = out, command, progress
         self._sections: dict[str, Section] = {}
         self.record: dict[str, Any] = {"machine": describe(), "command": command, "quote": QUOTE, "complete": False}
 
@@ -51,7 +51,7 @@ class GrowingPage:
         sections, machine = list(self._sections.values()), self.record["machine"]
         lead = "Light, of eyes sure to 1 mm, is the figure to quote; higher is better."
         page = Page("Error against run time", lead, sections, machine, self._command, notes)
-        page.write(self._out, record="report.json", data=self.record)
+        page.write(self.out, record="report.json", data=self.record)
 
 
 def whole_report(
@@ -103,7 +103,7 @@ def _frontier(
     title = f"Error against run time: {title}"
     page.doing(f"{title}: drawing")
     before, results = page.record.get(key, []), dict[str, MethodResult]()
-    for done, result in measure(methods, pairs):
+    for done, result in measure(methods, pairs, viewers=page.out):
         page.doing(f"{title}: {done} is done")
         results[result.name] = result
         page.record[key] = before + [one.record() for one in results.values()]

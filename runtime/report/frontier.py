@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from runtime.optics.quality import psnr_db
 from runtime.records import U8
 from runtime.report.pairs import StillPair
 from runtime.report.worker import apart
+from runtime.support.artifacts import write_text
 
 if TYPE_CHECKING:
     from runtime.model.predictor import Predictor
@@ -83,6 +85,7 @@ class PairResult:
     memory_mib: float
     quality: PairQuality
     psnr_db_off_eye: dict[str, float]
+    viewer: str = ""  # name of the page that looks into its layers, where one was left
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,9 +120,9 @@ class MethodResult:
 
 
 def measure(
-    methods: Sequence[Method], pairs: Iterable[StillPair], *, threads: int = 2
+    methods: Sequence[Method], pairs: Iterable[StillPair], *, threads: int = 2, viewers: Path | None = None
 ) -> Iterator[tuple[str, MethodResult]]:
-    """Every method on every pair, pair by pair. Pairs share a resolution.
+    """Every method on every pair, pair by pair. Pairs share a resolution. viewers: folder for the first one's layers.
 
     Yields what was measured last, and its method's result so far. Raises FatalError where one fails.
     """
@@ -127,7 +130,8 @@ def measure(
     for pair in pairs:
         for method in methods:
             run = apart(run_method, method, replace(pair, off=()), threads)
-            found[method.name].append(pair_result(pair, run))
+            viewer = viewers if method is methods[0] else None
+            found[method.name].append(pair_result(pair, run, viewer=viewer))
             yield f"{method.name}, {pair.name}", _together(method, pair, run, found[method.name])
 
 
@@ -164,8 +168,11 @@ def _peak_mib() -> float:
     return int(status.partition("VmHWM:")[2].split()[0]) / 1024
 
 
-def pair_result(pair: StillPair, run: MethodRun) -> PairResult:
-    """Displayed quality (docs/contracts.md, Error) at the eyes, expected of unsure ones, and at places beside them."""
+def pair_result(pair: StillPair, run: MethodRun, *, viewer: Path | None = None) -> PairResult:
+    """Displayed quality (docs/contracts.md, Error) at the eyes, expected of unsure ones, and at places beside them.
+
+    viewer: folder that a page is left in, to look into the layers.
+    """
     height_px, width_px = pair.images[0].shape[:2]
     step = max(1, math.isqrt(height_px * width_px // ENOUGH_PIXELS))
     at_eyes = judged(run.layers, pair.images, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, step=step)
@@ -177,7 +184,11 @@ def pair_result(pair: StillPair, run: MethodRun) -> PairResult:
             error = squared_error(run.layers, [intensities(view.image)], pair.stack, **where)
             off.setdefault(f"{view.mm:g}mm", []).append(psnr_db(error))
     beside = {name: float(np.mean(values)) for name, values in off.items()}
-    return PairResult(pair.name, run.run_ms, run.memory_mib, at_eyes.quality, beside)
+    name = ""
+    if viewer is not None:
+        name = f"viewer-{re.sub(r'[^A-Za-z0-9]+', '-', pair.name)}.html"
+        write_text(viewer / name, at_eyes.viewer([pair.name]))
+    return PairResult(pair.name, run.run_ms, run.memory_mib, at_eyes.quality, beside, name)
 
 
 def _together(method: Method, pair: StillPair, run: MethodRun, pairs: list[PairResult]) -> MethodResult:

@@ -53,6 +53,7 @@ class Section:
     text: Sequence[str] = ()  # paragraphs, plain text
     figures: Sequence[Figure] = ()
     tables: Sequence[Table] = ()
+    links: Sequence[tuple[str, str]] = ()  # what is said, and the file next to the page
 
 
 @dataclass(frozen=True, slots=True)

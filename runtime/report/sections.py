@@ -25,7 +25,8 @@ def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) 
         "what published evaluations measure. The time is that of a whole solution, from two decoded pictures to 8-bit "
         "layers. Each method runs in a process of its own; its memory is that process's peak.",
     ]
-    return Section(title, text, [frontier_plot(results, name=f"frontier-{name}")], [method_table(results)])
+    links = [(f"Look into {pair.pair}, by {results[0].name}", pair.viewer) for pair in results[0].pairs if pair.viewer]
+    return Section(title, text, [frontier_plot(results, name=f"frontier-{name}")], [method_table(results)], links)
 
 
 def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:

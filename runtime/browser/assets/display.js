@@ -1,0 +1,434 @@
+// What a stack of panels shows and what eyes see of it: optics, WebGL 2, and the plan of eyes and panels.
+// Frame `stack`: metres, x out of the screen, y to the viewer's right, z up. Matrices are 3x3, row after row.
+
+const EVEN = 128 / 255; // beside a solution that was shifted
+const NEAREST_M = 0.01, MOST_SHIFT = 0.5, MOST_SCALE = 2; // limits of an alignment, as the runtime has them
+const PUPILS = 7;
+
+export const mul = (a, b) => [0, 1, 2].flatMap((i) => [0, 1, 2].map((j) => a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j]));
+export const apply = (m, x, y) => {
+  const w = m[6] * x + m[7] * y + m[8];
+  return [(m[0] * x + m[1] * y + m[2]) / w, (m[3] * x + m[4] * y + m[5]) / w];
+};
+export const middle = (eyes) => eyes[0].map((v, k) => (v + eyes[1][k]) / 2);
+export const moved = (eyes, by) => eyes.map((eye) => eye.map((v, k) => v + by[k]));
+const centre = (stack) => stack.x_m[stack.x_m.length >> 1];
+const dot = (a, b) => a.reduce((sum, v, k) => sum + v * b[k], 0);
+
+function reference(stack) {
+  const half = stack.x_m.length >> 1;
+  return stack.x_m.length % 2 ? stack.x_m[half] : (stack.x_m[half - 1] + stack.x_m[half]) / 2;
+}
+
+// (y, z, 1) on a plane x = x_m from a picture's pixel (u to the right, v down, 1): of an eye that looks at the origin.
+export function planeFromPicture(eye, picture, x_m) {
+  const norm = Math.hypot(...eye), back = eye.map((v) => v / norm), across = Math.hypot(eye[0], eye[1]) || 1;
+  const right = [-eye[1] / across, eye[0] / across, 0];
+  const up = [-back[2] * right[1], back[2] * right[0], back[0] * right[1] - back[1] * right[0]];
+  const focal = picture.width / 2 / Math.tan((picture.fov_deg * Math.PI) / 360);
+  const ray = [0, 1, 2].map((k) => [ // of the direction, times focal: against u, v, 1
+    right[k], -up[k], -back[k] * focal - (right[k] * picture.width) / 2 + (up[k] * picture.height) / 2]);
+  const far = eye[0] - x_m;
+  return [...ray[1].map((v, j) => far * v - eye[1] * ray[0][j]), ...ray[2].map((v, j) => far * v - eye[2] * ray[0][j]),
+    ...ray[0].map((v) => -v)];
+}
+
+// Where the layer of a tilted panel has what an eye sees at (y, z, 1) of the ideal one; null: it is not tilted.
+function layerFromSeen(stack, n, eye) {
+  const depth = stack.tilt?.depth[n];
+  if (!depth?.some((v) => v)) return null;
+  const [offset, right, up] = depth, x = stack.x_m[n], o = stack.tilt.seen_from_m, normal = [1, -right, -up];
+  const ideal = [[0, 1, 0], [0, 0, 1], [x, 0, 0]]; // columns: of y, z, 1
+  const far = x + offset - dot(normal, eye);
+  const columns = ideal.map((column, k) => {
+    const weight = dot(normal, column) - (k === 2 ? dot(normal, eye) : 0);
+    const point = eye.map((e, i) => e * weight + (column[i] - (k === 2 ? e : 0)) * far);
+    const ahead = point[0] - o[0] * weight;
+    return [1, 2].map((i) => o[i] * ahead + (point[i] - o[i] * weight) * (x - o[0])).concat(ahead);
+  });
+  return [0, 1, 2].flatMap((i) => columns.map((column) => column[i]));
+}
+
+// Panel pixels from (y, z, 1).
+function pixels(stack) {
+  const u = stack.width_px / stack.width_m, v = stack.height_px / stack.height_m;
+  return [u, 0, stack.width_px / 2, 0, -v, stack.height_px / 2, 0, 0, 1];
+}
+
+// Panel n's pixels from those of a picture: the ray of each is the one from `eye` through the point of the centre panel
+// that an eye at `nominal` has there.
+export function panelFromPicture(stack, n, eye, picture, nominal = eye) {
+  const x = centre(stack), share = (stack.x_m[n] - eye[0]) / (x - eye[0]);
+  const carried = [share, 0, eye[1] * (1 - share), 0, share, eye[2] * (1 - share), 0, 0, 1];
+  const seen = layerFromSeen(stack, n, eye);
+  const ideal = mul(carried, planeFromPicture(nominal, picture, x));
+  return mul(pixels(stack), seen ? mul(seen, ideal) : ideal);
+}
+
+// Layers solved for eyes, aligned to other eyes (runtime/optics/alignment.py has the derivation): for each panel
+// [scale u, scale v, shift u, shift v] of solved pixels from shown ones; `limited` says why they end before the eyes do.
+export function alignment(stack, solved, eyes) {
+  const old = middle(solved), now = middle(eyes), step = now.map((v, k) => v - old[k]), r = reference(stack);
+  let share = 1, limited = "";
+  const limit = (most, least, why) => {
+    const reach = least < 0 ? 0 : most <= least ? 1 : least / most;
+    if (reach < share) [share, limited] = [reach, why];
+    return least >= 0;
+  };
+  const front = stack.x_m.at(-1);
+  const open = solved.every((eye, k) => limit(eye[0] - eyes[k][0], eye[0] - front - NEAREST_M, "too near"));
+  for (const x of open ? stack.x_m.filter((x) => x !== r) : []) {
+    const far = old[0] - x, weight = (x - r) / (old[0] - r);
+    for (const [axis, size] of [[1, stack.width_m], [2, stack.height_m]]) {
+      const shift = Math.abs(weight * (old[axis] * step[0] - step[axis] * far));
+      limit(shift - MOST_SHIFT * size * step[0], MOST_SHIFT * size * far, "too far");
+    }
+    limit(step[0] * (1 - MOST_SCALE - weight), (MOST_SCALE - 1) * far, "too far");
+    limit(step[0] * (weight + 1 / MOST_SCALE - 1), (1 - 1 / MOST_SCALE) * far, "too far");
+  }
+  const maps = stack.x_m.map((x) => {
+    const [sx, sy, sz] = step.map((v) => v * share), far = old[0] - x, height = old[0] - r, present = far + sx;
+    const larger = (sx * (r - x)) / (present * height);
+    const shift = [[1, sy], [2, sz]].map(([k, s]) => (((x - r) / height) * (old[k] * sx - s * far)) / present);
+    return [1 + larger, 1 + larger,
+      ((-stack.width_m / 2) * larger + shift[0]) * (stack.width_px / stack.width_m),
+      -((stack.height_m / 2) * larger + shift[1]) * (stack.height_px / stack.height_m)];
+  });
+  return { maps, limited };
+}
+
+export const asTheyStand = (stack) => stack.x_m.map(() => [1, 1, 0, 0]);
+
+const VERTEX = `#version 300 es
+void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
+
+// One layer as its panel shows it: aligned, mixed with the flat picture. Rounded to 8 bits by what it is drawn into.
+const SHOW = `#version 300 es
+precision highp float; precision highp sampler2DArray;
+uniform sampler2DArray solved, flat_picture; uniform int panel; uniform vec4 map; uniform float flatness; uniform vec2 size;
+out vec4 colour;
+vec3 texel(ivec2 at) {
+  bool inside = all(greaterThanEqual(at, ivec2(0))) && all(lessThan(at, ivec2(size)));
+  return inside ? texelFetch(solved, ivec3(at, panel), 0).rgb : vec3(${EVEN});
+}
+void main() {
+  vec2 place = clamp(gl_FragCoord.xy * map.xy + map.zw - 0.5, vec2(-2.0), size + 1.0), low = floor(place), w = place - low;
+  ivec2 at = ivec2(low);
+  vec3 code = flatness >= 1.0 ? vec3(0.0) : mix(mix(texel(at), texel(at + ivec2(1, 0)), w.x),
+    mix(texel(at + ivec2(0, 1)), texel(at + ivec2(1, 1)), w.x), w.y);
+  if (flatness > 0.0) code = mix(code, texelFetch(flat_picture, ivec3(gl_FragCoord.xy, panel), 0).rgb, flatness);
+  colour = vec4(code, 1.0);
+}`;
+
+// What an eye sees: sin² of the summed phases along each ray, averaged over the pixel. Panels' pixels are even boxes. With
+// `rays` a grid of rays; without, exactly: the pixel is cut at every edge of every panel's pixels in it.
+const SEE = `#version 300 es
+precision highp float; precision highp sampler2DArray;
+const int PANELS = @PANELS@;
+uniform sampler2DArray layers; uniform sampler2D target;
+uniform mat3 into[PANELS]; uniform vec2 per_metre[PANELS]; uniform vec2 pupil[${PUPILS}]; uniform int pupils, rays, gain;
+uniform vec2 size, origin, stride, picture; uniform vec3 room;
+out vec4 colour;
+vec2 off;
+vec2 place(int n, vec2 p) { vec3 h = into[n] * vec3(p, 1.0); return h.z > 0.0 ? h.xy / h.z + off * per_metre[n] : vec2(-1.0); }
+vec3 malus(vec3 phase) {
+  vec3 s = sin(phase * 1.5707963267948966);
+  return s * s;
+}
+vec4 ray(vec2 p) { // and 1 where it crosses every panel
+  vec3 sum = vec3(0.0);
+  for (int n = 0; n < PANELS; n++) {
+    vec2 q = place(n, p);
+    if (any(lessThan(q, vec2(0.0))) || any(greaterThanEqual(q, size))) return vec4(0.0);
+    sum += texelFetch(layers, ivec3(q, n), 0).rgb;
+  }
+  return vec4(malus(sum), 1.0);
+}
+float next(float at, float slope) { // how far along the pixel the next edge is
+  float edge = slope > 0.0 ? floor(at + 1e-4) + 1.0 : ceil(at - 1e-4) - 1.0;
+  return abs(slope) < 1e-6 ? 2.0 : (edge - at) / slope;
+}
+vec4 exact(vec2 p) {
+  vec2 at[PANELS], right[PANELS], down[PANELS];
+  for (int n = 0; n < PANELS; n++) {
+    at[n] = place(n, p + 0.5);
+    right[n] = place(n, p + vec2(1.0, 0.5)) - place(n, p + vec2(0.0, 0.5));
+    down[n] = place(n, p + vec2(0.5, 1.0)) - place(n, p + vec2(0.5, 0.0));
+    if (at[n].x < -2.0 || at[n].y < -2.0 || any(greaterThan(at[n], size + 2.0))) return vec4(0.0);
+  }
+  vec4 sum = vec4(0.0);
+  float v = -0.5;
+  for (int j = 0; j < 96 && v < 0.5; j++) {
+    float v1 = j == 95 ? 0.5 : min(0.5, v + 0.25);
+    for (int n = 0; n < PANELS; n++) v1 = min(v1, v + max(1e-4, next(at[n].y + v * down[n].y, down[n].y)));
+    float mid = (v + v1) * 0.5, u = -0.5;
+    vec4 row = vec4(0.0);
+    for (int i = 0; i < 96 && u < 0.5; i++) {
+      float u1 = 0.5;
+      if (i < 95) for (int n = 0; n < PANELS; n++) u1 = min(u1, u + max(1e-4, next(at[n].x + u * right[n].x + mid * down[n].x, right[n].x)));
+      vec3 phase = vec3(0.0);
+      float inside = 1.0;
+      for (int n = 0; n < PANELS; n++) {
+        vec2 q = at[n] + (u + u1) * 0.5 * right[n] + mid * down[n];
+        if (any(lessThan(q, vec2(0.0))) || any(greaterThanEqual(q, size))) inside = 0.0;
+        else phase += texelFetch(layers, ivec3(q, n), 0).rgb;
+      }
+      row += (u1 - u) * inside * vec4(malus(phase), 1.0);
+      u = u1;
+    }
+    sum += (v1 - v) * row;
+    v = v1;
+  }
+  return sum;
+}
+void main() {
+  vec2 p = floor(vec2(gl_FragCoord.x - origin.x, origin.y - gl_FragCoord.y)) * stride;
+  vec4 sum = vec4(0.0);
+  for (int k = 0; k < pupils; k++) {
+    off = pupil[k];
+    if (rays == 0) { sum += exact(p); continue; }
+    float share = 1.0 / float(rays);
+    vec4 part = vec4(0.0);
+    for (int j = 0; j < rays; j++) for (int i = 0; i < rays; i++) part += ray(p + (vec2(i, j) + 0.5) * share);
+    sum += part * share * share;
+  }
+  sum /= float(pupils);
+  vec3 light = sum.rgb + room * (1.0 - sum.a);
+  if (gain > 0) {
+    float coarser = log2(max(1.0, float(textureSize(target, 0).x) / picture.x));
+    vec3 wanted = textureLod(target, (p + 0.5) / picture, coarser).rgb;
+    light = gain == 1 ? wanted : sum.a > 0.999 ? abs(light - wanted) * float(gain) : room;
+  }
+  colour = vec4(light, sum.a);
+}`;
+
+// A panel drawn as a parallelogram: its corner and two edges in the view, -1 to 1.
+const CARD_VERTEX = `#version 300 es
+uniform vec2 corner, right, down; out vec2 at;
+void main() { at = vec2(gl_VertexID & 1, gl_VertexID >> 1); gl_Position = vec4(corner + right * at.x + down * at.y, 0.0, 1.0); }`;
+const CARD = `#version 300 es
+precision highp float; precision highp sampler2DArray;
+uniform sampler2DArray layers; uniform int panel; uniform float opacity; in vec2 at; out vec4 colour;
+void main() {
+  vec2 dx = dFdx(at) * 0.25, dy = dFdy(at) * 0.25;
+  vec3 sum = vec3(0.0);
+  for (int k = 0; k < 4; k++)
+    sum += texture(layers, vec3(at + dx * (k % 2 == 0 ? -1.0 : 1.0) + dy * (k < 2 ? -1.0 : 1.0), panel)).rgb;
+  colour = vec4(sum * 0.25, 1.0) * opacity;
+}`;
+
+// The display in a canvas. Layers lie in texture arrays, a panel each.
+export class Display {
+  constructor(canvas, stack) {
+    this.canvas = canvas;
+    this.stack = stack;
+    const g = canvas.getContext("webgl2", { preserveDrawingBuffer: true, alpha: false, antialias: false });
+    if (!g) throw new Error("this browser has no WebGL 2");
+    this.g = g;
+    const { width_px: width, height_px: height, x_m } = stack;
+    if (Math.max(width, height) > g.getParameter(g.MAX_TEXTURE_SIZE)) throw new Error("the panels have more pixels than this browser's textures");
+    this.programs = {};
+    for (const [name, vertex, fragment] of [["show", VERTEX, SHOW], ["see", VERTEX, SEE], ["card", CARD_VERTEX, CARD]])
+      this.programs[name] = this.#program(vertex, fragment.replace("@PANELS@", x_m.length));
+    this.textures = {};
+    for (const name of ["solved", "flat", "shown"]) {
+      const texture = (this.textures[name] = g.createTexture());
+      g.bindTexture(g.TEXTURE_2D_ARRAY, texture);
+      g.texStorage3D(g.TEXTURE_2D_ARRAY, 1, g.RGBA8, width, height, x_m.length);
+      for (const wrap of [g.TEXTURE_WRAP_S, g.TEXTURE_WRAP_T]) g.texParameteri(g.TEXTURE_2D_ARRAY, wrap, g.CLAMP_TO_EDGE);
+      for (const filter of [g.TEXTURE_MIN_FILTER, g.TEXTURE_MAG_FILTER]) g.texParameteri(g.TEXTURE_2D_ARRAY, filter, g.LINEAR);
+    }
+    this.targets = [null, null];
+    this.framebuffer = g.createFramebuffer();
+    this.maps = null; // of what `shown` holds; null: nothing yet
+  }
+
+  #program(vertex, fragment) {
+    const g = this.g, program = g.createProgram();
+    for (const [kind, source] of [[g.VERTEX_SHADER, vertex], [g.FRAGMENT_SHADER, fragment]]) {
+      const shader = g.createShader(kind);
+      g.shaderSource(shader, source);
+      g.compileShader(shader);
+      g.attachShader(program, shader);
+    }
+    g.linkProgram(program);
+    if (!g.getProgramParameter(program, g.LINK_STATUS) && !g.isContextLost())
+      throw new Error(`WebGL: ${g.getProgramInfoLog(program)} ${g.getAttachedShaders(program).map((s) => g.getShaderInfoLog(s)).join(" ")}`);
+    const places = {};
+    for (let k = 0; k < g.getProgramParameter(program, g.ACTIVE_UNIFORMS); k += 1) {
+      const { name } = g.getActiveUniform(program, k);
+      places[name.replace("[0]", "")] = g.getUniformLocation(program, name);
+    }
+    return { program, places };
+  }
+
+  #use(name, layers) {
+    const g = this.g, { program, places } = this.programs[name];
+    g.useProgram(program);
+    g.activeTexture(g.TEXTURE0);
+    g.bindTexture(g.TEXTURE_2D_ARRAY, this.textures[layers]);
+    return places;
+  }
+
+  // `solved` or `flat`: all layers after each other as RGBA bytes, or a picture for each panel.
+  load(name, layers) {
+    const g = this.g, { width_px: w, height_px: h, x_m } = this.stack;
+    g.activeTexture(g.TEXTURE0);
+    g.bindTexture(g.TEXTURE_2D_ARRAY, this.textures[name]);
+    g.pixelStorei(g.UNPACK_COLORSPACE_CONVERSION_WEBGL, g.NONE);
+    if (layers instanceof Uint8Array) g.texSubImage3D(g.TEXTURE_2D_ARRAY, 0, 0, 0, 0, w, h, x_m.length, g.RGBA, g.UNSIGNED_BYTE, layers);
+    else layers.forEach((image, n) => g.texSubImage3D(g.TEXTURE_2D_ARRAY, 0, 0, 0, n, w, h, 1, g.RGBA, g.UNSIGNED_BYTE, image));
+    this.maps = null;
+  }
+
+  // What an eye should see.
+  target(side, image) {
+    const g = this.g, texture = g.createTexture();
+    g.activeTexture(g.TEXTURE1);
+    g.bindTexture(g.TEXTURE_2D, texture);
+    g.pixelStorei(g.UNPACK_COLORSPACE_CONVERSION_WEBGL, g.NONE);
+    g.texImage2D(g.TEXTURE_2D, 0, g.RGBA8, g.RGBA, g.UNSIGNED_BYTE, image);
+    g.generateMipmap(g.TEXTURE_2D);
+    g.texParameteri(g.TEXTURE_2D, g.TEXTURE_MIN_FILTER, g.LINEAR_MIPMAP_LINEAR);
+    this.targets[side] = texture;
+  }
+
+  // The panels show the solution by these maps, mixed with the flat picture.
+  show(maps, flatness = 0) {
+    const g = this.g, key = JSON.stringify([maps, flatness]);
+    if (key === this.maps) return;
+    const { width_px: w, height_px: h } = this.stack, places = this.#use("show", "solved");
+    g.activeTexture(g.TEXTURE1);
+    g.bindTexture(g.TEXTURE_2D_ARRAY, this.textures.flat);
+    g.uniform1i(places.flat_picture, 1);
+    g.uniform1f(places.flatness, flatness);
+    g.uniform2f(places.size, w, h);
+    g.bindFramebuffer(g.FRAMEBUFFER, this.framebuffer);
+    g.viewport(0, 0, w, h);
+    maps.forEach((map, n) => {
+      g.framebufferTextureLayer(g.FRAMEBUFFER, g.COLOR_ATTACHMENT0, this.textures.shown, 0, n);
+      g.uniform1i(places.panel, n);
+      g.uniform4f(places.map, ...map);
+      g.drawArrays(g.TRIANGLES, 0, 3);
+    });
+    g.bindFramebuffer(g.FRAMEBUFFER, null);
+    this.maps = key;
+  }
+
+  // One eye's picture into a part [x, y, width, height] (from below) of what is bound. `rays` 0: exact boxes; nominal: whose
+  // picture it is, carried along on the centre panel; gain 1: the target itself, more: the difference to it, so many times.
+  see({ eye, nominal = eye, picture, part, rays = 0, pupil_mm = 0, side = 0, gain = 0, stride = [1, 1], room = [0.07, 0.08, 0.1] }) {
+    const g = this.g, { stack } = this, places = this.#use("see", "shown"), count = stack.x_m.length;
+    g.viewport(...part);
+    const columns = [], apart = [];
+    for (let n = 0; n < count; n += 1) {
+      const m = panelFromPicture(stack, n, eye, picture, nominal), share = 1 - (stack.x_m[n] - eye[0]) / (centre(stack) - eye[0]);
+      const scale = 1 / (m[6] * picture.width / 2 + m[7] * picture.height / 2 + m[8] || 1); // before the eye: positive
+      for (let k = 0; k < 3; k += 1) columns.push(...[m[k], m[3 + k], m[6 + k]].map((v) => v * scale));
+      apart.push((share * stack.width_px) / stack.width_m, (-share * stack.height_px) / stack.height_m);
+    }
+    g.uniformMatrix3fv(places.into, false, columns);
+    g.uniform2fv(places.per_metre, apart);
+    const points = [0, 0], radius = pupil_mm / 2000;
+    for (let k = 0; k < PUPILS - 1; k += 1) points.push(...[Math.cos, Math.sin].map((f) => 0.764 * radius * f((k * Math.PI) / 3)));
+    if (places.pupil) g.uniform2fv(places.pupil, points);
+    g.uniform1i(places.pupils, pupil_mm > 0 ? PUPILS : 1);
+    g.uniform1i(places.rays, rays);
+    g.uniform1i(places.gain, this.targets[side] ? gain : 0);
+    g.uniform2f(places.size, stack.width_px, stack.height_px);
+    g.uniform2f(places.origin, part[0], part[1] + part[3]);
+    g.uniform2f(places.stride, ...stride);
+    g.uniform2f(places.picture, picture.width, picture.height);
+    g.uniform3f(places.room, ...room);
+    g.activeTexture(g.TEXTURE1);
+    g.bindTexture(g.TEXTURE_2D, this.targets[side]);
+    g.uniform1i(places.target, 1);
+    g.drawArrays(g.TRIANGLES, 0, 3);
+  }
+
+  // The same as numbers: RGBA bytes, the top row first; opaque where every ray crosses every panel. Drawn a few rows at a time, so that no browser ends it.
+  seen({ columns, rows, ...how }) {
+    const g = this.g, texture = g.createTexture(), bytes = new Uint8Array(columns * rows * 4);
+    g.activeTexture(g.TEXTURE1);
+    g.bindTexture(g.TEXTURE_2D, texture);
+    g.texStorage2D(g.TEXTURE_2D, 1, g.RGBA8, columns, rows);
+    g.bindTexture(g.TEXTURE_2D, null);
+    g.bindFramebuffer(g.FRAMEBUFFER, this.framebuffer);
+    g.framebufferTexture2D(g.FRAMEBUFFER, g.COLOR_ATTACHMENT0, g.TEXTURE_2D, texture, 0);
+    g.enable(g.SCISSOR_TEST);
+    for (let y = 0; y < rows; y += 64) {
+      g.scissor(0, y, columns, 64);
+      this.see({ ...how, part: [0, 0, columns, rows] });
+      g.flush();
+    }
+    g.disable(g.SCISSOR_TEST);
+    const below = new Uint8Array(columns * rows * 4);
+    g.readPixels(0, 0, columns, rows, g.RGBA, g.UNSIGNED_BYTE, below);
+    g.bindFramebuffer(g.FRAMEBUFFER, null);
+    g.deleteTexture(texture);
+    for (let y = 0; y < rows; y += 1) bytes.set(below.subarray((rows - 1 - y) * columns * 4, (rows - y) * columns * 4), y * columns * 4);
+    return bytes;
+  }
+
+  // A PNG's data URL of what an eye sees, light of even boxes.
+  picture(how, width, height) {
+    const bytes = this.seen({ ...how, columns: width, rows: height, picture: { width, height, fov_deg: how.fov_deg } });
+    for (let k = 3; k < bytes.length; k += 4) bytes[k] = 255;
+    const canvas = Object.assign(document.createElement("canvas"), { width, height });
+    canvas.getContext("2d").putImageData(new ImageData(new Uint8ClampedArray(bytes.buffer), width, height), 0, 0);
+    return canvas.toDataURL("image/png");
+  }
+
+  // The codes that panel n shows at a pixel.
+  codes(n, u, v) {
+    const g = this.g, found = new Uint8Array(4);
+    g.bindFramebuffer(g.FRAMEBUFFER, this.framebuffer);
+    g.framebufferTextureLayer(g.FRAMEBUFFER, g.COLOR_ATTACHMENT0, this.textures.shown, 0, n);
+    g.readPixels(Math.floor(u), Math.floor(v), 1, 1, g.RGBA, g.UNSIGNED_BYTE, found);
+    g.bindFramebuffer(g.FRAMEBUFFER, null);
+    return [...found.slice(0, 3)];
+  }
+
+  // Panel n as a parallelogram: corner, edge to the right, edge down, in the canvas's pixels.
+  card(n, corner, right, down, opacity = 1) {
+    const g = this.g, places = this.#use("card", "shown"), { width, height } = this.canvas;
+    g.viewport(0, 0, width, height);
+    g.enable(g.BLEND);
+    g.blendFunc(g.ONE, g.ONE_MINUS_SRC_ALPHA);
+    g.uniform2f(places.corner, (2 * corner[0]) / width - 1, 1 - (2 * corner[1]) / height);
+    for (const [name, [x, y]] of [["right", right], ["down", down]]) g.uniform2f(places[name], (2 * x) / width, (-2 * y) / height);
+    g.uniform1i(places.panel, n);
+    g.uniform1f(places.opacity, opacity);
+    g.drawArrays(g.TRIANGLE_STRIP, 0, 4);
+    g.disable(g.BLEND);
+  }
+}
+
+// Eyes and panels in an SVG, from above (axis 1) or from the side (axis 2): x, to the viewer, is drawn to the right.
+export function drawPlan(svg, { stack, eyes, axis, range = null, sigma_m = 0, solved = null, far_m = 1 }) {
+  const size_m = axis === 1 ? stack.width_m : stack.height_m;
+  const far = Math.max(far_m, eyes ? 1.15 * Math.max(eyes[0][0], eyes[1][0]) : 0), scale = 300 / (far + 0.15);
+  const at = (x, across) => [10 + (x + 0.15) * scale, 85 - across * scale], shapes = [];
+  const add = (name, attributes) => {
+    const made = document.createElementNS("http://www.w3.org/2000/svg", name);
+    for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+    shapes.push(made);
+  };
+  const line = (from, to, kind) => {
+    const [[x1, y1], [x2, y2]] = [at(...from), at(...to)];
+    add("line", { x1, y1, x2, y2, class: kind });
+  };
+  if (range) add("polygon", { points: range.map(([x, across]) => at(x, across).map((v) => v.toFixed(1)).join(",")).join(" "), class: "range" });
+  for (const x of stack.x_m) line([x, -size_m / 2], [x, size_m / 2], "panel");
+  for (const eye of solved ?? []) {
+    const [cx, cy] = at(eye[0], eye[axis]);
+    add("circle", { cx, cy, r: 4.5, class: "solved" });
+  }
+  eyes?.forEach((eye, index) => {
+    const side = index ? "right" : "left", place = [eye[0], eye[axis]], [cx, cy] = at(...place);
+    for (const edge of [-size_m / 2, size_m / 2]) line(place, [stack.x_m[0], edge], `ray ${side}`);
+    add("circle", { cx, cy, r: Math.max(sigma_m * scale, 0.1), class: `sure ${side}` });
+    add("circle", { cx, cy, r: 3.5, class: side });
+  });
+  svg.replaceChildren(...shapes);
+}

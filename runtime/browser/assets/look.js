@@ -1,0 +1,357 @@
+// The page around a display: pointer and keys are the head, modes to look in, what is told beside it.
+import { Display, alignment, asTheyStand, drawPlan, middle, moved } from "/display.js";
+
+const MODES = [ // key, name, group, what it says of itself
+  ["parallel", "Side by side", "Eyes", "Look through the screen: the left picture is the left eye's."],
+  ["crossed", "Crossed", "Eyes", "Cross your eyes: the left picture is the right eye's."],
+  ["anaglyph", "Red and cyan", "Eyes", "For glasses with a red left and a cyan right glass."],
+  ["left", "Left eye", "Eyes", ""],
+  ["right", "Right eye", "Eyes", ""],
+  ["wiggle", "Wiggle", "Eyes", "Both eyes' pictures in turn: what jumps most is nearest."],
+  ["panels", "Each panel", "Panels", "What each panel shows, rear to front."],
+  ["apart", "Drawn apart", "Panels", "A point of the picture, and the rays that reach each eye from there. Point at another one."],
+  ["target", "Asked for", "Check", "What each eye should see where the layers were solved for."],
+  ["difference", "Difference × 8", "Check", "Between what each eye sees and should see; black is perfect. Head where the layers were solved for."],
+];
+const KEYS = { ArrowLeft: [0, -1, 0], ArrowRight: [0, 1, 0], ArrowUp: [0, 0, 1], ArrowDown: [0, 0, -1], "+": [-2, 0, 0], "-": [2, 0, 0] };
+const STEP_M = 0.005, REACH_M = [0.5, 0.3]; // of a key; of the picture's whole width and height
+const REST_MS = 200, REST_RAYS = 5, STRIPS = 12, WIGGLE_MS = 280, SAMPLED = 12; // every so-manieth pixel, each way, tells the light
+const PAGE = `
+<div class="stage"><canvas tabindex="0" aria-label="What the eyes see. Arrow keys move the head, + and - bring it nearer and farther."></canvas>
+<svg class="over" aria-hidden="true"></svg><div class="names" aria-hidden="true"></div></div>
+<aside><h1></h1><div class="modes"></div><p class="hint"></p>
+<div class="switches"><label><input type="checkbox" data-key="aligned" checked> outer panels follow the head</label>
+<label><input type="checkbox" data-key="pupil"> pupils 4 mm wide</label><button type="button" class="quiet">Head back</button></div>
+<p class="head" role="status"></p><p class="light"></p><div class="point"></div>
+<div class="views"><figure><svg data-axis="1" viewBox="0 0 320 170" role="img" aria-label="Eyes and panels from above"></svg><figcaption>from above</figcaption></figure>
+<figure><svg data-axis="2" viewBox="0 0 320 170" role="img" aria-label="Eyes and panels from the side"></svg><figcaption>from the side</figcaption></figure></div>
+<div class="more"></div></aside>`;
+
+const node = (name, text = "", kind = "") => Object.assign(document.createElement(name), { textContent: text, className: kind });
+const mm = (metres) => Math.round(Math.abs(metres) * 1000);
+
+export class Look {
+  // scene: stack, fov_deg, and eyes_m that the layers at hand were solved for; eyesAt: both eyes from the head's move.
+  constructor(root, scene, { title, eyesAt = (head) => moved(scene.eyes_m, head) }) {
+    root.innerHTML = PAGE;
+    this.$ = (query) => root.querySelector(query);
+    [this.scene, this.stack, this.eyesAt] = [scene, scene.stack, eyesAt];
+    this.canvas = this.$("canvas");
+    this.display = new Display(this.canvas, this.stack);
+    Object.assign(this, { mode: "parallel", head: [0, 0, 0], aligned: true, pupil: false, point: [0, 0], rays: 3, frames: 0 });
+    this.flatness = 0;
+    this.used = null; // eyes that the panels are aligned to, where that is not where they truly are
+    this.told = () => {}; // called where the head has moved
+    this.$("h1").textContent = title;
+    this.#modes();
+    this.#controls();
+    new ResizeObserver(() => this.draw()).observe(this.canvas);
+    this.canvas.addEventListener("webglcontextlost", () => (this.$(".hint").textContent = "The browser has lost its graphics. Load the page again."));
+  }
+
+  get eyes() {
+    return this.eyesAt(this.head);
+  }
+
+  get maps() {
+    if (!this.aligned || !this.scene.eyes_m) return { maps: asTheyStand(this.stack), limited: "" };
+    return alignment(this.stack, this.scene.eyes_m, this.used ?? this.eyes);
+  }
+
+  moveTo(head) {
+    this.head = head;
+    this.told(this.eyes);
+    this.draw();
+  }
+
+  // Soon; with more rays once nothing has moved for a while.
+  draw() {
+    this.moving = performance.now();
+    this.fresh = true;
+    this.next ??= requestAnimationFrame((now) => this.#frame(now));
+  }
+
+  #frame(now) {
+    this.next = null;
+    const gap = now - (this.before ?? now);
+    if (this.strip === undefined && gap > 0 && gap < 1000) { // as fine as this machine draws in time
+      this.pace = 0.8 * (this.pace ?? gap) + 0.2 * gap;
+      if (this.pace > 70 && this.rays > 1) [this.rays, this.pace] = [this.rays - 1, 40];
+    }
+    this.before = now;
+    this.frames += 1;
+    const { width, height } = this.#fitted(), resting = !this.fresh && performance.now() - this.moving > REST_MS;
+    this.fresh = false;
+    const { maps, limited } = this.mode === "difference" ? { maps: asTheyStand(this.stack), limited: "" } : this.maps;
+    this.display.show(maps, this.flatness);
+    const turning = this.mode === "wiggle";
+    if (!resting || turning || ["panels", "apart", "target"].includes(this.mode)) {
+      this.strip = undefined;
+      this.#paint(width, height, this.rays);
+      if (!resting) this.#tell(limited);
+      if (!resting || turning) this.next = requestAnimationFrame((then) => this.#frame(then));
+      else this.#measure();
+      return;
+    }
+    const g = this.display.g, rows = Math.ceil(height / STRIPS);
+    this.strip ??= 0;
+    g.enable(g.SCISSOR_TEST);
+    g.scissor(0, height - (this.strip + 1) * rows, width, rows);
+    this.#paint(width, height, REST_RAYS);
+    g.disable(g.SCISSOR_TEST);
+    this.strip += 1;
+    if (this.strip < STRIPS) this.next = requestAnimationFrame((then) => this.#frame(then));
+    else {
+      this.strip = undefined;
+      this.#measure();
+    }
+  }
+
+  #fitted() {
+    const scale = Math.min(window.devicePixelRatio || 1, 2), { clientWidth, clientHeight } = this.canvas;
+    const width = Math.max(16, Math.round(clientWidth * scale)), height = Math.max(16, Math.round(clientHeight * scale));
+    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
+    return { width, height };
+  }
+
+  // The display fills a picture of this size for a head where the layers were solved for.
+  #picture(width, height) {
+    const away = middle(this.scene.eyes_m ?? this.eyes)[0] - this.stack.x_m.at(-1);
+    const focal = 0.94 * away * Math.min(width / this.stack.width_m, height / this.stack.height_m);
+    return { width, height, fov_deg: (Math.atan(width / 2 / focal) * 360) / Math.PI };
+  }
+
+  #paint(width, height, rays) {
+    const { display, mode } = this, g = display.g, pupil_mm = this.pupil ? 4 : 0;
+    const wide = width >= height, checks = mode === "target" || mode === "difference", two = checks || mode === "parallel" || mode === "crossed";
+    const across = two && wide ? 2 : 1, down = two && !wide ? 2 : 1, w = Math.floor(width / across), h = Math.floor(height / down);
+    this.$(".over").replaceChildren();
+    g.clearColor(0.07, 0.08, 0.1, 1);
+    const sides = two ? (mode === "crossed" ? [1, 0] : [0, 1]) : [mode === "right" || (mode === "wiggle" && Math.floor(performance.now() / WIGGLE_MS) % 2) ? 1 : 0];
+    if (mode === "panels" || mode === "apart") g.clear(g.COLOR_BUFFER_BIT);
+    if (mode === "panels") return this.#cards(width, height);
+    if (mode === "apart") return this.#apart(width, height);
+    if (checks) {
+      g.clear(g.COLOR_BUFFER_BIT);
+      const { width: pw, height: ph } = this.scene.picture, fit = Math.min(w / pw, h / ph), pic = { width: Math.floor(pw * fit), height: Math.floor(ph * fit) };
+      sides.forEach((side, k) => {
+        const left = (k % across) * w + ((w - pic.width) >> 1), below = height - (Math.floor(k / across) + 1) * h + ((h - pic.height) >> 1);
+        display.see({ eye: this.scene.eyes_m[side], picture: { ...pic, fov_deg: this.scene.fov_deg }, part: [left, below, pic.width, pic.height],
+          rays, pupil_mm, side, gain: mode === "target" ? 1 : 8 });
+      });
+    } else if (mode === "anaglyph") {
+      for (const side of [0, 1]) {
+        g.colorMask(side === 0, side === 1, side === 1, true);
+        display.see({ eye: this.eyes[side], picture: this.#picture(w, h), part: [0, 0, w, h], rays, pupil_mm });
+      }
+      g.colorMask(true, true, true, true);
+    } else {
+      sides.forEach((side, k) => display.see({ eye: this.eyes[side], picture: this.#picture(w, h), rays, pupil_mm,
+        part: [(k % across) * w, height - (Math.floor(k / across) + 1) * h, w, h] }));
+    }
+    this.#names(mode === "anaglyph" ? [] : sides.map((side, k) => [`${side ? "right" : "left"} eye`, ((k % across) + 0.5) / across, (Math.floor(k / across) + 1) / down]));
+  }
+
+  #names(names) {
+    const key = JSON.stringify(names), box = this.$(".names");
+    if (box.dataset.key === key) return;
+    box.dataset.key = key;
+    box.replaceChildren(...names.map(([text, x, y]) => {
+      const name = node("span", text);
+      name.style.left = `${100 * x}%`;
+      name.style.bottom = `${100 * (1 - y)}%`;
+      return name;
+    }));
+  }
+
+  #cards(width, height) {
+    const count = this.stack.x_m.length, aspect = this.stack.width_px / this.stack.height_px, gap = 12;
+    const fit = (columns) => Math.min((width - gap) / columns - gap, ((height - gap) / Math.ceil(count / columns) - gap - 20) * aspect);
+    const columns = [...Array(count).keys()].map((k) => k + 1).reduce((best, k) => (fit(k) > fit(best) ? k : best), 1), w = fit(columns), h = w / aspect;
+    const names = this.stack.x_m.map((x, n) => {
+      const left = gap + (n % columns) * (w + gap), top = gap + Math.floor(n / columns) * (h + gap + 20);
+      this.display.card(n, [left, top], [w, 0], [0, h]);
+      return [panelName(n, count), (left + w / 2) / width, (top + h + 22) / height];
+    });
+    this.#names(names);
+  }
+
+  // The panels drawn apart, seen from the left and above; two rays cross at a point of the centre panel.
+  #drawnApart(width, height) {
+    const { x_m, width_m, height_m } = this.stack, deep = x_m.at(-1) - x_m[0], scale = Math.min((0.56 * width) / width_m, (0.6 * height) / height_m);
+    const toViewer = [(0.26 * width) / deep, (0.2 * height) / deep], origin = [0.47 * width, 0.47 * height], half = (x_m.at(-1) + x_m[0]) / 2;
+    return { scale, at: (x, y, z) => [origin[0] + y * scale + (x - half) * toViewer[0], origin[1] - z * scale + (x - half) * toViewer[1]],
+      inverse: (px, py, x) => [(px - origin[0] - (x - half) * toViewer[0]) / scale, (origin[1] + (x - half) * toViewer[1] - py) / scale] };
+  }
+
+  #apart(width, height) {
+    const { stack, eyes } = this, { width_m, height_m, x_m } = stack, count = x_m.length, { scale, at } = this.#drawnApart(width, height);
+    x_m.forEach((x, n) => this.display.card(n, at(x, -width_m / 2, height_m / 2), [width_m * scale, 0], [0, height_m * scale], n ? 0.72 : 1));
+    const over = this.$(".over"), shapes = [], reference = x_m[count >> 1], deep = x_m.at(-1) - x_m[0], lines = [];
+    over.setAttribute("viewBox", `0 0 ${width} ${height}`);
+    const add = (name, attributes, text = "") => {
+      const made = document.createElementNS("http://www.w3.org/2000/svg", name);
+      for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+      made.textContent = text;
+      shapes.push(made);
+    };
+    eyes.forEach((eye, side) => {
+      const kind = side ? "right" : "left";
+      const on = (x) => [1, 2].map((k) => eye[k] + (this.point[k - 1] - eye[k]) * ((x - eye[0]) / (reference - eye[0])));
+      const begin = at(x_m[0], ...on(x_m[0])), ends = x_m.at(-1) + 0.42 * deep, end = at(ends, ...on(ends));
+      add("line", { x1: begin[0], y1: begin[1], x2: end[0], y2: end[1], class: `ray ${kind}` });
+      const codes = x_m.map((x, n) => {
+        const [y, z] = on(x), [cx, cy] = at(x, y, z);
+        add("circle", { cx, cy, r: 0.006 * width, class: kind });
+        const u = (y / width_m + 0.5) * stack.width_px, v = (0.5 - z / height_m) * stack.height_px;
+        return u >= 0 && v >= 0 && u < stack.width_px && v < stack.height_px ? this.display.codes(n, u, v) : null;
+      });
+      add("text", { x: end[0], y: end[1] + (side ? -0.012 : 0.03) * width, class: kind, "font-size": Math.max(12, 0.016 * width) }, `to the ${kind} eye`);
+      lines.push(this.#sum(kind, codes));
+    });
+    over.replaceChildren(...shapes);
+    this.$(".point").replaceChildren(...lines);
+    this.#names(x_m.map((x, n) => [panelName(n, count), ...at(x, 0, -height_m / 2 - 0.005).map((p, k) => p / (k ? height : width))]));
+  }
+
+  // What a ray's panels show, and what comes of it.
+  #sum(kind, codes) {
+    const line = node("p", `${kind} eye: `, kind);
+    if (codes.includes(null)) return line.append("passes beside a panel"), line;
+    const swatch = (rgb) => {
+      const made = node("i");
+      made.style.background = `rgb(${rgb.map(Math.round)})`;
+      return made;
+    };
+    const seen = [0, 1, 2].map((k) => 255 * Math.sin((codes.reduce((sum, c) => sum + c[k], 0) / 255) * (Math.PI / 2)) ** 2);
+    const turns = codes.map((c) => Math.round((c[1] / 255) * 90));
+    codes.forEach((code, n) => line.append(n ? " + " : "", swatch(code)));
+    line.append(" → ", swatch(seen), node("small", ` green: ${turns.join("° + ")}° of turn, sin² = ${((100 * seen[1]) / 255).toFixed(0)}% of the light`));
+    return line;
+  }
+
+  #tell(limited) {
+    const { eyes_m: solved } = this.scene, eyes = this.eyes;
+    for (const svg of this.$(".views").querySelectorAll("svg"))
+      drawPlan(svg, { stack: this.stack, eyes, solved, axis: Number(svg.dataset.axis), far_m: 0.7, sigma_m: this.sigma_m ?? 0 });
+    if (this.mode !== "apart") this.$(".point").replaceChildren();
+    const [x, y, z] = solved ? middle(eyes).map((v, k) => v - middle(solved)[k]) : [0, 0, 0];
+    const parts = [[y, "to the right", "to the left"], [z, "up", "down"], [x, "farther", "nearer"]].filter(([v]) => mm(v));
+    const where = parts.length ? `The head is ${parts.map(([v, one, other]) => `${mm(v)} mm ${v > 0 ? one : other}`).join(", ")} from where the layers were solved for` : "The head is where the layers were solved for";
+    const limit = limited ? `; the panels could only follow part of the way: ${limited}` : "";
+    this.$(".head").textContent = `${where}${limit}.`;
+    if (this.display.targets[0]) this.$(".light").textContent = "…";
+  }
+
+  // The light that both eyes get, against what was asked for, carried along on the centre panel; of some of its pixels.
+  #measure() {
+    const { display, scene } = this;
+    if (!display.targets[0] || this.flatness > 0) return;
+    const { width, height } = scene.picture, picture = { width, height, fov_deg: scene.fov_deg };
+    const columns = Math.floor(width / SAMPLED), rows = Math.floor(height / SAMPLED);
+    const { maps } = this.maps;
+    display.show(maps, 0);
+    let error = 0, counted = 0;
+    for (const side of [0, 1]) {
+      const how = { nominal: scene.eyes_m[side], picture, columns, rows, stride: [width / columns, height / rows].map(Math.floor), side };
+      const seen = display.seen({ ...how, eye: this.eyes[side], pupil_mm: 4 }), target = display.seen({ ...how, eye: this.eyes[side], rays: 1, gain: 1 });
+      for (let k = 0; k < columns * rows; k += 1) {
+        if (seen[4 * k + 3] < 255) continue;
+        for (let c = 0; c < 3; c += 1) error += ((seen[4 * k + c] - target[4 * k + c]) / 255) ** 2;
+        counted += 3;
+      }
+    }
+    if (!counted) return void (this.$(".light").textContent = "From here nothing is seen through all panels.");
+    this.light_db = -10 * Math.log10(Math.max(error / counted, 1e-9));
+    const words = this.light_db > 33 ? "hard to tell from what was asked for" : this.light_db > 27 ? "a good picture with faint traces of the other layers" :
+      this.light_db > 21 ? "ghosts and coloured edges are plain to see" : "the layers fall apart";
+    this.$(".light").textContent = `Light that reaches both eyes here: ${this.light_db.toFixed(1)} dB against what was asked for: ${words}.`;
+  }
+
+  #modes() {
+    const groups = {};
+    MODES.forEach(([key, name, group], k) => {
+      if (group === "Check" && !this.scene.picture) return;
+      const box = (groups[group] ??= node("div", "", "group"));
+      const button = Object.assign(node("button", name), { type: "button", title: `key ${(k + 1) % 10}` });
+      button.dataset.mode = key;
+      button.addEventListener("click", () => this.choose(key));
+      box.append(button);
+    });
+    this.$(".modes").append(...Object.entries(groups).map(([name, box]) => (box.prepend(node("span", name)), box)));
+    this.choose(this.canvas.clientWidth < 500 ? "left" : "parallel");
+  }
+
+  choose(mode) {
+    this.mode = mode;
+    for (const button of this.$(".modes").querySelectorAll("button")) button.setAttribute("aria-pressed", String(button.dataset.mode === mode));
+    this.$(".hint").textContent = MODES.find(([key]) => key === mode)[3];
+    this.draw();
+  }
+
+  #controls() {
+    const { canvas } = this, fingers = new Map();
+    const point = (event) => [event.offsetX / canvas.clientWidth - 0.5, 0.5 - event.offsetY / canvas.clientHeight];
+    canvas.addEventListener("pointerdown", (event) => fingers.set(event.pointerId, event));
+    for (const kind of ["pointerup", "pointercancel", "pointerleave"]) canvas.addEventListener(kind, (event) => fingers.delete(event.pointerId));
+    canvas.addEventListener("pointermove", (event) => {
+      const [x, y] = point(event), before = fingers.get(event.pointerId);
+      if (this.mode === "apart") {
+        const { width, height } = canvas, { inverse } = this.#drawnApart(width, height), { x_m, width_m, height_m } = this.stack;
+        const at = inverse((x + 0.5) * width, (0.5 - y) * height, x_m[x_m.length >> 1]);
+        this.point = at.map((v, k) => Math.max(-0.49 * [width_m, height_m][k], Math.min(0.49 * [width_m, height_m][k], v)));
+        return this.draw();
+      }
+      if (event.pointerType === "mouse") return this.moveTo([this.head[0], x * REACH_M[0], y * REACH_M[1]]);
+      if (!before) return;
+      const [a, b] = point(before), other = [...fingers.values()].find((f) => f.pointerId !== event.pointerId);
+      fingers.set(event.pointerId, event);
+      if (!other) return this.moveTo([this.head[0], this.head[1] + (x - a) * REACH_M[0], this.head[2] + (y - b) * REACH_M[1]]);
+      const apart = (one) => Math.hypot(one.offsetX - other.offsetX, one.offsetY - other.offsetY);
+      this.#nearer((apart(before) - apart(event)) / canvas.clientWidth);
+    });
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.#nearer(event.deltaY / 2000);
+    }, { passive: false });
+    addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey || /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
+      const step = KEYS[event.key], mode = MODES[(Number(event.key) + 9) % 10];
+      if (step) this.moveTo(this.head.map((v, k) => v + step[k] * STEP_M * (event.shiftKey ? 4 : 1)));
+      else if (event.key === "a") this.$("[data-key=aligned]").click();
+      else if (event.key === "p") this.$("[data-key=pupil]").click();
+      else if (event.key === "Home") this.moveTo([0, 0, 0]);
+      else if (/^\d$/.test(event.key) && this.$(`[data-mode=${mode[0]}]`)) this.choose(mode[0]);
+      else return;
+      event.preventDefault();
+    });
+    for (const box of this.$(".switches").querySelectorAll("input"))
+      box.addEventListener("change", () => {
+        this[box.dataset.key] = box.checked;
+        this.draw();
+      });
+    this.$(".switches button").addEventListener("click", () => this.moveTo([0, 0, 0]));
+  }
+
+  #nearer(metres) {
+    const least = this.stack.x_m.at(-1) + 0.1 - middle(this.eyesAt([0, 0, 0]))[0];
+    this.moveTo([Math.max(least, Math.min(1.5, this.head[0] + metres)), this.head[1], this.head[2]]);
+  }
+
+  // What scripts may ask of every page (docs/contracts.md).
+  get doors() {
+    return {
+      setHead: (head) => this.moveTo([...head]),
+      align: (on) => {
+        this.$("[data-key=aligned]").checked = this.aligned = Boolean(on);
+        this.draw();
+      },
+      picture: (eye, width, height, pupil_mm = 0) => {
+        this.display.show(this.maps.maps, this.flatness);
+        return this.display.picture({ eye: this.eyes[eye], fov_deg: this.scene.fov_deg, pupil_mm }, width, height);
+      },
+    };
+  }
+}
+
+const panelName = (n, count) => (n === 0 ? "rear panel" : n === count - 1 ? "front panel" : count === 3 ? "centre panel" : `panel ${n}`);

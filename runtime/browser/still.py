@@ -1,0 +1,71 @@
+"""A solution as one HTML file that needs no other: its layers, and the script that traces what eyes see of them."""
+
+from __future__ import annotations
+
+import base64
+import html
+import re
+from collections.abc import Sequence
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+from runtime.optics.stack import PanelStack
+from runtime.records import F64, U8
+from runtime.support.artifacts import png_bytes, to_json
+
+
+def asset(name: str) -> str:
+    """The text of one of the browser's files."""
+    return (files("runtime.browser") / "assets" / name).read_text(encoding="utf-8")
+
+
+def viewer_html(
+    layers: U8,
+    wanted: Sequence[U8],
+    stack: PanelStack,
+    *,
+    eyes_m: F64,
+    fov_deg: float,
+    title: str,
+    lines: Sequence[str] = (),
+) -> str:
+    """The page. layers: (N, h, w, 3 or 4), rear to front, as the panels show them to eyes (2, 3), frame `stack`.
+
+    wanted: an (h, w, 3) picture for each eye, `fov_deg` wide; () where none is known; lines: what stands below.
+    """
+    scene = {"stack": stack_table(stack), "eyes_m": eyes_m, "fov_deg": fov_deg, "title": title, "lines": list(lines)}
+    parts = {
+        "TITLE": html.escape(title),
+        "CSS": asset("look.css"),
+        "SCRIPT": _script(),
+        "SCENE": _embedded(scene),
+        "LAYERS": _embedded([_url(layer) for layer in layers]),
+        "WANTED": _embedded([_url(picture) for picture in wanted]),
+    }
+    return re.sub(r"@([A-Z]+)@", lambda found: parts.get(found[1], found[0]), asset("still.html"))
+
+
+def stack_table(stack: PanelStack) -> dict[str, Any]:
+    """The panels, as the script wants them."""
+    fields = ("width_m", "height_m", "x_m", "width_px", "height_px")
+    table: dict[str, Any] = {name: getattr(stack, name) for name in fields}
+    if stack.tilt is not None:
+        table["tilt"] = {"depth": stack.tilt.depth, "seen_from_m": stack.tilt.seen_from_m}
+    return table
+
+
+@cache
+def _script() -> str:
+    """The modules as one script: what they export to each other is in one scope."""
+    text = "\n".join(asset(name) for name in ("display.js", "look.js", "still.js"))
+    return re.sub(r"^export |^import .*\n", "", text, flags=re.MULTILINE)
+
+
+def _url(picture: U8) -> str:
+    return "data:image/png;base64," + base64.b64encode(png_bytes(picture)).decode()
+
+
+def _embedded(value: Any) -> str:
+    """JSON that ends no script element."""
+    return to_json(value).replace("<", "\\u003c")

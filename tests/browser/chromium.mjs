@@ -1,0 +1,35 @@
+// Debian's Chromium for a test: NODE_PATH=... node -e/import, with playwright-core under NODE_PATH. What it asks of anywhere
+// but `origin`, and every error, is kept.
+import { createRequire } from "node:module";
+import { createInterface } from "node:readline";
+
+const find = createRequire(process.env.NODE_PATH + "/x");
+const { chromium } = find("playwright-core");
+const lines = createInterface({ input: process.stdin })[Symbol.asyncIterator]();
+
+export const say = (what, value = null) => console.log(JSON.stringify({ what, value }));
+export const answered = async (what, value = null) => {
+  say(what, value);
+  return JSON.parse((await lines.next()).value);
+};
+
+export async function opened({ width = 1280, height = 800, origin = null, ...more } = {}) {
+  const browser = await chromium.launch({
+    executablePath: "/usr/bin/chromium",
+    args: ["--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
+      "--disable-background-networking", "--disable-component-update", "--disable-sync"],
+  });
+  const context = await browser.newContext({ viewport: { width, height }, ...more });
+  const elsewhere = [], errors = [];
+  context.on("request", (request) => {
+    const url = request.url();
+    if (!/^(data|blob|file):/.test(url) && !(origin && url.startsWith(origin))) elsewhere.push(url);
+  });
+  const page = async () => {
+    const made = await context.newPage();
+    made.on("console", (message) => { if (message.type() === "error") errors.push(message.text()); });
+    made.on("pageerror", (error) => errors.push(error.message));
+    return made;
+  };
+  return { browser, context, page, elsewhere, errors };
+}

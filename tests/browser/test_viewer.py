@@ -1,0 +1,174 @@
+"""`viewer.html` in Debian's Chromium against an independent tracer; the script's optics against the runtime's."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import phasestack
+from runtime.browser.still import asset, stack_table, viewer_html
+from runtime.config import StackGeometry
+from runtime.optics.alignment import align, scale_and_shift
+from runtime.optics.light import panels_from_centre
+from runtime.optics.rpu import panel_from_image
+from runtime.optics.stack import PanelStack, Tilt
+from runtime.optics.views import image_from_stack
+from runtime.report.pairs import Painter, eyes_at
+from tests.browser.tracer import Panels, light
+
+HERE = Path(__file__).parent
+STACK = StackGeometry().stack()
+TILT = ((0.01, -0.02), (0.0, 0.0), (-0.015, 0.012))
+MOVE = [0.01, 0.03, -0.01]
+
+
+def driven(script: str, *arguments: object) -> dict[str, Any]:
+    """What a script that drives Chromium says, by its name."""
+    modules = Path(os.environ.get("NODE_PATH", ""))
+    if shutil.which("node") is None or shutil.which("chromium") is None or not (modules / "playwright-core").is_dir():
+        pytest.skip("chromium, node, and a NODE_PATH with playwright-core are needed")
+    command = ["node", str(HERE / script), *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1800, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return {told["what"]: told["value"] for told in map(json.loads, done.stdout.splitlines())}
+
+
+def in_node(code: str, given: Any) -> Any:
+    """The value of a JavaScript expression over the module `d` and `given`."""
+    if shutil.which("node") is None:
+        pytest.skip("node is needed")
+    text = f"{asset('display.js')}\nconst given = {json.dumps(given)};\nconsole.log(JSON.stringify({code}));"
+    done = subprocess.run(
+        ["node", "--input-type=module", "-"], input=text, capture_output=True, text=True, timeout=60, check=True
+    )
+    return json.loads(done.stdout)
+
+
+STACKS = (
+    STACK,
+    replace(STACK, x_m=(-0.02, 0.05)),
+    replace(STACK, x_m=(-0.1, -0.02, 0.03, 0.07), tilt=Tilt(((0.0, 0.02, 0.01),) * 4, (0.6, 0.1, 0.05))),
+)
+
+
+@pytest.mark.parametrize("stack", STACKS, ids=lambda stack: f"{stack.count} panels")
+def test_the_page_aligns_as_the_runtime_does_to_its_limits(stack: PanelStack) -> None:
+    random = np.random.default_rng(3)
+    old = [eyes_at(distance_m=d, angle_deg=a, height_m=0.1) for d, a in random.uniform((0.3, -40), (1.2, 40), (40, 2))]
+    moves = random.normal(size=(40, 3)) * np.geomspace(1e-2, 100, 40)[:, None]
+    now = [eyes + move for eyes, move in zip(old, moves, strict=True)]
+    cases = [[a.tolist(), b.tolist()] for a, b in zip(old, now, strict=True)]
+    table = json.loads(json.dumps(stack_table(stack)))
+    found = in_node("given[1].map(([a, b]) => alignment(given[0], a, b))", [table, cases])
+    limited = 0
+    for one, solved, eyes in zip(found, old, now, strict=True):
+        wanted = align(stack, solved_for_m=solved, eyes_m=eyes)
+        np.testing.assert_allclose(one["maps"], [scale_and_shift(m) for m in wanted.solved_from_shown], atol=1e-8)
+        assert bool(one["limited"]) == bool(wanted.limited)
+        limited += bool(wanted.limited)
+    assert 0 < limited < 40
+
+
+@pytest.mark.parametrize("stack", STACKS, ids=lambda stack: f"{stack.count} panels")
+def test_the_page_looks_through_the_pixels_that_the_runtime_looks_through(stack: PanelStack) -> None:
+    nominal, true = np.array([0.6, -0.1, 0.12]), np.array([0.55, -0.07, 0.1])
+    picture = {"width": 640, "height": 360, "fov_deg": 40}
+    code = "given[0].x_m.map((_, n) => panelFromPicture(given[0], n, given[1], given[3], given[2]))"
+    found = in_node(code, [stack_table(stack), true.tolist(), nominal.tolist(), picture])
+    image = image_from_stack(nominal, width_px=640, height_px=360, fov_deg=40)
+    wanted = panels_from_centre(true, stack) @ panel_from_image(image, stack.panel(stack.count // 2))
+    points = np.array([[u, v, 1.0] for u in (0.5, 320, 639) for v in (0.5, 180, 359)]).T
+    for one, other in zip(found, wanted, strict=True):
+        ours, theirs = (m @ points for m in (np.reshape(one, (3, 3)), other))
+        np.testing.assert_allclose(ours[:2] / ours[2], theirs[:2] / theirs[2], atol=1e-6)
+
+
+def pair(stack: phasestack.Stack) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    eyes = eyes_at(distance_m=0.7, angle_deg=6, height_m=0.1)
+    with Painter("demo", stack) as painter:
+        size = {"width_px": stack.width_px, "height_px": stack.height_px}
+        return eyes, tuple(painter.image(eye, **size) for eye in eyes)
+
+
+def agreement_db(folder: Path, name: str, layers: np.ndarray, panels: Panels, eyes: np.ndarray, step: int) -> float:
+    """PSNR of what the page shows against the tracer's light, of every so-manieth pixel of both eyes."""
+    errors = []
+    for side, eye in enumerate(eyes):
+        seen = cv2.imread(str(folder / f"{name}-{side}.png"))[..., ::-1] / 255
+        rows, columns = (np.arange(step // 2, size, step) for size in seen.shape[:2])
+        truth, inside = light(layers, panels, eye, rows=rows, columns=columns)
+        assert inside.mean() > 0.5
+        errors.append(((seen[np.ix_(rows, columns)] - truth) ** 2)[inside])
+    return float(-10 * np.log10(np.concatenate(errors).mean()))
+
+
+def judged(tmp_path: Path, panels: Panels, eyes: np.ndarray, layers: np.ndarray, step: int) -> list[float]:
+    moved = eyes + MOVE
+    return [
+        agreement_db(tmp_path, "rest", layers, panels, eyes, step),
+        agreement_db(tmp_path, "aligned", panels.aligned(layers, eyes, moved), panels, moved, step),
+        agreement_db(tmp_path, "standing", layers, panels, moved, step),
+    ]
+
+
+@pytest.mark.slow
+def test_a_solution_s_viewer_shows_the_light_that_a_tracer_finds_at_rest_and_moved(tmp_path: Path) -> None:
+    eyes, pictures = pair(STACK)
+    result = phasestack.solve(*pictures, eyes_m=eyes, stack=STACK, model="fast")
+    result.save(tmp_path)
+    told = driven("look.mjs", tmp_path / "viewer.html", 1920, 1080, json.dumps(MOVE), tmp_path)
+    panels = Panels(STACK.width_m, STACK.height_m, STACK.x_m)
+    found = judged(tmp_path, panels, eyes, result.layers, step=7)
+    print("agreement with the tracer, dB: at rest, aligned, as they stand:", np.round(found, 2))
+    assert min(found) > 45
+    at_eyes = float(re.search(r"([\d.]+) dB", told["told"])[1])
+    assert at_eyes == pytest.approx(result.quality.light_db["0"], abs=2.0)  # of other rays, and another pupil
+    assert told["keys move the head"] and told["fits a phone"]
+    assert len(told["modes"]) == 10 and min(told["modes"].values()) > 20_000
+    assert told["elsewhere"] == [] and told["errors"] == []
+
+
+@pytest.mark.slow
+def test_tilted_panels_too(tmp_path: Path) -> None:
+    tilt = Tilt(tuple((0.0, *slopes) for slopes in TILT), (0.5, 0.0, 0.0))
+    stack = replace(STACK, width_px=320, height_px=180, tilt=tilt)
+    random = np.random.default_rng(4)
+    coarse = random.integers(0, 256, (3, 45, 80, 3)).astype(np.uint8)
+    layers = np.stack([cv2.resize(layer, (320, 180), interpolation=cv2.INTER_CUBIC) for layer in coarse])
+    eyes = eyes_at(distance_m=0.7, angle_deg=6, height_m=0.1)
+    page = viewer_html(layers, (), stack, eyes_m=eyes, fov_deg=40, title="tilted")
+    (tmp_path / "viewer.html").write_text(page)
+    driven("look.mjs", tmp_path / "viewer.html", 320, 180, json.dumps(MOVE), tmp_path)
+    panels = Panels(stack.width_m, stack.height_m, stack.x_m, TILT)
+    assert min(judged(tmp_path, panels, eyes, layers, step=2)) > 45
+
+
+def test_the_page_is_small_beside_its_pictures_and_asks_for_nothing(tmp_path: Path) -> None:
+    layers = np.zeros((3, 36, 64, 3), np.uint8)
+    eyes = eyes_at(distance_m=0.6)
+    page = viewer_html(layers, (layers[0],) * 2, STACK, eyes_m=eyes, fov_deg=40, title="</script><b>", lines=["<i>"])
+    assert len(re.sub(r"data:image/png;base64,[^\"]*", "", page)) < 60 * 1024
+    assert page.count("</script>") == 4 and "<b>" not in page and "<i>" not in page and "import " not in page
+    assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", page)
+
+
+def test_a_result_opens_in_a_browser_and_is_a_notebook_s_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    stack = replace(STACK, width_px=64, height_px=36)
+    random = np.random.default_rng(5).integers(0, 256, (2, 36, 64, 3)).astype(np.uint8)
+    result = phasestack.solve(*random, eyes_m=eyes_at(distance_m=0.6), stack=stack, model="fast")
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    path = result.show()
+    assert opened == [path.as_uri()] and "window.phasestack" in path.read_text()
+    assert result._repr_html_().startswith("<iframe srcdoc=") and result._repr_html_().count("<") == 2
+    shutil.rmtree(path.parent)
