@@ -3,24 +3,37 @@
 from __future__ import annotations
 
 import errno
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 PART_CHARACTERS_MAX = 300  # of a message: an untrusted name must not fill the screen, nor forge a line of the log
 PROBLEM_CHARACTERS_MAX = 1500  # of what is wrong with a file, all its fields together
+_USER_OF_ADDRESS = re.compile(r"""://[^/\s'"]*@""")
 # The system has none left, or its hardware failed this once.
 PASSING = frozenset(
     (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.ENOBUFS, errno.EINTR)
 )
 
 
+def without_secrets(text: str) -> str:
+    """Text in which the name and password of an address (`rtsp://user:password@host`) are left out.
+
+    >>> without_secrets("rtsp://user:a@b@host/door")
+    'rtsp://host/door'
+    """
+    return _USER_OF_ADDRESS.sub("://", text) if "://" in text else text
+
+
 def one_line(text: str, *, most: int = PART_CHARACTERS_MAX) -> str:
-    r"""Text on one line: what can't be printed (line breaks, escapes, NUL) becomes `?`, a long one's middle `...`.
+    r"""Text on one line, without secrets: what can't be printed (line breaks, escapes, NUL) becomes `?`, a long one's
+    middle `...`.
 
     >>> one_line("a\nb"), one_line("x" * 9, most=7)
     ('a?b', 'xx...xx')
     """
+    text = without_secrets(text)
     if len(text) > most:
         half = (most - 3) // 2
         text = f"{text[:half]}...{text[-half:]}"

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from runtime.clock import NS_PER_MS, NS_PER_S
-from runtime.errors import InputError, Stopped, one_line
+from runtime.errors import InputError, Stopped, one_line, without_secrets
 from runtime.frame.observer import line_of
 from runtime.frame.presenter import Presenter, Refresh
 from runtime.records import F64, RefreshAccount, SensorFrame
@@ -218,7 +218,7 @@ class Recorder(logging.Handler):
             told = [saved]
             if self._waiting and self._waiting[-1].kind == kind:  # not begun: one file is enough for both
                 told = [*self._waiting.pop().told, saved]
-            self._waiting.append(_Asked(kind, kept, header, settings.model_dump_json(), told))
+            self._waiting.append(_Asked(kind, kept, header, without_secrets(settings.model_dump_json()), told))
             if self._is_writing:
                 return
             self._writer = Job("black box", self._write)

@@ -23,7 +23,7 @@ from runtime.config import ContentSettings
 from runtime.content.base import ContentInfo, ContentSource
 from runtime.content.pictures import Layout, ScreenSource, layout_of
 from runtime.content.placing import SceneFile
-from runtime.errors import ContentFailure, InputError, MissingPart, one_line
+from runtime.errors import ContentFailure, InputError, MissingPart, one_line, without_secrets
 from runtime.records import U8
 from runtime.support import untrusted_input
 from runtime.support.background import begin
@@ -57,7 +57,7 @@ class Reader:
         av.logging.set_level(av.logging.PANIC)
         self._url, self._options = settings.scene, settings.stream_options
         # A password must not be in the status, nor in a log.
-        self.shown = re.sub(r"//[^/@]*@", "//", self._url)
+        self.shown = without_secrets(self._url)
         self.ending, self.first = threading.Event(), threading.Event()
         self.newest: tuple[int, U8] | None = None  # number, (h, w, 4) RGBA
         self.arrived_ns = time.monotonic_ns()

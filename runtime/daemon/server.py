@@ -25,7 +25,7 @@ from runtime.config import ServiceSettings
 from runtime.daemon.client import DEFAULT_SOCKET, user_socket
 from runtime.daemon.commands import Command, parse
 from runtime.daemon.listener import LIMITED, Listener, Refusal
-from runtime.errors import InputError, TransientError
+from runtime.errors import InputError, TransientError, without_secrets
 from runtime.support.artifacts import to_json
 
 log = logging.getLogger("phasestack.service")
@@ -146,7 +146,7 @@ class StatusServer(Listener):
 
 
 def _line(answer: dict[str, Any]) -> bytes:
-    return to_json(answer).encode() + b"\n"
+    return without_secrets(to_json(answer)).encode() + b"\n"
 
 
 def _is_gone(writer: StreamWriter) -> bool:

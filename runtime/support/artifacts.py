@@ -1,4 +1,4 @@
-"""Files that are whole and on the disk, or not there: written under a temporary name and renamed; pictures without a library's noise."""
+"""Files that are whole and on the disk, or not there, written under a temporary name and renamed; pictures quietly."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import errno
 import json
 import os
 import shutil
+import stat
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -41,9 +42,14 @@ def put_in_place(part: Path, path: Path) -> None:
     sync(path.parent)
 
 
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file atomically, making its parents. Raises InputError where it can't be written, or is a folder."""
+def write_bytes(path: Path, data: bytes, *, like: Path | None = None) -> None:
+    """Write a file atomically, making its parents. Raises InputError where it can't be written, or is a folder.
+
+    like: the file whose owner and readers it has; None: the one that it replaces, where there is one.
+    """
+    like = like or path
     try:
+        before = like.stat() if like.is_file() else None
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -53,7 +59,10 @@ def write_bytes(path: Path, data: bytes) -> None:
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(data)
-        Path(name).chmod(0o644)
+        if before is not None:
+            with suppress(PermissionError):  # somebody else's: it becomes ours
+                os.chown(name, before.st_uid, before.st_gid)
+        Path(name).chmod(0o644 if before is None else stat.S_IMODE(before.st_mode))
         if any(part.startswith(STAGING) for part in path.parts):  # an OutputFolder has it on the disk at its end
             Path(name).replace(path)
         else:

@@ -13,7 +13,7 @@ import traceback
 from datetime import UTC, datetime
 from pathlib import Path
 
-from runtime.errors import one_line
+from runtime.errors import one_line, without_secrets
 from runtime.support.folders import state_folder
 
 STEM = "phasestack-error-"
@@ -37,7 +37,7 @@ def written(error: BaseException) -> str:
             # Its owner alone reads it: a path or a name in it may be private.
             file, path = tempfile.mkstemp(".log", f"{STEM}{now:%Y%m%dT%H%M%S}-{os.getpid()}-", folder)
             with os.fdopen(file, "w", encoding="utf-8", errors="backslashreplace") as opened:
-                opened.write(text)
+                opened.write(without_secrets(text))
             with contextlib.suppress(OSError):  # another user's
                 for old in sorted(folder.glob(f"{STEM}*.log"))[:-KEPT]:
                     old.unlink()

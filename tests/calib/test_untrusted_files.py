@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import stat
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from calib.config_file import read_document, save
+from calib.config_file import put, read_document, rewrite, save
 from calib.pairs import PairsFile, read_pairs
 from calib.photographs import read_photograph
 from calib.service_files import gather
@@ -50,3 +51,16 @@ def test_a_fifo_is_refused(name: str, tmp_path: Path) -> None:
     assert "a.toml" in told
     assert "FIFO" in told or "is not what setup wrote" in told
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.toml"]
+
+
+def test_a_rewritten_configuration_and_its_past_are_read_by_no_more_and_a_link_stays_one(tmp_path: Path) -> None:
+    """A camera's password in it: setup made 0600 to 0644, and the link a file of its own."""
+    (tmp_path / "kept").mkdir()
+    config, link = tmp_path / "kept" / "display.toml", tmp_path / "phasestack.toml"
+    config.write_text('[content]\nscene = "rtsp://user:secret@cam/1"\n')
+    config.chmod(0o600)
+    link.symlink_to(config)
+    past = rewrite(link, lambda document: put(document, "calibration", {"viewing_m": [0.4, 0.7]}))
+    assert link.is_symlink() and "viewing_m" in config.read_text()
+    assert past is not None and past.parent == config.parent
+    assert [stat.S_IMODE(path.stat().st_mode) for path in (config, past)] == [0o600, 0o600]

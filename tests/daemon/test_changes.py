@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.reader import make_reader
 
+from runtime.blackbox.recorder import Recorder
 from runtime.clock import NS_PER_S, MonotonicClock
 from runtime.config import Settings, load_settings
 from runtime.content.placed import PlacedSource
@@ -27,6 +29,7 @@ from runtime.daemon.server import StatusServer
 from runtime.daemon.signals import Signals
 from runtime.daemon.supervise import Daemon
 from runtime.support import progress
+from runtime.support.logs import TextFormat
 from runtime.support.untrusted_input import LIMITS
 from tests.daemon.rig import SMALL, TRACKING, Rig
 
@@ -399,3 +402,22 @@ def test_a_configuration_that_takes_long_to_read_takes_no_refresh(
     assert on == ["job reconfiguration"]
     instants = [account.present_ns for account in served.rig.accounts[before:]]
     assert max(after - before for before, after in pairwise(instants)) < 0.7 * NS_PER_S
+
+
+def test_a_streams_password_is_in_no_answer_no_log_and_no_black_box(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("runtime.content.stream.FIRST_PICTURE_S", 0.1)
+    caplog.set_level("INFO", "phasestack")
+    with Served(tmp_path, recorder=Recorder(tmp_path / "boxes", minutes=1)) as served:
+        answer = served.asked("scene", "rtsp://operator:secret@127.0.0.1:9/door")
+        assert answer["scene"] == "rtsp://127.0.0.1:9/door"
+        boxed = served.asked("blackbox")
+        told = [answer, served.status(), *(ask([served.server.path], {"command": name}) for name in ("log", "about"))]
+        with Path(boxed["file"]).open("rb") as file:
+            reader = make_reader(file)
+            told += [attachment.data for attachment in reader.iter_attachments()]
+            told += [message.data for *_, message in reader.iter_messages()]
+    assert "127.0.0.1:9" in str(told) and "secret" not in str(told)
+    formatted = [TextFormat(journald=True).format(record) for record in caplog.records]
+    assert any("asked for: scene rtsp" in line for line in formatted) and "secret" not in str(formatted)
