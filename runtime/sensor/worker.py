@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import zlib
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
@@ -26,6 +27,8 @@ QUEUE_MAX = 1024  # samples that wait to be read: four seconds of the fastest se
 PICTURES_MAX = 8  # the same of samples that carry pictures
 AHEAD_NS = NS_PER_S // 1000  # a capture so far after its arrival is no time of this machine's clock
 BEHIND_NS = 60 * NS_PER_S  # nor is one so far before it
+FROZEN_NS = 2 * NS_PER_S  # a camera that is well never delivers the same picture for so long: it has noise
+LOOKED_AT = slice(None, None, 4)  # rows and columns of a picture
 
 log = logging.getLogger(__name__)
 
@@ -74,6 +77,9 @@ class SensorWorker(Samples):
         self._attempt: _Attempt | None = None
         self._hung: list[_Attempt] = []
         self._state, self.reason = SensorState.STOPPED, ""
+        self._was_well = False  # a sample was once what it should be
+        self._picture: tuple[int, int] = (0, 0)  # the newest one's checksum, and since when it is the same
+        self._untimely = ""  # what was wrong with the newest stamp that was
         self._skipped = 0  # samples that a newer one overtook, but those that the driver at hand counts
         self._driver: Sensor | None = None
         self.serial = ""  # of the device, once it was open; it is reopened by this
@@ -225,7 +231,7 @@ class SensorWorker(Samples):
     def _receive(self, attempt: _Attempt, driver: Sensor) -> None:
         """Read until the driver fails or the worker stops."""
         s = self._settings
-        timeouts = 0
+        timeouts, well_ns = 0, self._clock.now_ns()
         if attempt.abandoned.is_set():
             return
         find = finder(driver, self._make_find)
@@ -243,12 +249,17 @@ class SensorWorker(Samples):
                 if timeouts >= TIMEOUTS_TO_REOPEN:
                     raise SensorLost(f"nothing new for {timeouts * s.timeout_s:g} s") from error
                 continue
-            age_ns = self._clock.now_ns() - frames[-1].capture_ns
-            if not attempt.received and not -AHEAD_NS <= age_ns <= BEHIND_NS:
-                raise FatalError(f"captures are stamped {-age_ns / NS_PER_S:+.3f} s from now, not by the run's clock")
+            timeouts, now_ns = 0, self._clock.now_ns()
+            if not (frames := self._timely(frames, now_ns)):
+                if now_ns - well_ns > s.timeout_s * NS_PER_S:
+                    raise SensorLost(self._untimely)
+                continue
+            well_ns, self._was_well = now_ns, True
+            if not driver.capabilities.may_pause:
+                self._look_at(frames[-1], now_ns)
             overtaken = 0 if find is None else len(frames) - 1  # a search takes a camera's period: only the newest
             frames = [searched(frame, find, keep_images=self._keep_images) for frame in frames[overtaken:]]
-            attempt.received, timeouts = attempt.received + 1, 0
+            attempt.received += 1
             with self._lock:
                 if attempt.abandoned.is_set():
                     return
@@ -257,6 +268,29 @@ class SensorWorker(Samples):
                     self._keep(frame)
             if self._state is not SensorState.RUNNING:
                 self._set(attempt, SensorState.RUNNING, "")
+
+    def _timely(self, frames: list[SensorFrame], now_ns: int) -> list[SensorFrame]:
+        """Those that can have been taken when they say. Raises FatalError where none ever was: no device does that."""
+        timely = [frame for frame in frames if -AHEAD_NS <= now_ns - frame.capture_ns <= BEHIND_NS]
+        if len(timely) < len(frames):
+            ahead_s = (frames[-1].capture_ns - now_ns) / NS_PER_S
+            self._untimely = f"captures are stamped {ahead_s:+.3f} s from now, not by the run's clock"
+            if not self._was_well:
+                raise FatalError(self._untimely)
+            with self._lock:
+                self._skipped += len(frames) - len(timely)
+        return timely
+
+    def _look_at(self, frame: SensorFrame, now_ns: int) -> None:
+        """Raises SensorLost where a camera's picture never changes."""
+        picture = frame.colour if frame.colour is not None else frame.depth_mm
+        if picture is None:
+            return
+        checksum = zlib.crc32(picture[LOOKED_AT, LOOKED_AT].tobytes())
+        if checksum != self._picture[0]:
+            self._picture = checksum, now_ns
+        elif now_ns - self._picture[1] > FROZEN_NS:
+            raise SensorLost(f"its picture has not changed for {FROZEN_NS / NS_PER_S:g} s")
 
     def _keep(self, frame: SensorFrame) -> None:
         """Let a sample wait to be read; where too many wait, the oldest goes."""

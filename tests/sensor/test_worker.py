@@ -286,3 +286,57 @@ def test_where_no_thread_can_be_started_what_hangs_is_left_behind_later(
 
 def _no_thread(*_: Any) -> None:
     raise RuntimeError("can't start new thread")  # as the interpreter does at the limit of tasks
+
+
+class Camera(Scripted):
+    """Stamps its pictures as the test says."""
+
+    ahead_ns, changes = 0, True
+    capabilities = Capabilities(colour=True, eye_points=True)
+
+    def read_newest(self, timeout_s: float) -> SensorFrame:
+        time.sleep(0.005)
+        self._count += 1
+        picture = np.full((16, 16, 3), self._count % 200 if Camera.changes else 7, np.uint8)
+        return SensorFrame(self._count, time.monotonic_ns() + Camera.ahead_ns, colour=picture)
+
+
+@pytest.fixture
+def camera(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.setattr(Camera, "ahead_ns", 0)
+    monkeypatch.setattr(Camera, "changes", True)
+    worker = SensorWorker(lambda: Camera(None, []), SETTINGS, MonotonicClock())
+    worker.start()
+    assert eventually(lambda: worker.state is SensorState.RUNNING)
+    yield worker
+    worker.close()
+
+
+def test_stamps_of_the_future_are_never_believed_and_a_sensor_that_goes_on_so_is_lost(
+    camera: SensorWorker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After the first sample nobody looked: 105 mm off, and sure to 2 mm."""
+    monkeypatch.setattr(Camera, "ahead_ns", 900_000_000)
+    camera.take()
+    assert eventually(lambda: camera.state is SensorState.LOST)
+    assert "stamped +0.9" in camera.fault()
+    time.sleep(0.3)  # it is opened anew meanwhile
+    assert camera.state is not SensorState.FAILED
+    assert all(frame.capture_ns <= time.monotonic_ns() for frame in camera.take())
+    monkeypatch.setattr(Camera, "ahead_ns", 0)
+    assert eventually(lambda: camera.state is SensorState.RUNNING)
+
+
+def test_a_camera_whose_picture_never_changes_is_lost_until_it_does(
+    camera: SensorWorker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frozen eyes were at rest, and sure to 0.7 mm."""
+    monkeypatch.setattr("runtime.sensor.worker.FROZEN_NS", 100_000_000)
+    monkeypatch.setattr(Camera, "changes", False)
+    assert eventually(lambda: camera.state is SensorState.LOST)
+    assert camera.fault() == "its picture has not changed for 0.1 s"
+    for _ in range(30):  # opened anew, it is not well for a moment each time
+        time.sleep(0.01)
+        assert camera.state is SensorState.LOST
+    monkeypatch.setattr(Camera, "changes", True)
+    assert eventually(lambda: camera.state is SensorState.RUNNING)
