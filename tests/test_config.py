@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pwd
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -152,6 +153,19 @@ def test_a_command_or_option_that_is_gone_says_what_took_its_place() -> None:
     done = phasestack("run", "--config", "a.toml", "--budget-ms=16")
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.count("\n") == 1 and "is gone: " in done.stderr and "model.budget_ms" in done.stderr
+
+
+def test_a_user_whom_the_system_does_not_know_and_who_has_no_home_is_served(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`docker run --user 12345` ended with exit code 70."""
+    monkeypatch.setenv("XDG_CACHE_HOME", "")
+    monkeypatch.delenv("HOME")
+    monkeypatch.setattr(pwd, "getpwuid", {}.__getitem__)  # as for such a user
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    folders._root.cache_clear()
+    assert folders.user_cache("a").parent == tmp_path / f"phasestack-{os.geteuid()}"
+    folders._root.cache_clear()
 
 
 def test_a_cache_that_can_not_be_written_is_told_once_and_kept_elsewhere(tmp_path: Path, monkeypatch: Any) -> None:

@@ -12,31 +12,38 @@ from runtime.clock import NS_PER_MS, NS_PER_S
 from runtime.frame.solver_host import SOLVING_STAGES
 from runtime.records import RefreshAccount, State
 
-WINDOW = 8192  # values that quantiles are taken over
+WINDOW = 8192  # values at most that quantiles are taken over
 NOW_NS = NS_PER_S  # rates "now" are those of the last second
 NOW_KEPT = 1024
 STAGES = ("sensor", "track", *SOLVING_STAGES, "present", "wait")
 OVERHEAD_STAGES = ("sensor", "track")
 
 
-class Ring:
-    """The newest values, for quantiles."""
+class Quantiles:
+    """Of all values of a run: of every one, of every second, fourth, ... once there are many; the largest exactly."""
 
     def __init__(self, size: int = WINDOW) -> None:
         self._values = np.zeros(size)
-        self._count = 0
+        self._count, self._every, self._largest = 0, 1, -np.inf
 
     def add(self, value: float) -> None:
-        self._values[self._count % self._values.size] = value
+        self._largest = max(self._largest, value)
+        if self._count % self._every == 0:
+            place = self._count // self._every
+            if place == self._values.size:
+                place //= 2
+                self._values[:place] = self._values[::2]
+                self._every *= 2
+            self._values[place] = value
         self._count += 1
 
-    def quantiles(self, *names: str) -> dict[str, float] | None:
-        """`p50`, `p95`, `p99`, `max`, ... of what is held; None before the first value."""
-        held = self._values[: min(self._count, self._values.size)]
+    def of(self, *names: str) -> dict[str, float] | None:
+        """`p50`, `p95`, `p99`, `max`, ...; None before the first value."""
+        held = self._values[: -(-self._count // self._every)]
         if held.size == 0:
             return None
-        shares = [1.0 if name == "max" else float(name[1:]) / 100.0 for name in names]
-        return {name: round(value, 4) for name, value in zip(names, np.quantile(held, shares).tolist(), strict=True)}
+        found = {name: float(np.quantile(held, float(name[1:]) / 100)) for name in names if name != "max"}
+        return {name: round(found.get(name, self._largest), 4) for name in names}
 
 
 class RunStats:
@@ -47,9 +54,9 @@ class RunStats:
         self.faults: dict[str, int] = {}
         self._first_ns = self._last_ns = -1
         self._last_presented_ns = -1
-        self._stages = {stage: Ring() for stage in STAGES}
-        self._interval, self._photon, self._overhead = Ring(), Ring(), Ring()
-        self._overhead_run, self._skew, self._age, self._sigma = Ring(), Ring(), Ring(), Ring()
+        self._stages = {stage: Quantiles() for stage in STAGES}
+        self._interval, self._photon, self._overhead = Quantiles(), Quantiles(), Quantiles()
+        self._overhead_run, self._skew, self._age, self._sigma = Quantiles(), Quantiles(), Quantiles(), Quantiles()
         self._recent: deque[tuple[int, bool, bool]] = deque(maxlen=NOW_KEPT)  # when, presented, a new solution
 
     def add(self, account: RefreshAccount, *, overhead_ms: float, missed_blanks: int = 0) -> None:
@@ -88,7 +95,7 @@ class RunStats:
 
     def reuse_saves_ms(self) -> float | None:
         """What a refresh that shows a solution again does without; None before there was a solution."""
-        medians = [self._stages[stage].quantiles("p50") for stage in SOLVING_STAGES]
+        medians = [self._stages[stage].of("p50") for stage in SOLVING_STAGES]
         known = [median["p50"] for median in medians if median is not None]
         return sum(known) if known and self.presented > self.solutions > 0 else None
 
@@ -120,13 +127,13 @@ class RunStats:
             "seconds": round(seconds, 3),
             "fps": round((self.presented - 1) / seconds, 2) if seconds > 0 else None,
             "solutions_per_s": round(self.solutions / seconds, 2) if seconds > 0 else None,
-            "stage_ms": {stage: ring.quantiles("p50", "p95", "p99", "max") for stage, ring in self._stages.items()},
-            "interval_ms": self._interval.quantiles("p50", "p99"),
-            "photon_ms": self._photon.quantiles("p50", "p99"),
-            "overhead_ms": (self._overhead_run if simulated else self._overhead).quantiles("p50", "p99"),
-            "skew_ms": self._skew.quantiles("p50", "p99", "max"),
-            "solution_age_ms": self._age.quantiles("p50", "p99"),
-            "eye_sigma_mm": self._sigma.quantiles("p50", "p99"),
+            "stage_ms": {stage: ring.of("p50", "p95", "p99", "max") for stage, ring in self._stages.items()},
+            "interval_ms": self._interval.of("p50", "p99"),
+            "photon_ms": self._photon.of("p50", "p99"),
+            "overhead_ms": (self._overhead_run if simulated else self._overhead).of("p50", "p99"),
+            "skew_ms": self._skew.of("p50", "p99", "max"),
+            "solution_age_ms": self._age.of("p50", "p99"),
+            "eye_sigma_mm": self._sigma.of("p50", "p99"),
             "missed_blanks": self.missed_blanks,
             "faults": dict(self.faults),
         }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import os
 import shutil
@@ -22,7 +23,7 @@ from runtime.errors import InputError
 from runtime.records import U8
 from runtime.support.picture_header import PNG, is_cut_off, read_coded
 
-STAGING = ".phasestack-"
+STAGING = ".phasestack-staging-"
 JPEG = b"\xff\xd8\xff"
 
 
@@ -179,10 +180,10 @@ class OutputFolder:
         try:
             self._made = [folder for folder in (self.target, *self.target.parents) if not folder.exists()]
             self.target.mkdir(parents=True, exist_ok=True)
-            for left in self.target.glob(f"{STAGING}*"):
-                if not Path("/proc", left.name.split("-")[1]).exists():
-                    shutil.rmtree(left, ignore_errors=True)
-            self.staging = Path(tempfile.mkdtemp(prefix=f"{STAGING}{os.getpid()}-", dir=self.target))
+            _sweep(self.target)
+            self.staging = Path(tempfile.mkdtemp(prefix=STAGING, dir=self.target))
+            self._held = os.open(self.staging, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            fcntl.flock(self._held, fcntl.LOCK_EX)  # for as long as this process lives
         except OSError as error:
             raise InputError(self.target, "", f"cannot be written ({error.strerror})") from None
         return self
@@ -226,6 +227,21 @@ class OutputFolder:
     def discard(self) -> None:
         """Remove what was staged so far, before the end."""
         shutil.rmtree(self.staging, ignore_errors=True)
+        if self._held >= 0:
+            os.close(self._held)
+            self._held = -1
+
+
+def _sweep(target: Path) -> None:
+    """What killed processes left staged: nobody holds it any more, in whichever namespace they were."""
+    for left in target.glob(f"{STAGING}*"):
+        with suppress(OSError):
+            opened = os.open(left, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            try:
+                fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(left, ignore_errors=True)
+            finally:
+                os.close(opened)
 
 
 def _check_free(place: Path, *, within: Path) -> None:

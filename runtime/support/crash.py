@@ -36,8 +36,12 @@ def written(error: BaseException) -> str:
             folder.mkdir(parents=True, exist_ok=True)
             # Its owner alone reads it: a path or a name in it may be private.
             file, path = tempfile.mkstemp(".log", f"{STEM}{now:%Y%m%dT%H%M%S}-{os.getpid()}-", folder)
-            with os.fdopen(file, "w", encoding="utf-8", errors="backslashreplace") as opened:
-                opened.write(without_secrets(text))
+            try:
+                with os.fdopen(file, "w", encoding="utf-8", errors="backslashreplace") as opened:
+                    opened.write(without_secrets(text))
+            except OSError:
+                Path(path).unlink()
+                raise
             with contextlib.suppress(OSError):  # another user's
                 for old in sorted(folder.glob(f"{STEM}*.log"))[:-KEPT]:
                     old.unlink()

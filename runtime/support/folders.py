@@ -26,8 +26,9 @@ def user_cache(name: str) -> Path:
 def _root(base: str) -> Path:
     """Under $XDG_CACHE_HOME, else ~/.cache; where that is not this user's to write, their own in the
     temporary folder; `NOWHERE` where that is not theirs either."""
-    own = (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "phasestack"
-    with suppress(OSError):
+    own = NOWHERE
+    with suppress(OSError, RuntimeError):  # a user whom the system does not know has no home
+        own = (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "phasestack"
         own.mkdir(mode=0o700, parents=True, exist_ok=True)
     if os.access(own, os.W_OK | os.X_OK) and _is_ours(own.stat(), others_may=0o055):
         return own
@@ -60,4 +61,6 @@ def state_folder() -> Path:
     own, home = os.environ.get("XDG_STATE_HOME", ""), os.environ.get("HOME", "")
     if Path(own).is_absolute():
         return Path(own) / "phasestack"
-    return Path(home) / ".local" / "state" / "phasestack" if home else Path(tempfile.gettempdir()) / "phasestack"
+    if home:
+        return Path(home) / ".local" / "state" / "phasestack"
+    return Path(tempfile.gettempdir()) / f"phasestack-state-{os.geteuid()}"

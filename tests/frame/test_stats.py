@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from runtime.clock import NS_PER_MS, NS_PER_S
-from runtime.frame.stats import RunStats
+from runtime.frame.stats import Quantiles, RunStats
 from runtime.records import RefreshAccount, State
 
 PERIOD_NS = NS_PER_S // 50
@@ -87,3 +87,13 @@ def test_rates_now_are_of_the_last_second_and_those_of_the_run_are_not() -> None
     stats = told(slow + fast)
     assert stats.rates_now() == {"fps_now": 50.0, "solutions_per_s_now": 50.0}
     assert stats.summary(stale_inputs=0)["fps"] < 15
+
+
+def test_quantiles_are_of_the_whole_run_and_a_stall_early_on_is_not_forgotten() -> None:
+    """After 8,192 refreshes it was."""
+    figures = Quantiles(64)
+    for number in range(10_000):
+        figures.add(3000.0 if number == 37 else float(number))
+        assert figures.of("max")["max"] == max(number, 3000.0 if number >= 37 else 0.0)
+    assert figures.of("p50")["p50"] == pytest.approx(5000, rel=0.02)
+    assert figures.of("p99")["p99"] == pytest.approx(9900, rel=0.02)

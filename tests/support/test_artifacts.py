@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from runtime.errors import InputError
+from runtime.support import crash
 from runtime.support.artifacts import OutputFolder, held_back, write_bytes
 
 
@@ -104,3 +105,46 @@ def test_a_file_replaces_another_whole(tmp_path: Path) -> None:
         write_bytes(tmp_path / "new" / "a", data)
         assert (tmp_path / "new" / "a").read_bytes() == data
     assert len(list((tmp_path / "new").iterdir())) == 1
+
+
+HOLDS = """
+import sys
+from pathlib import Path
+from runtime.support.artifacts import OutputFolder
+with OutputFolder(Path(sys.argv[1])) as folder:
+    print(folder.staging.name, flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_of_what_is_staged_only_what_a_killed_process_left_is_cleared_away(tmp_path: Path) -> None:
+    """A folder of somebody's, and what a container was at, went with it."""
+
+    def writer() -> subprocess.Popen[str]:
+        command = [sys.executable, "-c", HOLDS, str(tmp_path)]
+        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    (tmp_path / ".phasestack-backup").mkdir()
+    (tmp_path / ".phasestack-backup" / "only-copy.mcap").touch()
+    with writer() as killed:
+        assert killed.stdout is not None
+        left = killed.stdout.readline().strip()
+        killed.kill()
+    with writer() as living:
+        assert living.stdout is not None
+        held = living.stdout.readline().strip()
+        assert not (tmp_path / left).exists()
+        with OutputFolder(tmp_path) as folder:
+            write_bytes(folder.staging / "a", b"x")
+        assert sorted(path.name for path in tmp_path.iterdir()) == [".phasestack-backup", held, "a"]
+    assert (tmp_path / ".phasestack-backup" / "only-copy.mcap").exists()
+
+
+@pytest.mark.usefixtures("tiny")
+def test_an_error_that_the_disk_has_no_room_for_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sixty empty ones were left where twenty are kept."""
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    told = [crash.written(RuntimeError("x" * 5000)) for _ in range(3)]
+    assert all(line.endswith("it could be written down nowhere") for line in told)
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
