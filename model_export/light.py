@@ -1,0 +1,179 @@
+"""Differentiable light: what eyes see of a stack of panels, and the step that improves the panels. In plain torch.
+
+This is the reference that the runtime's kernels are held to, and what networks are trained through. Equations are those
+of docs/mathematics.md, "A step".
+
+*Light.* Panel n shows x_n in [0, 1]; along a ray s = sum of x_n, and I = sin²(pi/2·s) = (1 - Re exp(i·pi·s))/2. A pixel
+of an eye's picture is a bundle of rays. Within it the panels' values are nearly independent, so that
+
+    E[exp(i·pi·s)] = Z = prod_n z_n,   z_n = sum_q w_nq·exp(i·pi·x_nq)                                        (L1)
+    I = (1 - Re Z)/2                                                                                          (L2)
+
+with w_nq the part of the bundle on panel n that pixel q covers: for a bundle as wide as a pixel, bilinear weights.
+
+*A step.* With T what an eye should see, e = I - T (0 where a ray misses a panel) and A_n the product of the other
+panels' z_m, the squared error's derivative to pixel q of panel n, and a bound of its curvature, are sums over all sets:
+
+    g_q = Im(exp(i·pi·x_q)·sum w·e·A_n)        (pi/2 times it is the derivative of sum e²/2)                  (L3)
+    D_q = sum w·(Im Z)²                                                                                       (L4)
+    x' = clip(y - size·g/(1.5·pi·max(D, floor·E))·3/N, 0, 1),   y' = x' + momentum·(x' - x)                   (L5)
+
+for N panels and E ray sets. The sums over rays through a panel's pixel (the transpose of bilinear sampling) are taken
+as one bilinear sample of the rays' values, through the inverse homography: the same where a ray's pixel and a panel's
+are equally large, elsewhere the same but for a factor that g and D share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from runtime.optics.light import panels_from_centre
+from runtime.optics.rpu import panel_from_image
+from runtime.optics.stack import PanelStack
+from runtime.optics.views import image_from_stack
+from runtime.records import F64
+
+NEAR_PX = 0.5  # a ray counts that is at least so far inside every panel
+SIZES = (2.0, 1.6, 1.2, 0.8, 0.8, 0.8)  # of steps from the network's panels, the best that was measured
+MOMENTUM, FLOOR = 0.7, 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Views:
+    """E sets of rays, left and right eye in turn, one of each for every place that the head may be at."""
+
+    panels_from_rays: Tensor  # (E, N, 3, 3) float64: a panel's pixels from the rays' raster, centres at halves
+    width_px: int  # of the rays' raster
+    height_px: int
+
+    @classmethod
+    def of(
+        cls,
+        stack: PanelStack,
+        eyes_m: F64,
+        *,
+        width_px: int,
+        height_px: int,
+        fov_deg: float | None,
+        places_m: Sequence[Sequence[float]] = ((0.0, 0.0, 0.0),),
+    ) -> Views:
+        """Rays of a picture's own pixels (`fov_deg` wide, horizontally), or, without one, of the centre panel's pixels.
+
+        eyes_m: (2, 3) left, right, frame `stack`; places_m: what is added to both, a picture's rays then being those
+        through the same points of the centre panel. Raises ValueError for an eye in the centre panel's plane.
+        """
+        sets = []
+        for place in places_m:
+            for eye in np.asarray(eyes_m, np.float64):
+                matrices = panels_from_centre(eye + np.asarray(place), stack)
+                if fov_deg is not None:
+                    image = image_from_stack(eye, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
+                    matrices = matrices @ panel_from_image(image, stack.panel(stack.count // 2))
+                sets.append(matrices)
+        return cls(torch.from_numpy(np.stack(sets)), width_px, height_px)
+
+
+def light(panels: Tensor, views: Views) -> tuple[Tensor, Tensor]:
+    """What every ray set sees of panels (N, C, H, W): intensities (E, C, h, w), and which rays count (E, 1, h, w).
+
+    (L1) and (L2). Differentiable with respect to the panels; on their device, in their type.
+    """
+    bundles, counts = _bundles(panels, views)
+    return torch.stack([(1 - reduce(torch.mul, z).real) / 2 for z in bundles]), counts
+
+
+def traced(panels: Tensor, views: Views, *, rays: int = 2, random: torch.Generator | None = None) -> Tensor:
+    """The same intensities (E, C, h, w) by rays by rays single ones a pixel, at random places of it: noisy, but exact.
+
+    Two calls err independently of each other: the mean of the product of both errors is the squared error, unbiased.
+    """
+    size, angle = (views.height_px, views.width_px), torch.pi * panels
+    total = torch.zeros((), dtype=panels.dtype, device=panels.device)
+    for stratum in range(rays * rays):
+        at = torch.tensor([stratum % rays, stratum // rays])[:, None, None]
+        within = (torch.rand(2, *size, generator=random, dtype=torch.float64) + at) / rays
+        sums = [
+            _sample(angle, matrices, size, near_px=NEAR_PX, within=within)[0].sum(dim=0)
+            for matrices in views.panels_from_rays
+        ]
+        total = total + (1 - torch.cos(torch.stack(sums))) / (2 * rays * rays)
+    return total
+
+
+def step(
+    x: Tensor,
+    y: Tensor,
+    targets: Tensor,
+    views: Views,
+    *,
+    size: float | Tensor,
+    momentum: float | Tensor = MOMENTUM,
+    floor: float = FLOOR,
+) -> tuple[Tensor, Tensor]:
+    """x' and y' of (L5) from panels x and what momentum makes of them, y (at first the same), both (N, C, H, W).
+
+    targets: (2, C, h, w) what the left and the right eye should see, on the rays' raster.
+    """
+    count, sets, shape = len(y), len(views.panels_from_rays), y.shape[-2:]
+    back = torch.linalg.inv(views.panels_from_rays)
+    bundles, counts = _bundles(y, views)
+    slope, bound = torch.zeros_like(torch.complex(y, y)), torch.zeros_like(y)
+    for e, z in enumerate(bundles):
+        whole = reduce(torch.mul, z)
+        error = ((1 - whole.real) / 2 - targets[e % 2]) * counts[e]
+        others = [error * reduce(torch.mul, [z[m] for m in range(count) if m != n]) for n in range(count)]
+        curved = whole.imag.square() * counts[e]
+        rays = torch.stack([torch.cat([b.real, b.imag, curved]) for b in others])
+        real, imaginary, curvature = _sample(rays, back[e], shape, near_px=0.0)[0].chunk(3, dim=1)
+        slope, bound = slope + torch.complex(real, imaginary), bound + curvature
+    gradient = (_phasors(y) * slope).imag
+    moved = size * gradient / (1.5 * torch.pi * bound.clamp(min=floor * sets)) * (3 / count)
+    new = (y - moved).clamp(0, 1)
+    return new, new + momentum * (new - x)
+
+
+def _phasors(panels: Tensor) -> Tensor:
+    angle = torch.pi * panels
+    return torch.complex(torch.cos(angle), torch.sin(angle))
+
+
+def _bundles(panels: Tensor, views: Views) -> tuple[list[Tensor], Tensor]:
+    """z_n of every ray set, (N, C, h, w) complex each, and which rays count, (E, 1, h, w)."""
+    parts = torch.view_as_real(_phasors(panels)).movedim(-1, 1).flatten(1, 2)  # (N, 2C, H, W)
+    bundles, counts = [], []
+    for matrices in views.panels_from_rays:
+        found, inside = _sample(parts, matrices, (views.height_px, views.width_px), near_px=NEAR_PX)
+        bundles.append(torch.complex(*found.chunk(2, dim=1)))
+        counts.append(inside.all(dim=0))
+    return bundles, torch.stack(counts)
+
+
+def _sample(
+    images: Tensor, matrices: Tensor, size: tuple[int, int], *, near_px: float, within: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Samples (N, K, h, w) of images (N, K, H, W), each at its homography (N, 3, 3) of the result's pixels.
+
+    Bilinear at the pixels' middles; of the nearest pixel `within` (2, h, w) them, columns and rows in [0, 1]. Zero
+    where that is not `near_px` inside an image: the second result, (N, 1, h, w), says where it is.
+    """
+    height, width = images.shape[-2:]
+    to: dict[str, Any] = {"dtype": torch.float64, "device": images.device}
+    v, u = torch.meshgrid(torch.arange(size[0], **to), torch.arange(size[1], **to), indexing="ij")
+    u, v = torch.stack([u, v]) + (0.5 if within is None else within.to(**to))
+    places = torch.einsum("nij,jhw->nihw", matrices.to(images.device), torch.stack([u, v, torch.ones_like(u)]))
+    x, y, w = places.unbind(1)
+    at = torch.stack([x / w / width, y / w / height], dim=-1)
+    margin = torch.tensor([near_px / width, near_px / height], **to)
+    inside = ((at >= margin) & (at <= 1 - margin)).all(dim=-1) & (w > 0)
+    grid = torch.where(inside[..., None], 2 * at - 1, 0.0).to(images.dtype)
+    mode = "bilinear" if within is None else "nearest"
+    found = functional.grid_sample(images, grid, mode, padding_mode="border", align_corners=False)
+    return found * inside[:, None], inside[:, None]
