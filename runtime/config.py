@@ -6,6 +6,7 @@ file are relative to the folder of the file.
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -401,12 +402,23 @@ def changed(settings: Settings, section: str, values: dict[str, Any], *, source:
     return settings.model_copy(update={section: new})
 
 
+KEY_PARTS_MAX = 16
+TEXTS = re.compile(
+    r'''"""(?:[^\\]|\\.)*?"""|\'{3}.*?\'{3}|"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|#[^\n]*''', re.DOTALL
+)  # TOML's strings and comments
+BESIDE_KEYS = re.compile(r"[\n=,{}\[\]]")
+
+
 def read_table(path: Path) -> dict[str, Any]:
     """A TOML or JSON file as a table. Raises InputError, naming the file and the line of the mistake."""
     text = untrusted_input.read_text(path, most_bytes=TABLE_BYTES_MAX)
     if path.suffix.lower() == ".json":
         table = untrusted_input.parsed_json(text, source=path)
     else:
+        plain = TEXTS.sub("_", text)
+        # tomllib takes the square of a key's parts in time and memory.
+        if max(key.count(".") for key in BESIDE_KEYS.split(plain)) >= KEY_PARTS_MAX:
+            raise InputError(path, "", f"malformed: a key of more than {KEY_PARTS_MAX} parts")
         try:
             table = tomllib.loads(text)
         except ValueError as error:

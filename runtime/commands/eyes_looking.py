@@ -21,8 +21,8 @@ from runtime.eyes.pupils import Pupils
 from runtime.records import U8, SensorFrame
 from runtime.sensor.recording import Recording
 from runtime.sensor.registry import open_sensor
-from runtime.support import untrusted_input
 from runtime.support.artifacts import OutputFolder, held_back, png_bytes, read_image
+from runtime.support.film import open_film
 
 FILMS = (".mp4", ".mkv", ".avi", ".mov", ".webm", ".m4v")
 RECORDING = ".mcap"
@@ -97,9 +97,8 @@ def _frames(path: Path, place: int, rate_hz: float) -> Iterator[SensorFrame]:
 
 def _filmed(path: Path, rate_hz: float) -> Iterator[SensorFrame]:
     """Raises InputError for what is no film."""
-    untrusted_input.open_regular(path).close()
     with held_back():  # what FFmpeg and OpenCV say of it is one line of ours
-        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        capture = open_film(path)
     try:
         rate = capture.get(cv2.CAP_PROP_FPS)
         rate = rate if 0.1 <= rate <= 1000 else rate_hz

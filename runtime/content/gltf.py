@@ -7,9 +7,9 @@ there; anything else that a damaged file provokes here is one line. Colours are 
 from __future__ import annotations
 
 import base64
-import io
 from dataclasses import dataclass, replace
 from functools import cache
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -23,7 +23,7 @@ from runtime.content.triangles import Part
 from runtime.errors import InputError, one_line
 from runtime.records import F32, F64, U8
 from runtime.support import progress, untrusted_input
-from runtime.support.picture_header import check_picture
+from runtime.support.picture_header import decoded_picture
 from runtime.support.untrusted_input import LIMITS
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -103,6 +103,8 @@ class _Reader:
         """binary: a GLB's own buffer."""
         self._path, self._table, self._binary = path, table, binary
         self._elements = 0  # that were read of all accessors
+        self._pixels = 0  # of all textures
+        self._decoded: dict[tuple[bytes, float], U8] = {}
         # What several things refer to is read once.
         self._buffer, self._mesh = cache(self._buffer_of), cache(self._mesh_of)
         self._look, self._picture = cache(self._look_of), cache(self._picture_of)
@@ -314,15 +316,17 @@ class _Reader:
 
     def _picture_of(self, index: Any, cutoff: float) -> U8:
         """RGBA whose alpha is cut at a half, wherever the material cuts it; 0: nowhere."""
-        from PIL import Image
-
         item = self._at("images", index)
         coded = self._bytes_of(item, "texture")
         if coded is None:
             coded = self._view(item["bufferView"])[0]
-        check_picture(coded, source=self._path, field="texture", name=f"images[{index}]")
-        with Image.open(io.BytesIO(coded)) as image:
-            rgba = texture_of(image)
+        key = sha256(coded).digest(), cutoff
+        if key in self._decoded:  # several name the same bytes
+            return self._decoded[key]
+        image = decoded_picture(coded, source=self._path, field="texture", name=f"images[{index}]")
+        self._pixels += image.width * image.height
+        self._within(self._pixels, LIMITS.texture_pixels, "textures' pixels")
+        rgba = self._decoded[key] = texture_of(image)
         rgba[..., 3] = np.clip(rgba[..., 3] * (0.5 / max(cutoff, 1e-3)), 0, 255) if cutoff else 255
         return rgba
 

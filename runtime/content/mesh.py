@@ -22,7 +22,7 @@ from runtime.content.triangles import DrawnPart, Part, TriangleSource
 from runtime.errors import InputError, one_line
 from runtime.records import F32, F64, U8
 from runtime.support import progress, untrusted_input
-from runtime.support.picture_header import check_picture
+from runtime.support.picture_header import decoded_picture
 from runtime.support.untrusted_input import LIMITS
 
 log = logging.getLogger("phasestack.content")
@@ -128,6 +128,7 @@ def _loaded(path: Path, data: bytes) -> list[Any]:
         """What a loader reads beside a file: it passes over what it does not get, so that this keeps why."""
 
         refused: InputError | None = None
+        pixels = 0  # of all textures
         has_materials = kind != "obj" or b"mtllib" in data
 
         def get(self, name: str) -> bytes:
@@ -135,7 +136,9 @@ def _loaded(path: Path, data: bytes) -> list[Any]:
                 beside = file_of(name, source=path, field="texture")
                 found = untrusted_input.read_bytes(beside, most_bytes=LIMITS.file_bytes, source=path, field="texture")
                 if not name.lower().endswith(".mtl"):
-                    check_picture(found, source=path, field="texture", name=untrusted_input.shown(name))
+                    image = decoded_picture(found, source=path, field="texture", name=untrusted_input.shown(name))
+                    self.pixels += image.width * image.height
+                    untrusted_input.within(self.pixels, LIMITS.texture_pixels, source=path, field="textures' pixels")
             except InputError as error:
                 if name.lower().endswith(".mtl"):
                     log.warning("%s: is drawn grey without its materials (%s)", path, error.problem)

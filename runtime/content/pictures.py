@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -21,8 +20,9 @@ from runtime.content.placing import SceneFile
 from runtime.errors import ContentFailure, InputError
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.records import U8
-from runtime.support import progress, untrusted_input
+from runtime.support import progress
 from runtime.support.artifacts import read_image
+from runtime.support.film import open_film
 from runtime.support.picture_header import check_size, size_of_file
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -35,7 +35,6 @@ MARKS = (  # in a file's name, the longer ones first
     ("_half_tb", "half-top-bottom"), ("_sbs", "side-by-side"), ("_tb", "top-bottom"), ("_ou", "top-bottom"),
 )  # fmt: skip
 TELL_EVERY = 64
-CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi"
 VIDEO_FRAMES_MAX = 1e8
 VIDEO_PROPERTIES = (
     cv2.CAP_PROP_FRAME_COUNT,
@@ -157,25 +156,12 @@ class PictureFiles(Frames):
         return self._held[1]
 
 
-def _opened(path: Path) -> cv2.VideoCapture:
-    """A video by FFmpeg alone, whose complaints and OpenCV's stay off stderr: our own line names the file."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    # A playlist under a video's name would make FFmpeg open other files, and connections.
-    os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", f"protocol_whitelist;file|format_whitelist;{CONTAINERS}")
-    level = cv2.utils.logging.setLogLevel(0)
-    try:
-        return cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-
-
 class Video(Frames):
     """A video file, read by OpenCV as it goes."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        untrusted_input.open_regular(path).close()
-        self._capture = _opened(path)
+        self._capture = open_film(path)
         if not self._capture.isOpened():
             raise InputError(path, "", "is not a video that can be decoded")
         try:

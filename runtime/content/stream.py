@@ -32,6 +32,7 @@ from runtime.support.picture_header import check_size
 log = logging.getLogger("phasestack.content")
 
 PROTOCOLS = ("rtsp", "rtsps", "rtp", "rtmp", "http", "https", "udp", "tcp", "srt")
+LISTENS = re.compile(r"[?&](?:listen|mode)=(?!0\b|caller\b)", re.IGNORECASE)  # of FFmpeg's tcp, rtmp, http; srt
 STREAM_OPTIONS = {  # for FFmpeg: nothing is opened but what was named
     "fflags": "nobuffer",
     "analyzeduration": "1000000",  # microseconds before the first picture; it would look at five seconds
@@ -135,6 +136,8 @@ def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
     scheme = url.partition("://")[0].lower()
     if "://" in url and scheme not in PROTOCOLS:
         raise InputError("content", "scene", f"{untrusted_input.shown(scheme)}:// is none of {', '.join(PROTOCOLS)}")
+    if LISTENS.search(url):
+        raise InputError("content", "scene", "an address that others may send to is not opened (listen)")
     layout = layout_of(Path(re.sub(r"[?#].*", "", url)), file.settings)
     if layout.kind == "rgbd":
         raise InputError("content", "layout", "rgbd is not for live pictures")

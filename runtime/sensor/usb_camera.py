@@ -15,6 +15,7 @@ from runtime.config import SensorSettings
 from runtime.errors import InputError, SensorLost
 from runtime.records import Intrinsics, SensorFrame
 from runtime.sensor.base import Capabilities, Sensor
+from runtime.support.film import open_film
 
 WAITED_NS = 3 * NS_PER_MS  # a picture that comes sooner lay in the driver's queue, and a newer one may
 QUEUE_MAX = 8
@@ -48,7 +49,7 @@ class UsbCameraDriver(Sensor):
         self.close()
         if self._is_device and not Path(self._source).exists():
             raise SensorLost(f"{self._source}: there is no such camera")
-        capture = cv2.VideoCapture(self._source, cv2.CAP_V4L2 if self._is_device else cv2.CAP_FFMPEG)
+        capture = self._opened()
         if not capture.isOpened():
             capture.release()
             raise SensorLost(
@@ -56,6 +57,11 @@ class UsbCameraDriver(Sensor):
             )
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         self._capture = capture
+
+    def _opened(self) -> cv2.VideoCapture:
+        if self._is_device or "://" in self._source:
+            return cv2.VideoCapture(self._source, cv2.CAP_V4L2 if self._is_device else cv2.CAP_FFMPEG)
+        return open_film(Path(self._source))
 
     def read_newest(self, timeout_s: float) -> SensorFrame:
         if self._capture is None:

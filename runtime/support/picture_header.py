@@ -14,6 +14,7 @@ from runtime.support.untrusted_input import LIMITS
 PNG = b"\x89PNG\r\n\x1a\n"
 CHUNK_BYTES = 12  # of a PNG's part without what it holds: length, kind, checksum
 SIDE_MAX_PX = 1 << 16
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM", "TGA")  # Pillow's; of EPS it would start Ghostscript
 ORIENTATION = 0x0112  # EXIF's tag
 TURNED = (5, 6, 7, 8)  # by a quarter: width and height are exchanged
 
@@ -26,7 +27,7 @@ def picture_size(coded: bytes | IO[bytes], *, turned: bool = False) -> tuple[int
         warnings.simplefilter("ignore")  # Pillow's own warning of large pictures: the caller has limits
         most, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
-            with Image.open(io.BytesIO(coded) if isinstance(coded, bytes) else coded) as image:
+            with Image.open(io.BytesIO(coded) if isinstance(coded, bytes) else coded, formats=FORMATS) as image:
                 width, height = image.size
                 is_turned = turned and _orientation(image) in TURNED
         except Exception as error:  # each of Pillow's formats raises its own
@@ -72,15 +73,16 @@ def check_size(width_px: int, height_px: int, *, source: str | Path, field: str 
         raise InputError(source, field, f"{name} {problem}".strip())
 
 
-def check_picture(coded: bytes, *, source: str | Path, field: str, name: str) -> None:
-    """A picture that is whole and within the limit. Raises InputError."""
+def decoded_picture(coded: bytes, *, source: str | Path, field: str, name: str) -> Any:
+    """Pillow's image of a picture that is whole and within the limit. Raises InputError."""
     from PIL import Image
 
     try:
         width, height = picture_size(coded)
         check_size(width, height, source=source, field=field, name=name)
-        with Image.open(io.BytesIO(coded)) as image:
-            image.load()
+        image = Image.open(io.BytesIO(coded), formats=FORMATS)
+        image.load()
+        return image
     except InputError:
         raise
     except Exception:  # each of Pillow's decoders raises its own

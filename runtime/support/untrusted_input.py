@@ -28,6 +28,7 @@ class Limits:
 
     file_bytes: int = 1 << 30  # one file of content or of a recording
     pixels: int = 134_217_728  # of one picture; 16384 x 8192
+    texture_pixels: int = 134_217_728  # of all pictures of a scene together
     triangles: int = 2_000_000  # of a mesh, all instances together
     splats: int = 3_000_000
     instances: int = 2000  # times that meshes stand in a glTF scene

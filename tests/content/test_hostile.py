@@ -7,6 +7,8 @@ import io
 import json
 import os
 import struct
+import subprocess
+import sys
 import time
 import zlib
 from pathlib import Path
@@ -15,14 +17,17 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import EpsImagePlugin, Image
 
-from runtime.config import ContentSettings
+from runtime.clock import MonotonicClock
+from runtime.commands.eyes_looking import _filmed
+from runtime.config import ContentSettings, SensorSettings
 from runtime.content.mesh import load_mesh
 from runtime.content.pictures import open_frames
 from runtime.content.registry import prepare_content
-from runtime.errors import InputError
+from runtime.errors import InputError, SensorLost
 from runtime.optics.stack import PanelStack
+from runtime.sensor.usb_camera import UsbCameraDriver
 from runtime.support.artifacts import read_image
 from runtime.support.progress import listening
 from runtime.support.untrusted_input import LIMITS
@@ -126,6 +131,84 @@ def test_a_playlist_under_a_videos_name_opens_no_other_file(tmp_path: Path, name
     ):
         (tmp_path / name).write_text(text)
         assert "is not a video that can be decoded" in refused(tmp_path / name)
+
+
+def test_a_script_under_a_films_name_opens_no_other_file_for_those_who_look_for_eyes(tmp_path: Path) -> None:
+    other = video(tmp_path / "secret.mp4", (64, 48))
+    for name, text in (("a.mp4", f"ffconcat version 1.0\nfile {other}\n"), ("concat:secret.mp4", "")):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(InputError, match="is not a film that can be decoded"):
+            list(_filmed(tmp_path / name, 30.0))
+        with pytest.raises(SensorLost, match="cannot be opened"):
+            UsbCameraDriver(SensorSettings(source=str(tmp_path / name), fov_deg=60.0), MonotonicClock()).open()
+
+
+def painted(folder: Path, *pictures: bytes) -> Path:
+    """A triangle for each picture."""
+    b = Buffer()
+    corners, uv = b.add([[0, 0, 0], [1, 0, 0], [0, 1, 0]]), b.add([[0, 0], [1, 0], [0, 1]])
+    count = len(pictures)
+    primitives = [{"attributes": {"POSITION": corners, "TEXCOORD_0": uv}, "material": k} for k in range(count)]
+    return b.write(
+        folder / "a.gltf",
+        {},
+        meshes=[{"primitives": primitives}],
+        materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": k}}} for k in range(count)],
+        textures=[{"source": k} for k in range(count)],
+        images=[{"uri": "data:image/png;base64," + base64.b64encode(coded).decode()} for coded in pictures],
+    )
+
+
+def test_pictures_of_the_same_bytes_are_decoded_once_and_all_together_have_a_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Forty textures of one 20 KB picture took 2.8 GB and eight minutes."""
+    monkeypatch.setattr(LIMITS, "texture_pixels", 100_000)
+    parts = load_mesh(painted(tmp_path, *[png(300, 300)] * 40)).parts
+    assert len(parts) == 40 and len({id(part.picture) for part in parts}) == 1
+    told = refused(painted(tmp_path, png(300, 300), png(301, 300)))
+    assert told.endswith("textures' pixels: 180,300 is over the limit of 100,000")
+
+
+def test_a_texture_starts_no_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pillow hands an EPS to Ghostscript."""
+    program = tmp_path / "gs"
+    program.write_text(f"#!/bin/sh\ntouch {tmp_path}/started\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)
+    eps = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 64 64\n%%EndComments\nshowpage\n%%EOF\n"
+    assert "is not an image that can be decoded" in refused(painted(tmp_path, eps))
+    assert not (tmp_path / "started").exists()
+
+
+READS = """
+import resource, sys
+from pathlib import Path
+from runtime.support.artifacts import read_image
+resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+print(read_image(Path(sys.argv[1])).shape, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+
+
+def test_a_transparent_picture_of_sixteen_bits_takes_little_more_memory_than_its_pixels(tmp_path: Path) -> None:
+    """One megabyte of file took 11 GB: 82 bytes a pixel."""
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((2048, 2048, 4), 0x8080, np.uint16))
+    command = [sys.executable, "-c", READS, str(tmp_path / "a.png")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    shape, _, used = done.stdout.rpartition(" ")
+    assert shape == "(2048, 2048, 3)" and int(used) * 1024 < 30 * 2048 * 2048
+
+
+@pytest.mark.parametrize("text", ["{}=1", "[{}]", "a={{{}=1}}", 'a=["""\n", """, {{{}=1}}]'])
+@pytest.mark.parametrize("part", ["a", '"a,=[]"', "'\"'"])
+def test_a_key_of_very_many_parts_is_refused_before_it_is_read(tmp_path: Path, text: str, part: str) -> None:
+    """Eighty kilobytes took 5.4 GB."""
+    (tmp_path / "list.toml").write_text(text.format(".".join([part] * 20_000)))
+    begun_s = time.monotonic()
+    assert "a key of more than 16 parts" in refused(tmp_path / "list.toml")
+    assert time.monotonic() - begun_s < 5
 
 
 def ply(folder: Path, vertices: Any, faces: Any, form: str = "binary_little_endian") -> Path:

@@ -136,6 +136,8 @@ def test_a_password_is_in_no_name_and_no_log(context: Any, stack: PanelStack, mo
         ("live:film.mp4", {}, "content: scene: `live:` is gone: a film plays by its own name, film.mp4"),
         ("gopher://x", {}, "content: scene: gopher:// is none of rtsp"),
         ("file:///etc/passwd", {}, "content: scene: file:// is none of"),
+        ("tcp://0.0.0.0:9/?listen=1", {}, "content: scene: an address that others may send to is not opened"),
+        ("srt://:9?latency=2&mode=listener", {}, "content: scene: an address that others may send to is not opened"),
         ("rtsp://127.0.0.1:9/x", {"layout": "rgbd"}, "content: layout: rgbd is not for live pictures"),
     ],
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from runtime.model.onnx_bytes import digest, has_external_data
 from runtime.model.predictor import SHIPPED, load_predictor, model_path
 from runtime.model.session import ModelSession
 from runtime.support.onnx_runtime import onnxruntime
+from runtime.support.untrusted_input import LIMITS
 from tests.model.scenes import STACK
 
 
@@ -152,3 +154,26 @@ def test_a_provider_that_is_installed_and_does_not_start_is_refused(monkeypatch:
     monkeypatch.setattr(session, "onnxruntime", lambda: Module)
     with pytest.raises(MissingPart, match=r"model\.provider: cuda is installed and does not start here"):
         ModelSession(path, provider="cuda")
+
+
+def test_constants_that_are_worked_out_to_all_memory_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A model of 6 KB took 17.5 GB: a constant, doubled again and again when the model is loaded."""
+    monkeypatch.setattr(session, "MEMORY_MAX", 1 << 29)
+    nodes = [helper.make_node("Concat", [f"x{k}", f"x{k}"], [f"x{k + 1}"], axis=0) for k in range(31)]
+    nodes.append(helper.make_node("ReduceSum", ["x31"], ["y"], keepdims=0))
+    output = helper.make_tensor_value_info("y", TensorProto.FLOAT, None)
+    grows = helper.make_graph(nodes, "g", [], [output], [numpy_helper.from_array(np.ones(1, np.float32), "x0")])
+    model = helper.make_model(grows, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    (tmp_path / "grows.onnx").write_bytes(model.SerializeToString())
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match="its constants take more than 512 MiB"):
+        ModelSession(tmp_path / "grows.onnx")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100 << 10
+
+
+def test_a_model_that_takes_for_ever_to_load_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(LIMITS, "load_s", 0.01)
+    with pytest.raises(InputError, match=r"takes longer to load than 0\.01 s"):
+        ModelSession(saved(shipped(), tmp_path, name="slow"))
