@@ -10,7 +10,7 @@ from typing import Any
 
 
 class Key(Enum):
-    """What a key means here."""
+    """What a key means here; a digit's name ends in it."""
 
     ACCEPT = auto()
     NEXT = auto()
@@ -23,6 +23,17 @@ class Key(Enum):
     COARSER = auto()
     UNDO = auto()
     QUIT = auto()
+    POINT = auto()
+    DIGIT_0 = auto()
+    DIGIT_1 = auto()
+    DIGIT_2 = auto()
+    DIGIT_3 = auto()
+    DIGIT_4 = auto()
+    DIGIT_5 = auto()
+    DIGIT_6 = auto()
+    DIGIT_7 = auto()
+    DIGIT_8 = auto()
+    DIGIT_9 = auto()
 
 
 # What a key means: GLFW's names of it, and its bytes in a terminal.
@@ -38,7 +49,9 @@ _MEANINGS: dict[Key, tuple[str, tuple[bytes, ...]]] = {
     Key.COARSER: ("C", (b"c",)),
     Key.UNDO: ("U BACKSPACE", (b"u", b"\x7f", b"\x08")),
     Key.QUIT: ("Q ESCAPE", (b"q", b"\x04")),
-}
+    Key.POINT: ("PERIOD COMMA KP_DECIMAL", (b".", b",")),
+} | {Key[f"DIGIT_{n}"]: (f"{n} KP_{n}", (b"%d" % n,)) for n in range(10)}  # fmt: skip
+TYPED = {Key.POINT: "."} | {Key[f"DIGIT_{n}"]: str(n) for n in range(10)}
 _OF_BYTES = {data: key for key, (_, pieces) in _MEANINGS.items() for data in pieces}
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import shlex
+import subprocess
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +17,7 @@ from calib.capture_run import capture_live
 from calib.config_file import put, put_lut, put_monitors, rewrite
 from calib.grey_chart import grey_chart, lut_from_photographs
 from calib.hardware import Say, SetupHardware
-from calib.keys import Key
+from calib.keys import TYPED, Key
 from calib.registration_run import register_photos
 from calib.service_files import gather
 from calib.solve_run import solve_file
@@ -59,7 +62,8 @@ class Setup:
         if before:
             self.say(before)
         self.say(f"{question}  ({keys}; q: stop)")
-        self.hardware.show_words(self.settings, [line for line in (question, f"{keys}; q: stop", before) if line])
+        lines = (*question.splitlines(), f"{keys}; q: stop", before)
+        self.hardware.show_words(self.settings, [line for line in lines if line])
         key = self.hardware.key()
         if key is Key.QUIT:
             raise Stopped
@@ -86,7 +90,7 @@ def identify(setup: Setup) -> Figures:
     monitors = hardware.monitors()
     if len(monitors) < count:
         raise InputError(setup.config, "stack.x_m", f"{len(monitors)} monitors for {count} panels")
-    free, taken = list(range(len(monitors))), []  # the first of those that are free shows its card
+    free, taken = list(range(len(monitors))), list[int]()  # the first of those that are free shows its card
     tables: list[dict[str, Any]] = []
 
     def ask(question: str, keys: str, answers: Container[Key]) -> Key:
@@ -97,23 +101,35 @@ def identify(setup: Setup) -> Figures:
                 raise Stopped
         return key
 
+    arrows: list[Arrow] = []  # of the panels that are taken, and of the next one once it is known
+    asked = 0  # of the panel: whether it is the one, its arrow, its writing
     while len(tables) < count:
         place = {0: "the rearmost, at the backlight", count - 1: "the front one"}.get(len(tables), "the next one")
-        keys, answers = "Enter: yes, n: another monitor, u: one back", (Key.ACCEPT, Key.NEXT, Key.UNDO)
-        key = ask(f"Is it panel {len(tables)}, {place}?", keys, answers)
-        if key is Key.NEXT:
+        question, keys, answers = (
+            (f"Is it panel {len(tables)}, {place}?", "Enter: yes, n: another monitor", {Key.ACCEPT, Key.NEXT}),
+            ("Which way does its arrow point, seen from the front?", "arrow keys", set(ARROWS)),
+            ("Does its writing read rightly?", "Enter: yes, n: it is mirrored", {Key.ACCEPT, Key.NEXT}),
+        )[asked]
+        key = ask(question, f"{keys}, u: one back", answers | {Key.UNDO})
+        if key is Key.UNDO:
+            if asked == 0 and taken:
+                free.insert(0, taken.pop())
+                tables.pop()
+                asked = 3
+            elif asked == 2:
+                arrows.pop()
+            asked = max(0, asked - 1)
+        elif asked == 0 and key is Key.NEXT:
             free.append(free.pop(0))
-        elif key is Key.ACCEPT:
-            arrow = ARROWS[ask("Which way does its arrow point, seen from the front?", "arrow keys", ARROWS)]
-            yes_no = (Key.ACCEPT, Key.NEXT)
-            mirrored = ask("Does its writing read rightly?", "Enter: yes, n: it is mirrored", yes_no) is Key.NEXT
-            rotation_deg, mirror = mounting_of(arrow, mirrored=mirrored)
+        elif asked < 2:
+            arrows += [ARROWS[key]] if asked == 1 else []
+            asked += 1
+        else:
+            rotation_deg, mirror = mounting_of(arrows[-1], mirrored=key is Key.NEXT)
             named = _name_of(monitors[free[0]], monitors)
             tables.append(named | {"rotation_deg": rotation_deg, "mirror": mirror})
             taken.append(free.pop(0))
-        elif taken:
-            free.insert(0, taken.pop())
-            tables.pop()
+            asked = 0
     setup.write(lambda document: put_monitors(document, tables))
     return {"text": f"{count} bound to their monitors"}
 
@@ -126,7 +142,7 @@ def _name_of(monitor: Monitor, monitors: Sequence[Monitor]) -> dict[str, Any]:
 
 @dataclass
 class Dial:
-    """A number that arrows change."""
+    """A number that arrows change, or that is typed."""
 
     name: str
     value: float
@@ -141,6 +157,18 @@ class Dial:
             self.value = self.unknown if steps > 0 else 0.0
         else:
             self.value = min(max(self.value + steps * self.step, self.low), self.high)
+
+    def take(self, typed: str) -> str:
+        """What was typed, in the unit that it is shown in; returns why it can't be (empty: it is)."""
+        unit = 1e-3 if self.show is _mm else 1.0
+        try:
+            value = float(typed) * unit
+        except ValueError:
+            return f"{typed} is no number"
+        if not self.low <= value <= self.high:
+            return f"{typed}: {self.name} is between {self.show(self.low)} and {self.show(self.high)}"
+        self.value = value
+        return ""
 
 
 def _mm(value: float) -> str:
@@ -184,14 +212,29 @@ def geometry(setup: Setup) -> Figures:
 
 def _turn_dials(setup: Setup, dials: list[Dial]) -> None:
     chosen, coarse = 0, 1  # which dial; how many of its steps at once
+    typed, problem, before = "", "", list[tuple[int, float]]()  # what the dials were, to take back
     while True:
-        key = setup.ask(
-            f"{dials[chosen].name}: {dials[chosen].show(dials[chosen].value)}",
-            "left, right: change; f, c: finer, coarser; up, down: another number; Enter: all are right",
-        )
+        lines = [f"{'>' if dial is dials[chosen] else ' '} {dial.name}: {dial.show(dial.value)}" for dial in dials]
+        lines[chosen] += f" -> {typed}" if typed else ""
+        keys = "digits, or left, right (f, c: finer, coarser): change; up, down: another number; u: one back"
+        key, problem = setup.ask("\n".join(lines), f"{keys}; Enter: {'take it' if typed else 'all are right'}",
+                                 before=problem), ""  # fmt: skip
+        if key in (Key.LEFT, Key.RIGHT) or (typed and key is Key.ACCEPT):
+            before.append((chosen, dials[chosen].value))
+        if key not in TYPED and key not in (Key.ACCEPT, Key.UNDO):
+            typed = ""
         match key:
+            case key if key in TYPED:
+                typed += TYPED[key]
+            case Key.ACCEPT if typed:
+                typed, problem = "", dials[chosen].take(typed)
             case Key.ACCEPT:
                 return
+            case Key.UNDO if typed:
+                typed = typed[:-1]
+            case Key.UNDO if before:
+                chosen, value = before.pop()
+                dials[chosen].value = value
             case Key.UP:
                 chosen = (chosen - 1) % len(dials)
             case Key.DOWN:
@@ -302,15 +345,25 @@ def calibration(setup: Setup) -> Figures:
 
 
 def service(setup: Setup) -> Figures:
-    """A folder with all that the service reads, and the commands that install it: they need another user's rights."""
-    files = gather(setup.config, setup.out / "service")
+    """A folder with all that the service reads, and the commands that apply it, which are run where they may be."""
     folder = (setup.out / "service").resolve()
+    files = gather(setup.config, folder)
+    sudo = "" if os.geteuid() == 0 else "sudo "
     commands = [
-        f"sudo install -D -m 644 -t {SERVICE_FOLDER} {folder}/*",
-        "sudo systemctl enable --now phasestack",
+        f"{sudo}install --backup=numbered -D -m 644 -t {SERVICE_FOLDER} {shlex.quote(str(folder))}/*",
+        f"{sudo}systemctl enable phasestack",
+        f"{sudo}systemctl restart phasestack",
     ]
-    setup.say("the service reads its own copy of all this; it is installed by\n  " + "\n  ".join(commands))
-    return {"text": f"{len(files)} files; at every start: {'; '.join(commands)}"}
+    told = "; ".join(commands)
+    if setup.hardware.simulated or sudo:
+        setup.say("the service reads its own copy of all this; apply it by\n  " + "\n  ".join(commands))
+        return {"text": f"{len(files)} files; apply them by: {told}"}
+    setup.hardware.let_go()  # the panels, which the service wants
+    for command in commands:
+        result = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
+        if result.returncode != 0:
+            raise InputError(setup.config, "service", f"{command}: {result.stderr.strip() or 'failed'}")
+    return {"text": f"{len(files)} files, applied: {told} (the files before: *.~1~)"}
 
 
 STEPS = (
@@ -322,5 +375,5 @@ STEPS = (
     Step("sensor", "The depth sensor", "which one sees the viewer's eyes", sensor),
     Step("calibration", "Where the sensor stands", "you stand where lines fuse, and press Enter: 27 places, or 9 "
          "(q: enough)", calibration),
-    Step("service", "At every start", "what the service reads, gathered in a folder, and how it is installed", service),
+    Step("service", "At every start", "what the service reads is gathered in a folder and, by root, applied", service),
 )  # fmt: skip

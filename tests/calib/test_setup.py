@@ -18,7 +18,7 @@ import pytest
 from calib.hardware import SimulatedHardware
 from calib.keys import Key
 from calib.setup_run import progress_path, read_progress, walk_through
-from calib.setup_steps import STEPS, Setup, geometry, identify
+from calib.setup_steps import STEPS, Setup, geometry, identify, service
 from calib.viewpoints import grid
 from runtime.config import Settings, load_settings
 from runtime.errors import InputError
@@ -134,6 +134,24 @@ class Scripted:
         self.setup = Setup(tmp_path / "c.toml", tmp_path / "out", self.hardware, self.said.append)
 
 
+def test_as_root_the_last_step_applies_what_was_made_and_keeps_the_files_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scripted, installed = Scripted(tmp_path, []), tmp_path / "etc"
+    scripted.hardware.simulated = False
+    monkeypatch.setattr("calib.setup_steps.SERVICE_FOLDER", str(installed))
+    monkeypatch.setattr("os.geteuid", lambda: 0)
+    (tmp_path / "systemctl").write_text(f'#!/bin/sh\necho "$@" >> {tmp_path}/asked\n')
+    (tmp_path / "systemctl").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    for width_px in (640, 1280):
+        (tmp_path / "c.toml").write_text(f"[stack]\nwidth_px = {width_px}\nheight_px = {width_px * 9 // 16}\n")
+        assert "applied" in service(scripted.setup)["text"]
+    assert load_settings(installed / "phasestack.toml").stack.width_px == 1280
+    assert "width_px = 640" in (installed / "phasestack.toml.~1~").read_text()
+    assert (tmp_path / "asked").read_text() == "enable phasestack\nrestart phasestack\n" * 2
+
+
 def test_a_step_that_is_done_is_where_it_goes_on_after(tmp_path: Path) -> None:
     first = Scripted(tmp_path, [Key.NEXT, Key.ACCEPT, Key.ACCEPT, Key.QUIT])
     assert not walk_through(first.setup)
@@ -167,6 +185,28 @@ def test_sizes_are_set_with_arrows_and_measured_distances_stay(tmp_path: Path) -
     assert load_settings(config).stack.x_m == pytest.approx((-0.0587, 0.0, 0.0587))
 
 
+def test_an_answer_about_a_panel_can_be_taken_back_alone(tmp_path: Path) -> None:
+    wrong = [Key.ACCEPT, Key.UP, Key.UNDO, Key.DOWN, Key.NEXT]  # the arrow, before the writing; and the writing, after
+    pressed = [*wrong, Key.UNDO, Key.ACCEPT, *[Key.ACCEPT, Key.UP, Key.ACCEPT] * 2]
+    identify(Scripted(tmp_path, pressed).setup)
+    panels = load_settings(tmp_path / "c.toml").output.panels
+    assert [(panel.rotation_deg, panel.mirror) for panel in panels] == [(180, "none"), (0, "none"), (0, "none")]
+
+
+def test_sizes_are_typed_seen_before_they_are_right_and_taken_back(tmp_path: Path) -> None:
+    digits = {**{str(n): Key[f"DIGIT_{n}"] for n in range(10)}, ".": Key.POINT}
+    typed = [*(digits[c] for c in "3445"), Key.UNDO, digits["."], digits["2"]]
+    height = [Key.DOWN, *(digits[c] for c in "99999"), Key.ACCEPT, *(digits[c] for c in "193.6"), Key.ACCEPT]
+    scripted = Scripted(tmp_path, [*typed, Key.ACCEPT, *height, Key.RIGHT, Key.UNDO, Key.ACCEPT])
+    geometry(scripted.setup)
+    found = load_settings(tmp_path / "c.toml").stack
+    assert (found.width_m, found.height_m) == pytest.approx((0.3442, 0.1936))
+    assert any("its height is between 20.0 mm and 5000.0 mm" in said for said in scripted.said)
+    last = scripted.said[-1]
+    for shown in ("344.2 mm", "193.6 mm", "60.0 mm", "viewer", "Enter: all are right"):
+        assert shown in last
+
+
 def test_panels_already_known_keep_their_registration_when_they_are_identified_again(tmp_path: Path) -> None:
     hardware = simulated(1)
     meanings = {"\n": Key.ACCEPT, "n": Key.NEXT, UP: Key.UP, DOWN: Key.DOWN}
@@ -197,10 +237,11 @@ class FourMonitors(SimulatedHardware):
 
 def test_a_monitor_is_named_by_a_serial_of_its_own_and_an_answer_can_be_taken_back(tmp_path: Path) -> None:
     taken = [Key.ACCEPT, Key.UP, Key.ACCEPT]
-    pressed = iter([Key.NEXT, *taken, *[Key.NEXT] * 3, Key.UNDO, *[Key.NEXT] * 3, *taken * 3])
+    back = [Key.UNDO] * 3  # its writing, its arrow, whether it is the one
+    pressed = iter([Key.NEXT, *taken, *[Key.NEXT] * 3, *back, *[Key.NEXT] * 3, *taken * 3])
     hardware = FourMonitors(lambda: next(pressed), STACK, say=lambda text: None)
     identify(Setup(tmp_path / "c.toml", tmp_path / "out", hardware, lambda text: None))
-    assert hardware.shown[:9] == [0, 1, 1, 1, 2, 3, 0, 2, 1], "what is taken is not offered, until it is taken back"
+    assert hardware.shown[:10] == [0, 1, 1, 1, 2, 3, 0, 2, 1, 1], "what is taken is not offered, until it is taken back"
     panels = load_settings(tmp_path / "c.toml").output.panels
     assert [panel.edid_serial or panel.connector for panel in panels] == ["S", "HDMI-1", "HDMI-2"]
 
