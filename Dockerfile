@@ -11,8 +11,11 @@
 #     --device /dev/dri --group-add "$(getent group render | cut -d: -f3)" \
 #     -v /dev/bus/usb:/dev/bus/usb --device-cgroup-rule 'c 189:* rmw' \
 #     --group-add "$(getent group plugdev | cut -d: -f3)" \
-#     -v /etc/phasestack:/etc/phasestack:ro \
+#     -v /etc/phasestack:/etc/phasestack:ro -v phasestack-run:/run/phasestack \
 #     phasestack run --config /etc/phasestack/phasestack.toml
+# Its page, at http://localhost:8717 (the token: docker exec page cat page-token):
+#   docker run -d --name page --network host -v phasestack-run:/run/phasestack phasestack page \
+#     --token-file page-token
 # NVIDIA: --gpus all -e NVIDIA_DRIVER_CAPABILITIES=all in place of --device /dev/dri.
 
 # The digest of the index of all architectures, as others pin it too (where this was written no image registry could be
@@ -22,9 +25,9 @@ ARG BASE=python:3.11.14-slim-bookworm@sha256:65a93d69fa75478d554f4ad27c85c1e69fa
 FROM ${BASE} AS build
 WORKDIR /src
 # Dependencies first: they change less often than the program.
-COPY requirements/runtime.lock requirements/runtime.lock
+COPY requirements/runtime.lock requirements/page.lock requirements/
 RUN python -m venv /opt/phasestack \
- && /opt/phasestack/bin/pip install --no-cache-dir -r requirements/runtime.lock
+ && /opt/phasestack/bin/pip install --no-cache-dir -r requirements/runtime.lock -r requirements/page.lock
 COPY pyproject.toml README.md ./
 COPY phasestack phasestack
 COPY runtime runtime
