@@ -31,31 +31,52 @@ if [ -z "$DESTDIR" ] && [ "$(id -u)" != 0 ]; then
 fi
 
 library=/opt/phasestack/lib
-put() { install -D -m "$1" "$here/$2" "$DESTDIR$3"; }
+kept=$(mktemp -d)
+trap 'rm -rf "$kept"' EXIT
+live=no running=''
+if [ -z "$DESTDIR" ] && [ -d /run/systemd/system ]; then
+  live=yes
+fi
+# What is replaced is kept until the new one runs.
+put() {
+  [ ! -e "$DESTDIR$3" ] || install -D -m "$1" "$DESTDIR$3" "$kept/tree$3"
+  case $2 in /*) from=$2 ;; *) from=$here/$2 ;; esac
+  install -D -m "$1" "$from" "$DESTDIR$3"
+}
 
 if [ "${APP:-yes}" != no ]; then
   # An earlier installation may have made it for root alone.
   install -d -m 755 "$DESTDIR/opt/phasestack"
   rm -rf "$DESTDIR$library.new"
-  "$python" -m pip install --quiet --no-compile --target "$DESTDIR$library.new" -r "$source/requirements/runtime.lock" \
+  "$python" -m pip install --quiet --root-user-action=ignore --target "$DESTDIR$library.new" -r "$source/requirements/runtime.lock" \
     -r "$source/requirements/page.lock"
   # From a copy: what an earlier build left beside the source would come along, modules that are gone included.
-  copy=$(mktemp -d)
-  trap 'rm -rf "$copy"' EXIT
-  (cd "$source" && cp -r pyproject.toml README.md runtime calib model_export "$copy")
-  "$python" -m pip install --quiet --no-compile --no-deps --target "$DESTDIR$library.new" "$copy"
-  # The old program stays whole until the new one is.
-  rm -rf "$DESTDIR$library"
-  mv "$DESTDIR$library.new" "$DESTDIR$library"
+  (cd "$source" && mkdir "$kept/source" && cp -r pyproject.toml README.md runtime calib model_export "$kept/source")
+  "$python" -m pip install --quiet --root-user-action=ignore --no-deps --target "$DESTDIR$library.new" "$kept/source"
 fi
 
-mkdir -p "$DESTDIR/usr/bin"
-cat > "$DESTDIR/usr/bin/phasestack" <<LAUNCHER
+# What runs must not load the new program's modules into the old one.
+if [ "$live" = yes ]; then
+  for unit in phasestack-page phasestack phasestack-x; do
+    case $(systemctl show --property=ActiveState --value "$unit") in
+      inactive | failed) ;;
+      *) running="$unit $running" ;;
+    esac
+  done
+  # shellcheck disable=SC2086
+  [ -z "$running" ] || systemctl stop $running
+fi
+if [ "${APP:-yes}" != no ]; then
+  rm -rf "$DESTDIR$library.old"
+  [ ! -e "$DESTDIR$library" ] || mv "$DESTDIR$library" "$DESTDIR$library.old"
+  mv "$DESTDIR$library.new" "$DESTDIR$library"
+fi
+cat > "$kept/launcher" <<LAUNCHER
 #!/bin/sh
 export ORT_DISABLE_TELEMETRY=1
 PYTHONPATH=$library exec $python -sP -c 'import sys; sys.argv[0] = "phasestack"; from runtime.cli import main; main()' "\$@"
 LAUNCHER
-chmod 755 "$DESTDIR/usr/bin/phasestack"
+put 755 "$kept/launcher" /usr/bin/phasestack
 
 put 644 phasestack.service /usr/lib/systemd/system/phasestack.service
 put 644 phasestack-x.service /usr/lib/systemd/system/phasestack-x.service
@@ -75,12 +96,25 @@ put 644 ../THIRD_PARTY.md /usr/share/doc/phasestack/THIRD_PARTY.md
 # What the operator has written is never replaced.
 [ -e "$DESTDIR/etc/phasestack/phasestack.toml" ] || put 644 phasestack.toml /etc/phasestack/phasestack.toml
 
-if [ -z "$DESTDIR" ] && [ -d /run/systemd/system ]; then
+if [ "$live" = yes ]; then
   systemd-sysusers
   systemd-tmpfiles --create phasestack.conf
-  udevadm control --reload && udevadm trigger --subsystem-match=usb
+  { udevadm control --reload && udevadm trigger --subsystem-match=usb; } || echo "install: no udev runs here"
   systemctl daemon-reload
+  # shellcheck disable=SC2086
+  if [ -n "$running" ] && ! systemctl start $running; then
+    echo "install: the new one does not start; back to the one before. Why:" >&2
+    systemctl show phasestack --property=StatusText --value >&2
+    systemctl stop $running 2>/dev/null || true
+    rm -rf "$library.new"
+    [ ! -e "$library.old" ] || { mv "$library" "$library.new" && mv "$library.old" "$library" && rm -rf "$library.new"; }
+    cp -a "$kept/tree/." /
+    systemctl daemon-reload
+    systemctl start $running
+    exit 1
+  fi
 fi
+rm -rf "$DESTDIR$library.old"
 cat <<NEXT
 phasestack is installed${DESTDIR:+ in $DESTDIR}. Next:
   1. edit /etc/phasestack/phasestack.toml (phasestack identify, phasestack doctor)

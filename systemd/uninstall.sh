@@ -34,6 +34,7 @@ rm -f "$DESTDIR/usr/bin/phasestack" \
   "$DESTDIR/usr/lib/sysusers.d/phasestack.conf" \
   "$DESTDIR/usr/lib/tmpfiles.d/phasestack.conf" \
   "$DESTDIR/usr/lib/udev/rules.d/70-phasestack-sensors.rules"
+rm -f /run/phasestack.failures /run/phasestack-x.failures
 rm -rf "$DESTDIR/usr/lib/phasestack" "$DESTDIR/opt/phasestack" "$DESTDIR/usr/share/doc/phasestack" \
   "$DESTDIR/usr/lib/systemd/system/phasestack.service.d"
 if [ "${PURGE:-no}" = yes ]; then
@@ -41,6 +42,10 @@ if [ "${PURGE:-no}" = yes ]; then
 fi
 if [ "$live" = yes ]; then
   systemctl daemon-reload
-  udevadm control --reload
+  udevadm control --reload 2>/dev/null || true
 fi
 echo "phasestack is removed${DESTDIR:+ from $DESTDIR}"
+for left in /etc/phasestack /var/lib/phasestack /var/cache/phasestack; do
+  [ ! -e "$DESTDIR$left" ] || echo "  left: $DESTDIR$left (PURGE=yes takes it)"
+done
+[ "$live" = no ] || ! id phasestack >/dev/null 2>&1 || echo "  left: the user and group phasestack (userdel phasestack)"

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 Verdict = Literal["ok", "warn", "fail", "skip"]
 CHECK_SENSOR_FOR_S = 3.0
 HUNG_AFTER_S = 5.0
+SERVICE_CONFIG = Path("/etc/phasestack/phasestack.toml")
 NO_DEVICE = ("replay", "fixed")  # drivers that need no device
 
 
@@ -39,6 +40,9 @@ class Row:
 
 def doctor(
     config: Annotated[Path | None, typer.Option(help="configuration to check; without one, the defaults")] = None,
+    as_service: Annotated[
+        bool, typer.Option("--service", help="as root: with the service's user, groups, environment and configuration")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="one JSON object on stdout")] = False,
 ) -> None:
     """Check settings, sensor, permissions, OpenGL, monitors and their binding, scene, model, calibration, the service.
@@ -46,9 +50,14 @@ def doctor(
     What is only unusual is a warning. Exits with 1 where a check fails.
 
     Example: phasestack doctor --config /etc/phasestack/phasestack.toml
+
+    Example: sudo phasestack doctor --service
     """
     from runtime.config import load_settings
 
+    if as_service:
+        _become_service()
+        config = config or SERVICE_CONFIG
     rows = examine(load_settings(config))
     failed = sum(row.state == "fail" for row in rows)
     if as_json:
@@ -59,6 +68,33 @@ def doctor(
             typer.echo(f"{row.state:5} {row.name}: {row.detail}{remedy}")
     if failed:
         raise typer.Exit(1)
+
+
+def _become_service() -> None:
+    """The rest of this process is as systemd would start the daemon, but for the unit's sandbox. Raises InputError."""
+    import grp
+    import pwd
+    import shlex
+    import subprocess
+
+    from runtime.errors import InputError
+
+    wanted = ("LoadState", "User", "Group", "SupplementaryGroups", "Environment", "WorkingDirectory", "StateDirectory")
+    try:
+        shown = subprocess.run(
+            ["systemctl", "show", "phasestack", f"--property={','.join(wanted)}"], capture_output=True, text=True
+        ).stdout
+        unit = dict(line.partition("=")[::2] for line in shown.splitlines())
+        if unit.get("LoadState") != "loaded":
+            raise InputError("doctor", "--service", "no phasestack.service is installed here")
+        os.setgroups([grp.getgrnam(name).gr_gid for name in unit["SupplementaryGroups"].split()])
+        os.setgid(grp.getgrnam(unit["Group"]).gr_gid)
+        os.setuid(pwd.getpwnam(unit["User"]).pw_uid)
+        os.chdir(unit["WorkingDirectory"])
+    except (OSError, KeyError) as error:
+        raise InputError("doctor", "--service", f"can't become the service's user ({error}): sudo, or root") from None
+    os.environ |= dict(entry.partition("=")[::2] for entry in shlex.split(unit["Environment"]))
+    os.environ["STATE_DIRECTORY"] = f"/var/lib/{unit['StateDirectory']}"
 
 
 Check = Callable[["Settings"], Iterator[Row]]

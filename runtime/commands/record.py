@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -86,9 +87,12 @@ def _refuse_target(out: Path, *, motion: bool) -> None:
     checked_path(out, source="record", field="--out")
     if out.suffix.lower() != SUFFIX:
         raise InputError(out, "--out", f"must end in {SUFFIX}: recordings are MCAP files")
-    if out.is_dir():
+    if os.path.isdir(out):  # noqa: PTH112 - a Path raises where a folder above it is forbidden
         raise InputError(out, "--out", "is a folder")
-    if not (out.exists() or out.is_symlink()):
+    if not os.path.lexists(out):
+        folder = next(folder for folder in out.absolute().parents if os.path.lexists(folder))
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise InputError(out, "--out", "cannot be written (Permission denied)")
         return
     try:
         if motion and Recording(out).header.driver == "motion":

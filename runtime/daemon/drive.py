@@ -15,7 +15,7 @@ from runtime.support import progress
 from runtime.support.background import wait_for_all
 from runtime.support.figures import lines_of
 
-JOBS_END_WITHIN_S = 3.0  # what is still loading at the end
+JOBS_END_WITHIN_S = 0.5  # what is still loading at the end
 
 
 def drive(settings: Settings, options: RunOptions, host: Host | None = None) -> dict[str, Any]:

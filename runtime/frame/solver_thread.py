@@ -91,12 +91,13 @@ class SolverThread(SolverHost):
     def do(self, task: Task) -> None:
         self._tasks.put(task)
 
-    def close(self, timeout_s: float = 5.0) -> None:
+    def close(self, timeout_s: float = 1.0) -> None:
+        """One that is still being made is not waited for: the process ends without it (`commands.guard`)."""
         self._closing.set()
         with self._lock:
             self._lock.notify_all()
         thread = self._attempt.thread
-        if thread is not None and thread is not threading.current_thread():
+        if thread is not None and thread is not threading.current_thread() and self._attempt.ready.is_set():
             thread.join(timeout_s)
 
     def _late_reason(self) -> str:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -114,6 +116,23 @@ def test_a_name_that_is_not_a_recordings_is_refused_before_anything_is_recorded(
     answer = CliRunner().invoke(app, ["--motion", "still", "--out", f"{tmp_path}/{name}"])
     assert isinstance(answer.exception, InputError)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can be another user")
+@pytest.mark.parametrize("folder", ["closed", "closed/new", "bare"])
+def test_a_forbidden_place_is_refused_in_one_line(folder: str) -> None:
+    """For nobody (65534): a folder that may not be looked into, and one that may not be written to."""
+    with tempfile.TemporaryDirectory() as root:
+        Path(root).chmod(0o755)
+        (Path(root) / "bare").mkdir(mode=0o755)
+        (Path(root) / "closed").mkdir(mode=0o700)
+        os.seteuid(65534)
+        try:
+            answer = CliRunner().invoke(app, ["--seconds", "0.5", "--out", f"{root}/{folder}/a.mcap"])
+        finally:
+            os.seteuid(0)
+    assert isinstance(answer.exception, InputError)
+    assert "cannot be written (Permission denied)" in str(answer.exception)
 
 
 def test_images_of_a_sensor_that_has_none_are_not_claimed(tmp_path: Path) -> None:
