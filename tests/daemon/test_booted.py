@@ -281,6 +281,7 @@ def test_a_reboot_a_power_cut_a_full_disk_and_a_missing_panel_leave_nobody_waiti
     pc.done("systemctl enable var-lib-phasestack.mount var-cache-phasestack.mount; sync")
     pc.cut()
     pc.boot()
+    assert eventually(lambda: pc.is_active("var-lib-phasestack.mount", "var-cache-phasestack.mount"))
     for what in ("lib", "cache"):
         assert pc.run(f"head -c 8M /dev/zero > /var/{what}/phasestack/full").returncode != 0
     assert eventually(lambda: pc.is_active(*UP) and pc.shows(), within_s=120)
