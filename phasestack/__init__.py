@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from phasestack.pair import Result, solve
+from phasestack.pair import Result, camera, evaluate, project, solve
 from phasestack.pictures import find_eyes
+from phasestack.stack import Stack
 from runtime.content.base import ContentSource
 from runtime.errors import SensorLost, SensorTimeout
 from runtime.evaluation.solved import PairQuality as Quality
 from runtime.eyes.pupils import Pupils
-from runtime.optics.stack import PanelStack as Stack
 from runtime.records import EyePoints, SensorFrame
 from runtime.sensor.base import Capabilities, DeviceClock, Sensor
+from runtime.support.version import version
+
+__version__ = version()
 
 __all__ = [
     "Capabilities",
@@ -25,6 +28,10 @@ __all__ = [
     "SensorLost",
     "SensorTimeout",
     "Stack",
+    "__version__",
+    "camera",
+    "evaluate",
     "find_eyes",
+    "project",
     "solve",
 ]

@@ -1,14 +1,16 @@
-"""Two pictures, two eyes and a stack of panels to layers, from Python."""
+"""Two pictures, two eyes and a stack of panels to layers, and anybody's layers to what the eyes make of them."""
 
 from __future__ import annotations
 
 import html
+import os
 import tempfile
 import time
+import warnings
 import webbrowser
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -17,37 +19,73 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from phasestack.pictures import as_codes, as_picture
-from runtime.config import StackGeometry, validated
+from phasestack.stack import checked_stack
 from runtime.errors import InputError, ModelFailure
+from runtime.evaluation.displayed import Picture
 from runtime.evaluation.solved import PairQuality, SolvedPair, judged
 from runtime.model.job import Job
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.model.still import solve_still
 from runtime.model.trim import Scene, trim
+from runtime.optics.cameras import as_cameras, doubts, looking_at_origin
+from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack
+from runtime.optics.views import image_from_stack
 from runtime.records import F64, U8
 from runtime.support.artifacts import OutputFolder, write_json
-from runtime.support.ranges import FOV_RANGE_DEG
+from runtime.support.ranges import EYE_MOST_M, FOV_RANGE_DEG, refusal
 
 SEPARATION_MIN_M = 0.005
+SAME_PLACE_M = 0.001  # an eye and its camera
 _one_at_a_time = Lock()  # a loaded model has buffers of its own
 
+Eyes = Sequence[Sequence[float]] | F64
+Cameras = Sequence[Sequence[Sequence[float]]] | F64
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(frozen=True)
+class _Pair:
+    """What is asked for, checked: pictures of pinhole eyes that look at the stack's origin."""
+
+    pictures: tuple[Picture, ...]
+    eyes_m: F64
+    stack: PanelStack
+    fov_deg: float
+
+    def judged(self, layers: U8) -> SolvedPair:
+        """What the eyes make of layers."""
+        return judged(layers, self.pictures, self.stack, eyes_m=self.eyes_m, fov_deg=self.fov_deg)
+
+
 class Result:
     """Layers for a pair of pictures, and what the eyes make of them."""
 
     layers: U8  # (panels, h, w, 3), rear to front
-    quality: PairQuality
     model: str  # what solved: a stack that the networks do not serve is solved by `sart`
     eye_sigma_mm: float
     total_ms: float  # of this one call, its first-time compiling included
-    _pair: SolvedPair
+
+    def __init__(self, layers: U8, pair: _Pair, *, model: str, eye_sigma_mm: float, total_ms: float) -> None:
+        self.layers, self.model, self.eye_sigma_mm, self.total_ms = layers, model, eye_sigma_mm, total_ms
+        self._asked = pair
+
+    def __repr__(self) -> str:
+        count, height, width = self.layers.shape[:3]
+        return f"<phasestack.Result: {count} layers of {width}x{height} by {self.model}>"
+
+    @property
+    def quality(self) -> PairQuality:
+        """How good what the eyes get is; measured when it is first asked for, which may take longer than solving."""
+        return self._pair.quality
 
     @property
     def seen(self) -> U8:
         """(2, h, w, 3): what each eye sees, left first."""
         return np.stack(self._pair.seen)
+
+    @cached_property
+    def _pair(self) -> SolvedPair:
+        return self._asked.judged(self.layers)
 
     @property
     def _line(self) -> str:
@@ -78,66 +116,160 @@ def solve(
     left: ArrayLike,
     right: ArrayLike,
     *,
-    eyes_m: Sequence[Sequence[float]] | F64,
     stack: PanelStack,
+    eyes_m: Eyes | None = None,
     fov_deg: float = 40.0,
-    model: str = "balanced",
+    cameras: Cameras | None = None,
+    model: str | Path = "balanced",
     eye_sigma_mm: float = 1.0,
 ) -> Result:
     """Layers with which two eyes see two pictures.
 
-    left, right: (h, w, 3 or 4), uint8 or float in 0..1, as wide as `fov_deg`. eyes_m: left and right eye, metres, frame
-    `stack` (+x out of the screen, +y the viewer's right, +z up). model: fast, balanced, best, sart or an ONNX file.
-    eye_sigma_mm: how unsure the eyes are; 1: a pupil; 0: two points. Raises ValueError, naming the argument.
+    left, right: (h, w, 3 or 4), uint8 or float in 0..1: what a pinhole camera at each eye sees that looks at the
+    stack's origin, x to its right and parallel to the ground, `fov_deg` wide; nothing else has to be known of them.
+    eyes_m: left and right eye, metres, frame `stack` (+x out of the screen, +y the viewer's right, +z up).
+    cameras: how the pictures were taken, where it was otherwise (parallel, shifted, any pinhole): two 3x4 matrices from
+    homogeneous metres of the stack's frame to pixels, +u right, +v down, a pixel's centre at a half: K·[R | t] with
+    OpenCV's axes, and half a pixel more to K's middle where that has centres at whole numbers. They say where the eyes
+    are and how wide the pictures: `eyes_m` and `fov_deg` are not needed. What is solved for, and measured, is then the
+    pictures turned to the stack's origin, as large as the panels are seen.
+    model: fast, balanced, best, sart or an ONNX file. eye_sigma_mm: how unsure the eyes are; 1: a pupil; 0: two points.
+    Raises ValueError, naming the argument; warns where pictures or eyes can hardly be meant as they are.
     """
-    pictures = [as_picture("left", left), as_picture("right", right)]
-    if pictures[0].shape != pictures[1].shape:
-        raise ValueError(f"right: is {pictures[1].shape}, left is {pictures[0].shape}")
-    if not FOV_RANGE_DEG[0] <= fov_deg <= FOV_RANGE_DEG[1]:
-        raise ValueError(f"fov_deg: {fov_deg:g} is not within {FOV_RANGE_DEG[0]:g} and {FOV_RANGE_DEG[1]:g}")
-    if not 0 <= eye_sigma_mm <= 1000:
-        raise ValueError(f"eye_sigma_mm: {eye_sigma_mm:g} is not within 0 and 1000")
-    eyes = _eyes(eyes_m, _checked(stack))
+    pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
+    eye_sigma_mm = _number("eye_sigma_mm", eye_sigma_mm, 0.0, 1000.0, "mm")
     with _one_at_a_time:
         try:
-            predictor = _loaded(model, stack)
+            predictor = _loaded(_name_of(model), pair.stack)
             start_ns = time.perf_counter_ns()
-            codes = [as_codes(picture) for picture in pictures]
+            codes = [as_codes(picture) for picture in pair.pictures]
 
             def trimmed(job: Job) -> Job:
-                return trim(job, Scene(stack))[0] if predictor.trims else job
+                return trim(job, Scene(pair.stack))[0] if predictor.trims else job
 
-            solved = solve_still(
-                *codes, eyes_m=eyes, fov_deg=fov_deg, predictor=predictor, eye_sigma_mm=eye_sigma_mm, changed=trimmed
-            )
+            how: dict[str, Any] = {"eyes_m": pair.eyes_m, "fov_deg": pair.fov_deg, "eye_sigma_mm": eye_sigma_mm}
+            solved = solve_still(*codes, predictor=predictor, changed=trimmed, **how)
             total_ms = (time.perf_counter_ns() - start_ns) / 1e6
             layers = np.ascontiguousarray(solved.layers[..., :3])
         except InputError as error:
             raise ValueError(f"model: {error}") from None
         except ModelFailure as error:
             raise ValueError(f"eyes_m: {error}") from None
-    try:
-        pair = judged(layers, pictures, stack, eyes_m=eyes, fov_deg=fov_deg)
-    except ValueError as error:
-        raise ValueError(f"eyes_m: {error}: nothing of the display can be seen from there") from None
-    return Result(layers, pair.quality, predictor.name, eye_sigma_mm, total_ms, pair)
+    return Result(layers, pair, model=predictor.name, eye_sigma_mm=eye_sigma_mm, total_ms=total_ms)
+
+
+def evaluate(
+    layers: ArrayLike,
+    left: ArrayLike,
+    right: ArrayLike,
+    *,
+    stack: PanelStack,
+    eyes_m: Eyes | None = None,
+    fov_deg: float = 40.0,
+    cameras: Cameras | None = None,
+) -> PairQuality:
+    """How good what two eyes get of anybody's layers is, against the pictures that they should see.
+
+    layers: (panels, h, w, 3 or 4), rear to front, in the stack's pixels, uint8 or float in 0..1: a panel's value v
+    turns light by v·90 degrees, and an eye sees sin² of the summed angle; floats are rounded to the panels' 8 bits.
+    The rest is as for `solve`. Raises ValueError, naming the argument.
+    """
+    pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)
+    given: Any = np.asarray(layers)
+    wanted = (pair.stack.count, pair.stack.height_px, pair.stack.width_px)
+    if given.ndim != 4 or given.shape[:3] != wanted or given.shape[3] not in (3, 4):
+        last = given.ndim == 4 and given.shape[1] in (3, 4) and given.shape[3] not in (3, 4)
+        advice = ": channels come last, np.moveaxis(layers, 1, -1)" if last else ""
+        raise ValueError(f"layers: have the shape {given.shape}, the stack's are {(*wanted, 3)}{advice}")
+    codes = [as_codes(as_picture(f"layers[{n}]", layer[..., :3])) for n, layer in enumerate(given)]
+    return pair.judged(np.stack(codes)).quality
+
+
+def camera(eye_m: Sequence[float] | F64, *, width_px: int, height_px: int, fov_deg: float = 40.0) -> F64:
+    """(3, 4) the pinhole camera at an eye that pictures are taken with, where no other is told: from homogeneous metres
+    of the stack's frame to homogeneous pixels. It looks at the stack's origin, x parallel to the ground.
+
+    The third coordinate is the distance along the gaze. Raises ValueError, naming the argument.
+    """
+    sizes = {"width_px": width_px, "height_px": height_px}
+    for name, size in sizes.items():
+        _number(name, size, 1, 1 << 16, "pixels")
+    eye = np.asarray(eye_m, np.float64)
+    if eye.shape != (3,) or not np.isfinite(eye).all() or not eye.any():
+        raise ValueError("eye_m: must be three finite numbers, metres, not all of them 0")
+    return image_from_stack(eye, fov_deg=_number("fov_deg", fov_deg, *FOV_RANGE_DEG, "degrees"), **sizes)
+
+
+def project(
+    points_m: ArrayLike, *, eye_m: Sequence[float] | F64, width_px: int, height_px: int, fov_deg: float = 40.0
+) -> F64:
+    """(..., 2) pixels at which an eye's picture shows points (..., 3) of the stack's frame, metres; NaN behind the eye.
+
+    Raises ValueError, naming the argument.
+    """
+    points = np.asarray(points_m, np.float64)
+    if points.ndim < 1 or points.shape[-1] != 3:
+        raise ValueError(f"points_m: has the shape {points.shape}, not (..., 3)")
+    matrix = camera(eye_m, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
+    seen = points @ matrix[:, :3].T + matrix[:, 3]
+    depth = np.where(seen[..., 2:] > 0, seen[..., 2:], np.nan)
+    return np.asarray(seen[..., :2] / depth)
+
+
+def _checked(
+    given: tuple[ArrayLike, ArrayLike],
+    *,
+    stack: PanelStack,
+    eyes_m: Eyes | None,
+    fov_deg: float,
+    cameras: Cameras | None,
+) -> _Pair:
+    """Raises ValueError, naming the argument."""
+    pictures = [as_picture(name, picture) for name, picture in zip(("left", "right"), given, strict=True)]
+    if pictures[0].shape != pictures[1].shape:
+        raise ValueError(f"right: is {pictures[1].shape}, left is {pictures[0].shape}: both must have one size")
+    stack = checked_stack(stack)
+    fov_deg = _number("fov_deg", fov_deg, *FOV_RANGE_DEG, "degrees")
+    if cameras is None:
+        if eyes_m is None:
+            raise ValueError("eyes_m: is needed: the left and the right eye, metres; or cameras, which stand there")
+        eyes = _eyes(eyes_m, stack)
+    else:
+        try:
+            matrices, places_m = as_cameras(cameras)
+            eyes = _eyes(places_m, stack)
+            if eyes_m is not None and np.abs(_eyes(eyes_m, stack) - eyes).max() > SAME_PLACE_M:
+                raise ValueError(f"stand at {np.round(eyes, 4).tolist()}, eyes_m are elsewhere: leave those out")
+            pictures, fov_deg = looking_at_origin(pictures, matrices, eyes, stack)
+        except ValueError as error:
+            raise ValueError(f"cameras: {error}") from None
+    for line in doubts(eyes, stack, fov_deg=fov_deg, size=(pictures[0].shape[1], pictures[0].shape[0])):
+        warnings.warn(line, stacklevel=3)
+    pair = _Pair(tuple(pictures), eyes, stack, fov_deg)
+    black = np.zeros((stack.count, stack.height_px, stack.width_px, 3), np.uint8)
+    if not all(seen_by(eye, black, stack, fov_deg=fov_deg, width_px=64, height_px=64).mask.any() for eye in eyes):
+        raise ValueError("eyes_m: nothing of the display can be seen from there")
+    return pair
+
+
+def _number(name: str, given: Any, low: float, high: float, unit: str) -> float:
+    """Raises ValueError, naming the argument."""
+    if isinstance(given, bool) or not isinstance(given, int | float | np.integer | np.floating):
+        raise ValueError(f"{name}: is {given!r}, not a number of {unit}")
+    if problem := refusal(float(given), low, high, unit):
+        raise ValueError(f"{name}: {problem}")
+    return float(given)
+
+
+def _name_of(model: Any) -> str:
+    if not isinstance(model, str | os.PathLike):
+        raise ValueError(f"model: is {model!r}, not fast, balanced, best, sart or an ONNX file")
+    return os.fspath(model)
 
 
 @lru_cache(maxsize=2)
 def _loaded(model: str, stack: PanelStack) -> Predictor:
     return load_predictor(model, stack)
-
-
-def _checked(stack: PanelStack) -> PanelStack:
-    """Raises ValueError, naming the field, for what is no stack of panels."""
-    if not isinstance(stack, PanelStack):
-        raise ValueError(f"stack: is a {type(stack).__name__}, not a phasestack.Stack")
-    fields = {name: getattr(stack, name) for name in ("width_m", "height_m", "x_m", "width_px", "height_px")}
-    try:
-        validated(StackGeometry, fields, source="stack")
-    except InputError as error:
-        raise ValueError(str(error)) from None
-    return stack
 
 
 def _eyes(eyes_m: Any, stack: PanelStack) -> F64:
@@ -147,7 +279,9 @@ def _eyes(eyes_m: Any, stack: PanelStack) -> F64:
     except (TypeError, ValueError):
         raise ValueError("eyes_m: must be two points of three numbers, metres") from None
     if eyes.shape != (2, 3) or not np.isfinite(eyes).all():
-        raise ValueError("eyes_m: must be two points of three finite numbers, metres")
+        raise ValueError(f"eyes_m: has the shape {eyes.shape}; must be two points of three finite numbers, metres")
+    if np.abs(eyes).max() > EYE_MOST_M:
+        raise ValueError(f"eyes_m: {refusal(float(np.abs(eyes).max()), -EYE_MOST_M, EYE_MOST_M, 'm')}")
     if eyes[:, 0].min() <= stack.x_m[-1]:
         raise ValueError(f"eyes_m: x = {eyes[:, 0].min():g} m is not in front of the panels (x > {stack.x_m[-1]:g})")
     apart_m = float(np.linalg.norm(eyes[0] - eyes[1]))

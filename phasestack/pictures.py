@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
@@ -20,14 +21,27 @@ def as_picture(name: str, given: ArrayLike) -> Picture:
 
     Raises ValueError, naming the argument.
     """
+    if isinstance(given, str | os.PathLike):
+        raise ValueError(f"{name}: is a file's name: read it first, as with numpy.asarray(PIL.Image.open({given!r}))")
     picture: Any = np.asarray(given)
     if picture.ndim != 3 or picture.shape[2] not in (3, 4) or min(picture.shape[:2]) < LEAST_PX:
-        raise ValueError(f"{name}: has the shape {picture.shape}, not (h, w, 3|4) with {LEAST_PX} pixels at least")
+        advice = ""
+        if picture.ndim == 2:
+            advice = f": a grey one is np.dstack([{name}] * 3)"
+        elif picture.ndim == 3 and picture.shape[0] in (3, 4):
+            advice = f": channels come last, np.moveaxis({name}, 0, -1)"
+        elif picture.ndim == 4 and picture.shape[0] == 1:
+            advice = f": one picture, {name}[0]"
+        raise ValueError(
+            f"{name}: has the shape {picture.shape}, not (h, w, 3|4) with {LEAST_PX} pixels at least{advice}"
+        )
     if picture.dtype != np.uint8:
         if not np.issubdtype(picture.dtype, np.floating):
-            raise ValueError(f"{name}: is of {picture.dtype}, neither uint8 nor floating point")
-        if not (np.isfinite(picture).all() and picture.min() >= 0 and picture.max() <= 1):
-            raise ValueError(f"{name}: holds values that are not within 0 and 1")
+            raise ValueError(f"{name}: is of {picture.dtype}, neither uint8 (0..255) nor floating point (0..1)")
+        low, high = (float(bound) for bound in (picture.min(), picture.max()))
+        if not (low >= 0 and high <= 1):  # nor NaN
+            advice = f": divide by 255, or {name}.astype(np.uint8)" if low >= 0 and 1 < high <= 255 else ""
+            raise ValueError(f"{name}: holds {low:g} to {high:g}, not within 0 and 1{advice}")
         picture = picture.astype(np.float32)
     if picture.shape[2] == 3:
         return np.ascontiguousarray(picture)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,9 @@ import numpy as np
 import pytest
 
 import phasestack
+from phasestack import pair as pair_module
 from runtime.commands.app import app
+from runtime.errors import InputError
 from tests.test_cli import pair_in, solve_arguments
 
 STACK = phasestack.Stack(width_m=0.5184, height_m=0.2916, x_m=(-0.06, 0.0, 0.06), width_px=320, height_px=180)
@@ -66,7 +70,17 @@ def test_pictures_are_codes_or_intensities_with_or_without_transparency() -> Non
         ({"eyes_m": (0.7, 0.0, 0.0)}, "eyes_m"),
         ({"eyes_m": ((0.05, -0.03, 0.0), (0.05, 0.03, 0.0))}, "eyes_m"),
         ({"eyes_m": ((0.7, 0.0, 0.0), (0.7, 0.001, 0.0))}, "eyes_m"),
-        ({"stack": phasestack.Stack(0.5, 0.3, (0.1, 0.0), 320, 180)}, "x_m"),
+        ({"eyes_m": ((780, -30, 240), (780, 30, 240))}, "eyes_m: .*millimetres"),
+        ({"eyes_m": None}, "eyes_m: is needed"),
+        ({"stack": (0.5, 0.3)}, "stack: is a tuple: make a phasestack.Stack"),
+        ({"left": np.moveaxis(picture(), 2, 0)}, "left: .*channels come last, np.moveaxis"),
+        ({"left": "left.png"}, "left: is a file's name: read it first"),
+        ({"right": picture().astype(np.float32)}, "right: .*divide by 255"),
+        ({"fov_deg": "40"}, "fov_deg: is '40', not a number"),
+        ({"model": 3}, "model: is 3"),
+        ({"cameras": np.zeros((2, 4, 4))}, "cameras: must be two 3x4 matrices"),
+        ({"cameras": np.zeros((2, 3, 4))}, "cameras: are no cameras"),
+        ({"cameras": [phasestack.camera(eye, width_px=320, height_px=180) for eye in EYES[::-1]]}, "cameras: stand at"),
         ({"fov_deg": 190.0}, "fov_deg"),
         ({"eye_sigma_mm": float("nan")}, "eye_sigma_mm"),
         ({"model": "fats"}, "model"),
@@ -100,3 +114,165 @@ def test_importing_and_solving_load_neither_torch_nor_opengl_nor_x() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=240)
     assert done.stdout.strip() == "[]", done.stderr
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"x_m": (0.1, 0.0)}, "x_m"),
+        ({"x_m": 0.1}, "x_m: is 0.1; must list"),
+        ({"x_m": [0.0]}, "x_m"),
+        ({"width_m": 518.4}, "width_m: .*millimetres"),
+        ({"width_px": 0}, "width_px"),
+        ({"height_px": 10.5}, "height_px"),
+    ],
+)
+def test_a_stack_that_can_t_be_is_refused_when_it_is_made(given: dict[str, Any], told: str) -> None:
+    well: dict[str, Any] = {"width_m": 0.5, "height_m": 0.3, "x_m": [-0.03, 0.03], "width_px": 320, "height_px": 180}
+    assert phasestack.Stack(**well).x_m == (-0.03, 0.03)
+    assert replace(phasestack.Stack(**well), width_px=100).width_px == 100
+    with pytest.raises(ValueError, match=told):
+        phasestack.Stack(**well | given)
+
+
+def test_a_result_says_itself_in_a_line_and_measures_its_quality_when_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    real = pair_module.judged
+    monkeypatch.setattr(pair_module, "judged", lambda *given, **how: calls.append(1) or real(*given, **how))
+    result = phasestack.solve(picture(), picture(3), eyes_m=EYES, stack=STACK, model="fast")
+    assert repr(result) == "<phasestack.Result: 3 layers of 320x180 by fast>" and calls == []
+    assert result.quality is result.quality and calls == [1]
+    assert phasestack.__version__[0].isdigit()
+
+
+def scene_at(points_m: np.ndarray) -> np.ndarray:
+    """(h, w, 3) colours of a wavy picture that hangs 1 cm before the stack's middle, at points of that plane."""
+    y, z = points_m[..., 1], points_m[..., 2]
+    waves = [np.sin(60 * y + k) * np.cos(45 * z - k) for k in range(3)]
+    return np.rint(127 + 100 * np.stack(waves, axis=-1)).astype(np.uint8)
+
+
+def taken(matrix: np.ndarray, width_px: int, height_px: int) -> np.ndarray:
+    """What a pinhole camera sees of it: a plain tracer."""
+    u, v = np.meshgrid(np.arange(width_px) + 0.5, np.arange(height_px) + 0.5)
+    place = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(matrix[:, :3]).T
+    return scene_at(place + rays * ((0.01 - place[0]) / rays[..., :1]))
+
+
+def parallel(eye_m: Any, focal_px: float = 330.0) -> np.ndarray:
+    """A camera whose axis is the stack's: it looks along -x, +u to the viewer's right."""
+    axes = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+    k = np.array([[focal_px, 0, 200], [0, focal_px, 150], [0, 0, 1]])
+    return k @ np.column_stack([axes, -axes @ np.asarray(eye_m)])
+
+
+def test_pictures_of_parallel_cameras_are_solved_for_what_they_are() -> None:
+    """They were taken for pictures that look at the middle: 9 dB, and 24 were told."""
+    eyes_m = ((0.7, -0.05, 0.02), (0.7, 0.05, 0.02))
+    cameras = [parallel(eye) for eye in eyes_m]
+    pictures = [taken(matrix, 400, 300) for matrix in cameras]
+    wanted = [taken(phasestack.camera(eye, width_px=320, height_px=180), 320, 180) for eye in eyes_m]
+
+    def truth_db(**how: Any) -> float:
+        layers = phasestack.solve(*pictures, stack=STACK, model="fast", **how).layers
+        return phasestack.evaluate(layers, *wanted, eyes_m=eyes_m, stack=STACK).psnr_db
+
+    solved = phasestack.solve(*pictures, cameras=cameras, stack=STACK, model="fast")
+    assert solved.quality.psnr_db > 30 and truth_db(cameras=cameras) > 30
+    assert abs(solved.quality.psnr_db - truth_db(cameras=cameras)) < 2
+    with pytest.warns(UserWarning, match="beside the panels"):
+        assert truth_db(eyes_m=eyes_m, fov_deg=62) < 20
+
+
+def test_cameras_that_look_at_the_middle_are_what_is_meant_without_them() -> None:
+    cameras = [phasestack.camera(eye, width_px=320, height_px=180) for eye in EYES]
+    without = phasestack.solve(picture(), picture(3), eyes_m=EYES, stack=STACK, model="fast")
+    scaled = [-3 * matrix for matrix in cameras]
+    for given in (cameras, scaled):
+        result = phasestack.solve(picture(), picture(3), cameras=given, stack=STACK, model="fast")
+        assert np.array_equal(result.layers, without.layers)
+    points = np.array([[0.0, 0.0, 0.0], [0.0, 0.1, 0.05], [2.0, 0.0, 0.0]])
+    pixels = phasestack.project(points, eye_m=EYES[0], width_px=320, height_px=180)
+    assert np.allclose(pixels[0], (160, 90)) and pixels[1, 0] > 160 > 0 and np.isnan(pixels[2]).all()
+
+
+def test_anybody_s_layers_are_evaluated_as_ours_are() -> None:
+    result = phasestack.solve(picture(), picture(3), eyes_m=EYES, stack=STACK, model="fast")
+    how: dict[str, Any] = {"eyes_m": EYES, "stack": STACK}
+    assert phasestack.evaluate(result.layers, picture(), picture(3), **how) == result.quality
+    assert phasestack.evaluate(result.layers / 255, picture(), picture(3), **how) == result.quality
+    with pytest.raises(ValueError, match=r"layers: .*channels come last, np.moveaxis\(layers, 1, -1\)"):
+        phasestack.evaluate(np.moveaxis(result.layers, 3, 1), picture(), picture(3), **how)
+    with pytest.raises(ValueError, match=r"layers: have the shape \(2, "):
+        phasestack.evaluate(result.layers[:2], picture(), picture(3), **how)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"fov_deg": 70}, "beside the panels"),
+        ({"eyes_m": EYES[::-1]}, "exchanged"),
+        ({"fov_deg": 0.7}, "looks like radians"),
+    ],
+)
+def test_what_can_hardly_be_meant_is_warned_of_where_it_is_written(change: dict[str, Any], told: str) -> None:
+    layers = np.full((3, 180, 320, 3), 99, np.uint8)
+    given: dict[str, Any] = {"eyes_m": EYES, "stack": STACK}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        phasestack.evaluate(layers, picture(), picture(3), **given)
+    with pytest.warns(UserWarning, match=told) as caught:
+        phasestack.evaluate(layers, picture(), picture(3), **given | change)
+    assert caught[0].filename == __file__
+
+
+TYPED = """
+import numpy as np
+import phasestack
+
+picture = np.zeros((180, 320, 3), np.uint8)
+stack = phasestack.Stack(width_m=0.5, height_m=0.3, x_m=[-0.06, 0.0, 0.06], width_px=320, height_px=180)
+result = phasestack.solve(picture, picture, eyes_m=((0.7, -0.03, 0), (0.7, 0.03, 0)), stack=stack)
+quality = phasestack.evaluate(result.layers, picture, picture, stack=stack, cameras=np.zeros((2, 3, 4)))
+psnr_db: float = quality.psnr_db
+reveal_type(quality.light_db)
+reveal_type(stack.x_m)
+"""
+
+
+def test_types_lead_from_a_script_to_what_they_are(tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text(TYPED)
+    command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path), "script.py"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=240)
+    assert 'Revealed type is "Any"' not in done.stdout and "import-untyped" not in done.stdout, done.stdout
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_command_takes_the_cameras_that_pictures_were_taken_with(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    eyes_m = ((0.7, -0.05, 0.02), (0.7, 0.05, 0.02))
+    cameras = {side: parallel(eye) for side, eye in zip(("left", "right"), eyes_m, strict=True)}
+    for side, matrix in cameras.items():
+        cv2.imwrite(str(tmp_path / f"{side}.png"), taken(matrix, 400, 300)[..., ::-1])
+    (tmp_path / "cameras.json").write_text(json.dumps({side: matrix.tolist() for side, matrix in cameras.items()}))
+    geometry = {"width_m": STACK.width_m, "height_m": STACK.height_m, "x_m": list(STACK.x_m)}
+    (tmp_path / "panels.json").write_text(json.dumps(geometry | {"width_px": 320, "height_px": 180}))
+    command = ["solve", "--model", "fast", "--panels", f"{tmp_path}/panels.json", "--out", f"{tmp_path}/out"]
+    command += ["--left", f"{tmp_path}/left.png", "--right", f"{tmp_path}/right.png"]
+    app([*command, "--camera", f"{tmp_path}/cameras.json"], standalone_mode=False)
+    told = json.loads((tmp_path / "out" / "solve.json").read_text())
+    pictures = [taken(matrix, 400, 300) for matrix in cameras.values()]
+    result = phasestack.solve(*pictures, cameras=list(cameras.values()), stack=STACK, model="fast")
+    assert told["psnr_db"] == pytest.approx(result.quality.psnr_db, abs=0.01) and told["psnr_db"] > 30
+    assert capfd.readouterr().err == ""
+    eyes = ["--left-eye", *map(str, eyes_m[0]), "--right-eye", *map(str, eyes_m[1])]
+    app([*command, *eyes, "--fov", "62"], standalone_mode=False)
+    assert "beside the panels" in capfd.readouterr().err
+    for given, told in (
+        (eyes[:4], "are needed"),
+        ([*eyes, "--camera", f"{tmp_path}/cameras.json"], "leave --left-eye"),
+    ):
+        with pytest.raises(InputError, match=told):
+            app([*command, *given], standalone_mode=False)

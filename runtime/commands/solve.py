@@ -12,12 +12,21 @@ from runtime.support.ranges import FOV_RANGE_DEG
 
 
 def solve(
-    left: Annotated[Path, typer.Option(help="picture for the left eye")],
-    right: Annotated[Path, typer.Option(help="picture for the right eye")],
-    left_eye: Annotated[tuple[float, float, float], place(help="left eye, metres, stack frame")],
-    right_eye: Annotated[tuple[float, float, float], place(help="right eye, metres")],
+    left: Annotated[
+        Path, typer.Option(help="picture of a pinhole camera at the left eye that looks at the stack's origin")
+    ],
+    right: Annotated[Path, typer.Option(help="the same of the right eye")],
     panels: Annotated[Path, typer.Option(help="TOML or JSON: width_m, height_m, x_m")],
     out: Annotated[Path, typer.Option(help="folder for the layers")],
+    left_eye: Annotated[tuple[float, float, float] | None, place(help="left eye, metres, stack frame")] = None,
+    right_eye: Annotated[tuple[float, float, float] | None, place(help="right eye, metres")] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(
+            help="for pictures taken otherwise, and instead of eyes and --fov: TOML or JSON with `left` and `right`, "
+            "3x4 matrices from metres of the stack's frame to pixels"
+        ),
+    ] = None,
     fov: Annotated[
         float, number(*FOV_RANGE_DEG, "degrees", help="the pictures' horizontal field of view, degrees")
     ] = 40.0,
@@ -38,16 +47,15 @@ def solve(
     Example: phasestack solve --left l.png --right r.png --left-eye 0.6 -0.03 0 --right-eye 0.6 0.03 0 --fov 40
     --panels panels.json --out out/solve
     """
-    from runtime.commands.solving import solve_pair
+    from runtime.commands.solving import Eyes, solve_pair
     from runtime.support.figures import shown
 
     with blame_option("solve", model=model):
         result = solve_pair(
             (left, right),
-            (left_eye, right_eye),
+            Eyes(left_eye, right_eye, fov, camera),
             panels,
             out,
-            fov_deg=fov,
             model=model,
             repeat=repeat,
             eye_sigma_mm=eye_sigma_mm,

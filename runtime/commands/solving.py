@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import typer
 
 from runtime.clock import Stopwatch
-from runtime.config import Settings, load_stack, with_options
+from runtime.config import Settings, load_stack, read_table, with_options
 from runtime.content.base import ContentInfo
 from runtime.errors import EyesNotServed, InputError
 from runtime.evaluation.solved import judged
@@ -22,6 +23,7 @@ from runtime.model.job import Job
 from runtime.model.predictor import Prediction, load_predictor
 from runtime.model.still import solve_still
 from runtime.model.trim import Savings, Scene, trim
+from runtime.optics.cameras import as_cameras, doubts, looking_at_origin
 from runtime.optics.stack import PanelStack
 from runtime.plan.savings import Measured, network_items
 from runtime.records import F64
@@ -32,13 +34,22 @@ SEPARATION_MIN_M = 0.005
 MEASURED_FROM = 10  # runs that are worth a look at which backend is faster
 
 
+@dataclass(frozen=True, slots=True)
+class Eyes:
+    """Where the pictures were taken, and how, as the options say it."""
+
+    left: tuple[float, ...] | None
+    right: tuple[float, ...] | None
+    fov_deg: float
+    cameras: Path | None
+
+
 def solve_pair(
     files: tuple[Path, Path],
-    eyes: tuple[tuple[float, ...], tuple[float, ...]],
+    eyes: Eyes,
     panels: Path,
     out: Path,
     *,
-    fov_deg: float,
     model: str,
     repeat: int,
     eye_sigma_mm: float,
@@ -49,12 +60,14 @@ def solve_pair(
     watch = Stopwatch()
     settings = with_options(Settings(), model=model, backend=backend).model
     cv2.setNumThreads(settings.threads)
-    pictures = [read_image(path) for path in files]
+    pictures: list[Any] = [read_image(path) for path in files]
     if pictures[0].shape != pictures[1].shape:
         sizes = " and ".join(f"{p.shape[1]}x{p.shape[0]}" for p in pictures)
         raise InputError(files[1], "size", f"the two pictures differ: {sizes}")
     stack = load_stack(panels, width_px=pictures[0].shape[1], height_px=pictures[0].shape[0])
-    eyes_m = checked_eyes(*eyes, stack)
+    pictures, eyes_m, fov_deg = taken(pictures, eyes, stack)
+    for line in doubts(eyes_m, stack, fov_deg=fov_deg, size=(pictures[0].shape[1], pictures[0].shape[0])):
+        typer.echo(f"phasestack: {line}", err=True)
     watch.lap("read pictures")
     with ExitStack() as contexts, ExitStack() as cleanup:
 
@@ -116,6 +129,24 @@ def solve_pair(
             }
             write_json(folder.staging / "solve.json", result)
     return result
+
+
+def taken(pictures: list[Any], eyes: Eyes, stack: PanelStack) -> tuple[list[Any], F64, float]:
+    """Pictures of eyes (2, 3) that look at the stack's origin, and their field of view. Raises InputError."""
+    if eyes.cameras is None:
+        if eyes.left is None or eyes.right is None:
+            raise InputError("solve", "--left-eye, --right-eye", "are needed, metres; or --camera")
+        return pictures, checked_eyes(eyes.left, eyes.right, stack), eyes.fov_deg
+    if eyes.left is not None or eyes.right is not None:
+        raise InputError("solve", "--camera", "says where the eyes are: leave --left-eye and --right-eye out")
+    table = read_table(eyes.cameras)
+    try:
+        cameras, places_m = as_cameras([table.get("left"), table.get("right")])
+        eyes_m = checked_eyes(tuple(places_m[0]), tuple(places_m[1]), stack)
+        pictures, fov_deg = looking_at_origin(pictures, cameras, eyes_m, stack)
+    except ValueError as error:
+        raise InputError(eyes.cameras, "left, right", str(error)) from None
+    return pictures, eyes_m, fov_deg
 
 
 def checked_eyes(left_eye: tuple[float, ...], right_eye: tuple[float, ...], stack: PanelStack) -> F64:

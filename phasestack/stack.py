@@ -1,0 +1,44 @@
+"""The display as a program says it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+
+from runtime.config import StackGeometry, validated
+from runtime.errors import InputError
+from runtime.optics.stack import PanelStack, Tilt
+
+
+class Stack(PanelStack):
+    """Parallel panels of one size: rear (0, at the backlight) to front along `x_m`, metres, centred on the origin."""
+
+    __slots__ = ()
+
+    def __init__(
+        self,
+        width_m: float,
+        height_m: float,
+        x_m: Sequence[float],
+        width_px: int,
+        height_px: int,
+        tilt: Tilt | None = None,
+    ) -> None:
+        """Raises ValueError, naming the argument, for what is no display."""
+        given = {"width_m": width_m, "height_m": height_m, "width_px": width_px, "height_px": height_px}
+        try:
+            places = tuple(float(x) for x in x_m)
+        except (TypeError, ValueError):
+            raise ValueError(f"x_m: is {x_m!r}; must list the panels' places, such as (-0.03, 0.0, 0.03)") from None
+        try:
+            checked = validated(StackGeometry, {**given, "x_m": places}, source="")
+        except InputError as error:
+            raise ValueError(str(error)) from None
+        super().__init__(checked.width_m, checked.height_m, checked.x_m, checked.width_px, checked.height_px, tilt)
+
+
+def checked_stack(stack: object) -> PanelStack:
+    """Raises ValueError for what is none."""
+    if not isinstance(stack, PanelStack):
+        raise ValueError(f"stack: is a {type(stack).__name__}: make a phasestack.Stack")
+    return PanelStack(*(getattr(stack, field.name) for field in fields(PanelStack)))
