@@ -241,6 +241,7 @@ reveal_type(stack.x_m)
 """
 
 
+@pytest.mark.slow
 def test_types_lead_from_a_script_to_what_they_are(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(TYPED)
     command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path), "script.py"]
