@@ -48,8 +48,7 @@ if [ "${APP:-yes}" != no ]; then
   # An earlier installation may have made it for root alone.
   install -d -m 755 "$DESTDIR/opt/phasestack"
   rm -rf "$DESTDIR$library.new"
-  "$python" -m pip install --quiet --root-user-action=ignore --target "$DESTDIR$library.new" -r "$source/requirements/runtime.lock" \
-    -r "$source/requirements/page.lock"
+  "$python" -m pip install --quiet --root-user-action=ignore --target "$DESTDIR$library.new" -r "$source/requirements/runtime.lock"
   # From a copy: what an earlier build left beside the source would come along, modules that are gone included.
   (cd "$source" && mkdir "$kept/source" && cp -r pyproject.toml README.md runtime calib model_export "$kept/source")
   "$python" -m pip install --quiet --root-user-action=ignore --no-deps --target "$DESTDIR$library.new" "$kept/source"

@@ -25,6 +25,7 @@ from runtime.commands.run import run
 from runtime.commands.setup import setup
 from runtime.commands.solve import solve
 from runtime.commands.stability import stability
+from runtime.commands.try_ import try_
 
 app = typer.Typer(
     name="phasestack",
@@ -35,8 +36,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-COMMANDS: tuple[Callable[..., None] | tuple[str, typer.Typer], ...] = (
+COMMANDS: tuple[Callable[..., None] | tuple[str, typer.Typer | Callable[..., None]], ...] = (
     demo,
+    ("try", try_),
     run,
     setup,
     solve,
@@ -58,10 +60,11 @@ COMMANDS: tuple[Callable[..., None] | tuple[str, typer.Typer], ...] = (
     config,
 )
 for command in COMMANDS:
-    if isinstance(command, tuple):
-        app.add_typer(command[1], name=command[0])
+    name, made = command if isinstance(command, tuple) else (None, command)
+    if isinstance(made, typer.Typer):
+        app.add_typer(made, name=name)
     else:
-        app.command()(command)
+        app.command(name)(made)
 
 
 def _tell_version(wanted: bool) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 
 import cv2
 
+from runtime.browser.link import BrowserLink
 from runtime.clock import NS_PER_MS, NS_PER_S, Clock, MonotonicClock, SimulatedClock
 from runtime.config import Settings
 from runtime.daemon.solver_parts import RunningSolver, SolverMaker
@@ -27,10 +28,11 @@ from runtime.frame.solver_thread import SolverThread
 from runtime.frame.viewer import Viewer
 from runtime.optics.stack import PanelStack
 from runtime.panels.base import PanelSink
-from runtime.panels.registry import open_panels
+from runtime.panels.registry import BrowserPanels, open_panels
 from runtime.plan.savings import Saving
 from runtime.records import RefreshAccount
 from runtime.sensor.base import Sensor
+from runtime.sensor.browser import BrowserEyes
 from runtime.sensor.registry import open_sensor
 from runtime.sensor.samples import FindEyes, RecordedSamples, Samples
 from runtime.sensor.worker import SensorWorker
@@ -59,6 +61,8 @@ class RunOptions:
     keep_light: int = 0
     frames: int | None = None  # refreshes; None: to the end
     out: Path | None = None  # folder for the run's files
+    browser: BrowserLink | None = None  # a page shows the panels, and may be the sensor
+    until: Callable[[], str] = str  # why to stop; empty: go on
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +151,8 @@ def build_run(
         log.warning("%s", warning)
 
     def make_driver() -> Sensor:
+        if options.browser is not None and options.browser.is_sensor:
+            return BrowserEyes(options.browser, clock)
         return open_sensor(settings.sensor, clock, latency_ms=settings.loop.sensor_latency_ms)
 
     def make_find() -> FindEyes:
@@ -160,7 +166,11 @@ def build_run(
     host.starting("opening OpenGL")
     context = offscreen_context()
     cleanup.callback(context.release)
-    panels = _open_panels(settings, stack, clock, context, host)
+    panels: PanelSink = (
+        _open_panels(settings, stack, clock, context, host)
+        if options.browser is None
+        else BrowserPanels(options.browser, clock)
+    )
     cleanup.callback(panels.close)
     maker = SolverMaker(settings, stack, calibration, panels_group=lambda: panels.group)
     solver: SolverHost

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from runtime.browser.link import BrowserLink
 from runtime.clock import NS_PER_MS
 from runtime.config import ContentSettings, Settings
 from runtime.content.pictures import PICTURES, VIDEOS
@@ -48,6 +49,25 @@ def holds(presenter: Presenter) -> dict[str, Any]:
     }
 
 
+def shown(presenter: Presenter, account: RefreshAccount, link: BrowserLink) -> dict[str, Any]:
+    """What a page that shows the panels is told of each refresh."""
+    assert presenter.last is not None
+    frame, solution = presenter.last.frame, presenter.last.solution
+    return {
+        "frame": account.frame,
+        "state": presenter.machine.name,
+        "reason": presenter.machine.reason,
+        "eyes_m": account.eyes_m,
+        "eyes_label": account.eyes_label,
+        "eye_sigma_mm": account.eye_sigma_mm,
+        "flatness": 1.0 if frame.solved is None else frame.flatness,
+        "solved_for_m": None if solution is None else solution.solved_for_m,
+        "scene": presenter.run_cell.state.settings.content.scene,
+        "model": presenter.run_cell.state.settings.model.name,
+        "page_ms": link.page_ms_of(account.capture_ns),
+    }
+
+
 def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
     """What `status` answers."""
     presenter = run.presenter
@@ -71,6 +91,7 @@ def snapshot(run: Run, account: RefreshAccount) -> dict[str, Any]:
         "solution": account.solution,
         # What was solved for an instant after this light has no age yet.
         "solution_age_now_ms": None if account.solution_age_ms is None else max(0.0, account.solution_age_ms),
+        "light_db": run.observer.light_db,
         "photon_now_ms": (account.photon_ns - account.capture_ns) / NS_PER_MS if account.capture_ns else None,
         "rejected_samples": dict(presenter.viewer.refused),
         "sensor_hz": presenter.viewer.rate_hz if "sensor" not in presenter.missing else None,

@@ -69,8 +69,11 @@ class Daemon(Host):
         server: StatusServer | None = None,
         metrics: Metrics | None = None,
         recorder: Recorder | None = None,
+        options: RunOptions | None = None,
     ) -> None:
         """read_settings: the configuration as it is now; raises InputError."""
+        self._until = (options or RunOptions()).until
+        self._link = (options or RunOptions()).browser
         self._read_settings = read_settings
         self._signals, self._notifier, self._server, self._metrics = signals, notifier, server, metrics
         self.recorder = recorder
@@ -83,7 +86,7 @@ class Daemon(Host):
         self._refused = ""  # why the last change was refused, until one is taken
 
     def stop_reason(self) -> str:
-        return f"{self._signals.stop} received" if self._signals.stop else ""
+        return f"{self._signals.stop} received" if self._signals.stop else self._until()
 
     def carry_out_commands(self, presenter: Presenter) -> None:
         if self._signals.take_reload():
@@ -131,6 +134,8 @@ class Daemon(Host):
         self._notifier.refreshed(machine.state, machine.missing, presented=account.presented)
         if self._server is not None and (run := self.run) is not None:
             self._server.publish(lambda: status.snapshot(run, account) | self._news())
+        if self._link is not None:
+            self._link.refreshed(status.shown(presenter, account, self._link))
         if self._metrics is not None:
             stats = presenter.stats
             self._metrics.refresh(account, faults=stats.faults, missed_blanks=stats.missed_blanks)
@@ -313,7 +318,13 @@ def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> di
             cleanup.callback(server.close)
         metrics = _metrics(service.metrics_port, cleanup)
         daemon = Daemon(
-            read_settings, signals=signals, notifier=notifier, server=server, metrics=metrics, recorder=recorder
+            read_settings,
+            signals=signals,
+            notifier=notifier,
+            server=server,
+            metrics=metrics,
+            recorder=recorder,
+            options=options,
         )
         try:
             summary = drive(settings, options, daemon)

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import socket as sockets
 from typing import Any
 
+import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from runtime.errors import InputError
+
+LOOPBACK = "127.0.0.1"
+MESSAGE_MAX_BYTES = 65536  # of a page
 
 CONNECTIONS_MAX = 64
 REQUEST_S = 5.0  # for a whole request to come
@@ -35,3 +42,29 @@ class LimitedConnection(H11Protocol):
     def _let_go(self) -> None:
         if self.waits and self in self.connections:  # it is another protocol's after an upgrade
             self.transport.abort()
+
+
+def listening(command: str, port: int) -> sockets.socket:
+    """A bound socket on loopback. Raises InputError where the port is taken."""
+    try:
+        return sockets.create_server((LOOPBACK, port))
+    except OSError as error:
+        raise InputError(command, "--port", f"{port}: can't be listened on ({error.strerror})") from None
+
+
+def server_of(application: Any) -> uvicorn.Server:
+    """What serves an application, as all pages are."""
+    return uvicorn.Server(
+        uvicorn.Config(
+            application,
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            proxy_headers=False,
+            timeout_graceful_shutdown=2,
+            http=LimitedConnection,
+            ws="websockets-sansio",
+            ws_max_size=MESSAGE_MAX_BYTES,
+            ws_per_message_deflate=False,
+        )
+    )

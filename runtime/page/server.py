@@ -20,20 +20,26 @@ from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.middleware.base import BaseHTTPMiddleware
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
-from starlette.routing import Route
+from starlette.routing import BaseRoute, Route, WebSocketRoute
+from starlette.websockets import WebSocket
 
+from runtime.browser.link import BrowserLink
+from runtime.browser.still import asset as browser_asset
 from runtime.daemon.client import LOOKED_UP_AGAIN_S, Daemon
 from runtime.daemon.commands import NAMES
 from runtime.errors import InputError
 from runtime.page.connections import REQUEST_S
+from runtime.page.live import live
 from runtime.page.token import cookie_of, same
 from runtime.support.artifacts import to_json
 from runtime.support.untrusted_input import parsed_json
 
 BODY_MAX_BYTES = 65536
-ASSETS = {"page.js": "text/javascript", "page.css": "text/css"}
+SCRIPT, STYLE = "text/javascript", "text/css"
+ASSETS = {"page.css": STYLE, "look.css": STYLE}
+ASSETS |= dict.fromkeys(("page.js", "display.js", "look.js", "try.js"), SCRIPT)
 Handler = Callable[[Request], Awaitable[Response]]
 
 
@@ -48,14 +54,15 @@ class TooLong(ValueError):
     """A request's body."""
 
 
-def application(daemon: Daemon, token: str, *, port: int) -> Starlette:
+def application(daemon: Daemon, token: str, *, port: int, link: BrowserLink | None = None) -> Starlette:
     """The application, on loopback: by another name than this machine's own nobody reaches it.
 
     port: that it is served on. Browsers know cookies by the host alone: another display's page has another name.
+    link: this page is the display itself; the address with the token opens it.
     """
     name, cookie = f"phasestack-{port}", cookie_of(token)
 
-    def permitted(request: Request) -> bool:
+    def permitted(request: HTTPConnection) -> bool:
         kind, _, given = request.headers.get("authorization", "").partition(" ")
         if kind.lower() == "bearer":
             return same(given.strip(), token)
@@ -70,13 +77,28 @@ def application(daemon: Daemon, token: str, *, port: int) -> Starlette:
         return answer
 
     async def index(request: Request) -> Response:
+        if link is not None and same(request.query_params.get("token", ""), token):
+            return entered()
         if not permitted(request):
             return HTMLResponse(_login(), 401)
+        return HTMLResponse(_asset("page.html") if link is None else browser_asset("try.html"))
+
+    async def operator(request: Request) -> Response:
         return HTMLResponse(_asset("page.html"))
+
+    async def connected(socket: WebSocket) -> None:
+        own = (socket.headers.get("origin") or "").partition("://")[2] == socket.headers.get("host")
+        bearer = socket.headers.get("authorization", "").lower().startswith("bearer ")
+        if link is None or _refused(socket) or not permitted(socket) or not (own or bearer):
+            await socket.close(1008)
+            return
+        await live(socket, link)
 
     async def asset(request: Request) -> Response:
         name = request.path_params["name"]
-        return Response(_asset(name), media_type=ASSETS[name]) if name in ASSETS else Response(status_code=404)
+        if name not in ASSETS:
+            return Response(status_code=404)
+        return Response(_asset(name) if name.startswith("page") else browser_asset(name), media_type=ASSETS[name])
 
     async def look_up(request: Request) -> Response:
         name = request.path_params["name"]
@@ -105,15 +127,20 @@ def application(daemon: Daemon, token: str, *, port: int) -> Starlette:
             fields = {}
         if not same(fields.get("token", [""])[0].strip(), token):
             return HTMLResponse(_login("That is not the token."), 401)
+        return entered()
+
+    def entered() -> Response:
         answer = RedirectResponse("/", 303)
         answer.set_cookie(name, cookie, httponly=True, samesite="strict", path="/")
         return answer
 
-    routes = [
+    routes: list[BaseRoute] = [
         Route("/", index, methods=["GET"]),
         Route("/login", login, methods=["POST"]),
         Route("/do", guarded(do), methods=["POST"]),
         Route("/now/{name}", guarded(look_up), methods=["GET"]),
+        Route("/operator", guarded(operator), methods=["GET"]),
+        WebSocketRoute("/live", connected),
         Route("/{name}", guarded(asset), methods=["GET"]),
     ]
     return Starlette(routes=routes, middleware=[Middleware(BaseHTTPMiddleware, dispatch=_guard)])
@@ -127,12 +154,12 @@ async def _guard(request: Request, handler: Handler) -> Response:
     return answer
 
 
-def _refused(request: Request) -> str:
+def _refused(request: HTTPConnection) -> str:
     host = request.headers.get("host", "")
     # A name that another site has made to lead here is none of ours.
     if re.sub(r":\d*$", "", host) not in ("localhost", "127.0.0.1", "[::1]"):
         return "not by this name: open http://localhost"
-    if request.method in ("GET", "HEAD"):
+    if request.scope.get("method", "GET") in ("GET", "HEAD"):
         return ""
     origin = request.headers.get("origin")
     if origin is None:

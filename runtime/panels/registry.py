@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from runtime.browser.link import BrowserLink
 from runtime.clock import Clock
 from runtime.config import OutputSettings, PanelSettings
 from runtime.optics.stack import PanelStack
@@ -34,6 +35,22 @@ class OffscreenPanels(PanelSink):
     def close(self) -> None:
         if self._group is not None:
             self._group.close()
+
+
+class BrowserPanels(PanelSink):
+    """Panels in a page, which aligns and draws them itself at its own rate."""
+
+    name = "browser"
+
+    def __init__(self, link: BrowserLink, clock: Clock) -> None:
+        self._link, self._clock = link, clock
+
+    def present(self, frame: PanelFrame, *, unchanged: bool = False) -> PresentReport:
+        self._link.frame = frame
+        return PresentReport(frame.number, self._clock.now_ns(), 0.0)
+
+    def close(self) -> None:
+        self._link.frame = None
 
 
 def panel_settings(settings: OutputSettings, count: int) -> tuple[PanelSettings, ...]:

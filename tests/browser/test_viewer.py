@@ -32,11 +32,15 @@ TILT = ((0.01, -0.02), (0.0, 0.0), (-0.015, 0.012))
 MOVE = [0.01, 0.03, -0.01]
 
 
-def driven(script: str, *arguments: object) -> dict[str, Any]:
-    """What a script that drives Chromium says, by its name."""
+def needs_chromium() -> None:
     modules = Path(os.environ.get("NODE_PATH", ""))
     if shutil.which("node") is None or shutil.which("chromium") is None or not (modules / "playwright-core").is_dir():
         pytest.skip("chromium, node, and a NODE_PATH with playwright-core are needed")
+
+
+def driven(script: str, *arguments: object) -> dict[str, Any]:
+    """What a script that drives Chromium says, by its name."""
+    needs_chromium()
     command = ["node", str(HERE / script), *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=1800, check=False)
     assert done.returncode == 0, done.stderr[-3000:]

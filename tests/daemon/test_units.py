@@ -282,7 +282,7 @@ def packages(lock: str) -> dict[str, tuple[str, list[str]]]:
 
 
 def test_all_locks_mean_the_same_files() -> None:
-    runtime, test = packages("runtime.lock") | packages("page.lock"), packages("test.lock")
+    runtime, test = packages("runtime.lock"), packages("test.lock")
     assert {name: test.get(name) for name in runtime} == runtime
 
 

@@ -41,7 +41,9 @@ export class Look {
     Object.assign(this, { mode: "parallel", head: [0, 0, 0], aligned: true, pupil: false, point: [0, 0], rays: 3, frames: 0 });
     this.flatness = 0;
     this.used = null; // eyes that the panels are aligned to, where that is not where they truly are
+    this.state = ""; // why this is not what two eyes should see
     this.told = () => {}; // called where the head has moved
+    this.onframe = () => {};
     this.$("h1").textContent = title;
     this.#modes();
     this.#controls();
@@ -56,6 +58,12 @@ export class Look {
   get maps() {
     if (!this.aligned || !this.scene.eyes_m) return { maps: asTheyStand(this.stack), limited: "" };
     return alignment(this.stack, this.scene.eyes_m, this.used ?? this.eyes);
+  }
+
+  // Panels of the same pixels elsewhere; what is shown of them comes later.
+  turnTo(stack) {
+    this.stack = this.scene.stack = this.display.stack = stack;
+    this.scene.eyes_m = null;
   }
 
   moveTo(head) {
@@ -88,6 +96,7 @@ export class Look {
     if (!resting || turning || ["panels", "apart", "target"].includes(this.mode)) {
       this.strip = undefined;
       this.#paint(width, height, this.rays);
+      this.onframe();
       if (!resting) this.#tell(limited);
       if (!resting || turning) this.next = requestAnimationFrame((then) => this.#frame(then));
       else this.#measure();
@@ -238,6 +247,7 @@ export class Look {
     const [x, y, z] = solved ? middle(eyes).map((v, k) => v - middle(solved)[k]) : [0, 0, 0];
     const parts = [[y, "to the right", "to the left"], [z, "up", "down"], [x, "farther", "nearer"]].filter(([v]) => mm(v));
     const where = parts.length ? `The head is ${parts.map(([v, one, other]) => `${mm(v)} mm ${v > 0 ? one : other}`).join(", ")} from where the layers were solved for` : "The head is where the layers were solved for";
+    if (this.state) return void (this.$(".head").textContent = this.state);
     const limit = limited ? `; the panels could only follow part of the way: ${limited}` : "";
     this.$(".head").textContent = `${where}${limit}.`;
     if (this.display.targets[0]) this.$(".light").textContent = "…";
@@ -279,7 +289,7 @@ export class Look {
       box.append(button);
     });
     this.$(".modes").append(...Object.entries(groups).map(([name, box]) => (box.prepend(node("span", name)), box)));
-    this.choose(this.canvas.clientWidth < 500 ? "left" : "parallel");
+    this.choose(this.scene.picture && this.canvas.clientWidth >= 500 ? "parallel" : "left");
   }
 
   choose(mode) {

@@ -1,5 +1,5 @@
 // The operator's page: asks what is new, draws it, and posts what is wished. Nothing is loaded from elsewhere.
-"use strict";
+import { drawPlan } from "/display.js";
 
 const $ = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
@@ -73,35 +73,11 @@ function plot(status) {
   }
 }
 
-// The eyes from above and from the side: x (to the viewer) is drawn to the right, 0.25 m behind the display to 1.2 m.
+// The eyes from above and from the side.
 
-function view(svg, status, axis, size_m, range) {
-  const eyes = status.eyes_m;
-  const far = Math.max(1.0, 1.15 * (about.viewing_m?.[1] ?? 0.6), eyes ? 1.15 * Math.max(eyes[0][0], eyes[1][0]) : 0);
-  const scale = 300 / (far + 0.15);
-  const at = (x, across) => [10 + (x + 0.15) * scale, 85 - across * scale];
-  const shapes = [];
-  const line = (from, to, kind) => {
-    const [[x1, y1], [x2, y2]] = [at(...from), at(...to)];
-    shapes.push(element("line", { x1, y1, x2, y2, class: kind }));
-  };
-  const outline = range.map(([x, across]) => at(x, across).map((v) => v.toFixed(1)).join(",")).join(" ");
-  shapes.push(element("polygon", { points: outline, class: "range" }));
-  for (const x of about.stack.x_m) line([x, -size_m / 2], [x, size_m / 2], "panel");
-  if (eyes) {
-    const rear = about.stack.x_m[0];
-    eyes.forEach((eye, index) => {
-      const side = index ? "right" : "left";
-      const place = [eye[0], eye[axis]];
-      line(place, [rear, -size_m / 2], `ray ${side}`);
-      line(place, [rear, size_m / 2], `ray ${side}`);
-      const [cx, cy] = at(...place);
-      const sure = ((status.eye_sigma_now_mm ?? 0) / 1000) * ZOOMED_SIGMAS * scale;
-      shapes.push(element("circle", { cx, cy, r: Math.max(sure, 0.1), class: `sure ${side}` }));
-      shapes.push(element("circle", { cx, cy, r: 3.5, class: side }));
-    });
-  }
-  svg.replaceChildren(...shapes);
+function view(svg, status, axis, range) {
+  const sigma_m = ((status.eye_sigma_now_mm ?? 0) / 1000) * ZOOMED_SIGMAS;
+  drawPlan(svg, { stack: about.stack, eyes: status.eyes_m, axis, range, sigma_m, far_m: Math.max(1.0, 1.15 * (about.viewing_m?.[1] ?? 0.6)) });
 }
 
 function sector(low_deg, high_deg) {
@@ -119,8 +95,8 @@ function drawEyes(status) {
   setText($("eyes-told"), told);
   if (!about?.stack) return;
   const side = about.viewing_side_deg;
-  view($("above"), status, 1, about.stack.width_m, sector(-side, side));
-  view($("side"), status, 2, about.stack.height_m, sector(...about.viewing_up_deg));
+  view($("above"), status, 1, sector(-side, side));
+  view($("side"), status, 2, sector(...about.viewing_up_deg));
 }
 
 // Figures, what is left out, faults.

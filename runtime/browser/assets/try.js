@@ -1,0 +1,188 @@
+// The display, live: this page's pointer is the head that the daemon's sensor sees, and this page is the panels.
+import { Look } from "/look.js";
+
+const AGAIN_MS = 500, STATUS_MS = 500, RETRY_MS = 1000, KEPT = 600; // a head that rests is still there; what latencies are kept
+const PLACE_M = [0.6, 0, 0];
+const CONTROLS = `
+<dl class="figures"></dl>
+<form><label>Scene <input type="text" name="scene" list="scenes" autocomplete="off"></label><datalist id="scenes"></datalist>
+<label>Model <select name="model"></select></label>
+<label>Gap between panels, mm <input type="number" name="gap_mm" min="1" max="500" step="1"></label>
+<label>Sensor's noise, mm <input type="number" name="noise_mm" min="0" max="50" step="0.1"></label>
+<label>Sensor's latency, ms <input type="number" name="latency_ms" min="0" max="1000" step="5"></label>
+<label>Eyes apart, mm <input type="number" name="ipd_mm" min="45" max="80" step="1"></label>
+<label>Turns a minute <input type="number" name="turntable" min="-60" max="60" step="1" value="0"></label>
+<label class="tick"><input type="checkbox" name="held"> hold the solver: alignment alone follows the head</label>
+<label class="tick"><input type="checkbox" name="lost"> eyes lost: nobody before the display</label></form>
+<p class="told" role="status"></p><p><a href="/operator">the operator's page</a></p>`;
+
+let look = null, socket = null, viewer = false, sensor = true, lastSent = 0, follows = null, ipd_m = 0.063, newest = null, pending = null;
+let layersSeen = { solved: false, flat: false }, first = null;
+const latencies = [], drawn = [];
+const main = document.querySelector("main");
+
+// Both eyes of a head that faces the display's middle.
+function eyesOf(head) {
+  const at = PLACE_M.map((v, k) => v + head[k]), norm = Math.hypot(at[0], at[1]);
+  const right = [-at[1] / norm, at[0] / norm, 0];
+  return [-0.5, 0.5].map((side) => at.map((v, k) => v + side * ipd_m * right[k]));
+}
+
+// Where they truly are: under the pointer; of another page's or a camera's head, what is known of it.
+const eyesNow = (head) => (viewer && sensor ? eyesOf(head) : newest?.eyes_m ?? follows ?? eyesOf([0, 0, 0]));
+const say = (message) => { if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message)); };
+
+function see() {
+  if (!look || !viewer || !sensor) return;
+  lastSent = performance.now();
+  const gone = document.hidden || form("lost").checked;
+  say({ eyes: gone ? null : eyesOf(look.head), page_ms: lastSent });
+}
+
+const form = (name) => main.querySelector(`[name=${name}]`);
+const told = (text) => (main.querySelector(".told").textContent = text);
+
+async function wish(command, value = null) {
+  told(`${command} …`);
+  try {
+    const answer = await (await fetch("/do", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ command, value }) })).json();
+    told(answer.ok ? "" : answer.error);
+  } catch {
+    told("phasestack try has ended.");
+  }
+}
+
+function build({ stack, fov_deg }) {
+  main.replaceChildren();
+  const title = stack.x_m.length > 2 ? `${stack.x_m.length} panels, live` : "two panels, live";
+  look = new Look(main, { stack, fov_deg, eyes_m: null }, { title, eyesAt: (head) => eyesNow(head) });
+  look.told = see;
+  look.follows = true;
+  main.querySelector(".more").innerHTML = CONTROLS;
+  for (const [name, value] of [["noise_mm", 0.2], ["latency_ms", 0], ["ipd_mm", ipd_m * 1000]]) form(name).value = value;
+  for (const name of ["noise_mm", "latency_ms", "gap_mm"]) form(name).addEventListener("change", (event) => say({ [name]: Number(event.target.value) }));
+  form("ipd_mm").addEventListener("change", (event) => {
+    ipd_m = Math.max(45, Math.min(80, Number(event.target.value))) / 1000;
+    look.moveTo(look.head);
+  });
+  form("scene").addEventListener("change", (event) => wish("scene", event.target.value));
+  form("model").addEventListener("change", (event) => wish("model", event.target.value));
+  form("turntable").addEventListener("change", (event) => wish("place", { turntable_per_min: Number(event.target.value) }));
+  form("held").addEventListener("change", (event) => wish(event.target.checked ? "pause" : "resume"));
+  form("lost").addEventListener("change", see);
+  main.querySelector("form").addEventListener("submit", (event) => event.preventDefault());
+  look.onframe = painted;
+  about();
+}
+
+function painted() {
+  drawn.push(performance.now());
+  while (drawn[0] < drawn.at(-1) - 1000) drawn.shift();
+  if (newest?.page_ms && newest.page_ms !== painted.counted && newest.eyes_label !== "rested") {
+    painted.counted = newest.page_ms;
+    latencies.push(performance.now() - newest.page_ms);
+    if (latencies.length > KEPT) latencies.shift();
+  }
+}
+
+function take({ refresh, viewer: mine }) {
+  const before = newest;
+  [newest, viewer] = [refresh, mine];
+  if (!look) return;
+  look.used = refresh.eyes_m ?? look.used;
+  look.sigma_m = (refresh.eye_sigma_mm ?? 0) / 1000;
+  const flatness = layersSeen.solved ? (layersSeen.flat ? refresh.flatness : 0) : 1;
+  const same = before && look.flatness === flatness && JSON.stringify(before.eyes_m) === JSON.stringify(refresh.eyes_m);
+  look.flatness = flatness;
+  look.state = refresh.state === "tracking" ? "" : `${refresh.state}: ${refresh.reason}`;
+  if (!same || before.state !== refresh.state) look.draw();
+  if (layersSeen.solved && flatness < 1) first?.();
+}
+
+function load(bytes) {
+  const { layers: kind, solved_for_m } = pending;
+  look.display.load(kind, new Uint8Array(bytes));
+  layersSeen[kind] = true;
+  if (kind === "solved") look.scene.eyes_m = solved_for_m ?? look.scene.eyes_m;
+  look.draw();
+  say({ drawn: true });
+}
+
+function connect() {
+  socket = new WebSocket(`ws://${location.host}/live`);
+  socket.binaryType = "arraybuffer";
+  socket.onmessage = ({ data }) => {
+    if (typeof data !== "string") return load(data);
+    const message = JSON.parse(data);
+    if (message.layers) pending = message;
+    else if (message.stack) {
+      layersSeen = { solved: false, flat: false };
+      sensor = message.is_sensor;
+      const same = look && ["width_px", "height_px"].every((k) => look.stack[k] === message.stack[k]) && look.stack.x_m.length === message.stack.x_m.length;
+      if (same) look.turnTo(message.stack);
+      else build(message);
+      form("gap_mm").value = Math.round(1e5 * (message.stack.x_m[1] - message.stack.x_m[0])) / 100;
+    } else if (message.refresh) take(message);
+  };
+  socket.onclose = () => {
+    if (look) look.state = "phasestack try has ended, or its page was closed";
+    look?.draw();
+    setTimeout(connect, RETRY_MS);
+  };
+}
+
+const status = async () => (await fetch("/now/status")).json();
+const number = (value, digits = 1) => (typeof value === "number" ? value.toFixed(digits) : "–");
+
+async function about() {
+  try {
+    const answer = await (await fetch("/now/about")).json();
+    if (!answer.ok) throw new Error(answer.error);
+    main.querySelector("datalist").replaceChildren(...answer.scenes.map((value) => Object.assign(document.createElement("option"), { value })));
+    form("model").replaceChildren(...answer.models.map((value) => Object.assign(document.createElement("option"), { value, textContent: value })));
+  } catch {
+    setTimeout(about, RETRY_MS);
+  }
+}
+
+function figures(now) {
+  const at = (share) => [...latencies].sort((a, b) => a - b)[Math.floor(share * (latencies.length - 1))];
+  const rows = {
+    "this page draws": `${drawn.length} times a second`,
+    "the panels are given": `${number(now.fps_now)} refreshes a second`,
+    "the solver makes": `${number(now.solutions_per_s_now)} solutions a second, ${now.model ?? ""}`,
+    "the newest is": `${number(now.solution_age_now_ms, 0)} ms old`,
+    "the eyes are known to": `${number(now.eye_sigma_now_mm, 2)} mm (${now.eyes_label ?? "–"})`,
+    "pointer to aligned picture": `${number(at(0.5), 0)} ms, 99 of 100 within ${number(at(0.99), 0)} ms`,
+    "light at the eyes": now.light_db === null || now.light_db === undefined ? "not measured yet" : `${number(now.light_db)} dB`,
+  };
+  main.querySelector(".figures")?.replaceChildren(...Object.entries(rows).flatMap(([name, text]) =>
+    [["dt", name], ["dd", text]].map(([kind, textContent]) => Object.assign(document.createElement(kind), { textContent }))));
+  for (const [name, value] of [["scene", now.scene], ["model", now.model_asked]]) {
+    if (form(name) && document.activeElement !== form(name)) form(name).value = value ?? "";
+  }
+  if (form("held")) form("held").checked = Boolean(now.paused);
+}
+
+async function report() {
+  try {
+    const now = await status();
+    const starting = main.querySelector(".starting");
+    if (starting && now.reason) starting.textContent = `Starting: ${now.reason}. The first time on a machine takes some ten seconds longer.`;
+    if (look && now.ok) figures(now);
+  } catch {
+    // told by the connection
+  }
+  setTimeout(report, document.hidden ? 4 * STATUS_MS : STATUS_MS);
+}
+
+window.phasestack = {
+  ready: new Promise((done) => (first = done)).then(() => Object.assign(window.phasestack, look.doors)),
+  status,
+  eyes: () => eyesNow(look.head),
+  latencies: () => [...latencies],
+};
+setInterval(() => { if (performance.now() - lastSent >= AGAIN_MS) see(); }, AGAIN_MS);
+document.addEventListener("visibilitychange", see);
+connect();
+report();

@@ -1,0 +1,31 @@
+"""`phasestack try`: the display without the display."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from runtime.support.options import blame_option, number
+
+
+def try_(
+    config: Annotated[Path | None, typer.Option(help="TOML file; without: panels of 960x540")] = None,
+    scene: Annotated[str | None, typer.Option(help="a built-in scene, a file or folder")] = None,
+    model: Annotated[str | None, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = None,
+    webcam: Annotated[bool, typer.Option("--webcam", help="your own head, before this PC's camera")] = False,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any that is free")] = 0,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="only say the address")] = False,
+    seconds: Annotated[float | None, number(1, 1e6, "s", help="end after so long")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help='{"url": ...} on a line once it is served')] = False,
+) -> None:
+    """Look into a display that is not there: the daemon's own loop, with a browser as the viewer's head and the panels.
+
+    Example: phasestack try
+    """
+    from runtime.commands.trying import settings_of, try_display
+
+    with blame_option("try", scene=scene, model=model):
+        settings = settings_of(config, scene=scene, model=model, webcam=webcam)
+        try_display(settings, port=port, opens=not no_browser, seconds=seconds, as_json=as_json)

@@ -1,0 +1,98 @@
+"""The body of `phasestack try`: the daemon, and beside it the web server that is its sensor and its panels."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import tempfile
+import threading
+import time
+import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from runtime.browser.link import BrowserLink
+from runtime.config import Settings, changed, load_settings, with_options
+from runtime.daemon.build import RunOptions
+from runtime.daemon.client import Daemon
+from runtime.daemon.supervise import run_daemon
+from runtime.page.connections import LOOPBACK, listening, server_of
+from runtime.page.server import application
+
+SIZE_PX = {"width_px": 960, "height_px": 540}  # without a configuration: solved often on a small machine
+MEASURED_EVERY_S = 4.0  # the light at the eyes
+
+
+def settings_of(config: Path | None, *, scene: str | None, model: str | None, webcam: bool) -> Settings:
+    """Raises InputError."""
+    settings = load_settings(config) if config else changed(Settings(), "stack", SIZE_PX, source="try")
+    settings = with_options(settings, scene=scene, model=model)
+    if settings.sensor.driver != "usb-camera" or not webcam:
+        sensor = {"driver": "usb-camera", "source": ""} if webcam else {"driver": "browser"}
+        settings = changed(settings, "sensor", sensor, source="try")
+    every = max(1, round(MEASURED_EVERY_S * settings.loop.rate_hz))
+    return changed(settings, "loop", {"evaluate_every": every}, source="try")
+
+
+def try_display(settings: Settings, *, port: int, opens: bool, seconds: float | None, as_json: bool) -> None:
+    """Serve and run until told to stop. Raises InputError."""
+    is_sensor = settings.sensor.driver == "browser"
+    link = BrowserLink(settings.stack.stack(), settings.content.fov_deg, is_sensor=is_sensor)
+    ends_s = float("inf") if seconds is None else time.monotonic() + seconds
+
+    def until() -> str:
+        if link.gap_wanted_m is not None:
+            return "another gap between the panels is asked for"
+        return "its time is up" if time.monotonic() > ends_s else ""
+
+    with tempfile.TemporaryDirectory(prefix="phasestack-") as folder:
+        socket = Path(folder) / "status.sock"
+        service = {"socket": str(socket), "metrics_port": 0, "blackbox_minutes": 0.0}
+        settings = changed(settings, "service", service, source="try")
+        with _served(link, socket, port) as url:
+            typer.echo(json.dumps({"url": url}) if as_json else f"look into it: {url}")
+            if opens and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+                webbrowser.open(url)
+            while True:
+                run_daemon(partial(_as_it_is, settings), RunOptions(measure=True, browser=link, until=until))
+                if link.gap_wanted_m is None:
+                    return
+                settings = _with_gap(settings, link)
+
+
+def _as_it_is(settings: Settings) -> Settings:
+    return settings
+
+
+def _with_gap(settings: Settings, link: BrowserLink) -> Settings:
+    """The gap that a page asked for; scene and model as they were."""
+    gap_m, link.gap_wanted_m = link.gap_wanted_m or 0.0, None
+    account = link.shown[1]
+    settings = with_options(settings, scene=account.get("scene"), model=account.get("model"))
+    middle = (len(settings.stack.x_m) - 1) / 2
+    x_m = tuple((n - middle) * gap_m for n in range(len(settings.stack.x_m)))
+    settings = changed(settings, "stack", {"x_m": x_m}, source="try")
+    link.stack = settings.stack.stack()
+    return settings
+
+
+@contextmanager
+def _served(link: BrowserLink, socket: Path, port: int) -> Iterator[str]:
+    """The page, in a thread; answers its address, token included."""
+    token, served = secrets.token_urlsafe(32), listening("try", port)
+    own_port = served.getsockname()[1]
+    server = server_of(application(Daemon((socket,)), token, port=own_port, link=link))
+    sockets: dict[str, Any] = {"sockets": [served]}
+    thread = threading.Thread(target=server.run, kwargs=sockets, name="page", daemon=True)
+    thread.start()
+    try:
+        yield f"http://{LOOPBACK}:{own_port}/?token={token}"
+    finally:
+        server.should_exit = True
+        thread.join(timeout=5.0)

@@ -1,0 +1,78 @@
+"""Driver `browser`: a page's pointer is the head. With the noise and latency of a sensor that one may think of."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from runtime.browser.link import BrowserLink, SeenEyes
+from runtime.clock import NS_PER_MS, NS_PER_S, Clock
+from runtime.errors import SensorLost
+from runtime.records import EyePoints, SensorFrame
+from runtime.sensor.base import Capabilities, DeviceClock, Sensor
+
+AGAIN_NS = NS_PER_S // 30  # a page says where the eyes are as they move: until then they are where they were
+SILENT_NS = 5 * NS_PER_S  # without a word from a page nobody is seen
+LEAST_SIGMA_M = 5e-5
+
+
+class BrowserEyes(Sensor):
+    """Samples as pages send them, and between them the last one again."""
+
+    name = "browser"
+    capabilities = Capabilities(eye_points=True, in_stack_frame=True)
+
+    def __init__(self, link: BrowserLink, clock: Clock) -> None:
+        self._link, self._clock = link, clock
+        self._random = np.random.default_rng(0)
+        self._waiting: deque[tuple[int, SensorFrame]] | None = None  # when each is there
+        self._times, self._heard_ns, self._sampled_ns, self._count = DeviceClock(), 0, 0, 0
+        self._last = SeenEyes(None, 0.0)
+
+    def open(self) -> None:
+        self._waiting, self._times, self._last = deque(), DeviceClock(), SeenEyes(None, 0.0)
+        self._heard_ns = self._sampled_ns = self._clock.now_ns()
+
+    def read_newest(self, timeout_s: float) -> SensorFrame:
+        *overtaken, newest = self.read_arrived(timeout_s)
+        self.skipped += len(overtaken)
+        return newest
+
+    def read_arrived(self, timeout_s: float) -> list[SensorFrame]:
+        if self._waiting is None:
+            raise SensorLost("not open")
+        while True:
+            now_ns = self._clock.now_ns()
+            due = []
+            while self._waiting and self._waiting[0][0] <= now_ns:
+                due.append(self._waiting.popleft()[1])
+            if due:
+                return due
+            next_ns = min([self._sampled_ns + AGAIN_NS, *(due_ns for due_ns, _ in self._waiting)])
+            samples = self._link.seen(max(next_ns - now_ns, 0) / NS_PER_S)
+            now_ns = self._clock.now_ns()
+            for sample in samples:
+                capture_ns = self._times.host_ns(round(sample.page_ms * NS_PER_MS), arrival_ns=now_ns)
+                self._link.captured(capture_ns, sample.page_ms)
+                self._heard_ns, self._last = now_ns, sample
+                self._take(capture_ns, now_ns)
+            if not samples and now_ns - self._sampled_ns >= AGAIN_NS:
+                if now_ns - self._heard_ns > SILENT_NS:
+                    self._last = SeenEyes(None, 0.0)
+                self._take(now_ns, now_ns)
+
+    def _take(self, capture_ns: int, now_ns: int) -> None:
+        assert self._waiting is not None
+        self._sampled_ns = now_ns
+        self._count += 1
+        points, eyes_m = None, self._last.eyes_m
+        if eyes_m is not None:
+            sigma_m = max(self._link.noise_mm * 1e-3, LEAST_SIGMA_M)
+            noise_m = self._random.normal(size=3) * self._link.noise_mm * 1e-3
+            points = EyePoints(eyes_m + noise_m, np.ones(2), covariance_m2=np.eye(3) * sigma_m**2)
+        due_ns = now_ns + round(self._link.latency_ms * NS_PER_MS)
+        self._waiting.append((due_ns, SensorFrame(self._count, capture_ns, points, true_eyes_m=eyes_m)))
+
+    def close(self) -> None:
+        self._waiting = None

@@ -1,0 +1,187 @@
+"""`phasestack try`: in Debian's Chromium, and its connection without one."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from runtime.page.token import cookie_of
+from tests.browser.test_viewer import driven, needs_chromium
+from tests.page.rig import ROOT
+from tests.test_cli import refusal
+from tests.waiting import eventually
+
+SMALL = '[stack]\nwidth_px = 320\nheight_px = 180\n[model]\nname = "fast"\nbackend = "cpu"\n'
+TRIED = (
+    "the token is not in the address", "the pointer moved the head", "status has the eyes there to 1 mm",
+    "another solution", "and the page shows it", "the picture is one", "figures are told", "the solver is held",
+    "while alignment goes on", "eyes lost: flat", "and back", "a scene that is not there", "another scene",
+    "another page looks on", "and takes over", "nobody: held, then flat", "back: tracking", "another gap",
+    "and the scene stays",
+)  # fmt: skip
+
+
+@contextmanager
+def trying(folder: Path, *more: str) -> Iterator[str]:
+    """The address of a running `phasestack try`; it must end well."""
+    (folder / "try.toml").write_text(SMALL)
+    command = [
+        sys.executable,
+        "-m",
+        "runtime.cli",
+        "try",
+        "--config",
+        str(folder / "try.toml"),
+        "--no-browser",
+        "--json",
+    ]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "STATE_DIRECTORY": str(folder)}
+    with (folder / "log").open("wb") as log:
+        process = subprocess.Popen(
+            [*command, *more], cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=log, text=True
+        )
+        assert process.stdout is not None
+        try:
+            yield json.loads(process.stdout.readline())["url"]
+        finally:
+            if "its time is up" not in (folder / "log").read_text():
+                process.terminate()
+            assert process.wait(60) == 0, (folder / "log").read_text()[-3000:]
+            process.stdout.close()
+
+
+class Client:
+    """A program that is the page: it looks, and says where the eyes are."""
+
+    def __init__(self, url: str, **headers: str) -> None:
+        parts = urlsplit(url)
+        token = parts.query.removeprefix("token=")
+        given = {"Authorization": f"Bearer {token}"} | {k.replace("_", "-"): v for k, v in headers.items()}
+        self._connection = connect(
+            f"ws://{parts.netloc}/live", additional_headers=given, max_size=None, compression=None
+        )
+        self.layers: dict[str, bytes] = {}
+        self.refresh: dict[str, Any] = {}
+        self.stack: dict[str, Any] = {}
+
+    def __enter__(self) -> Client:
+        self.socket = self._connection.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._connection.__exit__(*error)
+
+    def look(self) -> None:
+        message = json.loads(self.socket.recv(30))
+        if "layers" in message:
+            self.layers[message["layers"]] = self.socket.recv(30)
+            self.socket.send(json.dumps({"drawn": True}))
+        self.stack = message.get("stack", self.stack)
+        self.refresh = message.get("refresh", self.refresh)
+
+    def until(self, holds: Any) -> bool:
+        def looked() -> bool:
+            self.look()
+            return bool(holds(self))
+
+        return eventually(looked, within_s=120.0)
+
+    def say(self, **message: Any) -> None:
+        self.socket.send(json.dumps(message))
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with trying(tmp_path_factory.mktemp("try")) as address:
+        yield address
+
+
+def off_m(eyes_m: list, others_m: list) -> float:
+    return float(np.abs(np.subtract(eyes_m, others_m)).max())
+
+
+def test_eyes_go_in_and_layers_come_out_solved_for_them(url: str) -> None:
+    eyes = [[0.55, 0.02, 0.05], [0.55, 0.08, 0.05]]
+    with Client(url) as client:
+        client.say(eyes=eyes, page_ms=1.0)
+        assert client.until(lambda c: "solved" in c.layers and c.refresh["state"] == "tracking")
+        assert len(client.layers["solved"]) == 3 * 180 * 320 * 4 and client.stack["width_px"] == 320
+        assert client.until(
+            lambda c: c.refresh["eyes_m"] and np.abs(np.subtract(c.refresh["eyes_m"], eyes)).max() < 1e-3
+        )
+        assert client.until(lambda c: np.abs(np.subtract(c.refresh["solved_for_m"], eyes)).max() < 0.002)
+        client.say(eyes=None, page_ms=2.0)
+        assert client.until(lambda c: c.refresh["state"] == "holding")
+        assert client.until(lambda c: c.refresh["state"] == "flat" and c.refresh["flatness"] == 1.0)
+
+
+@pytest.mark.parametrize(
+    "message", [{"eyes": "no"}, {"eyes": [[0, 0, 0], [0, 0, 0]]}, {"eyes": [[1, 2], 3]}, {"noise_mm": "x"}, [], 7, {}]
+)
+def test_what_is_no_message_changes_nothing(url: str, message: Any) -> None:
+    with Client(url) as client:
+        client.socket.send(json.dumps(message))
+        client.say(eyes=[[0.6, -0.03, 0.0], [0.6, 0.03, 0.0]], page_ms=3.0)
+        assert client.until(lambda c: c.refresh and c.refresh["state"] == "tracking")
+
+
+@pytest.mark.parametrize("text", ["{", "x" * 100_000])
+def test_who_sends_no_json_or_too_much_is_sent_away(url: str, text: str) -> None:
+    with Client(url) as client:
+        client.socket.send(text)
+        with pytest.raises(ConnectionClosed):
+            while True:
+                client.look()
+
+
+@pytest.mark.parametrize("headers", [{"Authorization": ""}, {"Authorization": "Bearer wrong"}, {"Host": "a.example"}])
+def test_without_the_token_or_by_another_name_there_is_nothing(url: str, headers: dict) -> None:
+    with pytest.raises((InvalidStatus, ConnectionClosed)), Client(url, **headers) as client:
+        client.look()
+
+
+def test_another_site_s_page_gets_no_connection_though_the_browser_gives_the_cookie(url: str) -> None:
+    parts = urlsplit(url)
+    token = parts.query.removeprefix("token=")
+    cookie = f"phasestack-{parts.port}={cookie_of(token)}"
+
+    def told(origin: str) -> Any:
+        given = {"Cookie": cookie, "Origin": origin}
+        with connect(f"ws://{parts.netloc}/live", additional_headers=given) as socket:
+            return json.loads(socket.recv(30))
+
+    assert "stack" in told(f"http://{parts.netloc}")
+    for origin in ("http://elsewhere.example", "null"):
+        with pytest.raises((InvalidStatus, ConnectionClosed)):
+            told(origin)
+
+
+def test_it_ends_when_its_time_is_up(tmp_path: Path) -> None:
+    with trying(tmp_path, "--seconds", "1") as address:
+        assert eventually(lambda: "its time is up" in (tmp_path / "log").read_text(), within_s=120.0), address
+
+
+@pytest.mark.parametrize(("option", "value"), [("--scene", "no-such-scene"), ("--model", "none.onnx")])
+def test_bad_options_are_one_line_and_exit_2(option: str, value: str) -> None:
+    assert value in refusal("try", "--no-browser", option, value)
+
+
+@pytest.mark.slow
+def test_it_works_in_a_browser(tmp_path: Path) -> None:
+    needs_chromium()
+    with trying(tmp_path) as address:
+        told = driven("try.mjs", address, os.environ.get("PHASESTACK_SCREENSHOTS") or tmp_path)
+    assert [what for what in TRIED if told.get(what) is not True] == []
+    assert told["elsewhere"] == [] and told["errors"] == []

@@ -1,0 +1,77 @@
+// node try.mjs URL FOLDER: `phasestack try` in Chromium; prints a line of JSON for each thing tried.
+import { opened, say } from "./chromium.mjs";
+
+const [, , url, folder] = process.argv;
+const origin = new URL(url).origin, token = new URL(url).searchParams.get("token");
+const { browser, context, page: newPage, elsewhere, errors } = await opened({ origin, width: 640, height: 480 });
+const status = async () => (await fetch(`${origin}/now/status`, { headers: { Authorization: `Bearer ${token}` } })).json();
+const until = async (holds, within_ms = 60000) => {
+  const end = Date.now() + within_ms;
+  while (Date.now() < end) {
+    if (await holds()) return true;
+    await new Promise((done) => setTimeout(done, 50));
+  }
+  return false;
+};
+const far = (a, b) => Math.hypot(...a.map((v, k) => v - b[k]));
+const off = (a, b) => Math.max(far(a[0], b[0]), far(a[1], b[1]));
+
+let page = await newPage();
+await page.goto(url);
+await page.evaluate(() => window.phasestack.ready);
+say("the token is not in the address", !page.url().includes("token"));
+const before = await status();
+await page.mouse.move(200, 150);
+const eyes = await page.evaluate(() => window.phasestack.eyes());
+say("the pointer moved the head", far(eyes[0], [0.6, -0.0315, 0]) > 0.03);
+say("status has the eyes there to 1 mm", await until(async () => { const { eyes_m: found } = await status(); return found && off(found, eyes) < 0.001; }));
+say("another solution", await until(async () => (await status()).solution > before.solution));
+say("and the page shows it", await until(() => page.evaluate(() => /is where/.test(document.querySelector(".head").textContent))));
+const size = await page.evaluate(() => window.phasestack.picture(0, 320, 180).length);
+say("the picture is one", size > 5000);
+say("figures are told", await until(async () => /[\d.]+ refreshes a second/.test(await page.textContent(".figures"))));
+await page.screenshot({ path: `${folder}/try.png` });
+
+await page.check("[name=held]");
+say("the solver is held", await until(async () => (await status()).paused));
+const held = (await status()).solution;
+await page.mouse.move(420, 300);
+await until(async () => off((await status()).eyes_m, await page.evaluate(() => window.phasestack.eyes())) < 0.001);
+say("while alignment goes on", (await status()).solution === held && (await status()).state === "tracking");
+await page.uncheck("[name=held]");
+await page.check("[name=lost]");
+say("eyes lost: flat", await until(async () => (await status()).state === "flat"));
+await page.screenshot({ path: `${folder}/lost.png` });
+await page.uncheck("[name=lost]");
+say("and back", await until(async () => (await status()).state === "tracking"));
+await page.fill("[name=scene]", "no-such-scene");
+await page.keyboard.press("Enter");
+say("a scene that is not there", await until(async () => (await page.textContent(".told")).includes("no-such-scene")));
+await page.fill("[name=scene]", "texture");
+await page.keyboard.press("Enter");
+say("another scene", await until(async () => (await status()).scene === "texture"));
+
+const other = await newPage();
+await other.goto(origin);
+await other.evaluate(() => window.phasestack.ready);
+await other.mouse.move(100, 100);
+const first = await page.evaluate(() => window.phasestack.eyes());
+await new Promise((done) => setTimeout(done, 500));
+say("another page looks on", off((await status()).eyes_m, first) < 0.001);
+await page.close();
+say("and takes over", await until(async () => { const s = await status(); return s.eyes_m && off(s.eyes_m, await other.evaluate(() => window.phasestack.eyes())) < 0.001 && far(s.eyes_m[0], first[0]) > 0.01; }));
+
+const states = new Set();
+await other.close();
+say("nobody: held, then flat", await until(async () => { states.add((await status()).state); return states.has("flat"); }) && states.has("holding"));
+page = await newPage();
+await page.goto(origin);
+await page.evaluate(() => window.phasestack.ready);
+say("back: tracking", await until(async () => (await status()).state === "tracking"));
+await page.fill("[name=gap_mm]", "40");
+await page.keyboard.press("Enter");
+say("another gap", await until(async () => (await page.evaluate(() => fetch("/now/about").then((a) => a.json()))).stack?.x_m[2] === 0.04, 120000));
+say("and the scene stays", await until(async () => { const s = await status(); return s.scene === "texture" && s.state === "tracking"; }, 120000));
+say("elsewhere", elsewhere);
+say("errors", errors.filter((text) => !/status of (503|409)/.test(text)));
+await browser.close();
