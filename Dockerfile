@@ -25,9 +25,9 @@ ARG BASE=python:3.11.14-slim-bookworm@sha256:65a93d69fa75478d554f4ad27c85c1e69fa
 FROM ${BASE} AS build
 WORKDIR /src
 # Dependencies first: they change less often than the program.
-COPY requirements/runtime.lock requirements/page.lock requirements/
+COPY requirements/runtime.lock requirements/
 RUN python -m venv /opt/phasestack \
- && /opt/phasestack/bin/pip install --no-cache-dir -r requirements/runtime.lock -r requirements/page.lock
+ && /opt/phasestack/bin/pip install --no-cache-dir -r requirements/runtime.lock
 COPY pyproject.toml README.md ./
 COPY phasestack phasestack
 COPY runtime runtime
