@@ -45,10 +45,10 @@ HEAD = """\
     phasestack bench --out new.json           # the regression file
     phasestack bench compare old.json new.json
 
-**Quote light, of eyes sure to 1 mm** (`light_db`, `"1"`): a panel's pixel is an even box, an eye makes of a pixel of
-its picture the mean intensity of nine rays through it, and 1 mm is what a pupil alone amounts to. It is the PSNR of
-displayed layers, clipped and rounded to 8 bits, against that picture, over eye errors of that size. The other
-figures:
+**Quote light, at a tracking error of 1 mm** (`light_db`, `"1"`): a panel's pixel is an even box, and an eye makes of a
+pixel of its picture the mean intensity over that pixel and over its pupil, 4 mm wide. It is the PSNR of displayed
+layers, clipped and rounded to 8 bits, against that picture, expected over such errors, and
+[measured without bias](mathematics.md#light). The other figures:
 
 * *one ray* (`psnr_db`, `expected_db`): panels sampled bilinearly along one ray a pixel, as published evaluations do;
   a solver can polish those rays without the light getting better.

@@ -22,7 +22,7 @@ from phasestack.pictures import as_codes, as_picture
 from phasestack.stack import checked_stack
 from runtime.errors import InputError, ModelFailure
 from runtime.evaluation.displayed import Picture
-from runtime.evaluation.solved import PairQuality, SolvedPair, judged
+from runtime.evaluation.solved import PairQuality, SolvedPair
 from runtime.model.job import Job
 from runtime.model.predictor import Predictor, load_predictor
 from runtime.model.still import solve_still
@@ -54,7 +54,7 @@ class _Pair:
 
     def judged(self, layers: U8) -> SolvedPair:
         """What the eyes make of layers."""
-        return judged(layers, self.pictures, self.stack, eyes_m=self.eyes_m, fov_deg=self.fov_deg)
+        return SolvedPair(layers, self.pictures, self.stack, self.eyes_m, self.fov_deg)
 
 
 class Result:
@@ -89,7 +89,7 @@ class Result:
 
     @property
     def _line(self) -> str:
-        line = f"model {self.model}, solved for eyes unsure by {self.eye_sigma_mm:g} mm; "
+        line = f"model {self.model}, solved for a tracking error of {self.eye_sigma_mm:g} mm; "
         return line + f"one ray a pixel, as published: {self.quality.psnr_db:.1f} dB"
 
     def show(self) -> Path:
@@ -133,7 +133,7 @@ def solve(
     OpenCV's axes, and half a pixel more to K's middle where that has centres at whole numbers. They say where the eyes
     are and how wide the pictures: `eyes_m` and `fov_deg` are not needed. What is solved for, and measured, is then the
     pictures turned to the stack's origin, as large as the panels are seen.
-    model: fast, balanced, best, sart or an ONNX file. eye_sigma_mm: how unsure the eyes are; 1: a pupil; 0: two points.
+    model: fast, balanced, best, sart or an ONNX file. eye_sigma_mm: the tracking's error; 1: a good tracker's; 0: none.
     Raises ValueError, naming the argument; warns where pictures or eyes can hardly be meant as they are.
     """
     pair = _checked((left, right), stack=stack, eyes_m=eyes_m, fov_deg=fov_deg, cameras=cameras)

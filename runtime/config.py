@@ -266,8 +266,8 @@ class ModelSettings(Section):
     threads: Annotated[int, Field(ge=0, le=256)] = Field(2, description="inference threads; 0: all cores")
     eye_sigma_mm: Literal["auto"] | NonNegative = Field(
         "auto",
-        description="standard deviation of where light enters an eye, millimetres an axis: a picture for two points "
-        "(0) or a forgiving one; auto: a pupil of 4 mm and the tracker's own covariance together",
+        description="standard deviation of the eyes' common place, millimetres an axis: a picture for eyes that are "
+        "known (0) or a forgiving one; auto: the tracker's own covariance",
     )
     budget_ms: NonNegative = Field(
         0.0, description="time for one solution, drawing included, after which no further step begins; 0: none"

@@ -163,7 +163,7 @@ class Solution:
     solved_for_m: F64 | None  # (2, 3) left, right; frame `stack`; None: flat, for eyes anywhere
     solved_for_ns: int  # the instant that it was made for; its content is of that instant
     seeing: tuple[bool, bool] = (True, True)  # left, right: an eye that can't see the display gave way to the other
-    eye_sigma_mm: float | None = None  # how far off the eyes it was made to hold: pupil and tracker together
+    eye_sigma_mm: float | None = None  # tracking error that it was made to hold for
     stage_ms: dict[str, float] = field(default_factory=dict)  # render, prepare, inference, finish; the run's clock
 
     @property

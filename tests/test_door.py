@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 import phasestack
-from phasestack import pair as pair_module
 from runtime.commands.app import app
 from runtime.errors import InputError
+from runtime.evaluation import solved
 from tests.test_cli import pair_in, solve_arguments
 
 STACK = phasestack.Stack(width_m=0.5184, height_m=0.2916, x_m=(-0.06, 0.0, 0.06), width_px=320, height_px=180)
@@ -137,8 +137,8 @@ def test_a_stack_that_can_t_be_is_refused_when_it_is_made(given: dict[str, Any],
 
 def test_a_result_says_itself_in_a_line_and_measures_its_quality_when_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
-    real = pair_module.judged
-    monkeypatch.setattr(pair_module, "judged", lambda *given, **how: calls.append(1) or real(*given, **how))
+    real = solved.displayed
+    monkeypatch.setattr(solved, "displayed", lambda *given, **how: calls.append(1) or real(*given, **how))
     result = phasestack.solve(picture(), picture(3), eyes_m=EYES, stack=STACK, model="fast")
     assert repr(result) == "<phasestack.Result: 3 layers of 320x180 by fast>" and calls == []
     assert result.quality is result.quality and calls == [1]

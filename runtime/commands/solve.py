@@ -33,7 +33,7 @@ def solve(
     model: Annotated[str, typer.Option(help="fast, balanced, best, sart or an ONNX file")] = "balanced",
     repeat: Annotated[int, typer.Option(min=1, max=10000, help="timed runs, after the warm-up")] = 1,
     eye_sigma_mm: Annotated[
-        float, number(0, 1000, "mm", help="how unsure the eyes are, mm an axis; 1: a pupil; 0: two points")
+        float, number(0, 1000, "mm", help="the tracking's error, mm an axis; 1: a good tracker's; 0: none")
     ] = 1.0,
     backend: Annotated[
         str | None,
@@ -64,5 +64,5 @@ def solve(
         )
     typer.echo(shown(result, as_json=as_json))
     if not as_json:
-        typer.echo("light_db of eyes sure to 1 mm (a pupil) is the figure to quote")
+        typer.echo("light_db at a tracking error of 1 mm is the figure to quote")
         typer.echo(f"see {out / 'contact-sheet.png'}; look into it: {out / 'viewer.html'}")

@@ -16,7 +16,7 @@ from runtime.clock import Stopwatch
 from runtime.config import Settings, load_stack, read_table, with_options
 from runtime.content.base import ContentInfo
 from runtime.errors import EyesNotServed, InputError
-from runtime.evaluation.solved import judged
+from runtime.evaluation.solved import SolvedPair
 from runtime.evaluation.trials import timed
 from runtime.model.backends import choose
 from runtime.model.job import Job
@@ -104,19 +104,18 @@ def solve_pair(
             raise InputError("solve", "--left-eye, --right-eye", why) from None
         watch.lap("solve, warm-up included")
         with OutputFolder(out) as folder:
+            seen = SolvedPair(done.answer.layers, pictures, stack, eyes_m, fov_deg)
             try:
-                seen = judged(done.answer.layers, pictures, stack, eyes_m=eyes_m, fov_deg=fov_deg)
+                quality = seen.quality
             except ValueError as error:
                 why = f"{error}: nothing of the display can be seen from there"
                 raise InputError("solve", "--left-eye", why) from None
-            line = (
-                f"{files[0].name} and {files[1].name}, model {model}, solved for eyes unsure by {eye_sigma_mm:g} mm; "
-            )
-            line += f"one ray a pixel, as published: {seen.quality.psnr_db:.1f} dB"
+            line = f"{files[0].name} and {files[1].name}, model {model}, solved for a tracking error of "
+            line += f"{eye_sigma_mm:g} mm; one ray a pixel, as published: {quality.psnr_db:.1f} dB"
             seen.write(folder.staging, lines=[line])
             watch.lap("measure and write")
             items = network_items(ContentInfo(files[0].name), Measured(left_out=left_out))
-            result = seen.quality.table() | {
+            result = quality.table() | {
                 "inference_ms": round(float(np.median(inference_ms[-repeat:])), 3),
                 "total_ms": round(done.median_ms, 3),
                 "model": predictor.name,

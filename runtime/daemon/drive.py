@@ -58,6 +58,6 @@ def print_summary(summary: dict[str, Any], out: Path | None) -> None:
         for line in lines_of({name: summary[name] for name in configured}):
             print(f"  {line}")
     if summary["light_db"] is not None:
-        print("light_db, of a pupil at the eyes used, is the figure to quote")
+        print("light_db, of pupils at the eyes used and a tracking error of 1 mm, is the figure to quote")
     if out is not None:
         print(f"see {out}/contact-sheet.png; look into it: {out}/viewer.html")

@@ -10,6 +10,7 @@ import numpy as np
 
 from runtime.evaluation.displayed import EyeViews
 from runtime.optics.carried import intensities
+from runtime.optics.pupil import PUPIL_MM, TRACKING_SIGMA_MM
 from runtime.optics.retina import as_codes
 from runtime.records import U8
 
@@ -27,7 +28,7 @@ class Moment:
 
     layers: U8  # (N, h, w, 3 or 4), as the panels showed them
     eye_views: EyeViews
-    light_db: float  # of a pupil (1 mm)
+    light_db: float  # of tracking errors of 1 mm
     lines: tuple[str, ...]  # where the eyes were, and how well that was known
 
 
@@ -73,7 +74,8 @@ def headline(light_db: float | None) -> str:
     """The figure to quote, in words."""
     if light_db is None:
         return "the light at these eyes was not measured"
-    return f"{light_db:.1f} dB of light: what both eyes make of the panels' pixels, with pupils 4 mm wide"
+    told = f"pixels as squares, pupil {PUPIL_MM:g} mm, tracking error {TRACKING_SIGMA_MM:g} mm"
+    return f"PSNR {light_db:.1f} dB at the eyes ({told})"
 
 
 def _write(sheet: U8, text: str, *, x: int, y: int, scale: float) -> None:

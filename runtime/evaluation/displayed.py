@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from runtime.browser.still import viewer_html
-from runtime.optics.carried import expected_psnrs_db, intensities
+from runtime.optics.carried import expected_psnrs_db, intensities, light_psnrs_db
 from runtime.optics.quality import Quality, quality
 from runtime.optics.retina import Retina, as_codes, seen_by
 from runtime.optics.stack import PanelStack
@@ -20,7 +20,7 @@ from runtime.records import F32, F64, U8
 from runtime.support.artifacts import write_png
 
 Picture = U8 | F32  # (h, w, 3): code values, or intensities in [0, 1]
-SIGMAS_MM = (0.0, 1.0, 2.0)  # two points, a pupil alone, a pupil and a good tracker
+SIGMAS_MM = (0.0, 1.0, 2.0)  # of tracking: eyes that are known, a good tracker's, twice that
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,26 +73,18 @@ def displayed(
 
 
 def expected_db(
-    eye_views: EyeViews,
-    layers: U8,
-    stack: PanelStack,
-    *,
-    eyes_m: F64,
-    fov_deg: float,
-    sigmas_mm: Sequence[float] = SIGMAS_MM,
-    step: int = 1,
-    rays: int = 0,
+    eye_views: EyeViews, layers: U8, *, light: bool = False, sigmas_mm: Sequence[float] = SIGMAS_MM
 ) -> dict[str, float | None]:
-    """Expected PSNR (docs/contracts.md, Error) of layers, by the eyes' uncertainty in millimetres: "0", "1", "2".
+    """Expected PSNR (docs/contracts.md, Error) of layers, by the tracking's error in millimetres: "0", "1", "2".
 
-    step: only every so-manieth ray of every so-manieth row; rays: of light, along and down a pixel, 0: one, bilinear.
-    None where such an error would take an eye to where it sees nothing.
+    light: of what pupils get of the panels' pixels, else of one ray a pixel. None where such an error would take an eye
+    to where it sees nothing.
     """
+    psnrs_db = light_psnrs_db if light else expected_psnrs_db
     values: dict[float, float | None] = dict.fromkeys(sigmas_mm)
+    how: Any = {"eyes_m": eye_views.eyes_m, "fov_deg": eye_views.fov_deg, "sigmas_mm": sigmas_mm}
     with contextlib.suppress(ValueError):
-        values |= expected_psnrs_db(
-            layers, eye_views.wanted, stack, eyes_m=eyes_m, fov_deg=fov_deg, sigmas_mm=sigmas_mm, step=step, rays=rays
-        )
+        values |= psnrs_db(layers, eye_views.wanted, eye_views.stack, **how)
     return {f"{sigma_mm:g}": value for sigma_mm, value in values.items()}
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from runtime.evaluation.contact_sheet import contact_sheet, headline
 from runtime.evaluation.displayed import EyeViews, Picture, displayed, expected_db
-from runtime.optics.light import RAYS
 from runtime.optics.retina import as_codes
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
@@ -20,11 +20,11 @@ BySigma = Mapping[str, float | None]
 
 @dataclass(frozen=True, slots=True)
 class PairQuality:
-    """How good what the eyes get is (docs/contracts.md, Error); by "0", "1", "2" mm of eye error; 1: a pupil alone."""
+    """How good what the eyes get is (docs/contracts.md, Error); by "0", "1", "2" mm of tracking error."""
 
-    light_db: BySigma  # of the panels' real pixels; "1" is the figure to quote
+    light_db: BySigma  # of real pixels and pupils; "1", a good tracker's, is the figure to quote
     expected_db: BySigma  # one ray a pixel
-    psnr_db: float  # one ray a pixel, of two points
+    psnr_db: float  # one ray a pixel, of eyes that are known
     ssim: float
     eye_psnr_db: tuple[float, ...]  # left, right
 
@@ -39,13 +39,31 @@ class PairQuality:
         }
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class SolvedPair:
-    """Layers, what the eyes see of them, and how good that is."""
+    """Layers, what eyes see of them, and how good that is: worked out when it is first asked for.
+
+    Asking raises ValueError where an eye sees nothing of the display.
+    """
 
     layers: U8  # (N, h, w, 3 or 4), rear to front
-    eye_views: EyeViews
-    quality: PairQuality
+    pictures: Sequence[Picture]
+    stack: PanelStack
+    eyes_m: F64  # (2, 3), frame `stack`
+    fov_deg: float
+
+    @cached_property
+    def eye_views(self) -> EyeViews:
+        """What the eyes see, and should."""
+        return displayed(self.layers, self.pictures, self.stack, eyes_m=self.eyes_m, fov_deg=self.fov_deg)
+
+    @cached_property
+    def quality(self) -> PairQuality:
+        """The judgement: seconds of work for a large picture."""
+        views = self.eye_views
+        light, expected = (expected_db(views, self.layers, light=light) for light in (True, False))
+        at_eyes = views.quality
+        return PairQuality(light, expected, at_eyes.psnr_db, at_eyes.ssim, tuple(at_eyes.eye_psnr_db))
 
     @property
     def seen(self) -> tuple[U8, ...]:
@@ -64,22 +82,6 @@ class SolvedPair:
         sheet = contact_sheet(self.layers, self.eye_views, headline=headline(self.quality.light_db["1"]), lines=lines)
         write_png(folder / "contact-sheet.png", sheet)
         write_text(folder / "viewer.html", self.viewer(lines))
-
-
-def judged(
-    layers: U8, pictures: Sequence[Picture], stack: PanelStack, *, eyes_m: F64, fov_deg: float, step: int = 1
-) -> SolvedPair:
-    """What eyes (2, 3), frame `stack`, make of layers. Raises ValueError where they see nothing of the display.
-
-    step: what is expected of unsure eyes is measured on every so-manieth ray of every so-manieth row alone.
-    """
-    views = displayed(layers, pictures, stack, eyes_m=eyes_m, fov_deg=fov_deg)
-    light, expected = (
-        expected_db(views, layers, stack, eyes_m=eyes_m, fov_deg=fov_deg, step=step, rays=rays) for rays in (RAYS, 0)
-    )
-    at_eyes = views.quality
-    quality = PairQuality(light, expected, at_eyes.psnr_db, at_eyes.ssim, tuple(at_eyes.eye_psnr_db))
-    return SolvedPair(layers, views, quality)
 
 
 def _rounded(by_sigma: BySigma) -> dict[str, float | None]:

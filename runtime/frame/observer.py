@@ -25,7 +25,8 @@ from runtime.frame.presenter import Refresh
 from runtime.frame.solver_host import SolverHost
 from runtime.optics.alignment import shown_layers
 from runtime.optics.carried import carried_db, light_psnrs_db
-from runtime.optics.pupil import PUPIL_SIGMA_MM
+from runtime.optics.light import Sampling
+from runtime.optics.pupil import TRACKING_SIGMA_MM
 from runtime.optics.stack import PanelStack
 from runtime.plan.drawing import retina_pictures
 from runtime.records import F64, U8, RefreshAccount, SensorFrame, State
@@ -33,7 +34,7 @@ from runtime.support.background import Job
 
 log = logging.getLogger("phasestack.quality")
 
-LIGHT_STEP = 2  # of the pixels whose light is measured
+MEASURED = Sampling(step=2)  # light, of a part of the pixels
 FIGURES = ("light_db", "psnr_db", "ssim", "carried_db", "psnr_db_true_eyes", "carried_db_true_eyes")
 WAITING_MAX = 2048  # lines that wait for the truth; older ones go without
 DRAWN_WITHIN_S = 10.0  # the pictures of the last refresh, by the solver
@@ -293,11 +294,11 @@ class RunObserver:
                 stack,
                 eyes_m=solved_for_m,
                 seen_from_m=account.eyes_m,
-                sigmas_mm=(PUPIL_SIGMA_MM,),
+                sigmas_mm=(TRACKING_SIGMA_MM,),
                 fov_deg=fov_deg,
-                step=LIGHT_STEP,
+                sampling=MEASURED,
             )
-            moment = Moment(layers, views, light[PUPIL_SIGMA_MM], _where(account))
+            moment = Moment(layers, views, light[TRACKING_SIGMA_MM], _where(account))
             values = [moment.light_db, views.quality.psnr_db, views.quality.ssim]
             values.append(seen_db("solved", solved_for_m=solved_for_m, eyes_m=account.eyes_m))
             if true_m is not None:

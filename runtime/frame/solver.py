@@ -19,7 +19,6 @@ from runtime.frame.run_state import RunCell, RunState
 from runtime.model.assembly import flat_layers
 from runtime.model.job import Part
 from runtime.model.trim import Savings
-from runtime.optics.pupil import configured_sigma_mm
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import raster_from_stack
 from runtime.plan.drawing import drawn_for
@@ -89,7 +88,7 @@ class Solver:
 
     def _solve(self, state: RunState, request: SolveRequest, eyes_m: F64, *, revision: int) -> SolverStep:
         settings, watch = state.settings.model, Stopwatch()
-        sigma_mm = configured_sigma_mm(settings.eye_sigma_mm, tracker_sigma_m=request.sigma_m)
+        sigma_mm = request.sigma_m * 1e3 if settings.eye_sigma_mm == "auto" else settings.eye_sigma_mm
         limited = self._timed and settings.budget_ms > 0
         deadline_ns = perf_counter_ns() + round(settings.budget_ms * NS_PER_MS) if limited else None
         try:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from runtime.model.fade import Fade
-from runtime.optics.pupil import PUPIL_SIGMA_MM
+from runtime.optics.pupil import TRACKING_SIGMA_MM
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
@@ -66,7 +66,7 @@ class Job:
     pictures: Sequence[Sequence[Picture]]  # [eye][raster] (h, w, 4) RGBA, left eye first, on `Predictor.rasters`
     eyes_m: F64  # (2, 3) left and right, frame `stack`
     # Standard deviation, an axis, of where light enters the eyes, common to both, right and up; 0: two points.
-    eye_sigma_mm: float = PUPIL_SIGMA_MM
+    eye_sigma_mm: float = TRACKING_SIGMA_MM
     part: Part | None = None  # None: all of the panels
     channels: int = 3  # 1: the pictures are grey, and one channel is solved for all three
     deadline_ns: int | None = None  # of `time.perf_counter_ns`: no further step begins after it; None: none

@@ -12,7 +12,7 @@ from runtime.model.base import Prediction, Predictor
 from runtime.model.job import Job
 from runtime.model.own_rays import refined
 from runtime.model.unseen import extrapolate_border, is_whole, shown_of
-from runtime.optics.pupil import PUPIL_SIGMA_MM
+from runtime.optics.pupil import TRACKING_SIGMA_MM
 from runtime.optics.rect import PixelRect
 from runtime.optics.stack import PlaneRaster
 from runtime.optics.views import image_from_raster, image_from_stack
@@ -31,7 +31,7 @@ def solve_still(
     eyes_m: F64,
     fov_deg: float,
     predictor: Predictor,
-    eye_sigma_mm: float = PUPIL_SIGMA_MM,
+    eye_sigma_mm: float = TRACKING_SIGMA_MM,
     changed: Callable[[Job], Job] = lambda job: job,
 ) -> Prediction:
     """Layers for two pictures (h, w, 3 or 4) that a left and a right eye (2, 3), frame `stack`, should see.

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from runtime.optics.light import RAYS, squared_error
+from runtime.optics.light import LIGHT, ONE_RAY, Sampling, squared_error
 from runtime.optics.quality import psnr_db
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import stack_from_eye
@@ -39,7 +39,9 @@ def carried_db(
     """
     targets = [intensities(picture) for picture in drawn]
     solved_for, eyes = np.asarray(solved_for_m, np.float64), np.asarray(eyes_m, np.float64)
-    error = squared_error(layers, targets, stack, solved_for_m=solved_for, eyes_m=eyes, fov_deg=fov_deg, rays=0)
+    error = squared_error(
+        layers, targets, stack, solved_for_m=solved_for, eyes_m=eyes, fov_deg=fov_deg, sampling=ONE_RAY
+    )
     return psnr_db(error)
 
 
@@ -52,43 +54,49 @@ def expected_psnrs_db(
     fov_deg: float,
     sigmas_mm: Sequence[float],
     seen_from_m: ArrayLike | None = None,
-    step: int = 1,
-    rays: int = 0,
+    sampling: Sampling = ONE_RAY,
 ) -> dict[float, float]:
     """PSNR of the carried squared error expected over normal errors of the eyes' common place (docs/contracts.md).
 
     For each standard deviation to the right and up, by five points: no error with weight 1/2, two standard deviations
     to either side with 1/8 each, which is exact for second moments. drawn: an (h, w, 3) picture for each of the eyes
-    (2, 3) that the layers were solved for; seen_from_m: (2, 3) where they really are, without: there; rays: of light,
-    along and down a pixel; 0: one ray, bilinear. What moved eyes see of a picture of `PLENTY` is told by every second
-    pixel of every second row, to 0.02 dB. The other arguments and errors are those of `carried_db`.
+    (2, 3) that the layers were solved for; seen_from_m: (2, 3) where they really are, without: there. What moved eyes
+    see is told by a quarter of the rays, to 0.02 dB: of a picture of `PLENTY` by every second pixel of every second
+    row, else, of light, by two rays for four. The other arguments and errors are those of `carried_db`.
     """
     eyes = np.asarray(eyes_m, dtype=np.float64)
     true = eyes if seen_from_m is None else np.asarray(seen_from_m, dtype=np.float64)
     targets = [intensities(picture) for picture in drawn]
     right, up = stack_from_eye(eyes.mean(axis=0))[:3, 0], np.array([0.0, 0.0, 1.0])
 
-    def error(move_m: F64, step: int) -> float:
+    def error(move_m: F64) -> float:
         return squared_error(
-            layers, targets, stack, solved_for_m=eyes, eyes_m=true + move_m, fov_deg=fov_deg, rays=rays, step=step
+            layers, targets, stack, solved_for_m=eyes, eyes_m=true + move_m, fov_deg=fov_deg, sampling=sampling
         )
 
-    unmoved = error(np.zeros(3), step)
-    if targets[0].size > PLENTY * step**2:
-        step *= 2
+    unmoved = error(np.zeros(3))
+    if targets[0].size > PLENTY * sampling.step**2:
+        sampling = sampling._replace(step=2 * sampling.step)
+    elif sampling.rays > LIGHT.rays:
+        sampling = LIGHT._replace(pupil_mm=sampling.pupil_mm, step=sampling.step)
     result = {}
     for sigma_mm in sigmas_mm:
         moves = [side * 2e-3 * sigma_mm * axis for axis in (right, up) for side in (-1, 1)]
-        moved = sum(error(move, step) for move in moves) / 8 if sigma_mm > 0 else unmoved / 2
+        moved = sum(error(move) for move in moves) / 8 if sigma_mm > 0 else unmoved / 2
         result[sigma_mm] = psnr_db(unmoved / 2 + moved)
     return result
 
 
 def light_psnrs_db(
-    layers: U8, drawn: Sequence[U8 | F32], stack: PanelStack, *, rays: int = RAYS, **how: Any
+    layers: U8, drawn: Sequence[U8 | F32], stack: PanelStack, *, sampling: Sampling | None = None, **how: Any
 ) -> dict[float, float]:
-    """The same of the light that leaves real pixels (`light`): the figure to quote."""
-    return expected_psnrs_db(layers, drawn, stack, rays=rays, **how)
+    """The same of what pupils get of real pixels (`light`): the figure to quote.
+
+    Without a sampling, a picture of fewer numbers than `PLENTY` has four times as many rays a pixel.
+    """
+    if sampling is None:
+        sampling = LIGHT if drawn[0].size > PLENTY else LIGHT._replace(rays=2 * LIGHT.rays)
+    return expected_psnrs_db(layers, drawn, stack, sampling=sampling, **how)
 
 
 def intensities(picture: U8 | F32) -> F32:

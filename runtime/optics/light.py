@@ -1,8 +1,10 @@
 """What eyes see of displayed layers, in two ways, as one mean squared error (docs/contracts.md, Error).
 
 *Light*, the figure to quote: a panel's pixel is an even box, and an eye makes of a pixel of its picture the mean
-intensity of `RAYS` by `RAYS` rays through it, each through the nearest pixel of every panel. *One ray*, as published
-evaluations have it: through the pixel's centre, panels sampled bilinearly.
+intensity over that pixel and over its pupil, which is focused on the centre panel. Two sets of rays at random places
+tell it, each with an error of its own: the mean of the product of both errors is the squared error without the rays'
+noise, which a square would count as the picture's. *One ray*, as published evaluations have it: through the pixel's
+centre and the pupil's, panels sampled bilinearly.
 """
 
 from __future__ import annotations
@@ -11,19 +13,43 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from runtime.optics.malus import intensity_from_phase
-from runtime.optics.retina import Rays, checked_eye
+from runtime.optics.pupil import PUPIL_MM
+from runtime.optics.retina import Rays, checked_eye, pupil_points
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack
 from runtime.optics.tilt import layer_from_seen, layer_pixels_from_seen
+from runtime.optics.views import stack_from_eye
 from runtime.records import F32, F64, U8
 
-RAYS = 3  # along and down a picture's pixel
+RINGS = 9  # of points, of which each ray of light takes one: 271, as good as a disc
 TABLE = 16  # entries a code value, of the table that sums along bilinear rays are looked up in
+
+
+class Sampling(NamedTuple):
+    """Along which rays the squared error is measured."""
+
+    rays: int = 2  # of light, along and down a pixel, in each of its two sets; 0: one ray, bilinear
+    pupil_mm: float = PUPIL_MM  # diameter, of light; 0: a point
+    step: int = 1  # only every so-manieth pixel of every so-manieth row
+
+
+LIGHT = Sampling()
+ONE_RAY = Sampling(rays=0, pupil_mm=0.0)
+
+
+class View(NamedTuple):
+    """One eye's picture, and the geometry of its rays."""
+
+    target: F32  # (h, w, 3) intensities
+    centre_from_image: F64  # (3, 3) pixels of the centre panel
+    panels_from_centre: F64  # (points of the pupil, N, 3, 3) pixels of the panels
+    toward: F64  # (3,) times (u, v, 1): negative for a ray that goes towards the panels
+    first_ray: int  # its number
 
 
 def squared_error(
@@ -34,30 +60,26 @@ def squared_error(
     solved_for_m: F64,
     eyes_m: F64,
     fov_deg: float,
-    rays: int,
-    step: int = 1,
+    sampling: Sampling,
 ) -> float:
     """Mean squared error of what eyes (2, 3) see against what those solved for (2, 3) should: carried, as `carried`.
 
     layers: (N, H, W, 3 or 4) code values, rear to front; targets: (h, w, 3) intensities for each eye solved for, of
-    pictures `fov_deg` wide; rays: along and down a pixel, of light; 0: one ray, bilinear; step: only every
-    so-manieth pixel of every so-manieth row. A pixel counts whose rays all cross every panel half a pixel inside.
+    pictures `fov_deg` wide. A pixel counts whose rays all cross every panel half a pixel inside. Of light that is
+    nearly perfect it can be less than 0, by the rays' noise.
     Raises ValueError for an eye that is not before every panel, or where no pixel counts.
     """
-    of_rows, cores = _kernel(), len(os.sched_getaffinity(0))
+    of_rows, cores, step = _kernel(), len(os.sched_getaffinity(0)), sampling.step
     codes = np.ascontiguousarray(layers)
-    fine = 1 if rays else TABLE
+    fine = 1 if sampling.rays else TABLE
     table = intensity_from_phase(np.arange(255 * fine * stack.count + 1, dtype=np.float32) / np.float32(255 * fine))
     calls = []
-    for nominal, true, target in zip(solved_for_m, eyes_m, targets, strict=True):
-        height, width = target.shape[:2]
-        view = Rays.of_eye(checked_eye(nominal, stack), width_px=width, height_px=height, fov_deg=fov_deg)
-        centre = panel_from_image(view.from_stack, stack.panel(stack.count // 2))
-        panels = panels_from_centre(checked_eye(true, stack), stack)
-        rows = range(0, height, step * -(-height // (4 * cores * step)))
+    for side, (nominal, true, target) in enumerate(zip(solved_for_m, eyes_m, targets, strict=True)):
+        view = view_of(side, nominal, true, target, stack, fov_deg=fov_deg, pupil_mm=sampling.pupil_mm)
+        rows = range(0, len(target), step * -(-len(target) // (4 * cores * step)))
         calls += [
-            (codes, target, centre, panels, stack.tilt is not None, view.toward(), table, rays, step, first, last)
-            for first, last in zip(rows, [*rows[1:], height], strict=True)
+            (codes, view, table, sampling.rays, step, stack.tilt is not None, first, last)
+            for first, last in zip(rows, [*rows[1:], len(target)], strict=True)
         ]
     with ThreadPoolExecutor(cores) as pool:
         total, counted = map(sum, zip(*pool.map(lambda call: of_rows(*call), calls), strict=True))
@@ -66,21 +88,53 @@ def squared_error(
     return float(total / counted)
 
 
+def view_of(
+    side: int, nominal_m: F64, true_m: F64, target: F32, stack: PanelStack, *, fov_deg: float, pupil_mm: float
+) -> View:
+    """The rays of one of the eyes. Raises ValueError for one that is not before every panel."""
+    height, width = target.shape[:2]
+    rays = Rays.of_eye(checked_eye(nominal_m, stack), width_px=width, height_px=height, fov_deg=fov_deg)
+    centre = panel_from_image(rays.from_stack, stack.panel(stack.count // 2))
+    pupil = pupil_points(pupil_mm / 1e3, rings=RINGS if pupil_mm > 0 else 0)
+    ends = [checked_eye(true_m + place, stack) for place in pupil @ stack_from_eye(nominal_m)[:3, :2].T]
+    return View(target, centre, panels_from_centre(np.array(ends), stack), rays.toward(), first_ray(side))
+
+
+def first_ray(side: int) -> int:
+    """The number of an eye's first ray: no ray is both eyes'."""
+    return side << 40
+
+
 def panels_from_centre(true_m: F64, stack: PanelStack) -> F64:
-    """(N, 3, 3) where the lines from an eye through the centre panel's pixels cross each panel's layer."""
+    """(..., N, 3, 3) where the lines from eyes (..., 3) through the centre panel's pixels cross each panel's layer."""
     centre = stack.panel(stack.count // 2)
-    own_pixel = np.array(
-        [(true_m[1] - centre.left_m) / centre.pitch_u_m, (centre.top_m - true_m[2]) / centre.pitch_v_m]
-    )
-    matrices = np.zeros((stack.count, 3, 3))
-    for index, x_m in enumerate(stack.x_m):
-        share = (x_m - true_m[0]) / (centre.x_m - true_m[0])
-        matrices[index] = np.diag([share, share, 1.0])
-        matrices[index, :2, 2] = own_pixel * (1 - share)
-        if stack.tilt is not None:
-            moved = layer_pixels_from_seen(stack.panel(index), layer_from_seen(stack, index, true_m))
-            matrices[index] = moved @ matrices[index]
+    x, y, z = np.moveaxis(true_m[..., None], -2, 0)
+    share = (np.array(stack.x_m) - x) / (centre.x_m - x)
+    matrices = np.zeros((*share.shape, 3, 3))
+    matrices[..., 0, 0] = matrices[..., 1, 1] = share
+    matrices[..., 0, 2] = (y - centre.left_m) / centre.pitch_u_m * (1 - share)
+    matrices[..., 1, 2] = (centre.top_m - z) / centre.pitch_v_m * (1 - share)
+    matrices[..., 2, 2] = 1
+    if stack.tilt is not None:
+        for place in np.ndindex(*share.shape):
+            moved = layer_from_seen(stack, place[-1], true_m[place[:-1]])
+            matrices[place] = layer_pixels_from_seen(stack.panel(place[-1]), moved) @ matrices[place]
     return matrices
+
+
+def random_bits(ray: Any) -> Any:
+    """Of a ray, by its number (splitmix64): 24 for its place along the pixel, 24 down, 16 for the pupil's point."""
+    bits = np.uint64(ray) * np.uint64(0x9E3779B97F4A7C15)
+    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return bits ^ (bits >> np.uint64(31))
+
+
+def ray_of(bits: Any, points: Any) -> Any:
+    """Where a ray crosses its part of a pixel, along and down in [0, 1), and at which point of the pupil it ends."""
+    part = np.uint64(0xFFFFFF)
+    along, down = (bits & part) * 2.0**-24, (bits >> np.uint64(24) & part) * 2.0**-24
+    return along, down, np.int64(bits >> np.uint64(48)) * points >> 16
 
 
 @cache
@@ -88,37 +142,46 @@ def _kernel() -> Any:
     """The compiled loop: sum of the squared error over some rows of one eye's picture, and of how many numbers."""
     from numba import config, njit  # noqa: PLC0415 - half a second that only this needs
 
+    bits_of, place_of = njit(random_bits), njit(ray_of)
+
     @njit(nogil=True, error_model="numpy", fastmath={"contract"}, cache=bool(config.CACHE_DIR))  # type: ignore
-    def of_rows(codes, target, centre, panels, tilted, toward, table, rays, step, first, last):  # type: ignore
+    def of_rows(codes, view, table, rays, step, tilted, first, last):  # type: ignore
         height, width = codes.shape[1:3]
-        along, half, one = max(rays, 1), np.float32(0.5), np.float32(1)
-        share = one / np.float32(along * along)
+        centre, panels, toward = view.centre_from_image, view.panels_from_centre, view.toward
+        half, one = np.float32(0.5), np.float32(1)
+        a_set, sets = max(rays * rays, 1), 2 if rays else 1
+        share, seen = one / np.float32(a_set), np.empty((2, 3), np.float32)
         total, counted = 0.0, 0
         for row in range(first, last, step):
-            for column in range(0, target.shape[1], step):
-                red, green, blue, counts = np.float32(0), np.float32(0), np.float32(0), True
-                for ray in range(along * along):
-                    down = ray // along
-                    u, v = column + (ray - down * along + 0.5) / along, row + (down + 0.5) / along
+            for column in range(0, view.target.shape[1], step):
+                seen[:], counts = 0, True
+                for ray in range(a_set * sets):
+                    u, v, point = column + 0.5, row + 0.5, 0
+                    if rays:
+                        number = view.first_ray + (row * view.target.shape[1] + column) * a_set * sets + ray
+                        along, down, point = place_of(bits_of(number), len(panels))
+                        u = column + (ray % rays + along) / rays
+                        v = row + (ray % a_set // rays + down) / rays
                     counts = counts and toward[0] * u + toward[1] * v + toward[2] < 0
                     weight = 1 / (centre[2, 0] * u + centre[2, 1] * v + centre[2, 2])
                     a = (centre[0, 0] * u + centre[0, 1] * v + centre[0, 2]) * weight
                     b = (centre[1, 0] * u + centre[1, 1] * v + centre[1, 2]) * weight
-                    r, g, bl = half, half, half  # rounded, where the table is looked into
-                    for n in range(panels.shape[0]):
-                        x = panels[n, 0, 0] * a + panels[n, 0, 1] * b + panels[n, 0, 2]
-                        y = panels[n, 1, 0] * a + panels[n, 1, 1] * b + panels[n, 1, 2]
+                    red, green, blue = half, half, half  # rounded, where the table is looked into
+                    for n in range(panels.shape[1]):
+                        panel = panels[point, n]
+                        x = panel[0, 0] * a + panel[0, 1] * b + panel[0, 2]
+                        y = panel[1, 0] * a + panel[1, 1] * b + panel[1, 2]
                         if tilted:
-                            weight = 1 / (panels[n, 2, 0] * a + panels[n, 2, 1] * b + panels[n, 2, 2])
+                            weight = 1 / (panel[2, 0] * a + panel[2, 1] * b + panel[2, 2])
                             x, y = x * weight, y * weight
                         counts = counts and 0.5 < x < width - 0.5 and 0.5 < y < height - 0.5
                         if not counts:
                             break
                         if rays:
                             i, j = np.uint32(y), np.uint32(x)
-                            r += codes[n, i, j, 0]
-                            g += codes[n, i, j, 1]
-                            bl += codes[n, i, j, 2]
+                            red += codes[n, i, j, 0]
+                            green += codes[n, i, j, 1]
+                            blue += codes[n, i, j, 2]
                             continue
                         i, j = np.uint32(y - 0.5), np.uint32(x - 0.5)
                         down_share, right_share = np.float32(y - 0.5 - i), np.float32(x - 0.5 - j)
@@ -127,16 +190,20 @@ def _kernel() -> Any:
                             weight_x = right_share if k & 1 else one - right_share
                             part = weight_y * weight_x * np.float32(TABLE)
                             below, beside = i + np.uint32(k > 1), j + np.uint32(k & 1)
-                            r += part * codes[n, below, beside, 0]
-                            g += part * codes[n, below, beside, 1]
-                            bl += part * codes[n, below, beside, 2]
+                            red += part * codes[n, below, beside, 0]
+                            green += part * codes[n, below, beside, 1]
+                            blue += part * codes[n, below, beside, 2]
                     if not counts:
                         break
-                    red, green, blue = red + table[int(r)], green + table[int(g)], blue + table[int(bl)]
+                    one_set = seen[ray // a_set]
+                    one_set[0] += table[int(red)]
+                    one_set[1] += table[int(green)]
+                    one_set[2] += table[int(blue)]
                 if counts:
-                    total += (red * share - target[row, column, 0]) ** 2
-                    total += (green * share - target[row, column, 1]) ** 2
-                    total += (blue * share - target[row, column, 2]) ** 2
+                    other = seen[sets - 1]
+                    for channel in range(3):
+                        wanted = view.target[row, column, channel]
+                        total += (seen[0, channel] * share - wanted) * (other[channel] * share - wanted)
                     counted += 3
         return total, counted
 

@@ -11,7 +11,7 @@ from runtime.errors import ContextLost, PhasestackError
 from runtime.model.job import Job, Part, Picture
 from runtime.model.predictor import Predictor
 from runtime.model.trim import Scene, trim
-from runtime.optics.pupil import PUPIL_SIGMA_MM
+from runtime.optics.pupil import TRACKING_SIGMA_MM
 from runtime.optics.rect import PixelRect, union
 from runtime.optics.stack import PanelStack, PlaneRaster
 from runtime.optics.views import image_from_stack, raster_from_stack
@@ -58,7 +58,7 @@ def drawn_for(
     time_ns: int,
     trimmed: bool = False,
     before: Part | None = None,
-    eye_sigma_mm: float = PUPIL_SIGMA_MM,
+    eye_sigma_mm: float = TRACKING_SIGMA_MM,
     deadline_ns: int | None = None,
 ) -> Job:
     """What a model is asked for eyes (2, 3), with the pictures that it wants.

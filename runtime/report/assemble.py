@@ -16,7 +16,7 @@ from runtime.report.pairs import StillPair, procedural_pairs, read_pairs
 from runtime.report.sections import focal_section, frontier_section, moving_section
 from runtime.report.worker import apart
 
-QUOTE = "light_db of eyes sure to 1 mm: what both eyes make of the panels' pixels"
+QUOTE = "light_db at a tracking error of 1 mm: what both eyes' pupils make of the panels' pixels"
 Progress = Callable[[str], None]
 
 
@@ -49,7 +49,7 @@ class GrowingPage:
         doing = self.record.get("measuring")
         notes = [f"Not finished: it grows while it is measured. The last that was known: {doing}."] if doing else []
         sections, machine = list(self._sections.values()), self.record["machine"]
-        lead = "Light, of eyes sure to 1 mm, is the figure to quote; higher is better."
+        lead = "Light, at a tracking error of 1 mm, is the figure to quote; higher is better."
         page = Page("Error against run time", lead, sections, machine, self._command, notes)
         page.write(self.out, record="report.json", data=self.record)
 

@@ -161,6 +161,6 @@ def _times(name: str, ratio: float, noise: float, of_what: str) -> list[Change]:
 
 def _gains(before: Entry, after: Entry) -> Iterator[tuple[str, float]]:
     for sigma in sorted(before.light_db.keys() & after.light_db.keys()):
-        yield f"of light, eyes sure to {sigma} mm", after.light_db[sigma] - before.light_db[sigma]
+        yield f"of light, at a tracking error of {sigma} mm", after.light_db[sigma] - before.light_db[sigma]
     yield "one ray a pixel", after.psnr_db - before.psnr_db
     yield "one ray a pixel, at the worse eye", after.worst_eye_psnr_db - before.worst_eye_psnr_db

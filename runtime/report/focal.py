@@ -19,6 +19,7 @@ from runtime.content.scenes import Scene, Thing
 from runtime.model.job import Job
 from runtime.model.predictor import load_predictor
 from runtime.optics.carried import intensities
+from runtime.optics.pupil import PUPIL_MM
 from runtime.optics.retina import Rays, Retina, average, pupil_points, through_layers
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_camera, raster_from_stack, stack_from_eye
@@ -26,7 +27,7 @@ from runtime.records import F32, F64, U8
 from runtime.report.pairs import Painter, eyes_at
 
 WIDTH_PX, HEIGHT_PX, FOV_DEG = 720, 300, 18.0
-PUPIL_M = 0.004
+PUPIL_M = PUPIL_MM / 1e3
 DISTANCE_M = 0.4
 CARDS_M = (-0.05, 0.0, 0.045)  # where three cards stand, along +x of the stack
 OFFSETS_M = (-0.043, 0.0, 0.040)  # and aside

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from runtime.evaluation.solved import PairQuality, judged
+from runtime.evaluation.solved import PairQuality, SolvedPair
 from runtime.evaluation.trials import timed
 from runtime.optics.carried import intensities
-from runtime.optics.light import squared_error
+from runtime.optics.light import ONE_RAY, squared_error
 from runtime.optics.quality import psnr_db
 from runtime.records import U8
 from runtime.report.pairs import StillPair
@@ -33,9 +33,8 @@ ENOUGH_S = 2.0  # of timed runs on one pair; slow methods run once
 MOST_RUNS = 25
 FEWEST_RUNS = 3
 SLOW_S = 4.0  # a first run that takes longer counts, and is the only one
-ENOUGH_PIXELS = 200_000  # of an eye's picture, for an expected error: within some hundredths of a decibel
 OFF_STEP = 3  # away from the eyes, every third ray of every third row is enough
-QUOTED = "1"  # of `light_db`: eyes sure to 1 mm, a pupil
+QUOTED = "1"  # of `light_db`: a tracking error of 1 mm
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +100,7 @@ class MethodResult:
     ms_p99: float
     memory_mib: float
     parameters: int
-    light_db: dict[str, float]  # by how sure the eyes are, millimetres: "0", "1", "2"
+    light_db: dict[str, float]  # by the tracking's error, millimetres: "0", "1", "2"
     expected_db: dict[str, float]  # the same, one ray a pixel
     psnr_db: float
     ssim: float
@@ -173,13 +172,12 @@ def pair_result(pair: StillPair, run: MethodRun, *, viewer: Path | None = None) 
 
     viewer: folder that a page is left in, to look into the layers.
     """
-    height_px, width_px = pair.images[0].shape[:2]
-    step = max(1, math.isqrt(height_px * width_px // ENOUGH_PIXELS))
-    at_eyes = judged(run.layers, pair.images, pair.stack, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, step=step)
+    at_eyes = SolvedPair(run.layers, pair.images, pair.stack, pair.eyes_m, pair.fov_deg)
     off: dict[str, list[float]] = {}
+    sampling = ONE_RAY._replace(step=OFF_STEP)
     for view in pair.off:
         place = view.eye_m[None]
-        where: Any = {"solved_for_m": place, "eyes_m": place, "fov_deg": pair.fov_deg, "rays": 0, "step": OFF_STEP}
+        where: Any = {"solved_for_m": place, "eyes_m": place, "fov_deg": pair.fov_deg, "sampling": sampling}
         with contextlib.suppress(ValueError):  # nothing is seen from there
             error = squared_error(run.layers, [intensities(view.image)], pair.stack, **where)
             off.setdefault(f"{view.mm:g}mm", []).append(psnr_db(error))

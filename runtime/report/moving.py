@@ -17,6 +17,7 @@ from runtime.daemon.build import RunOptions, build_run, scaled_stack
 from runtime.errors import FatalError
 from runtime.evaluation.motion_recording import write_motion
 from runtime.optics.carried import light_psnrs_db
+from runtime.optics.light import Sampling
 from runtime.records import F64, U8
 
 MOTIONS = ("still", "lean", "walk", "stop-and-go")
@@ -89,7 +90,7 @@ def moving_run(motion: str, solver_ms: float, *, seconds: float = SECONDS, scale
         watched = simulated_run(settings, scale=scale, keep_light=EVERY)
     first = SETTLED_S * settings.loop.rate_hz
     where: Any = {"stack": scaled_stack(settings, scale), "fov_deg": settings.content.fov_deg}
-    where |= {"sigmas_mm": (0.0,), "step": STEP}
+    where |= {"sigmas_mm": (0.0,), "sampling": Sampling(step=STEP)}
     seen = []
     for _, layers, drawn, info in (light for light in watched.lights if light[0] >= first):
         where |= {"eyes_m": info["solved_for_m"], "seen_from_m": info["true_eyes_m"]}

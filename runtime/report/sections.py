@@ -20,8 +20,8 @@ def frontier_section(results: Sequence[MethodResult], *, title: str, name: str) 
     """The plot and the table of one resolution's methods, as far as they are measured."""
     pairs = "; ".join(pair.pair for pair in results[0].pairs)
     text = [
-        f"Every method on {pairs}, in one run. Light, the figure to quote: what both eyes make of the panels' pixels, "
-        "which are even boxes, for eyes that are sure to 1 mm: a pupil. One ray a pixel, sampled bilinearly, is "
+        f"Every method on {pairs}, in one run. Light, the figure to quote: what pupils of 4 mm make of the panels' "
+        "pixels, which are even boxes, at a tracking error of 1 mm. One ray a pixel, sampled bilinearly, is "
         "what published evaluations measure. The time is that of a whole solution, from two decoded pictures to 8-bit "
         "layers. Each method runs in a process of its own; its memory is that process's peak.",
     ]
@@ -41,7 +41,7 @@ def frontier_plot(results: Sequence[MethodResult], *, name: str) -> Figure:
                 axes.plot(*zip(*places, strict=True), marker=marker, markersize=7, color=colour, label=kind)
             for result in dots:  # up and to the left of a curve that rises
                 axes.annotate(result.name, (result.ms_p50, result.quoted_db), xytext=(-5, 6), ha="right", **beside)
-        axes.set(xscale="log", xlabel="median time of a whole solution, ms", ylabel="light, dB (a pupil)")
+        axes.set(xscale="log", xlabel="median time of a whole solution, ms", ylabel="light, dB (tracking error 1 mm)")
         axes.margins(x=0.1, y=0.15)
         axes.set_title("Light against run time: up and to the left is better")
         axes.xaxis.set_major_formatter("{x:g}")

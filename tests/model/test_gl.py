@@ -229,7 +229,7 @@ def test_the_eyes_see_no_less_than_on_the_processor(pose: str, sigma_mm: float, 
     for predictor in both("balanced", STACK, gl):
         layers = layers_of(predictor, pictures, pair, sigma_mm=sigma_mm)
         look = displayed(layers, pictures, STACK, eyes_m=pair, fov_deg=FOV_DEG, similarity=False)
-        expected = expected_db(look, layers, STACK, eyes_m=pair, fov_deg=FOV_DEG)
+        expected = expected_db(look, layers)
         shown.append([look.quality.psnr_db, *(value for value in expected.values() if value is not None)])
     assert len(shown[0]) == 4
     assert (np.array(shown[1]) - shown[0] >= LEAST_DB).all()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import replace
 from typing import Any
@@ -15,6 +14,7 @@ from hypothesis import strategies as st
 
 from runtime.optics import carried
 from runtime.optics.carried import carried_db, expected_psnrs_db
+from runtime.optics.light import LIGHT, ONE_RAY, Sampling
 from runtime.optics.quality import quality
 from runtime.optics.retina import seen_by
 from runtime.optics.stack import PanelStack, Tilt
@@ -32,45 +32,34 @@ STACKS = (  # no line of sight lies in an edge between pixels, where the nearest
 
 
 def traced_error(
-    nominal: np.ndarray, true: np.ndarray, layers: U8, picture: U8, stack: PanelStack, *, fov_deg: float, rays: int = 0
+    nominal: np.ndarray, true: np.ndarray, layers: U8, picture: U8, stack: PanelStack, *, fov_deg: float
 ) -> list[float]:
-    """Squared differences of the pixels that count, one ray at a time: through the centre panel's points.
-
-    rays: of light, along and down a pixel, through the panels' nearest pixels; 0: one, bilinear.
-    """
+    """Squared differences of the pixels that count, one ray at a time: through the centre panel's points."""
     width, height = picture.shape[1::-1]
     centre_x = stack.x_m[len(stack.x_m) // 2]
     grey = [(layer[..., channel] / 255).tolist() for layer in layers for channel in range(3)]
     found = []
-    offsets = [(k + 0.5) / rays for k in range(rays)] or [0.5]
     for v in range(height):
         for u in range(width):
-            seen = []
-            for down, along in itertools.product(offsets, offsets):
-                ray = reference.ray(tuple(nominal), u + along, v + down, width=width, height=height, fov_deg=fov_deg)
-                centre = reference.hit_plane(tuple(nominal), ray, centre_x)
-                direction = reference.subtract(centre, tuple(true))
-                places = [
-                    reference.panel_pixel(
-                        reference.hit_plane(tuple(true), direction, x),
-                        width_m=stack.width_m,
-                        height_m=stack.height_m,
-                        width=stack.width_px,
-                        height=stack.height_px,
-                    )
-                    for x in stack.x_m
-                ]
-                if any(not (0.5 < a < stack.width_px - 0.5 and 0.5 < b < stack.height_px - 0.5) for a, b in places):
-                    break
-                for channel in range(3):
-                    values = [grey[3 * n + channel] for n in range(stack.count)]
-                    sample = (lambda value, a, b: value[int(b)][int(a)]) if rays else reference.bilinear
-                    phase = sum(sample(value, a, b) for value, (a, b) in zip(values, places, strict=True))
-                    seen.append(math.sin(phase * math.pi / 2) ** 2)
-            else:
-                for channel in range(3):
-                    mean = sum(seen[channel::3]) / len(offsets) ** 2
-                    found.append((mean - picture[v, u, channel] / 255) ** 2)
+            ray = reference.ray(tuple(nominal), u + 0.5, v + 0.5, width=width, height=height, fov_deg=fov_deg)
+            centre = reference.hit_plane(tuple(nominal), ray, centre_x)
+            direction = reference.subtract(centre, tuple(true))
+            places = [
+                reference.panel_pixel(
+                    reference.hit_plane(tuple(true), direction, x),
+                    width_m=stack.width_m,
+                    height_m=stack.height_m,
+                    width=stack.width_px,
+                    height=stack.height_px,
+                )
+                for x in stack.x_m
+            ]
+            if any(not (0.5 < a < stack.width_px - 0.5 and 0.5 < b < stack.height_px - 0.5) for a, b in places):
+                continue
+            for channel in range(3):
+                values = [grey[3 * n + channel] for n in range(stack.count)]
+                phase = sum(reference.bilinear(value, a, b) for value, (a, b) in zip(values, places, strict=True))
+                found.append((math.sin(phase * math.pi / 2) ** 2 - picture[v, u, channel] / 255) ** 2)
     return found
 
 
@@ -100,12 +89,8 @@ def test_carried_error_is_what_the_true_eyes_rays_cross(
 
 
 @settings(max_examples=8)
-@given(
-    st.sampled_from(STACKS), st.integers(0, 2**31), st.sampled_from([0.5, 1.0, 2.0, 7.0]), st.sampled_from([0, 2, 3])
-)
-def test_expected_psnr_is_five_points_of_the_eyes_common_place_of_rays_or_of_light(
-    stack: PanelStack, seed: int, sigma_mm: float, rays: int
-) -> None:
+@given(st.sampled_from(STACKS), st.integers(0, 2**31), st.sampled_from([0.5, 1.0, 2.0, 7.0]))
+def test_expected_psnr_is_five_points_of_the_eyes_common_place(stack: PanelStack, seed: int, sigma_mm: float) -> None:
     layers, pictures, eyes = case(stack, seed)
     middle = (eyes[0] + eyes[1]) / 2
     right = np.array([-middle[1], middle[0], 0.0]) / math.hypot(middle[0], middle[1])
@@ -117,10 +102,10 @@ def test_expected_psnr_is_five_points_of_the_eyes_common_place_of_rays_or_of_lig
         errors = [
             error
             for eye, picture in zip(eyes, pictures, strict=True)
-            for error in traced_error(eye, eye + move, layers, picture, stack, fov_deg=30, rays=rays)
+            for error in traced_error(eye, eye + move, layers, picture, stack, fov_deg=30)
         ]
         total += weight * sum(errors) / len(errors)
-    how = {"eyes_m": eyes, "fov_deg": 30, "sigmas_mm": (sigma_mm,), "rays": rays}
+    how = {"eyes_m": eyes, "fov_deg": 30, "sigmas_mm": (sigma_mm,)}
     told = expected_psnrs_db(layers, pictures, stack, **how)[sigma_mm]
     assert told == pytest.approx(-10 * math.log10(total), abs=2e-3)
 
@@ -151,8 +136,10 @@ def test_eyes_that_are_where_the_layers_were_solved_for_see_the_exact_quality() 
     assert sure == pytest.approx(expected.psnr_db, abs=1e-4)
 
 
-@pytest.mark.parametrize("rays", [0, 3])
-def test_large_pictures_are_looked_at_by_a_part_where_eyes_are_off(monkeypatch: pytest.MonkeyPatch, rays: int) -> None:
+@pytest.mark.parametrize("sampling", [ONE_RAY, LIGHT])
+def test_large_pictures_are_looked_at_by_a_part_where_eyes_are_off(
+    monkeypatch: pytest.MonkeyPatch, sampling: Sampling
+) -> None:
     rng = np.random.default_rng(8)
     stack = PanelStack(0.5, 0.3, (-0.06, 0.0, 0.06), 330, 210)
     smooth: Any = cv2.resize(
@@ -160,7 +147,7 @@ def test_large_pictures_are_looked_at_by_a_part_where_eyes_are_off(monkeypatch: 
     )
     layers = rng.integers(60, 90, (3, 210, 330, 3)).astype(np.uint8)
     eyes = np.array([[0.7, -0.03, 0.1], [0.7, 0.03, 0.1]])
-    how = {"eyes_m": eyes, "fov_deg": 40, "sigmas_mm": (0.0, 2.0), "rays": rays}
+    how = {"eyes_m": eyes, "fov_deg": 40, "sigmas_mm": (0.0, 2.0), "sampling": sampling}
     whole = expected_psnrs_db(layers, [smooth, smooth], stack, **how)
     monkeypatch.setattr(carried, "PLENTY", 1000)
     part = expected_psnrs_db(layers, [smooth, smooth], stack, **how)

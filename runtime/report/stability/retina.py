@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from runtime.optics.light import squared_error
-from runtime.optics.retina import seen_by
+from runtime.optics.light import LIGHT, RINGS, first_ray, random_bits, ray_of, squared_error
+from runtime.optics.retina import pupil_points, seen_by
 from runtime.optics.stack import PanelStack
 from runtime.records import U8
 from runtime.report.stability import exact
@@ -20,7 +20,7 @@ STAGE = "retina"
 SIZE = (32, 18)  # of the pictures and panels: every ray of a small picture is traced
 FOV_DEG = 40.0
 THREE = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), *SIZE)
-SMALL = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 16, 9)  # for nine rays a pixel
+SMALL = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 16, 9)  # for eight rays a pixel
 EDGE_PX = 1e-4  # a ray so near to where it begins to count may count or not
 
 
@@ -85,43 +85,53 @@ def seen_rays(eye: Sequence[float], stack: PanelStack, kind: str) -> Answer:
 
 
 def light(eyes: Sequence[Sequence[float]], true: Sequence[Sequence[float]], kind: str) -> Answer:
-    """Mean squared error of the light of nine rays a pixel, for eyes that are elsewhere than solved for, ray by ray."""
-    layers, rays = layers_of(kind, SMALL), 3
+    """Mean squared error of the light in eyes that are elsewhere than solved for, along the same rays one by one."""
+    layers = layers_of(kind, SMALL)
     targets = [np.random.default_rng(3).random((SMALL.height_px, SMALL.width_px, 3), dtype=np.float32) for _ in eyes]
     total, count, doubtful = exact.mpf(0), 0, 0
-    for nominal, place, target in zip(map(exact.vector, eyes), map(exact.vector, true), targets, strict=True):
+    for side, (nominal, place, target) in enumerate(zip(eyes, true, targets, strict=True)):
+        e = exact.vector(nominal), exact.vector(place)
         for row, column in np.ndindex(SMALL.height_px, SMALL.width_px):
-            seen, inside, edge = lit(nominal, place, layers, column, row, rays)
+            sets, inside, edge = lit(*e, layers, column, row, first_ray=first_ray(side))
             doubtful += min(abs(inside), edge) < EDGE_PX
             if inside > 0:
-                total += sum((a - exact.mpf(float(b))) ** 2 for a, b in zip(seen, target[row, column], strict=True))
+                wanted = [exact.mpf(float(value)) for value in target[row, column]]
+                total += sum((a - t) * (b - t) for a, b, t in zip(*sets, wanted, strict=True))
                 count += 3
-    found = squared_error(
-        layers, targets, SMALL, solved_for_m=np.array(eyes), eyes_m=np.array(true), fov_deg=FOV_DEG, rays=rays
-    )
-    # A ray on the border between two pixels may take either: a ninth of a pixel's intensity.
-    tolerance = 64 * EPS32 + doubtful / rays**2 / max(count, 1)
+    where: Any = {"solved_for_m": np.array(eyes), "eyes_m": np.array(true), "fov_deg": FOV_DEG}
+    found = squared_error(layers, targets, SMALL, **where, sampling=LIGHT)
+    # A ray on the border between two pixels may take either: its share of a pixel's intensity.
+    tolerance = 64 * EPS32 + doubtful / LIGHT.rays**2 / max(count, 1)
     return Answer(exact.distance(found, total / count), tolerance, note=f"{count} values, {doubtful} on a border")
 
 
-def lit(nominal: Any, true: Any, layers: U8, column: int, row: int, rays: int) -> tuple[list[Any], float, float]:
-    """The mean intensities of a pixel's rays, how far inside they cross, and how near to a border between pixels."""
-    width, height, half = SMALL.width_px, SMALL.height_px, exact.mpf("0.5")
-    sums, inside, edge = [exact.mpf(0)] * 3, math.inf, math.inf
-    for ray in range(rays * rays):
-        u, v = column + (ray % rays + half) / rays, row + (ray // rays + half) / rays
+def lit(
+    nominal: Any, true: Any, layers: U8, column: int, row: int, *, first_ray: int
+) -> tuple[list[list[Any]], float, float]:
+    """The mean intensities of both of a pixel's sets, how far inside they cross, and how near to a border of pixels."""
+    width, height, half, rays = SMALL.width_px, SMALL.height_px, exact.mpf("0.5"), LIGHT.rays
+    right, up, _ = exact.axes(nominal)
+    pupil, a_set = pupil_points(LIGHT.pupil_mm / 1e3, rings=RINGS), rays * rays
+    sums, inside, edge = [[exact.mpf(0)] * 3, [exact.mpf(0)] * 3], math.inf, math.inf
+    numbers = first_ray + (row * width + column) * 2 * a_set + np.arange(2 * a_set)
+    for ray, (along, down, point) in enumerate(zip(*ray_of(random_bits(numbers), len(pupil)), strict=True)):
+        u = column + (ray % rays + exact.mpf(float(along))) / rays
+        v = row + (ray % a_set // rays + exact.mpf(float(down))) / rays
         direction = exact.ray(nominal, u, v, width_px=width, height_px=height, fov_deg=FOV_DEG)
-        through = exact.combine(exact.hit(nominal, direction, SMALL.x_m[1]), -1, true)
+        across, high = map(float, pupil[point])
+        end = exact.combine(exact.combine(true, exact.mpf(across), right), exact.mpf(high), up)
+        through = exact.combine(exact.hit(nominal, direction, SMALL.x_m[1]), -1, end)
         phases = [0, 0, 0]
         for index, layer in enumerate(layers):
-            x, y = exact.on_panel(true, through, SMALL, index)
+            x, y = exact.on_panel(end, through, SMALL, index)
             inside = min(inside, *map(float, (x - half, width - half - x, y - half, height - half - y)))
             if inside <= 0:
                 return sums, inside, edge
             edge = min(edge, *(float(abs(p - exact.mp.nint(p))) for p in (x, y)))
             phases = [p + int(value) for p, value in zip(phases, layer[int(y), int(x)], strict=True)]
-        sums = [s + exact.mp.sin(exact.mp.pi / 2 * p / 255) ** 2 for s, p in zip(sums, phases, strict=True)]
-    return [s / rays**2 for s in sums], inside, edge
+        own = sums[ray // a_set]
+        own[:] = [s + exact.mp.sin(exact.mp.pi / 2 * p / 255) ** 2 / a_set for s, p in zip(own, phases, strict=True)]
+    return sums, inside, edge
 
 
 def trials() -> Iterator[Trial]:
