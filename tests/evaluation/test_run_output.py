@@ -47,7 +47,7 @@ def test_the_sheet_shows_the_moment_with_the_one_figure_to_quote(
     moment = contact_sheet.Moment(pictures(1)[0], look, 33.25, ("This moment",))
     with RunOutput(tmp_path) as output:
         output.finish(SUMMARY | {"light_db": 31.0, "quality_frames": 2}, layers, look, moment)
-    assert written[0].startswith("33.2 dB of light")
+    assert written[0] == "PSNR 33.2 dB at the eyes (pixels as squares, pupil 4 mm, tracking error 1 mm)"
     assert "This moment" in written
     assert any("light 31.0 dB, mean of 2 refreshes" in text for text in written)
     np.testing.assert_array_equal(read_image(tmp_path / "layer-0.png"), layers[0, ..., :3])  # the last frame's

@@ -52,7 +52,7 @@ def change_scene(name: str) -> Action:
     def do(presenter: Presenter) -> None:
         present = presenter.run_cell.state.settings
         settings = present.model_copy(update={"content": present.content.model_copy(update={"scene": name})})
-        change = Reconfiguration(settings, present, presenter.stack, reload_content=True)
+        change = Reconfiguration(lambda: settings, present, presenter.stack, reload_content=True)
         deadline_s = time.monotonic() + LOADED_WITHIN_S
 
         def load(parts: Any) -> bool:
