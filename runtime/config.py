@@ -190,7 +190,9 @@ class ContentSettings(Section):
     """What is shown."""
 
     scene: str = Field("demo", description="a built-in scene, a preset, a file or folder, or a class: `module:Class`")
-    options: dict[str, Any] = Field(default_factory=dict, description="of a scene that is a class: its own settings")
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="of a scene that is a class: its own settings; of `program`: port"
+    )
     fov_deg: Annotated[float, within(*FOV_RANGE_DEG, "degrees")] = Field(
         40.0, description="horizontal field of view of eye images"
     )

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -76,6 +77,14 @@ class ContentSource(ABC):
         asked. Raises ContentFailure."""
         return None
 
+    def expect(self, views: Sequence[View], *, time_ns: int) -> None:  # noqa: B027 - most have nothing to prepare
+        """These views of both eyes are rendered next. Raises ContentFailure."""
+
+    @property
+    def program(self) -> dict[str, Any] | None:
+        """Of a scene that another program draws: `address`, and `frame_ms` that it takes lately. None: it is none."""
+        return None
+
     def extent(self, view: View, *, time_ns: int) -> PixelRect | None:
         """A box of the view's pixels beside which only the background shows, without drawing it; None: not known."""
         return None
@@ -113,6 +122,14 @@ class ForwardingSource(ContentSource):
     @property
     def problem(self) -> str:
         return self.source.problem
+
+    @property
+    def program(self) -> dict[str, Any] | None:
+        return self.source.program
+
+    def expect(self, views: Sequence[View], *, time_ns: int) -> None:
+        asked = [self.asked(view, time_ns) for view in views]
+        asked[0][0].expect([view for _, view, _ in asked], time_ns=asked[0][2])
 
     @property
     def draws_in(self) -> object:  # type: ignore[override]

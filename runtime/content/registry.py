@@ -64,6 +64,10 @@ def _prepared(file: SceneFile) -> Opener:
         if not settings.file:
             raise InputError("content", "file", f"is needed: {name}'s .ply, .glb or data-set folder (not shipped)")
         return _from_path(replace(file, path=Path(settings.file), preset=name))
+    if name == "program":
+        from runtime.content import program
+
+        return program.prepare(file)
     if "://" in name or name.startswith("/dev/video"):
         from runtime.content import stream
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from queue import Empty, SimpleQueue
 from typing import Any, Protocol
@@ -18,7 +19,7 @@ import numpy as np
 
 from runtime.clock import NS_PER_S
 from runtime.content.base import ContentSource
-from runtime.errors import ContextLost
+from runtime.errors import ContentFailure, ContextLost
 from runtime.evaluation.contact_sheet import Moment
 from runtime.evaluation.displayed import EyeViews, displayed
 from runtime.frame.presenter import Refresh
@@ -229,7 +230,8 @@ class RunObserver:
 
         def task(parts: Any) -> bool:
             try:
-                then(self._drawn(parts.content, refresh, true_m))
+                with suppress(ContentFailure):  # the state says so
+                    then(self._drawn(parts.content, refresh, true_m))
             finally:
                 self._drawing = False
             return True

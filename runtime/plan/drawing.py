@@ -38,15 +38,10 @@ def retina_pictures(
     content: ContentSource, eyes_m: F64, stack: PanelStack, *, fov_deg: float, time_ns: int
 ) -> tuple[U8, U8]:
     """What content shows to eyes (2, 3), frame `stack`: (h, w, 3) each, of the panels' size, as retina pictures."""
-    left, right = (
-        np.ascontiguousarray(
-            content.render(
-                retina_view(eye, side, width_px=stack.width_px, height_px=stack.height_px, fov_deg=fov_deg),
-                time_ns=time_ns,
-            )[..., :3]
-        )
-        for side, eye in enumerate(eyes_m)
-    )
+    size = {"width_px": stack.width_px, "height_px": stack.height_px}
+    views = [retina_view(eye, side, **size, fov_deg=fov_deg) for side, eye in enumerate(eyes_m)]
+    content.expect(views, time_ns=time_ns)
+    left, right = (np.ascontiguousarray(content.render(view, time_ns=time_ns)[..., :3]) for view in views)
     return left, right
 
 
@@ -78,7 +73,9 @@ def drawn_for(
         rasters = tuple(job.part.box.cut(raster) for raster in rasters)
     images: list[list[Picture]] = [[], []]
     for raster in rasters:
-        for view in raster_views(eyes_m, raster):
+        views = raster_views(eyes_m, raster)
+        content.expect(views, time_ns=time_ns)
+        for view in views:
             if len(rasters) == 1 and (drawn := _drawn(predictor, content, view, time_ns=time_ns)) is not None:
                 images[view.side].append(drawn)
                 continue

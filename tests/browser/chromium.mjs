@@ -1,17 +1,11 @@
-// Debian's Chromium for a test: NODE_PATH=... node -e/import, with playwright-core under NODE_PATH. What it asks of anywhere
+// Debian's Chromium for a test, with playwright-core under NODE_PATH. What it asks of anywhere
 // but `origin`, and every error, is kept.
 import { createRequire } from "node:module";
-import { createInterface } from "node:readline";
 
 const find = createRequire(process.env.NODE_PATH + "/x");
 const { chromium } = find("playwright-core");
-const lines = createInterface({ input: process.stdin })[Symbol.asyncIterator]();
 
 export const say = (what, value = null) => console.log(JSON.stringify({ what, value }));
-export const answered = async (what, value = null) => {
-  say(what, value);
-  return JSON.parse((await lines.next()).value);
-};
 
 export async function opened({ width = 1280, height = 800, origin = null, ...more } = {}) {
   const browser = await chromium.launch({

@@ -148,12 +148,13 @@ async function about() {
 function figures(now) {
   const at = (share) => [...latencies].sort((a, b) => a - b)[Math.floor(share * (latencies.length - 1))];
   const rows = {
-    "this page draws": `${drawn.length} times a second`,
+    "this page draws": `${drawn.length} pictures in the last second`,
     "the panels are given": `${number(now.fps_now)} refreshes a second`,
     "the solver makes": `${number(now.solutions_per_s_now)} solutions a second, ${now.model ?? ""}`,
     "the newest is": `${number(now.solution_age_now_ms, 0)} ms old`,
     "the eyes are known to": `${number(now.eye_sigma_now_mm, 2)} mm (${now.eyes_label ?? "–"})`,
     "pointer to aligned picture": `${number(at(0.5), 0)} ms, 99 of 100 within ${number(at(0.99), 0)} ms`,
+    ...(now.program ? { "a program draws": now.missing?.content ?? `${number(now.program.frame_ms, 0)} ms a frame`, "it connects to": now.program.address } : {}),
     "light at the eyes": now.light_db === null || now.light_db === undefined ? "not measured yet" : `${number(now.light_db)} dB`,
   };
   main.querySelector(".figures")?.replaceChildren(...Object.entries(rows).flatMap(([name, text]) =>

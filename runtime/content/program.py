@@ -1,0 +1,264 @@
+"""A program that draws: a renderer, a game, a web page connects, is asked for both eyes' pictures and answers them.
+
+The protocol is in docs/programs.md. What comes late, or not at all, leaves the last pictures where they are.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import logging
+import secrets
+import struct
+import threading
+import time
+import weakref
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+from pydantic import Field
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.server import ServerConnection, serve
+
+from runtime.clock import NS_PER_S
+from runtime.config import Section, validated
+from runtime.content.base import ContentInfo, ContentSource, View
+from runtime.content.placing import SceneFile
+from runtime.errors import ContentFailure, InputError, one_line
+from runtime.records import U8
+from runtime.support.background import begin
+
+log = logging.getLogger("phasestack.content")
+
+HOST = "127.0.0.1"
+ANSWERED_S = 0.4  # both pictures; later they are late
+GIVEN_UP_S = 2.0  # a frame that is late is no more waited for: another may be asked for in its place
+IN_FLIGHT_MAX = 2
+HELLO_S = 5.0
+NEAR_M, FAR_M = 0.05, 100.0
+HEAD = struct.Struct("<II")  # of an answer: the frame, and whose picture (0 left, 1 right)
+SIDES = ("left", "right")
+
+
+class ProgramOptions(Section):
+    """What [content.options] may hold for it."""
+
+    port: int = Field(0, ge=0, le=65535, description="of the address; 0: any that is free")
+
+
+def prepare(file: SceneFile) -> Callable[[Any], ContentSource]:
+    """Listens from now on. Raises InputError where the port is taken."""
+    options = validated(ProgramOptions, file.settings.options, source="content.options")
+    size_px = file.stack.width_px * file.stack.height_px
+    source = ProgramSource(Programs(options.port, most_bytes=8 * size_px + HEAD.size), background=file.background)
+    return lambda context: source
+
+
+def camera_of(view: View) -> dict[str, Any]:
+    """View and projection matrix of a view as OpenGL wants them: column after column, depth -1 to 1, metres."""
+    pixels = view.pixels_from_stack
+    forward = pixels[2, :3] / np.linalg.norm(pixels[2, :3])
+    right, down = (row[:3] - (row[:3] @ forward) * forward for row in pixels[:2])
+    camera = np.eye(4)
+    camera[:3, :3] = [right / np.linalg.norm(right), -down / np.linalg.norm(down), -forward]
+    camera[:3, 3] = -camera[:3, :3] @ view.eye_m
+    clip = np.zeros((4, 4))
+    clip[0] = 2 / view.width_px * pixels[0] - pixels[2]
+    clip[1] = pixels[2] - 2 / view.height_px * pixels[1]
+    clip[2] = (FAR_M + NEAR_M) / (FAR_M - NEAR_M) * pixels[2]
+    clip[2, 3] -= 2 * FAR_M * NEAR_M / (FAR_M - NEAR_M)
+    clip[3] = pixels[2]
+    matrices = {"view": camera, "projection": clip @ np.linalg.inv(camera)}
+    return {"eye": SIDES[view.side], "eye_m": view.eye_m.tolist()} | {
+        k: m.T.ravel().tolist() for k, m in matrices.items()
+    }
+
+
+@dataclass(slots=True)
+class _Frame:
+    """One that a program was asked for."""
+
+    views: Sequence[View]
+    asked_s: float
+    pictures: dict[int, U8] = field(default_factory=dict)  # by side
+    wanted: bool = True  # somebody waits for it
+
+    @property
+    def complete(self) -> bool:
+        return len(self.pictures) == len(self.views)
+
+
+class Programs:
+    """Who is connected, and what they have answered. Any thread may use it."""
+
+    def __init__(self, port: int, *, most_bytes: int) -> None:
+        """Raises InputError where the port is taken."""
+        self._token = secrets.token_urlsafe(24)
+        self._changed = threading.Condition()
+        self._drawing: ServerConnection | None = None  # the newest
+        self._listening: set[ServerConnection] = set()
+        self._frames: dict[int, _Frame] = {}  # that are not answered, by number
+        self._count, self._bottom_up = 0, False
+        self.problem = ""
+        self.frame_ms: float | None = None  # from asking to the last picture, lately
+        try:
+            self._server = serve(
+                self._connected, HOST, port, process_request=self._refused, max_size=most_bytes, compression=None
+            )
+        except OSError as error:
+            raise InputError("content.options", "port", f"{port}: can't be listened on ({error.strerror})") from None
+        self.address = f"ws://{HOST}:{self._server.socket.getsockname()[1]}/?token={self._token}"
+        begin("programs", self._server.serve_forever)
+        log.info("a program may draw: its address is in `phasestack status` (program)")
+
+    def ask(self, views: Sequence[View], *, time_ns: int) -> int:
+        """Ask for pictures of one size; answers the frame's number. Raises ContentFailure where nobody may be asked."""
+        view, now_s = views[0], time.monotonic()
+        with self._changed:
+            self._count += 1
+            number, program = self._count, self._drawing
+            self._frames = {n: frame for n, frame in self._frames.items() if now_s - frame.asked_s < GIVEN_UP_S}
+            told = {"frame": number, "time_s": time_ns / NS_PER_S, "width": view.width_px, "height": view.height_px}
+            message = json.dumps(told | {"eyes": [camera_of(one) for one in views]})
+            if program is not None and len(self._frames) < IN_FLIGHT_MAX:
+                self._frames[number] = _Frame(views, now_s)
+            others = tuple(self._listening)
+        for connection in (*others, *([program] if program is not None and number in self._frames else [])):
+            with suppress(ConnectionClosed):
+                connection.send(message)
+        if program is None:
+            why = f" ({self.problem})" if self.problem else ""
+            raise ContentFailure(f"no program draws{why}: where it may connect is in the status (program)")
+        if number not in self._frames:
+            raise ContentFailure(f"the program is late: {IN_FLIGHT_MAX} frames are not answered")
+        return number
+
+    def answer(self, number: int, side: int) -> U8:
+        """One picture of a frame; waits for it. Raises ContentFailure."""
+        with self._changed:
+            frame = self._frames.get(number)
+            if frame is not None:
+                within_s = frame.asked_s + ANSWERED_S - time.monotonic()
+                self._changed.wait_for(lambda: side in frame.pictures or number not in self._frames, within_s)
+                if side in frame.pictures:
+                    return frame.pictures[side]
+        raise ContentFailure(self.problem or f"the program has not answered within {1e3 * ANSWERED_S:.0f} ms")
+
+    def done(self, number: int) -> None:
+        """A frame is not waited for any more: it is in flight until it is answered."""
+        with self._changed:
+            frame = self._frames.get(number)
+            if frame is not None:
+                frame.wanted = False
+                if frame.complete:
+                    del self._frames[number]
+
+    def close(self) -> None:
+        """Nobody may connect any more."""
+        begin("programs", self._server.shutdown)
+
+    def _refused(self, connection: ServerConnection, request: Any) -> Any:
+        given = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
+        if not hmac.compare_digest(given.encode(), self._token.encode()):
+            return connection.respond(403, "the token of the address is wrong\n")
+        return None
+
+    def _connected(self, connection: ServerConnection) -> None:
+        """One connection's thread: what it says first is what it does."""
+        why = "it is gone"
+        try:
+            hello = json.loads(connection.recv(timeout=HELLO_S))
+            if not isinstance(hello, dict):
+                raise ValueError("begins with no JSON object")
+            self._welcome(connection, hello)
+            for message in connection:
+                self._take(connection, message)
+        except (ConnectionClosed, TimeoutError):
+            pass
+        except ValueError as error:
+            why = one_line(str(error), most=100)
+            connection.close(1007, why)
+        finally:
+            with self._changed:
+                self._listening.discard(connection)
+                if self._drawing is connection:
+                    self._drawing, self.problem = None, why
+                    self._frames.clear()
+                    self._changed.notify_all()
+                    log.warning("a program draws no more: %s", why)
+
+    def _welcome(self, connection: ServerConnection, hello: dict[str, Any]) -> None:
+        with self._changed:
+            if hello.get("listens"):
+                self._listening.add(connection)
+                return
+            before, self._drawing = self._drawing, connection
+            self._bottom_up, self.problem = hello.get("rows") == "bottom-up", ""
+            self._frames.clear()
+            self._changed.notify_all()
+        log.info("a program draws: %s", one_line(str(hello.get("name", "without a name")), most=80))
+        if before is not None:
+            before.close(1001, "another program draws")
+
+    def _take(self, connection: ServerConnection, message: str | bytes) -> None:
+        """One picture. Raises ValueError for what is none."""
+        if not isinstance(message, bytes) or len(message) < HEAD.size:
+            raise ValueError("it answered with something that is no picture")
+        number, side = HEAD.unpack_from(message)
+        with self._changed:
+            frame = self._frames.get(number)
+            if connection is not self._drawing or frame is None:
+                return  # it was given up
+            height, width = frame.views[0].height_px, frame.views[0].width_px
+            if len(message) - HEAD.size != 4 * width * height:
+                found = len(message) - HEAD.size
+                raise ValueError(f"it answered with {found} bytes for {width}x{height} RGBA pixels")
+            picture = np.frombuffer(message, np.uint8, offset=HEAD.size).reshape(height, width, 4)
+            frame.pictures[side] = np.ascontiguousarray(picture[::-1]) if self._bottom_up else picture
+            if frame.complete:
+                self.frame_ms = 1e3 * (time.monotonic() - frame.asked_s)
+                if not frame.wanted:
+                    del self._frames[number]
+            self._changed.notify_all()
+
+
+class ProgramSource(ContentSource):
+    """What the program that is connected draws, for exactly the eyes that are solved for."""
+
+    def __init__(self, programs: Programs, *, background: Any) -> None:
+        self._programs = programs
+        self.info = ContentInfo("program", moving=True, background=background)
+        self._expected: tuple[int, list[View]] | None = None  # the frame that was asked for, of these views
+        weakref.finalize(self, programs.close)
+
+    @property
+    def program(self) -> dict[str, Any]:
+        return {"address": self._programs.address, "frame_ms": self._programs.frame_ms}
+
+    @property
+    def problem(self) -> str:
+        return self._programs.problem
+
+    def expect(self, views: Sequence[View], *, time_ns: int) -> None:
+        if self._expected is not None:
+            self._programs.done(self._expected[0])
+            self._expected = None
+        self._expected = self._programs.ask(views, time_ns=time_ns), list(views)
+
+    def render(self, view: View, *, time_ns: int) -> U8:
+        if self._expected is None or not any(_same(view, one) for one in self._expected[1]):
+            self.expect([view], time_ns=time_ns)
+        assert self._expected is not None
+        return self._programs.answer(self._expected[0], view.side)
+
+    def close(self) -> None:
+        self._programs.close()
+
+
+def _same(view: View, other: View) -> bool:
+    matrices = view.pixels_from_stack, other.pixels_from_stack
+    return view.side == other.side and np.array_equal(*matrices) and view.width_px == other.width_px

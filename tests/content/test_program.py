@@ -1,0 +1,252 @@
+"""`scene = "program"`: a real client over a real connection."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from runtime.config import ContentSettings, StackGeometry
+from runtime.content.placed import Placing, placed_source
+from runtime.content.program import camera_of
+from runtime.content.registry import open_content
+from runtime.errors import ContentFailure, InputError
+from runtime.optics.views import image_from_stack
+from runtime.plan.drawing import raster_views, retina_pictures, retina_view
+from tests.browser.test_viewer import needs_chromium
+from tests.waiting import eventually
+
+STACK = replace(StackGeometry().stack(), width_px=64, height_px=36)
+EYES = np.array([[0.6, -0.03, 0.05], [0.6, 0.03, 0.05]])
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def source() -> Iterator[Any]:
+    made = open_content(ContentSettings(scene="program"), STACK, None)
+    yield made
+    made.close()
+
+
+def picture_of(asked: dict, eye: dict) -> bytes:
+    """Its red tells whose it is, its green which row (from above)."""
+    picture = np.zeros((asked["height"], asked["width"], 4), np.uint8)
+    picture[..., 0] = 200 if eye["eye"] == "left" else 100
+    picture[..., 1] = np.arange(asked["height"])[:, None]
+    picture[..., 3] = 255
+    return picture.tobytes()
+
+
+class Program:
+    """Answers as it is told to, on a thread of its own."""
+
+    def __init__(self, source: Any, answer: Callable[..., bytes | None] = picture_of, **hello: Any) -> None:
+        self.asked: list[dict] = []
+        self.ended = threading.Event()
+        self._begun = threading.Event()
+        self._address, self._answer, self._hello = source.program["address"], answer, hello
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+        assert self._begun.wait(10)
+
+    def _run(self) -> None:
+        with connect(self._address, max_size=None, compression=None) as self.socket:
+            self.socket.send(json.dumps({"name": "test"} | self._hello))
+            time.sleep(0.1)
+            self._begun.set()
+            try:
+                for message in self.socket:
+                    self.asked.append(json.loads(message))
+                    for side, eye in enumerate(self.asked[-1]["eyes"]):
+                        answer = self._answer(self.asked[-1], eye)
+                        if answer is not None:
+                            self.socket.send(struct.pack("<II", self.asked[-1]["frame"], side) + answer)
+            except ConnectionClosed:
+                pass
+        self.ended.set()
+
+    def end(self) -> None:
+        self.socket.close()
+        self._thread.join(10)
+
+
+def drawn(source: Any, time_ns: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    return retina_pictures(source, EYES, STACK, fov_deg=40, time_ns=time_ns)
+
+
+def test_both_eyes_are_asked_for_at_once_and_get_their_own_picture(source: Any) -> None:
+    program = Program(source)
+    left, right = drawn(source, time_ns=1_500_000_000)
+    (asked,) = program.asked
+    assert (asked["width"], asked["height"], asked["time_s"]) == (64, 36, 1.5)
+    assert [eye["eye"] for eye in asked["eyes"]] == ["left", "right"]
+    assert (left[..., 0] == 200).all() and (right[..., 0] == 100).all() and (left[:, 5, 1] == np.arange(36)).all()
+    assert 0 < source.program["frame_ms"] < 400 and source.problem == ""
+    program.end()
+
+
+def test_rows_may_come_from_below_as_opengl_reads_them(source: Any) -> None:
+    program = Program(source, rows="bottom-up")
+    assert (drawn(source)[0][:, 5, 1] == np.arange(36)[::-1]).all()
+    program.end()
+
+
+@pytest.mark.parametrize("placed", [False, True])
+def test_matrices_put_points_where_the_view_has_them(source: Any, placed: bool) -> None:
+    points = np.random.default_rng(1).uniform(-0.05, 0.05, (20, 3))
+    views = [*raster_views(EYES, STACK.panel(0)), retina_view(EYES[1], 1, width_px=64, height_px=36, fov_deg=40)]
+    if placed:
+        moved: Any = placed_source(source, Placing(2.0, (0.01, 0.02, 0.03)))
+        views = [moved.asked(view, 0)[1] for view in views]
+    for view in views:
+        told = camera_of(view)
+        look, projection = (np.reshape(told[name], (4, 4)).T for name in ("view", "projection"))
+        np.testing.assert_allclose(look[:3, :3] @ look[:3, :3].T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(look[:3, :3]) == pytest.approx(1)
+        np.testing.assert_allclose(look @ [*view.eye_m, 1], [0, 0, 0, 1], atol=1e-12)
+        clip = projection @ look @ np.column_stack([points, np.ones(20)]).T
+        seen = view.pixels_from_stack @ np.column_stack([points, np.ones(20)]).T
+        np.testing.assert_allclose((clip[0] / clip[3] + 1) / 2 * 64, seen[0] / seen[2], atol=1e-9)
+        np.testing.assert_allclose((1 - clip[1] / clip[3]) / 2 * 36, seen[1] / seen[2], atol=1e-9)
+        assert (np.abs(clip[2] / clip[3]) < 1).all()
+
+
+def test_without_a_program_the_state_says_where_one_may_connect(source: Any) -> None:
+    with pytest.raises(ContentFailure, match="no program draws: where it may connect"):
+        drawn(source)
+
+
+def test_a_silent_program_is_late_and_is_not_asked_for_more_than_two_frames(source: Any) -> None:
+    program = Program(source, lambda asked, eye: None)
+    for _ in range(2):
+        with pytest.raises(ContentFailure, match="not answered within 400 ms"):
+            drawn(source)
+    with pytest.raises(ContentFailure, match="late: 2 frames"):
+        drawn(source)
+    assert len(program.asked) == 2
+    time.sleep(2.1)
+    with pytest.raises(ContentFailure, match="not answered within"):
+        drawn(source)
+    assert len(program.asked) == 3
+    program.end()
+
+
+def test_what_comes_late_is_left_and_the_next_is_right(source: Any) -> None:
+    late = [0.3, 0.3]
+    program = Program(source, lambda asked, eye: time.sleep(late.pop() if late else 0) or picture_of(asked, eye))
+    with pytest.raises(ContentFailure):
+        drawn(source)
+    assert eventually(lambda: program.asked[-1]["frame"] > 1 or _draws(source))
+    assert (drawn(source)[1][..., 0] == 100).all()
+    program.end()
+
+
+def _draws(source: Any) -> bool:
+    try:
+        return len(drawn(source)) == 2
+    except ContentFailure:
+        return False
+
+
+def test_who_answers_with_the_wrong_size_is_sent_away_with_the_reason_and_may_come_back(source: Any) -> None:
+    program = Program(source, lambda asked, eye: b"x" * 100)
+    with pytest.raises(ContentFailure, match="100 bytes for 64x36"):
+        drawn(source)
+    assert program.ended.wait(10) and "100 bytes" in source.problem
+    again = Program(source)
+    assert drawn(source)[0].shape == (36, 64, 3) and source.problem == ""
+    again.end()
+    assert eventually(lambda: source.problem == "it is gone")
+
+
+def test_the_newest_program_draws(source: Any) -> None:
+    first, second = Program(source), Program(source, lambda asked, eye: b"\x07" * (4 * 64 * 36))
+    assert first.ended.wait(10)
+    assert (drawn(source)[0] == 7).all()
+    second.end()
+
+
+def test_who_listens_is_told_of_the_eyes_and_asked_for_nothing(source: Any) -> None:
+    listener, program = Program(source, lambda asked, eye: None, listens=True), Program(source)
+    drawn(source)
+    assert eventually(lambda: len(listener.asked) == 1)
+    assert [eye["eye_m"] for eye in listener.asked[0]["eyes"]] == EYES.tolist()
+    program.end()
+    listener.end()
+
+
+@pytest.mark.parametrize("hello", ["{", "[]", b"\x00"])
+def test_who_begins_with_nonsense_is_sent_away(source: Any, hello: Any) -> None:
+    with connect(source.program["address"]) as socket:
+        socket.send(hello)
+        with pytest.raises(ConnectionClosed):
+            socket.recv(10)
+    with pytest.raises(ContentFailure, match="no program draws"):
+        drawn(source)
+
+
+def test_without_the_token_nobody_connects(source: Any) -> None:
+    address = source.program["address"].partition("?")[0]
+    with pytest.raises(InvalidStatus), connect(address):
+        pass
+
+
+def test_a_port_that_is_taken_is_refused(source: Any) -> None:
+    port = int(source.program["address"].partition("127.0.0.1:")[2].partition("/")[0])
+    with pytest.raises(InputError, match=f"port: {port}"):
+        open_content(ContentSettings(scene="program", options={"port": port}), STACK, None)
+
+
+def test_the_example_draws_a_cube_for_each_eye(source: Any) -> None:
+    command = [sys.executable, str(ROOT / "examples" / "program.py"), source.program["address"]]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert eventually(lambda: process.poll() is not None or _draws(source), within_s=60.0)
+            left, right = drawn(source)
+            projection = image_from_stack(EYES[0], width_px=64, height_px=36, fov_deg=40)
+            u, v = (projection @ [0, 0, 0, 1])[:2] / (projection @ [0, 0, 0, 1])[2]
+            assert (left[0, 0] > 220).all() and not (left[int(v), int(u)] > 220).all()
+            assert np.abs(left.astype(int) - right).max() > 20
+        finally:
+            process.kill()
+
+
+@pytest.mark.slow
+def test_a_page_with_three_js_draws_a_knot_for_each_eye(source: Any, tmp_path: Path) -> None:
+    needs_chromium()
+    modules = Path(os.environ["NODE_PATH"])
+    if not (modules / "three").is_dir():
+        pytest.skip("three is needed in NODE_PATH")
+    for name in ("three.html", "program.js"):
+        shutil.copy(ROOT / "examples" / name, tmp_path)
+    (tmp_path / "node_modules").symlink_to(modules)
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=tmp_path)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        page = f"http://127.0.0.1:{server.server_port}/three.html#{source.program['address']}"
+        script = str(ROOT / "tests" / "browser" / "page.mjs")
+        with subprocess.Popen(["node", script, page], stdin=subprocess.PIPE, text=True) as browser:
+            try:
+                assert eventually(lambda: browser.poll() is not None or _draws(source), within_s=120.0)
+                left, right = (picture.astype(int) for picture in drawn(source))
+            finally:
+                browser.communicate("end")
+        server.shutdown()
+    reds = [(picture[..., 0] - picture[..., 1] > 60) for picture in (left, right)]
+    assert all(50 < red.sum() < 1000 for red in reds) and (reds[0] != reds[1]).sum() > 5
+    assert left[2, 2].tolist() == [0xDF, 0xE8, 0xF5]
