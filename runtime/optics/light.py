@@ -151,28 +151,31 @@ def _kernel() -> Any:
         half, one = np.float32(0.5), np.float32(1)
         a_set, sets = max(rays * rays, 1), 2 if rays else 1
         share, seen = one / np.float32(a_set), np.empty((2, 3), np.float32)
+        part_px, columns, points = 1.0 / max(rays, 1), view.target.shape[1], len(panels)
         total, counted = 0.0, 0
         for row in range(first, last, step):
-            for column in range(0, view.target.shape[1], step):
+            for column in range(0, columns, step):
                 seen[:], counts = 0, True
+                number = view.first_ray + (row * columns + column) * a_set * sets
+                part_u, part_v, own = 0, 0, 0  # of the pixel, and which of the sets
                 for ray in range(a_set * sets):
                     u, v, point = column + 0.5, row + 0.5, 0
                     if rays:
-                        number = view.first_ray + (row * view.target.shape[1] + column) * a_set * sets + ray
-                        along, down, point = place_of(bits_of(number), len(panels))
-                        u = column + (ray % rays + along) / rays
-                        v = row + (ray % a_set // rays + down) / rays
+                        along, down, point = place_of(bits_of(number + ray), points)
+                        u, v = column + (part_u + along) * part_px, row + (part_v + down) * part_px
                     counts = counts and toward[0] * u + toward[1] * v + toward[2] < 0
                     weight = 1 / (centre[2, 0] * u + centre[2, 1] * v + centre[2, 2])
                     a = (centre[0, 0] * u + centre[0, 1] * v + centre[0, 2]) * weight
                     b = (centre[1, 0] * u + centre[1, 1] * v + centre[1, 2]) * weight
                     red, green, blue = half, half, half  # rounded, where the table is looked into
                     for n in range(panels.shape[1]):
-                        panel = panels[point, n]
-                        x = panel[0, 0] * a + panel[0, 1] * b + panel[0, 2]
-                        y = panel[1, 0] * a + panel[1, 1] * b + panel[1, 2]
+                        x = panels[point, n, 0, 0] * a + panels[point, n, 0, 2]
+                        y = panels[point, n, 1, 1] * b + panels[point, n, 1, 2]
                         if tilted:
-                            weight = 1 / (panel[2, 0] * a + panel[2, 1] * b + panel[2, 2])
+                            x, y = x + panels[point, n, 0, 1] * b, y + panels[point, n, 1, 0] * a
+                            weight = 1 / (
+                                panels[point, n, 2, 0] * a + panels[point, n, 2, 1] * b + panels[point, n, 2, 2]
+                            )
                             x, y = x * weight, y * weight
                         counts = counts and 0.5 < x < width - 0.5 and 0.5 < y < height - 0.5
                         if not counts:
@@ -195,10 +198,14 @@ def _kernel() -> Any:
                             blue += part * codes[n, below, beside, 2]
                     if not counts:
                         break
-                    one_set = seen[ray // a_set]
-                    one_set[0] += table[int(red)]
-                    one_set[1] += table[int(green)]
-                    one_set[2] += table[int(blue)]
+                    seen[own, 0] += table[int(red)]
+                    seen[own, 1] += table[int(green)]
+                    seen[own, 2] += table[int(blue)]
+                    part_u += 1
+                    if part_u == rays:
+                        part_u, part_v = 0, part_v + 1
+                    if part_v == rays and rays:
+                        part_v, own = 0, own + 1
                 if counts:
                     other = seen[sets - 1]
                     for channel in range(3):
