@@ -20,6 +20,7 @@ test: $(VENV)/.test lint types
 	$(BIN)/python -m pytest -m "not slow" -n $(TEST_WORKERS) --dist loadfile --max-worker-restart 0 $(PYTEST_ARGS)
 
 test-slow: $(VENV)/.test
+	@sh systemd/packages.sh slow
 	$(BIN)/python -m pytest -m slow --timeout 3600 $(PYTEST_ARGS)
 
 # The golden runs' references anew, on purpose; GOLDEN_ARGS="walk fault" for some of them.

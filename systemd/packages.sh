@@ -1,10 +1,15 @@
 #!/bin/sh
-# Debian's packages for the runtime, and with `test` for the test suite. Root: installed. Others: asked for, in one line.
+# Debian's packages for the runtime; with `test` for the test suite too, with `slow` for its slow tests too. Root: installed.
+# Others: asked for, in one line.
 set -u
 runtime="libegl1 libgl1-mesa-dri libgles2 libgl1 libusb-1.0-0 libopenni2-0"
 testing="xvfb xserver-xorg-core xserver-xorg-video-dummy x11-xserver-utils x11-apps imagemagick chromium systemd udev"
-wanted=$runtime
-[ "${1:-}" = test ] && wanted="$runtime $testing"
+slow="debootstrap systemd-container buildah e2fsprogs"  # a booted system, the image, a power cut
+case ${1:-} in
+  test) wanted="$runtime $testing" ;;
+  slow) wanted="$runtime $testing $slow" ;;
+  *) wanted=$runtime ;;
+esac
 command -v dpkg-query >/dev/null || { echo "Not Debian: see to it that these libraries are there: $wanted"; exit 0; }
 missing=""
 for name in $wanted; do
