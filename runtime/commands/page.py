@@ -25,6 +25,7 @@ def page(
     Example: phasestack page --port 8717
     """
     from runtime.daemon.client import Daemon, sockets
+    from runtime.errors import retry_advised
     from runtime.page.connections import LOOPBACK, listening, server_of
     from runtime.page.server import application
     from runtime.page.token import token_of
@@ -34,7 +35,8 @@ def page(
     set_niceness(BACKGROUND_NICENESS)  # the display comes first; its threads are started after this
     places = sockets(config)
     path = token_file or state_folder() / "page-token"
-    token = token_of(path)
+    with retry_advised():  # a full disk may pass: the service is started again
+        token = token_of(path)
     served = listening("page", port)
     own_port = served.getsockname()[1]
     typer.echo(f"the page is at http://{LOOPBACK}:{own_port}/ - its token is in {path}", err=True)
