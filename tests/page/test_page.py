@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import resource
@@ -17,9 +18,10 @@ import anyio
 import pytest
 
 from runtime.clock import MonotonicClock
+from runtime.commands.page import page as page_command
 from runtime.daemon.client import Daemon
 from runtime.daemon.server import StatusServer
-from runtime.errors import InputError
+from runtime.errors import InputError, TransientError
 from runtime.page.connections import CONNECTIONS_MAX
 from runtime.page.server import application
 from runtime.page.token import cookie_of, token_of
@@ -219,6 +221,15 @@ def test_a_disk_that_has_no_room_for_a_token_leaves_none_behind(tmp_path: Path) 
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert list(tmp_path.iterdir()) == []
     assert len(token_of(tmp_path / "token")) >= 40
+
+
+def test_a_full_disk_may_pass_and_the_page_is_started_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "link", full)
+    with pytest.raises(TransientError, match="No space left on device"):
+        page_command(config=None, port=0, token_file=tmp_path / "token")
 
 
 def test_connections_that_ask_nothing_shut_nobody_out(page: Page, loop: Loop) -> None:
