@@ -11,10 +11,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from model_export.eyereal import EyeRealNet
-from model_export.network import SpectralSolver
-from model_export.recipe import Recipe
-from runtime.config import validated
 from runtime.errors import InputError, one_line
 from runtime.support import untrusted_input
 from runtime.support.artifacts import write_bytes
@@ -41,49 +37,12 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     return table
 
 
-def load_eyereal(path: Path) -> EyeRealNet:
-    """The published network with a checkpoint's weights; its width is the checkpoint's. Raises InputError."""
-    state = load_checkpoint(path)["model"]
+def eyereal_width(state: Mapping[str, Tensor], *, source: Path) -> int:
+    """The width of the published network that a checkpoint is of. Raises InputError."""
     first = state.get(WIDTH_KEY)
     if first is None or first.ndim != 4:
-        raise InputError(path, WIDTH_KEY, "missing: not a checkpoint of the published network")
-    width = int(first.shape[0])
-    if not 1 <= width <= 256:
-        raise InputError(path, WIDTH_KEY, f"{width} channels are not a width of this network")
-    net = EyeRealNet(width)
-    fill(net, state, source=path, arch="eyereal")
-    return net.eval()
-
-
-def load_spectral(path: Path, *, name: str) -> tuple[SpectralSolver, Recipe]:
-    """A trained model and the recipe that it was trained by. Raises InputError, also where it is another model."""
-    table = load_checkpoint(path)
-    if not isinstance(table.get("recipe"), dict):
-        raise InputError(path, "recipe", "missing: not a checkpoint of phasestack train")
-    recipe = validated(Recipe, table["recipe"], source=f"{path}: recipe")
-    if recipe.name != name:
-        raise InputError(path, "recipe.name", f"is a checkpoint of {recipe.name}, not of {name}")
-    net = SpectralSolver(recipe.cell_px, recipe.iterations)
-    fill(net, table["model"], source=path, arch=name)
-    return net.eval(), recipe.model_copy(update={"weights": plain_weights(net)})
-
-
-def solver_of(recipe: Recipe, *, source: str) -> SpectralSolver:
-    """The network with a recipe's own weights, or the analytic start. Raises InputError."""
-    torch.manual_seed(recipe.training.seed)
-    net = SpectralSolver(recipe.cell_px, recipe.iterations)
-    if recipe.weights is not None:
-        try:
-            state = {key: torch.tensor(value, dtype=torch.float32) for key, value in recipe.weights.items()}
-        except (TypeError, ValueError):
-            raise InputError(source, "weights", "must be tables of numbers") from None
-        fill(net, state, source=source, arch=recipe.name)
-    return net.eval()
-
-
-def plain_weights(net: nn.Module) -> dict[str, Any]:
-    """A state_dict as nested lists; float32 survives the way through JSON."""
-    return {key: value.detach().cpu().tolist() for key, value in net.state_dict().items()}
+        raise InputError(source, WIDTH_KEY, "missing: not a checkpoint of the published network")
+    return int(first.shape[0])
 
 
 def fill(net: nn.Module, state: Mapping[str, Tensor], *, source: str | Path, arch: str) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,13 +20,12 @@ LEAST_COMMON = 0.4  # of the centre panel's width that both eyes must see throug
 
 @dataclass(frozen=True, slots=True)
 class TrainingPair:
-    """Two pictures, and how unsure the eyes that should see them are."""
+    """Two pictures, and the eyes that should see them."""
 
     stack: PanelStack
     eyes_m: F64  # (2, 3) left, right; frame `stack`
     images: tuple[U8, U8]  # (h, w, 3), each eye's own
     fov_deg: float  # of both, horizontal
-    eye_sigma_mm: float
 
 
 def random_stack(random: Random, *, width_px: int, height_px: int) -> PanelStack:
@@ -76,39 +73,31 @@ def is_served(eyes_m: F64, stack: PanelStack) -> bool:
     return True
 
 
-def random_place(random: Random, *, width_px: int, height_px: int) -> tuple[PanelStack, F64]:
-    """Panels, and eyes (2, 3) that see enough through them."""
+def random_place(
+    random: Random, *, width_px: int, height_px: int, stack: PanelStack | None = None
+) -> tuple[PanelStack, F64]:
+    """Panels, those given or random ones, and eyes (2, 3) that see enough through them."""
+    given = stack
     while True:
-        stack = random_stack(random, width_px=width_px, height_px=height_px)
+        stack = given or random_stack(random, width_px=width_px, height_px=height_px)
         eyes = random_eyes(random, stack)
         if is_served(eyes, stack):
             return stack, eyes
 
 
 def random_pair(
-    random: Random, *, width_px: int, height_px: int, eye_sigma_mm: tuple[float, float] = (0.0, 4.0)
+    random: Random, *, width_px: int, height_px: int, stack: PanelStack | None = None, fov_deg: float = 0.0
 ) -> TrainingPair:
-    """One pair of the endless stream. A quarter of them has no uncertainty at all: two points."""
-    stack, eyes = random_place(random, width_px=width_px, height_px=height_px)
+    """One pair of the endless stream, of the panels given or random ones; fov_deg 0: what the panels fill."""
+    stack, eyes = random_place(random, width_px=width_px, height_px=height_px, stack=stack)
     scene = random_scene(random, stack, eyes.mean(axis=0))
-    low, high = eye_sigma_mm
-    sigma_mm = low if random.random() < 0.25 else random.uniform(low, high)
-    fov_deg = filling_fov_deg(stack, eyes.mean(axis=0))
+    fov_deg = fov_deg or filling_fov_deg(stack, eyes.mean(axis=0))
     size = {"width_px": width_px, "height_px": height_px}
     left, right = (draw(scene, image_from_stack(eye, **size, fov_deg=fov_deg), **size) for eye in eyes)
-    return TrainingPair(stack, eyes, (left, right), fov_deg, sigma_mm)
+    return TrainingPair(stack, eyes, (left, right), fov_deg)
 
 
 def filling_fov_deg(stack: PanelStack, eye_m: F64) -> float:
     """The horizontal field of view that the panels fill as seen from before them, WIDEST_DEG at most."""
     distance_m = float(np.linalg.norm(eye_m))
     return min(WIDEST_DEG, math.degrees(2 * math.atan(stack.width_m / 2 / distance_m)))
-
-
-def endless_pairs(
-    seed: int, *, width_px: int, height_px: int, eye_sigma_mm: tuple[float, float]
-) -> Iterator[TrainingPair]:
-    """The pairs of a seed, one after the other: each is made from (seed, number) alone."""
-    for number in itertools.count():
-        random = np.random.default_rng([seed, number])
-        yield random_pair(random, width_px=width_px, height_px=height_px, eye_sigma_mm=eye_sigma_mm)

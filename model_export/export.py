@@ -5,17 +5,18 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from model_export import eyereal, network
-from model_export.checkpoint import FILE_BYTES_MAX, load_eyereal, load_spectral, solver_of
-from model_export.eyereal import LEAST_PX, OFFSET, PICTURE_FOV_DEG, EyeRealNet
+from model_export.checkpoint import FILE_BYTES_MAX, eyereal_width, fill, load_checkpoint
+from model_export.eyereal import LEAST_PX, OFFSET
+from model_export.modules import PANELS, Network, blamed, check_known, check_static, made, probe
 from model_export.network import SpectralSolver
-from model_export.onnx_files import eyereal_bytes, ports, spectral_bytes, with_contract
+from model_export.onnx_files import picture_bytes, ports, spectral_bytes, with_contract
 from model_export.recipe import DESIGN_RANGE, Recipe, read_recipe
 from model_export.stress import Feeds
 from model_export.validate import Reference, Report, check_model
@@ -37,22 +38,26 @@ def export_model(
     width_px: int = 1920,
     height_px: int = 1080,
     eye_order: EyeOrder = "left-right",
+    options: dict[str, Any] | None = None,
 ) -> Report:
     """Make, check, and write where every check passed. Raises InputError."""
-    if arch not in (*SHIPPED, "eyereal"):
-        raise InputError("export", "--arch", f"{arch!r} is neither {', '.join(SHIPPED)} nor eyereal")
+    check_known(arch, *SHIPPED)
     if checkpoint is not None and random_init is not None:
         raise InputError("export", "--random-init", "and --checkpoint exclude one another")
-    if arch == "eyereal" and checkpoint is None and random_init is None:
-        raise InputError("export", "--checkpoint", "or --random-init is needed: eyereal's weights aren't shipped")
     for option, value in (("--width", width_px), ("--height", height_px)):
         if value < LEAST_PX or value > 8192 or value % 2:
             raise InputError("export", option, f"{value} must be an even number from {LEAST_PX} to 8192")
-    if arch == "eyereal":
+    if arch not in SHIPPED:
+        network, origin = picture_network(arch, checkpoint, random_init, options or {})
+        module = network.net
         size = {"width_px": width_px, "height_px": height_px}
-        data, module = eyereal_model(checkpoint, random_init=random_init, eye_order=eye_order, **size)
+        data = picture_file(network, origin, eye_order=eye_order, **size)
     else:
-        data, module = spectral_model(arch, checkpoint=checkpoint, random_init=random_init)
+        if checkpoint is not None or random_init is not None:
+            raise InputError(
+                "export", "--arch", f"{arch} is made from its recipe, without --checkpoint or --random-init"
+            )
+        data, module = spectral_model(arch)
     report = check_model(data, source=str(out), reference=in_torch(module))
     if report.passed:
         write_bytes(out, data)
@@ -70,29 +75,16 @@ def in_torch(module: nn.Module) -> Reference:
     return run
 
 
-def spectral_model(
-    name: str, *, checkpoint: Path | None = None, random_init: int | None = None
-) -> tuple[bytes, nn.Module]:
-    """One of the shipped family: as it ships, or with a checkpoint's weights or untrained ones."""
+def spectral_model(name: str) -> tuple[bytes, nn.Module]:
+    """One of the shipped family, from its recipe."""
     recipe = read_recipe(name)
-    if checkpoint is not None:
-        net, recipe = load_spectral(checkpoint, name=name)
-    else:
-        if random_init is not None:
-            training = recipe.training.model_copy(update={"seed": random_init})
-            recipe = recipe.model_copy(update={"weights": None, "training": training})
-        net = solver_of(recipe, source=name)
-    return spectral_file(net, recipe, trained=random_init is None), net
+    net = SpectralSolver(recipe.cell_px, recipe.iterations).eval()
+    return spectral_file(net, recipe), net
 
 
-def spectral_file(net: SpectralSolver, recipe: Recipe, *, trained: bool = True) -> bytes:
-    """The ONNX file of a recipe's network, with its contract; `trained`: on the pairs of `phasestack train`."""
-    return with_contract(spectral_bytes(net, cell_px=recipe.cell_px), spectral_contract(net, recipe, trained=trained))
-
-
-def spectral_contract(net: SpectralSolver, recipe: Recipe, *, trained: bool = True) -> Contract:
-    """What the file of a recipe's network says about itself."""
-    return Contract(
+def spectral_file(net: SpectralSolver, recipe: Recipe) -> bytes:
+    """The ONNX file of a recipe's network, with its contract."""
+    contract = Contract(
         version=2,
         arch="spectral",
         name=recipe.name,
@@ -105,7 +97,7 @@ def spectral_contract(net: SpectralSolver, recipe: Recipe, *, trained: bool = Tr
         output="outer",
         branch=2,
         value_range=(0.0, 1.0),
-        trained_for=DESIGN_RANGE if trained else None,
+        trained_for=DESIGN_RANGE,
         recipe_sha256=recipe.sha256(),
         inputs=ports(network.INPUTS),
         outputs=ports(network.OUTPUTS),
@@ -117,48 +109,63 @@ def spectral_contract(net: SpectralSolver, recipe: Recipe, *, trained: bool = Tr
         steps=recipe.steps,
         refining=recipe.refining,
     )
+    return with_contract(spectral_bytes(net, cell_px=recipe.cell_px), contract)
 
 
-def eyereal_model(
-    checkpoint: Path | None,
-    *,
-    random_init: int | None = None,
-    width_px: int,
-    height_px: int,
-    eye_order: EyeOrder = "left-right",
-) -> tuple[bytes, nn.Module]:
-    """The published network with a checkpoint's weights, or untrained ones."""
-    if checkpoint is not None:
-        net = load_eyereal(checkpoint)
-        origin = hashlib.sha256(untrusted_input.read_bytes(checkpoint, most_bytes=FILE_BYTES_MAX))
-    else:
-        torch.manual_seed(random_init or 0)
-        net = EyeRealNet().eval()
-        origin = hashlib.sha256(f"eyereal 32 random {random_init}".encode())
-    data = eyereal_bytes(net, width_px=width_px, height_px=height_px)
+def picture_network(
+    arch: str, checkpoint: Path | None, random_init: int | None, options: dict[str, Any]
+) -> tuple[Network, str]:
+    """A network of pictures with a checkpoint's weights, or untrained ones, and the digest of where they are from.
+
+    A checkpoint of `phasestack train` knows the network's options, and it must be of that network.
+    """
+    if checkpoint is None:
+        if random_init is None:
+            raise InputError("export", "--checkpoint", f"or --random-init is needed: {arch}'s weights aren't shipped")
+        network = made(arch, options, seed=random_init)
+        return network, hashlib.sha256(f"{arch} {network.options} random {random_init}".encode()).hexdigest()
+    table = load_checkpoint(checkpoint)
+    trained = table.get("training")
+    if isinstance(trained, dict):
+        if trained.get("arch") != arch:
+            raise InputError(checkpoint, "training.arch", f"is a checkpoint of {trained.get('arch')}, not of {arch}")
+        options = {**trained.get("options", {}), **options}
+    elif arch == "eyereal":
+        options = {"width": eyereal_width(table["model"], source=checkpoint), **options}
+    network = made(arch, options)
+    fill(network.net, table["model"], source=checkpoint, arch=arch)
+    data = untrusted_input.read_bytes(checkpoint, most_bytes=FILE_BYTES_MAX)
+    return network, hashlib.sha256(data).hexdigest()
+
+
+def picture_file(
+    network: Network, origin: str, *, width_px: int, height_px: int, eye_order: EyeOrder = "left-right"
+) -> bytes:
+    """The ONNX file of a network of pictures, of one size. Raises InputError where it can't be one."""
+    form, net, size = network.form, network.net.eval(), {"width_px": width_px, "height_px": height_px}
+    probe(network, **size)
+    check_static(network, **size)
+    with blamed(network.arch, "export"):
+        data = picture_bytes(net, channels=form.channels, **size)
+    least = -OFFSET if network.arch == "eyereal" else 0.0
     contract = Contract(
         version=2,
-        arch="eyereal",
-        name="eyereal",
-        panels=3,
+        arch=network.arch,
+        name=network.arch.rpartition(":")[2],
+        panels=PANELS,
         eyes=2,
-        input_frame="panel",
-        input_value="intensity",
         layout="NCHW",
         eye_order=eye_order,
-        output="panels",
-        branch=1,
-        value_range=(-OFFSET, 1 - OFFSET),
+        value_range=(least, 1 + least),
         trained_for=None,  # a checkpoint does not tell what it was trained on
-        picture_fov_deg=PICTURE_FOV_DEG,
-        recipe_sha256=origin.hexdigest(),
-        width_px=width_px,
-        height_px=height_px,
+        recipe_sha256=origin,
+        **form.model_dump(),
+        **size,
         inputs=ports((eyereal.INPUT,)),
         outputs=ports((eyereal.OUTPUT,)),
         parameters=_parameters(net),
     )
-    return with_contract(data, contract), net
+    return with_contract(data, contract)
 
 
 def _parameters(net: nn.Module) -> int:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
+
+from runtime.config import Section
 
 PICTURE_FOV_DEG = 40.0  # horizontal; the published code feeds black outside it
 OFFSET = 0.2  # the published code shows sigmoid(y) - 0.2, clipped at the panel
@@ -73,6 +78,14 @@ class EyeRealNet(nn.Module):
     Channels in: panel-major, then eye, then RGB, intensities in [0, 1]. Out: panel-major, then RGB; in
     [-0.2, 0.8], as published: the panel clips what is negative.
     """
+
+    input_frame, input_value, output = "panel", "intensity", "panels"
+    picture_fov_deg = PICTURE_FOV_DEG
+
+    class Options(Section):
+        """What its size is."""
+
+        width: Annotated[int, Field(ge=1, le=256)] = Field(32, description="channels of its first layer")
 
     def __init__(self, width: int = 32) -> None:
         super().__init__()

@@ -32,6 +32,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.nn import functional
 
@@ -39,7 +40,6 @@ from runtime.optics.light import panels_from_centre
 from runtime.optics.rpu import panel_from_image
 from runtime.optics.stack import PanelStack
 from runtime.optics.views import image_from_stack
-from runtime.records import F64
 
 NEAR_PX = 0.5  # a ray counts that is at least so far inside every panel
 SIZES = (2.0, 1.6, 1.2, 0.8, 0.8, 0.8)  # of steps from the network's panels, the best that was measured
@@ -58,12 +58,12 @@ class Views:
     def of(
         cls,
         stack: PanelStack,
-        eyes_m: F64,
+        eyes_m: ArrayLike,
         *,
         width_px: int,
         height_px: int,
         fov_deg: float | None,
-        places_m: Sequence[Sequence[float]] = ((0.0, 0.0, 0.0),),
+        places_m: ArrayLike = ((0.0, 0.0, 0.0),),
     ) -> Views:
         """Rays of a picture's own pixels (`fov_deg` wide, horizontally), or, without one, of the centre panel's pixels.
 
@@ -71,9 +71,9 @@ class Views:
         through the same points of the centre panel. Raises ValueError for an eye in the centre panel's plane.
         """
         sets = []
-        for place in places_m:
+        for place in np.asarray(places_m, np.float64):
             for eye in np.asarray(eyes_m, np.float64):
-                matrices = panels_from_centre(eye + np.asarray(place), stack)
+                matrices = panels_from_centre(eye + place, stack)
                 if fov_deg is not None:
                     image = image_from_stack(eye, width_px=width_px, height_px=height_px, fov_deg=fov_deg)
                     matrices = matrices @ panel_from_image(image, stack.panel(stack.count // 2))
@@ -157,7 +157,7 @@ def _bundles(panels: Tensor, views: Views) -> tuple[list[Tensor], Tensor]:
 
 
 def _sample(
-    images: Tensor, matrices: Tensor, size: tuple[int, int], *, near_px: float, within: Tensor | None = None
+    images: Tensor, matrices: Tensor, size: Sequence[int], *, near_px: float, within: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Samples (N, K, h, w) of images (N, K, H, W), each at its homography (N, 3, 3) of the result's pixels.
 

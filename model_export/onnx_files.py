@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
-import logging
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import onnx
@@ -14,6 +11,7 @@ import torch
 from torch import nn
 
 from model_export import eyereal, network
+from model_export.modules import quiet
 from runtime.model.chain import chain_modes
 from runtime.model.contract import METADATA_KEY, Contract, Port
 from runtime.model.onnx_bytes import digest
@@ -47,9 +45,9 @@ def ports(names: Sequence[str]) -> tuple[Port, ...]:
     return tuple(Port(name=name, axes=(CELL_AXES | PICTURE_AXES)[name]) for name in names)
 
 
-def eyereal_bytes(net: nn.Module, *, width_px: int, height_px: int) -> bytes:
-    """The published network, of one picture size."""
-    return _exported(net, (torch.zeros(1, 18, height_px, width_px),), (eyereal.INPUT,), (eyereal.OUTPUT,), {})
+def picture_bytes(net: nn.Module, *, channels: int, width_px: int, height_px: int) -> bytes:
+    """A network of pictures, of one size."""
+    return _exported(net, (torch.zeros(1, channels, height_px, width_px),), (eyereal.INPUT,), (eyereal.OUTPUT,), {})
 
 
 def with_contract(data: bytes, contract: Contract) -> bytes:
@@ -75,7 +73,7 @@ def _exported(
 ) -> bytes:
     """folded: constants are worked out; else every weight keeps its name (onnxruntime folds as it loads)."""
     buffer = io.BytesIO()
-    with _quiet(), torch.no_grad():
+    with quiet(), torch.no_grad():
         torch.onnx.export(
             net.eval(),
             example,
@@ -90,16 +88,3 @@ def _exported(
             dynamo=False,
         )
     return buffer.getvalue()
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """The exporters advise developers of models, not users of this command."""
-    level = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logging.disable(level)

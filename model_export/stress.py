@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from model_export.data import endless_pairs
+from model_export.data import random_pair
 from runtime.model.chain import chain_modes
 from runtime.model.contract import Contract
 from runtime.model.targets import FULL
@@ -42,7 +42,7 @@ def stress_pictures(height: int, width: int) -> dict[str, tuple[F32, F32]]:
 
 def ordinary_pictures(height: int, width: int) -> tuple[F32, F32]:
     """(h, w, 3) for each eye: a procedural pair of that size."""
-    pair = next(endless_pairs(77, width_px=width, height_px=height, eye_sigma_mm=(0.0, 0.0)))
+    pair = random_pair(np.random.default_rng([77, 0]), width_px=width, height_px=height)
     left, right = (image.astype(np.float32) / np.float32(255) for image in pair.images)
     return left, right
 

@@ -1,161 +1,267 @@
-"""`phasestack train`: a model's numbers, by the light that eyes get of what it solves.
+"""`phasestack train`: a network of pictures by gradients, with the light that eyes get of its panels as the loss.
 
-Learned through the whole of the runtime's solver, as it ships: every unrolled step, clipping, eight bits, real pixels.
-Its numbers are few (the network's, the steps' sizes and momenta), so they are searched for one by one, without
-gradients: compass search (Kolda, Lewis and Torczon, SIAM Review 2003).
+AdamW, the learning rate along a cosine. Pair number k and every random number of iteration k follow from (seed, k), so
+that a training that was stopped goes on as if it had not been.
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
 import math
+import os
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-import numpy as np
+import torch
+from matplotlib.figure import Figure
+from pydantic import Field
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
 
-from model_export import network
-from model_export.checkpoint import plain_weights, save_checkpoint, solver_of
-from model_export.data import TrainingPair, endless_pairs
-from model_export.export import in_torch, spectral_contract
-from model_export.network import SpectralSolver
-from model_export.recipe import Recipe, read_recipe
-from runtime.errors import InputError, ModelFailure
-from runtime.model.contract import Contract
-from runtime.model.still import solve_still
-from runtime.model.unrolled import UnrolledPredictor
-from runtime.optics.carried import light_psnrs_db
-from runtime.support.artifacts import write_text
+from model_export.checkpoint import fill, load_checkpoint, save_checkpoint
+from model_export.light import Views, light, traced
+from model_export.modules import COLOURS, PANELS, Form, Network, blamed, made, probe
+from model_export.pairs import Pairs, folder_pairs
+from runtime.config import Section, load_stack
+from runtime.errors import InputError
+from runtime.support.artifacts import write_bytes, write_text
 from runtime.support.progress import progress_bar
 
 HELD_OUT_SEED = 9_000_001  # of the validation pairs: no training seed reaches it
-FIRST_MOVE = 0.15  # of a number: of weights, which are logarithms or shares, and of steps
-LAST_MOVE = 0.01
+HELD_OUT, HELD_OUT_SHARE = 6, 8  # procedural pairs; one in so many of a folder's
+LEAST_ERROR = 1e-6  # squared: beyond 60 dB nothing is won
 COLUMNS = ("iteration", "light_db", "held_out_light_db")
-Numbers = dict[str, float]
+Device = Literal["auto", "cpu", "cuda"]
+Batch = dict[str, Tensor]
 
 
-@dataclass(frozen=True, slots=True)
-class Point:
-    """The best so far after some solutions of all training pairs, in the order of COLUMNS."""
+class Training(Section):
+    """All that decides what a training finds; a checkpoint holds it."""
 
-    iteration: int
-    light_db: float  # for each pair's own uncertainty, mean over training pairs
-    held_out_db: float  # the same of pairs that no search sees
+    arch: str
+    options: Annotated[dict[str, Any], Field(default_factory=dict)]
+    iterations: Annotated[int, Field(ge=1)] = 2000
+    seed: Annotated[int, Field(ge=0, lt=HELD_OUT_SEED)] = 1
+    width_px: Annotated[int, Field(ge=32, le=8192)] = 480
+    height_px: Annotated[int, Field(ge=32, le=8192)] = 270
+    batch: Annotated[int, Field(ge=1, le=256)] = 1
+    pairs: Annotated[int, Field(ge=0)] = 0
+    learning_rate: Annotated[float, Field(gt=0, le=1)] = 1e-3
+    eye_sigma_mm: Annotated[float, Field(ge=0, le=20)] = 1.0
+    validate_every: Annotated[int, Field(ge=1)] = 100
+    data: str = ""
+    panels: str = ""
 
 
 def run_training(
-    out: Path, recipe_name: str, *, iterations: int | None = None, seed: int | None = None
+    out: Path, training: Training, *, device: Device = "auto", resume: bool = False, tensorboard: bool = False
 ) -> dict[str, Any]:
-    """Train, write checkpoint, recipe and curve. Raises InputError."""
-    recipe = read_recipe(recipe_name)
-    asked = {name: value for name, value in (("iterations", iterations), ("seed", seed)) if value is not None}
-    training = recipe.training.model_copy(update=asked)
-    net = solver_of(recipe.model_copy(update={"training": training}), source=recipe_name)
-    recipe = recipe.model_copy(update={"training": training, "weights": plain_weights(net)})
-    how: dict[str, Any] = training.model_dump(include={"width_px", "height_px", "eye_sigma_mm"})
-    pairs, held_out = (
-        [pair for pair, _ in zip(endless_pairs(seed, **how), range(count), strict=False)]
-        for seed, count in ((training.seed, training.pairs), (HELD_OUT_SEED, training.validation_pairs))
-    )
-    start, best, at, learned = time.monotonic(), light_db(recipe, pairs), numbers_of(recipe), recipe
-    if not math.isfinite(best):
-        raise InputError(recipe_name, "weights", "the network answers with what is no number")
-    points = [Point(0, best, light_db(recipe, held_out))]
-    moves, done = dict.fromkeys(at, FIRST_MOVE), 0
-    with progress_bar(f"training {recipe.name}") as progress:
-        while done < training.iterations and max(moves.values()) > LAST_MOVE:
-            for name in at:
-                for towards in (1, -1):
-                    found = recipe_with(recipe, {**at, name: at[name] + towards * moves[name]})
-                    if found is None or done == training.iterations:
-                        continue
-                    done += 1
-                    progress(done, training.iterations)
-                    if (light := light_db(found, pairs)) > best:
-                        best, at[name], learned = light, at[name] + towards * moves[name], found
-                        _save(out, learned, points)  # whoever stops it has the best so far
-                        break
-                else:
-                    moves[name] /= 2
-            points.append(Point(done, best, light_db(learned, held_out)))
-            _save(out, learned, points)
+    """Train; checkpoint, curve and its picture are written as it goes. Raises InputError."""
+    place, start = _placed(device), time.monotonic()
+    network = made(training.arch, training.options, seed=training.seed)
+    probe(network, width_px=training.width_px, height_px=training.height_px)
+    pairs, held_out = _data(training, network.form)
+    net = network.net.to(place)
+    optimizer = torch.optim.AdamW(net.parameters(), lr=training.learning_rate)
+    rate = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, training.iterations)
+    done, curve = 0, list[list[float]]()
+    if resume:
+        done, curve = _resumed(out, training, network, optimizer, rate)
+    unseen = list(DataLoader(held_out, 1, sampler=range(len(held_out))))
+    needs = _needs(network, _loader(pairs, training, 0, 1), place)
+    curve = curve or [[0, math.nan, _held_out_db(network, unseen, place)]]
+    with progress_bar(f"training {training.arch}, {needs}") as progress, _board(out, done, asked=tensorboard) as board:
+        lights: list[float] = []
+        for number, batch in enumerate(_loader(pairs, training, done, training.iterations), start=done + 1):
+            torch.manual_seed(training.seed * HELD_OUT_SEED + number)
+            with blamed(training.arch, f"iteration {number}"):
+                loss = _loss(network, _on(batch, place))
+                optimizer.zero_grad(set_to_none=True)
+                loss.backward()  # type: ignore[no-untyped-call]
+            if not torch.isfinite(loss):
+                raise InputError(training.arch, f"iteration {number}", "its light is no number")
+            nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+            optimizer.step()
+            rate.step()
+            lights.append(-loss.item())
+            progress(number, training.iterations)
+            if number % training.validate_every and number != training.iterations:
+                continue
+            curve.append([number, sum(lights) / len(lights), _held_out_db(network, unseen, place)])
+            lights.clear()
+            board(curve[-1])
+            state = {"model": net.state_dict(), "optimizer": optimizer.state_dict(), "rate": rate.state_dict()}
+            save_checkpoint(out / "checkpoint.pth", {**state, "curve": curve, "training": training.model_dump()})
+            write_text(out / "curve.csv", "\n".join([",".join(COLUMNS), *map(_row, curve)]) + "\n")
+            write_bytes(out / "curve.png", _drawn(curve, training.arch))
     return {
-        "name": recipe.name,
-        "iterations": done,
+        "arch": training.arch,
+        "iterations": curve[-1][0],
         "seconds": round(time.monotonic() - start, 1),
-        "start_db": round(points[0].held_out_db, 3),
-        "held_out_db": round(points[-1].held_out_db, 3),
+        "needs": needs,
+        "start_db": round(curve[0][2], 3),
+        "held_out_db": round(curve[-1][2], 3),
+        "held_out_pairs": "the pair that it learned from" if pairs.folder == held_out.folder != () else held_out.count,
         "checkpoint": str(out / "checkpoint.pth"),
     }
 
 
-def light_db(recipe: Recipe, pairs: Sequence[TrainingPair]) -> float:
-    """Mean over pairs, each for its own uncertainty; -inf where the network answers with what is no number."""
-    net = solver_of(recipe, source=recipe.name)
-    session: Any = TorchSession(net, spectral_contract(net, recipe))
-    found: list[float] = []
-    for pair in pairs:
-        predictor = UnrolledPredictor(session, pair.stack)
-        where: dict[str, Any] = {"eyes_m": pair.eyes_m, "fov_deg": pair.fov_deg}
-        try:
-            solved = solve_still(*pair.images, **where, predictor=predictor, eye_sigma_mm=pair.eye_sigma_mm)
-        except ModelFailure:
-            return -math.inf
-        sigmas = (pair.eye_sigma_mm,)
-        found += light_psnrs_db(solved.layers, pair.images, pair.stack, **where, sigmas_mm=sigmas).values()
-    return float(np.mean(found))
+def displayed(panels: Tensor) -> Tensor:
+    """Panel values as they are shown, clipped and in 8 bits, whose gradient passes straight through."""
+    codes = (panels.clamp(0, 1) * 255).round() / 255
+    return panels + (codes - panels).detach()
 
 
-class TorchSession:
-    """What `UnrolledPredictor` asks of a model's session, by the module itself."""
-
-    provider, fell_back = "torch", ()
-
-    def __init__(self, net: SpectralSolver, contract: Contract) -> None:
-        self.contract, self._run = contract, in_torch(net)
-
-    def run(self, feeds: Mapping[str, Any], shapes: Mapping[str, Any]) -> dict[str, Any]:
-        return dict(zip(network.OUTPUTS, self._run(dict(feeds)), strict=True))
-
-
-def numbers_of(recipe: Recipe) -> Numbers:
-    """All that is learned, by name: the network's weights, the steps' sizes, the joint steps' momenta."""
-    found = {
-        f"weights.{key}.{index}": value
-        for key, values in (recipe.weights or {}).items()
-        for index, value in enumerate(values)
-    }
-    for name, steps in (("steps", recipe.steps), ("refining", recipe.refining)):
-        for index, step in enumerate(steps):
-            if step.kind != "chain":
-                found[f"{name}.{index}.size"] = step.size
-            if step.momentum:
-                found[f"{name}.{index}.momentum"] = step.momentum
-    return found
+def _loss(network: Network, batch: Batch) -> Tensor:
+    """Minus the mean light in dB: each pair counts alike, however hard."""
+    with torch.autocast(batch["input"].device.type, torch.bfloat16, enabled=batch["input"].is_cuda):
+        answer = network.net.train()(batch["input"])
+    losses = []
+    for panels, targets, matrices in zip(displayed(answer.float()), batch["targets"], batch["views"], strict=True):
+        views = Views(matrices, targets.shape[-1], targets.shape[-2])
+        seen, counts = light(panels.reshape(PANELS, COLOURS, *panels.shape[1:]), views)
+        error = ((seen - targets) * counts).square().sum() / (counts.sum() * COLOURS)
+        losses.append(10 * torch.log10(error + LEAST_ERROR))
+    return torch.stack(losses).mean()
 
 
-def recipe_with(recipe: Recipe, numbers: Numbers) -> Recipe | None:
-    """A recipe with other numbers; None where a step can't have them."""
-    table = recipe.model_dump(mode="json")
-    for name, value in numbers.items():
-        group, place, field = name.split(".")
-        if group == "weights":
-            table[group][place][int(field)] = value
-        else:
-            table[group][int(place)][field] = value
-    try:
-        return Recipe.model_validate(table)
-    except ValueError:
-        return None
+@torch.no_grad()
+def _held_out_db(network: Network, batches: list[Batch], device: torch.device) -> float:
+    """Mean light of pairs that no iteration saw, of real pixels by random rays, without bias."""
+    found = []
+    for number, batch in enumerate(_on(batch, device) for batch in batches):
+        with blamed(network.arch, "validation"):
+            answer = network.net.eval()(batch["input"])
+        panels = displayed(answer.float()).reshape(PANELS, COLOURS, *answer.shape[2:])
+        targets = batch["targets"][0]
+        views = Views(batch["views"][0], targets.shape[-1], targets.shape[-2])
+        counts = light(panels, views)[1]
+        random = torch.Generator().manual_seed(number)
+        a, b = ((traced(panels, views, rays=1, random=random) - targets) * counts for _ in range(2))
+        error = float((a * b).sum() / (counts.sum() * COLOURS))
+        found.append(-10 * math.log10(max(error, LEAST_ERROR)))
+    return sum(found) / len(found)
 
 
-def _save(out: Path, recipe: Recipe, points: Sequence[Point]) -> None:
-    net = solver_of(recipe, source=recipe.name)
-    write_text(out / "recipe.json", recipe.model_copy(update={"weights": plain_weights(net)}).text())
-    plain = recipe.model_copy(update={"weights": None}).model_dump(mode="json")
-    save_checkpoint(out / "checkpoint.pth", {"model": net.state_dict(), "recipe": plain})
-    lines = [",".join(f"{x:.6g}" for x in astuple(point)) for point in points]
-    write_text(out / "validation.csv", "\n".join([",".join(COLUMNS), *lines]) + "\n")
+def _data(training: Training, form: Form) -> tuple[Pairs, Pairs]:
+    """What is learned from, and what is not. Raises InputError."""
+    how: dict[str, Any] = {"width_px": training.width_px, "height_px": training.height_px}
+    stack = load_stack(Path(training.panels), **how) if training.panels else None
+    if stack is not None:
+        stack = replace(stack, **how)
+        if stack.count != PANELS:
+            raise InputError(training.panels, "x_m", f"has {stack.count} panels; networks of pictures serve {PANELS}")
+    folder = folder_pairs(Path(training.data)) if training.data else ()
+    held = folder[::-HELD_OUT_SHARE] if len(folder) > 1 else folder
+    kept = tuple(pair for pair in folder if pair not in held) or folder
+    how |= {"form": form, "eye_sigma_mm": training.eye_sigma_mm, "stack": stack}
+    return (
+        Pairs(seed=training.seed, count=len(kept) or training.pairs, folder=kept, **how),
+        Pairs(seed=HELD_OUT_SEED, count=len(held) or HELD_OUT, folder=held, **how),
+    )
+
+
+def _loader(pairs: Pairs, training: Training, first: int, last: int, *, batch: int | None = None) -> DataLoader[Batch]:
+    """Iterations `first` to `last`, by number: so one that was stopped goes on where it was."""
+    size = batch or training.batch
+    workers = min(8, len(os.sched_getaffinity(0)) - 1) if torch.cuda.is_available() else 0
+    return DataLoader(pairs, size, sampler=range(first * size, last * size), num_workers=workers)
+
+
+def _placed(device: Device) -> torch.device:
+    if device == "cuda" and not torch.cuda.is_available():
+        raise InputError("train", "--device", "cuda: torch sees none here")
+    return torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def _on(batch: Batch, device: torch.device) -> Batch:
+    return {name: value.to(device) for name, value in batch.items()}
+
+
+def _needs(network: Network, batches: DataLoader[Batch], device: torch.device) -> str:
+    """What an iteration needs of memory, in words, by one forward. Raises InputError as soon as there is less."""
+    free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else _free_bytes()
+    weights = 4 * sum(p.numel() * p.element_size() for p in network.net.parameters())  # with gradient and two moments
+    kept: dict[int, int] = {}
+
+    def keep(tensor: Tensor) -> Tensor:
+        kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+        if weights + sum(kept.values()) > free:
+            problem = f"needs more than the {_gib(free)} that are free: a smaller --width, --height or --batch"
+            raise InputError(network.arch, "memory", problem)
+        return tensor
+
+    state = {name: value.clone() for name, value in network.net.state_dict().items()}
+    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor), blamed(network.arch, "forward"):
+        loss = _loss(network, _on(next(iter(batches)), device))
+    del loss
+    network.net.load_state_dict(state)  # what a batch changes of running statistics
+    return f"{_gib(weights + sum(kept.values()))} of memory of {_gib(free)} free"
+
+
+def _free_bytes() -> int:
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) << 10
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def _gib(size: int) -> str:
+    return f"{size / (1 << 30):.2g} GiB"
+
+
+def _resumed(out: Path, training: Training, network: Network, *parts: Any) -> tuple[int, list[list[float]]]:
+    """Iterations done and the curve so far, weights, optimizer and learning rate as they were. Raises InputError."""
+    path = out / "checkpoint.pth"
+    table = load_checkpoint(path)
+    was, now = table.get("training"), training.model_dump()
+    if not isinstance(was, dict) or "curve" not in table:
+        raise InputError(path, "training", "missing: not a checkpoint of phasestack train")
+    for name, value in now.items():
+        if was.get(name) != value:
+            raise InputError(path, name, f"was {was.get(name)!r}, and {value!r} was asked for: the same to resume")
+    fill(network.net, table["model"], source=path, arch=training.arch)
+    with blamed(str(path), "optimizer"):
+        for part, name in zip(parts, ("optimizer", "rate"), strict=True):
+            part.load_state_dict(table[name])
+    return int(table["curve"][-1][0]), [list(row) for row in table["curve"]]
+
+
+@contextlib.contextmanager
+def _board(out: Path, done: int, *, asked: bool) -> Iterator[Callable[[list[float]], None]]:
+    """Where points of the curve go besides: TensorBoard's event files, by torch's writer, if asked."""
+    if not asked:
+        yield lambda point: None
+        return
+    from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415 - needs a package that only this needs
+
+    with SummaryWriter(str(out / "tensorboard"), purge_step=done + 1) as writer:
+
+        def told(point: list[float]) -> None:
+            for name, value in zip(COLUMNS[1:], point[1:], strict=True):
+                writer.add_scalar(name, value, int(point[0]))
+
+        yield told
+
+
+def _row(point: list[float]) -> str:
+    return ",".join("" if math.isnan(value) else f"{value:.6g}" for value in point)
+
+
+def _drawn(curve: list[list[float]], title: str) -> bytes:
+    """The curve as a picture."""
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.add_subplot(title=title, xlabel="iterations", ylabel="light, dB")
+    numbers, learned, held_out = zip(*curve, strict=True)
+    axes.plot(numbers, learned, label="of the pairs learned from (by the model of light)")
+    axes.plot(numbers, held_out, "o-", label="held out (by rays)")
+    axes.legend()
+    axes.grid(alpha=0.3)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=120)
+    return buffer.getvalue()

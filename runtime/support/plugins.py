@@ -43,7 +43,8 @@ def plugin_class(name: str, base: type, *, field: str) -> Any:
         problem = one_line(f"{type(error).__name__}: {error}")
         raise InputError(field, "", f"`{module}` cannot be imported from Python's path ({problem})") from error
     if not (isinstance(found, type) and issubclass(found, base)):
-        raise InputError(field, "", f"`{name}` is no class that derives from phasestack.{base.__name__}")
+        of = "torch.nn" if base.__module__.startswith("torch.") else "phasestack"
+        raise InputError(field, "", f"`{name}` is no class that derives from {of}.{base.__name__}")
     return found
 
 

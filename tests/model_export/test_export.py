@@ -125,7 +125,8 @@ def test_a_model_that_answers_nan_fails(tmp_path: Path) -> None:
         ({"arch": "huge"}, "--arch"),
         ({"arch": "eyereal"}, "--checkpoint"),
         ({"random_init": 1, "checkpoint": Path("x.pth")}, "--random-init"),
-        ({"checkpoint": Path("absent.pth")}, "cannot be read"),
+        ({"arch": "eyereal", "checkpoint": Path("absent.pth")}, "cannot be read"),
+        ({"random_init": 1}, "fast is made from its recipe"),
     ],
 )
 def test_what_cannot_be_exported_is_refused_in_one_line(tmp_path: Path, options: dict[str, Any], field: str) -> None:

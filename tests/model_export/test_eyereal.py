@@ -8,13 +8,13 @@ import os
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
-from model_export.checkpoint import load_eyereal, load_spectral  # noqa: E402
-from model_export.export import eyereal_model, spectral_model  # noqa: E402
+from model_export.export import picture_file, picture_network, spectral_model  # noqa: E402
 from model_export.eyereal import EyeRealNet  # noqa: E402
 from runtime.content.eyereal import Pair, read_folder  # noqa: E402
 from runtime.errors import InputError  # noqa: E402
@@ -25,6 +25,14 @@ from runtime.model.still import solve_still  # noqa: E402
 from runtime.optics.stack import PanelStack  # noqa: E402
 from runtime.support.artifacts import read_image, write_png  # noqa: E402
 from tests.model_export.golden import EYES, SIZE, WIDTH, golden, picture, weights  # noqa: E402
+
+
+def load_eyereal(path: Path) -> EyeRealNet:
+    return picture_network("eyereal", path, None, {})[0].net.eval()
+
+
+def eyereal_file(path: Path | None, **how: Any) -> bytes:
+    return picture_file(*picture_network("eyereal", path, None if path else 1, {} if path else {"width": 4}), **how)
 
 
 def saved(path: Path, net: EyeRealNet) -> Path:
@@ -124,11 +132,6 @@ def test_a_damaged_checkpoint_is_refused_by_the_key_that_is_amiss(published: Pat
         load_eyereal(published)
 
 
-def test_a_checkpoint_of_another_architecture_is_refused(published: Path) -> None:
-    with pytest.raises(InputError, match="recipe: missing: not a checkpoint of phasestack train"):
-        load_spectral(published, name="balanced")
-
-
 @pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 cut"], ids=range(3))
 def test_a_corrupt_file_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "corrupt.pth"
@@ -137,13 +140,12 @@ def test_a_corrupt_file_is_refused(tmp_path: Path, content: bytes) -> None:
         load_eyereal(path)
 
 
-def test_a_checkpoint_that_becomes_a_fifo_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Never waited for. It is read twice: the weights, and what they are told by."""
+def test_a_checkpoint_that_becomes_a_fifo_is_refused(tmp_path: Path) -> None:
+    """Never waited for."""
     path = tmp_path / "a.pth"
     os.mkfifo(path)
-    monkeypatch.setattr("model_export.export.load_eyereal", lambda checkpoint: None)
     with pytest.raises(InputError, match=r"a\.pth: is a FIFO"):
-        eyereal_model(path, width_px=64, height_px=64)
+        load_eyereal(path)
 
 
 # ---- what the official code does and feeds
@@ -179,7 +181,7 @@ def pair_of(folder: Path, place: str) -> Pair:
 
 def predictor_of(official: Path, folder: Path) -> NetworkPredictor:
     path = folder / "eyereal.onnx"
-    path.write_bytes(eyereal_model(official, width_px=SIZE[0], height_px=SIZE[1], eye_order="right-left")[0])
+    path.write_bytes(eyereal_file(official, width_px=SIZE[0], height_px=SIZE[1], eye_order="right-left"))
     # The published code's panels of lego_bulldozer: with square pixels, whatever their shape.
     stack = PanelStack(0.5184, 0.5184 * SIZE[1] / SIZE[0], (-0.06, 0.0, 0.06), *SIZE)
     return NetworkPredictor(ModelSession(path, threads=1), stack, source=path)
@@ -233,7 +235,6 @@ def test_an_export_says_what_it_was_trained_for_only_where_that_is_known(officia
         return parse_contract({item.key: item.value for item in model.metadata_props}, source="x").trained_for
 
     size = {"width_px": 64, "height_px": 40}
-    assert trained_for(eyereal_model(official, **size)[0]) is None
-    assert trained_for(eyereal_model(None, random_init=1, **size)[0]) is None
-    assert trained_for(spectral_model("fast", random_init=1)[0]) is None
+    assert trained_for(eyereal_file(official, **size)) is None
+    assert trained_for(eyereal_file(None, **size)) is None
     assert trained_for(spectral_model("fast")[0]) is not None

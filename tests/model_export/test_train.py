@@ -1,34 +1,50 @@
-"""Training: exact geometry of the data, a loss that is the runtime's own light, and determinism."""
+"""Training: exact geometry of the data, light as the loss, resumed as if never stopped; and modules of one's own."""
 
 from __future__ import annotations
 
-import json
+import dataclasses
+import math
+import os
+import re
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
-from model_export.checkpoint import load_spectral, plain_weights, solver_of  # noqa: E402
-from model_export.data import TrainingPair, endless_pairs  # noqa: E402
-from model_export.recipe import Recipe, read_recipe  # noqa: E402
+from typer.testing import CliRunner  # noqa: E402
+
+from model_export.checkpoint import load_checkpoint  # noqa: E402
+from model_export.data import TrainingPair, random_pair  # noqa: E402
+from model_export.export import export_model, picture_file  # noqa: E402
+from model_export.modules import Form, made  # noqa: E402
+from model_export.pairs import Pairs, network_input  # noqa: E402
 from model_export.scene import Plane, Scene, draw  # noqa: E402
-from model_export.train import light_db, numbers_of, recipe_with, run_training  # noqa: E402
+from model_export.train import Training, _held_out_db, displayed, run_training  # noqa: E402
+from model_export.validate import validate_file  # noqa: E402
+from runtime.commands.app import app  # noqa: E402
 from runtime.errors import InputError  # noqa: E402
 from runtime.model.predictor import load_predictor  # noqa: E402
 from runtime.model.still import solve_still  # noqa: E402
-from runtime.optics.carried import light_psnrs_db  # noqa: E402
 from runtime.optics.stack import PanelStack  # noqa: E402
 from runtime.optics.views import raster_from_stack  # noqa: E402
+from runtime.support.artifacts import read_image, write_png  # noqa: E402
+from tests.model_export.golden import EYES as PUBLISHED_EYES  # noqa: E402
+from tests.model_export.golden import picture  # noqa: E402
+from tests.model_export.unservable import FAULTS  # noqa: E402
+from tests.waiting import eventually  # noqa: E402
 
+ROOT = Path(__file__).resolve().parents[2]
 STACK = PanelStack(0.5184, 0.2916, (-0.06, 0.0, 0.06), 480, 270)
 EYES = np.array([[0.7, -0.0315, 0.02], [0.7, 0.0315, 0.02]])
 SMALL = {"width_px": 160, "height_px": 96}
 
 
 def first_pairs(count: int, *, seed: int = 1, **size: int) -> list[TrainingPair]:
-    stream = endless_pairs(seed, eye_sigma_mm=(0.0, 4.0), **(size or SMALL))
-    return [pair for pair, _ in zip(stream, range(count), strict=False)]
+    return [random_pair(np.random.default_rng([seed, number]), **(size or SMALL)) for number in range(count)]
 
 
 def drawn(scene: Scene, eye: np.ndarray) -> np.ndarray:
@@ -74,65 +90,153 @@ def test_poses_stay_within_the_design_range() -> None:
         assert eyes[:, 0].min() > pair.stack.x_m[2] + 0.08
         assert np.linalg.norm(middle) < 4.2
         assert 0.005 <= pair.stack.x_m[2] <= 0.5
-        assert 0 <= pair.eye_sigma_mm <= 4
 
 
-def test_what_is_learned_is_the_light_that_the_runtime_gives_of_the_shipped_file() -> None:
-    """The training's network and contract are those of the exported model: the same layers, the same figure."""
-    pair = first_pairs(1, seed=3, width_px=480, height_px=270)[0]
-    predictor = load_predictor("best", pair.stack)
-    how = {"eyes_m": pair.eyes_m, "fov_deg": pair.fov_deg}
-    solved = solve_still(*pair.images, **how, predictor=predictor, eye_sigma_mm=pair.eye_sigma_mm)
-    predictor.close()
-    seen = light_psnrs_db(solved.layers, pair.images, pair.stack, **how, sigmas_mm=(pair.eye_sigma_mm,))
-    assert light_db(read_recipe("best"), [pair]) == pytest.approx(seen[pair.eye_sigma_mm], abs=0.02)
+def test_a_network_of_pictures_is_fed_what_the_runtime_feeds_it(tmp_path: Path) -> None:
+    """Pixel by pixel: the runtime's own input, of a pair of its own panels."""
+    pair = random_pair(np.random.default_rng([4, 1]), **SMALL)
+    for frame, value in (("centre", "intensity"), ("panel", "phase")):
+        form = Form(input_frame=frame, input_value=value)
+        network = made("tests.model_export.unservable:Even", {})
+        network = dataclasses.replace(network, form=form)
+        path = tmp_path / f"{frame}.onnx"
+        path.write_bytes(picture_file(network, "", **SMALL))
+        predictor = load_predictor(str(path), pair.stack)
+        solve_still(*pair.images, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, predictor=predictor, eye_sigma_mm=0.0)
+        fed, wanted = predictor._input[0], network_input(pair, form)
+        assert wanted.shape == fed.shape
+        inside = slice(8, -8)  # what goes on beside the pictures is the runtime's guess
+        assert np.abs(fed - wanted)[:, inside, inside].max() < 3 / 255
+        predictor.close()
 
 
-def test_a_number_goes_where_light_is_and_no_further_than_a_step_can() -> None:
-    recipe = read_recipe("fast")
-    recipe = recipe.model_copy(update={"weights": plain_weights(solver_of(recipe, source="test"))})
-    numbers = numbers_of(recipe)
-    assert {"weights.log_floor.0", "steps.1.size", "steps.2.size"} <= set(numbers)
-    assert recipe_with(recipe, numbers) == recipe
-    assert recipe_with(recipe, numbers | {"steps.1.size": 2.1}) is None
-    pairs = first_pairs(1, seed=4, width_px=320, height_px=180)
-    assert (
-        light_db(recipe, pairs) > light_db(recipe_with(recipe, numbers | {"steps.2.size": 0.1}) or recipe, pairs) + 0.3
+def test_what_is_displayed_is_clipped_in_eight_bits_and_lets_gradients_through() -> None:
+    values = torch.tensor([-0.3, 0.2501, 1.7], requires_grad=True)
+    shown = displayed(values)
+    assert shown.detach().numpy() == pytest.approx([0.0, 64 / 255, 1.0])
+    (shown * torch.tensor([1.0, 2.0, 3.0])).sum().backward()
+    assert values.grad.tolist() == [1.0, 2.0, 3.0]
+
+
+SHORT: dict[str, Any] = {
+    "arch": "my_network:MyNetwork", "options": {"width": 8, "levels": 1}, "iterations": 12, "width_px": 96,
+    "height_px": 64, "validate_every": 4, "pairs": 2, "learning_rate": 1e-2,
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def examples(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+
+
+def curve(out: Path) -> list[list[str]]:
+    return [row.split(",") for row in (out / "curve.csv").read_text().splitlines()]
+
+
+def test_training_raises_the_light_that_eyes_get_and_leaves_its_files(tmp_path: Path) -> None:
+    result = run_training(tmp_path, Training(**SHORT | {"iterations": 40, "validate_every": 40, "pairs": 1}))
+    rows = curve(tmp_path)
+    assert rows[0] == ["iteration", "light_db", "held_out_light_db"] and [row[0] for row in rows[1:]] == ["0", "40"]
+    assert "GiB" in result["needs"] and result["iterations"] == 40
+    assert read_image(tmp_path / "curve.png").shape[2] == 3
+    table = load_checkpoint(tmp_path / "checkpoint.pth")
+    assert table["training"]["options"] == SHORT["options"]
+    # Of the very pair, by the exact rays: from where it began to what it learned.
+    pairs = Pairs(Form(), seed=1, width_px=96, height_px=64, eye_sigma_mm=0.0, count=1)
+    batch = torch.utils.data.default_collate([pairs[0]])
+    before, after = made(SHORT["arch"], SHORT["options"], seed=1), made(SHORT["arch"], SHORT["options"])
+    after.net.load_state_dict(table["model"])
+    assert _held_out_db(after, [batch], torch.device("cpu")) > _held_out_db(before, [batch], torch.device("cpu")) + 0.5
+
+
+def test_a_training_that_was_killed_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:
+    """kill -9 between two checkpoints; then --resume: the same curve and weights as without."""
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    run_training(whole, Training(**SHORT))
+    options = (
+        "--option width=8 --option levels=1 --iterations 12 --width 96 --height 64 --validate-every 4 --pairs 2 "
+        "--learning-rate 0.01"
     )
+    command = [sys.executable, "-m", "runtime.cli", "train", "--arch", SHORT["arch"], *options.split(), "--out", cut]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "examples")])}
+    process = subprocess.Popen(command, env=environment, cwd=tmp_path)
+    assert eventually(lambda: (cut / "curve.csv").exists(), within_s=120)
+    process.kill()
+    process.wait()
+    assert len(curve(cut)) < len(curve(whole))
+    run_training(cut, Training(**SHORT), resume=True)
+    assert curve(cut) == curve(whole)
+    ends = [load_checkpoint(out / "checkpoint.pth")["model"] for out in (whole, cut)]
+    assert all(torch.equal(value, ends[1][key]) for key, value in ends[0].items())
+    with pytest.raises(InputError, match=r"checkpoint\.pth: seed: was 1, and 2 was asked for"):
+        run_training(cut, Training(**SHORT | {"seed": 2}), resume=True)
 
 
-@pytest.fixture
-def tiny(tmp_path: Path) -> Path:
-    """A recipe that trains in seconds."""
-    table = json.loads(read_recipe("fast").text())
-    table.pop("weights", None)
-    table["training"] |= SMALL | {"iterations": 8, "pairs": 2, "validation_pairs": 2}
-    path = tmp_path / "tiny.json"
-    path.write_text(json.dumps(table))
-    return path
+def test_the_published_network_learns_from_a_folder_of_its_pictures(tmp_path: Path) -> None:
+    folder = tmp_path / "lego_bulldozer"
+    for number in (0, 1):
+        for half, (x, y, z) in enumerate(PUBLISHED_EYES["usual"]):
+            write_png(folder / f"pair{number}_x{x}_y{y}_z{z}_{half}.png", picture(half))
+    training = Training(arch="eyereal", options={"width": 4}, iterations=2, width_px=64, height_px=40, data=str(folder))
+    result = run_training(tmp_path / "out", training)
+    assert result["held_out_pairs"] == 1 and math.isfinite(result["held_out_db"])
+    report = export_model(
+        "eyereal", tmp_path / "eyereal.onnx", checkpoint=tmp_path / "out" / "checkpoint.pth", width_px=64, height_px=40
+    )
+    assert report.passed, report.table()
 
 
-def trained(out: Path, recipe: Path) -> Recipe:
-    run_training(out, str(recipe))
-    return Recipe.model_validate_json((out / "recipe.json").read_text())
-
-
-def test_a_network_that_answers_with_no_number_is_refused_before_anything_is_written(
-    tmp_path: Path, tiny: Path
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"data": "/nowhere/lego_bulldozer"}, "is no folder"),
+        ({"data": "/nowhere/unnamed"}, "holds none of"),
+        ({"arch": "tests.model_export.unservable:NotFinite", "options": {}}, "not finite"),
+        ({"options": {"width": 8, "depth": 3}}, "--option: depth"),
+        ({"arch": "balanced", "options": {}}, "'balanced' is neither eyereal nor module:Class"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_before_anything_is_written(
+    tmp_path: Path, changes: dict[str, Any], problem: str
 ) -> None:
-    table = json.loads(tiny.read_text())
-    weights = plain_weights(solver_of(read_recipe(str(tiny)), source="test"))
-    tiny.write_text(json.dumps(table | {"weights": weights | {"log_floor": [1000.0, 1000.0]}}))
-    with pytest.raises(InputError, match="weights: the network answers with what is no number"):
-        run_training(tmp_path / "out", str(tiny))
+    with pytest.raises(InputError, match=re.escape(problem)):
+        run_training(tmp_path / "out", Training(**SHORT | changes))
     assert not (tmp_path / "out").exists()
 
 
-def test_training_is_the_same_twice_and_leaves_its_files(tmp_path: Path, tiny: Path) -> None:
-    first = trained(tmp_path / "a", tiny)
-    assert trained(tmp_path / "b", tiny).weights == first.weights
-    _, recipe = load_spectral(tmp_path / "a" / "checkpoint.pth", name="fast")
-    assert recipe.steps == first.steps and recipe.weights == first.weights
-    rows = [row.split(",") for row in (tmp_path / "a" / "validation.csv").read_text().splitlines()]
-    assert rows[0] == ["iteration", "light_db", "held_out_light_db"] and [row[0] for row in rows[1:]] == ["0", "8"]
-    assert float(rows[2][1]) > float(rows[1][1])
+def test_more_memory_than_there_is_is_told_before_it_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("model_export.train._free_bytes", lambda: 1 << 20)
+    with pytest.raises(InputError, match=r"memory: needs more than the .* GiB that are free"):
+        run_training(tmp_path / "out", Training(**SHORT | {"width_px": 256, "height_px": 160}))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("arch", "problem"), FAULTS.items())
+def test_a_module_that_cannot_be_served_is_refused_in_one_line(tmp_path: Path, arch: str, problem: str) -> None:
+    out = tmp_path / "new" / "model.onnx"
+    command = ["export", "--arch", arch, "--random-init", "1", "--width", "64", "--height", "48", "--out", str(out)]
+    result = CliRunner().invoke(app, [*command, *(["--option", "width=2"] if arch.endswith("Narrow") else [])])
+    assert isinstance(result.exception, InputError) and problem in str(result.exception), result.exception
+    assert "\n" not in str(result.exception)
+    assert not out.parent.exists()
+
+
+def test_a_network_of_ones_own_is_trained_exported_and_served(tmp_path: Path) -> None:
+    """The example, by the commands of its page: what the runtime shows is what torch answers."""
+    run_training(tmp_path, Training(**SHORT | {"iterations": 4}))
+    path, checkpoint = tmp_path / "mine.onnx", tmp_path / "checkpoint.pth"
+    assert export_model(SHORT["arch"], path, checkpoint=checkpoint, width_px=160, height_px=96).passed
+    assert validate_file(path).passed
+    pair = random_pair(np.random.default_rng([4, 1]), **SMALL)
+    predictor = load_predictor(str(path), pair.stack)
+    assert predictor.name == "MyNetwork"
+    solved = solve_still(*pair.images, eyes_m=pair.eyes_m, fov_deg=pair.fov_deg, predictor=predictor, eye_sigma_mm=0.0)
+    net = made(SHORT["arch"], SHORT["options"]).net.eval()
+    net.load_state_dict(load_checkpoint(checkpoint)["model"])
+    with torch.no_grad():
+        panels = net(torch.from_numpy(predictor._input))[0].clamp(0, 1).mul(255).round().reshape(3, 3, 96, 160)
+    layers = solved.layers[..., :3].astype(np.float32)
+    predictor.close()
+    assert np.abs(layers - panels.permute(0, 2, 3, 1).numpy()).max() <= 1
+    with pytest.raises(InputError, match="is a checkpoint of my_network:MyNetwork, not of"):
+        export_model("tests.model_export.unservable:Even", path, checkpoint=checkpoint)

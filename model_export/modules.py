@@ -1,0 +1,128 @@
+"""Networks of pictures: the published one, and any `torch.nn.Module` that is named `module:Class`."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from runtime.config import Section, validated
+from runtime.errors import InputError, PhasestackError
+from runtime.support.plugins import is_plugin, plugin_class, strict
+
+KNOWN = {"eyereal": "model_export.eyereal:EyeRealNet"}
+PANELS, COLOURS = 3, 3
+
+
+class Form(Section):
+    """What a network of pictures takes and gives: class attributes of these names, or what stands here."""
+
+    input_frame: Literal["centre", "panel"] = Field(
+        "centre", description="both eyes' pictures on the centre panel's pixels, or on those of every panel"
+    )
+    input_value: Literal["intensity", "phase"] = "intensity"
+    output: Literal["panels"] = "panels"
+    branch: Literal[1, 2] = Field(1, description="of phases: their sums lie in [0, 1] or in [1, 2]")
+    picture_fov_deg: Annotated[float, Field(ge=0, lt=180)] = Field(
+        0.0, description="it sees pictures so wide, black beside them; 0: whatever is drawn"
+    )
+
+    @property
+    def channels(self) -> int:
+        """Of the input: panel-major, then eye, then RGB."""
+        return (PANELS if self.input_frame == "panel" else 1) * 2 * COLOURS
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """A module that was made, and what it says of itself."""
+
+    arch: str
+    net: nn.Module
+    form: Form
+    options: dict[str, Any]
+
+
+@contextmanager
+def blamed(arch: str, field: str) -> Iterator[None]:
+    """Whatever a module of a user's own does is told as an InputError, in one line."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except PhasestackError:
+        raise
+    except (Exception, SystemExit) as error:
+        said = str(error).strip().partition("\n")[0]
+        raise InputError(arch, field, f"{type(error).__name__}: {said}" if said else type(error).__name__) from error
+
+
+def check_known(arch: str, *others: str) -> None:
+    """Raises InputError for what is neither a network's name nor `module:Class`."""
+    if not is_plugin(arch) and arch not in (*others, *KNOWN):
+        raise InputError("--arch", "", f"{arch!r} is neither {', '.join([*others, *KNOWN])} nor module:Class")
+
+
+def made(arch: str, options: dict[str, Any], *, seed: int = 0) -> Network:
+    """A network with the weights of a seed. Raises InputError: no such class, or one that says what none may."""
+    check_known(arch)
+    kind = plugin_class(KNOWN.get(arch, arch), nn.Module, field="--arch")
+    said = {name: getattr(kind, name) for name in Form.model_fields if hasattr(kind, name)}
+    form = validated(Form, said, source=arch)
+    options = validated(strict(getattr(kind, "Options", Section)), options, source=f"{arch}: --option").model_dump()
+    torch.manual_seed(seed)
+    with blamed(arch, "__init__"):
+        net = kind(**options)
+    return Network(arch, net, form, options)
+
+
+def probe(network: Network, *, width_px: int, height_px: int) -> None:
+    """Raises InputError where it does not answer a picture of that size with panels, or as values decide."""
+    arch, form = network.arch, network.form
+    example = torch.rand(1, form.channels, height_px, width_px, generator=torch.Generator().manual_seed(1))
+    given, wanted = tuple(example.shape), (1, PANELS * COLOURS, height_px, width_px)
+    with torch.no_grad(), blamed(arch, f"forward, of {given}"):
+        answer = network.net.eval()(example)
+    if not isinstance(answer, Tensor):
+        raise InputError(arch, "forward", f"answers with {type(answer).__name__}; one tensor is needed")
+    found = tuple(answer.shape)
+    for axis, found_, wanted_ in zip(("batch", "channels", "height", "width"), found, wanted, strict=False):
+        if found_ != wanted_ or len(found) != len(wanted):
+            problem = f"answers {found}, where {wanted} is needed: {axis}"
+            raise InputError(arch, "forward", f"{problem} ({PANELS} panels of {COLOURS} colours)")
+    if answer.dtype != torch.float32:
+        raise InputError(arch, "forward", f"answers with {answer.dtype}; torch.float32 is needed")
+    if not torch.isfinite(answer).all():
+        raise InputError(arch, "forward", "answers with numbers that are not finite")
+
+
+def check_static(network: Network, *, width_px: int, height_px: int) -> None:
+    """Raises InputError where values decide what the module does: no graph holds that."""
+    example = torch.zeros(1, network.form.channels, height_px, width_px)
+    try:
+        with quiet(), torch.no_grad():
+            torch.export.export(network.net.eval(), (example,), strict=False)
+    except Exception as error:  # what it can't follow it tells in many ways: the exporter itself will tell of the rest
+        if "data-dependent" in str(error).lower():
+            problem = "branches on the values of its input: a graph can't (use torch.where)"
+            raise InputError(network.arch, "forward", problem) from None
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """The exporters advise developers of models, not users of this command."""
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(level)

@@ -1,0 +1,123 @@
+"""Pairs as a network of pictures learns from them: its input, what the eyes should see, and where they really are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from model_export.data import CENTRE, PITCH_WIDTH_M, TrainingPair, random_pair
+from model_export.light import Views
+from model_export.modules import Form
+from runtime.content.eyereal import Pair, read_folder
+from runtime.content.presets import preset_names
+from runtime.errors import InputError
+from runtime.optics.malus import phase_from_intensity
+from runtime.optics.stack import PanelStack
+from runtime.optics.views import image_from_raster, image_from_stack, stack_from_eye
+from runtime.records import F32, F64, U8
+from runtime.support.artifacts import read_image
+
+PICTURE_FOV_DEG = 40.0  # of the published data set's pictures
+
+
+@dataclass(frozen=True)
+class Pairs(Dataset[dict[str, Tensor]]):
+    """Pairs by number as a network of pictures learns from them: each is made from (seed, number) alone."""
+
+    form: Form
+    seed: int
+    width_px: int
+    height_px: int
+    eye_sigma_mm: float
+    count: int = 0  # so many, again and again; 0: ever new ones
+    stack: PanelStack | None = None  # None: random ones
+    folder: tuple[Pair, ...] = ()  # pictures; none: procedural pairs
+
+    def __getitem__(self, number: int) -> dict[str, Tensor]:
+        """The network's input, what the eyes should see, and homographies of the rays where the head really is."""
+        pair = self.pair(number)
+        random = np.random.default_rng([self.seed, number, 1])
+        pose = stack_from_eye(pair.eyes_m.mean(axis=0))
+        place = pose[:3, :2] @ random.normal(0.0, self.eye_sigma_mm * 1e-3, 2)
+        views = Views.of(pair.stack, pair.eyes_m, **self._size, fov_deg=pair.fov_deg, places_m=place[None])
+        images = np.stack(pair.images).transpose(0, 3, 1, 2)
+        return {
+            "input": torch.from_numpy(network_input(pair, self.form)),
+            "targets": torch.from_numpy(images.astype(np.float32) / np.float32(255)),
+            "views": views.panels_from_rays,
+        }
+
+    @property
+    def _size(self) -> dict[str, int]:
+        return {"width_px": self.width_px, "height_px": self.height_px}
+
+    def __len__(self) -> int:
+        return self.count
+
+    def pair(self, number: int) -> TrainingPair:
+        """The pictures and eyes of a number."""
+        if self.folder:
+            pair = self.folder[number % len(self.folder)]
+            return photographed(
+                pair, self.stack or prototype(**self._size), self.form.picture_fov_deg or PICTURE_FOV_DEG
+            )
+        random = np.random.default_rng([self.seed, number % self.count if self.count else number])
+        return random_pair(random, **self._size, stack=self.stack, fov_deg=self.form.picture_fov_deg)
+
+
+def folder_pairs(folder: Path) -> tuple[Pair, ...]:
+    """The pairs of a folder in the published data set's form, whose name holds the scene's. Raises InputError."""
+    name = next((name for name in preset_names() if name in folder.resolve().name), "")
+    if not name:
+        raise InputError(folder, "name", f"holds none of {', '.join(preset_names())}")
+    if not folder.is_dir():
+        raise InputError(folder, "", "is no folder")
+    return read_folder(folder, name)
+
+
+def prototype(*, width_px: int, height_px: int) -> PanelStack:
+    """The panels that the published pictures were made for."""
+    return PanelStack(PITCH_WIDTH_M, PITCH_WIDTH_M * 9 / 16, (-0.06, 0.0, 0.06), width_px, height_px)
+
+
+def photographed(pair: Pair, stack: PanelStack, fov_deg: float) -> TrainingPair:
+    """A pair of a folder at the panels' raster, turned so that the eyes look at the display's middle."""
+    size, images = {"width_px": stack.width_px, "height_px": stack.height_px}, []
+    for side, eye_m in enumerate(pair.eyes_m):
+        size_px = stack.width_px, stack.height_px
+        picture = np.asarray(cv2.resize(read_image(pair.paths[side]), size_px, interpolation=cv2.INTER_AREA), np.uint8)
+        drawn = pair.image_from_stack(side, **size, fov_deg=fov_deg)
+        straight = image_from_stack(eye_m, **size, fov_deg=fov_deg)
+        images.append(_warped(picture, drawn[:, :3] @ np.linalg.inv(straight[:, :3]), stack, cv2.BORDER_REPLICATE))
+    return TrainingPair(stack, pair.eyes_m, (images[0], images[1]), fov_deg)
+
+
+def network_input(pair: TrainingPair, form: Form) -> F32:
+    """(channels, H, W) what the runtime feeds a network of pictures: panel-major, then eye, then RGB."""
+    stack, table = pair.stack, np.arange(256, dtype=np.float32) / np.float32(255)
+    if form.input_value == "phase":
+        table = phase_from_intensity(table, form.branch)
+    border = cv2.BORDER_CONSTANT if form.picture_fov_deg else cv2.BORDER_REPLICATE
+    channels = []
+    for n in range(stack.count) if form.input_frame == "panel" else (CENTRE,):
+        for eye_m, image in zip(pair.eyes_m, pair.images, strict=True):
+            size = {"width_px": image.shape[1], "height_px": image.shape[0]}
+            projection = image_from_stack(eye_m, **size, fov_deg=pair.fov_deg)
+            warped = _warped(image, image_from_raster(projection, stack.panel(n)), stack, border)
+            channels.append(table[warped].transpose(2, 0, 1))
+    return np.concatenate(channels)
+
+
+def _warped(picture: U8, picture_from_raster: F64, stack: PanelStack, border: int) -> U8:
+    """A picture on a raster of the panels' pixels, bilinear; OpenCV puts pixel centres at integers."""
+    to_centres = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+    matrix = np.linalg.inv(to_centres) @ picture_from_raster @ to_centres
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    size = stack.width_px, stack.height_px
+    return np.asarray(cv2.warpPerspective(picture, matrix, size, flags=flags, borderMode=border), np.uint8)
