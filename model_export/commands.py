@@ -37,22 +37,22 @@ def train(
     ] = None,
     pairs: Annotated[int, typer.Option(min=0, help="only so many procedural pairs; 0: ever new ones")] = 0,
     panels: Annotated[Path | None, typer.Option(help="panels to learn for; without: any three even ones")] = None,
-    iterations: Annotated[int, typer.Option(min=1)] = 2000,
+    iterations: Annotated[int, typer.Option(min=1, help="of gradients, in all")] = 2000,
     batch: Annotated[int, typer.Option(min=1, help="pairs of an iteration")] = 1,
     learning_rate: Annotated[float, number(1e-8, 1, help="at first; then along a cosine to none")] = 1e-3,
     width: Annotated[int, typer.Option(min=32, max=8192, help="of the panels and pictures learned from, pixels")] = 480,
-    height: Annotated[int, typer.Option(min=32, max=8192)] = 270,
+    height: Annotated[int, typer.Option(min=32, max=8192, help="of the same")] = 270,
     eye_sigma_mm: Annotated[float, number(0, 20, "mm", help="how far eyes are from where they are believed")] = 1.0,
     seed: Annotated[int, typer.Option(min=0, help="of weights and pairs")] = 1,
     validate_every: Annotated[int, typer.Option(min=1, help="iterations from point to point of the curve")] = 100,
-    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option()] = "auto",
+    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="auto: a GPU where torch sees one")] = "auto",
     resume: Annotated[bool, typer.Option("--resume", help="go on from --out's checkpoint")] = False,
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="event files besides")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="the result as one object on stdout")] = False,
 ) -> None:
     """Train a network of pictures by gradients, by the light that eyes get of its panels.
 
-    Example: PYTHONPATH=. phasestack train --arch my_network:MyNetwork --out out/mine
+    Example: phasestack train --arch my_network:MyNetwork --out out/mine
     """
     require("torch", *(["tensorboard"] if tensorboard else []))
     from model_export.train import Training, run_training

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +17,9 @@ from model_export.light import FLOOR, Views, light, step, traced  # noqa: E402
 from model_export.scene import draw, random_scene  # noqa: E402
 from runtime.optics.stack import PanelStack, Tilt  # noqa: E402
 from runtime.optics.views import image_from_raster, image_from_stack  # noqa: E402
+from runtime.support.artifacts import write_png  # noqa: E402
 
+ROOT = Path(__file__).resolve().parents[2]
 EYES = np.array([[0.62, -0.04, 0.03], [0.6, 0.024, 0.035]])
 STACK = PanelStack(0.5184, 0.2916, (-0.02, 0.0, 0.03), 12, 8)
 STACKS = {
@@ -169,3 +175,30 @@ def test_a_ray_counts_half_a_pixel_inside_every_panel() -> None:
     assert counts[0, 0].all(dim=0).tolist() == [True] * 11 + [False]
     assert counts[1, 0].all(dim=1).tolist() == [False] * 2 + [True] * 6
     assert not light(random_panels(STACK), Views(-matrices, 12, 8))[1].any()  # behind the eye
+
+
+def test_the_example_that_bounds_what_panels_could_show_runs(tmp_path: Path, still: tuple[PanelStack, Any]) -> None:
+    for name, target in zip(("left.png", "right.png"), still[1], strict=True):
+        write_png(tmp_path / name, (target * 255).round().byte().permute(1, 2, 0).numpy())
+    (tmp_path / "panels.json").write_text('{"width_m": 0.5184, "height_m": 0.2916, "x_m": [-0.02, 0.0, 0.02]}')
+    eyes = [word for name, eye in zip(("left", "right"), EYES) for word in (f"--{name}-eye", *map(str, eye))]
+    command = [
+        sys.executable,
+        str(ROOT / "examples" / "adam_bound.py"),
+        "left.png",
+        "right.png",
+        "--panels",
+        "panels.json",
+    ]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [*command, *eyes, "--width", "96", "--steps", "16"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    rows = [row.split(", ") for row in done.stdout.splitlines()]
+    assert rows[0] == ["steps", "dB by steps", "dB by Adam"], done.stderr
+    by_steps, by_adam = ([float(row[column]) for row in rows[1:]] for column in (1, 2))
+    assert by_steps[-1] > by_steps[0] + 10 and by_adam[-1] > by_adam[0] + 3
