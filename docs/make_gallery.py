@@ -10,23 +10,31 @@ from __future__ import annotations
 import argparse
 import io
 import json
+import math
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
 
+import phasestack
 from calib.board import boards as boards_of
 from calib.placed import PlacedPanel
 from calib.simulator import Exposure, Scene, camera_from_stack, camera_rays, phone, photograph
 from runtime.config import StackGeometry
+from runtime.optics.alignment import align, shown_layers
+from runtime.optics.retina import seen_by
+from runtime.records import PanelFrame
+from runtime.report.pairs import Painter, eyes_at
 
 DOCS = Path(__file__).resolve().parent
 IMAGES = DOCS / "images"
 WIDTH_PX, LIMIT_BYTES = 1200, 200_000
+MOVED_MM, MOVED_FRAMES, MOVED_MS = 70, 16, 90  # the head's way to either side, and the pictures of it
 PICTURES = {  # in docs/images: what the commands leave, and what is made here
     "boards.jpg": "boards.png",
     "kinds.jpg": "kinds.png",
@@ -148,6 +156,36 @@ def boards() -> Image.Image:
     return Image.fromarray(photograph(scene, lens, pose, Exposure(), random=random, rays=camera_rays(lens)))
 
 
+def look_into(folder: Path) -> None:
+    """`looked-into.webp`: what an eye sees while the head goes to and fro, the outer panels as they were solved, and
+    aligned; and the solution's `viewer.html`."""
+    stack = replace(StackGeometry().stack(), width_px=640, height_px=360)
+    eyes = eyes_at(distance_m=0.65, angle_deg=4, height_m=0.08)
+    with Painter("demo", stack) as painter:
+        pair = painter.pair("demo", eyes, stack, off_mm=())
+    result = phasestack.solve(*pair.images, eyes_m=eyes, stack=stack)
+    result.save(folder)
+    codes = np.concatenate([result.layers, np.full_like(result.layers[..., :1], 255)], axis=-1)
+    frames = []
+    for k in range(MOVED_FRAMES):
+        now = eyes + np.array([0.0, MOVED_MM / 1000 * math.sin(2 * math.pi * k / MOVED_FRAMES), 0.0])
+        maps = align(stack, solved_for_m=eyes, eyes_m=now).solved_from_shown
+        aligned = shown_layers(PanelFrame(k, codes, 1, maps))
+        seen = [seen_by(now[0], layers, stack, fov_deg=46) for layers in (codes, aligned)]
+        sheet = Image.new("RGB", (2 * stack.width_px, stack.height_px))
+        for n, retina in enumerate(seen):
+            picture = np.rint(255 * np.where(retina.mask[..., None], retina.image, 0.1)).astype(np.uint8)
+            sheet.paste(Image.fromarray(picture), (n * stack.width_px, 0))
+        frames.append(sheet.resize((960, 270), Image.Resampling.LANCZOS))
+    path = folder / "looked-into.webp"
+    options: dict[str, Any] = {"duration": MOVED_MS, "loop": 0, "method": 6}
+    for quality in range(60, 10, -10):
+        frames[0].save(path, save_all=True, append_images=frames[1:], quality=quality, **options)
+        if path.stat().st_size <= LIMIT_BYTES:
+            return
+    raise SystemExit(f"{path.name}: more than {LIMIT_BYTES} bytes")
+
+
 def smaller(source: Path, name: str) -> bytes:
     """A picture as the pages show it. Raises SystemExit where it stays too large."""
     image = Image.open(source).convert("RGB")
@@ -180,7 +218,9 @@ def main() -> None:
         )
     kinds(content).save(arguments.work / "kinds.png")
     boards().save(arguments.work / "boards.png")
+    look_into(arguments.work / "look")
     files = {name: smaller(arguments.work / source, name) for name, source in PICTURES.items()}
+    files |= {name: (arguments.work / "look" / name).read_bytes() for name in ("looked-into.webp", "viewer.html")}
     text = page(json.loads((arguments.work / "report" / "report.json").read_text(encoding="utf-8")))
     for old in IMAGES.iterdir():
         old.unlink()
