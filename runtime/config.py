@@ -378,14 +378,19 @@ def with_options(
     settings: Settings,
     *,
     replay: str | None = None,
+    loop: bool = False,
     headless: bool = False,
     scene: str | None = None,
     model: str | None = None,
     backend: str | None = None,
 ) -> Settings:
-    """The settings with what a command line says in force. Raises InputError, naming the option."""
+    """The settings with what a command line says in force. Raises InputError, naming the option.
+
+    loop: the replayed recording begins anew at its end.
+    """
     given: tuple[tuple[str, str, dict[str, Any] | None], ...] = (
         ("--replay", "sensor", None if replay is None else {"driver": "replay", "source": replay}),
+        ("--replay", "sensor", {"loop": True} if loop else None),
         ("--headless", "output", {"kind": "offscreen"} if headless else None),
         ("--scene", "content", None if scene is None else {"scene": scene}),
         ("--model", "model", None if model is None else {"name": model}),

@@ -6,7 +6,7 @@ import hashlib
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,9 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from runtime.clock import NS_PER_S
+from runtime.commands.app import app
 from runtime.config import Settings, with_options
+from runtime.daemon import supervise
 from runtime.daemon.build import RunOptions
 from runtime.daemon.drive import drive
 from runtime.eyes.demo_geometry import demo_sensor_from_stack
@@ -248,3 +250,19 @@ def test_real_and_simulated_time_pass_the_same_states(tmp_path: Path) -> None:
     real, simulated = summary_of(tmp_path / "real"), summary_of(tmp_path / "simulated")
     assert real["seconds"] == pytest.approx(simulated["seconds"], abs=0.5)
     assert "fps" in simulated["configured"] and real["configured"] == []
+
+
+def test_the_demo_recording_begins_anew_unless_it_is_told_how_long(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Settings] = []
+
+    def run_daemon(read_settings: Callable[[], Settings], options: RunOptions) -> dict[str, Any]:
+        told.append(read_settings())
+        return {"stopped": "at once"}
+
+    monkeypatch.setattr(supervise, "run_daemon", run_daemon)
+    for more in ([], ["--frames", "5"], ["--max-speed"], ["--out", str(tmp_path)]):
+        app(["run", "--replay", "demo", "--headless", *more], standalone_mode=False)
+    app(["run", "--replay", str(demo_recording_path()), "--headless"], standalone_mode=False)
+    assert [settings.sensor.loop for settings in told] == [True, False, False, False, False]

@@ -8,7 +8,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -17,7 +17,9 @@ from runtime.support.options import blame_option, number
 
 def run(
     config: Annotated[Path | None, typer.Option(help="TOML file; see `phasestack config`")] = None,
-    replay: Annotated[str | None, typer.Option(help="a recording, or `demo`, instead of the sensor")] = None,
+    replay: Annotated[
+        str | None, typer.Option(help="a recording, instead of the sensor; `demo` goes on until it is told")
+    ] = None,
     headless: Annotated[bool, typer.Option("--headless", help="offscreen panels, whatever is configured")] = False,
     frames: Annotated[int | None, typer.Option(min=1, help="stop after so many refreshes")] = None,
     max_speed: Annotated[
@@ -55,7 +57,9 @@ def run(
 
     def read_settings() -> Settings:
         settings = load_settings(config)
-        return with_options(settings, replay=replay, headless=headless, scene=scene, model=model, backend=backend)
+        loop = replay == "demo" and frames is None and out is None and not max_speed
+        given: dict[str, Any] = {"headless": headless, "scene": scene, "model": model, "backend": backend}
+        return with_options(settings, replay=replay, loop=loop, **given)
 
     options = RunOptions(
         max_speed=max_speed, measure=out is not None, scale=scale, keep_light=keep_light, frames=frames, out=out

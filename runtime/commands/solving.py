@@ -110,7 +110,7 @@ def solve_pair(
             except ValueError as error:
                 why = f"{error}: nothing of the display can be seen from there"
                 raise InputError("solve", "--left-eye", why) from None
-            line = f"{files[0].name} and {files[1].name}, model {model}, solved for a tracking error of "
+            line = f"{files[0].name} and {files[1].name}, model {predictor.name}, solved for a tracking error of "
             line += f"{eye_sigma_mm:g} mm; one ray a pixel, as published: {quality.psnr_db:.1f} dB"
             seen.write(folder.staging, lines=[line])
             watch.lap("measure and write")

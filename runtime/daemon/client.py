@@ -47,16 +47,21 @@ def sockets(config: Path | None) -> tuple[Path, ...]:
 class NotRunning(TransientError):
     """No daemon answers at the socket; the text says why, and what to do."""
 
+    hangs = False  # there is one, and it has not answered in time
+
 
 def ask(paths: Iterable[Path], request: dict[str, Any], *, timeout_s: float = 10.0) -> dict[str, Any]:
     """The daemon's answer. Raises NotRunning where none answers at any of the paths; timeout_s: of each step."""
-    problems = []
+    problems, hangs = [], False
     for path in paths:
         try:
             return _exchanged(path, request, timeout_s)
         except (OSError, ValueError) as error:
             problems.append(f"{path}: {_advice(error)}")
-    raise NotRunning("; ".join(problems) or "no socket is configured")
+            hangs |= isinstance(error, TimeoutError)
+    silent = NotRunning("; ".join(problems) or "no socket is configured")
+    silent.hangs = hangs
+    raise silent
 
 
 def _exchanged(path: Path, request: dict[str, Any], timeout_s: float) -> dict[str, Any]:
@@ -139,4 +144,4 @@ class Daemon:
         try:
             return ask(self._sockets, request, timeout_s=timeout_s)
         except NotRunning as error:
-            return {"ok": False, "running": False, "error": str(error)}
+            return {"ok": False, "running": False, "hangs": error.hangs, "error": str(error)}

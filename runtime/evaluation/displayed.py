@@ -43,7 +43,7 @@ class EyeViews:
     def write(self, folder: Path) -> None:
         """What each eye sees and should see, as pictures."""
         for eye, retina, target in zip(("left", "right"), self.seen, self.wanted, strict=True):
-            write_png(folder / f"seen-{eye}.png", as_codes(retina.image))
+            write_png(folder / f"seen-{eye}.png", retina.codes())
             write_png(folder / f"wanted-{eye}.png", as_codes(intensities(target)))
 
 

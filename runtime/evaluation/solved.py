@@ -10,7 +10,6 @@ from typing import Any
 
 from runtime.evaluation.contact_sheet import contact_sheet, headline
 from runtime.evaluation.displayed import EyeViews, Picture, displayed, expected_db
-from runtime.optics.retina import as_codes
 from runtime.optics.stack import PanelStack
 from runtime.records import F64, U8
 from runtime.support.artifacts import write_png, write_text
@@ -67,8 +66,8 @@ class SolvedPair:
 
     @property
     def seen(self) -> tuple[U8, ...]:
-        """Per eye (h, w, 3): what it sees."""
-        return tuple(as_codes(retina.image) for retina in self.eye_views.seen)
+        """Per eye (h, w, 3): what it sees; black where it looks past a panel."""
+        return tuple(retina.codes() for retina in self.eye_views.seen)
 
     def viewer(self, lines: Sequence[str]) -> str:
         """The page to look into the layers."""

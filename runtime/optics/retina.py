@@ -29,6 +29,10 @@ class Retina:
     image: F32  # (h, w, 3) in [0, 1]
     mask: Mask  # (h, w)
 
+    def codes(self) -> U8:
+        """(h, w, 3) 8 bits; black where a ray passes beside a panel."""
+        return np.asarray(as_codes(self.image) * self.mask[..., None], np.uint8)
+
 
 def strips(rows: int) -> Iterator[slice]:
     """An image's rows, a few at a time: what one step writes is still in the cache for the next."""

@@ -134,7 +134,11 @@ for (let k = 0; k < 70; k += 1) {
 }
 say("reached by tab", reached);
 
-// The daemon dies and comes back.
+// The daemon hangs, dies and comes back.
+await parent("freeze");
+say("it says that the daemon hangs", (await until(() => page.isVisible("#gone"))) && (await shows("#state", "hangs")));
+await parent("thaw");
+say("it goes on when it hangs no more", await until(() => page.isHidden("#gone")));
 await parent("kill");
 say("it says that the daemon is gone", (await until(() => page.isVisible("#gone"))) && (await shows("#state", "no daemon")));
 await page.click("[data-command=pause]");

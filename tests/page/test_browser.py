@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -25,6 +26,7 @@ pytestmark = pytest.mark.slow
 CONTROLS = (
     "state is shown", "pictures are shown", "pause", "resume", "flat", "resume by the keyboard", "reload", "scene",
     "a scene that is not there", "scene back", "black box", "it says that the daemon is gone",
+    "it says that the daemon hangs", "it goes on when it hangs no more",
     "moved at once", "turntable", "as configured", "another model", "the model back", "a playlist", "the next one",
     "from a playlist to a scene", "a wish without a daemon is refused",
     "it goes on when it is back", "and without the old refusal", "fits 1280", "fits 390",
@@ -60,6 +62,14 @@ class RunningDaemon:
             self._process.wait()
             self._process = None
 
+    def freeze(self) -> None:
+        assert self._process is not None
+        self._process.send_signal(signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        assert self._process is not None
+        self._process.send_signal(signal.SIGCONT)
+
 
 @pytest.fixture(scope="module")
 def tried(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
@@ -83,8 +93,8 @@ def tried(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
                 for line in driver.stdout:
                     told = json.loads(line)
                     results[told["what"]] = told["value"]
-                    if told["what"] in ("kill", "start"):
-                        daemon.kill() if told["what"] == "kill" else daemon.start()
+                    if told["what"] in ("kill", "start", "freeze", "thaw"):
+                        getattr(daemon, told["what"])()
                         driver.stdin.write("done\n")
                         driver.stdin.flush()
             assert driver.returncode == 0, results

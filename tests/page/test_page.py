@@ -181,6 +181,16 @@ def test_what_is_no_wish_is_refused_in_one_line(page: Page, loop: Loop, body: st
     assert code in (400, 413) and json.loads(answer)["ok"] is False and loop.told == []
 
 
+def test_a_daemon_that_hangs_is_not_taken_for_none(page: Page, folder: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as silent:
+        silent.bind(str(folder / "s.sock"))
+        silent.listen()
+        told = page.look_up("status")
+        assert told["hangs"] is True and "the daemon hangs" in told["error"]
+    (folder / "s.sock").unlink()
+    assert eventually(lambda: page.look_up("status")["hangs"] is False)
+
+
 def test_without_a_daemon_it_says_so_and_when_one_is_back_it_goes_on(page: Page, folder: Path) -> None:
     assert eventually(lambda: "no daemon" in page.look_up("status").get("error", ""))
     assert page.ask("GET", "/now/status", **page.bearer)[0] == 503

@@ -246,11 +246,11 @@ async function lookUp(name) {
   return answer.json();
 }
 
-function gone(why) {
+function gone(why, hangs = false) {
   running = false;
   $("gone").hidden = false;
-  setText($("gone"), `No daemon answers. ${why}`);
-  setText($("state"), "no daemon");
+  setText($("gone"), `${hangs ? "The daemon does not answer." : "No daemon answers."} ${why}`);
+  setText($("state"), hangs ? "hangs" : "no daemon");
   $("state").dataset.state = "gone";
   setText($("reason"), "");
   setText($("eyes-told"), "unknown");
@@ -267,8 +267,8 @@ function show(status) {
   const hangs = status.turn_age_s > 5;
   $("gone").hidden = !hangs;
   if (hangs) setText($("gone"), `the daemon's loop has stood still for ${number(status.turn_age_s, 0)} s`);
-  setText($("state"), status.state ?? "starting");
-  $("state").dataset.state = (status.state ?? "starting").split(":")[0];
+  setText($("state"), hangs ? "hangs" : status.state ?? "starting");
+  $("state").dataset.state = hangs ? "gone" : (status.state ?? "starting").split(":")[0];
   setText($("reason"), status.reason ?? "");
   if (status.state === undefined) return; // it answers, and has shown nothing yet
   document.querySelector('[data-command="pause"]').setAttribute("aria-pressed", String(status.paused));
@@ -302,7 +302,7 @@ async function every(ms, work) {
 every(STATUS_MS, async () => {
   const status = await lookUp("status");
   if (status.ok) show(status);
-  else gone(status.error);
+  else gone(status.error, status.hangs);
 });
 every(PICTURES_MS, async () => {
   if (!running || document.hidden) return;
