@@ -20,7 +20,7 @@ from runtime.panels.presentation import FrameTextures, Painter
 from runtime.panels.watch import PlacementWatch
 from runtime.records import U8, PanelFrame, PresentReport
 from runtime.support.gl import offscreen_context
-from runtime.support.gl_sharing import ShareGroup
+from runtime.support.gl_sharing import ShareGroup, gl_function
 
 log = logging.getLogger("phasestack.panels")
 
@@ -233,11 +233,8 @@ def _error(context: moderngl.Context) -> str:
 
 def _reset_status() -> str:
     """What the driver says of a lost context (GPU reset); empty where all is well or it can't say."""
-    address = glfw.get_proc_address("glGetGraphicsResetStatus")
-    address = getattr(address, "value", address)
-    if not address:
-        return ""
-    status: int = ctypes.CFUNCTYPE(ctypes.c_uint)(address)()
+    address = gl_function("glGetGraphicsResetStatus")
+    status: int = ctypes.CFUNCTYPE(ctypes.c_uint)(address)() if address else 0
     return f"was reset (0x{status:x})" if status else ""
 
 
