@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -108,20 +109,25 @@ class Pc:
         """Whether there is the container's first process, and which: nspawn begins with others."""
         assert self._container is not None
         children = Path(f"/proc/{self._container.pid}/task/{self._container.pid}/children").read_text().split()
-        found = [int(child) for child in children if Path(f"/proc/{child}/comm").read_text() == "systemd\n"]
-        self._leader = found[0] if found else 0
-        return bool(found)
+        for child in children:
+            with suppress(OSError):  # it has gone
+                if Path(f"/proc/{child}/comm").read_text() == "systemd\n":
+                    self._leader = int(child)
+                    return True
+        return False
 
     def cut(self) -> None:
         """The power is gone."""
         if self._container is not None and self._container.poll() is None:
-            os.kill(self._leader, 9)
+            if self._leader:
+                os.kill(self._leader, 9)
             self._container.wait(60)
 
     def reboot(self) -> None:
         assert self._container is not None
         self.run("systemctl poweroff")
         self._container.wait(90)
+        self._leader = 0
         self.boot()
 
     def run(self, command: str, *, timeout_s: float = 900.0, user: str = "") -> subprocess.CompletedProcess[str]:
