@@ -26,6 +26,7 @@ from runtime.page.connections import LOOPBACK, listening, server_of
 from runtime.page.server import application
 
 SIZE_PX = {"width_px": 960, "height_px": 540}  # without a configuration: solved often on a small machine
+WEBCAM_FOV_DEG = 65.0  # of most cameras in or on a screen; a configuration says it of others
 MEASURED_EVERY_S = 4.0  # the light at the eyes
 
 
@@ -34,7 +35,7 @@ def settings_of(config: Path | None, *, scene: str | None, model: str | None, we
     settings = load_settings(config) if config else changed(Settings(), "stack", SIZE_PX, source="try")
     settings = with_options(settings, scene=scene, model=model)
     if settings.sensor.driver != "usb-camera" or not webcam:
-        sensor = {"driver": "usb-camera", "source": ""} if webcam else {"driver": "browser"}
+        sensor = {"driver": "usb-camera", "source": "", "fov_deg": WEBCAM_FOV_DEG} if webcam else {"driver": "browser"}
         settings = changed(settings, "sensor", sensor, source="try")
     every = max(1, round(MEASURED_EVERY_S * settings.loop.rate_hz))
     return changed(settings, "loop", {"evaluate_every": every}, source="try")

@@ -17,7 +17,6 @@ from runtime.records import Layers, pixels_of
 from runtime.support.artifacts import to_json
 
 PAGES_MAX = 8
-MESSAGE_MAX_BYTES = 65536
 RANGES = {"noise_mm": (0.0, 50.0), "latency_ms": (0.0, 1000.0), "gap_mm": (1.0, 500.0)}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -45,10 +46,14 @@ def test_the_judgement_is_that_of_the_optics(pair: StillPair) -> None:
         assert found.psnr_db_off_eye[distance] == pytest.approx(np.mean(values), abs=2e-3)
 
 
-def test_methods_are_measured_whole_pair_by_pair(pair: StillPair, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_methods_are_measured_whole_pair_by_pair(
+    pair: StillPair, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr("runtime.report.frontier.apart", lambda call, *given: call(*given))
     methods = [Method("SART-3", "iterative", "sart", 3), Method("fast", "network", "fast")]
-    done = list(measure(methods, [pair, replace(pair, name="again")], threads=cv2.getNumThreads()))
+    done = list(measure(methods, [pair, replace(pair, name="again")], threads=cv2.getNumThreads(), viewers=tmp_path))
+    assert "window.phasestack" in (tmp_path / "viewer-again.html").read_text()
+    assert [one.viewer for one in done[-2][1].pairs] == ["viewer-demo.html", "viewer-again.html"]
     assert [what for what, _ in done] == ["SART-3, demo", "fast, demo", "SART-3, again", "fast, again"]
     newest = {result.name: result for _, result in done}
     for result in newest.values():

@@ -81,12 +81,12 @@ export class Look {
 
   #frame(now) {
     this.next = null;
-    const gap = now - (this.before ?? now);
-    if (this.strip === undefined && gap > 0 && gap < 1000) { // as fine as this machine draws in time
-      this.pace = 0.8 * (this.pace ?? gap) + 0.2 * gap;
-      if (this.pace > 70 && this.rays > 1) [this.rays, this.pace] = [this.rays - 1, 40];
+    if (this.before !== undefined) { // pictures after each other: as fine as this machine draws in time
+      this.pace = 0.8 * (this.pace ?? 30) + 0.2 * (now - this.before);
+      if (this.pace > 50 && this.rays > 1) [this.rays, this.pace] = [this.rays - 1, 30];
+      else if (this.pace < 20 && this.rays < 3) [this.rays, this.pace] = [this.rays + 1, 30];
     }
-    this.before = now;
+    this.before = undefined;
     this.frames += 1;
     const { width, height } = this.#fitted(), resting = !this.fresh && performance.now() - this.moving > REST_MS;
     this.fresh = false;
@@ -98,8 +98,10 @@ export class Look {
       this.#paint(width, height, this.rays);
       this.onframe();
       if (!resting) this.#tell(limited);
-      if (!resting || turning) this.next = requestAnimationFrame((then) => this.#frame(then));
-      else this.#measure();
+      if (!resting || turning) {
+        this.before = now;
+        this.next = requestAnimationFrame((then) => this.#frame(then));
+      } else this.#measure();
       return;
     }
     const g = this.display.g, rows = Math.ceil(height / STRIPS);
