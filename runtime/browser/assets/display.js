@@ -316,13 +316,15 @@ export class Display {
   }
 
   // One eye's picture into a part [x, y, width, height] (from below) of what is bound. `rays` 0: exact boxes; nominal: whose
-  // picture it is, carried along on the centre panel; gain 1: the target itself, more: the difference to it, so many times.
-  see({ eye, nominal = eye, picture, part, rays = 0, pupil_mm = 0, side = 0, gain = 0, stride = [1, 1], room = [0.07, 0.08, 0.1] }) {
-    const g = this.g, { stack } = this, places = this.#use("see", "shown"), count = stack.x_m.length;
+  // picture it is, carried along on the centre panel; gain 1: the target itself, more: the difference to it, so many times;
+  // maps: through the solution itself, shifted, without what panels make of it: quick.
+  see({ eye, nominal = eye, picture, part, maps = null, rays = 0, pupil_mm = 0, side = 0, gain = 0, stride = [1, 1], room = [0.07, 0.08, 0.1] }) {
+    const g = this.g, { stack } = this, places = this.#use("see", maps ? "solved" : "shown"), count = stack.x_m.length;
     g.viewport(...part);
     const columns = [], apart = [];
     for (let n = 0; n < count; n += 1) {
-      const m = panelFromPicture(stack, n, eye, picture, nominal), share = 1 - (stack.x_m[n] - eye[0]) / (centre(stack) - eye[0]);
+      const ideal = panelFromPicture(stack, n, eye, picture, nominal), [su, sv, tu, tv] = maps?.[n] ?? [1, 1, 0, 0];
+      const m = maps ? mul([su, 0, tu, 0, sv, tv, 0, 0, 1], ideal) : ideal, share = 1 - (stack.x_m[n] - eye[0]) / (centre(stack) - eye[0]);
       const scale = 1 / (m[6] * picture.width / 2 + m[7] * picture.height / 2 + m[8] || 1); // before the eye: positive
       for (let k = 0; k < 3; k += 1) columns.push(...[m[k], m[3 + k], m[6 + k]].map((v) => v * scale));
       apart.push((share * stack.width_px) / stack.width_m, (-share * stack.height_px) / stack.height_m);

@@ -38,7 +38,7 @@ export class Look {
     [this.scene, this.stack, this.eyesAt] = [scene, scene.stack, eyesAt];
     this.canvas = this.$("canvas");
     this.display = new Display(this.canvas, this.stack);
-    Object.assign(this, { mode: "parallel", head: [0, 0, 0], aligned: true, pupil: false, point: [0, 0], rays: 3, frames: 0 });
+    Object.assign(this, { mode: "parallel", head: [0, 0, 0], aligned: true, pupil: false, point: [0, 0], rays: 3, coarse: 1, frames: 0 });
     this.flatness = 0;
     this.used = null; // eyes that the panels are aligned to, where that is not where they truly are
     this.state = ""; // why this is not what two eyes should see
@@ -84,14 +84,16 @@ export class Look {
     if (this.before !== undefined) { // pictures after each other: as fine as this machine draws in time
       this.pace = 0.8 * (this.pace ?? 30) + 0.2 * (now - this.before);
       if (this.pace > 50 && this.rays > 1) [this.rays, this.pace] = [this.rays - 1, 30];
+      else if (this.pace > 50 && this.coarse > 0.6) [this.coarse, this.pace] = [this.coarse * 0.7, 30];
       else if (this.pace < 20 && this.rays < 3) [this.rays, this.pace] = [this.rays + 1, 30];
     }
     this.before = undefined;
     this.frames += 1;
-    const { width, height } = this.#fitted(), resting = !this.fresh && performance.now() - this.moving > REST_MS;
+    const resting = !this.fresh && performance.now() - this.moving > REST_MS, { width, height, resized } = this.#fitted(resting);
     this.fresh = false;
     const { maps, limited } = this.mode === "difference" ? { maps: asTheyStand(this.stack), limited: "" } : this.maps;
-    this.display.show(maps, this.flatness);
+    this.quick = !resting && this.rays === 1 && this.flatness === 0 && !["panels", "apart"].includes(this.mode) ? maps : null;
+    if (!this.quick) this.display.show(maps, this.flatness);
     const turning = this.mode === "wiggle";
     if (!resting || turning || ["panels", "apart", "target"].includes(this.mode)) {
       this.strip = undefined;
@@ -105,6 +107,7 @@ export class Look {
       return;
     }
     const g = this.display.g, rows = Math.ceil(height / STRIPS);
+    if (resized) this.#paint(width, height, 1);
     this.strip ??= 0;
     g.enable(g.SCISSOR_TEST);
     g.scissor(0, height - (this.strip + 1) * rows, width, rows);
@@ -118,11 +121,12 @@ export class Look {
     }
   }
 
-  #fitted() {
-    const scale = Math.min(window.devicePixelRatio || 1, 2), { clientWidth, clientHeight } = this.canvas;
+  #fitted(resting) {
+    const scale = Math.min(window.devicePixelRatio || 1, 2) * (resting ? 1 : this.coarse), { clientWidth, clientHeight } = this.canvas;
     const width = Math.max(16, Math.round(clientWidth * scale)), height = Math.max(16, Math.round(clientHeight * scale));
-    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
-    return { width, height };
+    const resized = this.canvas.width !== width || this.canvas.height !== height; // which clears it
+    if (resized) Object.assign(this.canvas, { width, height });
+    return { width, height, resized };
   }
 
   // The display fills a picture of this size for a head where the layers were solved for.
@@ -148,16 +152,16 @@ export class Look {
       sides.forEach((side, k) => {
         const left = (k % across) * w + ((w - pic.width) >> 1), below = height - (Math.floor(k / across) + 1) * h + ((h - pic.height) >> 1);
         display.see({ eye: this.scene.eyes_m[side], picture: { ...pic, fov_deg: this.scene.fov_deg }, part: [left, below, pic.width, pic.height],
-          rays, pupil_mm, side, gain: mode === "target" ? 1 : 8 });
+          rays, pupil_mm, maps: this.quick, side, gain: mode === "target" ? 1 : 8 });
       });
     } else if (mode === "anaglyph") {
       for (const side of [0, 1]) {
         g.colorMask(side === 0, side === 1, side === 1, true);
-        display.see({ eye: this.eyes[side], picture: this.#picture(w, h), part: [0, 0, w, h], rays, pupil_mm });
+        display.see({ eye: this.eyes[side], picture: this.#picture(w, h), part: [0, 0, w, h], rays, pupil_mm, maps: this.quick });
       }
       g.colorMask(true, true, true, true);
     } else {
-      sides.forEach((side, k) => display.see({ eye: this.eyes[side], picture: this.#picture(w, h), rays, pupil_mm,
+      sides.forEach((side, k) => display.see({ eye: this.eyes[side], picture: this.#picture(w, h), rays, pupil_mm, maps: this.quick,
         part: [(k % across) * w, height - (Math.floor(k / across) + 1) * h, w, h] }));
     }
     this.#names(mode === "anaglyph" ? [] : sides.map((side, k) => [`${side ? "right" : "left"} eye`, ((k % across) + 0.5) / across, (Math.floor(k / across) + 1) / down]));
