@@ -28,7 +28,7 @@ class BrowserEyes(Sensor):
         self._random = np.random.default_rng(0)
         self._waiting: deque[tuple[int, SensorFrame]] | None = None  # when each is there
         self._times, self._heard_ns, self._sampled_ns, self._count = DeviceClock(), 0, 0, 0
-        self._last = SeenEyes(None, 0.0)
+        self._last, self._captured_ns = SeenEyes(None, 0.0), 0
 
     def open(self) -> None:
         self._waiting, self._times, self._last = deque(), DeviceClock(), SeenEyes(None, 0.0)
@@ -65,6 +65,7 @@ class BrowserEyes(Sensor):
     def _take(self, capture_ns: int, now_ns: int) -> None:
         assert self._waiting is not None
         self._sampled_ns = now_ns
+        self._captured_ns = capture_ns = max(capture_ns, self._captured_ns + 1)  # one that came slowly is no older
         self._count += 1
         points, eyes_m = None, self._last.eyes_m
         if eyes_m is not None:

@@ -17,7 +17,11 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from runtime.browser.link import BrowserLink
+from runtime.clock import MonotonicClock
+from runtime.config import StackGeometry
 from runtime.page.token import cookie_of
+from runtime.sensor.browser import BrowserEyes
 from tests.browser.test_viewer import driven, needs_chromium
 from tests.page.rig import ROOT
 from tests.test_cli import refusal
@@ -166,6 +170,19 @@ def test_another_site_s_page_gets_no_connection_though_the_browser_gives_the_coo
     for origin in ("http://elsewhere.example", "null"):
         with pytest.raises((InvalidStatus, ConnectionClosed)):
             told(origin)
+
+
+def test_a_resting_head_is_sampled_on_and_captures_only_go_forward() -> None:
+    link = BrowserLink(StackGeometry().stack(), 40.0)
+    samples: list[Any] = []
+    with BrowserEyes(link, MonotonicClock()) as sensor:
+        for page_ms in (1000.0, 1001.0):  # the second one was long under way
+            link.see([[0.6, -0.03, 0.0], [0.6, 0.03, 0.0]], page_ms)
+            end = len(samples) + 4
+            while len(samples) < end:
+                samples += sensor.read_arrived(1.0)
+    captures = [sample.capture_ns for sample in samples]
+    assert captures == sorted(set(captures)) and all(sample.eyes is not None for sample in samples)
 
 
 def test_it_ends_when_its_time_is_up(tmp_path: Path) -> None:
